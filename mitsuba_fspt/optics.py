@@ -1,0 +1,224 @@
+"""The lens: lens law, diaphragm (Eq. 3), and the discs of the lens plane through which light may pass.
+
+Camera frame: lens plane z = 0, optical axis +z towards the object. Lengths in mm, all distances positive magnitudes
+from the lens plane. Pure Python floats in double precision; nothing here knows Mitsuba.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .errors import OpticsError
+
+MODELS = ("diaphragm", "hrrt", "pinhole", "ripoll")
+
+
+@dataclass(frozen=True)
+class Disc:
+    """Disc of the lens plane open to a virtual point at (x, y, u): centre `shift`·(x, y), radius `radius` [mm].
+
+    `shift` is 0 for a border that lies in the lens plane and 1 for a cone that moves along with the virtual point.
+    """
+
+    shift: float
+    radius: float
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Thin lens with a diaphragm, focused on the virtual detector plane z = u (paper, section 2.C).
+
+    Parameters
+    ----------
+    focal_length : F [mm], > 0
+    f_number : f_num = F/D (Eq. 3), > 0
+    focus_distance : u [mm], > F, from the lens plane to the virtual detector plane
+    lens_diameter : the lens border [mm]; None leaves the diaphragm as the only border
+    diaphragm_distance : from the lens plane to the diaphragm [mm]; > 0 behind the lens (detector side), < 0 in front
+    model : 'diaphragm' (this paper), 'hrrt' (lens border only), 'pinhole' (one line of sight a point), 'ripoll'
+        (acceptance cone of `numerical_aperture` about the detector normal)
+    numerical_aperture : sine of the half angle of that cone, in (0, 1); only for 'ripoll'
+
+    Raises
+    ------
+    OpticsError : the lens cannot exist or forms no real image; the message names the parameter.
+    """
+
+    focal_length: float
+    f_number: float
+    focus_distance: float
+    lens_diameter: float | None = None
+    diaphragm_distance: float = 0.0
+    model: str = "diaphragm"
+    numerical_aperture: float | None = None
+
+    @classmethod
+    def focused(
+        cls,
+        focal_length: float,
+        f_number: float,
+        *,
+        focus_distance: float | None = None,
+        magnification: float | None = None,
+        image_distance: float | None = None,
+        **borders: object,
+    ) -> Lens:
+        """Lens focused by exactly one of u (`focus_distance`), t (`magnification`) or v (`image_distance`).
+
+        Lens law: 1/F = 1/u + 1/v, t = v/u. Raises OpticsError where none or several are given.
+        """
+        _require_positive("focal_length", focal_length, "mm, for example 55")
+        given = {
+            name: value
+            for name, value in (
+                ("focus_distance", focus_distance),
+                ("magnification", magnification),
+                ("image_distance", image_distance),
+            )
+            if value is not None
+        }
+        if len(given) != 1:
+            raise OpticsError(
+                f"lens: exactly one of 'focus_distance', 'magnification', 'image_distance' sets the focus, got "
+                f"{' and '.join(repr(n) for n in given) or 'none'}. Give one, for example magnification = 0.5."
+            )
+        ((name, value),) = given.items()
+        _require_positive(name, value, "for example magnification = 0.5")
+        if name == "magnification":
+            focus_distance = focal_length * (1 + 1 / value)
+        elif name == "image_distance":
+            if value <= focal_length:
+                raise OpticsError(
+                    f"lens: 'image_distance' must be > focal_length = {focal_length:g} mm for a real image, "
+                    f"got {value:g}."
+                )
+            focus_distance = focal_length * value / (value - focal_length)
+        else:
+            focus_distance = value
+        return cls(focal_length, f_number, focus_distance, **borders)  # type: ignore[arg-type]
+
+    def __post_init__(self) -> None:
+        _require_positive("focal_length", self.focal_length, "mm, for example 55")
+        _require_positive("f_number", self.f_number, "f_number = F/D, for example 8")
+        _require_positive("focus_distance", self.focus_distance, "mm, for example 165")
+        if self.focus_distance <= self.focal_length:
+            raise OpticsError(
+                f"lens: 'focus_distance' must be > focal_length = {self.focal_length:g} mm for a real image, "
+                f"got {self.focus_distance:g}. Move the camera back or use a shorter lens."
+            )
+        if self.model not in MODELS:
+            raise OpticsError(f"lens: 'model' must be one of {', '.join(MODELS)}, got '{self.model}'.")
+        if not math.isfinite(self.diaphragm_distance):
+            raise OpticsError(f"lens: 'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm.")
+        self._check_borders()
+
+    def _check_borders(self) -> None:
+        if self.model == "ripoll":
+            if self.numerical_aperture is None or not 0 < self.numerical_aperture < 1:
+                raise OpticsError(
+                    f"lens: model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}."
+                )
+        elif self.numerical_aperture is not None:
+            raise OpticsError(
+                f"lens: 'numerical_aperture' = {self.numerical_aperture:g} belongs to model 'ripoll', this is "
+                f"'{self.model}'. Leave it out or set model to 'ripoll'."
+            )
+        if self.model == "hrrt" and self.lens_diameter is None:
+            raise OpticsError("lens: model 'hrrt' needs 'lens_diameter', the border that stops its light.")
+        if self.lens_diameter is not None:
+            _require_positive("lens_diameter", self.lens_diameter, "mm, for example 20")
+            # Float32 parameters pass through here: D = F/f_num computed twice may differ by its last bit.
+            if self.model == "diaphragm" and self.diaphragm_distance == 0:
+                if self.lens_diameter < self.diaphragm_diameter * (1 - 1e-6):
+                    raise OpticsError(
+                        f"lens: 'lens_diameter' = {self.lens_diameter:g} mm is smaller than the diaphragm "
+                        f"D = focal_length/f_number = {self.diaphragm_diameter:g} mm. Give a larger lens or "
+                        f"f_number >= {self.focal_length / self.lens_diameter:.4g}."
+                    )
+        if self.model == "diaphragm" and self.diaphragm_distance != 0:
+            if self.lens_diameter is None:
+                raise OpticsError(
+                    f"lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm needs 'lens_diameter', the second "
+                    "border a line of sight has to pass."
+                )
+            if self.diaphragm_distance >= self.image_distance:
+                raise OpticsError(
+                    f"lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be smaller than the image "
+                    f"distance {self.image_distance:g} mm: the diaphragm stands between lens and detector."
+                )
+            if -self.diaphragm_distance >= self.focus_distance:
+                raise OpticsError(
+                    f"lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be above -focus_distance = "
+                    f"{-self.focus_distance:g} mm: the diaphragm stands between lens and virtual detector plane."
+                )
+
+    @property
+    def image_distance(self) -> float:
+        """v [mm] from the lens law 1/F = 1/u + 1/v."""
+        return self.focal_length * self.focus_distance / (self.focus_distance - self.focal_length)
+
+    @property
+    def magnification(self) -> float:
+        """t = v/u."""
+        return self.focal_length / (self.focus_distance - self.focal_length)
+
+    @property
+    def diaphragm_diameter(self) -> float:
+        """D = F/f_num [mm] (Eq. 3)."""
+        return self.focal_length / self.f_number
+
+    @property
+    def discs(self) -> tuple[Disc, ...]:
+        """The one or two discs of the lens plane a line of sight has to pass; their overlap is the open pupil.
+
+        Eq. 5's β, generalised: the first disc is the one to integrate over, a second one clips it.
+        """
+        u, radius = self.focus_distance, self.diaphragm_diameter / 2
+        if self.model == "ripoll":
+            assert self.numerical_aperture is not None
+            return (Disc(1.0, u * math.tan(math.asin(self.numerical_aperture))),)
+        if self.model == "hrrt":
+            assert self.lens_diameter is not None
+            return (Disc(0.0, self.lens_diameter / 2),)
+        if self.model == "pinhole" or self.diaphragm_distance == 0:
+            return (Disc(0.0, radius),)
+        assert self.lens_diameter is not None
+        pupil = self._entrance_pupil_disc(radius)
+        lens = Disc(0.0, self.lens_diameter / 2)
+        return (lens,) if pupil is None else (pupil, lens)
+
+    def _entrance_pupil_disc(self, radius: float) -> Disc | None:
+        """The diaphragm's image through the lens, projected from the virtual plane onto the lens plane.
+
+        A diaphragm at s behind the lens has its image at s F/(s - F), magnified F/(F - s), seen from the object
+        side; one in front is its own image. A virtual point at (x, u) sees a circle of radius R_p at depth z_p as
+        the disc of the lens plane with radius R_p u/(u - z_p) about -x z_p/(u - z_p).
+        """
+        s, focal, u = self.diaphragm_distance, self.focal_length, self.focus_distance
+        if s < 0:
+            depth, pupil_radius = -s, radius
+        elif s == focal:
+            # The image lies at infinity: the diaphragm stops directions, |slope| <= radius / F, a cone about the axis.
+            return Disc(1.0, u * radius / focal)
+        else:
+            depth, pupil_radius = s * focal / (s - focal), abs(radius * focal / (focal - s))
+        if depth == u:
+            return None  # the diaphragm lies on the detector: a field stop, not a pupil
+        return Disc(-depth / (u - depth), abs(pupil_radius * u / (u - depth)))
+
+
+def configuration_factor(radius: float, distance: float, offset: float) -> float:
+    """Share of a Lambertian point's power that a parallel coaxial-or-offset disc receives (no unit).
+
+    f = ½ (1 − (Z − 2R²)/√(Z² − 4R²a²)), Z = u² + R² + a², with R `radius`, u `distance`, a `offset` [mm], written
+    without the cancellation at small R.
+    """
+    z = distance**2 + radius**2 + offset**2
+    s = math.sqrt((z - 2 * radius * offset) * (z + 2 * radius * offset))
+    return 2 * radius**2 * distance**2 / (s * (s + z - 2 * radius**2))
+
+
+def _require_positive(name: str, value: float, example: str) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise OpticsError(f"lens: '{name}' must be > 0 and finite, got {value:g}. Give {example}.")
