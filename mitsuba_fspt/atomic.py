@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import FsptError
@@ -15,26 +15,24 @@ from .errors import FsptError
 def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError) -> Iterator[Path]:
     """Path of an empty temporary file beside `path`; it takes the place of `path` when the block ends well.
 
-    The temporary name keeps the suffix of `path`, for libraries that choose the format by it. If the block raises
-    anything (an error, a full disk, Ctrl-C), the temporary file is removed and what stood at `path` stays as it
-    was. An OSError comes out as `error`, everything else as it is.
+    The temporary name keeps the suffix of `path`, for libraries that choose the format by it. If the block
+    raises anything (an error, a full disk, Ctrl-C), the temporary file is removed and what stood at `path` stays
+    as it was. An OSError comes out as `error`, everything else as it is.
 
         with atomic_path("phantom.ply", FluxError) as temporary:
             mesh.export(temporary)
 
     Raises
     ------
-    error : `path` is a folder or write-protected, or its folder does not exist, cannot be written to or is full.
+    error : `path` is a folder or write-protected, or its folder does not exist, is full or write-protected.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):
         raise error(f"output file '{path}' is a folder. Give the name of a file in it.")
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):
         raise error(f"output file '{path}': the folder '{path.parent}' does not exist. Create it first.")
-    if path.exists() and not os.access(path, os.W_OK):
-        raise error(
-            f"output file '{path}' exists and is write-protected. Give another name or remove it first."
-        )
+    if os.path.exists(path) and not os.access(path, os.W_OK):
+        raise error(f"output file '{path}' is write-protected. Give another name or remove it first.")
     # A long stem is cut, so that the temporary name is not refused where the final one is allowed.
     temporary = path.with_name(f".{path.stem[:40]}-{secrets.token_hex(4)}{path.suffix}")
     try:
@@ -44,8 +42,8 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
     except OSError as cause:
         reason = (cause.strerror or str(cause)).replace("\n", " ")
         raise error(
-            f"output file '{path}' cannot be written: {reason}. Give a path in another folder."
+            f"output file '{path}' cannot be written: {reason}. Give another place for it."
         ) from cause
     finally:
-        # Where the folder itself has gone, so has the file.
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
