@@ -16,8 +16,8 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
     """Path of an empty temporary file beside `path`; it takes the place of `path` when the block ends well.
 
     The temporary name keeps the suffix of `path`, for libraries that choose the format by it. If the block
-    raises anything (an error, a full disk, Ctrl-C), the temporary file is removed and what stood at `path` stays
-    as it was. An OSError comes out as `error`, everything else as it is.
+    raises anything (an error, a full disk, Ctrl-C), the temporary file is removed and what stood at `path`
+    stays as it was. An OSError comes out as `error`, everything else as it is.
 
         with atomic_path("phantom.ply", FluxError) as temporary:
             mesh.export(temporary)
