@@ -122,15 +122,19 @@ def _one_line(cause: BaseException) -> str:
 def _muted() -> Iterator[None]:
     """Nothing of what OpenEXR prints about a damaged file, which it reports by raising as well.
 
-    Its Python part prints to `sys.stdout`; its C part writes past `sys.stderr`, so that for a moment the whole
-    process has no standard error.
+    Its Python part prints to `sys.stdout`; its C part writes past `sys.stderr`, so that for a moment the
+    whole process has no standard error.
     """
-    stderr = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        with redirect_stdout(StringIO()):
+    with redirect_stdout(StringIO()):
+        try:
+            stderr = os.dup(2)
+        except OSError:  # standard error is closed already
             yield
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
+            return
+        try:
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
