@@ -80,7 +80,7 @@ class Lens:
         }
         if len(given) != 1:
             raise OpticsError(
-                f"lens: exactly one of 'focus_distance', 'magnification', 'image_distance' sets the focus, got "
+                f"fspt_lens: exactly one of 'focus_distance', 'magnification', 'image_distance' sets the focus, got "
                 f"{' and '.join(repr(n) for n in given) or 'none'}. Give one, for example magnification = 0.5."
             )
         ((name, value),) = given.items()
@@ -90,7 +90,7 @@ class Lens:
         elif name == "image_distance":
             if value <= focal_length:
                 raise OpticsError(
-                    f"lens: 'image_distance' must be > focal_length = {focal_length:g} mm for a real image, "
+                    f"fspt_lens: 'image_distance' must be > focal_length = {focal_length:g} mm for a real image, "
                     f"got {value:g}."
                 )
             focus_distance = focal_length * value / (value - focal_length)
@@ -104,52 +104,52 @@ class Lens:
         _require_positive("focus_distance", self.focus_distance, "mm, for example 165")
         if self.focus_distance <= self.focal_length:
             raise OpticsError(
-                f"lens: 'focus_distance' must be > focal_length = {self.focal_length:g} mm for a real image, "
+                f"fspt_lens: 'focus_distance' must be > focal_length = {self.focal_length:g} mm for a real image, "
                 f"got {self.focus_distance:g}. Move the camera back or use a shorter lens."
             )
         if self.model not in MODELS:
-            raise OpticsError(f"lens: 'model' must be one of {', '.join(MODELS)}, got '{self.model}'.")
+            raise OpticsError(f"fspt_lens: 'model' must be one of {', '.join(MODELS)}, got '{self.model}'.")
         if not math.isfinite(self.diaphragm_distance):
-            raise OpticsError(f"lens: 'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm.")
+            raise OpticsError(f"fspt_lens: 'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm.")
         self._check_borders()
 
     def _check_borders(self) -> None:
         if self.model == "ripoll":
             if self.numerical_aperture is None or not 0 < self.numerical_aperture < 1:
                 raise OpticsError(
-                    f"lens: model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}."
+                    f"fspt_lens: model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}."
                 )
         elif self.numerical_aperture is not None:
             raise OpticsError(
-                f"lens: 'numerical_aperture' = {self.numerical_aperture:g} belongs to model 'ripoll', this is "
+                f"fspt_lens: 'numerical_aperture' = {self.numerical_aperture:g} belongs to model 'ripoll', this is "
                 f"'{self.model}'. Leave it out or set model to 'ripoll'."
             )
         if self.model == "hrrt" and self.lens_diameter is None:
-            raise OpticsError("lens: model 'hrrt' needs 'lens_diameter', the border that stops its light.")
+            raise OpticsError("fspt_lens: model 'hrrt' needs 'lens_diameter', the border that stops its light.")
         if self.lens_diameter is not None:
             _require_positive("lens_diameter", self.lens_diameter, "mm, for example 20")
             # Float32 parameters pass through here: D = F/f_num computed twice may differ by its last bit.
             if self.model == "diaphragm" and self.diaphragm_distance == 0:
                 if self.lens_diameter < self.diaphragm_diameter * (1 - 1e-6):
                     raise OpticsError(
-                        f"lens: 'lens_diameter' = {self.lens_diameter:g} mm is smaller than the diaphragm "
+                        f"fspt_lens: 'lens_diameter' = {self.lens_diameter:g} mm is smaller than the diaphragm "
                         f"D = focal_length/f_number = {self.diaphragm_diameter:g} mm. Give a larger lens or "
                         f"f_number >= {self.focal_length / self.lens_diameter:.4g}."
                     )
         if self.model == "diaphragm" and self.diaphragm_distance != 0:
             if self.lens_diameter is None:
                 raise OpticsError(
-                    f"lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm needs 'lens_diameter', the second "
+                    f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm needs 'lens_diameter', the second "
                     "border a line of sight has to pass."
                 )
             if self.diaphragm_distance >= self.image_distance:
                 raise OpticsError(
-                    f"lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be smaller than the image "
+                    f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be smaller than the image "
                     f"distance {self.image_distance:g} mm: the diaphragm stands between lens and detector."
                 )
             if -self.diaphragm_distance >= self.focus_distance:
                 raise OpticsError(
-                    f"lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be above -focus_distance = "
+                    f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be above -focus_distance = "
                     f"{-self.focus_distance:g} mm: the diaphragm stands between lens and virtual detector plane."
                 )
 
@@ -176,14 +176,11 @@ class Lens:
         """
         u, radius = self.focus_distance, self.diaphragm_diameter / 2
         if self.model == "ripoll":
-            assert self.numerical_aperture is not None
             return (Disc(1.0, u * math.tan(math.asin(self.numerical_aperture))),)
         if self.model == "hrrt":
-            assert self.lens_diameter is not None
             return (Disc(0.0, self.lens_diameter / 2),)
         if self.model == "pinhole" or self.diaphragm_distance == 0:
             return (Disc(0.0, radius),)
-        assert self.lens_diameter is not None
         pupil = self._entrance_pupil_disc(radius)
         lens = Disc(0.0, self.lens_diameter / 2)
         return (lens,) if pupil is None else (pupil, lens)
@@ -221,4 +218,4 @@ def configuration_factor(radius: float, distance: float, offset: float) -> float
 
 def _require_positive(name: str, value: float, example: str) -> None:
     if not (math.isfinite(value) and value > 0):
-        raise OpticsError(f"lens: '{name}' must be > 0 and finite, got {value:g}. Give {example}.")
+        raise OpticsError(f"fspt_lens: '{name}' must be > 0 and finite, got {value:g}. Give {example}.")

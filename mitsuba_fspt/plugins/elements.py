@@ -1,0 +1,154 @@
+"""Elements of an emitting surface: small patches with known area and power, to sample from and to integrate over.
+
+A mesh is cut into its faces, each into k² equal triangles where it has few; any other shape into a grid of its
+surface parameters (u, v). Elements know where they lie on the surface and which one holds a given surface point.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+MIN_ELEMENTS = 1 << 16
+# Share of the samples that goes everywhere alike, so that light smaller than an element is never excluded.
+UNIFORM_SHARE = 1e-3
+
+
+def elements_of(shape: mi.Shape, minimum: int = MIN_ELEMENTS) -> Elements:
+    """The elements of `shape`, at least `minimum` of them."""
+    return MeshElements(shape, minimum) if shape.is_mesh() else ParameterElements(shape, minimum)
+
+
+class Elements:
+    """Patches of one shape: `count` of them, element `index` placed by a point of the unit square."""
+
+    count: int
+
+    def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        """Surface point of element `index` at `sample` of [0, 1]², and dA/d(sample) there [mm²]."""
+        raise NotImplementedError
+
+    def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
+        """Element that holds `si`, and dA/d(sample) of `place` there [mm²]."""
+        raise NotImplementedError
+
+    def areas(self) -> mi.Float:
+        """Area of each element [mm²], the mean of dA over a few points."""
+        index = dr.arange(mi.UInt32, self.count)
+        total = dr.zeros(mi.Float, self.count)
+        for point in _FIVE_POINTS:
+            total += self.place(index, mi.Point2f(*point))[1]
+        return total / len(_FIVE_POINTS)
+
+
+_FIVE_POINTS = ((0.5, 0.5), (0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))
+
+
+class MeshElements(Elements):
+    """Faces of a triangle mesh, each cut into k² congruent triangles."""
+
+    def __init__(self, shape: mi.Shape, minimum: int) -> None:
+        self.shape = shape
+        self.mesh = mi.MeshPtr(shape)
+        faces = shape.primitive_count()
+        self.k = math.ceil(math.sqrt(minimum / max(1, faces)))
+        self.count = faces * self.k**2
+
+    def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        k = self.k
+        face, part = index // (k * k), index % (k * k)
+        # Part r² + c of a face lies in row r of its k rows; odd c are the triangles that stand upside down.
+        row = mi.UInt32(dr.sqrt(mi.Float(part) + 0.5))
+        column = part - row * row
+        i, j, upright = mi.Float(row), mi.Float(column // 2), (column % 2) == 0
+        b = mi.warp.square_to_uniform_triangle(sample)
+        x = i + dr.select(upright, b.x + b.y, b.x)
+        y = j + dr.select(upright, b.y, b.x + b.y)
+        return self._interaction(face, mi.Point2f(x - y, y) / k)
+
+    def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
+        k = self.k
+        p0, e1, e2 = self._corners(si.prim_index)
+        b = _barycentric(si.p - p0, e1, e2)
+        x, y = k * (b.x + b.y), k * b.y
+        row, half = dr.clip(dr.floor(x), 0, k - 1), dr.floor(y)
+        upside_down = dr.select(y - half > x - row, 1, 0)
+        column = dr.clip(2 * half + upside_down, 0, 2 * row)
+        index = si.prim_index * (k * k) + mi.UInt32(row * row + column)
+        return index, self._area(e1, e2)
+
+    def _interaction(self, face: mi.UInt32, uv: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        p0, e1, e2 = self._corners(face)
+        pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(face))
+        pi.valid, pi.t, pi.prim_index, pi.prim_uv = True, 1.0, face, uv
+        pi.shape = mi.ShapePtr(self.shape)
+        si = pi.compute_surface_interaction(mi.Ray3f(p0, dr.cross(e2, e1)), mi.RayFlags.All)
+        return si, self._area(e1, e2)
+
+    def _corners(self, face: mi.UInt32) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
+        f = self.mesh.face_indices(face)
+        p0, p1, p2 = (self.mesh.vertex_position(f[n]) for n in range(3))
+        return p0, mi.Vector3f(p1 - p0), mi.Vector3f(p2 - p0)
+
+    def _area(self, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Float:
+        return dr.norm(dr.cross(e1, e2)) / (2 * self.k**2)
+
+
+class ParameterElements(Elements):
+    """Grid of equal cells in the surface parameters (u, v) of an analytic shape."""
+
+    def __init__(self, shape: mi.Shape, minimum: int) -> None:
+        self.shape = shape
+        self.side = math.ceil(math.sqrt(minimum))
+        self.count = self.side**2
+
+    def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        cell = mi.Point2f(mi.Float(index % self.side), mi.Float(index // self.side))
+        si = self.shape.eval_parameterization((cell + sample) / self.side)
+        return si, self._area(si)
+
+    def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
+        cell = mi.Point2u(dr.clip(si.uv * self.side, 0, self.side - 1))
+        return cell.x + cell.y * self.side, self._area(si)
+
+    def _area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / self.count
+
+
+def _barycentric(d: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Point2f:
+    """Coordinates (b1, b2) of d = b1 e1 + b2 e2 in the plane of the two edges."""
+    n = dr.cross(e1, e2)
+    scale = dr.rcp(dr.squared_norm(n))
+    return mi.Point2f(dr.dot(dr.cross(d, e2), n) * scale, dr.dot(dr.cross(e1, d), n) * scale)
+
+
+class ElementDistribution:
+    """Surface points with a density ∝ the exitance of their element [1/mm²]."""
+
+    def __init__(self, elements: Elements, exitance: mi.Texture) -> None:
+        self.elements = elements
+        index = dr.arange(mi.UInt32, elements.count)
+        power = dr.zeros(mi.Float, elements.count)
+        for point in _FIVE_POINTS:
+            si, area = elements.place(index, mi.Point2f(*point))
+            power += area * scalar(exitance.eval(si))
+        share = power + (UNIFORM_SHARE * dr.mean(power) / dr.mean(elements.areas())) * elements.areas()
+        self._choice = mi.DiscreteDistribution(share)
+
+    def sample(self, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        """Surface point drawn with two uniform numbers, and its density [1/mm²]."""
+        index, x, chance = self._choice.sample_reuse_pmf(sample.x, active)
+        si, area = self.elements.place(index, mi.Point2f(x, sample.y))
+        return si, dr.select(area > 0, chance / area, 0)
+
+    def pdf(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+        """Density of `sample` at `si` [1/mm²]."""
+        index, area = self.elements.locate(si)
+        return dr.select(active & (area > 0), self._choice.eval_pmf_normalized(index, active) / area, 0)
+
+
+def scalar(spectrum: mi.Spectrum) -> mi.Float:
+    """The one number of a spectrally flat, unpolarised quantity, whatever the variant stores it in."""
+    return dr.mean(mi.unpolarized_spectrum(spectrum)) if mi.is_polarized else dr.mean(spectrum)

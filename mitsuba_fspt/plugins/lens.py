@@ -1,0 +1,230 @@
+"""`fspt_lens`: the camera of the paper, a thin lens with a diaphragm, whose film holds power in W on the pixel."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import OpticsError
+from ..optics import Disc, Lens
+
+REQUIRED = ("focal_length", "f_number", "pixel_pitch")
+OPTIONAL = (
+    "focus_distance",
+    "magnification",
+    "image_distance",
+    "lens_diameter",
+    "diaphragm_distance",
+    "numerical_aperture",
+)
+
+
+class FsptLens(mi.Sensor):
+    r"""
+    .. _sensor-fspt_lens:
+
+    Thin lens with a diaphragm (:monosp:`fspt_lens`)
+    ------------------------------------------------
+
+    .. pluginparameters::
+
+     * - focal_length
+       - |float| [mm]
+       - F > 0. Updatable.
+     * - f_number
+       - |float|
+       - f_num > 0; the diaphragm has the diameter D = F/f_num (Eq. 3). Updatable.
+     * - focus_distance, magnification, image_distance
+       - |float| [mm, 1, mm]
+       - Exactly one of u > F, t = v/u or v > F sets the focus: 1/F = 1/u + 1/v. The given one is updatable.
+     * - pixel_pitch
+       - |float| [mm]
+       - Side p of a detector pixel; a virtual pixel on the plane z = u has the side p/t. Updatable.
+     * - lens_diameter
+       - |float| [mm]
+       - Optional border of the lens. Must not be smaller than a diaphragm that lies in the lens.
+     * - diaphragm_distance
+       - |float| [mm]
+       - From the lens to the diaphragm, > 0 behind the lens, < 0 in front (Default: 0, in the lens). Needs lens_diameter.
+     * - model
+       - |string|
+       - diaphragm (default) | hrrt (no diaphragm, D = lens_diameter) | pinhole (one line of sight a point) |
+         ripoll (acceptance cone of numerical_aperture about the detector normal).
+     * - numerical_aperture
+       - |float|
+       - Sine of the half angle of that cone, in (0, 1); only with model ripoll.
+     * - to_world
+       - |transform|
+       - Rotation and translation. Puts the lens centre at the origin looking along +z. Updatable.
+
+    The sensor weighs a line of sight from lens point a to virtual point r_vd with A_vd A_pupil cos⁴θ/u², so that
+    the mean of weight × radiance over a pixel is the power on it [W] (pupil form of Eq. 9). A power on a pixel is one
+    float32 number gathered by that pixel alone, so the film becomes a monochrome float32 film with a box filter
+    whatever the scene file says; its size and crop window are kept.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        _own_film(props)
+        super().__init__(props)
+        self._numbers = {n: mi.Float64(float(props[n])) for n in REQUIRED + OPTIONAL if props.has_property(n)}
+        missing = [name for name in REQUIRED if name not in self._numbers]
+        if missing:
+            raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
+        self._model = str(props.get("model", "diaphragm"))
+        self.m_needs_sample_2 = self.m_needs_sample_3 = True
+        self._update()
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        for name, value in self._numbers.items():
+            cb.put(name, value, mi.ParamFlags.NonDifferentiable)
+        cb.put("to_world", self.m_to_world, mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self._update()
+
+    def _update(self) -> None:
+        """Check the numbers and derive what the kernels read; opaque, so that a new value compiles nothing."""
+        numbers = {name: float(value[0]) for name, value in self._numbers.items()}
+        pitch = numbers.pop("pixel_pitch")
+        if not 0 < pitch < float("inf"):
+            raise OpticsError(
+                f"fspt_lens: 'pixel_pitch' must be > 0 and finite, got {pitch:g}. Give mm, for example 0.0135."
+            )
+        if dr.any(self.m_to_world.has_scale()):
+            raise OpticsError("fspt_lens: 'to_world' scales lengths. Give a rotation and a translation only.")
+        self.optics = Lens.focused(model=self._model, **numbers)
+        self.virtual_pitch = pitch / self.optics.magnification
+        self._discs = [_OpaqueDisc(disc) for disc in self.optics.discs]
+        self._spread = 0.0 if self._model == "pinhole" else 1.0
+        self._u = dr.opaque(mi.Float, self.optics.focus_distance)
+        self._pitch = dr.opaque(mi.Float, self.virtual_pitch)
+        # A_vd A_pupil/u² in double first: far away and stopped down, its factors leave the range of float32.
+        self.etendue = self.virtual_pitch**2 * math.pi * (self.optics.discs[0].radius / self.optics.focus_distance) ** 2
+        self._etendue = dr.opaque(mi.Float, self.etendue)
+        dr.make_opaque(self.m_to_world)
+
+    # ------------------------------------------------------------------ lines of sight
+
+    def virtual_point(self, position: mi.Point2f) -> mi.Point2f:
+        """Point of the virtual detector plane [mm] conjugate to a film position [pixels from the top left corner].
+
+        Mitsuba's camera frame has +x to the left and +y up of the upright picture.
+        """
+        size = mi.ScalarVector2f(self.film().size())
+        return (0.5 * mi.Vector2f(size) - position) * self._pitch
+
+    def line_of_sight(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Ray3f, mi.Float]:
+        """Ray from the pupil point through the virtual point, and its weight A_vd A_pupil cos⁴θ/u² [mm² sr].
+
+        `position` [film pixels], `pupil` [unit disc]. The weight is 0 where a second border clips the ray.
+        """
+        x = self.virtual_point(position)
+        disc = self._discs[0]
+        a = disc.shift * x + (disc.radius * self._spread) * pupil
+        d = mi.Vector3f(x.x - a.x, x.y - a.y, self._u)
+        distance2 = dr.squared_norm(d)
+        cos2 = dr.square(self._u) / distance2
+        weight = dr.select(self._open(x, a), self._etendue * dr.square(cos2), 0)
+        origin, direction = mi.Point3f(a.x, a.y, 0), d * dr.rsqrt(distance2)
+        ray = mi.Ray3f(self.m_to_world @ origin, self.m_to_world @ direction)
+        return ray, weight
+
+    def _open(self, x: mi.Point2f, a: mi.Point2f) -> mi.Bool:
+        """True where the line through virtual point x and lens point a passes every further border (Eq. 5)."""
+        passes = mi.Bool(True)
+        for disc in self._discs[1:]:
+            passes &= dr.squared_norm(a - disc.shift * x) <= dr.square(disc.radius)
+        return passes
+
+    # ------------------------------------------------------------------ Mitsuba's sensor interface
+
+    def sample_ray(
+        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Line of sight through a uniform point of the crop window and a uniform point of the pupil."""
+        film = self.film()
+        position = sample2 * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
+        ray, weight = self.line_of_sight(position, mi.warp.square_to_uniform_disk_concentric(sample3))
+        wavelengths, spectrum = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
+        ray.time, ray.wavelengths = time, wavelengths
+        return ray, spectrum * weight
+
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """Direction from `it` to a uniform point of the pupil, with the film position its light arrives at.
+
+        The weight is A_pupil cosθ/d² over the number of crop pixels, by which light tracers multiply again.
+        """
+        film, disc, u = self.film(), self._discs[0], self._u
+        p = self.m_to_world.inverse() @ it.p
+        rho = mi.warp.square_to_uniform_disk_concentric(sample) * (disc.radius * self._spread)
+        # r = x + (a − x)(u − z)/u with a = shift·x + ρ: solve for the virtual point x of the line through r and ρ.
+        back = (u - p.z) / u
+        scale = 1 - (1 - disc.shift) * back
+        x = (mi.Point2f(p.x, p.y) - rho * back) / scale
+        a = disc.shift * x + rho
+        d = mi.Vector3f(a.x - p.x, a.y - p.y, -p.z)
+        dist2 = dr.squared_norm(d)
+        cos_theta = p.z * dr.rsqrt(dist2)
+        position = 0.5 * mi.Vector2f(film.size()) - x / self._pitch - mi.Vector2f(film.crop_offset())
+        size = mi.Vector2f(film.crop_size())
+        valid = active & (p.z > 0) & dr.all((position >= 0) & (position < size)) & self._open(x, a)
+        # dA_a = (da/dρ)² dA_ρ: the pupil point moves along with x unless the disc is fixed in the lens plane.
+        area = dr.pi * dr.square(disc.radius * (1 - disc.shift * back / scale))
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.uv = mi.Point2f(position)
+        ds.p = self.m_to_world @ mi.Point3f(a.x, a.y, 0)
+        ds.n = mi.Normal3f(self.m_to_world @ mi.Vector3f(0, 0, 1))
+        ds.dist = dr.sqrt(dist2)
+        ds.d = self.m_to_world @ (d / ds.dist)
+        ds.pdf = dr.select(valid, dist2 / (cos_theta * area), 0)
+        return ds, mi.Spectrum(dr.select(valid, area * cos_theta / (dist2 * size.x * size.y), 0))
+
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
+        return dr.select(active, ds.pdf, 0)
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        centre = self.m_to_world.translation()
+        corner = mi.ScalarPoint3f(*(float(c[0]) for c in centre))
+        return mi.ScalarBoundingBox3f(corner, corner)
+
+    def to_string(self) -> str:
+        rows = [f"  {name} = {float(value[0]):g}," for name, value in self._numbers.items()]
+        return "\n".join(["FsptLens[", f"  model = {self._model},", *rows, f"  film = {self.film()}", "]"])
+
+
+class _OpaqueDisc:
+    """A disc of the lens plane as kernel parameters."""
+
+    def __init__(self, disc: Disc) -> None:
+        self.shift, self.radius = dr.opaque(mi.Float, disc.shift), dr.opaque(mi.Float, disc.radius)
+
+
+def _own_film(props: mi.Properties) -> None:
+    """Replace the film of the scene file by one of its size that stores power: monochrome, float32, box filter."""
+    size, crop_offset, crop_size = (256, 256), (0, 0), None
+    for name, child in props.objects():
+        if isinstance(child, mi.Film):
+            size, crop_offset, crop_size = child.size(), child.crop_offset(), child.crop_size()
+            props.remove_property(name)
+            break
+    crop_size = size if crop_size is None else crop_size
+    film = {
+        "type": "hdrfilm",
+        "width": int(size[0]),
+        "height": int(size[1]),
+        "crop_offset_x": int(crop_offset[0]),
+        "crop_offset_y": int(crop_offset[1]),
+        "crop_width": int(crop_size[0]),
+        "crop_height": int(crop_size[1]),
+        "pixel_format": "luminance",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    props["film"] = mi.load_dict(film)
+
+
+mi.register_sensor("fspt_lens", FsptLens)

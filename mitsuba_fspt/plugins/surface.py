@@ -1,0 +1,233 @@
+"""`fspt_surface`: the phantom's surface as an emitter with the surface flux density J_n [W/mm²]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import ExitanceError
+from .elements import ElementDistribution, elements_of, scalar
+
+
+class FsptSurface(mi.Emitter):
+    r"""
+    .. _emitter-fspt_surface:
+
+    Glowing surface (:monosp:`fspt_surface`)
+    ----------------------------------------
+
+    .. pluginparameters::
+
+     * - exitance
+       - |float| or |texture| [W/mm²]
+       - Surface flux density J_n >= 0, finite, > 0 somewhere: a number, a mesh attribute, a raw bitmap.
+         Updatable, differentiable.
+
+    Lambert's law (Eq. 1): the radiance is L = J_n/π [W/mm²/sr] on the outward side, the side of the geometric
+    normal, and 0 on the other. Positions are sampled ∝ J_n.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        if not props.has_property("exitance"):
+            raise ExitanceError("fspt_surface: 'exitance' is missing. Give J_n in W/mm² as a float or a texture.")
+        self.exitance = props.get_emissive_texture("exitance")
+        self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
+        self.m_needs_sample_2 = self.m_needs_sample_3 = True
+        self._positions: ElementDistribution | None = None
+        self._probe: mi.Scene | None = None
+        self._checked = False
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        super().traverse(cb)
+        cb.put("exitance", self.exitance, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        super().parameters_changed(keys)
+        self._positions = self._probe = None
+        self._checked = False
+
+    # ------------------------------------------------------------------ radiance
+
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        """Radiance J_n/π [W/mm²/sr] towards `si.wi`, 0 on the inward side."""
+        self.check()
+        outward = active & (dr.dot(si.n, si.to_world(si.wi)) > 0)
+        return mi.depolarizer(dr.select(outward, self._radiance(si, outward), 0))
+
+    def _radiance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        return self.exitance.eval(si, active) * dr.inv_pi
+
+    # ------------------------------------------------------------------ sampling
+
+    def sample_position(
+        self, time: mi.Float, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.PositionSample3f, mi.Float]:
+        """Surface point with density ∝ J_n [1/mm²]; the weight is 1/density."""
+        si, pdf = self._distribution().sample(sample, active)
+        ps = mi.PositionSample3f(si)
+        ps.n, ps.time, ps.pdf, ps.delta = si.n, time, pdf, False
+        return ps, _rcp(pdf)
+
+    def pdf_position(self, ps: mi.PositionSample3f, active: mi.Bool = True) -> mi.Float:
+        return self._distribution().pdf(self._surface_at(ps, active), active)
+
+    def sample_ray(
+        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Ray from a point ∝ J_n in a direction ∝ cosθ; its weight is the power it stands for [W]."""
+        si, pdf = self._distribution().sample(sample2, active)
+        si.wavelengths, weight = sample_wavelengths(sample1)
+        direction = mi.Frame3f(si.n).to_world(mi.warp.square_to_cosine_hemisphere(sample3))
+        si.time = time
+        ray = si.spawn_ray(direction)
+        power = self._radiance(si, active) * (dr.pi * _rcp(pdf))
+        return ray, mi.depolarizer(power * weight)
+
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """Direction from `it` to a surface point ∝ J_n; the weight is radiance over its density [1/sr]."""
+        si, pdf = self._distribution().sample(sample, active)
+        ds = mi.DirectionSample3f(mi.PositionSample3f(si))
+        ds.n, ds.time, ds.emitter, ds.delta = si.n, it.time, mi.EmitterPtr(self), False
+        ds.d = si.p - it.p
+        ds.dist = dr.norm(ds.d)
+        ds.d /= ds.dist
+        ds.pdf = _solid_angle(pdf, ds)
+        active &= ds.pdf > 0
+        si.wavelengths = it.wavelengths
+        weight = dr.select(active, self._radiance(si, active) * _rcp(ds.pdf), 0)
+        return ds, mi.depolarizer(weight)
+
+    def pdf_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+    ) -> mi.Float:
+        pdf = self._distribution().pdf(self._surface_at(ds, active), active)
+        return dr.select(active, _solid_angle(pdf, ds), 0)
+
+    def eval_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+    ) -> mi.Spectrum:
+        """Radiance [W/mm²/sr] that arrives at `it` from the surface point of `ds`."""
+        si = self._surface_at(ds, active)
+        si.wavelengths = it.wavelengths
+        outward = active & (dr.dot(ds.d, ds.n) < 0)
+        return mi.depolarizer(dr.select(outward, self._radiance(si, outward), 0))
+
+    def sample_wavelengths(
+        self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
+    ) -> tuple[mi.Wavelength, mi.Spectrum]:
+        """Wavelengths, and the radiance at `si` over their density; light tracers learn the radiance here."""
+        ps = mi.PositionSample3f(si)
+        ps.n = si.n
+        wavelengths, weight = sample_wavelengths(sample)
+        here = self._surface_at(ps, active)
+        here.wavelengths = wavelengths
+        return wavelengths, mi.depolarizer(self._radiance(here, active) * weight)
+
+    # ------------------------------------------------------------------ the surface itself
+
+    def check(self) -> None:
+        """Raise ExitanceError where J_n is missing, negative, not finite or zero everywhere; once a change."""
+        if self._checked:
+            return
+        self._checked = True
+        name = f"fspt_surface on shape '{self.get_shape().id()}'"
+        check_attribute(name, self.get_shape(), self.exitance)
+        outside_recording(check_values, name, self.get_shape(), self.exitance)
+
+    def _distribution(self) -> ElementDistribution:
+        self.check()
+        if self._positions is None:
+            with dr.suspend_grad():
+                self._positions = outside_recording(ElementDistribution, elements_of(self.get_shape()), self.exitance)
+        return self._positions
+
+    def _surface_at(self, ps: mi.PositionSample3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        """The full surface record at a position sample, which lacks the face it lies on."""
+        shape = self.get_shape()
+        if not shape.is_mesh():
+            return shape.eval_parameterization(ps.uv, active=active)
+        if self._probe is None:
+            self._probe = outside_recording(
+                mi.load_dict, {"type": "scene", "embree_use_robust_intersections": True, "shape": shape}
+            )
+        reach = 1e-4 * (dr.max(dr.abs(ps.p)) + 1e-3)
+        ray = mi.Ray3f(ps.p + reach * ps.n, -ps.n)
+        ray.maxt = 2 * reach
+        return self._probe.ray_intersect(ray, active)
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        return self.get_shape().bbox()
+
+    def to_string(self) -> str:
+        return f"FsptSurface[\n  exitance = {self.exitance}\n]"
+
+
+def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedSpectrum]:
+    """Wavelengths [nm] and the inverse of their density, in spectral variants; nothing and 1 elsewhere."""
+    if not mi.is_spectral:
+        return mi.Color0f(), mi.UnpolarizedSpectrum(1)
+    return mi.sample_rgb_spectrum(mi.math.sample_shifted(sample))
+
+
+def outside_recording(function: Callable[..., Any], *args: Any) -> Any:
+    """`function(*args)` evaluated now, even while the caller's thread records a kernel.
+
+    Light tracers first meet the emitter in the middle of a recording, where nothing can be evaluated. Dr.Jit records
+    by thread, so a thread of its own is free to.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(function, *args).result()
+
+
+def check_attribute(name: str, shape: mi.Shape, exitance: mi.Texture) -> None:
+    """Raise ExitanceError where `exitance` reads a mesh attribute the shape does not have (rendered black)."""
+    if exitance.class_name() != "MeshAttribute":
+        return
+    attribute = str(exitance).split('name = "', 1)[1].split('"', 1)[0]
+    if not dr.all(shape.has_attribute(attribute)):
+        kind, _, plain = attribute.partition("_")
+        raise ExitanceError(
+            f"{name}: mesh attribute '{attribute}' is missing. In a PLY name the {kind} property '{plain}_x', or "
+            f"import the values with 'fspt flux import'."
+        )
+
+
+def check_values(name: str, shape: mi.Shape, exitance: mi.Texture) -> None:
+    """Raise ExitanceError where J_n is negative, not finite or zero everywhere, at every corner and centre."""
+    elements = elements_of(shape, minimum=1 << 14)
+    index = dr.arange(mi.UInt32, elements.count)
+    lowest, highest = mi.Float(dr.inf), mi.Float(0)
+    finite = mi.Bool(True)
+    for point in ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5)):
+        value = scalar(exitance.eval(elements.place(index, mi.Point2f(*point))[0]))
+        finite &= dr.all(dr.isfinite(value))
+        lowest, highest = dr.minimum(lowest, dr.min(value)), dr.maximum(highest, dr.max(value))
+    if not finite[0]:
+        raise ExitanceError(f"{name}: 'exitance' has NaN or infinite values. Mend the data before rendering.")
+    if lowest[0] < 0:
+        raise ExitanceError(
+            f"{name}: 'exitance' must be >= 0 W/mm², its lowest value is {lowest[0]:.4g}. Clip it on import: "
+            "'fspt flux import --clip'."
+        )
+    if highest[0] == 0:
+        raise ExitanceError(f"{name}: 'exitance' is 0 everywhere: nothing glows. Give J_n in W/mm².")
+
+
+def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
+    """Density per solid angle [1/sr] from density per area [1/mm²]; 0 from behind."""
+    cos_theta = -dr.dot(ds.d, ds.n)
+    return dr.select(cos_theta > 0, pdf * dr.square(ds.dist) / cos_theta, 0)
+
+
+def _rcp(pdf: mi.Float) -> mi.Float:
+    return dr.select(pdf > 0, dr.rcp(pdf), 0)
+
+
+mi.register_emitter("fspt_surface", FsptSurface)
