@@ -27,3 +27,7 @@ class FluxError(FsptError):
 
 class BackendError(FsptError, ImportError):
     """No usable LLVM or CUDA, or a missing system library or optional package."""
+
+
+class DetectorError(FsptError):
+    """A detector that cannot exist, or an exposure it cannot make."""
