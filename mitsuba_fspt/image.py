@@ -48,7 +48,8 @@ class Image:
                     f"image: '{name}' must have the shape {shape} of 'power', got {plane.shape}. Crop it."
                 )
             object.__setattr__(self, name, plane)
-        metadata = {"quantity": "power", "unit": "W"} | self.metadata
+        metadata: Metadata = {"quantity": "power", "unit": "W"}
+        metadata |= {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
         if (metadata["quantity"], metadata["unit"]) != ("power", "W"):
             raise ImageError(
                 f"image: the values are {metadata['quantity']} in {metadata['unit']}, not power in W. "
