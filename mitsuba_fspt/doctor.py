@@ -210,5 +210,9 @@ def _cache() -> Iterator[Row]:
         Path(tempfile.gettempdir(), "drjit") if sys.platform == "win32" else Path("~/.drjit").expanduser()
     )
     folder = Path(os.environ.get("DRJIT_CACHE_DIR") or default)
-    kernels = [file.stat().st_size for file in folder.glob("*.bin")]
-    yield Row("kernel cache", "folder", f"{folder}: {len(kernels)} kernels, {sum(kernels) / 1e6:.1f} MB")
+    try:
+        sizes = [file.stat().st_size for file in folder.glob("*.bin")]
+    except OSError as error:
+        yield Row("kernel cache", "folder", str(error), ok=False)
+    else:
+        yield Row("kernel cache", "folder", f"{folder}: {len(sizes)} kernels, {sum(sizes) / 1e6:.1f} MB")
