@@ -1,4 +1,4 @@
-"""The backend: which LLVM Dr.Jit gets, how a bad one is refused, when plugins register, which variant is taken.
+"""The backend: which LLVM Dr.Jit gets, how a bad one is refused, when plugins register, which variant it is.
 
 What happens at import happens once in a process, so those tests run small scripts in processes of their own.
 """
@@ -83,14 +83,16 @@ print(json.dumps(plugins.seen))
 def test_plugins_register_at_once_where_a_variant_is_active() -> None:
     script = """
 import mitsuba
+mitsuba.set_variant("scalar_rgb")
 mitsuba.set_variant("llvm_ad_rgb")
 import mitsuba_fspt
-mitsuba_fspt.backend.prepare()
-print(json.dumps([plugins.seen, mitsuba_fspt.backend.ensure_variant()]))
+active = mitsuba_fspt.backend.ensure_variant()
+mitsuba.set_variant("scalar_rgb")  # loaded before: no import tells of this switch
+print(json.dumps([active, plugins.seen]))
 """
-    seen, active = run_script(script, **{libllvm.ENVIRONMENT_NAME: str(WORKING.path)})
-    assert seen == ["llvm_ad_rgb", "llvm_ad_rgb"]  # at import, and at the second call of prepare
+    active, seen = run_script(script, **{libllvm.ENVIRONMENT_NAME: str(WORKING.path)})
     assert active == "llvm_ad_rgb"
+    assert seen == ["llvm_ad_rgb", "scalar_rgb"]
 
 
 def test_a_failing_registration_comes_out_of_set_variant() -> None:
@@ -201,7 +203,7 @@ class FakeMitsuba:
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """A machine as the test sets it: `llvm`, the version that Dr.Jit has bound, `cuda`, `optix`, `mitsuba`."""
+    """A machine as the test sets it: `llvm`, the version that Dr.Jit bound, `cuda`, `optix`, `mitsuba`."""
     machine = SimpleNamespace(llvm=(-1, -1, -1), cuda=False, optix=True, mitsuba=FakeMitsuba(None))
     drjit = SimpleNamespace(
         detail=SimpleNamespace(llvm_version=lambda: machine.llvm),
