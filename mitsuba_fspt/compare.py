@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -69,7 +69,7 @@ class Comparison:
     max_error: float
     rms: float
     ratio: float
-    profiles: tuple[Profile, ...]
+    profiles: tuple[Profile, ...] = field(repr=False)
     z_test: ZTest | None
 
     def to_dict(self) -> dict[str, Any]:
@@ -102,8 +102,9 @@ def compare(
     rows, columns : numbers of the rows and columns to take profiles of, in 0 … h − 1 and 0 … w − 1; where
         neither is given, those through the standard's brightest pixel
 
-    The z-test counts `error` as a standard deviation and the two as independent. A deterministic bound for an
-    error is larger than a standard deviation and makes the test milder.
+    The z-test counts `error` as a standard deviation and the two as independent; that of a deterministic method
+    is a bound and makes the test milder. A Monte Carlo pixel that rare samples could have lit, but none did,
+    has error 0 and makes it too strict: give such images samples enough.
 
     Raises
     ------
@@ -157,7 +158,7 @@ def _profiles(
         for index in indices:
             if not 0 <= index < len(std):
                 raise ImageError(f"compare: {line} {index} does not exist. Give one in 0 … {len(std) - 1}.")
-            profiles.append(Profile(line, index, cal[index], std[index]))
+            profiles.append(Profile(line, int(index), cal[index], std[index]))
     return tuple(profiles)
 
 

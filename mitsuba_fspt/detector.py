@@ -38,7 +38,7 @@ class Exposure:
     electrons : float32 array, shape (h, w) [e-], before the conversion to counts; where there is hardly any
         light, read noise can make them negative
     counts : uint16 array, shape (h, w) [DN]
-    metadata : those of the image, and the detector's numbers
+    metadata : those of the image and the detector's numbers; `quantity` is electrons, `unit` e-
     """
 
     electrons: NDArray[np.float32]
@@ -46,11 +46,11 @@ class Exposure:
     metadata: Metadata
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the electrons to an EXR file: channel `Y`, `fspt:quantity` electrons, `fspt:unit` e-.
+        """Write the electrons to an EXR file: channel `Y`, the metadata under `fspt:`.
 
         Raises ImageError where the suffix is not .exr or the file cannot be written.
         """
-        write_exr(path, {"Y": self.electrons}, self.metadata | {"quantity": "electrons", "unit": "e-"})
+        write_exr(path, {"Y": self.electrons}, self.metadata)
 
     def write_counts(self, path: str | os.PathLike[str]) -> None:
         """Write the counts, unscaled, to a 16-bit greyscale PNG or TIFF; metadata as JSON in its description.
@@ -137,13 +137,16 @@ class Detector:
         )
 
     def __post_init__(self) -> None:
-        for name, low, high in (("quantum_efficiency", 0, 1), ("full_well", 0, 1e15), ("gain", 0, math.inf)):
-            _require(name, getattr(self, name), low < getattr(self, name) <= high, f"in ({low}, {high:g}]")
-        for name in ("dark_current", "read_noise", "bias"):
-            _require(name, getattr(self, name), getattr(self, name) >= 0, ">= 0")
-        _require("bits", self.bits, self.bits in range(1, 17), "a whole number in 1 … 16")
+        eta, full_well, bits = self.quantum_efficiency, self.full_well, self.bits
+        _require("quantum_efficiency", eta, 0 < eta <= 1, "in (0, 1], for example 0.85")
+        _require("full_well", full_well, 0 < full_well <= 1e15, "in (0, 1e15] e-, for example 1e5")
+        _require("gain", self.gain, self.gain > 0, "> 0 e-/DN, for example 1.6")
+        _require("dark_current", self.dark_current, self.dark_current >= 0, ">= 0 e-/px/s, for example 1e-3")
+        _require("read_noise", self.read_noise, self.read_noise >= 0, ">= 0 e-, for example 3.5")
+        _require("bias", self.bias, self.bias >= 0, ">= 0 DN, for example 500")
+        _require("bits", bits, bits in range(1, 17), "a whole number in 1 … 16, for example 16")
         if self.pixel_pitch is not None:
-            _require("pixel_pitch", self.pixel_pitch, self.pixel_pitch > 0, "> 0 mm")
+            _require("pixel_pitch", self.pixel_pitch, self.pixel_pitch > 0, "> 0 mm, for example 0.0135")
 
     def expected(
         self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1
@@ -152,10 +155,12 @@ class Detector:
 
         Parameters and errors as for `expose`.
         """
-        _require("exposure_time", exposure_time, exposure_time >= 0, ">= 0 s")
-        _require("wavelength_nm", wavelength_nm, wavelength_nm > 0, "> 0 nm")
+        _require("exposure_time", exposure_time, exposure_time >= 0, ">= 0 s, for example 60")
+        _require("wavelength_nm", wavelength_nm, wavelength_nm > 0, "> 0 nm, for example 650")
         if (darkest := image.power.min()) < 0:
-            raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W.")
+            raise DetectorError(
+                f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again."
+            )
         energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
         photons = image.power.astype(np.float64) * (exposure_time / energy)
         pitch = image.metadata.get("pixel_pitch")
@@ -181,7 +186,7 @@ class Detector:
         ------
         DetectorError : a number outside its range, or a binning that does not divide the image.
         """
-        _require("seed", seed, seed >= 0, ">= 0")
+        _require("seed", seed, seed >= 0, ">= 0, for example 1")
         rng = np.random.default_rng(seed)
         mean = self.expected(image, exposure_time, wavelength_nm, binning=binning).mean
         # Means this far above the full well end there for certain; NumPy draws none beyond 9e18.
@@ -192,6 +197,8 @@ class Detector:
         top = 2**self.bits - 1
         counts = np.clip(np.rint(self.bias + electrons / np.float64(self.gain)), 0, top)
         metadata = image.metadata | {
+            "quantity": "electrons",
+            "unit": "e-",
             "detector": self.name,
             "exposure_time": exposure_time,
             "wavelength_nm": wavelength_nm,
@@ -202,7 +209,7 @@ class Detector:
         metadata |= {name: getattr(self, name) for name in RECORDED}
         if "pixel_pitch" in image.metadata:
             metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
-        return Exposure(electrons.astype(np.float32), counts.astype(np.uint16), metadata)
+        return Exposure(electrons, counts.astype(np.uint16), metadata)
 
 
 def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
@@ -219,6 +226,4 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
 
 def _require(name: str, value: float, holds: bool, rule: str) -> None:
     if not (holds and math.isfinite(value)):
-        raise DetectorError(
-            f"detector: '{name}' must be {rule}, got {value}. Compare Detector.typical_ccd()."
-        )
+        raise DetectorError(f"detector: '{name}' must be finite and {rule}, got {value}.")

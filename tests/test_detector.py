@@ -197,8 +197,9 @@ def test_counts_files_that_cannot_be_written(tmp_path, monkeypatch):
     [
         ("quantum_efficiency", 0, r"in \(0, 1\]"),
         ("quantum_efficiency", 1.2, r"in \(0, 1\]"),
-        ("full_well", 0, r"in \(0, 1e\+15\]"),
-        ("gain", -1, r"in \(0, inf\]"),
+        ("full_well", 0, r"in \(0, 1e15\] e-"),
+        ("gain", -1, "> 0 e-/DN"),
+        ("gain", math.inf, "> 0 e-/DN"),
         ("dark_current", math.nan, ">= 0"),
         ("read_noise", math.inf, ">= 0"),
         ("bias", -1, ">= 0"),
@@ -208,16 +209,18 @@ def test_counts_files_that_cannot_be_written(tmp_path, monkeypatch):
     ],
 )
 def test_detectors_that_cannot_exist(name, value, rule):
-    with pytest.raises(DetectorError, match=f"'{name}' must be {rule}, got {value}"):
+    with pytest.raises(
+        DetectorError, match=f"'{name}' must be finite and {rule}.*, for example .*, got {value}"
+    ):
         replace(CCD, **{name: value})
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"exposure_time": -1.0}, "'exposure_time' must be >= 0 s, got -1.0"),
-        ({"wavelength_nm": 0.0}, "'wavelength_nm' must be > 0 nm"),
-        ({"seed": -1}, "'seed' must be >= 0"),
+        ({"exposure_time": -1.0}, "'exposure_time' must be finite and >= 0 s, for example 60, got -1.0"),
+        ({"wavelength_nm": 0.0}, "'wavelength_nm' must be finite and > 0 nm"),
+        ({"seed": -1}, "'seed' must be finite and >= 0"),
         ({"binning": 3}, r"'binning' = 3 does not divide the image of 4 × 4 pixels. Give a divisor of 4"),
         ({"binning": 0}, "'binning' = 0 does not divide"),
         ({"image": Image([[1.0, -1e-12]])}, "power must be >= 0 on every pixel, got -1e-12 W"),

@@ -134,6 +134,11 @@ def test_pictures_that_cannot_be_written(tmp_path, monkeypatch):
 
 
 def test_matplotlib_waits_until_it_is_needed():
-    code = "import mitsuba_fspt.picture, mitsuba_fspt.detector, sys; print({'matplotlib', 'PIL'} & {*sys.modules})"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    imports = "import sys, mitsuba_fspt.picture, mitsuba_fspt.detector;"
+    found = subprocess.run(
+        [sys.executable, "-c", imports + " print({'matplotlib', 'PIL'} & {*sys.modules})"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert found.stdout.strip() == "set()"
