@@ -102,8 +102,8 @@ def compare(
     rows, columns : numbers of the rows and columns to take profiles of, in 0 … h − 1 and 0 … w − 1; where
         neither is given, those through the standard's brightest pixel
 
-    The z-test counts `error` as a standard deviation and the two as independent; that of a deterministic method
-    is a bound and makes the test milder. A Monte Carlo pixel that rare samples could have lit, but none did,
+    The z-test counts `error` as a standard deviation and the two as independent; a deterministic method's is
+    a bound and makes the test milder. A Monte Carlo pixel that rare samples could have lit, but none did,
     has error 0 and makes it too strict: give such images samples enough.
 
     Raises
