@@ -7,7 +7,7 @@ import sys
 
 import mitsuba as mi
 
-_NAMES = ("surface", "lens")
+_NAMES = ("surface", "lens", "integral")
 _registered: set[str] = set()
 
 

@@ -2,11 +2,15 @@
 
 A mesh is cut into its faces, each into k² equal triangles where it has few; any other shape into a grid of its
 surface parameters (u, v). Elements know where they lie on the surface and which one holds a given surface point.
+
+Shapes and textures are called directly here, never through Dr.Jit pointers: elements may be built while a kernel is
+being recorded, and a pointer of the recording would find its way into what is evaluated aside.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -51,8 +55,9 @@ class MeshElements(Elements):
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         self.shape = shape
-        self.mesh = mi.MeshPtr(shape)
-        faces = shape.primitive_count()
+        buffers = mi.traverse(shape)
+        self._positions, self._faces = buffers["vertex_positions"], buffers["faces"]
+        faces = dr.width(self._faces) // 3
         self.k = math.ceil(math.sqrt(minimum / max(1, faces)))
         self.count = faces * self.k**2
 
@@ -83,13 +88,12 @@ class MeshElements(Elements):
         p0, e1, e2 = self._corners(face)
         pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(face))
         pi.valid, pi.t, pi.prim_index, pi.prim_uv = True, 1.0, face, uv
-        pi.shape = mi.ShapePtr(self.shape)
-        si = pi.compute_surface_interaction(mi.Ray3f(p0, dr.cross(e2, e1)), mi.RayFlags.All)
+        si = self.shape.compute_surface_interaction(mi.Ray3f(p0, dr.cross(e2, e1)), pi, mi.RayFlags.All)
         return si, self._area(e1, e2)
 
     def _corners(self, face: mi.UInt32) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
-        f = self.mesh.face_indices(face)
-        p0, p1, p2 = (self.mesh.vertex_position(f[n]) for n in range(3))
+        f = dr.gather(mi.Point3u, self._faces, face)
+        p0, p1, p2 = (dr.gather(mi.Point3f, self._positions, f[n]) for n in range(3))
         return p0, mi.Vector3f(p1 - p0), mi.Vector3f(p2 - p0)
 
     def _area(self, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Float:
@@ -127,13 +131,13 @@ def _barycentric(d: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Point2f
 class ElementDistribution:
     """Surface points with a density ∝ the exitance of their element [1/mm²]."""
 
-    def __init__(self, elements: Elements, exitance: mi.Texture) -> None:
+    def __init__(self, elements: Elements, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
         self.elements = elements
         index = dr.arange(mi.UInt32, elements.count)
         power = dr.zeros(mi.Float, elements.count)
         for point in _FIVE_POINTS:
             si, area = elements.place(index, mi.Point2f(*point))
-            power += area * scalar(exitance.eval(si))
+            power += area * exitance(si)
         share = power + (UNIFORM_SHARE * dr.mean(power) / dr.mean(elements.areas())) * elements.areas()
         self._choice = mi.DiscreteDistribution(share)
 

@@ -6,6 +6,8 @@ import math
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import OpticsError
 from ..optics import Disc, Lens
@@ -115,21 +117,18 @@ class FsptLens(mi.Sensor):
         size = mi.ScalarVector2f(self.film().size())
         return (0.5 * mi.Vector2f(size) - position) * self._pitch
 
-    def line_of_sight(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Ray3f, mi.Float]:
-        """Ray from the pupil point through the virtual point, and its weight A_vd A_pupil cos⁴θ/u² [mm² sr].
+    def line_of_sight(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
+        """Ray from the pupil point through the virtual point, its weight cos⁴θ and its cosθ to the optical axis.
 
-        `position` [film pixels], `pupil` [unit disc]. The weight is 0 where a second border clips the ray.
+        `position` [film pixels], `pupil` [unit disc]. The weight is 0 where a second border clips the ray. The mean
+        of weight × radiance over a pixel and the pupil, times `etendue`, is the power on the pixel [W] (Eq. 9).
         """
-        x = self.virtual_point(position)
-        disc = self._discs[0]
+        disc, x = self._discs[0], self.virtual_point(position)
         a = disc.shift * x + (disc.radius * self._spread) * pupil
-        d = mi.Vector3f(x.x - a.x, x.y - a.y, self._u)
-        distance2 = dr.squared_norm(d)
-        cos2 = dr.square(self._u) / distance2
-        weight = dr.select(self._open(x, a), self._etendue * dr.square(cos2), 0)
-        origin, direction = mi.Point3f(a.x, a.y, 0), d * dr.rsqrt(distance2)
-        ray = mi.Ray3f(self.m_to_world @ origin, self.m_to_world @ direction)
-        return ray, weight
+        d = dr.normalize(mi.Vector3f(x.x - a.x, x.y - a.y, self._u))
+        weight = dr.select(self._open(x, a), dr.square(dr.square(d.z)), 0)
+        ray = mi.Ray3f(self.m_to_world @ mi.Point3f(a.x, a.y, 0), self.m_to_world @ d)
+        return ray, weight, d.z
 
     def _open(self, x: mi.Point2f, a: mi.Point2f) -> mi.Bool:
         """True where the line through virtual point x and lens point a passes every further border (Eq. 5)."""
@@ -137,6 +136,29 @@ class FsptLens(mi.Sensor):
         for disc in self._discs[1:]:
             passes &= dr.squared_norm(a - disc.shift * x) <= dr.square(disc.radius)
         return passes
+
+    # ------------------------------------------------------------------ what the film can see, in double precision
+
+    def blur_radius(self, depth: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Radius [pixels] of the blur disc of a point at `depth` z [mm] from the lens plane; inf at z <= 0."""
+        disc, u = self.optics.discs[0], self.optics.focus_distance
+        back = (u - np.asarray(depth, np.float64)) / u
+        scale = 1 - (1 - disc.shift) * back
+        with np.errstate(divide="ignore", invalid="ignore"):
+            radius = self._spread * disc.radius * np.abs(back) / (scale * self.virtual_pitch)
+        return np.where(scale > 0, np.nan_to_num(radius, nan=np.inf), np.inf)
+
+    def film_bounds(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest film position (x, y) [pixels] at which light of the convex hull of `points` arrives."""
+        to_camera = np.linalg.inv(np.array(self.m_to_world.matrix, np.float64).reshape(4, 4))
+        p = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+        disc, u = self.optics.discs[0], self.optics.focus_distance
+        scale = 1 - (1 - disc.shift) * (u - p[:, 2:]) / u
+        if len(p) == 0 or scale.min() <= 0:
+            return np.full(2, -np.inf), np.full(2, np.inf)
+        centre = 0.5 * np.array(self.film().size(), np.float64) - p[:, :2] / (scale * self.virtual_pitch)
+        radius = self.blur_radius(p[:, 2:])
+        return (centre - radius).min(axis=0), (centre + radius).max(axis=0)
 
     # ------------------------------------------------------------------ Mitsuba's sensor interface
 
@@ -146,10 +168,10 @@ class FsptLens(mi.Sensor):
         """Line of sight through a uniform point of the crop window and a uniform point of the pupil."""
         film = self.film()
         position = sample2 * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
-        ray, weight = self.line_of_sight(position, mi.warp.square_to_uniform_disk_concentric(sample3))
+        ray, weight, _ = self.line_of_sight(position, mi.warp.square_to_uniform_disk_concentric(sample3))
         wavelengths, spectrum = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         ray.time, ray.wavelengths = time, wavelengths
-        return ray, spectrum * weight
+        return ray, spectrum * (weight * self._etendue)
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True

@@ -8,6 +8,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..errors import ExitanceError
 from .elements import ElementDistribution, elements_of, scalar
@@ -137,15 +138,15 @@ class FsptSurface(mi.Emitter):
         if self._checked:
             return
         self._checked = True
-        name = f"fspt_surface on shape '{self.get_shape().id()}'"
-        check_attribute(name, self.get_shape(), self.exitance)
-        outside_recording(check_values, name, self.get_shape(), self.exitance)
+        aside(lambda shape: check_values(shape, exitance_on(shape, self.exitance)), self.get_shape())
 
     def _distribution(self) -> ElementDistribution:
         self.check()
         if self._positions is None:
-            with dr.suspend_grad():
-                self._positions = outside_recording(ElementDistribution, elements_of(self.get_shape()), self.exitance)
+            self._positions = aside(
+                lambda shape: ElementDistribution(elements_of(shape), exitance_on(shape, self.exitance)),
+                self.get_shape(),
+            )
         return self._positions
 
     def _surface_at(self, ps: mi.PositionSample3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
@@ -154,8 +155,9 @@ class FsptSurface(mi.Emitter):
         if not shape.is_mesh():
             return shape.eval_parameterization(ps.uv, active=active)
         if self._probe is None:
-            self._probe = outside_recording(
-                mi.load_dict, {"type": "scene", "embree_use_robust_intersections": True, "shape": shape}
+            self._probe = aside(
+                lambda shape: mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "s": shape}),
+                shape,
             )
         reach = 1e-4 * (dr.max(dr.abs(ps.p)) + 1e-3)
         ray = mi.Ray3f(ps.p + reach * ps.n, -ps.n)
@@ -176,48 +178,56 @@ def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedS
     return mi.sample_rgb_spectrum(mi.math.sample_shifted(sample))
 
 
-def outside_recording(function: Callable[..., Any], *args: Any) -> Any:
-    """`function(*args)` evaluated now, even while the caller's thread records a kernel.
+def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
+    """`build(shape)` evaluated now, even while this thread records a kernel; its gradients are not tracked.
 
-    Light tracers first meet the emitter in the middle of a recording, where nothing can be evaluated. Dr.Jit records
+    Light tracers first meet the emitter in the middle of a recording, when nothing can be evaluated. Dr.Jit records
     by thread, so a thread of its own is free to.
     """
+
+    def run() -> Any:
+        with dr.suspend_grad():
+            return build(shape)
+
     with ThreadPoolExecutor(1) as pool:
-        return pool.submit(function, *args).result()
+        return pool.submit(run).result()
 
 
-def check_attribute(name: str, shape: mi.Shape, exitance: mi.Texture) -> None:
-    """Raise ExitanceError where `exitance` reads a mesh attribute the shape does not have (rendered black)."""
+def exitance_on(shape: mi.Shape, exitance: mi.Texture) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
+    """J_n [W/mm²] on one shape as a function that calls no pointer; ExitanceError where an attribute is missing.
+
+    A mesh attribute the shape does not have would render black without a word.
+    """
     if exitance.class_name() != "MeshAttribute":
-        return
-    attribute = str(exitance).split('name = "', 1)[1].split('"', 1)[0]
-    if not dr.all(shape.has_attribute(attribute)):
-        kind, _, plain = attribute.partition("_")
+        return lambda si: scalar(exitance.eval(si))
+    name = str(exitance).split('name = "', 1)[1].split('"', 1)[0]
+    if not dr.all(shape.has_attribute(name)):
+        kind, _, plain = name.partition("_")
         raise ExitanceError(
-            f"{name}: mesh attribute '{attribute}' is missing. In a PLY name the {kind} property '{plain}_x', or "
-            f"import the values with 'fspt flux import'."
+            f"fspt_surface: shape '{shape.id()}' has no mesh attribute '{name}'. In a PLY name the {kind} property "
+            f"'{plain}_x', or bring the values in with 'fspt flux import'."
         )
+    scale = float(mi.traverse(exitance)["scale"])
+    return lambda si: shape.eval_attribute_1(name, si) * scale
 
 
-def check_values(name: str, shape: mi.Shape, exitance: mi.Texture) -> None:
+def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
     """Raise ExitanceError where J_n is negative, not finite or zero everywhere, at every corner and centre."""
     elements = elements_of(shape, minimum=1 << 14)
     index = dr.arange(mi.UInt32, elements.count)
-    lowest, highest = mi.Float(dr.inf), mi.Float(0)
-    finite = mi.Bool(True)
-    for point in ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5)):
-        value = scalar(exitance.eval(elements.place(index, mi.Point2f(*point))[0]))
-        finite &= dr.all(dr.isfinite(value))
-        lowest, highest = dr.minimum(lowest, dr.min(value)), dr.maximum(highest, dr.max(value))
-    if not finite[0]:
-        raise ExitanceError(f"{name}: 'exitance' has NaN or infinite values. Mend the data before rendering.")
-    if lowest[0] < 0:
+    corners_and_centre = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
+    values = [exitance(elements.place(index, mi.Point2f(*point))[0]) for point in corners_and_centre]
+    values = np.concatenate([value.numpy() for value in values])
+    name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
+    if not np.isfinite(values).all():
+        raise ExitanceError(f"{name} has NaN or infinite values. Mend the data before rendering.")
+    if values.min() < 0:
         raise ExitanceError(
-            f"{name}: 'exitance' must be >= 0 W/mm², its lowest value is {lowest[0]:.4g}. Clip it on import: "
+            f"{name} must be >= 0 W/mm², its lowest value is {values.min():.4g}. Clip it on import: "
             "'fspt flux import --clip'."
         )
-    if highest[0] == 0:
-        raise ExitanceError(f"{name}: 'exitance' is 0 everywhere: nothing glows. Give J_n in W/mm².")
+    if values.max() == 0:
+        raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
 
 
 def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:

@@ -1,0 +1,65 @@
+"""Neighbourhoods on the pixel grid: which pixels lie near marked ones, and which way an image changes. Pure NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def box_sum(image: Image, radius: int) -> Image:
+    """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
+    for axis in (0, 1):
+        n = image.shape[axis]
+        total = np.concatenate([np.zeros_like(image.take([0], axis)), np.cumsum(image, axis)], axis)
+        index = np.arange(n)
+        upper, lower = np.minimum(index + radius + 1, n), np.maximum(index - radius, 0)
+        image = total.take(upper, axis) - total.take(lower, axis)
+    return image
+
+
+def dilate(mask: Mask, radius: int) -> Mask:
+    """True within `radius` pixels (square) of a marked pixel."""
+    return box_sum(mask.astype(np.int64), radius) > 0 if mask.any() else mask
+
+
+def spread_max(image: Image) -> Image:
+    """Largest value among the 3 × 3 pixels around each."""
+    for axis in (0, 1):
+        wide = np.pad(image, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
+        n = image.shape[axis]
+        image = np.max([wide.take(range(k, k + n), axis) for k in range(3)], axis=0)
+    return image
+
+
+def laplacian(image: Image) -> Image:
+    """Sum of the four neighbours minus four times the pixel; 0 on the border."""
+    result = np.zeros_like(image)
+    middle = image[1:-1, 1:-1]
+    result[1:-1, 1:-1] = image[:-2, 1:-1] + image[2:, 1:-1] + image[1:-1, :-2] + image[1:-1, 2:] - 4 * middle
+    return result
+
+
+def bend(image: Image) -> Image:
+    """Size of the second differences along rows and columns; an outermost pixel takes its neighbour's."""
+    total = np.zeros_like(image)
+    for axis in (0, 1):
+        if image.shape[axis] > 2:
+            inner = np.abs(np.diff(image, 2, axis))
+            total += np.pad(inner, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
+    return total
+
+
+def border(shape: tuple[int, int]) -> Mask:
+    """True on the outermost pixels."""
+    mask = np.ones(shape, bool)
+    mask[1:-1, 1:-1] = False
+    return mask
+
+
+def principal_angle(x: Image, y: Image, radius: int) -> Image:
+    """Angle of the axis along which the vectors (x, y) of a neighbourhood mostly point (structure tensor)."""
+    xx, yy, xy = (box_sum(product, radius) for product in (x * x, y * y, x * y))
+    return 0.5 * np.arctan2(2 * xy, xx - yy)

@@ -1,0 +1,185 @@
+"""Eq. 9 in its pupil form: P = étendue · mean over pixel and pupil of cos⁴θ · L(first surface point on the line).
+
+A ladder of three rules. Four nodes on the pupil serve every pixel; where the picture bends, twelve nodes over pupil
+and pixel; where the line of sight jumps (a silhouette, an occluder, an edge of J_n), chords: along each the jump is
+found by bisection and both sides are integrated on their own, so that only smooth averages are left to sample.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import pixels, rules
+from ..quadrature import Quadrature, Solution
+from .lines import RAYS_PER_CHORD, apply_rule, chord_at, integrate_chord
+from .window import Window, visible_window
+
+LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
+FIRST_CHORDS = 4
+LAST_CHORDS = 1 << rules.LATTICE_BITS
+FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
+# How far a jump can hide from a rule's nodes, in blur radii: from its outermost nodes to the rim of the pupil.
+GAP = {4: 0.5, 12: 0.2}
+
+Image = NDArray[np.float64]
+
+
+def solve(scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
+    """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised."""
+    return _Ladder(scene, lens, quadrature).climb()
+
+
+class _Ladder:
+    """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
+
+    def __init__(self, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> None:
+        self.scene, self.lens, self.quadrature = scene, lens, quadrature
+        self.area = quadrature.pixel == "area"
+        self.window: Window = visible_window(scene, lens)
+        shape = self.window.shape
+        self.value, self.error, self.hits = (np.zeros(shape) for _ in range(3))
+        self.nearest = np.full(shape, np.inf)
+        self.blur = 0.0  # largest blur radius in the picture [pixels]
+        self.rays = 0
+        self.levels: list[str] = []
+
+    def climb(self) -> Solution:
+        if self.value.size:
+            rough = self._four_nodes()
+            if self.quadrature.max_nodes >= 16 and rough.any():
+                rough = self._twelve_nodes(rough)
+                if rough.any():
+                    self._chords(rough)
+        error = np.maximum(self.error, FLOAT32_FLOOR * self.value.max(initial=0.0))
+        error[self.hits == 0] = self.error[self.hits == 0]
+        power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
+        coverage = self.window.expand(np.clip(self.hits, 0, 1))
+        return Solution(power, error, coverage, self.rays, tuple(self.levels))
+
+    @property
+    def tolerance(self) -> float:
+        return self.quadrature.rtol * float(self.value.max(initial=0.0))
+
+    # ------------------------------------------------------------------ smooth pixels
+
+    def _four_nodes(self) -> NDArray[np.bool_]:
+        """Four nodes at every pixel's centre; over its area the mean of a smooth picture is P + ΔP/24."""
+        everything = np.ones(self.window.shape, bool)
+        value, contrast, mx, my, self.hits, self.nearest, far = self._apply(rules.four(), everything)
+        self.value = value
+        self.blur = self._largest_blur(self.nearest, far)
+        # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
+        slope = 4 * np.hypot(mx, my)
+        bend = 0.25 * np.abs(contrast) + np.divide(slope**4, 16 * value**3, out=np.zeros_like(value), where=value > 0)
+        if self.area:
+            bend += pixels.bend(value) / 24
+            self.value = np.maximum(value + pixels.laplacian(value) / 24, 0)
+        self.error = bend
+        rough = bend > self.tolerance
+        if self.area:
+            rough |= pixels.border(rough.shape)
+        return pixels.dilate(rough, self._reach(4))
+
+    def _twelve_nodes(self, rough: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Twelve nodes over pupil and pixel on the rough pixels; returns the pixels they do not settle either."""
+        value, _, _, _, hits, nearest, _ = self._apply(rules.twelve(self.area), rough)
+        difference = np.abs(value - self.value)
+        # Where the ladder converges, each rung gains as much as the one before; a jump gains nothing.
+        gain = np.divide(4 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
+        error = difference * np.minimum(gain, 1)
+        self.value = np.where(rough, value, self.value)
+        self.hits = np.where(rough, hits, self.hits)
+        self.nearest = np.minimum(self.nearest, nearest)
+        self.error = np.where(rough, error, self.error)
+        rougher = rough & (self.error > self.tolerance)
+        return rough & pixels.dilate(rougher, self._reach(12))
+
+    def _apply(self, rule: rules.Rule, where: NDArray[np.bool_]) -> list[Image]:
+        """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
+        index = np.flatnonzero(where).astype(np.uint32)
+        fills = (0, 0, 0, 0, 0, np.inf, 0)
+        images = [np.full(where.size, fill, dtype=np.float64) for fill in fills]
+        for part in _chunks(index, LANES):
+            sums = apply_rule(self.scene, self.lens, self.window.centres(part), rule)
+            dr.eval(sums)
+            for image, column in zip(images, sums, strict=True):
+                image[part] = column.numpy()
+        self._count(f"{len(rule)} nodes", len(index), len(rule))
+        return [image.reshape(where.shape) for image in images]
+
+    # ------------------------------------------------------------------ jumps
+
+    def _chords(self, rough: NDArray[np.bool_]) -> None:
+        """Twice as many chords each round on the pixels whose last doubling still moved them or a neighbour."""
+        index = np.flatnonzero(rough).astype(np.uint32)
+        gy, gx = np.gradient(self.value) if min(self.value.shape) > 1 else (np.zeros_like(self.value),) * 2
+        angle = pixels.principal_angle(gx, gy, 1 + math.ceil(self.blur / 2)).ravel()
+        across_pupil = self._across_pupil().ravel()
+        total, hits = np.zeros(self.value.size), np.zeros(self.value.size)
+        start, stop = 0, FIRST_CHORDS
+        while len(index) and stop <= LAST_CHORDS and 16 + stop * RAYS_PER_CHORD <= self.quadrature.max_nodes:
+            for part in _chunks(index, max(1, LANES // (stop - start))):
+                sums = self._chord_sums(part, angle[part], across_pupil[part], start, stop)
+                total[part] += sums[0]
+                hits[part] += sums[1]
+            self._count(f"{stop} chords", len(index), (stop - start) * RAYS_PER_CHORD)
+            change = np.zeros(self.value.size)
+            change[index] = np.abs(total[index] / stop - self.value.ravel()[index])
+            self.value.ravel()[index] = total[index] / stop
+            self.hits.ravel()[index] = hits[index] / stop
+            error = pixels.spread_max(change.reshape(self.value.shape)).ravel()
+            self.error.ravel()[index] = error[index]
+            index = index[error[index] > self.tolerance]
+            start, stop = stop, 2 * stop
+
+    def _chord_sums(
+        self, part: NDArray[np.uint32], angle: Image, across_pupil: NDArray[np.bool_], start: int, stop: int
+    ) -> list[Image]:
+        """Σ weight × (mean radiance on film, hits) of chords `start`…`stop`-1 on each listed pixel, one launch."""
+        count = dr.opaque(mi.UInt32, stop - start)
+        lane = dr.arange(mi.UInt32, len(part) * (stop - start))
+        pixel, number = lane // count, lane % count
+        table = [mi.Float(column) for column in rules.lattice(start, stop).T]
+        u = mi.Point3f(*(dr.gather(mi.Float, column, number) for column in table))
+        chord = chord_at(
+            dr.gather(mi.Point2f, self.window.centres(part), pixel),
+            dr.gather(mi.Float, mi.Float(angle), pixel),
+            dr.gather(mi.Bool, mi.Bool(across_pupil), pixel),
+            u,
+            self.area,
+            dr.opaque(mi.Float, self.tolerance),
+        )
+        sums = [
+            dr.block_sum(mi.Float64(mean), stop - start)
+            for mean in integrate_chord(self.scene, self.lens, chord)
+        ]
+        dr.eval(sums)
+        return [column.numpy() for column in sums]
+
+    def _across_pupil(self) -> NDArray[np.bool_]:
+        """True where a jump crosses the pupil more than the pixel: its blur disc is wider than a pixel."""
+        if not self.area:
+            return np.ones(self.value.shape, bool)
+        nearest = -pixels.spread_max(-self.nearest)
+        return self.lens.blur_radius(nearest) > 0.5
+
+    def _largest_blur(self, nearest: Image, far: Image) -> float:
+        seen = np.isfinite(nearest)
+        depths = np.concatenate([nearest[seen], far[seen]])
+        return float(self.lens.blur_radius(depths).max(initial=0.0))
+
+    def _reach(self, nodes: int) -> int:
+        return 1 + math.ceil(min(GAP[nodes] * self.blur, max(self.value.shape)))
+
+    def _count(self, what: str, count: int, rays_each: int) -> None:
+        self.rays += count * rays_each
+        self.levels.append(f"{what}: {count} pixels")
+
+
+def _chunks(index: NDArray[np.uint32], size: int) -> list[NDArray[np.uint32]]:
+    return [index[k : k + size] for k in range(0, len(index), size)]

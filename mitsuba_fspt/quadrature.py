@@ -1,0 +1,53 @@
+"""The accuracy asked for and the picture that comes out: plain data between the integrator and its callers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import SceneError
+
+DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """All accuracy knobs of the deterministic integral, each with the error it bounds.
+
+    rtol : absolute error of every pixel, relative to the brightest pixel; 0 < rtol < 1 (default 1e-3)
+    domain : 'pupil' (lines of sight from the pixel) or 'surface' (power spread from surface elements)
+    pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
+    max_nodes : lines of sight a pixel may take at most; bounds the time, and where it is reached the error says so
+    """
+
+    rtol: float = 1e-3
+    domain: str = "pupil"
+    pixel: str = "area"
+    max_nodes: int = 1 << 15
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
+            raise SceneError(f"fspt_integral: 'rtol' must be in (0, 1), got {self.rtol:g}. Give for example 1e-3.")
+        if self.domain not in DOMAINS:
+            raise SceneError(f"fspt_integral: 'domain' must be one of {', '.join(DOMAINS)}, got '{self.domain}'.")
+        if self.pixel not in PIXELS:
+            raise SceneError(f"fspt_integral: 'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
+        if self.max_nodes < 1:
+            raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 32768.")
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
+
+    `rays` counts all lines of sight, `levels` what each rung of the refinement did (for humans and the EXR header).
+    """
+
+    power: NDArray[np.float64]
+    error: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+    rays: int
+    levels: tuple[str, ...] = field(default=())
