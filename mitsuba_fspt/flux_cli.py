@@ -1,0 +1,96 @@
+"""`fspt flux`: surface flux density from other codes and from diffusion, as a phantom to render."""
+
+from __future__ import annotations
+
+import json
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def flux() -> None:
+    """Make the phantom that a scene shows: J_n from other codes, or solved for."""
+
+
+class LengthUnit(str, Enum):
+    mm = "mm"
+    cm = "cm"
+    m = "m"
+
+
+class Per(str, Enum):
+    vertex = "vertex"
+    face = "face"
+
+
+@app.command("import")
+def import_(
+    mesh: Annotated[
+        Path,
+        typer.Argument(metavar="MESH", help="Mesh: .ply .stl .obj .off .glb .npz .vtu .vtk .msh .xdmf ..."),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The phantom to write, .ply.")],
+    values: Annotated[Path | None, typer.Option(help="File of one value per vertex or face.")] = None,
+    field: Annotated[
+        str | None, typer.Option(help="Array, property or column that holds the values.")
+    ] = None,
+    per: Annotated[Per | None, typer.Option(help="What the values stand on, where that is open.")] = None,
+    format: Annotated[
+        str, typer.Option(help="auto, mmc, nirfast, meshio, trimesh, ply, obj or npz.")
+    ] = "auto",
+    length_unit: Annotated[
+        LengthUnit, typer.Option(help="Of the mesh; the values are W per square of it.")
+    ] = LengthUnit.mm,
+    a: Annotated[
+        str | None, typer.Option(help="The values are fluence, J_n = phi/(2A): robin, haskell or a number.")
+    ] = None,
+    n: Annotated[float | None, typer.Option(help="Refractive index for A; 1.37 where not given.")] = None,
+    clip: Annotated[bool, typer.Option("--clip", help="Set negative values to 0 and say how much.")] = False,
+    flip: Annotated[bool, typer.Option("--flip", help="Turn all faces over.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Write a phantom from a mesh and values on it, as other codes write them.
+
+    Values are the surface flux density J_n in W per square of the mesh's length unit, or, with --a, the
+    fluence phi in the same unit, J_n = phi/(2A). MMC: MESH is node_ID.dat beside elem_ID.dat, --values
+    SESSION_dref.dat (energy of each face). NIRFAST: MESH is NAME.node beside NAME.elem, --values the nodal
+    phi.
+    """
+    from .flux_import import import_flux
+
+    phantom = import_flux(
+        mesh,
+        values,
+        field=field,
+        per=per.value if per else None,
+        format=format,
+        length_unit=length_unit.value,
+        a=a,
+        n=n,
+        clip=clip,
+        flip=flip,
+    )
+    phantom.write(output)
+    report = phantom.report() | {"output": str(output)}
+    typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
+
+
+def table(report: dict[str, object]) -> str:
+    """The report as lines of name, value and unit."""
+    units = {"area": "mm^2", "power": "W", "removed_power": "W", "removed_percent": "% of the power"}
+    units |= {"min": str(report["unit"]), "max": str(report["unit"])}
+    lines = []
+    for name, value in report.items():
+        if value is None:
+            text = "undecided (open surface)"
+        elif isinstance(value, bool):
+            text = "yes" if value else "no"
+        else:
+            text = f"{value:.6g}" if isinstance(value, float) else str(value)
+        lines.append(f"{name.replace('_', ' '):<16}{text} {units.get(name, '')}".rstrip())
+    return "\n".join(lines)

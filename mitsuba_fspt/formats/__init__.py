@@ -1,0 +1,120 @@
+"""Meshes with values from other codes: which reader takes which file, and what comes out of all of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FluxError
+from .meshio_files import FORMATS as MESHIO
+from .meshio_files import read_meshio
+from .mmc import mmc_mesh, read_mmc
+from .nirfast import nirfast_mesh, read_nirfast
+from .ply import read_ply
+from .raw import Field, RawMesh, SurfaceValues, surface_values
+from .surface_files import read_arrays, read_obj, read_trimesh
+from .table import read_values
+
+MeshLike = str | os.PathLike[str] | tuple[NDArray, NDArray]
+ValuesLike = str | os.PathLike[str] | NDArray
+
+READERS: dict[str, Callable[[Path], RawMesh]] = {
+    "nirfast": read_nirfast,
+    "meshio": read_meshio,
+    "trimesh": read_trimesh,
+    "ply": lambda path: read_ply(path)[0],
+    "obj": read_obj,
+    "npz": read_arrays,
+}
+FORMATS = ("auto", "mmc", *READERS)
+
+__all__ = [
+    "FORMATS",
+    "Field",
+    "MeshLike",
+    "RawMesh",
+    "SurfaceValues",
+    "ValuesLike",
+    "read_mesh",
+    "surface_values",
+]
+
+
+def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, format: str) -> RawMesh:
+    """The mesh of a file or of arrays (points, cells), with `values` as its only field where they are given.
+
+    Raises
+    ------
+    FluxError : an unknown format, or what the format's reader refuses.
+    """
+    if format not in FORMATS:
+        raise FluxError(f"flux import: 'format' must be one of {', '.join(FORMATS)}, got '{format}'.")
+    if isinstance(mesh, tuple):
+        return _from_arrays(mesh, values, field, format)
+    path = Path(mesh)
+    if not path.exists() and format != "nirfast":  # its name may come without a suffix
+        raise FluxError(f"mesh '{path}' does not exist. Check the name.")
+    if format == "auto":
+        format = _detect(path)
+    if format == "mmc":
+        if values is not None and not isinstance(values, (str, os.PathLike)):
+            raise FluxError(
+                "MMC: values in memory go with a mesh in memory, (node, elem). Give both that way."
+            )
+        return read_mmc(path, None if values is None else Path(values))
+    raw = READERS[format](path)
+    return raw if values is None else _with_values(raw, values, field)
+
+
+def _detect(path: Path) -> str:
+    """The format of a file by its name."""
+    suffix = path.suffix.lower()
+    if suffix == ".dat" and path.name.startswith(("node_", "elem_")):
+        return "mmc"
+    if suffix in (".node", ".elem"):
+        return "nirfast"
+    if suffix in (".ply", ".obj", ".npz"):
+        return suffix[1:]
+    return "meshio" if suffix in MESHIO else "trimesh"
+
+
+def _from_arrays(
+    mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field: str | None, format: str
+) -> RawMesh:
+    """Points and cells in memory; those of MMC and NIRFAST count from 1, all others from 0."""
+    points, cells = np.asarray(mesh[0], np.float64), np.asarray(mesh[1])
+    if values is None:
+        raise FluxError("flux import: a mesh in memory needs 'values', one for each vertex or face.")
+    if format == "mmc":
+        return mmc_mesh(points, cells, _array(values, field), "MMC dref")
+    if format == "nirfast":
+        return _with_values(nirfast_mesh(points, cells, "NIRFAST mesh"), values, field)
+    if format != "auto":
+        raise FluxError(
+            f"flux import: format '{format}' reads files; a mesh in memory is auto, mmc or nirfast."
+        )
+    return _with_values(RawMesh(points, cells, "arrays"), values, field)
+
+
+def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh:
+    """The mesh with these values in place of its own fields."""
+    name = Path(values).name if isinstance(values, (str, os.PathLike)) else "values"
+    array = _array(values, field)
+    if array.ndim != 1:
+        raise FluxError(f"values: must have shape (N,), one for each vertex or face, got {array.shape}.")
+    source = f"{raw.source} with {name}" + (f" '{field}'" if field else "")
+    return replace(raw, source=source, fields=(Field(name, array, None),))
+
+
+def _array(values: ValuesLike, field: str | None) -> NDArray[np.float64]:
+    if isinstance(values, (str, os.PathLike)):
+        return read_values(Path(values), field)
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise FluxError(f"values: must be real numbers, got {array.dtype}.")
+    return array.astype(np.float64)

@@ -1,0 +1,64 @@
+"""NIRFAST: text files of one stem, without headers; fluence at the nodes of a tetrahedral mesh.
+
+`.node`: `boundary x y z` (boundary 1 or 0; no number of the node, unlike TetGen's `.node`), `.elem`: four
+node numbers from 1, `.param` (if there): a line with its kind, then `mua kappa n` a node. Lengths in mm.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FluxError
+from ..surface import Indices, Points
+from .raw import RawMesh
+from .table import read_table
+
+
+def read_nirfast(mesh: Path) -> RawMesh:
+    """Mesh of `STEM.node` and `STEM.elem`, and the refractive index at the nodes of `STEM.param`.
+
+    Raises
+    ------
+    FluxError : a file is missing or of another layout (TetGen's, or a mesh of triangles).
+    """
+    stem = mesh.with_suffix("")
+    nodes, _ = read_table(stem.with_suffix(".node"))
+    elements, _ = read_table(stem.with_suffix(".elem"))
+    if nodes.shape[1] != 4 or not np.isin(nodes[:, 0], (0, 1)).all():
+        raise FluxError(
+            f"NIRFAST: lines of '{stem}.node' must be 'boundary x y z', boundary 0 or 1, these have "
+            f"{nodes.shape[1]} columns. A TetGen .node has to be converted, for example by meshio to VTU."
+        )
+    if elements.shape[1] != 4:
+        raise FluxError(
+            f"NIRFAST: '{stem}.elem' must have 4 columns (tetrahedra), it has {elements.shape[1]}. Meshes "
+            "in the plane and bare surfaces have no exitance to see."
+        )
+    index = _index(stem.with_suffix(".param"), len(nodes))
+    return nirfast_mesh(nodes[:, 1:], elements.astype(np.int64), f"NIRFAST {stem.name}", index)
+
+
+def nirfast_mesh(
+    nodes: Points, elements: Indices, source: str, index: NDArray[np.float64] | None = None
+) -> RawMesh:
+    """Mesh of `nodes` (V, 3), `elements` (T, 4) from 1, and index at the nodes; its values are fluence."""
+    return RawMesh(nodes, elements - 1, source, quantity="fluence", index=index)
+
+
+def _index(path: Path, nodes: int) -> NDArray[np.float64] | None:
+    """The refractive index at the nodes from a `.param` of kind 'stnd'; None where there is no such file."""
+    if not path.exists():
+        return None
+    with path.open(errors="replace") as file:
+        if file.readline().strip().lower() != "stnd":
+            return None
+    parameters, _ = read_table(path, skip_lines=1)
+    if parameters.shape != (nodes, 3):
+        raise FluxError(
+            f"NIRFAST: '{path}' must have 3 columns (mua kappa n) and {nodes} lines after its first, it has "
+            f"{parameters.shape[1]} and {parameters.shape[0]}."
+        )
+    return parameters[:, 2]

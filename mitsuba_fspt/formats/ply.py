@@ -1,0 +1,93 @@
+"""PLY: read with its scalar properties and comments, written as Mitsuba reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import atomic_path
+from ..errors import FluxError
+from ..surface import Indices, Points
+from .raw import Field, RawMesh
+from .surface_files import load_triangles
+
+# Properties that are geometry or colour.
+NOT_VALUES = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v"}
+
+
+def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
+    """A PLY's triangles with their scalar properties, in the file's order, and its comments as {first word:
+    rest}.
+
+    Raises
+    ------
+    FluxError : the file cannot be read, or holds no triangles.
+    """
+    # Texture coordinates would make trimesh split the vertices.
+    mesh = load_triangles(path, "ply", fix_texture=False, skip_materials=True)
+    elements = mesh.metadata.get("_ply_raw", {})
+    fields = []
+    for on, element, count in (("vertex", "vertex", len(mesh.vertices)), ("cell", "face", len(mesh.faces))):
+        data = elements.get(element, {}).get("data", {})
+        for name in (data.dtype.names or ()) if isinstance(data, np.ndarray) else data:
+            values = np.asarray(data[name])
+            if name not in NOT_VALUES and values.shape == (count,) and values.dtype.kind in "fiu":
+                fields.append(Field(name, values.astype(values.dtype.newbyteorder("=")), on))
+    points, cells = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    return RawMesh(points, cells, path.name, tuple(fields)), _comments(path)
+
+
+def _comments(path: Path) -> dict[str, str]:
+    comments = {}
+    with path.open("rb") as file:
+        for line in file:
+            word, _, text = line.decode("ascii", "replace").strip().partition(" ")
+            if word == "end_header":
+                break
+            if word == "comment":
+                key, _, value = text.partition(" ")
+                comments[key] = value
+    return comments
+
+
+def write_ply(
+    path: Path,
+    vertices: Points,
+    faces: Indices,
+    attributes: Mapping[str, NDArray[np.float64]],
+    per: str,
+    comments: Mapping[str, str],
+) -> None:
+    """Write triangles with scalar properties on each 'vertex' or 'face' (`per`) as a binary PLY of doubles.
+
+    Mitsuba makes mesh attributes of properties that end in an underscore and a letter or digit: `exitance_x`
+    becomes `vertex_exitance` or `face_exitance`; a plain `exitance` it passes over.
+
+    Raises
+    ------
+    FluxError : the suffix is not .ply, or the file cannot be written; nothing is left behind then.
+    """
+    if path.suffix.lower() != ".ply":
+        raise FluxError(f"output file '{path}' must end in .ply, the format of a phantom.")
+    scalars = [(name, "<f8") for name in attributes]
+    points = np.empty(len(vertices), [(axis, "<f8") for axis in "xyz"] + scalars * (per == "vertex"))
+    triangles = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", (3,))] + scalars * (per == "face"))
+    for k, axis in enumerate("xyz"):
+        points[axis] = vertices[:, k]
+    triangles["count"], triangles["corners"] = 3, faces
+    for name, values in attributes.items():
+        (points if per == "vertex" else triangles)[name] = values
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"comment {key} {' '.join(text.split())}" for key, text in comments.items()]
+    header += [f"element vertex {len(vertices)}"]
+    header += [f"property double {name}" for name in points.dtype.names or ()]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header += [f"property double {name}" for name in (triangles.dtype.names or ())[2:]]
+    header += ["end_header", ""]
+    with atomic_path(path, FluxError) as temporary, temporary.open("wb") as file:
+        file.write("\n".join(header).encode("ascii", "backslashreplace"))
+        file.write(points.tobytes())
+        file.write(triangles.tobytes())

@@ -1,0 +1,126 @@
+"""Surface meshes: `.npz`, OBJ, and what trimesh loads (STL, OFF, GLB, ...), with the fields they carry."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from ..errors import FluxError
+from ..surface import merge
+from .raw import Field, RawMesh
+from .table import one_line, read_npz
+
+
+def read_arrays(path: Path) -> RawMesh:
+    """A `.npz` with `vertices` (V, 3) and `faces` (F, 3) or `tetrahedra` (T, 4) from 0, and fields of any
+    name.
+
+    `vertices_mm` goes for `vertices`, and so on: the words may have a suffix.
+    """
+    arrays = read_npz(path)
+    points = _named(arrays, ("vertices", "nodes"), path)
+    cells = _named(arrays, ("faces", "tetrahedra"), path)
+    fields = tuple(
+        Field(name, values, None)
+        for name, values in arrays.items()
+        if values.dtype.kind in "fiu" and values.shape in (points.shape[:1], cells.shape[:1])
+    )
+    return RawMesh(points.astype(np.float64), cells, path.name, fields)
+
+
+def _named(arrays: dict[str, NDArray], words: tuple[str, ...], path: Path) -> NDArray:
+    """The one array of two axes whose name is a word or starts with it and an underscore."""
+    fitting = [
+        n for n, a in arrays.items() if a.ndim == 2 and any(n == w or n.startswith(f"{w}_") for w in words)
+    ]
+    if len(fitting) != 1:
+        listed = ", ".join(f"'{name}' {array.shape}" for name, array in arrays.items())
+        raise FluxError(
+            f"'{path}' must have one array named {' or '.join(words)}, of two axes. It has {listed}."
+        )
+    return arrays[fitting[0]]
+
+
+def read_obj(path: Path) -> RawMesh:
+    """Vertices and triangles of an OBJ in the order of its lines, which values beside it count on.
+
+    Normals, texture coordinates and materials are passed over: loaders that make use of them split and sort
+    the vertices.
+    """
+    try:
+        text = path.read_bytes()
+    except OSError as cause:
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
+    vertices = re.findall(rb"^[ \t]*v[ \t]+([^\r\n]*)", text, re.MULTILINE)
+    faces = re.sub(rb"/\S*", b"", b"\n".join(re.findall(rb"^[ \t]*f[ \t]+([^\r\n]*)", text, re.MULTILINE)))
+    if not vertices or not faces:
+        raise FluxError(f"'{path}' has no vertices or no faces, it is not an OBJ mesh.")
+    try:
+        points = np.loadtxt([line.decode("ascii") for line in vertices], ndmin=2, usecols=(0, 1, 2))
+        cells = np.loadtxt(faces.decode("ascii").split("\n"), ndmin=2, dtype=np.int64)
+    except ValueError as cause:  # not a number, or faces with different numbers of corners
+        raise FluxError(
+            f"'{path}' is not an OBJ of triangles: {one_line(cause)}. Triangulate it first."
+        ) from cause
+    if cells.shape[1] != 3 or cells.min() < 1:
+        what = f"{cells.shape[1]} corners a face" if cells.shape[1] != 3 else "relative vertex numbers"
+        raise FluxError(f"'{path}' has {what}. Save it with triangles and vertices numbered from 1.")
+    return RawMesh(points, cells - 1, path.name)
+
+
+def read_trimesh(path: Path) -> RawMesh:
+    """A mesh that trimesh loads, unchanged in order, with its scalar fields on vertices and faces.
+
+    The corners of an STL are merged where they are equal; its faces keep their order.
+
+    Raises
+    ------
+    FluxError : trimesh does not know the format or cannot read the file, or finds no triangles in it.
+    """
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in trimesh.available_formats():
+        raise FluxError(
+            f"'{path}': no reader for '.{kind}'. Known: .ply .stl .obj .off .glb .npz .vtu .vtk .msh .xdmf "
+            ".mesh .inp, node_ID.dat (MMC), .node (NIRFAST). Convert it, or choose by --format."
+        )
+    loaded = load_triangles(path, kind)
+    points, cells = np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)
+    if kind in ("stl", "stl_ascii"):
+        points, cells = merge(points, cells)
+        return RawMesh(points, cells, path.name, point_order=False)
+    return RawMesh(points, cells, path.name, _fields(loaded))
+
+
+def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
+    """trimesh's mesh of a file, its vertices and faces as they are; refused where there are no faces."""
+    try:
+        mesh = trimesh.load_scene(path, process=False, **options).to_mesh()
+        count = len(mesh.faces)
+    except OSError as cause:
+        raise FluxError(
+            f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name."
+        ) from cause
+    except Exception as cause:  # a damaged file makes trimesh's loaders raise anything
+        raise FluxError(
+            f"'{path}' cannot be read as .{kind}: {one_line(cause)}. Is the file damaged?"
+        ) from cause
+    if count == 0:
+        raise FluxError(f"'{path}' holds no triangles, only points or lines. Give a surface mesh.")
+    return mesh
+
+
+def _fields(mesh: trimesh.Trimesh) -> tuple[Field, ...]:
+    """Scalar attributes on the vertices and faces."""
+    found = []
+    for on, attributes in (("vertex", mesh.vertex_attributes), ("cell", mesh.face_attributes)):
+        count = len(mesh.vertices if on == "vertex" else mesh.faces)
+        for name, values in attributes.items():
+            values = np.asarray(values)
+            if values.size == count and values.shape[0] == count and values.dtype.kind in "fiu":
+                found.append(Field(name, values.ravel(), on))
+    return tuple(found)

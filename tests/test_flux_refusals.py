@@ -1,0 +1,172 @@
+"""Importing J_n: files of solvers and of meshio that must not be taken, or not without a choice."""
+
+import sys
+
+import meshio
+import numpy as np
+import pytest
+
+from mitsuba_fspt.errors import BackendError, FluxError
+from mitsuba_fspt.flux_import import import_flux
+
+POINTS = np.vstack([np.zeros(3), np.eye(3)])
+ELEMENT = np.array([[0, 1, 2, 3]])
+TRIANGLES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+NODES = "1 4\n1 0 0 0\n2 1 0 0\n3 0 1 0\n4 0 0 1\n"
+ELEMENTS = "1 1\n1 1 2 3 4 1\n"
+DREF = "1\t0.1\n2\t0.1\n3\t0.1\n4\t0.1\n"
+
+
+def mmc(folder, nodes=NODES, elements=ELEMENTS, dref=DREF, name="s_dref.dat"):
+    (folder / "node_s.dat").write_text(nodes)
+    if elements is not None:
+        (folder / "elem_s.dat").write_text(elements)
+    (folder / name).write_bytes(dref if isinstance(dref, bytes) else dref.encode())
+    return folder / "node_s.dat", folder / name
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({"name": "s_dref.jnii"}, r"s_dref\.jnii' is not a text _dref\.dat.*fluence.*no -F"),
+        ({"name": "s_dref.bin"}, r"not a text _dref"),
+        ({"dref": np.linspace(0, 1, 9).tobytes()}, r"is binary.*fluence; run mmc without -F"),
+        ({"dref": DREF + "5\t0.1\n"}, r"5 values do not fill time gates of 4 boundary faces"),
+        ({"dref": "1 1 0.1\n2 1 0.1\n3 1 0.1\n4 1 0.1\n"}, r"has 3 columns.*one source"),
+        ({"dref": "1 .1\n3 .1\n2 .1\n4 .1\n"}, r"must count faces from 1"),
+        ({"dref": "0 .1\n0 .1\n0 .1\n0 .1\n"}, r"must count faces from 1"),
+        ({"dref": DREF.replace("0.1", "100")}, r"400 times the launched energy.*-U 1"),
+        ({"elements": None}, r"elem_s\.dat' cannot be read"),
+        ({"elements": "10 1\n1 1 2 3 4 5 6 7 8 9 10 1\n"}, r"Linear tetrahedra"),
+        ({"elements": "1 1\n1 1 2 3 5 1\n"}, r"vertices 0 to 4 \(counted from 0\), there are 4"),
+        ({"nodes": "1 2\n1 0 0\n2 1 0\n"}, r"4 and 6 columns"),
+    ],
+)
+def test_mmc_files(tmp_path, files, message):
+    with pytest.raises(FluxError, match=message) as caught:
+        import_flux(*mmc(tmp_path, **files))
+    assert "\n" not in str(caught.value)
+
+
+def test_mmc_options(tmp_path):
+    mesh, values = mmc(tmp_path)
+    assert import_flux(mesh, values).power == pytest.approx(0.4)
+    with pytest.raises(FluxError, match="power that leaves each face already"):
+        import_flux(mesh, values, a="robin")
+    with pytest.raises(FluxError, match=r"Give --values SESSION_dref\.dat"):
+        import_flux(mesh)
+    with pytest.raises(FluxError, match=r"must be called node_ID\.dat"):
+        import_flux(mesh.rename(tmp_path / "mesh.dat"), values, format="mmc")
+
+
+@pytest.mark.parametrize(
+    ("node", "elem", "message"),
+    [
+        ("4 3 0 0\n1 0 0 0\n2 1 0 0\n3 0 1 0\n4 0 0 1\n", "1 2 3 4\n", r"TetGen"),
+        ("1 0 0\n1 1 0\n1 0 1\n", "1 2 3\n", r"3 columns"),
+        (
+            "1 0 0 0\n1 1 0 0\n1 0 1 0\n1 0 0 1\n",
+            "1 2 3\n2 3 4\n",
+            r"must have 4 columns \(tetrahedra\), it has 3",
+        ),
+        ("1 0 0 0\n1 1 0 0\n1 0 1 0\n1 0 0 1\n", None, r"mesh\.elem' cannot be read"),
+        ("1 0 0 0\n1 1 0 0\n1 0 1 0\n1 0 0 1\n", "0 1 2 3\n", r"vertices -1 to 2 .*from 0 or from 1"),
+    ],
+)
+def test_nirfast_files(tmp_path, node, elem, message):
+    (tmp_path / "mesh.node").write_text(node)
+    if elem is not None:
+        (tmp_path / "mesh.elem").write_text(elem)
+    with pytest.raises(FluxError, match=message):
+        import_flux(tmp_path / "mesh.node", np.ones(4))
+
+
+@pytest.mark.parametrize(
+    ("cells", "point_data", "cell_data", "options", "message"),
+    [
+        ([("tetra", ELEMENT)], {"phi": np.ones(4), "psi": np.ones(4)}, {}, {}, r"'phi', 'psi'.*--field"),
+        ([("tetra", ELEMENT)], {"phi": np.ones(4)}, {}, {"field": "jn"}, r"no field 'jn'.*has: 'phi'"),
+        (
+            [("tetra", ELEMENT)],
+            {"v": np.ones((4, 3))},
+            {},
+            {},
+            r"Fields it has: none\. Give the values by --values",
+        ),
+        (
+            [("triangle", TRIANGLES)],
+            {"jn": np.ones(4)},
+            {"jn": [np.ones(4)]},
+            {},
+            r"on vertices and on faces.*--per",
+        ),
+        (
+            [("tetra", ELEMENT), ("triangle", TRIANGLES)],
+            {},
+            {"jn": [np.ones(1), np.ones(4)]},
+            {},
+            r"cell data passed over: both on triangles and on tetrahedra",
+        ),
+        (
+            [("quad", np.array([[0, 1, 2, 3]]))],
+            {"jn": np.ones(4)},
+            {},
+            {},
+            r"holds quad; triangles or tetrahedra",
+        ),
+        ([("line", np.array([[0, 1]]))], {"jn": np.ones(4)}, {}, {}, r"holds line; triangles or tetrahedra"),
+    ],
+)
+def test_meshio_choices(tmp_path, cells, point_data, cell_data, options, message):
+    meshio.Mesh(POINTS, cells, point_data, cell_data).write(tmp_path / "m.vtu")
+    with pytest.raises(FluxError, match=message):
+        import_flux(tmp_path / "m.vtu", **options)
+
+
+def test_one_real_field_is_found_among_labels_and_vectors(tmp_path):
+    mesh = meshio.Mesh(
+        POINTS,
+        [("tetra", ELEMENT), ("triangle", TRIANGLES), ("line", ELEMENT[:, :2])],
+        {"phi": np.arange(4.0), "region": np.arange(4), "gradient": np.ones((4, 3))},
+    )
+    mesh.write(tmp_path / "m.vtu")
+    assert import_flux(tmp_path / "m.vtu").provenance["source"] == (
+        "m.vtu (its cell data passed over: both on triangles and on tetrahedra) 'phi'"
+    )
+    assert import_flux(tmp_path / "m.vtu", field="region").exitance.tolist() == [0, 1, 2, 3]
+
+
+def test_second_order_tetrahedra_keep_their_corners(tmp_path):
+    pairs = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
+    points = np.vstack([POINTS, POINTS[pairs].mean(axis=1)])
+    mesh = meshio.Mesh(points, [("tetra10", np.arange(10)[None])], {"phi": 1 + points @ [1.0, 2.0, 3.0]})
+    mesh.write(tmp_path / "m.vtu")
+    phantom = import_flux(tmp_path / "m.vtu")
+    assert phantom.exitance.tolist() == [1, 2, 3, 4]
+    assert phantom.area == pytest.approx(1.5 + np.sqrt(3) / 2)
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "extra"), [("meshio", "m.vtu", "mesh"), ("scipy.io", "phi.mat", "tissue")]
+)
+def test_a_missing_package_names_its_extra(tmp_path, monkeypatch, module, name, extra):
+    (tmp_path / name).touch()
+    monkeypatch.setitem(sys.modules, module, None)
+    mesh = tmp_path / name if extra == "mesh" else (POINTS, TRIANGLES)
+    with pytest.raises(BackendError, match=rf"is not installed\. pip install 'mitsuba-fspt\[{extra}\]'"):
+        import_flux(mesh, tmp_path / name)
+
+
+def test_npz_fields(tmp_path):
+    arrays = {"vertices_mm": POINTS, "faces": TRIANGLES, "source_mm": np.zeros(3), "jn_mc": np.ones(4)}
+    np.savez(tmp_path / "m.npz", **arrays)
+    assert import_flux(tmp_path / "m.npz", per="face").per == "face"
+    np.savez(tmp_path / "m.npz", jn_fem=np.full(4, 2.0), **arrays)
+    with pytest.raises(FluxError, match=r"'jn_fem', 'jn_mc'\. Choose one by --field"):
+        import_flux(tmp_path / "m.npz", per="face")
+    assert import_flux(tmp_path / "m.npz", field="jn_fem", per="face").exitance.tolist() == [2, 2, 2, 2]
+    np.savez(tmp_path / "m.npz", exitance=np.full(4, 3.0), jn_fem=np.ones(4), **arrays)
+    assert import_flux(tmp_path / "m.npz", per="vertex").exitance.tolist() == [3, 3, 3, 3]
+    np.savez(tmp_path / "m.npz", points=POINTS, faces=TRIANGLES)
+    with pytest.raises(FluxError, match=r"one array named vertices or nodes.*'points' \(4, 3\)"):
+        import_flux(tmp_path / "m.npz")
