@@ -56,10 +56,12 @@ def import_(
 ) -> None:
     """Write a phantom from a mesh and values on it, as other codes write them.
 
-    Values are the surface flux density J_n in W per square of the mesh's length unit, or, with --a, the
-    fluence phi in the same unit, J_n = phi/(2A). MMC: MESH is node_ID.dat beside elem_ID.dat, --values
-    SESSION_dref.dat (energy of each face). NIRFAST: MESH is NAME.node beside NAME.elem, --values the nodal
-    phi.
+    Values are the surface flux density J_n in W per square of the mesh's
+    length unit, or, with --a, the fluence phi in that unit, J_n = phi/(2A).
+
+    MMC: MESH is node_ID.dat beside elem_ID.dat, --values SESSION_dref.dat,
+    the energy that leaves each face. NIRFAST: MESH is NAME.node beside
+    NAME.elem, --values the fluence at the nodes.
     """
     from .flux_import import import_flux
 

@@ -72,9 +72,10 @@ def import_flux(
     source = raw.source if values is not None else f"{raw.source} '{found.name}'"
     exitance, provenance = _exitance(raw, found, scale, a, n)
     provenance = {"source": source, **provenance}
-    _require_outward(found, flip)
     exitance, negatives, removed = _without_negatives(found, exitance, clip)
-    return Phantom(found.vertices, found.faces, exitance, found.per, provenance, negatives, removed)
+    phantom = Phantom(found.vertices, found.faces, exitance, found.per, provenance, negatives, removed)
+    _require_outward(phantom, flip)
+    return phantom
 
 
 def _exitance(
@@ -121,16 +122,16 @@ def _boundary_factor(
     return (float(factors[0]) if len(factors) == 1 else factors[where.ravel()]), told
 
 
-def _require_outward(found: SurfaceValues, flip: bool) -> None:
+def _require_outward(phantom: Phantom, flip: bool) -> None:
     """Refuse faces that contradict each other, and a closed surface that shows inward: dark parts."""
-    shape = closure(found.vertices, found.faces)
+    shape = phantom.closure
     if shape.twisted:
         raise FluxError(
             f"mesh: on {shape.twisted} edges the two faces show to opposite sides, each face must show "
             "outward. Repair it, for example by trimesh.repair.fix_winding."
         )
     if shape.inside_out:
-        turned = closure(found.vertices, found.faces[:, ::-1])
+        turned = closure(phantom.vertices, phantom.faces[:, ::-1])
         if turned.outward:
             mend = "Leave out" if flip else "Give"
             raise FluxError(

@@ -62,11 +62,10 @@ def boundary(points: Points, tetrahedra: Indices) -> tuple[Indices, Indices]:
 
 
 def merge(points: Points, faces: Indices) -> tuple[Points, Indices]:
-    """The same faces, in the same order, on points that are all different; equal means equal in every bit.
+    """The same faces, in the same order, on points that are all different; none are merged that differ.
 
     A format without shared corners (STL) repeats a corner for each of its faces.
     """
-    points = points + 0.0  # -0 becomes 0
     order = np.lexsort(points.T)
     ordered = points[order]
     new = np.ones(len(points), dtype=bool)
@@ -130,23 +129,24 @@ def closure(points: Points, faces: Indices) -> Closure:
 
 def _inside_out(points: Points, faces: Indices) -> tuple[int, int]:
     """Number of pieces of a closed surface that are inside out, and of all pieces."""
-    piece = _pieces(len(points), faces)[faces[:, 0]]
-    _, first, piece = np.unique(piece, return_index=True, return_inverse=True)
+    label = _pieces(len(points), faces)[faces[:, 0]]
+    _, first, piece = np.unique(label, return_index=True, return_inverse=True)
     corners = points[faces]
     # About a corner of the piece: far from the origin the volume would cancel.
-    local = corners - corners[first, 0][piece][:, None]
-    volumes = np.bincount(piece, weights=np.linalg.det(local)) / 6
-    size = np.zeros(len(first))
-    np.maximum.at(size, piece, np.abs(local).max(axis=(1, 2)))
+    volumes = np.bincount(piece, weights=np.linalg.det(corners - corners[first, 0][piece][:, None])) / 6
+    areas = np.bincount(piece, weights=face_areas(points, faces))
+    # A sheet with a face on either side has no volume, only rounding, and is right as it is.
+    hollow = np.flatnonzero(volumes < -1e-9 * areas**1.5)  # few: cavities and mistakes
+    if len(hollow) == 0:
+        return 0, len(first)
     lowest, highest = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     wrong = 0
-    # A sheet with a face on either side has no volume, only rounding, and is right as it is.
-    for hollow in np.flatnonzero(volumes < -1e-9 * size**3):  # few: cavities and mistakes
+    for number in hollow:
         # A point of no particular place on the piece: the line upwards meets no edge of an aligned mesh.
-        point = np.array([0.5377, 0.2719, 0.1904]) @ corners[first[hollow]]
-        near = ((lowest <= point[:2]) & (highest >= point[:2])).all(axis=1) & (piece != hollow)
+        point = np.array([0.5377, 0.2719, 0.1904]) @ corners[first[number]]
+        near = ((lowest <= point[:2]) & (highest >= point[:2])).all(axis=1) & (piece != number)
         wrong += _crossings_above(point, corners[near]) <= 0
-    return wrong, len(volumes)
+    return wrong, len(first)
 
 
 def _crossings_above(point: Points, corners: NDArray[np.float64]) -> int:

@@ -118,6 +118,18 @@ def test_ply_properties(tmp_path, per):
         assert_law(phantom, SPHERE.area)
 
 
+def test_ply_with_texture_coordinates_keeps_its_vertices(tmp_path):
+    """Texture coordinates at the corners of faces would make trimesh split and sort the vertices."""
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(VERTICES)}\n"
+    header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "jn"))
+    header += f"element face {len(FACES)}\nproperty list uchar int vertex_indices\n"
+    header += "property list uchar float texcoord\nend_header\n"
+    faces = "".join(f"3 {a} {b} {c} 6 0 0 1 0 0 {c % 2}\n" for a, b, c in FACES)
+    mesh = write(tmp_path / "mesh.ply", header + rows(np.column_stack([VERTICES, law(VERTICES)])) + faces)
+    for values in (None, law(VERTICES), law(centroids(VERTICES, FACES))):
+        assert_law(import_flux(mesh, values), SPHERE.area)
+
+
 @pytest.mark.parametrize("suffix", ["vtu", "vtk", "msh", "xdmf", "mesh", "inp"])
 @pytest.mark.parametrize("cell", ["triangle", "tetra"])
 @pytest.mark.parametrize("per", ["vertex", "face"])

@@ -19,8 +19,7 @@ NOT_VALUES = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", 
 
 
 def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
-    """A PLY's triangles with their scalar properties, in the file's order, and its comments as {first word:
-    rest}.
+    """A PLY's triangles with their scalar properties, in the file's order, and its comments by first word.
 
     Raises
     ------
@@ -33,7 +32,7 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
     for on, element, count in (("vertex", "vertex", len(mesh.vertices)), ("cell", "face", len(mesh.faces))):
         data = elements.get(element, {}).get("data", {})
         for name in (data.dtype.names or ()) if isinstance(data, np.ndarray) else data:
-            values = np.asarray(data[name])
+            values = np.squeeze(data[name])  # (N, 1) in ASCII files
             if name not in NOT_VALUES and values.shape == (count,) and values.dtype.kind in "fiu":
                 fields.append(Field(name, values.astype(values.dtype.newbyteorder("=")), on))
     points, cells = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)

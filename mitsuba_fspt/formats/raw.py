@@ -62,7 +62,7 @@ class RawMesh:
                 f"{self.source}: cells name vertices {cells.min()} to {cells.max()} (counted from 0), there "
                 f"are {len(points)}. Is the mesh complete, does it count from 0 or from 1?"
             )
-        if not np.isfinite(points[cells.ravel()]).all():
+        if not np.isfinite(points).all() and not np.isfinite(points[cells]).all():
             raise FluxError(f"{self.source}: vertices of cells must be finite, some are NaN or inf.")
 
 
