@@ -41,8 +41,8 @@ def import_flux(
     field : which array, property or column holds them
     per : 'vertex' or 'face', what the values stand on; needed where their number or name leaves that open
     format : 'auto' (by the file's name) or one of `formats.FORMATS`
-    length_unit : 'mm', 'cm' or 'm', of the mesh **and** of its values: W per square of it. MMC's are W of a
-        face.
+    length_unit : 'mm', 'cm' or 'm', of the mesh **and** of its values: W per square of it. MMC's values are
+        the power of a face, whatever the unit.
     a : the values are fluence, J_n = phi/(2A): A by 'robin', 'haskell' (see `boundary`), or the number
         itself. None: they are J_n; NIRFAST's are fluence always, and A is its own 'robin' then.
     n : refractive index of the tissue for A; None: what the file says, else 1.37

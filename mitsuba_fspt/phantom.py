@@ -21,6 +21,11 @@ from .formats.ply import read_ply, write_ply
 from .surface import Closure, Indices, Points, closure, face_areas
 
 UNIT = "W/mm^2"
+# Words of the report and the PLY's comments that no provenance may overwrite.
+RESERVED = {
+    *("area", "power", "min", "max", "zeros", "negatives", "removed_power", "removed_percent", "quantity"),
+    *("unit", "length_unit", "watertight", "outward", "per", "vertices", "faces"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +34,10 @@ class Phantom:
 
     vertices : (V, 3) [mm]
     faces : (F, 3), numbers of vertices from 0, anticlockwise seen from outside
-    exitance : J_n, (V,) or (F,) as `per` says, finite, >= 0, somewhere > 0 [W/mm²]. Between vertices it is
-        linear.
+    exitance : J_n, (V,) or (F,) as `per` says, finite, >= 0, not all 0 [W/mm²]; linear between vertices
     per : 'vertex' or 'face'
-    provenance : where the values come from, words to texts of one line; goes into the PLY's comments
-    negatives, removed_power : how many values were negative before they were set to 0, and their power, >= 0
-        [W]
+    provenance : where the values come from, single words to texts, for the report and the PLY's comments
+    negatives, removed_power : how many values were negative and became 0, and their power, >= 0 [W]
 
     Raises
     ------
@@ -63,6 +66,11 @@ class Phantom:
             )
         if len(self.faces) == 0 or self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise FluxError(f"phantom: faces must be numbers of the {len(self.vertices)} vertices, from 0.")
+        for key in self.provenance:
+            if key in RESERVED or key.split() != [key]:
+                raise FluxError(
+                    f"phantom: '{key}' is taken or no single word. Name the provenance otherwise."
+                )
         require_finite(self.exitance, self.per)
         if self.exitance.min() < 0:
             raise ExitanceError(f"exitance: must be >= 0, the least is {self.exitance.min():.6g} {UNIT}.")
@@ -158,9 +166,12 @@ class Phantom:
                 raise FluxError(
                     f"'{path}': the {key} of a phantom must be {expected}. Import it by fspt flux import."
                 )
-        comments.pop("power", None)
-        negatives = int(comments.pop("negatives", "0"))
-        removed = float(comments.pop("removed_power", "0 W").split()[0])
+        try:
+            negatives = int(comments.pop("negatives", "0"))
+            removed = float(comments.pop("removed_power", "0 W").removesuffix(" W"))
+        except ValueError as cause:
+            raise FluxError(f"'{path}': its comments negatives and removed_power must be numbers.") from cause
+        comments = {key: text for key, text in comments.items() if key not in RESERVED}
         ((on, values),) = exitance.items()
         per = "vertex" if on == "vertex" else "face"
         return cls(raw.points, raw.cells, values.astype(np.float64), per, comments, negatives, removed)

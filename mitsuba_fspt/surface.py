@@ -37,8 +37,7 @@ def boundary(points: Points, tetrahedra: Indices) -> tuple[Indices, Indices]:
     """Faces (F, 3) that belong to one tetrahedron only, outward, and that tetrahedron's number (F,).
 
     They come tetrahedron by tetrahedron, within one in the order (1,2,3) (1,2,4) (1,3,4) (2,3,4). The corner
-    opposite to a face tells which side is outward, so the order of a tetrahedron's own corners does not
-    matter.
+    opposite to a face tells which side is outward; the order of a tetrahedron's own corners has no say in it.
 
     Raises
     ------
@@ -91,8 +90,7 @@ class Closure:
     watertight : every edge has a face on either side
     twisted : number of edges that both their faces walk in the same direction; 0 on a surface with two sides
     inside_out : number of closed pieces that are inside out; None unless watertight and not twisted. A piece
-        with its outward side towards its own middle is right where it is the wall of a cavity in another
-        piece.
+        that shows towards its own middle is right where it is the wall of a cavity in another piece.
     pieces : number of connected pieces; 0 where `inside_out` is None
     """
 

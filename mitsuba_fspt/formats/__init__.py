@@ -18,7 +18,7 @@ from .nirfast import nirfast_mesh, read_nirfast
 from .ply import read_ply
 from .raw import Field, RawMesh, SurfaceValues, surface_values
 from .surface_files import read_arrays, read_obj, read_trimesh
-from .table import read_values
+from .table import column, read_values
 
 MeshLike = str | os.PathLike[str] | tuple[NDArray, NDArray]
 ValuesLike = str | os.PathLike[str] | NDArray
@@ -62,10 +62,8 @@ def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, form
     if format == "auto":
         format = _detect(path)
     if format == "mmc":
-        if values is not None and not isinstance(values, (str, os.PathLike)):
-            raise FluxError(
-                "MMC: values in memory go with a mesh in memory, (node, elem). Give both that way."
-            )
+        if field is not None or isinstance(values, np.ndarray):
+            raise FluxError(f"MMC: '{path}' goes with a file SESSION_dref.dat and no field. Give --values.")
         return read_mmc(path, None if values is None else Path(values))
     raw = READERS[format](path)
     return raw if values is None else _with_values(raw, values, field)
@@ -91,7 +89,9 @@ def _from_arrays(
     if values is None:
         raise FluxError("flux import: a mesh in memory needs 'values', one for each vertex or face.")
     if format == "mmc":
-        return mmc_mesh(points, cells, _array(values, field), "MMC dref")
+        if field is not None or not isinstance(values, np.ndarray):
+            raise FluxError("MMC: a mesh in memory goes with dref in memory (faces, gates), and no field.")
+        return mmc_mesh(points, cells, values, "MMC dref")
     if format == "nirfast":
         return _with_values(nirfast_mesh(points, cells, "NIRFAST mesh"), values, field)
     if format != "auto":
@@ -103,18 +103,9 @@ def _from_arrays(
 
 def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh:
     """The mesh with these values in place of its own fields."""
-    name = Path(values).name if isinstance(values, (str, os.PathLike)) else "values"
-    array = _array(values, field)
-    if array.ndim != 1:
-        raise FluxError(f"values: must have shape (N,), one for each vertex or face, got {array.shape}.")
+    if isinstance(values, (str, os.PathLike)):
+        name, array = Path(values).name, read_values(Path(values), field)
+    else:
+        name, array = "values", column(np.asarray(values), [], field, "values")
     source = f"{raw.source} with {name}" + (f" '{field}'" if field else "")
     return replace(raw, source=source, fields=(Field(name, array, None),))
-
-
-def _array(values: ValuesLike, field: str | None) -> NDArray[np.float64]:
-    if isinstance(values, (str, os.PathLike)):
-        return read_values(Path(values), field)
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiu":
-        raise FluxError(f"values: must be real numbers, got {array.dtype}.")
-    return array.astype(np.float64)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BackendError, FluxError
-from .raw import Field, RawMesh
+from .raw import Field, RawMesh, scalars
 from .table import one_line
 
 FORMATS = {
@@ -48,7 +48,7 @@ def read_meshio(path: Path) -> RawMesh:
     cells = np.concatenate([mesh.cells[k].data[:, : wanted[mesh.cells[k].type]] for k in blocks]).astype(
         np.int64
     )
-    fields = [Field(name, np.squeeze(values), "vertex") for name, values in mesh.point_data.items()]
+    fields = [Field(name, values, "vertex") for name, values in mesh.point_data.items()]
     source = path.name
     if kinds & set(TRIANGLES) and kinds & set(TETRAHEDRA):
         # Which of the two carry the values? A guess could take the wrong ones.
@@ -56,9 +56,8 @@ def read_meshio(path: Path) -> RawMesh:
     else:
         for name, data in mesh.cell_data.items():
             if not name.startswith("gmsh:"):  # labels
-                fields.append(Field(name, np.squeeze(np.concatenate([data[k] for k in blocks])), "cell"))
-    scalars = tuple(f for f in fields if f.values.ndim == 1 and f.values.dtype.kind in "fiu")
-    return RawMesh(np.asarray(mesh.points, np.float64), cells, source, scalars)
+                fields.append(Field(name, np.concatenate([data[k] for k in blocks]), "cell"))
+    return RawMesh(np.asarray(mesh.points, np.float64), cells, source, scalars(fields))
 
 
 def _load(path: Path):

@@ -25,8 +25,8 @@ def read_mmc(mesh: Path, values: Path | None) -> RawMesh:
 
     Raises
     ------
-    FluxError : a file is missing or not in MMC's layout, the values are not text, unnormalised or of another
-        mesh.
+    FluxError : a file is missing or not in MMC's layout; values that are not text, not normalised, or of
+        another mesh.
     """
     kind, _, session = mesh.stem.partition("_")
     if kind not in ("node", "elem") or not session:
@@ -60,10 +60,10 @@ def mmc_mesh(nodes: Points, elements: Indices, dref: NDArray, source: str, turn:
         positive = np.linalg.det(edges) > 0
         tetrahedra[positive] = tetrahedra[positive][:, [0, 1, 3, 2]]
     faces = len(boundary(nodes, tetrahedra)[0])
-    if dref.shape[0] % faces or dref.ndim > 2 or dref.size == 0:
+    if dref.ndim not in (1, 2) or dref.size == 0 or dref.shape[0] % faces or dref.dtype.kind not in "fiu":
         raise FluxError(
-            f"{source}: {dref.shape[0]} values do not fill time gates of {faces} boundary faces. Is it the "
-            "_dref of this mesh, and not its fluence?"
+            f"{source}: values of shape {dref.shape} do not fill time gates of {faces} boundary faces. Is "
+            "it the _dref of this mesh, and not its fluence?"
         )
     energy = dref.sum(axis=1) if dref.ndim == 2 else dref.reshape(-1, faces).sum(axis=0)
     if np.isfinite(energy).all() and energy.sum() > 1 + 1e-3:

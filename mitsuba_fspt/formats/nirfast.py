@@ -24,9 +24,9 @@ def read_nirfast(mesh: Path) -> RawMesh:
     ------
     FluxError : a file is missing or of another layout (TetGen's, or a mesh of triangles).
     """
-    stem = mesh.with_suffix("")
-    nodes, _ = read_table(stem.with_suffix(".node"))
-    elements, _ = read_table(stem.with_suffix(".elem"))
+    stem = mesh.with_suffix("") if mesh.suffix.lower() in (".node", ".elem", ".param") else mesh
+    nodes, _ = read_table(stem.with_name(f"{stem.name}.node"))
+    elements, _ = read_table(stem.with_name(f"{stem.name}.elem"))
     if nodes.shape[1] != 4 or not np.isin(nodes[:, 0], (0, 1)).all():
         raise FluxError(
             f"NIRFAST: lines of '{stem}.node' must be 'boundary x y z', boundary 0 or 1, these have "
@@ -37,7 +37,7 @@ def read_nirfast(mesh: Path) -> RawMesh:
             f"NIRFAST: '{stem}.elem' must have 4 columns (tetrahedra), it has {elements.shape[1]}. Meshes "
             "in the plane and bare surfaces have no exitance to see."
         )
-    index = _index(stem.with_suffix(".param"), len(nodes))
+    index = _index(stem.with_name(f"{stem.name}.param"), len(nodes))
     return nirfast_mesh(nodes[:, 1:], elements.astype(np.int64), f"NIRFAST {stem.name}", index)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..atomic import atomic_path
 from ..errors import FluxError
 from ..surface import Indices, Points
-from .raw import Field, RawMesh
+from .raw import Field, RawMesh, scalars
 from .surface_files import load_triangles
 
 # Properties that are geometry or colour.
@@ -29,14 +29,15 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
     mesh = load_triangles(path, "ply", fix_texture=False, skip_materials=True)
     elements = mesh.metadata.get("_ply_raw", {})
     fields = []
-    for on, element, count in (("vertex", "vertex", len(mesh.vertices)), ("cell", "face", len(mesh.faces))):
+    for on, element in (("vertex", "vertex"), ("cell", "face")):
         data = elements.get(element, {}).get("data", {})
-        for name in (data.dtype.names or ()) if isinstance(data, np.ndarray) else data:
-            values = np.squeeze(data[name])  # (N, 1) in ASCII files
-            if name not in NOT_VALUES and values.shape == (count,) and values.dtype.kind in "fiu":
-                fields.append(Field(name, values.astype(values.dtype.newbyteorder("=")), on))
+        names = (data.dtype.names or ()) if isinstance(data, np.ndarray) else data
+        values = {name: np.asarray(data[name]) for name in names if name not in NOT_VALUES}
+        # trimesh splits polygons of more than three corners: then values on faces no longer fit.
+        fitting = len(mesh.vertices if on == "vertex" else mesh.faces)
+        fields += [Field(name, v, on) for name, v in values.items() if len(v) == fitting]
     points, cells = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    return RawMesh(points, cells, path.name, tuple(fields)), _comments(path)
+    return RawMesh(points, cells, path.name, scalars(fields)), _comments(path)
 
 
 def _comments(path: Path) -> dict[str, str]:

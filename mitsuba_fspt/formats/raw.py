@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,15 @@ class Field:
     name: str
     values: NDArray
     on: str | None
+
+
+def scalars(fields: Iterable[Field]) -> tuple[Field, ...]:
+    """Those of the fields that hold one real number each, as shape (N,)."""
+    return tuple(
+        replace(f, values=f.values.ravel())
+        for f in fields
+        if f.values.dtype.kind in "fiu" and f.values.size == len(f.values)
+    )
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,7 @@ class RawMesh:
 
 @dataclass(frozen=True)
 class SurfaceValues:
-    """Values on a triangle surface, per 'vertex' (V,) or per 'face' (F,), in the file's units, not judged
-    yet.
+    """Values on a triangle surface, per 'vertex' (V,) or per 'face' (F,), in the file's units.
 
     index : the refractive index at its vertices (V,), where the file knows it
     """
@@ -117,6 +126,9 @@ def _choose(mesh: RawMesh, name: str | None, per: str | None) -> Field:
     fitting = [
         f for f in mesh.fields if per is None or f.on is None or (f.on == "vertex") == (per == "vertex")
     ]
+    if mesh.fields and not fitting:
+        stand = "vertices" if per == "face" else "faces"
+        raise FluxError(f"{mesh.source}: its values stand on {stand}, not per {per}. Leave out --per.")
     if name is None:
         real = {f.name: f.values for f in fitting if f.values.dtype.kind == "f"}
         name = pick(real or {f.name: f.values for f in fitting}, None, mesh.source)

@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from ..errors import FluxError
 from ..surface import merge
-from .raw import Field, RawMesh
+from .raw import Field, RawMesh, scalars
 from .table import one_line, read_npz
+
+# What trimesh reads by itself; other kinds it would pass on to meshio.
+KINDS = ("stl", "off", "glb", "gltf", "3mf", "dae", "zae", "3dxml", "xaml", "ctm", "step", "stp")
 
 
 def read_arrays(path: Path) -> RawMesh:
-    """A `.npz` with `vertices` (V, 3) and `faces` (F, 3) or `tetrahedra` (T, 4) from 0, and fields of any
-    name.
+    """A `.npz` with `vertices` (V, 3), `faces` (F, 3) or `tetrahedra` (T, 4) from 0, and fields of any name.
 
     `vertices_mm` goes for `vertices`, and so on: the words may have a suffix.
     """
@@ -83,14 +85,14 @@ def read_trimesh(path: Path) -> RawMesh:
     FluxError : trimesh does not know the format or cannot read the file, or finds no triangles in it.
     """
     kind = path.suffix.lower().lstrip(".")
-    if kind not in trimesh.available_formats():
+    if kind not in KINDS:
         raise FluxError(
             f"'{path}': no reader for '.{kind}'. Known: .ply .stl .obj .off .glb .npz .vtu .vtk .msh .xdmf "
-            ".mesh .inp, node_ID.dat (MMC), .node (NIRFAST). Convert it, or choose by --format."
+            ".mesh .inp, node_ID.dat (MMC), .node (NIRFAST). Convert it, or choose one by --format."
         )
     loaded = load_triangles(path, kind)
     points, cells = np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)
-    if kind in ("stl", "stl_ascii"):
+    if kind == "stl":
         points, cells = merge(points, cells)
         return RawMesh(points, cells, path.name, point_order=False)
     return RawMesh(points, cells, path.name, _fields(loaded))
@@ -116,11 +118,6 @@ def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
 
 def _fields(mesh: trimesh.Trimesh) -> tuple[Field, ...]:
     """Scalar attributes on the vertices and faces."""
-    found = []
-    for on, attributes in (("vertex", mesh.vertex_attributes), ("cell", mesh.face_attributes)):
-        count = len(mesh.vertices if on == "vertex" else mesh.faces)
-        for name, values in attributes.items():
-            values = np.asarray(values)
-            if values.size == count and values.shape[0] == count and values.dtype.kind in "fiu":
-                found.append(Field(name, values.ravel(), on))
-    return tuple(found)
+    on_vertices = [Field(name, np.asarray(v), "vertex") for name, v in mesh.vertex_attributes.items()]
+    on_faces = [Field(name, np.asarray(v), "cell") for name, v in mesh.face_attributes.items()]
+    return scalars(on_vertices + on_faces)

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from .. import pixels, rules
 from ..quadrature import Quadrature, Solution
-from .lines import RAYS_PER_CHORD, apply_rule, chord_at, integrate_chord
+from .lines import apply_rule, chord_at, integrate_chord, rays_per_chord
 from .window import Window, visible_window
 
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
-FIRST_CHORDS = 4
-LAST_CHORDS = 1 << rules.LATTICE_BITS
+FIRST_BISECTIONS = 6
+SAFETY = 3.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
 # How far a jump can hide from a rule's nodes, in blur radii: from its outermost nodes to the rim of the pupil.
 GAP = {4: 0.5, 12: 0.2}
@@ -75,9 +75,9 @@ class _Ladder:
         self.blur = self._largest_blur(self.nearest, far)
         # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
         slope = 4 * np.hypot(mx, my)
-        bend = 0.25 * np.abs(contrast) + np.divide(slope**4, 16 * value**3, out=np.zeros_like(value), where=value > 0)
+        bend = 0.5 * np.abs(contrast) + np.divide(slope**4, 8 * value**3, out=np.zeros_like(value), where=value > 0)
         if self.area:
-            bend += pixels.bend(value) / 24
+            bend += pixels.bend(value) / 12
             self.value = np.maximum(value + pixels.laplacian(value) / 24, 0)
         self.error = bend
         rough = bend > self.tolerance
@@ -115,49 +115,53 @@ class _Ladder:
     # ------------------------------------------------------------------ jumps
 
     def _chords(self, rough: NDArray[np.bool_]) -> None:
-        """Twice as many chords each round on the pixels whose last doubling still moved them or a neighbour."""
+        """More chords each round on the pixels that the last round still moved, or moved a neighbour of."""
         index = np.flatnonzero(rough).astype(np.uint32)
         gy, gx = np.gradient(self.value) if min(self.value.shape) > 1 else (np.zeros_like(self.value),) * 2
         angle = pixels.principal_angle(gx, gy, 1 + math.ceil(self.blur / 2)).ravel()
         across_pupil = self._across_pupil().ravel()
-        total, hits = np.zeros(self.value.size), np.zeros(self.value.size)
-        start, stop = 0, FIRST_CHORDS
-        while len(index) and stop <= LAST_CHORDS and 16 + stop * RAYS_PER_CHORD <= self.quadrature.max_nodes:
-            for part in _chunks(index, max(1, LANES // (stop - start))):
-                sums = self._chord_sums(part, angle[part], across_pupil[part], start, stop)
-                total[part] += sums[0]
-                hits[part] += sums[1]
-            self._count(f"{stop} chords", len(index), (stop - start) * RAYS_PER_CHORD)
-            change = np.zeros(self.value.size)
-            change[index] = np.abs(total[index] / stop - self.value.ravel()[index])
-            self.value.ravel()[index] = total[index] / stop
-            self.hits.ravel()[index] = hits[index] / stop
-            error = pixels.spread_max(change.reshape(self.value.shape)).ravel()
-            self.error.ravel()[index] = error[index]
+        value, hits, error = self.value.ravel(), self.hits.ravel(), self.error.ravel()
+        for level, (m, q) in enumerate(rules.CHORD_LEVELS):
+            rule = rules.chords(m, q) if self.area else rules.chords(m * q * q, 1)
+            bisections = FIRST_BISECTIONS + level
+            rays = len(rule) * rays_per_chord(bisections)
+            if not len(index) or 16 + rays > self.quadrature.max_nodes:
+                break
+            change = np.zeros_like(value)
+            for part in _chunks(index, max(1, LANES // len(rule))):
+                mean, met = self._chord_means(part, angle[part], across_pupil[part], rule, bisections)
+                change[part] = np.abs(mean - value[part])
+                value[part], hits[part] = mean, met
+            self._count(f"{len(rule)} chords", len(index), rays)
+            error[index] = SAFETY * pixels.spread_max(change.reshape(self.value.shape)).ravel()[index]
             index = index[error[index] > self.tolerance]
-            start, stop = stop, 2 * stop
 
-    def _chord_sums(
-        self, part: NDArray[np.uint32], angle: Image, across_pupil: NDArray[np.bool_], start: int, stop: int
+    def _chord_means(
+        self,
+        part: NDArray[np.uint32],
+        angle: Image,
+        across_pupil: NDArray[np.bool_],
+        rule: rules.Chords,
+        bisections: int,
     ) -> list[Image]:
-        """Σ weight × (mean radiance on film, hits) of chords `start`…`stop`-1 on each listed pixel, one launch."""
-        count = dr.opaque(mi.UInt32, stop - start)
-        lane = dr.arange(mi.UInt32, len(part) * (stop - start))
+        """Mean radiance on film and share of hits over the chords of each listed pixel, in one launch."""
+        count = dr.opaque(mi.UInt32, len(rule))
+        lane = dr.arange(mi.UInt32, len(part) * len(rule))
         pixel, number = lane // count, lane % count
-        table = [mi.Float(column) for column in rules.lattice(start, stop).T]
-        u = mi.Point3f(*(dr.gather(mi.Float, column, number) for column in table))
+        table = [mi.Float(column) for column in (rule.across, *rule.pixel.T * self.area, rule.weight)]
+        *u, weight = (dr.gather(mi.Float, column, number) for column in table)
         chord = chord_at(
             dr.gather(mi.Point2f, self.window.centres(part), pixel),
             dr.gather(mi.Float, mi.Float(angle), pixel),
             dr.gather(mi.Bool, mi.Bool(across_pupil), pixel),
-            u,
-            self.area,
-            dr.opaque(mi.Float, self.tolerance),
+            mi.Point3f(*u),
+            weight,
+            dr.opaque(mi.Float, 2 * float(self.value.max())),
         )
-        sums = [
-            dr.block_sum(mi.Float64(mean), stop - start)
-            for mean in integrate_chord(self.scene, self.lens, chord)
-        ]
+        means = integrate_chord(self.scene, self.lens, chord, dr.opaque(mi.UInt32, bisections))
+        means = [mi.Float64(mean) for mean in means]
+        dr.eval(means)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
+        sums = [dr.block_sum(mean, len(rule)) for mean in means]
         dr.eval(sums)
         return [column.numpy() for column in sums]
 
