@@ -31,7 +31,7 @@ def mmc(folder, nodes=NODES, elements=ELEMENTS, dref=DREF, name="s_dref.dat"):
         ({"name": "s_dref.jnii"}, r"s_dref\.jnii' is not a text _dref\.dat.*fluence.*no -F"),
         ({"name": "s_dref.bin"}, r"not a text _dref"),
         ({"dref": np.linspace(0, 1, 9).tobytes()}, r"is binary.*fluence; run mmc without -F"),
-        ({"dref": DREF + "5\t0.1\n"}, r"5 values do not fill time gates of 4 boundary faces"),
+        ({"dref": DREF + "5\t0.1\n"}, r"values of shape \(5,\) do not fill time gates of 4 boundary faces"),
         ({"dref": "1 1 0.1\n2 1 0.1\n3 1 0.1\n4 1 0.1\n"}, r"has 3 columns.*one source"),
         ({"dref": "1 .1\n3 .1\n2 .1\n4 .1\n"}, r"must count faces from 1"),
         ({"dref": "0 .1\n0 .1\n0 .1\n0 .1\n"}, r"must count faces from 1"),
@@ -55,6 +55,10 @@ def test_mmc_options(tmp_path):
         import_flux(mesh, values, a="robin")
     with pytest.raises(FluxError, match=r"Give --values SESSION_dref\.dat"):
         import_flux(mesh)
+    with pytest.raises(FluxError, match=r"its values stand on faces, not per vertex"):
+        import_flux(mesh, values, per="vertex")
+    with pytest.raises(FluxError, match=r"no field"):
+        import_flux(mesh, values, field="2")
     with pytest.raises(FluxError, match=r"must be called node_ID\.dat"):
         import_flux(mesh.rename(tmp_path / "mesh.dat"), values, format="mmc")
 

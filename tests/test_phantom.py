@@ -71,6 +71,8 @@ def test_power_of_a_sphere():
         ({"faces": FACES + 1}, FluxError, r"numbers of the 42 vertices"),
         ({"faces": FACES[:0]}, FluxError, r"numbers of the 42 vertices"),
         ({"vertices": VERTICES * 0}, FluxError, r"no area"),
+        ({"provenance": {"power": "1 W"}}, FluxError, r"'power' is taken"),
+        ({"provenance": {"two words": "x"}}, FluxError, r"'two words' is taken or no single word"),
     ],
 )
 def test_what_a_phantom_cannot_be(changes, error, message):
