@@ -41,9 +41,7 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
         os.replace(temporary, path)
     except OSError as cause:
         reason = (cause.strerror or str(cause)).replace("\n", " ")
-        raise error(
-            f"output file '{path}' cannot be written: {reason}. Give another place for it."
-        ) from cause
+        raise error(f"output file '{path}' cannot be written: {reason}. Give another place for it.") from cause
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)

@@ -148,9 +148,7 @@ class Detector:
         if self.pixel_pitch is not None:
             _require("pixel_pitch", self.pixel_pitch, self.pixel_pitch > 0, "> 0 mm, for example 0.0135")
 
-    def expected(
-        self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1
-    ) -> Expectation:
+    def expected(self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1) -> Expectation:
         """Mean and variance of the electrons that `expose` draws, before the full well cuts them.
 
         Parameters and errors as for `expose`.
@@ -158,9 +156,7 @@ class Detector:
         _require("exposure_time", exposure_time, exposure_time >= 0, ">= 0 s, for example 60")
         _require("wavelength_nm", wavelength_nm, wavelength_nm > 0, "> 0 nm, for example 650")
         if (darkest := image.power.min()) < 0:
-            raise DetectorError(
-                f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again."
-            )
+            raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
         energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
         photons = image.power.astype(np.float64) * (exposure_time / energy)
         pitch = image.metadata.get("pixel_pitch")

@@ -30,9 +30,7 @@ OPTIONAL = {"matplotlib": "plot", "meshio": "mesh", "scikit-fem": "tissue", "sci
 
 VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
 
-_TRIAL = (
-    "import json, sys; from mitsuba_fspt import doctor; print(json.dumps(doctor.try_variant(sys.argv[1])))"
-)
+_TRIAL = "import json, sys; from mitsuba_fspt import doctor; print(json.dumps(doctor.try_variant(sys.argv[1])))"
 _TRIAL_TIMEOUT = 300.0  # s; a driver that hangs
 
 
@@ -194,9 +192,7 @@ def _backends(trials: dict[str, dict[str, float] | str]) -> Iterator[Row]:
             continue
         yield Row("backends", variant, "works")
         yield Row("backends", "  start", f"{trial['import']:.2f} s import, {trial['variant']:.2f} s variant")
-        yield Row(
-            "backends", "  kernel", f"{trial['first']:.3f} s the first, {trial['second']:.3f} s the second"
-        )
+        yield Row("backends", "  kernel", f"{trial['first']:.3f} s the first, {trial['second']:.3f} s the second")
 
 
 def _optional() -> Iterator[Row]:
@@ -206,9 +202,7 @@ def _optional() -> Iterator[Row]:
 
 def _cache() -> Iterator[Row]:
     """Where Dr.Jit keeps compiled kernels between runs."""
-    default = (
-        Path(tempfile.gettempdir(), "drjit") if sys.platform == "win32" else Path("~/.drjit").expanduser()
-    )
+    default = Path(tempfile.gettempdir(), "drjit") if sys.platform == "win32" else Path("~/.drjit").expanduser()
     folder = Path(os.environ.get("DRJIT_CACHE_DIR") or default)
     try:
         sizes = [file.stat().st_size for file in folder.glob("*.bin")]

@@ -37,9 +37,7 @@ def write_exr(
     """
     path = Path(path)
     if path.suffix.lower() != ".exr":
-        raise ImageError(
-            f"image file '{path}': images are written as OpenEXR. Give a name that ends in .exr."
-        )
+        raise ImageError(f"image file '{path}': images are written as OpenEXR. Give a name that ends in .exr.")
     header = {PREFIX + key: _attribute(key, value) for key, value in metadata.items()}
     header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {name: OpenEXR.Channel(_float32(name, values)) for name, values in channels.items()}
@@ -48,9 +46,7 @@ def write_exr(
             OpenEXR.File(header, pixels).write(str(temporary))
         except (RuntimeError, ValueError) as cause:
             reason = _one_line(cause).replace(str(temporary), str(path))
-            raise ImageError(
-                f"image file '{path}': {reason} Make room or give another place for it."
-            ) from cause
+            raise ImageError(f"image file '{path}': {reason} Make room or give another place for it.") from cause
 
 
 def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], Metadata]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import time
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -36,13 +38,9 @@ def import_(
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="The phantom to write, .ply.")],
     values: Annotated[Path | None, typer.Option(help="File of one value per vertex or face.")] = None,
-    field: Annotated[
-        str | None, typer.Option(help="Array, property or column that holds the values.")
-    ] = None,
+    field: Annotated[str | None, typer.Option(help="Array, property or column that holds the values.")] = None,
     per: Annotated[Per | None, typer.Option(help="What the values stand on, where that is open.")] = None,
-    format: Annotated[
-        str, typer.Option(help="auto, mmc, nirfast, meshio, trimesh, ply, obj or npz.")
-    ] = "auto",
+    format: Annotated[str, typer.Option(help="auto, mmc, nirfast, meshio, trimesh, ply, obj or npz.")] = "auto",
     length_unit: Annotated[
         LengthUnit, typer.Option(help="Of the mesh; the values are W per square of it.")
     ] = LengthUnit.mm,
@@ -79,6 +77,40 @@ def import_(
     )
     phantom.write(output)
     report = phantom.report() | {"output": str(output)}
+    typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
+
+
+@app.command()
+def solve(
+    description: Annotated[Path, typer.Argument(metavar="PHANTOM.toml", help="Geometry, optics, light sources, mesh.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The phantom to write, .ply.")],
+    volume: Annotated[
+        Path | None, typer.Option(help="Also write the fluence inside on a grid, for gridvolume: .vol.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Solve the diffusion equation in a phantom and write its surface with J_n.
+
+    The surface's power is what leaves by finite elements; absorbed and exit
+    power together are the sources' to the balance printed.
+    """
+    from .phantom_file import PhantomFile
+
+    start = time.perf_counter()
+    told = PhantomFile.read(description)
+    with Console(stderr=True).status("mesh") as status:
+        solution = told.solve(status.update)
+        status.update("surface")
+        phantom = solution.phantom(told.surface_edge)
+        report = phantom.report() | solution.report()
+        if volume is not None:
+            status.update("volume")
+            grid = solution.volume(told.voxel)
+            report |= {"volume": str(volume)} | grid.report()
+    phantom.write(output)
+    if volume is not None:
+        grid.write(volume)
+    report |= {"seconds": time.perf_counter() - start, "output": str(output)}
     typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
 
 

@@ -57,17 +57,13 @@ def import_flux(
     BackendError : the format needs an optional package.
     """
     if length_unit not in MILLIMETRES:
-        raise FluxError(
-            f"flux import: 'length_unit' must be one of {', '.join(MILLIMETRES)}, got '{length_unit}'."
-        )
+        raise FluxError(f"flux import: 'length_unit' must be one of {', '.join(MILLIMETRES)}, got '{length_unit}'.")
     if per not in (None, "vertex", "face"):
         raise FluxError(f"flux import: 'per' must be vertex or face, got '{per}'.")
     raw = read_mesh(mesh, values, field, format)
     found = surface_values(raw, field if values is None else None, per)
     scale = MILLIMETRES[length_unit]
-    found = replace(
-        found, vertices=found.vertices * scale, faces=found.faces[:, ::-1] if flip else found.faces
-    )
+    found = replace(found, vertices=found.vertices * scale, faces=found.faces[:, ::-1] if flip else found.faces)
     require_finite(found.values, found.per)
     source = raw.source if values is not None else f"{raw.source} '{found.name}'"
     exitance, provenance = _exitance(raw, found, scale, a, n)
@@ -85,19 +81,13 @@ def _exitance(
     if a is None and raw.quantity == "fluence":
         a = "robin"
     if n is not None and a not in ("robin", "haskell"):
-        raise FluxError(
-            f"flux import: 'n' = {n:g} goes with 'a' = robin or haskell, got a = {a}. Leave it out."
-        )
+        raise FluxError(f"flux import: 'n' = {n:g} goes with 'a' = robin or haskell, got a = {a}. Leave it out.")
     if raw.quantity == "power":
         if a is not None:
-            raise FluxError(
-                f"{raw.source}: is the power that leaves each face already, not fluence. Leave out --a."
-            )
+            raise FluxError(f"{raw.source}: is the power that leaves each face already, not fluence. Leave out --a.")
         areas = face_areas(found.vertices, found.faces)
         if (flat := (areas == 0) & (found.values != 0)).any():
-            raise FluxError(
-                f"{raw.source}: {np.count_nonzero(flat)} faces without area carry power. Repair the mesh."
-            )
+            raise FluxError(f"{raw.source}: {np.count_nonzero(flat)} faces without area carry power. Repair the mesh.")
         return np.divide(found.values, areas, out=np.zeros_like(areas), where=areas > 0), {}
     values = found.values / scale**2
     if a is None:
@@ -106,9 +96,7 @@ def _exitance(
     return values / (2 * factor), {"boundary_factor": told}
 
 
-def _boundary_factor(
-    a: str | float, n: float | None, found: SurfaceValues
-) -> tuple[float | NDArray[np.float64], str]:
+def _boundary_factor(a: str | float, n: float | None, found: SurfaceValues) -> tuple[float | NDArray[np.float64], str]:
     """A, one for all or one for each value, and what to record of it."""
     if n is None and found.index is not None and a in ("robin", "haskell"):
         index = found.index if found.per == "vertex" else found.index[found.faces].mean(axis=1)
@@ -134,12 +122,9 @@ def _require_outward(phantom: Phantom, flip: bool) -> None:
         turned = closure(phantom.vertices, phantom.faces[:, ::-1])
         if turned.outward:
             mend = "Leave out" if flip else "Give"
-            raise FluxError(
-                f"mesh: the closed surface is inside out, its light would stay inside. {mend} --flip."
-            )
+            raise FluxError(f"mesh: the closed surface is inside out, its light would stay inside. {mend} --flip.")
         raise FluxError(
-            f"mesh: {shape.inside_out} of its {shape.pieces} closed pieces are inside out. Turn those over "
-            "in the mesh."
+            f"mesh: {shape.inside_out} of its {shape.pieces} closed pieces are inside out. Turn those over in the mesh."
         )
 
 

@@ -44,9 +44,7 @@ class Image:
                 continue
             plane = _plane(name, values)
             if plane.shape != shape:
-                raise ImageError(
-                    f"image: '{name}' must have the shape {shape} of 'power', got {plane.shape}. Crop it."
-                )
+                raise ImageError(f"image: '{name}' must have the shape {shape} of 'power', got {plane.shape}. Crop it.")
             object.__setattr__(self, name, plane)
         metadata: Metadata = {"quantity": "power", "unit": "W"}
         metadata |= {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}

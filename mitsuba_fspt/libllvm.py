@@ -188,9 +188,7 @@ def _wheel_files(distribution: str) -> list[str]:
 
 def _system_files() -> list[str]:
     """Installed libraries by the version in their names, newest first, those without one last."""
-    name = (
-        "LLVM-C.dll" if sys.platform == "win32" else "libLLVM[-.]*"
-    )  # [-.]: not libLLVMSPIRVLib and its like
+    name = "LLVM-C.dll" if sys.platform == "win32" else "libLLVM[-.]*"  # [-.]: not libLLVMSPIRVLib and its like
     patterns = [os.path.join(folder, name) for folder in _system_folders()]
     paths = {os.path.realpath(path) for pattern in patterns for path in glob.glob(pattern)}
     return sorted(sorted(paths), key=lambda path: major_from_name(path) or 0, reverse=True)

@@ -139,8 +139,8 @@ class Lens:
         if self.model == "diaphragm" and self.diaphragm_distance != 0:
             if self.lens_diameter is None:
                 raise OpticsError(
-                    f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm needs 'lens_diameter', the second "
-                    "border a line of sight has to pass."
+                    f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm needs 'lens_diameter', the "
+                    "second border a line of sight has to pass."
                 )
             if self.diaphragm_distance >= self.image_distance:
                 raise OpticsError(
@@ -175,11 +175,11 @@ class Lens:
         Eq. 5's β, generalised: the first disc is the one to integrate over, a second one clips it.
         """
         u, radius = self.focus_distance, self.diaphragm_diameter / 2
-        if self.model == "ripoll":
+        if self.model == "ripoll" and self.numerical_aperture is not None:
             return (Disc(1.0, u * math.tan(math.asin(self.numerical_aperture))),)
-        if self.model == "hrrt":
+        if self.model == "hrrt" and self.lens_diameter is not None:
             return (Disc(0.0, self.lens_diameter / 2),)
-        if self.model == "pinhole" or self.diaphragm_distance == 0:
+        if self.model == "pinhole" or self.diaphragm_distance == 0 or self.lens_diameter is None:
             return (Disc(0.0, radius),)
         pupil = self._entrance_pupil_disc(radius)
         lens = Disc(0.0, self.lens_diameter / 2)

@@ -68,20 +68,14 @@ class Phantom:
             raise FluxError(f"phantom: faces must be numbers of the {len(self.vertices)} vertices, from 0.")
         for key in self.provenance:
             if key in RESERVED or key.split() != [key]:
-                raise FluxError(
-                    f"phantom: '{key}' is taken or no single word. Name the provenance otherwise."
-                )
+                raise FluxError(f"phantom: '{key}' is taken or no single word. Name the provenance otherwise.")
         require_finite(self.exitance, self.per)
         if self.exitance.min() < 0:
             raise ExitanceError(f"exitance: must be >= 0, the least is {self.exitance.min():.6g} {UNIT}.")
         if not self.area > 0:
-            raise FluxError(
-                f"phantom: the surface has no area ({self.area:g} mm^2), it can give off no light."
-            )
+            raise FluxError(f"phantom: the surface has no area ({self.area:g} mm^2), it can give off no light.")
         if not self.power > 0:
-            raise ExitanceError(
-                "exitance: zero everywhere, the phantom would be black. Check the field's name."
-            )
+            raise ExitanceError("exitance: zero everywhere, the phantom would be black. Check the field's name.")
 
     @cached_property
     def area(self) -> float:
@@ -163,9 +157,7 @@ class Phantom:
             )
         for key, expected in (("quantity", "exitance"), ("unit", UNIT), ("length_unit", "mm")):
             if comments.pop(key, expected) != expected:
-                raise FluxError(
-                    f"'{path}': the {key} of a phantom must be {expected}. Import it by fspt flux import."
-                )
+                raise FluxError(f"'{path}': the {key} of a phantom must be {expected}. Import it by fspt flux import.")
         try:
             negatives = int(comments.pop("negatives", "0"))
             removed = float(comments.pop("removed_power", "0 W").removesuffix(" W"))

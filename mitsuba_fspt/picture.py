@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -148,20 +149,21 @@ def _unit(values: NDArray) -> tuple[float, str]:
 def _png(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if path.suffix.lower() != ".png":
-        raise ImageError(
-            f"picture file '{path}': pictures are written as PNG. Give a name that ends in .png."
-        )
+        raise ImageError(f"picture file '{path}': pictures are written as PNG. Give a name that ends in .png.")
     return path
+
+
+def require_matplotlib() -> None:
+    """Raise BackendError where matplotlib is missing."""
+    if find_spec("matplotlib") is None:
+        raise BackendError("picture: matplotlib is not installed. pip install 'mitsuba-fspt[plot]'.")
 
 
 def _figure(width: float, height: float) -> Figure:
     """An empty figure [inches], free of pyplot's windows and global state."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as cause:
-        raise BackendError(
-            "picture: matplotlib is not installed. pip install 'mitsuba-fspt[plot]'."
-        ) from cause
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
     return Figure(figsize=(width, height), layout="constrained")
 
 

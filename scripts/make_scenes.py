@@ -98,9 +98,7 @@ def l_surface(width: float, height: float, bar: float, edge: float) -> tuple[Arr
     inside = (column < thick) | (row < thick)
     corner = (row * (columns + 1) + column)[inside]
     above = corner + columns + 1
-    faces = np.vstack(
-        [np.column_stack([corner, corner + 1, above + 1]), np.column_stack([corner, above + 1, above])]
-    )
+    faces = np.vstack([np.column_stack([corner, corner + 1, above + 1]), np.column_stack([corner, above + 1, above])])
     used, faces = np.unique(faces, return_inverse=True)
     y, z = used % (columns + 1) * edge - width / 2, used // (columns + 1) * edge - height / 2
     return np.column_stack([np.zeros(len(used)), y, z]), faces.reshape(-1, 3)
@@ -135,9 +133,7 @@ def mesh_power(vertices: Array, faces: Index, values: Array) -> float:
     return float(area @ np.asarray(values)[faces].mean(1))
 
 
-def write_ply(
-    path: Path, vertices: Array, faces: Index, comments: Sequence[str], values: Array | None = None
-) -> None:
+def write_ply(path: Path, vertices: Array, faces: Index, comments: Sequence[str], values: Array | None = None) -> None:
     """Binary PLY, float32; `values` (V,) become the property exitance_x, vertex_exitance in Mitsuba."""
     # A name without _x never arrives: Mitsuba reads only properties it can group into an attribute.
     mesh = trimesh.Trimesh(vertices, faces, process=False)

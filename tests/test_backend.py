@@ -40,9 +40,7 @@ sys.modules["mitsuba_fspt.plugins"] = plugins
 
 def run_script(script: str, **environ: str) -> list[object]:
     """What the script prints as JSON; fails if its process dies, above all by an abort."""
-    inherited = {
-        k: v for k, v in os.environ.items() if k not in (libllvm.ENVIRONMENT_NAME, "MI_DEFAULT_VARIANT")
-    }
+    inherited = {k: v for k, v in os.environ.items() if k not in (libllvm.ENVIRONMENT_NAME, "MI_DEFAULT_VARIANT")}
     done = subprocess.run(
         [sys.executable, "-c", PRELUDE + script],
         env={**inherited, "PYTHONPATH": str(REPOSITORY), **environ},
@@ -135,9 +133,7 @@ print(json.dumps([os.environ["DRJIT_LIBLLVM_PATH"], chosen.path, chosen.why]))
 
 BAD_LIBRARIES = [
     pytest.param("/nowhere/libLLVM.so", "cannot be loaded", id="missing"),
-    pytest.param(
-        "libc.so.6" if sys.platform == "linux" else "libSystem.dylib", "lacks the function", id="libc"
-    ),
+    pytest.param("libc.so.6" if sys.platform == "linux" else "libSystem.dylib", "lacks the function", id="libc"),
     pytest.param(LLVM_15, "LLVM 15 is too old", id="LLVM-15", marks=needs_llvm_15),
 ]
 
@@ -210,9 +206,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         JitBackend=SimpleNamespace(CUDA="cuda"),
         has_backend=lambda name: machine.cuda,
     )
-    nothing = libllvm.Selection(
-        None, None, "no usable LLVM library found", (libllvm.Rejected("/a/b", "broken"),)
-    )
+    nothing = libllvm.Selection(None, None, "no usable LLVM library found", (libllvm.Rejected("/a/b", "broken"),))
     monkeypatch.setitem(sys.modules, "drjit", drjit)
     monkeypatch.setitem(sys.modules, "mitsuba", machine.mitsuba)
     monkeypatch.setattr(sys, "platform", "linux")
@@ -237,9 +231,7 @@ def test_llvm_is_taken_where_there_is_no_cuda(machine: SimpleNamespace) -> None:
 
 
 @pytest.mark.parametrize("llvm", [(-1, -1, -1), (16, 0, 6)])
-def test_where_nothing_works_one_line_says_what_to_install(
-    machine: SimpleNamespace, llvm: libllvm.Version
-) -> None:
+def test_where_nothing_works_one_line_says_what_to_install(machine: SimpleNamespace, llvm: libllvm.Version) -> None:
     machine.llvm = llvm
     with pytest.raises(BackendError) as refused:
         backend.ensure_variant()

@@ -61,9 +61,7 @@ def test_counts():
     exposure = CCD.expose(flat(1000.0), 10.0, WAVELENGTH_NM, seed=4)
     error = exposure.counts - (500 + exposure.electrons.astype(np.float64) / 1.6)
     assert 0.49 < np.abs(error).max() <= 0.5
-    assert_moments(
-        exposure.counts.astype(np.float64), 500 + 8500.01 / 1.6, (8500.01 + 12.25) / 1.6**2 + 1 / 12
-    )
+    assert_moments(exposure.counts.astype(np.float64), 500 + 8500.01 / 1.6, (8500.01 + 12.25) / 1.6**2 + 1 / 12)
 
 
 def test_binning_sums_before_the_read_noise():
@@ -209,9 +207,7 @@ def test_counts_files_that_cannot_be_written(tmp_path, monkeypatch):
     ],
 )
 def test_detectors_that_cannot_exist(name, value, rule):
-    with pytest.raises(
-        DetectorError, match=f"'{name}' must be finite and {rule}.*, for example .*, got {value}"
-    ):
+    with pytest.raises(DetectorError, match=f"'{name}' must be finite and {rule}.*, for example .*, got {value}"):
         replace(CCD, **{name: value})
 
 

@@ -39,9 +39,7 @@ def test_a_broken_llvm_is_a_line_of_the_report(monkeypatch: pytest.MonkeyPatch) 
         ("raise ImportError('no such driver')", "ImportError: no such driver"),
     ],
 )
-def test_a_trial_that_dies_is_told_in_one_line(
-    script: str, reason: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trial_that_dies_is_told_in_one_line(script: str, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_TRIAL", script)
     assert doctor.run_trial("llvm_ad_mono") == reason
 

@@ -35,9 +35,7 @@ def block(orientation="mixed", cells=2, side=6.0):
     grid = np.linspace(0, side, cells + 1)
     nodes = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1).reshape(-1, 3)
     corner = np.arange((cells + 1) ** 3).reshape(3 * (cells + 1,))
-    cubes = np.stack(
-        [corner[i : i + cells, j : j + cells, k : k + cells].ravel() for i, j, k in np.ndindex(2, 2, 2)]
-    )
+    cubes = np.stack([corner[i : i + cells, j : j + cells, k : k + cells].ravel() for i, j, k in np.ndindex(2, 2, 2)])
     walks = [(1, 3), (3, 2), (2, 6), (6, 4), (4, 5), (5, 1)]
     elements = np.concatenate([cubes[[0, b, a, 7]].T for a, b in walks])
     if orientation == "mixed":
@@ -92,13 +90,9 @@ def test_trimesh_formats_with_values_beside(tmp_path, suffix, per):
 def test_obj_of_a_modeller_keeps_the_order_of_its_lines(tmp_path):
     """Texture coordinates, normals and materials of an OBJ make loaders split and sort; not here."""
     turned = np.random.default_rng(3).permutation(len(FACES))
-    faces = [
-        f"usemtl m{k % 3}\nf " + " ".join(f"{v + 1}/{v % 5 + 1}/{v + 1}" for v in FACES[k]) for k in turned
-    ]
+    faces = [f"usemtl m{k % 3}\nf " + " ".join(f"{v + 1}/{v % 5 + 1}/{v + 1}" for v in FACES[k]) for k in turned]
     text = "mtllib none.mtl\no sphere\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in VERTICES)
-    text += "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\nvt .5 .5\n" + "".join(
-        f"vn {x} {y} {z}\n" for x, y, z in VERTICES
-    )
+    text += "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\nvt .5 .5\n" + "".join(f"vn {x} {y} {z}\n" for x, y, z in VERTICES)
     mesh = write(tmp_path / "mesh.obj", text + "\n".join(faces) + "\n")
     assert_law(import_flux(mesh, law(VERTICES)), SPHERE.area)
     assert_law(import_flux(mesh, law(centroids(VERTICES, FACES[turned]))), SPHERE.area)
@@ -204,9 +198,7 @@ def test_mmc_faces_in_its_order(tmp_path, gates, beside):
     mesh, values = write_mmc(tmp_path, nodes, elements, energy, gates, beside)
     for given in (mesh, tmp_path / "elem_cube.dat"):
         phantom = import_flux(given, values)
-        np.testing.assert_allclose(
-            phantom.exitance, 1e-3 * law(centroids(phantom.vertices, phantom.faces)), rtol=1e-5
-        )
+        np.testing.assert_allclose(phantom.exitance, 1e-3 * law(centroids(phantom.vertices, phantom.faces)), rtol=1e-5)
     assert phantom.power == pytest.approx(energy.sum(), rel=1e-5)
     assert phantom.report()["outward"] is True
     in_memory = import_flux((nodes, elements + 1), np.tile(energy / 2, (2, 1)).T, format="mmc")

@@ -150,9 +150,7 @@ def test_second_order_tetrahedra_keep_their_corners(tmp_path):
     assert phantom.area == pytest.approx(1.5 + np.sqrt(3) / 2)
 
 
-@pytest.mark.parametrize(
-    ("module", "name", "extra"), [("meshio", "m.vtu", "mesh"), ("scipy.io", "phi.mat", "tissue")]
-)
+@pytest.mark.parametrize(("module", "name", "extra"), [("meshio", "m.vtu", "mesh"), ("scipy.io", "phi.mat", "tissue")])
 def test_a_missing_package_names_its_extra(tmp_path, monkeypatch, module, name, extra):
     (tmp_path / name).touch()
     monkeypatch.setitem(sys.modules, module, None)

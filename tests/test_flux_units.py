@@ -55,9 +55,7 @@ def test_power_per_vertex_is_the_integral_of_linear_exitance():
     assert on_vertices.power == pytest.approx(on_faces.power, rel=1e-12)
     assert on_vertices.power == pytest.approx(52.0)  # the box is centred: the slopes cancel
     uneven = import_flux(MESH, np.where(VERTICES[:, 2] > 0, 3.0, 0.0))
-    assert uneven.power == pytest.approx(
-        3 * 6 + (52 - 12) * 1.5
-    )  # top 2 × 3 at 3 W/mm², sides at 1.5 on average
+    assert uneven.power == pytest.approx(3 * 6 + (52 - 12) * 1.5)  # top 2 × 3 at 3 W/mm², sides at 1.5 on average
 
 
 def test_negative_values_need_clip_and_clip_tells_their_power():
@@ -193,9 +191,7 @@ def test_columns_by_name_or_number(tmp_path, content, field):
     assert import_flux(MESH, tmp_path / "v.csv", field=field).exitance.tolist() == [1.0] + [2.0] * 7
 
 
-@pytest.mark.parametrize(
-    "suffix", ["ply", "stl", "obj", "off", "glb", "vtu", "vtk", "msh", "xdmf", "npz", "step"]
-)
+@pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "off", "glb", "vtu", "vtk", "msh", "xdmf", "npz", "step"])
 @pytest.mark.parametrize("content", [b"", b"neither fish nor fowl\n" * 20, b"ply\nelement vertex 3\n"])
 def test_broken_mesh_files_give_one_line(tmp_path, suffix, content, capfd):
     path = tmp_path / f"broken.{suffix}"

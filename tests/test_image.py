@@ -75,9 +75,7 @@ def test_foreign_file(tmp_path, kind):
     """A half-float file and one with further channels can be read; the values are in range of each type."""
     values = np.arange(12, dtype=kind).reshape(3, 4)
     channels = {"Y": values, "A": np.ones_like(values), "R": values + 1, "G": values, "B": values}
-    OpenEXR.File({}, {name: OpenEXR.Channel(v) for name, v in channels.items()}).write(
-        str(tmp_path / "f.exr")
-    )
+    OpenEXR.File({}, {name: OpenEXR.Channel(v) for name, v in channels.items()}).write(str(tmp_path / "f.exr"))
     image = read(tmp_path / "f.exr")
     np.testing.assert_array_equal(image.power, values)
     assert image.power.dtype.itemsize >= 4

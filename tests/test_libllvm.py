@@ -50,9 +50,7 @@ def test_broken_ones_are_passed_over(shelf: dict[str, libllvm.Version]) -> None:
 def test_nothing_that_works(shelf: dict[str, libllvm.Version]) -> None:
     chosen = libllvm.select({})
     assert (chosen.path, chosen.version, len(chosen.rejected)) == (None, None, 4)
-    assert (
-        libllvm.select({libllvm.ENVIRONMENT_NAME: ""}) == chosen
-    )  # Dr.Jit takes an empty path for none as well
+    assert libllvm.select({libllvm.ENVIRONMENT_NAME: ""}) == chosen  # Dr.Jit takes an empty path for none as well
 
 
 def test_installed_libraries_newest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

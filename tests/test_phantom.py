@@ -47,9 +47,7 @@ def test_mitsuba_finds_the_exitance(tmp_path, per):
     parameters = mi.traverse(mesh)
     assert np.array_equal(np.array(parameters[f"{per}_exitance"]), written.exitance.astype(np.float32))
     assert np.array_equal(np.array(parameters["faces"]).reshape(-1, 3), FACES)
-    assert np.array_equal(
-        np.array(parameters["vertex_positions"]).reshape(-1, 3), VERTICES.astype(np.float32)
-    )
+    assert np.array_equal(np.array(parameters["vertex_positions"]).reshape(-1, 3), VERTICES.astype(np.float32))
 
 
 def test_power_of_a_sphere():

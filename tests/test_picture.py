@@ -77,9 +77,7 @@ def test_comparison(drawn):
     curves = {line.get_label(): line for line in profile.get_lines()}
     assert curves["calculated"].get_ydata()[0] == pytest.approx(1)
     assert curves["standard"].get_ydata()[0] == pytest.approx(3)
-    assert curves["standard"].get_xdata()[[0, -1]] == pytest.approx(
-        [-1.188, 1.188]
-    )  # centres of the outer pixels
+    assert curves["standard"].get_xdata()[[0, -1]] == pytest.approx([-1.188, 1.188])  # centres of the outer pixels
     assert figure.get_suptitle().startswith("ME 0,  CF 1,  ratio of powers 0.33333")
 
 
@@ -88,9 +86,7 @@ def test_upright(tmp_path):
     write_png(spot(power=1.0), tmp_path / "a.png")
     with Picture.open(tmp_path / "a.png") as shown:
         pixels = np.asarray(shown.convert("RGB")).astype(float)
-    yellow = (
-        (pixels[..., 0] > 240) & (pixels[..., 1] > 240) & (pixels[..., 2] < 200)
-    )  # the top of the colour map
+    yellow = (pixels[..., 0] > 240) & (pixels[..., 1] > 240) & (pixels[..., 2] < 200)  # the top of the colour map
     height, width = yellow.shape
     rows, columns = np.nonzero(yellow[:, : width * 3 // 4])  # without the colour bar
     assert rows.size > 100
@@ -126,9 +122,7 @@ def test_pictures_that_cannot_be_written(tmp_path, monkeypatch):
         write_comparison_png(spot(), spot(9), tmp_path / "a.png")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     for write in (write_png, lambda image, path: write_comparison_png(image, image, path)):
-        with pytest.raises(
-            BackendError, match=r"matplotlib is not installed. pip install 'mitsuba-fspt\[plot\]'"
-        ):
+        with pytest.raises(BackendError, match=r"matplotlib is not installed. pip install 'mitsuba-fspt\[plot\]'"):
             write(spot(), tmp_path / "a.png")
     assert os.listdir(tmp_path) == []
 

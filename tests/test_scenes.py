@@ -131,9 +131,7 @@ def test_sphere_picture_has_the_f_on_longitude_0_stem_west():
     rows, columns = np.nonzero(centred == 40)
     letter = (centred == 40)[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     coarse = letter[8::17, 8::17].astype(int)  # one look into each box of 12°
-    np.testing.assert_array_equal(
-        coarse, [[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]]
-    )
+    np.testing.assert_array_equal(coarse, [[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]])
     assert centred[128, 128] == 20  # longitude -90
     assert np.all(picture[:20] == 10)  # north
     assert np.all(picture[-20:] == 2)
@@ -169,9 +167,7 @@ def reciprocity(phantom, points, normals, weights, values):
 
     Green's second identity: ∇²ψ = k²ψ inside and ∂φ/∂n = -h φ leave no other J_n of a source of 1 W.
     """
-    directions = np.array(
-        [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]]
-    )
+    directions = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
     wave = np.exp(phantom.decay * points @ directions.T)
     integrand = wave * (1 + phantom.decay * (normals @ directions.T) / phantom.slope)
     source = np.exp(phantom.decay * directions @ [phantom.source_x, 0, phantom.source_z]) * phantom.ball

@@ -81,9 +81,7 @@ def _detect(path: Path) -> str:
     return "meshio" if suffix in MESHIO else "trimesh"
 
 
-def _from_arrays(
-    mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field: str | None, format: str
-) -> RawMesh:
+def _from_arrays(mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field: str | None, format: str) -> RawMesh:
     """Points and cells in memory; those of MMC and NIRFAST count from 1, all others from 0."""
     points, cells = np.asarray(mesh[0], np.float64), np.asarray(mesh[1])
     if values is None:
@@ -95,9 +93,7 @@ def _from_arrays(
     if format == "nirfast":
         return _with_values(nirfast_mesh(points, cells, "NIRFAST mesh"), values, field)
     if format != "auto":
-        raise FluxError(
-            f"flux import: format '{format}' reads files; a mesh in memory is auto, mmc or nirfast."
-        )
+        raise FluxError(f"flux import: format '{format}' reads files; a mesh in memory is auto, mmc or nirfast.")
     return _with_values(RawMesh(points, cells, "arrays"), values, field)
 
 

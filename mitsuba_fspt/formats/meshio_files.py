@@ -45,9 +45,7 @@ def read_meshio(path: Path) -> RawMesh:
         listed = ", ".join(sorted(other or kinds)) or "no cells"
         raise FluxError(f"'{path}' holds {listed}; triangles or tetrahedra are read. Split its cells first.")
     blocks = [k for k, block in enumerate(mesh.cells) if block.type in wanted]
-    cells = np.concatenate([mesh.cells[k].data[:, : wanted[mesh.cells[k].type]] for k in blocks]).astype(
-        np.int64
-    )
+    cells = np.concatenate([mesh.cells[k].data[:, : wanted[mesh.cells[k].type]] for k in blocks]).astype(np.int64)
     fields = [Field(name, values, "vertex") for name, values in mesh.point_data.items()]
     source = path.name
     if kinds & set(TRIANGLES) and kinds & set(TETRAHEDRA):
@@ -66,8 +64,7 @@ def _load(path: Path):
         import meshio
     except ImportError as cause:
         raise BackendError(
-            f"flux import: meshio, which reads '{path.name}', is not installed. pip install "
-            "'mitsuba-fspt[mesh]'."
+            f"flux import: meshio, which reads '{path.name}', is not installed. pip install 'mitsuba-fspt[mesh]'."
         ) from cause
     if not path.is_file():
         raise FluxError(f"'{path}' cannot be read: there is no such file. Check the name.")

@@ -85,9 +85,7 @@ def _read_dref(path: Path) -> NDArray[np.float64]:
     try:
         table, _ = read_table(path)
     except FluxError as cause:
-        raise FluxError(
-            f"MMC: {cause} A binary _dref appears to hold the fluence; run mmc without -F."
-        ) from cause
+        raise FluxError(f"MMC: {cause} A binary _dref appears to hold the fluence; run mmc without -F.") from cause
     if table.shape[1] != 2:
         raise FluxError(
             f"MMC: '{path}' has {table.shape[1]} columns, a _dref.dat of one source has 2: face and value. "
@@ -97,7 +95,5 @@ def _read_dref(path: Path) -> NDArray[np.float64]:
     starts = np.flatnonzero(number == 1)
     period = starts[1] if len(starts) > 1 else len(number)
     if len(number) % period or not np.array_equal(number, np.arange(len(number)) % period + 1):
-        raise FluxError(
-            f"MMC: the first column of '{path}' must count faces from 1, once for each time gate."
-        )
+        raise FluxError(f"MMC: the first column of '{path}' must count faces from 1, once for each time gate.")
     return table[:, 1]

@@ -41,9 +41,7 @@ def read_nirfast(mesh: Path) -> RawMesh:
     return nirfast_mesh(nodes[:, 1:], elements.astype(np.int64), f"NIRFAST {stem.name}", index)
 
 
-def nirfast_mesh(
-    nodes: Points, elements: Indices, source: str, index: NDArray[np.float64] | None = None
-) -> RawMesh:
+def nirfast_mesh(nodes: Points, elements: Indices, source: str, index: NDArray[np.float64] | None = None) -> RawMesh:
     """Mesh of `nodes` (V, 3), `elements` (T, 4) from 1, and index at the nodes; its values are fluence."""
     return RawMesh(nodes, elements - 1, source, quantity="fluence", index=index)
 

@@ -58,13 +58,10 @@ class RawMesh:
             raise FluxError(f"{self.source}: vertices must have shape (V, 3), got {points.shape}.")
         if cells.ndim != 2 or cells.shape[1] not in (3, 4) or len(cells) == 0:
             raise FluxError(
-                f"{self.source}: cells must be triangles (F, 3) or tetrahedra (T, 4), got shape "
-                f"{cells.shape}."
+                f"{self.source}: cells must be triangles (F, 3) or tetrahedra (T, 4), got shape {cells.shape}."
             )
         if cells.dtype.kind not in "iu":
-            raise FluxError(
-                f"{self.source}: cells must be integers, the numbers of vertices, got {cells.dtype}."
-            )
+            raise FluxError(f"{self.source}: cells must be integers, the numbers of vertices, got {cells.dtype}.")
         object.__setattr__(self, "points", points.astype(np.float64))
         object.__setattr__(self, "cells", cells.astype(np.int64))
         if cells.min() < 0 or cells.max() >= len(points):
@@ -123,9 +120,7 @@ def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceV
 
 def _choose(mesh: RawMesh, name: str | None, per: str | None) -> Field:
     """The one field of that name; without a name the only one that is no label (integers)."""
-    fitting = [
-        f for f in mesh.fields if per is None or f.on is None or (f.on == "vertex") == (per == "vertex")
-    ]
+    fitting = [f for f in mesh.fields if per is None or f.on is None or (f.on == "vertex") == (per == "vertex")]
     if mesh.fields and not fitting:
         stand = "vertices" if per == "face" else "faces"
         raise FluxError(f"{mesh.source}: its values stand on {stand}, not per {per}. Leave out --per.")
@@ -165,11 +160,8 @@ def _place(chosen: Field, mesh: RawMesh, faces: int, per: str | None) -> str:
     }
     listed = ", ".join(f"{there_are} {names[place]}" for place, there_are in counts.items())
     if places:
-        raise FluxError(
-            f"{chosen.name}: {count} values fit {' and '.join(names[p] for p in places)}. Give --per."
-        )
+        raise FluxError(f"{chosen.name}: {count} values fit {' and '.join(names[p] for p in places)}. Give --per.")
     asked = f" (asked for per {per})" if per else ""
     raise FluxError(
-        f"{chosen.name}: {count} values fit nothing{asked}, {mesh.source} has {listed}. Give one value for "
-        "each."
+        f"{chosen.name}: {count} values fit nothing{asked}, {mesh.source} has {listed}. Give one value for each."
     )

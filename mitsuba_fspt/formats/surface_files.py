@@ -37,14 +37,10 @@ def read_arrays(path: Path) -> RawMesh:
 
 def _named(arrays: dict[str, NDArray], words: tuple[str, ...], path: Path) -> NDArray:
     """The one array of two axes whose name is a word or starts with it and an underscore."""
-    fitting = [
-        n for n, a in arrays.items() if a.ndim == 2 and any(n == w or n.startswith(f"{w}_") for w in words)
-    ]
+    fitting = [n for n, a in arrays.items() if a.ndim == 2 and any(n == w or n.startswith(f"{w}_") for w in words)]
     if len(fitting) != 1:
         listed = ", ".join(f"'{name}' {array.shape}" for name, array in arrays.items())
-        raise FluxError(
-            f"'{path}' must have one array named {' or '.join(words)}, of two axes. It has {listed}."
-        )
+        raise FluxError(f"'{path}' must have one array named {' or '.join(words)}, of two axes. It has {listed}.")
     return arrays[fitting[0]]
 
 
@@ -66,9 +62,7 @@ def read_obj(path: Path) -> RawMesh:
         points = np.loadtxt([line.decode("ascii") for line in vertices], ndmin=2, usecols=(0, 1, 2))
         cells = np.loadtxt(faces.decode("ascii").split("\n"), ndmin=2, dtype=np.int64)
     except ValueError as cause:  # not a number, or faces with different numbers of corners
-        raise FluxError(
-            f"'{path}' is not an OBJ of triangles: {one_line(cause)}. Triangulate it first."
-        ) from cause
+        raise FluxError(f"'{path}' is not an OBJ of triangles: {one_line(cause)}. Triangulate it first.") from cause
     if cells.shape[1] != 3 or cells.min() < 1:
         what = f"{cells.shape[1]} corners a face" if cells.shape[1] != 3 else "relative vertex numbers"
         raise FluxError(f"'{path}' has {what}. Save it with triangles and vertices numbered from 1.")
@@ -104,13 +98,9 @@ def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
         mesh = trimesh.load_scene(path, process=False, **options).to_mesh()
         count = len(mesh.faces)
     except OSError as cause:
-        raise FluxError(
-            f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name."
-        ) from cause
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
     except Exception as cause:  # a damaged file makes trimesh's loaders raise anything
-        raise FluxError(
-            f"'{path}' cannot be read as .{kind}: {one_line(cause)}. Is the file damaged?"
-        ) from cause
+        raise FluxError(f"'{path}' cannot be read as .{kind}: {one_line(cause)}. Is the file damaged?") from cause
     if count == 0:
         raise FluxError(f"'{path}' holds no triangles, only points or lines. Give a surface mesh.")
     return mesh

@@ -87,9 +87,7 @@ def column(array: NDArray, names: list[str], field: str | None, where: str) -> N
         return array[:, int(field) - 1].astype(np.float64)
     asked = "which of" if field is None else f"there is no column '{field}' among"
     listed = ", ".join(f"'{label}'" for label in labels[:20])
-    raise FluxError(
-        f"{where}: {asked} its {count} columns? Choose one by --field, by name or number: {listed}."
-    )
+    raise FluxError(f"{where}: {asked} its {count} columns? Choose one by --field, by name or number: {listed}.")
 
 
 def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], list[str]]:
@@ -163,9 +161,7 @@ def _load_numpy(path: Path) -> NDArray | dict[str, NDArray]:
             loaded = np.load(file, allow_pickle=False)
             return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
     except OSError as cause:
-        raise FluxError(
-            f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name."
-        ) from cause
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
     except (ValueError, EOFError, BadZipFile) as cause:
         raise FluxError(f"'{path}' cannot be read as a NumPy file: {one_line(cause)}.") from cause
 
@@ -177,8 +173,7 @@ def _read_mat(path: Path) -> dict[str, NDArray]:
         from scipy.io.matlab import MatReadError
     except ImportError as cause:
         raise BackendError(
-            "flux import: SciPy, which reads .mat files, is not installed. pip install "
-            "'mitsuba-fspt[tissue]'."
+            "flux import: SciPy, which reads .mat files, is not installed. pip install 'mitsuba-fspt[tissue]'."
         ) from cause
     try:
         variables = loadmat(path, squeeze_me=False)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import SceneError
 from ..quadrature import Quadrature, Solution
 from . import pupil_form
+from .checks import check_scene
+from .intersections import robust_scene
 
 
 class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
@@ -46,14 +46,21 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             pixel=str(props.get("pixel", defaults.pixel)),
             max_nodes=int(props.get("max_nodes", defaults.max_nodes)),
         )
+        self._sound: mi.Scene | None = None
 
     def solve(self, scene: mi.Scene, sensor: mi.Sensor) -> Solution:
-        """Power, error and coverage of the sensor's crop window; raises SceneError without an `fspt_lens`."""
-        if type(sensor).__name__ != "FsptLens":
-            raise SceneError(
-                f"fspt_integral: the sensor is a {sensor.class_name()}, but the integral needs the lens of 'fspt_lens'."
-            )
-        return pupil_form.solve(scene, sensor, self.quadrature)
+        """Power, error and coverage of the sensor's crop window; errors as in `check_scene`."""
+        check_scene(scene, sensor)
+        return pupil_form.solve(self._traced(scene, sensor), sensor, self.quadrature)
+
+    def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
+        """`scene`, or its robust twin where it loses rays; looked at once a scene."""
+        if scene is not self._sound:
+            robust = robust_scene(scene, lens)
+            if robust is not scene:
+                return robust
+            self._sound = scene
+        return scene
 
     def render(
         self,

@@ -49,7 +49,7 @@ class FsptLens(mi.Sensor):
        - Optional border of the lens. Must not be smaller than a diaphragm that lies in the lens.
      * - diaphragm_distance
        - |float| [mm]
-       - From the lens to the diaphragm, > 0 behind the lens, < 0 in front (Default: 0, in the lens). Needs lens_diameter.
+       - From the lens to the diaphragm, > 0 behind the lens, < 0 in front, 0 in it (Default: 0). Needs lens_diameter.
      * - model
        - |string|
        - diaphragm (default) | hrrt (no diaphragm, D = lens_diameter) | pinhole (one line of sight a point) |
@@ -69,6 +69,7 @@ class FsptLens(mi.Sensor):
 
     def __init__(self, props: mi.Properties) -> None:
         _own_film(props)
+        _default_sampler(props)
         super().__init__(props)
         self._numbers = {n: mi.Float64(float(props[n])) for n in REQUIRED + OPTIONAL if props.has_property(n)}
         missing = [name for name in REQUIRED if name not in self._numbers]
@@ -97,6 +98,7 @@ class FsptLens(mi.Sensor):
         if dr.any(self.m_to_world.has_scale()):
             raise OpticsError("fspt_lens: 'to_world' scales lengths. Give a rotation and a translation only.")
         self.optics = Lens.focused(model=self._model, **numbers)
+        self.pixel_pitch = pitch
         self.virtual_pitch = pitch / self.optics.magnification
         self._discs = [_OpaqueDisc(disc) for disc in self.optics.discs]
         self._spread = 0.0 if self._model == "pinhole" else 1.0
@@ -163,7 +165,12 @@ class FsptLens(mi.Sensor):
     # ------------------------------------------------------------------ Mitsuba's sensor interface
 
     def sample_ray(
-        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        self,
+        time: mi.Float,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: mi.Bool = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Line of sight through a uniform point of the crop window and a uniform point of the pupil."""
         film = self.film()
@@ -247,6 +254,12 @@ def _own_film(props: mi.Properties) -> None:
         "rfilter": {"type": "box"},
     }
     props["film"] = mi.load_dict(film)
+
+
+def _default_sampler(props: mi.Properties) -> None:
+    """The best stock sampler for one bounce, where the scene file names none."""
+    if not any(isinstance(child, mi.Sampler) for _, child in props.objects()):
+        props["sampler"] = mi.load_dict({"type": "multijitter", "sample_count": 64})
 
 
 mi.register_sensor("fspt_lens", FsptLens)

@@ -37,7 +37,12 @@ def radiance_on_film(
     return weight * radiance, body, si.t * cos_theta
 
 
-def repeat(count: int | mi.UInt32, body: Callable[..., tuple], *state: Any, while_true: Callable[..., mi.Bool] | None = None) -> tuple:
+def repeat(
+    count: int | mi.UInt32,
+    body: Callable[..., tuple],
+    *state: Any,
+    while_true: Callable[..., mi.Bool] | None = None,
+) -> tuple:
     """`state` after `count` rounds of state = body(k, *state), as one loop inside the kernel."""
 
     def condition(k: mi.UInt32, *state: Any) -> mi.Bool:
@@ -85,9 +90,7 @@ def apply_rule(scene: mi.Scene, lens: mi.Sensor, centre: mi.Point2f, rule: rules
 # ---------------------------------------------------------------------- chords where the picture jumps
 
 
-def integrate_chord(
-    scene: mi.Scene, lens: mi.Sensor, chord: Chord, bisections: mi.UInt32
-) -> tuple[mi.Float, mi.Float]:
+def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, bisections: mi.UInt32) -> tuple[mi.Float, mi.Float]:
     """Mean of the integrand and of the hits along a chord, split at its largest jump.
 
     The jump is looked for between neighbours of `SCAN` + 1 points, then bisected towards the larger difference.
@@ -163,7 +166,12 @@ class Chord:
 
 
 def chord_at(
-    centre: mi.Point2f, angle: mi.Float, across_pupil: mi.Bool, u: mi.Point3f, weight: mi.Float, outline: mi.Float
+    centre: mi.Point2f,
+    angle: mi.Float,
+    across_pupil: mi.Bool,
+    u: mi.Point3f,
+    weight: mi.Float,
+    outline: mi.Float,
 ) -> Chord:
     """Chord of a pixel whose picture changes along `angle`; `u` = (across, pixel x, pixel y) of `rules.Chords`.
 

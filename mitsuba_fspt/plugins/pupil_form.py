@@ -34,6 +34,14 @@ def solve(scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
     return _Ladder(scene, lens, quadrature).climb()
 
 
+def coverage(scene: mi.Scene, lens: mi.Sensor) -> Image:
+    """Share of each pixel's lines of sight that meet a surface, by twelve of them; shape (h, w)."""
+    window = visible_window(scene, lens)
+    index = np.arange(math.prod(window.shape), dtype=np.uint32)
+    hits = [apply_rule(scene, lens, window.centres(part), rules.twelve(True))[4] for part in _chunks(index, LANES)]
+    return window.expand(np.concatenate([np.zeros(0), *(h.numpy() for h in hits)]).reshape(window.shape))
+
+
 class _Ladder:
     """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
 

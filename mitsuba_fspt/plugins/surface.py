@@ -78,7 +78,12 @@ class FsptSurface(mi.Emitter):
         return self._distribution().pdf(self._surface_at(ps, active), active)
 
     def sample_ray(
-        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        self,
+        time: mi.Float,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: mi.Bool = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Ray from a point ∝ J_n in a direction ∝ cosθ; its weight is the power it stands for [W]."""
         si, pdf = self._distribution().sample(sample2, active)
@@ -105,15 +110,11 @@ class FsptSurface(mi.Emitter):
         weight = dr.select(active, self._radiance(si, active) * _rcp(ds.pdf), 0)
         return ds, mi.depolarizer(weight)
 
-    def pdf_direction(
-        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
-    ) -> mi.Float:
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         pdf = self._distribution().pdf(self._surface_at(ds, active), active)
         return dr.select(active, _solid_angle(pdf, ds), 0)
 
-    def eval_direction(
-        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
-    ) -> mi.Spectrum:
+    def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
         """Radiance [W/mm²/sr] that arrives at `it` from the surface point of `ds`."""
         si = self._surface_at(ds, active)
         si.wavelengths = it.wavelengths

@@ -1,0 +1,5 @@
+"""`python -m mitsuba_fspt` is the command line `fspt`."""
+
+from .cli import main
+
+main()

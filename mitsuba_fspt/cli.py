@@ -1,0 +1,229 @@
+"""The command line `fspt`: thin verbs over the Python API, one line and exit code 2 for whatever is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from typer.exceptions import TyperException
+
+from .errors import FsptError, ImageError, SceneError
+
+app = typer.Typer(
+    name="fspt",
+    help="Calibrated CCD images of glowing phantoms, in watts per pixel.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")]
+Parameters = Annotated[
+    list[str] | None,
+    typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
+]
+
+
+@app.callback(invoke_without_command=True)
+def fspt(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    """Calibrated CCD images of glowing phantoms, in watts per pixel."""
+    if version:
+        from importlib.metadata import version as of
+
+        typer.echo(f"mitsuba-fspt {of('mitsuba-fspt')}")
+        raise typer.Exit()
+
+
+@app.command()
+def render(
+    scene: SceneFile,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Image to write, .exr.")] = None,
+    method: Annotated[str | None, typer.Option(help="integral, path or ptracer; the scene's own if left out.")] = None,
+    rtol: Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")] = None,
+    spp: Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")] = None,
+    define: Parameters = None,
+    png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
+) -> None:
+    """Render a scene to an EXR with the power [W], its error and the coverage of every pixel."""
+    output = output or Path(scene.stem + ".exr")
+    _require_writable(output, ".exr")
+    if png:
+        from .picture import require_matplotlib
+
+        require_matplotlib()
+    with _progress() as progress:
+        from .render import render
+        from .scene import load
+
+        _quiet_mitsuba()
+        image = render(
+            load(scene, **_parameters(define)),
+            method=method,
+            rtol=rtol,
+            spp=spp,
+            seed=seed,
+            progress=progress,
+        )
+    image.write(output)
+    power, peak = image.power.sum(), image.power.max()
+    typer.echo(f"{output}: total {power:.6g} W, brightest pixel {peak:.6g} W, {image.metadata['wall_time']:.3g} s")
+    if png:
+        from .picture import write_png
+
+        write_png(image, output.with_suffix(".png"))
+        typer.echo(f"{output.with_suffix('.png')}: the same to look at")
+
+
+@app.command()
+def compare(
+    calculated: Annotated[Path, typer.Argument(metavar="CALCULATED.exr")],
+    standard: Annotated[Path, typer.Argument(metavar="STANDARD.exr")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, profiles included.")] = False,
+    png: Annotated[Path | None, typer.Option(help="Also draw both images and their difference.")] = None,
+) -> None:
+    """Compare two images: ME and CF as the paper defines them, largest and RMS error, a z-test."""
+    from .compare import compare
+    from .image import read
+
+    images = read(calculated), read(standard)
+    result = compare(*images)
+    if png:
+        from .picture import write_comparison_png
+
+        write_comparison_png(*images, png)
+    if as_json:
+        typer.echo(json.dumps(result.to_dict()))
+        return
+    typer.echo(f"ME     {result.me:.3e}   mean error, each image over its own maximum")
+    typer.echo(f"CF     {result.cf:.7f}   correlation factor")
+    typer.echo(f"max    {result.max_error:.3e}   largest error over the standard's peak")
+    typer.echo(f"RMS    {result.rms:.3e}   over the standard's peak")
+    typer.echo(f"ratio  {result.ratio:.6f}   of the total powers")
+    if result.z_test:
+        z = result.z_test
+        typer.echo(
+            f"chi2   {z.chi2:.3f}   per pixel; largest |z| {z.max_z:.2f} of {z.pixels} pixels, p {z.p_value:.2g}"
+        )
+
+
+@app.command()
+def expose(
+    image: Annotated[Path, typer.Argument(metavar="IMAGE.exr", help="Power image, as 'fspt render' writes it.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Electrons to write, .exr.")],
+    exposure_time: Annotated[float, typer.Option(help="Exposure time [s].")],
+    wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
+    binning: Annotated[int, typer.Option(help="Pixels per side binned before read-out.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    counts: Annotated[Path | None, typer.Option(help="Also write the counts [DN], 16-bit .png or .tif.")] = None,
+) -> None:
+    """Expose a typical cooled CCD (not a data sheet) to an image: electrons, and counts if asked."""
+    from .detector import Detector
+    from .image import read
+
+    exposure = Detector.typical_ccd().expose(
+        read(image), exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, seed=seed
+    )
+    exposure.write(output)
+    if counts:
+        exposure.write_counts(counts)
+    saturated = exposure.metadata["saturated_pixels"]
+    typer.echo(f"{output}: brightest pixel {exposure.electrons.max():.6g} electrons, {saturated} pixels saturated")
+
+
+@app.command()
+def doctor() -> None:
+    """Print versions, the chosen LLVM and why, devices, and a timed first kernel."""
+    from .doctor import diagnose
+
+    diagnosis = diagnose()
+    typer.echo(diagnosis.render_text())
+    raise typer.Exit(0 if diagnosis.usable else 2)
+
+
+def _add_flux() -> None:
+    from .flux_cli import app as flux
+
+    app.add_typer(flux, name="flux")
+
+
+_add_flux()
+
+
+def main() -> None:
+    """Entry point: run the command line and exit with 0, 2 for bad input or 130 for Ctrl-C."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Exit code of `fspt` with these arguments; errors are one line on stderr and leave nothing behind."""
+    try:
+        code = app(args=arguments, standalone_mode=False)
+        return code if isinstance(code, int) else 0
+    except FsptError as error:
+        return _fail(str(error))
+    except TyperException as error:
+        message = getattr(error, "format_message", error.__str__)()
+        return _fail(f"{message.rstrip('.')}. See 'fspt --help'.")
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("interrupted; nothing was written.", 130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if os.environ.get("FSPT_DEBUG"):
+            raise
+        return _fail(f"{type(error).__name__}: {error} (FSPT_DEBUG=1 shows where)", 1)
+
+
+def _fail(message: str, code: int = 2) -> int:
+    typer.echo(f"fspt: {' '.join(message.split())}", err=True)
+    return code
+
+
+def _parameters(define: list[str] | None) -> dict[str, str]:
+    pairs = dict(text.partition("=")[::2] for text in define or ())
+    for text in define or ():
+        if "=" not in text.strip("="):
+            raise SceneError(f"-D {text}: must be NAME=VALUE, for example -D f_number=8.")
+    return pairs
+
+
+def _require_writable(path: Path, suffix: str) -> None:
+    """Refuse an output that cannot be written before the work, not after it."""
+    if path.suffix != suffix:
+        raise ImageError(f"{path}: images are written as {suffix}. Give a name that ends in {suffix}.")
+    folder = path.parent
+    if not folder.is_dir():
+        raise ImageError(f"{path}: the folder '{folder}' does not exist. Make it, or write elsewhere with -o.")
+    if not os.access(folder, os.W_OK):
+        raise ImageError(f"{path}: the folder '{folder}' is not writable. Write elsewhere with -o.")
+
+
+def _quiet_mitsuba() -> None:
+    """Mitsuba's warnings would break the one line that errors promise."""
+    from .backend import ensure_variant
+
+    ensure_variant()
+    import mitsuba as mi
+
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+@contextmanager
+def _progress() -> Iterator[object]:
+    """A progress bar on a terminal, nothing in a pipe."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("loading", total=None)
+        yield lambda what, share: bar.update(task, description=what, total=1.0, completed=share)

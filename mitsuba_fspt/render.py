@@ -1,0 +1,192 @@
+"""Pictures of a scene: by the deterministic integral, or by Mitsuba's own Monte Carlo with its standard error."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from . import backend
+from .errors import SceneError
+from .image import Image
+from .quadrature import Quadrature
+from .scene import load
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+METHODS = ("integral", "path", "ptracer")
+PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
+LANES = 1 << 23  # Monte Carlo samples in flight
+Progress = Callable[[str, float], None]
+
+
+def render(
+    scene: mi.Scene | str | os.PathLike[str],
+    *,
+    method: str | None = None,
+    sensor: int = 0,
+    rtol: float | None = None,
+    domain: str | None = None,
+    pixel: str | None = None,
+    max_nodes: int | None = None,
+    spp: int | None = None,
+    seed: int | None = None,
+    progress: Progress | None = None,
+) -> Image:
+    """Image of a scene, power in W on every pixel, with its error and coverage.
+
+    Parameters
+    ----------
+    scene : Mitsuba scene (see `load`) or the name of a scene file
+    method : 'integral' (Eq. 9, deterministic), 'path' or 'ptracer' (Monte Carlo); None takes the scene's own
+    sensor : number of the sensor, an `fspt_lens`
+    rtol, domain, pixel, max_nodes : accuracy of the integral, see `Quadrature`; None takes the scene's own
+    spp : Monte Carlo samples a pixel, >= 2 (default 256); their error is the standard error of independent passes
+    seed : of the Monte Carlo, >= 0 (default 0)
+    progress : called with what is being done and the share done
+
+    Raises
+    ------
+    SceneError, OpticsError, ExitanceError, BackendError : what is wrong and how to mend it.
+    """
+    if not _is_scene(scene):
+        scene = load(scene)
+    backend.ensure_variant()
+    lens = _sensor(scene, sensor)
+    integrator = _integrator(scene, method)
+    accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
+    sampling = {"spp": spp, "seed": seed}
+    deterministic = type(integrator).__name__ == "FsptIntegral"
+    _refuse(sampling if deterministic else accuracy, "integral" if deterministic else "Monte Carlo")
+    start = time.perf_counter()
+    if deterministic:
+        power, error, coverage, how = _integrate(scene, lens, integrator, accuracy, progress)
+    else:
+        power, error, coverage, how = _sample(scene, lens, integrator, spp or 256, seed or 0, progress)
+    how["wall_time"] = time.perf_counter() - start
+    return Image(power, error, coverage, {"scene": scene.id(), **how, **_lens_numbers(lens), **_versions()})
+
+
+def _integrate(
+    scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress | None
+) -> tuple:
+    """Arrays and metadata of the deterministic integral."""
+    import mitsuba as mi
+
+    own = asdict(integrator.quadrature)
+    wanted = own | {name: value for name, value in accuracy.items() if value is not None}
+    Quadrature(**wanted)  # says what is wrong better than the plugin can
+    if wanted != own:
+        integrator = mi.load_dict({"type": "fspt_integral", **wanted})
+    if progress:
+        progress("integrating", 0.0)
+    solution = integrator.solve(scene, lens)
+    how = {"method": "integral", **wanted, "nodes": solution.rays, "levels": "; ".join(solution.levels)}
+    return solution.power, solution.error, solution.coverage, how
+
+
+def _sample(
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    integrator: mi.Integrator,
+    spp: int,
+    seed: int,
+    progress: Progress | None,
+) -> tuple:
+    """Mean and standard error of independent Monte Carlo passes, summed in double precision."""
+    import drjit as dr
+
+    from .plugins.checks import check_scene
+    from .plugins.pupil_form import coverage
+
+    check_scene(scene, lens)
+    if spp < 2:
+        raise SceneError(f"render: 'spp' must be >= 2 for a standard error, got {spp}. Give for example 256.")
+    if seed < 0:
+        raise SceneError(f"render: 'seed' must be >= 0, got {seed}.")
+    pixels = math.prod(int(n) for n in lens.film().crop_size())
+    passes = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
+    total = squares = 0.0
+    samples = 0
+    for k in range(passes):
+        if progress:
+            progress("sampling", k / passes)
+        with dr.suspend_grad():
+            image = integrator.render(scene, lens, seed=seed * 65537 + k, spp=math.ceil(spp / passes))
+        power = np.array(image, np.float64)[..., 0]
+        total, squares = total + power, squares + power * power
+        samples += lens.sampler().sample_count()
+    mean = total / passes
+    variance = np.maximum(squares / passes - mean * mean, 0) * passes / (passes - 1)
+    name = {"PathIntegrator": "path", "ParticleTracerIntegrator": "ptracer"}
+    how = {
+        "method": name.get(integrator.class_name(), integrator.class_name()),
+        "sampler": lens.sampler().class_name(),
+        "spp": samples,
+        "passes": passes,
+        "seed": seed,
+    }
+    return mean, np.sqrt(variance / passes), coverage(scene, lens), how
+
+
+def _is_scene(scene: object) -> bool:
+    return not isinstance(scene, (str, os.PathLike))
+
+
+def _sensor(scene: mi.Scene, number: int) -> mi.Sensor:
+    sensors = scene.sensors()
+    if not 0 <= number < len(sensors):
+        raise SceneError(f"scene: sensor {number} does not exist, the scene has {len(sensors)}. Give an 'fspt_lens'.")
+    return sensors[number]
+
+
+def _integrator(scene: mi.Scene, method: str | None) -> mi.Integrator:
+    import mitsuba as mi
+
+    own = scene.integrator()
+    if method is None and own is not None:
+        return own
+    if method in (None, "integral"):
+        return own if type(own).__name__ == "FsptIntegral" else mi.load_dict({"type": "fspt_integral"})
+    if method not in METHODS:
+        raise SceneError(f"render: 'method' must be one of {', '.join(METHODS)}, got '{method}'.")
+    # Depth 1 is the light that leaves the surface straight into the lens, all there is in free space.
+    return mi.load_dict({"type": method, "max_depth": 1})
+
+
+def _refuse(settings: dict[str, object], method: str) -> None:
+    for name, value in settings.items():
+        if value is not None:
+            raise SceneError(f"render: '{name}' = {value} has no meaning for {method}. Leave it out or set 'method'.")
+
+
+def _lens_numbers(lens: mi.Sensor) -> dict[str, float | int | str]:
+    optics = lens.optics
+    numbers = {
+        "model": optics.model,
+        "focal_length": optics.focal_length,
+        "f_number": optics.f_number,
+        "diaphragm_diameter": optics.diaphragm_diameter,
+        "focus_distance": optics.focus_distance,
+        "image_distance": optics.image_distance,
+        "magnification": optics.magnification,
+        "lens_diameter": optics.lens_diameter,
+        "diaphragm_distance": optics.diaphragm_distance,
+        "numerical_aperture": optics.numerical_aperture,
+        "pixel_pitch": lens.pixel_pitch,
+    }
+    return {name: value for name, value in numbers.items() if value is not None}
+
+
+def _versions() -> dict[str, str]:
+    import mitsuba as mi
+
+    packages = ("mitsuba-fspt", "mitsuba", "drjit", "numpy")
+    return {"variant": mi.variant(), "versions": ", ".join(f"{name} {version(name)}" for name in packages)}

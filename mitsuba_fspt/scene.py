@@ -1,0 +1,91 @@
+"""Scene files: XML with `<default>` parameters in, a Mitsuba scene out."""
+
+from __future__ import annotations
+
+import os
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import backend
+from .errors import SceneError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+def load(path: str | os.PathLike[str], **parameters: object) -> mi.Scene:
+    """Mitsuba scene of an XML file; keywords replace the file's `<default>` values.
+
+    Sets a variant where none is set (see `backend.ensure_variant`), and turns Embree's robust mode on. The scene's
+    `id()` is the file and its parameters, for example 'scenes/nylon_cylinder.xml f_number=8'.
+
+    Raises
+    ------
+    SceneError : the file cannot be read, is no valid scene, or has no such parameter; one line with the cause.
+    """
+    path = Path(path)
+    backend.ensure_variant()
+    import mitsuba as mi
+
+    _check_parameters(path, parameters)
+    texts = {name: _text(value) for name, value in parameters.items()}
+    config = mi.parser.ParserConfig(mi.variant())
+    resolver = mi.file_resolver()
+    mi.set_file_resolver(mi.FileResolver(resolver))
+    mi.file_resolver().prepend(str(path.resolve().parent))
+    try:
+        state = mi.parser.parse_file(config, str(path), **texts)
+        if state.root.props.plugin_name() != "scene":
+            raise SceneError(f"{path}: the root is <{state.root.props.plugin_name()}>, a scene file has <scene>.")
+        state.root.props["embree_use_robust_intersections"] = True
+        state.root.props.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in texts.items())]))
+        mi.parser.transform_all(config, state)
+        scene = mi.parser.instantiate(config, state)
+    except (RuntimeError, ValueError) as error:
+        raise error if isinstance(error, SceneError) else SceneError(_one_line(str(error))) from error
+    finally:
+        mi.set_file_resolver(resolver)
+    return scene[0] if isinstance(scene, list) else scene
+
+
+def defaults(path: str | os.PathLike[str]) -> dict[str, str]:
+    """Names and values of the `<default>` parameters of a scene file and the files it includes."""
+    path = Path(path)
+    try:
+        root = ElementTree.parse(path).getroot()
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}. Check the name.") from error
+    except ElementTree.ParseError as error:
+        raise SceneError(f"{path}: not valid XML: {error}. Mend that line.") from error
+    found: dict[str, str] = {}
+    for include in root.iter("include"):
+        inner = path.parent / include.get("filename", "")
+        found |= defaults(inner) if inner.is_file() else {}
+    return found | {node.get("name", ""): node.get("value", "") for node in root.iter("default")}
+
+
+def _check_parameters(path: Path, parameters: dict[str, object]) -> None:
+    known = defaults(path)
+    for name in parameters:
+        if name not in known:
+            names = ", ".join(known) or "none"
+            raise SceneError(f"{path}: the scene has no parameter '{name}'. Its <default> parameters: {names}.")
+
+
+def _text(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _one_line(message: str) -> str:
+    """The place and the cause out of Mitsuba's message, without its source lines and Python's traceback."""
+    message = re.sub(r"\[\w+\.cpp:\d+\] ", "", message)
+    place = re.match(
+        r"(?:At|Error while loading|While loading|Parsing of XML file) ?(.*?\(line \d+, col \d+\))", message
+    )
+    errors = [line for line in message.splitlines() if re.match(r"(\w+\.)*\w*Error: ", line)]
+    if errors:
+        cause = errors[-1].split("Error: ", 1)[1]
+        return f"{place[1]}: {cause}" if place else cause
+    return " ".join(line.strip() for line in message.splitlines() if line.strip())
