@@ -1,0 +1,129 @@
+"""Fluence of uniform balls of light in endless homogeneous tissue: the exactly known part of the solution.
+
+-D ∇²φ + µa φ = q has φ = P/(4πDr) · exp(−kr) around a point of power P, k = √(µa/D). Outside a uniform ball
+of radius a the same holds with P · 3 i₁(ka)/(ka) in place of P (mean value property), i₁ the modified
+spherical Bessel function; inside, φ = q/(Dk²) · (1 − (1 + ka) exp(−ka) i₀(kr)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Below this decay [1/mm] the factor exp(-kr) is 1 over any phantom; it stands for tissue without absorption,
+# where the closed form of the ball is 0/0.
+SMALLEST_DECAY = 1e-7
+PAIRS_AT_ONCE = 2_000_000
+
+
+@dataclass(frozen=True)
+class FreeField:
+    """Field of K balls of light in endless tissue.
+
+    `centres` (K, 3) [mm], `radii` (K,) [mm] (0: a point), `powers` (K,) [W], `diffusion` D [mm], `mua`
+    [1/mm].
+    """
+
+    centres: Array
+    radii: Array
+    powers: Array
+    diffusion: float
+    mua: float
+
+    @property
+    def decay(self) -> float:
+        """k = √(µa/D) [1/mm]."""
+        return max(float(np.sqrt(self.mua / self.diffusion)), SMALLEST_DECAY)
+
+    def fluence(self, points: Array, core: float = 0.0) -> Array:
+        """φ [W/mm²] at `points` (N, 3) [mm], shape (N,).
+
+        Closer than `core` [mm] to a centre φ stays constant; at a point source, with core 0, it is infinite.
+        """
+        fluence = np.empty(len(points))
+        for part, distance in self._distances(points):
+            fluence[part] = self._fluence_of_balls(np.maximum(distance, core)).sum(axis=1)
+        return fluence
+
+    def with_gradient(self, points: Array) -> tuple[Array, Array, Array]:
+        """φ [W/mm²], shape (N,), ∇φ [W/mm³] and Σ P r/(4πr³) [W/mm²], shape (N, 3), at `points` (N, 3) [mm].
+
+        The last one is what -D ∇φ would be outside the balls if nothing were absorbed.
+        """
+        fluence, gradient, outflow = (
+            np.empty(len(points)),
+            np.empty((len(points), 3)),
+            np.empty((len(points), 3)),
+        )
+        for part, distance in self._distances(points):
+            value = self._fluence_of_balls(distance)
+            fluence[part] = value.sum(axis=1)
+            gradient[part] = self._along(points[part], self._slope_of_balls(distance, value))
+            outflow[part] = self._along(points[part], self.powers / (4 * np.pi * distance**3))
+        return fluence, gradient, outflow
+
+    def _distances(self, points: Array) -> Iterator[tuple[slice, Array]]:
+        """Blocks of points with their distances from the centres (n, K) [mm]."""
+        from scipy.spatial.distance import cdist
+
+        step = max(1, PAIRS_AT_ONCE // len(self.centres))
+        for start in range(0, len(points), step):
+            part = slice(start, start + step)
+            yield part, cdist(points[part], self.centres)
+
+    def _along(self, points: Array, weights: Array) -> Array:
+        """Σ weight · (point - centre) over the balls, (N, 3), of weights (N, K)."""
+        return points * weights.sum(axis=1, keepdims=True) - weights @ self.centres
+
+    def _fluence_of_balls(self, r: Array) -> Array:
+        """φ of each ball at the distances r (N, K) from its centre."""
+        from scipy.special import spherical_in
+
+        k, x = self.decay, self.decay * self.radii
+        inflation = np.where(x > 0, 3 * spherical_in(1, x) / np.where(x > 0, x, 1), 1.0)
+        with np.errstate(divide="ignore"):
+            value = self.powers * inflation / (4 * np.pi * self.diffusion) * np.exp(-k * r) / r
+        inside, a, density = self._inside(r)
+        if len(a):
+            # 1 − (1 + ka) exp(−ka) i₀(kr) as two terms which are both small where ka and kr are.
+            bend = (1 + k * a) * np.exp(-k * a) * _bend(k * r[inside])
+            value[inside] = density / (self.diffusion * k**2) * (_one_minus(k * a) - bend)
+        return value
+
+    def _slope_of_balls(self, r: Array, fluence: Array) -> Array:
+        """(dφ/dr)/r of each ball at the distances r (N, K), where its φ is `fluence`."""
+        k = self.decay
+        slope = -fluence * (k + 1 / r) / r
+        inside, a, density = self._inside(r)
+        if len(a):
+            slope[inside] = -density / (self.diffusion * k) * (1 + k * a) * np.exp(-k * a) * _slope_over(k, r[inside])
+        return slope
+
+    def _inside(self, r: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which distances end inside the ball, and there the ball's radius [mm] and power density [W/mm³]."""
+        inside = r < self.radii
+        ball = np.nonzero(inside)[1]
+        return inside, self.radii[ball], self.powers[ball] / (4 / 3 * np.pi * self.radii[ball] ** 3)
+
+
+def _one_minus(x: Array) -> Array:
+    """1 − (1 + x) exp(−x), accurate for small x."""
+    return np.where(x < 1e-2, x**2 * (1 / 2 - x / 3 + x**2 / 8 - x**3 / 30), 1 - (1 + x) * np.exp(-x))
+
+
+def _bend(y: Array) -> Array:
+    """i₀(y) − 1 = sinh(y)/y − 1, accurate for small y."""
+    return np.where(y < 1e-2, y**2 / 6 * (1 + y**2 / 20), np.sinh(y) / np.where(y > 0, y, 1) - 1)
+
+
+def _slope_over(k: float, r: Array) -> Array:
+    """i₁(kr)/r [1/mm], k/3 at r = 0."""
+    from scipy.special import spherical_in
+
+    safe = np.where(r > 0, r, 1)
+    return np.where(r > 0, spherical_in(1, k * safe) / safe, k / 3)

@@ -1,0 +1,85 @@
+"""The border of a tetrahedral mesh as a finer surface: each boundary facet cut into equal triangles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def border_lattice(grid: Any, cuts: int) -> tuple[Array, Index]:
+    """Points (P, 3) [mm] and triangles (F cuts², 3), outward, of the boundary facets of a scikit-fem mesh.
+
+    `cuts` >= 1: the number of parts of each edge. Curved facets give points on the curve. The surface is as
+    closed as the mesh's border.
+    """
+    facets = grid.boundary_facets()
+    place = np.array([(i, j) for i in range(cuts + 1) for j in range(cuts + 1 - i)])
+    points = grid.mapping().G(place.T / cuts, find=facets)
+    name = _names(grid, facets, place, cuts)
+    _, first, index = np.unique(name.ravel(), return_index=True, return_inverse=True)
+    points = np.asarray(points).reshape(3, -1).T[first]
+    triangles = index.reshape(name.shape)[:, _cut(place, cuts)]
+    # The vertex of the tetrahedron that the facet lacks tells inside from outside.
+    corners = grid.facets[:, facets]
+    opposite = grid.t[:, grid.f2t[0, facets]].sum(axis=0) - corners.sum(axis=0)
+    a, b, c = (grid.p[:, corner].T for corner in corners)
+    inward = np.einsum("fd,fd->f", np.cross(b - a, c - a), grid.p[:, opposite].T - a) > 0
+    triangles[inward] = triangles[inward][:, :, ::-1]
+    return points, triangles.reshape(-1, 3)
+
+
+def nearest_points(points: Array, triangles: Array) -> Array:
+    """The nearest point to each of `points` (N, 3) on `triangles` (F, 3 corners, 3), all [mm]; shape (N, 3).
+
+    Exact where the nearest triangle is among the eight with the nearest centroids, as on a border lattice.
+    """
+    from scipy.spatial import cKDTree
+    from trimesh.triangles import closest_point
+
+    candidates = cKDTree(triangles.mean(axis=1)).query(points, k=min(8, len(triangles)))[1].reshape(len(points), -1)
+    each = np.repeat(points, candidates.shape[1], axis=0)
+    found = closest_point(triangles[candidates.ravel()], each).reshape(*candidates.shape, 3)
+    best = np.argmin(np.linalg.norm(found - points[:, None], axis=2), axis=1)
+    return found[np.arange(len(points)), best]
+
+
+def _names(grid: Any, facets: Index, place: Index, cuts: int) -> Index:
+    """A number for every lattice point of every facet, the same where facets meet; (F, L).
+
+    Corners are named after the mesh's vertices, points of an edge after the edge, counted from its lower
+    vertex: facets list their vertices, and edges theirs, in ascending order.
+    """
+    i, j = place.T
+    k = cuts - i - j
+    inner = cuts - 1
+    edges_start = grid.nvertices
+    inside_start = edges_start + len(grid.edges[0]) * inner
+    name = np.empty((len(facets), len(place)), dtype=np.int64)
+    corners, edges = grid.facets[:, facets].astype(np.int64), grid.f2e[:, facets].astype(np.int64)
+    for corner, here in enumerate((k == cuts, i == cuts, j == cuts)):
+        name[:, here] = corners[corner][:, None]
+    # Edges of a facet run from vertex 0 to 1, 1 to 2 and 0 to 2.
+    on_edge = (
+        ((j == 0) & (i > 0) & (k > 0), i),
+        ((k == 0) & (i > 0) & (j > 0), j),
+        ((i == 0) & (j > 0) & (k > 0), j),
+    )
+    for edge, (here, step) in enumerate(on_edge):
+        name[:, here] = edges_start + edges[edge][:, None] * inner + step[here] - 1
+    inside = (i > 0) & (j > 0) & (k > 0)
+    count = np.count_nonzero(inside)
+    name[:, inside] = inside_start + np.arange(len(facets))[:, None] * count + np.arange(count)
+    return name
+
+
+def _cut(place: Index, cuts: int) -> Index:
+    """The cuts² triangles of a facet as rows of numbers of lattice points, all turning like (0, 1, 2)."""
+    number = {tuple(p): n for n, p in enumerate(place.tolist())}
+    up = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in number if i + j < cuts]
+    down = [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in number if i + j < cuts - 1]
+    return np.array(up + down)

@@ -1,0 +1,120 @@
+"""Tetrahedra from files: a tetrahedral mesh as it is, or a closed surface through the mesher fTetWild."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from numpy.typing import NDArray
+from trimesh.remesh import subdivide_to_size
+
+from .errors import BackendError, FluxError
+from .formats import read_mesh
+from .lattice import nearest_points
+from .surface import boundary, closure
+from .tetrahedra import Tetrahedra
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+
+
+def read_tetrahedra(
+    path: str | os.PathLike[str], edge: float, length_unit: str = "mm", labels: str | None = None
+) -> Tetrahedra:
+    """Tetrahedra of a file, or those that fill its closed surface with edges of about `edge` [mm].
+
+    `labels` names the file's field of whole numbers, one a tetrahedron, which become the mesh's regions as
+    they are. Any format of `fspt flux import` will do.
+
+    Raises
+    ------
+    FluxError : the file cannot be read, its surface is open, or it lacks the field of labels.
+    BackendError : a package to read or to mesh it is missing.
+    """
+    if length_unit not in MILLIMETRES:
+        raise FluxError(f"geometry: 'length_unit' must be {', '.join(MILLIMETRES)}, got '{length_unit}'.")
+    raw = read_mesh(path, None, None, "auto")
+    points = raw.points * MILLIMETRES[length_unit]
+    if raw.cells.shape[1] == 3:
+        if labels is not None:
+            raise FluxError(
+                f"geometry: '{path}' is a surface, it has no labels '{labels}' of tetrahedra. Leave them out."
+            )
+        return tetrahedralize(points, raw.cells, edge)
+    if labels is None:
+        return Tetrahedra(points, raw.cells)
+    found = [f for f in raw.fields if f.name == labels and f.values.shape == (len(raw.cells),)]
+    if not found:
+        names = ", ".join(f"'{f.name}'" for f in raw.fields) or "none"
+        raise FluxError(
+            f"geometry: '{path}' has no field '{labels}' with one value a tetrahedron. Fields it has: {names}."
+        )
+    values = found[0].values
+    if not (values == np.round(values)).all():
+        raise FluxError(f"geometry: the labels '{labels}' of '{path}' must be whole numbers.")
+    return Tetrahedra(points, raw.cells, values.astype(np.int64))
+
+
+def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
+    """Tetrahedra with edges of about `edge` [mm] in a closed surface, `vertices` (V, 3) [mm], `faces` (F, 3).
+
+    By fTetWild, whose border keeps within 1/20 of the edge of the surface.
+
+    Raises
+    ------
+    FluxError : the surface is open, or nothing comes out.
+    BackendError : pytetwild is not installed.
+    """
+    if not closure(vertices, faces).watertight:
+        raise FluxError(
+            f"geometry: the surface of {len(faces)} faces is not closed, so nothing is inside. Close its holes first."
+        )
+    try:
+        import pytetwild
+    except ImportError as cause:
+        raise BackendError(
+            f"flux solve: a mesher is needed to fill a surface ({cause}). pip install "
+            "'mitsuba-fspt[mesher]', or give a tetrahedral mesh."
+        ) from cause
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not 0 < edge <= diagonal:
+        raise FluxError(f"geometry: the mesh edge must be > 0 and at most the size {diagonal:.3g} mm, got {edge:g} mm.")
+    # One thread: with several the mesh differs from run to run.
+    points, cells = pytetwild.tetrahedralize(
+        np.ascontiguousarray(vertices, dtype=np.float64),
+        np.ascontiguousarray(faces, dtype=np.int32),
+        edge_length_fac=edge / diagonal,
+        epsilon=edge / 20 / diagonal,
+        num_threads=1,
+    )
+    if len(cells) == 0:
+        raise FluxError(f"geometry: the mesher filled the surface of {len(faces)} faces with nothing. Is it closed?")
+    return _on_surface(Tetrahedra(points, cells), vertices, faces)
+
+
+def _on_surface(mesh: Tetrahedra, vertices: Array, faces: Index) -> Tetrahedra:
+    """The mesh with the vertices of its border on the surface it fills; `snap` brings other points there."""
+    # Triangles of one size, so that the nearest one is among the few with the nearest centroids.
+    fine, parts = subdivide_to_size(vertices, faces, mesh.edge / 2, max_iter=20)
+    surface = fine[parts]
+
+    def snap(points: Array) -> Array:
+        return nearest_points(points, surface)
+
+    border = np.unique(boundary(mesh.vertices, mesh.cells)[0])
+    moved = mesh.vertices.copy()
+    moved[border] = snap(moved[border])
+    for _ in range(5):
+        # A flat cell can turn over; its vertices stay where they were.
+        crushed = _determinants(moved, mesh.cells) / _determinants(mesh.vertices, mesh.cells) < 0.3
+        kept = np.unique(mesh.cells[crushed])
+        moved[kept] = mesh.vertices[kept]
+    return Tetrahedra(moved, mesh.cells, snap=snap)
+
+
+def _determinants(vertices: Array, cells: Index) -> Array:
+    """Six times the signed volume of each cell [mm³]."""
+    corners = vertices[cells]
+    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))

@@ -1,0 +1,175 @@
+"""A solved phantom: fluence and exitance at any point, the border as a phantom, the fluence as a volume."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .elements import Solved
+from .errors import FluxError
+from .free_field import FreeField
+from .lattice import border_lattice, nearest_points
+from .medium import Medium
+from .phantom import Phantom
+from .surface import face_areas
+from .tetrahedra import Tetrahedra, depth
+from .volume import Volume, voxel_box
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Share of the exit power that values below 0, an error of the mesh, may take away before it is refused.
+LARGEST_REMOVED = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """φ = free fields of the sources + the rest `solved.rest` on the finite element `basis` of `mesh`.
+
+    `media` and boundary `factors` A: one a region of the mesh; `source_power` [W].
+    """
+
+    mesh: Tetrahedra
+    basis: Any
+    media: tuple[Medium, ...]
+    factors: tuple[float, ...]
+    fields: tuple[FreeField, ...]
+    source_power: float
+    solved: Solved
+
+    @property
+    def balance(self) -> float:
+        """(absorbed + exit power)/source power - 1, no unit: the quadrature's error at the border."""
+        return (self.solved.absorbed + self.solved.exited) / self.source_power - 1
+
+    def report(self) -> dict[str, float | int]:
+        """Power balance and size, ready for JSON.
+
+        source_power, absorbed_power, exit_power [W]; exit_fraction; balance = (absorbed + exit)/source - 1,
+        which the linear solver leaves over; nodes (unknowns), cells, iterations.
+        """
+        absorbed, leaving = self.solved.absorbed, self.solved.exited
+        return {
+            "source_power": self.source_power,
+            "absorbed_power": absorbed,
+            "exit_power": leaving,
+            "exit_fraction": leaving / self.source_power,
+            "balance": self.balance,
+            "nodes": int(self.basis.N),
+            "cells": len(self.mesh.cells),
+            "iterations": self.solved.iterations,
+        }
+
+    def fluence_at(self, points: Array, core: float = 0.0) -> Array:
+        """φ [W/mm²] at `points` (N, 3) [mm] in the tissue, shape (N,).
+
+        Just outside, the rest w is that of the nearest point of a nearby cell. Closer than `core` [mm] to a
+        point source φ stays constant; with core 0 it is infinite there.
+        """
+        cells, local = self._locate(points)
+        return self._fluence(points, cells, local, core)
+
+    def exitance_at(self, points: Array) -> Array:
+        """J_n = φ/(2A) [W/mm²] at `points` (N, 3) [mm] of the border, shape (N,)."""
+        cells, local = self._locate(points)
+        factor = np.asarray(self.factors)[self.mesh.region[cells]]
+        return self._fluence(points, cells, local, 0.0) / (2 * factor)
+
+    def phantom(self, edge: float) -> Phantom:
+        """The border with J_n on its vertices, the edges of its triangles about `edge` [mm] > 0 or shorter.
+
+        One factor, near 1, makes the sum over triangles of area times mean value the finite elements' exit
+        power; the provenance has it as `scale`. Values below 0 become 0 and are counted.
+
+        Raises
+        ------
+        FluxError : the edge is not positive, or the values below 0 matter: the mesh is too coarse.
+        """
+        if not (math.isfinite(edge) and edge > 0):
+            raise FluxError(f"surface: 'edge' must be > 0 and finite, got {edge:g}. Give mm.")
+        vertices, faces = self._border(edge)
+        exitance = self.exitance_at(vertices)
+        areas = face_areas(vertices, faces)
+        removed = float(areas @ np.maximum(-exitance, 0)[faces].mean(axis=1))
+        if removed > LARGEST_REMOVED * self.solved.exited:
+            raise FluxError(
+                f"solve: exitance below 0 takes away {removed:.3g} W of {self.solved.exited:.3g} W. The mesh "
+                f"is too coarse for these optics; give an edge below {self.mesh.edge:.3g} mm."
+            )
+        clipped = np.maximum(exitance, 0)
+        scale = self.solved.exited / float(areas @ clipped[faces].mean(axis=1))
+        provenance = {
+            "source": "diffusion equation by finite elements",
+            "boundary_factor": " ".join(f"{factor:.6g}" for factor in self.factors),
+            "source_power": f"{self.source_power!r} W",
+            "scale": f"{scale!r}",
+        }
+        negatives = int(np.count_nonzero(exitance < 0))
+        return Phantom(vertices, faces, clipped * scale, "vertex", provenance, negatives, removed)
+
+    def volume(self, voxel: float) -> Volume:
+        """φ [W/mm²] in the middle of cubes of edge `voxel` [mm], in a box one of them wider than the tissue.
+
+        Outside, φ goes on from the nearest point of the border as exp(-distance/(2AD)), the slope of the
+        boundary condition, so that trilinear interpolation up to the surface meets no jump.
+
+        Raises
+        ------
+        FluxError : the voxel's edge is not positive, or there would be too many of them.
+        """
+        border, faces = self._border(voxel)
+        low, high, axes = voxel_box(border.min(axis=0), border.max(axis=0), voxel)
+        z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+        points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+        cells, local = self._curved(points, *self.mesh.locate(points))
+        inside = depth(local) > -1e-9
+        fluence = np.empty(len(points))
+        # 1/r has over a cube about its middle the mean 1/(0.42 edge): a point source keeps its voxel finite.
+        fluence[inside] = self._fluence(points[inside], cells[inside], local[inside], 0.42 * voxel)
+        fluence[~inside] = self._continued(points[~inside], nearest_points(points[~inside], border[faces]))
+        return Volume(fluence.reshape(x.shape).astype(np.float32), low, high)
+
+    def _continued(self, points: Array, nearest: Array) -> Array:
+        """φ at `points` outside, from the nearest points of the border."""
+        cells, local = self._locate(nearest)
+        region = self.mesh.region[cells]
+        length = np.array([2 * a * m.diffusion for a, m in zip(self.factors, self.media, strict=True)])[region]
+        distance = np.linalg.norm(points - nearest, axis=1)
+        return self._fluence(nearest, cells, local, 0.0) * np.exp(-distance / length)
+
+    def _border(self, edge: float) -> tuple[Array, Index]:
+        """The border as vertices and faces with edges of about `edge` [mm] or less, on the true surface."""
+        vertices, faces = border_lattice(self.basis.mesh, max(1, math.ceil(self.mesh.edge / edge)))
+        return (vertices if self.mesh.snap is None else self.mesh.snap(vertices)), faces
+
+    def _fluence(self, points: Array, cells: Index, local: Array, core: float) -> Array:
+        dofs = self.basis.element_dofs[:, cells]
+        rest = sum(self.solved.rest[dof] * shape for dof, shape in zip(dofs, self._shapes(local), strict=True))
+        return np.asarray(rest + sum(field.fluence(points, core) for field in self.fields))
+
+    def _shapes(self, local: Array) -> list[Array]:
+        """The basis functions of a cell at local coordinates (N, 3)."""
+        return [self.basis.elem.lbasis(local.T, i)[0] for i in range(self.basis.Nbfun)]
+
+    def _locate(self, points: Array) -> tuple[Index, Array]:
+        """Cells and local coordinates of points, held inside the cell."""
+        cells, local = self._curved(points, *self.mesh.locate(points))
+        rest = np.maximum(1 - local.sum(axis=1, keepdims=True), 0)
+        local = np.maximum(local, 0)
+        return cells, local / (local.sum(axis=1, keepdims=True) + rest)
+
+    def _curved(self, points: Array, cells: Index, local: Array) -> tuple[Index, Array]:
+        """The same cells with the local coordinates that curved ones give the points."""
+        grid = self.basis.mesh
+        # A curved cell differs from the straight one by little: the difference as a fixed point.
+        near = np.flatnonzero(depth(local) > -0.5) if not grid.affine else np.zeros(0, np.int64)
+        nodes = grid.doflocs[:, self.basis.element_dofs[:, cells[near]]].swapaxes(0, 1)
+        inverse = np.linalg.inv(self.mesh.edges[cells[near]])
+        for _ in range(4):
+            mapped = sum(node * shape for node, shape in zip(nodes, self._shapes(local[near]), strict=True))
+            local[near] += np.einsum("nij,nj->ni", inverse, points[near] - np.asarray(mapped).T)
+        return cells, local

@@ -1,0 +1,142 @@
+"""A tetrahedral mesh of tissue: its regions, and which cell a point is in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import FluxError
+from .shapes import Shape
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+STARTS = 4  # of the search for a point's cell
+MOST_STEPS = 200
+ROUND_OFF = 1e-9  # of a barycentric coordinate
+
+
+@dataclass(frozen=True)
+class Tetrahedra:
+    """Tetrahedral mesh.
+
+    `vertices` (V, 3) [mm]; `cells` (T, 4), indices of vertices in either orientation; `region` (T,), the
+    label of each cell, all 0 where left out; `snap` brings points (N, 3) near the border onto the true,
+    curved one.
+
+    Raises
+    ------
+    FluxError : an array has another shape, a vertex is not finite, an index out of range, or a cell is flat.
+    """
+
+    vertices: Array
+    cells: Index
+    region: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    snap: Callable[[Array], Array] | None = None
+
+    def __post_init__(self) -> None:
+        vertices, cells = np.asarray(self.vertices, dtype=np.float64), np.asarray(self.cells, dtype=np.int64)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+            raise FluxError(f"tetrahedra: vertices must be finite, shape (V, 3), got shape {vertices.shape}.")
+        if cells.ndim != 2 or cells.shape[1] != 4 or len(cells) == 0:
+            raise FluxError(f"tetrahedra: cells must have shape (T, 4), T > 0, got {cells.shape}.")
+        if cells.min() < 0 or cells.max() >= len(vertices):
+            raise FluxError(
+                f"tetrahedra: cells refer to vertices {cells.min()} to {cells.max()}, there are "
+                f"{len(vertices)}, counted from 0. Subtract 1 from indices that count from 1."
+            )
+        region = np.asarray(self.region, dtype=np.int64) if len(self.region) else np.zeros(len(cells), np.int64)
+        if region.shape != (len(cells),):
+            raise FluxError(f"tetrahedra: {len(cells)} cells need as many region labels, got {region.shape}.")
+        for name, value in (("vertices", vertices), ("cells", cells), ("region", region)):
+            object.__setattr__(self, name, value)
+        flat = self.volumes <= 1e-12 * np.ptp(vertices, axis=0).max() ** 3 / len(cells)
+        if flat.any():
+            raise FluxError(
+                f"tetrahedra: {np.count_nonzero(flat)} of {len(cells)} cells have no volume, the first is "
+                f"cell {np.argmax(flat)}. Mesh again or remove the slivers."
+            )
+
+    @property
+    def edges(self) -> Array:
+        """The three edge vectors of each cell from its first vertex, as columns; (T, 3, 3) [mm]."""
+        corners = self.vertices[self.cells]
+        return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+
+    @property
+    def volumes(self) -> Array:
+        """Volume of each cell, (T,) [mm³]."""
+        return np.asarray(np.abs(np.linalg.det(self.edges)) / 6)
+
+    @property
+    def edge(self) -> float:
+        """Edge of the regular tetrahedron of mean volume [mm]."""
+        return float((6 * np.sqrt(2) * self.volumes.mean()) ** (1 / 3))
+
+    def inside(self, shape: Shape) -> NDArray[np.bool_]:
+        """Whether the centroid of each cell lies in the shape; (T,)."""
+        return shape.contains(self.vertices[self.cells].mean(axis=1))
+
+    def locate(self, points: Array) -> tuple[Index, Array]:
+        """The cell each of `points` (N, 3) [mm] is in; outside, one close to it.
+
+        Returns the cells (N,) and the points' local coordinates (N, 3): the barycentric coordinates of the
+        cell's second to fourth vertex; they and their complement to 1 are >= 0 (see `depth`) where the point
+        is inside.
+        """
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(self.vertices[self.cells].mean(axis=1))
+        starts = tree.query(points, k=min(STARTS, len(self.cells)))[1].reshape(len(points), -1)
+        cells, local = self._walk(points, starts[:, 0])
+        for start in starts.T[1:]:
+            # Stuck at the border: outside, or on the other side of a cleft. Another start tells which.
+            lost = np.flatnonzero(depth(local) < -ROUND_OFF)
+            other, there = self._walk(points[lost], start[lost])
+            better = depth(there) > depth(local[lost])
+            cells[lost[better]], local[lost[better]] = other[better], there[better]
+        return cells, local
+
+    def _walk(self, points: Array, start: Index) -> tuple[Index, Array]:
+        """From cell to cell, each time through the facet that the point is farthest behind."""
+        cells, local = start.copy(), np.empty((len(points), 3))
+        moving = np.arange(len(points))
+        for _ in range(MOST_STEPS):
+            here = cells[moving]
+            offset = points[moving] - self.vertices[self.cells[here, 0]]
+            local[moving] = np.einsum("nij,nj->ni", self._inverse[here], offset)
+            weights = np.column_stack([1 - local[moving].sum(axis=1), local[moving]])
+            weights[self._neighbours[here] < 0] = 0
+            through = np.argmin(weights, axis=1)
+            on = weights[np.arange(len(here)), through] < -ROUND_OFF
+            moving = moving[on]
+            cells[moving] = self._neighbours[here[on], through[on]]
+            if len(moving) == 0:
+                break
+        else:
+            local[moving] = -np.inf  # going round in circles
+        return cells, local
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """Inverse of each cell's edge matrix, (T, 3, 3) [1/mm]."""
+        return np.linalg.inv(self.edges)
+
+    @cached_property
+    def _neighbours(self) -> Index:
+        """The cell behind the facet opposite to each vertex of each cell, (T, 4); -1 at the border."""
+        facets = np.sort(self.cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+        order = np.lexsort(facets.T)
+        pair = np.flatnonzero((facets[order[1:]] == facets[order[:-1]]).all(axis=1))
+        neighbours = np.full(len(facets), -1)
+        neighbours[order[pair]], neighbours[order[pair + 1]] = order[pair + 1] // 4, order[pair] // 4
+        return neighbours.reshape(-1, 4)
+
+
+def depth(local: Array) -> Array:
+    """Smallest barycentric coordinate of local coordinates (..., 3): negative outside the cell."""
+    return np.minimum(local.min(axis=-1), 1 - local.sum(axis=-1))
