@@ -52,6 +52,17 @@ def bend(image: Image) -> Image:
     return total
 
 
+def gradient(image: Image) -> tuple[Image, Image]:
+    """Central differences along x and y, one-sided at the border; 0 along an axis of a single pixel."""
+    along = [np.gradient(image, axis=axis) if image.shape[axis] > 1 else np.zeros_like(image) for axis in (1, 0)]
+    return along[0], along[1]
+
+
+def outline(hits: Image, reach: int) -> Mask:
+    """True within `reach` pixels of both a hit and a miss, where lines of sight may pass a silhouette."""
+    return dilate(hits > 0, reach) & dilate(hits < 1, reach)
+
+
 def border(shape: tuple[int, int]) -> Mask:
     """True on the outermost pixels."""
     mask = np.ones(shape, bool)

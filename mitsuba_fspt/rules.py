@@ -64,30 +64,53 @@ def twelve(area: bool) -> Rule:
 # Chords a level: m across the pupil times q × q points of the pixel. Found on straight edges of every blur and angle:
 # these balance the error of the two, which falls like (chords)^-1.2.
 CHORD_LEVELS = ((4, 1), (4, 2), (8, 2), (8, 3), (16, 3), (16, 4), (24, 5), (32, 6), (48, 8), (64, 11))
+CHORD_ORDER = 1.2
 GOLDEN = 0.6180339887498949
+PLASTIC = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(frozen=True)
 class Chords:
-    """Chords of disc × square: `across` (n,) in (0, 1), `pixel` (n, 2) in [-½, ½]², `weight` (n,) of sum 1."""
+    """Chords of disc × square, n of each kind, every array with the weights or measure 1 in all.
+
+    Across the pupil: `across` (n,) in (0, 1) numbers the chord, `pixel` (n, 2) in [-½, ½]² is its pixel point, with
+    `weight` (n,). Across the pixel: `side` (n,) in [-½, ½] numbers the chord, `pupil` (n, 2) in the unit disc is its
+    pupil point, all with weight 1/n.
+    """
 
     across: NDArray[np.float64]
     pixel: NDArray[np.float64]
     weight: NDArray[np.float64]
+    side: NDArray[np.float64]
+    pupil: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.weight)
 
 
-def chords(m: int, q: int) -> Chords:
-    """m equidistant chords for each of q × q Gauss points of the pixel, shifted from point to point."""
+def chords(m: int, q: int, area: bool = True) -> Chords:
+    """m · q² chords: across the pupil m equidistant ones for each of q × q Gauss points, shifted from point to point.
+
+    Without `area` all belong to the pixel's centre. Across the pixel they are equidistant, and their pupil points
+    fill the disc evenly, whatever run of them is taken (R₂ sequence).
+    """
+    if not area:
+        m, q = m * q * q, 1
     x, w = gauss(q)
     px, py = (grid.ravel() for grid in np.meshgrid(x - 0.5, x - 0.5))
     shift = np.mod(0.5 + GOLDEN * np.arange(q * q), 1.0)
     across = (np.arange(m)[:, None] + shift) / m
     pixel = np.broadcast_to(np.stack([px, py], axis=-1), (m, q * q, 2))
     weight = np.broadcast_to(np.outer(w, w).ravel() / m, (m, q * q))
-    return Chords(across.ravel(), pixel.reshape(-1, 2), weight.ravel())
+    number = np.arange(m * q * q) + 0.5
+    radius, turn = np.mod(np.outer(PLASTIC, number), 1.0)
+    return Chords(
+        across=across.ravel(),
+        pixel=pixel.reshape(-1, 2),
+        weight=weight.ravel(),
+        side=number / len(number) - 0.5,
+        pupil=_polar(np.sqrt(radius), 2 * np.pi * turn),
+    )
 
 
 def gauss(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

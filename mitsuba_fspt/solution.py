@@ -24,6 +24,8 @@ Index = NDArray[np.int64]
 
 # Share of the exit power that values below 0, an error of the mesh, may take away before it is refused.
 LARGEST_REMOVED = 1e-4
+# Of the search in curved cells; each one divides the error by about 8 radii of curvature over an edge.
+CURVED_STEPS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +128,7 @@ class Solution:
         z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
         points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
         cells, local = self._curved(points, *self.mesh.locate(points))
-        inside = depth(local) > -1e-9
+        inside = depth(local) > -1e-6
         fluence = np.empty(len(points))
         # 1/r has over a cube about its middle the mean 1/(0.42 edge): a point source keeps its voxel finite.
         fluence[inside] = self._fluence(points[inside], cells[inside], local[inside], 0.42 * voxel)
@@ -163,13 +165,26 @@ class Solution:
         return cells, local / (local.sum(axis=1, keepdims=True) + rest)
 
     def _curved(self, points: Array, cells: Index, local: Array) -> tuple[Index, Array]:
-        """The same cells with the local coordinates that curved ones give the points."""
-        grid = self.basis.mesh
-        # A curved cell differs from the straight one by little: the difference as a fixed point.
-        near = np.flatnonzero(depth(local) > -0.5) if not grid.affine else np.zeros(0, np.int64)
-        nodes = grid.doflocs[:, self.basis.element_dofs[:, cells[near]]].swapaxes(0, 1)
-        inverse = np.linalg.inv(self.mesh.edges[cells[near]])
-        for _ in range(4):
-            mapped = sum(node * shape for node, shape in zip(nodes, self._shapes(local[near]), strict=True))
-            local[near] += np.einsum("nij,nj->ni", inverse, points[near] - np.asarray(mapped).T)
+        """Cells and local coordinates in the curved mesh, from those in the straight one."""
+        near = np.flatnonzero(depth(local) > -0.5)
+        if self.basis.mesh.affine or len(near) == 0:
+            return cells, local
+        local[near] = self._curved_local(points[near], cells[near])
+        for _ in range(CURVED_STEPS):
+            # A facet that ends in a curved edge is curved too: the point can be in the next cell.
+            behind = self.mesh.behind(cells[near], local[near])
+            near, behind = near[behind >= 0], behind[behind >= 0]
+            there = self._curved_local(points[near], behind)
+            better = depth(there) > depth(local[near])
+            near = near[better]
+            cells[near], local[near] = behind[better], there[better]
         return cells, local
+
+    def _curved_local(self, points: Array, cells: Index) -> Array:
+        """Local coordinates of points in curved cells, which differ from straight ones by little: a fixed point."""
+        nodes = self.basis.mesh.doflocs[:, self.basis.element_dofs[:, cells]].swapaxes(0, 1)
+        local = self.mesh.local(points, cells)
+        for _ in range(CURVED_STEPS):
+            mapped = sum(node * shape for node, shape in zip(nodes, self._shapes(local), strict=True))
+            local += np.einsum("nij,nj->ni", self.mesh.inverse[cells], points - np.asarray(mapped).T)
+        return local

@@ -106,28 +106,35 @@ class Tetrahedra:
         cells, local = start.copy(), np.empty((len(points), 3))
         moving = np.arange(len(points))
         for _ in range(MOST_STEPS):
-            here = cells[moving]
-            offset = points[moving] - self.vertices[self.cells[here, 0]]
-            local[moving] = np.einsum("nij,nj->ni", self._inverse[here], offset)
-            weights = np.column_stack([1 - local[moving].sum(axis=1), local[moving]])
-            weights[self._neighbours[here] < 0] = 0
-            through = np.argmin(weights, axis=1)
-            on = weights[np.arange(len(here)), through] < -ROUND_OFF
-            moving = moving[on]
-            cells[moving] = self._neighbours[here[on], through[on]]
+            local[moving] = self.local(points[moving], cells[moving])
+            behind = self.behind(cells[moving], local[moving])
+            moving, behind = moving[behind >= 0], behind[behind >= 0]
+            cells[moving] = behind
             if len(moving) == 0:
                 break
         else:
             local[moving] = -np.inf  # going round in circles
         return cells, local
 
+    def local(self, points: Array, cells: Index) -> Array:
+        """Local coordinates (N, 3) of `points` (N, 3) [mm] in one cell each (N,)."""
+        return np.einsum("nij,nj->ni", self.inverse[cells], points - self.vertices[self.cells[cells, 0]])
+
+    def behind(self, cells: Index, local: Array) -> Index:
+        """The next cell towards each point with these local coordinates, (N,); -1 in its own cell and at the border."""
+        weights = np.column_stack([1 - local.sum(axis=1), local])
+        weights[self.neighbours[cells] < 0] = 0
+        through = np.argmin(weights, axis=1)
+        row = np.arange(len(cells))
+        return np.where(weights[row, through] < -ROUND_OFF, self.neighbours[cells, through], -1)
+
     @cached_property
-    def _inverse(self) -> Array:
+    def inverse(self) -> Array:
         """Inverse of each cell's edge matrix, (T, 3, 3) [1/mm]."""
         return np.linalg.inv(self.edges)
 
     @cached_property
-    def _neighbours(self) -> Index:
+    def neighbours(self) -> Index:
         """The cell behind the facet opposite to each vertex of each cell, (T, 4); -1 at the border."""
         facets = np.sort(self.cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
         order = np.lexsort(facets.T)

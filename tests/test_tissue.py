@@ -48,25 +48,33 @@ def nylon() -> Solution:
     return solve(cylinder_tetrahedra(15, 30, 3), [NYLON], [POINT])
 
 
-@pytest.mark.parametrize(("order", "rate", "ceiling"), [(1, 1.7, 3e-3), (2, 2.7, 3e-4)])
-def test_order_of_convergence_on_a_ball(order: int, rate: float, ceiling: float) -> None:
-    """Rationale: J_n from a point source 5 mm off the middle of a ball, exact by a Legendre series.
+@pytest.mark.parametrize(
+    ("order", "local", "total"), [(1, (1.8, 1.8e-3), (1.8, 3.5e-3)), (2, (2.4, 1.6e-4), (3.8, 3.6e-5))]
+)
+def test_order_of_convergence_on_a_ball(order: int, local: tuple[float, float], total: tuple[float, float]) -> None:
+    """Rationale: a point source 3 mm off the middle of a ball is exact by a Legendre series.
 
-    Expected behaviour: the greatest error over the surface falls as edge^(order + 1), on the curved border
-    too; ceiling: 1.3 times what was measured. Seen to fail with straight edges (order 2 falls to rate 2),
-    with D_f dropped from the load, and with 1/(2A) taken for 1/A there.
+    Expected behaviour: J_n falls as edge^(order + 1), measured 2.08 and 2.65 (the meshes are not quite similar), the
+    exit power as edge^(2 order), measured 1.99 and 4.22; each with its slope and a ceiling for the finest mesh, 1.3
+    times what was measured. Seen to fail with straight edges (order 2: slopes 2.2 and 2.1), with D_f dropped from the
+    load (slope 0.04) and with 1/A for 1/(2A) there (no balance).
     """
-    cosine = np.linspace(-1, 1, 41)
-    exact = ball_exitance(10, 5, NYLON.mua, NYLON.musp, robin_a(NYLON.n), cosine)
-    assert exact.max() > 10 * exact.min() > 0
+    cosine = np.linspace(-1, 1, 201)
+    exact = ball_exitance(10, 3, NYLON.mua, NYLON.musp, robin_a(NYLON.n), cosine)
+    # Over the sphere only the term of order 0 is left.
+    mean = ball_exitance(10, 3, NYLON.mua, NYLON.musp, robin_a(NYLON.n), np.zeros(1), orders=1)[0]
+    assert exact.max() > 3 * exact.min() > 0
     edges, errors = [], []
     for refinements in range(3 - order, 6 - order):
-        solution = solve(ball_mesh(10, refinements), [NYLON], [Source(Ball((0.0, 0.0, 5.0)))], order=order)
+        solution = solve(ball_mesh(10, refinements), [NYLON], [Source(Ball((0.0, 0.0, 3.0)))], order=order)
+        difference = solution.exitance_at(circle(10, cosine)) - exact
+        power = solution.solved.exited / (4 * np.pi * 100 * mean) - 1
         edges.append(solution.mesh.edge)
-        errors.append(np.abs(solution.exitance_at(circle(10, cosine)) - exact).max() / exact.max())
-    slope = np.polyfit(np.log(edges), np.log(errors), 1)[0]
-    assert rate < slope < order + 1.6
-    assert errors[-1] < ceiling
+        errors.append([np.sqrt((difference**2).mean()) / exact.max(), abs(power)])
+    slopes = np.polyfit(np.log(edges), np.log(errors), 1)[0]
+    for slope, last, (rate, ceiling) in zip(slopes, errors[-1], (local, total), strict=True):
+        assert slope > rate
+        assert last < ceiling
 
 
 @pytest.mark.parametrize("upper", [Medium(0.1, 1.0, 1.37), Medium(0.03, 0.6, 1.5)], ids=["one", "two"])
@@ -74,8 +82,8 @@ def test_slab_of_two_layers(upper: Medium) -> None:
     """Rationale: endless slab, 12 mm thick, point source 3 mm above its bottom, exact by a Hankel transform.
 
     Expected behaviour: φ on both faces out to 8 mm, where the wall of the meshed disc at 25 mm does not
-    matter, within 1 % of the face's peak. Seen to fail with either term of the integral over the other layer
-    dropped (3 % and 28 %).
+    matter, within 1 % of the face's peak. Seen to fail without the gradient in the integral over the other
+    layer (27 % low); without its other term the powers do not balance.
     """
     lower, interface = Medium(0.1, 1.0, 1.37), Rod((0.0, 0.0, 3.0), 6, 30)
     mesh = cylinder_tetrahedra(25, 12, 2)
@@ -101,8 +109,8 @@ def test_slab_of_two_layers(upper: Medium) -> None:
 def test_endless_medium() -> None:
     """Rationale: far from every border φ = P exp(-kr)/(4πDr), whatever the body.
 
-    Expected behaviour: in a ball of 40 mm, 20 decay lengths, to 1e-4 out to 15 mm. Seen to fail with 4π for
-    2π.
+    Expected behaviour: in a ball of 40 mm, 20 decay lengths, to 1e-4 out to 15 mm. Seen to fail with 2π for
+    4π.
     """
     medium = Medium(0.08, 1.0)
     solution = solve(ball_mesh(40, 2), [medium], [Source(Ball((1.0, 2.0, -3.0)), 2.5)])
@@ -184,8 +192,7 @@ def test_regions_of_the_same_optics_change_nothing(nylon: Solution) -> None:
 def test_a_ball_of_light_outside_is_a_brighter_point() -> None:
     """Rationale: mean value property, φ of a uniform ball outside = point · 3 (x cosh x - sinh x)/x³, x = ka.
 
-    Inside, φ and its slope go on without a jump, and the mean over the ball is that of pairs of points: here
-    against a sum over 4000 points. Seen to fail with the factor left at 1.
+    On the border φ and its slope have no jump, inside the equation holds, by differences. Seen to fail with the factor left at 1.
     """
     ball = FreeField(np.zeros((1, 3)), np.array([2.0]), np.ones(1), 0.36, 0.05)
     point = FreeField(np.zeros((1, 3)), np.zeros(1), np.ones(1), 0.36, 0.05)
@@ -255,8 +262,8 @@ def test_surface_of_the_paper(nylon: Solution, tmp_path: Path) -> None:
 def test_no_imprint_of_the_mesh(order: int) -> None:
     """Rationale: a source on the axis lights every point of a circle of the side alike.
 
-    Expected behaviour: to 1 % with order 2 on edges of 3 mm; order 1 needs half of that. Seen to fail with
-    straight edges (order 2: 2.4 %).
+    Expected behaviour: to 0.2 % with order 2 on edges of 3 mm, measured 0.09 %, and to 1 % with order 1 on half of
+    that, measured 0.6 %. Seen to fail with straight edges (order 2: 0.8 %).
     """
     solution = solve(
         cylinder_tetrahedra(15, 30, 3 / (3 - order)), [NYLON], [Source(Ball((0.0, 0.0, 1.0)))], order=order
@@ -267,7 +274,7 @@ def test_no_imprint_of_the_mesh(order: int) -> None:
         ring = (np.abs(z - height) < 1e-6) & (np.hypot(x, y) > 14.99)
         assert ring.sum() > 90
         values = phantom.exitance[ring]
-        assert np.ptp(values) / values.mean() < 0.01
+        assert np.ptp(values) / values.mean() < (0.01 if order == 1 else 0.002)
 
 
 def test_report(nylon: Solution) -> None:

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..quadrature import Quadrature, Solution
-from . import pupil_form
+from . import pupil_form, surface_form
 from .checks import check_scene
 from .intersections import robust_scene
 

@@ -107,6 +107,7 @@ class FsptLens(mi.Sensor):
         # A_vd A_pupil/u² in double first: far away and stopped down, its factors leave the range of float32.
         self.etendue = self.virtual_pitch**2 * math.pi * (self.optics.discs[0].radius / self.optics.focus_distance) ** 2
         self._etendue = dr.opaque(mi.Float, self.etendue)
+        self._pupil = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
         dr.make_opaque(self.m_to_world)
 
     # ------------------------------------------------------------------ lines of sight
@@ -132,6 +133,30 @@ class FsptLens(mi.Sensor):
         ray = mi.Ray3f(self.m_to_world @ mi.Point3f(a.x, a.y, 0), self.m_to_world @ d)
         return ray, weight, d.z
 
+    def arrival(
+        self, point: mi.Point3f, pupil: mi.Point2f
+    ) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
+        """Where light of a world point that heads for `pupil` [unit disc] arrives: film position [pixels], lens point.
+
+        Third (da/dρ)² cosθ u²/d², by which A_pupil/u² turns into the solid angle of the pupil [sr], 0 where no light
+        passes; fourth cosθ of the line of sight to the optical axis.
+        """
+        p = self.m_to_world.inverse() @ point
+        disc, rho = self._discs[0], pupil * (self._discs[0].radius * self._spread)
+        # r = x + (a − x)(u − z)/u with a = shift·x + ρ: solve for the virtual point x of the line through r and ρ.
+        back = (self._u - p.z) / self._u
+        scale = 1 - (1 - disc.shift) * back
+        x = (mi.Point2f(p.x, p.y) - rho * back) / scale
+        a = disc.shift * x + rho
+        d = mi.Vector3f(a.x - p.x, a.y - p.y, -p.z)
+        distance = dr.norm(d)
+        cos_theta = p.z / distance
+        # dA_a = (da/dρ)² dA_ρ: the pupil point moves along with x unless the disc is fixed in the lens plane.
+        weight = dr.square((1 - disc.shift * back / scale) * self._u / distance) * cos_theta
+        position = 0.5 * mi.Vector2f(self.film().size()) - x / self._pitch
+        weight = dr.select((p.z > 0) & (scale != 0) & self._open(x, a), weight, 0)
+        return position, self.m_to_world @ mi.Point3f(a.x, a.y, 0), weight, cos_theta
+
     def _open(self, x: mi.Point2f, a: mi.Point2f) -> mi.Bool:
         """True where the line through virtual point x and lens point a passes every further border (Eq. 5)."""
         passes = mi.Bool(True)
@@ -150,16 +175,21 @@ class FsptLens(mi.Sensor):
             radius = self._spread * disc.radius * np.abs(back) / (scale * self.virtual_pitch)
         return np.where(scale > 0, np.nan_to_num(radius, nan=np.inf), np.inf)
 
-    def film_bounds(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and largest film position (x, y) [pixels] at which light of the convex hull of `points` arrives."""
+    def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Blur discs of world points (…, 3): centres (…, 2) and radii (…, 1) [film pixels], inf where nothing bounds it."""
         to_camera = np.linalg.inv(np.array(self.m_to_world.matrix, np.float64).reshape(4, 4))
         p = points @ to_camera[:3, :3].T + to_camera[:3, 3]
         disc, u = self.optics.discs[0], self.optics.focus_distance
-        scale = 1 - (1 - disc.shift) * (u - p[:, 2:]) / u
-        if len(p) == 0 or scale.min() <= 0:
+        scale = 1 - (1 - disc.shift) * (u - p[..., 2:]) / u
+        scale = np.where(scale > 0, scale, 1)  # there the radius is infinite
+        centre = 0.5 * np.array(self.film().size(), np.float64) - p[..., :2] / (scale * self.virtual_pitch)
+        return centre, self.blur_radius(p[..., 2:])
+
+    def film_bounds(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest film position (x, y) [pixels] at which light of the convex hull of `points` arrives."""
+        if len(points) == 0:
             return np.full(2, -np.inf), np.full(2, np.inf)
-        centre = 0.5 * np.array(self.film().size(), np.float64) - p[:, :2] / (scale * self.virtual_pitch)
-        radius = self.blur_radius(p[:, 2:])
+        centre, radius = self.film_discs(points)
         return (centre - radius).min(axis=0), (centre + radius).max(axis=0)
 
     # ------------------------------------------------------------------ Mitsuba's sensor interface
@@ -187,30 +217,20 @@ class FsptLens(mi.Sensor):
 
         The weight is A_pupil cosθ/d² over the number of crop pixels, by which light tracers multiply again.
         """
-        film, disc, u = self.film(), self._discs[0], self._u
-        p = self.m_to_world.inverse() @ it.p
-        rho = mi.warp.square_to_uniform_disk_concentric(sample) * (disc.radius * self._spread)
-        # r = x + (a − x)(u − z)/u with a = shift·x + ρ: solve for the virtual point x of the line through r and ρ.
-        back = (u - p.z) / u
-        scale = 1 - (1 - disc.shift) * back
-        x = (mi.Point2f(p.x, p.y) - rho * back) / scale
-        a = disc.shift * x + rho
-        d = mi.Vector3f(a.x - p.x, a.y - p.y, -p.z)
-        dist2 = dr.squared_norm(d)
-        cos_theta = p.z * dr.rsqrt(dist2)
-        position = 0.5 * mi.Vector2f(film.size()) - x / self._pitch - mi.Vector2f(film.crop_offset())
+        film = self.film()
+        pupil = mi.warp.square_to_uniform_disk_concentric(sample)
+        position, lens_point, weight, _ = self.arrival(it.p, pupil)
+        position -= mi.Vector2f(film.crop_offset())
         size = mi.Vector2f(film.crop_size())
-        valid = active & (p.z > 0) & dr.all((position >= 0) & (position < size)) & self._open(x, a)
-        # dA_a = (da/dρ)² dA_ρ: the pupil point moves along with x unless the disc is fixed in the lens plane.
-        area = dr.pi * dr.square(disc.radius * (1 - disc.shift * back / scale))
+        inside = active & (weight > 0) & dr.all((position >= 0) & (position < size))
+        solid_angle = weight * self._pupil
         ds = dr.zeros(mi.DirectionSample3f)
-        ds.uv = mi.Point2f(position)
-        ds.p = self.m_to_world @ mi.Point3f(a.x, a.y, 0)
-        ds.n = mi.Normal3f(self.m_to_world @ mi.Vector3f(0, 0, 1))
-        ds.dist = dr.sqrt(dist2)
-        ds.d = self.m_to_world @ (d / ds.dist)
-        ds.pdf = dr.select(valid, dist2 / (cos_theta * area), 0)
-        return ds, mi.Spectrum(dr.select(valid, area * cos_theta / (dist2 * size.x * size.y), 0))
+        ds.uv, ds.p, ds.n = mi.Point2f(position), lens_point, mi.Normal3f(self.m_to_world @ mi.Vector3f(0, 0, 1))
+        ds.d = lens_point - it.p
+        ds.dist = dr.norm(ds.d)
+        ds.d /= ds.dist
+        ds.pdf = dr.select(inside, dr.rcp(solid_angle), 0)
+        return ds, mi.Spectrum(dr.select(inside, solid_angle / (size.x * size.y), 0))
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         return dr.select(active, ds.pdf, 0)

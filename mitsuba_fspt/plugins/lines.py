@@ -165,33 +165,29 @@ class Chord:
         return self.pupil_middle + s * self.pupil_half
 
 
-def chord_at(
-    centre: mi.Point2f,
-    angle: mi.Float,
-    across_pupil: mi.Bool,
-    u: mi.Point3f,
-    weight: mi.Float,
-    outline: mi.Float,
+def chords_across(
+    rule: rules.Chords, number: mi.UInt32, centre: mi.Point2f, angle: mi.Float, across_pupil: mi.Bool, outline: mi.Float
 ) -> Chord:
-    """Chord of a pixel whose picture changes along `angle`; `u` = (across, pixel x, pixel y) of `rules.Chords`.
+    """Chord `number` of a rule for pixels whose picture changes along `angle`.
 
     Across the pupil: direction n = (cos, sin), distance sin φ from the middle, half length cos φ; with φ uniform the
     mean over the disc is that of 2 cos²φ × (chord mean), smooth and periodic in φ. Across the pixel: along the film
-    axis nearest to n, at a pupil point that turns with φ.
+    axis nearest to n.
     """
+    across, dx, dy, weight, side, ax, ay = (
+        dr.gather(mi.Float, mi.Float(column), number)
+        for column in (rule.across, *rule.pixel.T, rule.weight, rule.side, *rule.pupil.T)
+    )
     n = mi.Vector2f(dr.cos(angle), dr.sin(angle))
-    sine, cosine = dr.sincos(dr.pi * (u.x - 0.5))
-    turn_sine, turn_cosine = dr.sincos(2 * dr.pi * (u.z + u.x))
-    disc = dr.sqrt(u.y + 0.5) * mi.Vector2f(turn_cosine, turn_sine)
+    sine, cosine = dr.sincos(dr.pi * (across - 0.5))
     along_x = dr.abs(n.x) > dr.abs(n.y)
-    side = u.x - 0.5
     fixed = dr.select(along_x, mi.Vector2f(0, side), mi.Vector2f(side, 0))
     moving = dr.select(along_x, mi.Vector2f(0.5, 0), mi.Vector2f(0, 0.5))
     return Chord(
-        pixel_middle=centre + dr.select(across_pupil, mi.Vector2f(u.y, u.z), fixed),
+        pixel_middle=centre + dr.select(across_pupil, mi.Vector2f(dx, dy), fixed),
         pixel_half=dr.select(across_pupil, mi.Vector2f(0), moving),
-        pupil_middle=dr.select(across_pupil, sine * mi.Vector2f(-n.y, n.x), disc),
+        pupil_middle=dr.select(across_pupil, sine * mi.Vector2f(-n.y, n.x), mi.Vector2f(ax, ay)),
         pupil_half=dr.select(across_pupil, cosine * n, mi.Vector2f(0)),
-        weight=weight * dr.select(across_pupil, 2 * dr.square(cosine), 1),
+        weight=dr.select(across_pupil, 2 * dr.square(cosine) * weight, dr.opaque(mi.Float, 1 / len(rule))),
         outline=outline,
     )

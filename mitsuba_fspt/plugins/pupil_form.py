@@ -16,15 +16,18 @@ from numpy.typing import NDArray
 
 from .. import pixels, rules
 from ..quadrature import Quadrature, Solution
-from .lines import apply_rule, chord_at, integrate_chord, rays_per_chord
+from .lines import apply_rule, chords_across, integrate_chord, rays_per_chord
 from .window import Window, visible_window
 
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 FIRST_BISECTIONS = 6
+NODES_IN_CHORDS = 2  # what twelve nodes are worth where the picture jumps
 SAFETY = 3.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
-# How far a jump can hide from a rule's nodes, in blur radii: from its outermost nodes to the rim of the pupil.
+# A silhouette can pass between a rule's outermost nodes and the rim of the pupil: that far in (blur radii), where
+# it cuts off up to this share of the light.
 GAP = {4: 0.5, 12: 0.2}
+CUT = {4: 0.2, 12: 0.06}
 
 Image = NDArray[np.float64]
 
@@ -87,8 +90,8 @@ class _Ladder:
         if self.area:
             bend += pixels.bend(value) / 12
             self.value = np.maximum(value + pixels.laplacian(value) / 24, 0)
-        self.error = bend
-        rough = bend > self.tolerance
+        self.error = np.maximum(bend, self._cut_off(4))
+        rough = self.error > self.tolerance
         if self.area:
             rough |= pixels.border(rough.shape)
         return pixels.dilate(rough, self._reach(4))
@@ -99,13 +102,17 @@ class _Ladder:
         difference = np.abs(value - self.value)
         # Where the ladder converges, each rung gains as much as the one before; a jump gains nothing.
         gain = np.divide(4 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
-        error = difference * np.minimum(gain, 1)
         self.value = np.where(rough, value, self.value)
         self.hits = np.where(rough, hits, self.hits)
         self.nearest = np.minimum(self.nearest, nearest)
+        error = np.maximum(difference * np.minimum(gain, 1), self._cut_off(12))
         self.error = np.where(rough, error, self.error)
         rougher = rough & (self.error > self.tolerance)
         return rough & pixels.dilate(rougher, self._reach(12))
+
+    def _cut_off(self, nodes: int) -> Image:
+        """Light that a silhouette may cut off unseen between a rule's nodes and the rim of the pupil."""
+        return np.where(pixels.outline(self.hits, self._reach(nodes)), CUT[nodes] * self.value, 0)
 
     def _apply(self, rule: rules.Rule, where: NDArray[np.bool_]) -> list[Image]:
         """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
@@ -125,22 +132,24 @@ class _Ladder:
     def _chords(self, rough: NDArray[np.bool_]) -> None:
         """More chords each round on the pixels that the last round still moved, or moved a neighbour of."""
         index = np.flatnonzero(rough).astype(np.uint32)
-        gy, gx = np.gradient(self.value) if min(self.value.shape) > 1 else (np.zeros_like(self.value),) * 2
-        angle = pixels.principal_angle(gx, gy, 1 + math.ceil(self.blur / 2)).ravel()
+        angle = pixels.principal_angle(*pixels.gradient(self.value), 1 + math.ceil(self.blur / 2)).ravel()
         across_pupil = self._across_pupil().ravel()
         value, hits, error = self.value.ravel(), self.hits.ravel(), self.error.ravel()
+        change, count = error.copy(), NODES_IN_CHORDS
         for level, (m, q) in enumerate(rules.CHORD_LEVELS):
-            rule = rules.chords(m, q) if self.area else rules.chords(m * q * q, 1)
+            rule = rules.chords(m, q, self.area)
             bisections = FIRST_BISECTIONS + level
             rays = len(rule) * rays_per_chord(bisections)
             if not len(index) or 16 + rays > self.quadrature.max_nodes:
                 break
-            change = np.zeros_like(value)
-            for part in _chunks(index, max(1, LANES // len(rule))):
+            # What the change before this one should have become by now, lest two wrong values agree by chance.
+            change *= (count / len(rule)) ** rules.CHORD_ORDER
+            count = len(rule)
+            for part in _chunks(index, max(1, LANES // count)):
                 mean, met = self._chord_means(part, angle[part], across_pupil[part], rule, bisections)
-                change[part] = np.abs(mean - value[part])
+                change[part] = np.maximum(np.abs(mean - value[part]), change[part])
                 value[part], hits[part] = mean, met
-            self._count(f"{len(rule)} chords", len(index), rays)
+            self._count(f"{count} chords", len(index), rays)
             error[index] = SAFETY * pixels.spread_max(change.reshape(self.value.shape)).ravel()[index]
             index = index[error[index] > self.tolerance]
 
@@ -156,14 +165,12 @@ class _Ladder:
         count = dr.opaque(mi.UInt32, len(rule))
         lane = dr.arange(mi.UInt32, len(part) * len(rule))
         pixel, number = lane // count, lane % count
-        table = [mi.Float(column) for column in (rule.across, *rule.pixel.T * self.area, rule.weight)]
-        *u, weight = (dr.gather(mi.Float, column, number) for column in table)
-        chord = chord_at(
+        chord = chords_across(
+            rule,
+            number,
             dr.gather(mi.Point2f, self.window.centres(part), pixel),
             dr.gather(mi.Float, mi.Float(angle), pixel),
             dr.gather(mi.Bool, mi.Bool(across_pupil), pixel),
-            mi.Point3f(*u),
-            weight,
             dr.opaque(mi.Float, 2 * float(self.value.max())),
         )
         means = integrate_chord(self.scene, self.lens, chord, dr.opaque(mi.UInt32, bisections))
