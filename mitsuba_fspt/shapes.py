@@ -111,7 +111,9 @@ class Rod:
         its field converges exponentially.
         """
         z, z_weight = _gauss(4 + math.ceil(self.length / spacing))
-        square, square_weight, angle = np.zeros(1), np.ones(1), np.zeros(1)
+        square: Array = np.zeros(1)
+        square_weight: Array = np.ones(1)
+        angle: Array = np.zeros(1)
         if self.radius > 0:
             rings = 2 + math.ceil(self.radius / spacing)
             square, square_weight = _gauss(rings)

@@ -132,7 +132,8 @@ class Solution:
         fluence = np.empty(len(points))
         # 1/r has over a cube about its middle the mean 1/(0.42 edge): a point source keeps its voxel finite.
         fluence[inside] = self._fluence(points[inside], cells[inside], local[inside], 0.42 * voxel)
-        fluence[~inside] = self._continued(points[~inside], nearest_points(points[~inside], border[faces]))
+        nearest = self._snap(nearest_points(points[~inside], border[faces]))
+        fluence[~inside] = self._continued(points[~inside], nearest)
         return Volume(fluence.reshape(x.shape).astype(np.float32), low, high)
 
     def _continued(self, points: Array, nearest: Array) -> Array:
@@ -146,7 +147,11 @@ class Solution:
     def _border(self, edge: float) -> tuple[Array, Index]:
         """The border as vertices and faces with edges of about `edge` [mm] or less, on the true surface."""
         vertices, faces = border_lattice(self.basis.mesh, max(1, math.ceil(self.mesh.edge / edge)))
-        return (vertices if self.mesh.snap is None else self.mesh.snap(vertices)), faces
+        return self._snap(vertices), faces
+
+    def _snap(self, points: Array) -> Array:
+        """Points near the border on the true one, where the mesh knows it."""
+        return points if self.mesh.snap is None else self.mesh.snap(points)
 
     def _fluence(self, points: Array, cells: Index, local: Array, core: float) -> Array:
         dofs = self.basis.element_dofs[:, cells]

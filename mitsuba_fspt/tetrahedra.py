@@ -131,7 +131,7 @@ class Tetrahedra:
     @cached_property
     def inverse(self) -> Array:
         """Inverse of each cell's edge matrix, (T, 3, 3) [1/mm]."""
-        return np.linalg.inv(self.edges)
+        return np.asarray(np.linalg.inv(self.edges))
 
     @cached_property
     def neighbours(self) -> Index:

@@ -51,7 +51,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     def solve(self, scene: mi.Scene, sensor: mi.Sensor) -> Solution:
         """Power, error and coverage of the sensor's crop window; errors as in `check_scene`."""
         check_scene(scene, sensor)
-        return pupil_form.solve(self._traced(scene, sensor), sensor, self.quadrature)
+        form = surface_form if self.quadrature.domain == "surface" else pupil_form
+        return form.solve(self._traced(scene, sensor), sensor, self.quadrature)
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""

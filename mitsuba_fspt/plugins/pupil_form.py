@@ -21,7 +21,6 @@ from .window import Window, visible_window
 
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 FIRST_BISECTIONS = 6
-NODES_IN_CHORDS = 2  # what twelve nodes are worth where the picture jumps
 SAFETY = 3.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
 # A silhouette can pass between a rule's outermost nodes and the rim of the pupil: that far in (blur radii), where
@@ -86,9 +85,9 @@ class _Ladder:
         self.blur = self._largest_blur(self.nearest, far)
         # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
         slope = 4 * np.hypot(mx, my)
-        bend = 0.5 * np.abs(contrast) + np.divide(slope**4, 8 * value**3, out=np.zeros_like(value), where=value > 0)
+        bend = np.abs(contrast) + np.divide(slope**4, 4 * value**3, out=np.zeros_like(value), where=value > 0)
         if self.area:
-            bend += pixels.bend(value) / 12
+            bend += pixels.bend(value) / 6
             self.value = np.maximum(value + pixels.laplacian(value) / 24, 0)
         self.error = np.maximum(bend, self._cut_off(4))
         rough = self.error > self.tolerance
@@ -135,7 +134,7 @@ class _Ladder:
         angle = pixels.principal_angle(*pixels.gradient(self.value), 1 + math.ceil(self.blur / 2)).ravel()
         across_pupil = self._across_pupil().ravel()
         value, hits, error = self.value.ravel(), self.hits.ravel(), self.error.ravel()
-        change, count = error.copy(), NODES_IN_CHORDS
+        change, count = np.zeros_like(value), 1
         for level, (m, q) in enumerate(rules.CHORD_LEVELS):
             rule = rules.chords(m, q, self.area)
             bisections = FIRST_BISECTIONS + level
