@@ -100,7 +100,7 @@ class _Ladder:
         value, _, _, _, hits, nearest, _ = self._apply(rules.twelve(self.area), rough)
         difference = np.abs(value - self.value)
         # Where the ladder converges, each rung gains as much as the one before; a jump gains nothing.
-        gain = np.divide(4 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
+        gain = np.divide(8 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
         self.value = np.where(rough, value, self.value)
         self.hits = np.where(rough, hits, self.hits)
         self.nearest = np.minimum(self.nearest, nearest)
