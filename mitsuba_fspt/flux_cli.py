@@ -11,6 +11,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from .errors import FluxError
+
 app = typer.Typer(no_args_is_help=True)
 
 
@@ -97,6 +99,9 @@ def solve(
     from .phantom_file import PhantomFile
 
     start = time.perf_counter()
+    for path in filter(None, (output, volume)):
+        if not path.parent.is_dir():
+            raise FluxError(f"output file '{path}': the folder '{path.parent}' does not exist. Create it first.")
     told = PhantomFile.read(description)
     with Console(stderr=True).status("mesh") as status:
         solution = told.solve(status.update)
@@ -116,7 +121,8 @@ def solve(
 
 def table(report: dict[str, object]) -> str:
     """The report as lines of name, value and unit."""
-    units = {"area": "mm^2", "power": "W", "removed_power": "W", "removed_percent": "% of the power"}
+    units = {"area": "mm^2", "removed_percent": "% of the power", "seconds": "s"}
+    units |= dict.fromkeys(("power", "removed_power", "source_power", "absorbed_power", "exit_power"), "W")
     units |= {"min": str(report["unit"]), "max": str(report["unit"])}
     lines = []
     for name, value in report.items():

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +63,7 @@ def read_tetrahedra(
 def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
     """Tetrahedra with edges of about `edge` [mm] in a closed surface, `vertices` (V, 3) [mm], `faces` (F, 3).
 
-    By fTetWild, whose border keeps within 1/20 of the edge of the surface.
+    By fTetWild; the border's vertices lie on the surface. The mesh differs a little from run to run.
 
     Raises
     ------
@@ -81,17 +84,27 @@ def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not 0 < edge <= diagonal:
         raise FluxError(f"geometry: the mesh edge must be > 0 and at most the size {diagonal:.3g} mm, got {edge:g} mm.")
-    # One thread: with several the mesh differs from run to run.
-    points, cells = pytetwild.tetrahedralize(
-        np.ascontiguousarray(vertices, dtype=np.float64),
-        np.ascontiguousarray(faces, dtype=np.int32),
-        edge_length_fac=edge / diagonal,
-        epsilon=edge / 20 / diagonal,
-        num_threads=1,
-    )
+    with _in_temporary_folder():  # the mesher leaves a file where it runs
+        points, cells = pytetwild.tetrahedralize(
+            np.ascontiguousarray(vertices, dtype=np.float64),
+            np.ascontiguousarray(faces, dtype=np.int32),
+            edge_length_fac=edge / diagonal,
+            epsilon=edge / 20 / diagonal,
+        )
     if len(cells) == 0:
         raise FluxError(f"geometry: the mesher filled the surface of {len(faces)} faces with nothing. Is it closed?")
     return _on_surface(Tetrahedra(points, cells), vertices, faces)
+
+
+@contextmanager
+def _in_temporary_folder() -> Iterator[None]:
+    here = os.getcwd()
+    with TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            yield
+        finally:
+            os.chdir(here)
 
 
 def _on_surface(mesh: Tetrahedra, vertices: Array, faces: Index) -> Tetrahedra:

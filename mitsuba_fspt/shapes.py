@@ -111,13 +111,9 @@ class Rod:
         its field converges exponentially.
         """
         z, z_weight = _gauss(4 + math.ceil(self.length / spacing))
-        square: Array = np.zeros(1)
-        square_weight: Array = np.ones(1)
-        angle: Array = np.zeros(1)
-        if self.radius > 0:
-            rings = 2 + math.ceil(self.radius / spacing)
-            square, square_weight = _gauss(rings)
-            angle = np.arange(4 * rings) * (2 * math.pi / (4 * rings))
+        rings = 2 + math.ceil(self.radius / spacing) if self.radius > 0 else 0
+        square, square_weight = _gauss(rings) if rings else (np.zeros(1), np.ones(1))
+        angle = np.linspace(0, 2 * math.pi, max(1, 4 * rings), endpoint=False)
         zz, ss, aa = np.meshgrid((z - 0.5) * self.length, self.radius * np.sqrt(square), angle, indexing="ij")
         local = np.stack([ss * np.cos(aa), ss * np.sin(aa), zz], axis=-1).reshape(-1, 3)
         shares = (z_weight[:, None, None] * square_weight[:, None] / len(angle) * np.ones(len(angle))).ravel()

@@ -107,6 +107,7 @@ class Solution:
         provenance = {
             "source": "diffusion equation by finite elements",
             "boundary_factor": " ".join(f"{factor:.6g}" for factor in self.factors),
+            "media": "; ".join(f"mua {m.mua:g}/mm, musp {m.musp:g}/mm, n {m.n:g}" for m in self.media),
             "source_power": f"{self.source_power!r} W",
             "scale": f"{scale!r}",
         }

@@ -192,7 +192,8 @@ def test_regions_of_the_same_optics_change_nothing(nylon: Solution) -> None:
 def test_a_ball_of_light_outside_is_a_brighter_point() -> None:
     """Rationale: mean value property, φ of a uniform ball outside = point · 3 (x cosh x - sinh x)/x³, x = ka.
 
-    On the border φ and its slope have no jump, inside the equation holds, by differences. Seen to fail with the factor left at 1.
+    On the border φ and its slope have no jump, inside the equation holds, by differences. Seen to fail
+    with the factor left at 1.
     """
     ball = FreeField(np.zeros((1, 3)), np.array([2.0]), np.ones(1), 0.36, 0.05)
     point = FreeField(np.zeros((1, 3)), np.zeros(1), np.ones(1), 0.36, 0.05)
