@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 from . import backend
 
 if TYPE_CHECKING:
-    from .compare import Comparison as Comparison
-    from .compare import compare as compare
+    from .comparison import Comparison as Comparison
+    from .comparison import compare as compare
     from .detector import Detector as Detector
     from .detector import Exposure as Exposure
     from .errors import FsptError as FsptError
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from .image import Image as Image
     from .image import read as read
     from .phantom import Phantom as Phantom
-    from .render import render as render
+    from .rendering import render as render
     from .scene import load as load
 
 _HOMES = {
     "load": "scene",
-    "render": "render",
+    "render": "rendering",
     "Image": "image",
     "read": "image",
-    "compare": "compare",
-    "Comparison": "compare",
+    "compare": "comparison",
+    "Comparison": "comparison",
     "Detector": "detector",
     "Exposure": "detector",
     "Phantom": "phantom",

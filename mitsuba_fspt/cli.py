@@ -60,7 +60,7 @@ def render(
 
         require_matplotlib()
     with _progress() as progress:
-        from .render import render
+        from .rendering import render
         from .scene import load
 
         _quiet_mitsuba()
@@ -90,7 +90,7 @@ def compare(
     png: Annotated[Path | None, typer.Option(help="Also draw both images and their difference.")] = None,
 ) -> None:
     """Compare two images: ME and CF as the paper defines them, largest and RMS error, a z-test."""
-    from .compare import compare
+    from .comparison import compare
     from .image import read
 
     images = read(calculated), read(standard)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import atomic_path
-from .compare import compare
+from .comparison import compare
 from .errors import BackendError, ImageError
 from .image import Image
 

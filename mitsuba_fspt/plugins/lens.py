@@ -261,25 +261,29 @@ def _own_film(props: mi.Properties) -> None:
             props.remove_property(name)
             break
     crop_size = size if crop_size is None else crop_size
-    film = {
-        "type": "hdrfilm",
-        "width": int(size[0]),
-        "height": int(size[1]),
-        "crop_offset_x": int(crop_offset[0]),
-        "crop_offset_y": int(crop_offset[1]),
-        "crop_width": int(crop_size[0]),
-        "crop_height": int(crop_size[1]),
-        "pixel_format": "luminance",
-        "component_format": "float32",
-        "rfilter": {"type": "box"},
-    }
-    props["film"] = mi.load_dict(film)
+    film = mi.Properties("hdrfilm")
+    film["width"], film["height"] = int(size[0]), int(size[1])
+    film["crop_offset_x"], film["crop_offset_y"] = int(crop_offset[0]), int(crop_offset[1])
+    film["crop_width"], film["crop_height"] = int(crop_size[0]), int(crop_size[1])
+    film["pixel_format"], film["component_format"] = "luminance", "float32"
+    film["rfilter"] = _make(mi.Properties("box"))
+    props["film"] = _make(film)
 
 
 def _default_sampler(props: mi.Properties) -> None:
     """The best stock sampler for one bounce, where the scene file names none."""
     if not any(isinstance(child, mi.Sampler) for _, child in props.objects()):
-        props["sampler"] = mi.load_dict({"type": "multijitter", "sample_count": 64})
+        sampler = mi.Properties("multijitter")
+        sampler["sample_count"] = 64
+        props["sampler"] = _make(sampler)
+
+
+def _make(props: mi.Properties) -> mi.Object:
+    """A plugin made without `mi.load_dict`, which sets the process's file resolver aside for a moment.
+
+    Scenes load on several threads, and one that looks for a file in that moment reads freed memory.
+    """
+    return mi.PluginManager.instance().create_object(props)
 
 
 mi.register_sensor("fspt_lens", FsptLens)

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import ExitanceError
 from .elements import ElementDistribution, elements_of, scalar
+from .emission import law_of
 
 
 class FsptSurface(mi.Emitter):
@@ -27,9 +28,22 @@ class FsptSurface(mi.Emitter):
        - |float| or |texture| [W/mm²]
        - Surface flux density J_n >= 0, finite, > 0 somewhere: a number, a mesh attribute, a raw bitmap.
          Updatable, differentiable.
+     * - emission
+       - |string|
+       - How the radiance depends on the direction: lambert (Default) | fresnel.
+     * - int_ior
+       - |float|
+       - Refractive index n >= 1 of the tissue relative to outside; only with emission fresnel.
 
-    Lambert's law (Eq. 1): the radiance is L = J_n/π [W/mm²/sr] on the outward side, the side of the geometric
-    normal, and 0 on the other. Positions are sampled ∝ J_n.
+    The radiance is 0 on the inward side, the side away from the geometric normal; on the outward side, with µ the
+    cosine to the normal, ∫ L µ dΩ = J_n and
+
+    - lambert (Eq. 1, the paper's): L = J_n/π [W/mm²/sr];
+    - fresnel: L = J_n/(4π) · (2A + 3µ_i) · T(µ)/n², the diffusion approximation's radiance refracted at a smooth
+      border; µ_i = √(1 − (1 − µ²)/n²), T the unpolarised Fresnel transmittance, A of Haskell et al. (1994). At
+      n = 1.37 it is 1.11 × J_n/π face-on and falls to 0 at the limb.
+
+    Positions are sampled ∝ J_n, directions ∝ µ.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -37,6 +51,7 @@ class FsptSurface(mi.Emitter):
         if not props.has_property("exitance"):
             raise ExitanceError("fspt_surface: 'exitance' is missing. Give J_n in W/mm² as a float or a texture.")
         self.exitance = props.get_emissive_texture("exitance")
+        self.law = law_of(props)
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
         self._positions: ElementDistribution | None = None
@@ -55,13 +70,15 @@ class FsptSurface(mi.Emitter):
     # ------------------------------------------------------------------ radiance
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
-        """Radiance J_n/π [W/mm²/sr] towards `si.wi`, 0 on the inward side."""
+        """Radiance [W/mm²/sr] towards `si.wi`, 0 on the inward side."""
         self.check()
-        outward = active & (dr.dot(si.n, si.to_world(si.wi)) > 0)
-        return mi.depolarizer(dr.select(outward, self._radiance(si, outward), 0))
+        return mi.depolarizer(self._radiance(si, si.to_world(si.wi), active))
 
-    def _radiance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        return self.exitance.eval(si, active) * dr.inv_pi
+    def _radiance(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Radiance [W/mm²/sr] towards a unit vector of the world, 0 on the inward side."""
+        outward = active & (dr.dot(si.n, direction) > 0)
+        radiance = self.exitance.eval(si, outward) * self.law.profile(si, direction, outward)
+        return dr.select(outward, radiance, 0)
 
     # ------------------------------------------------------------------ sampling
 
@@ -91,7 +108,7 @@ class FsptSurface(mi.Emitter):
         direction = mi.Frame3f(si.n).to_world(mi.warp.square_to_cosine_hemisphere(sample3))
         si.time = time
         ray = si.spawn_ray(direction)
-        power = self._radiance(si, active) * (dr.pi * _rcp(pdf))
+        power = self._radiance(si, direction, active) * (dr.pi * _rcp(pdf))
         return ray, mi.depolarizer(power * weight)
 
     def sample_direction(
@@ -107,8 +124,7 @@ class FsptSurface(mi.Emitter):
         ds.pdf = _solid_angle(pdf, ds)
         active &= ds.pdf > 0
         si.wavelengths = it.wavelengths
-        weight = dr.select(active, self._radiance(si, active) * _rcp(ds.pdf), 0)
-        return ds, mi.depolarizer(weight)
+        return ds, mi.depolarizer(self._radiance(si, -ds.d, active) * _rcp(ds.pdf))
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         pdf = self._distribution().pdf(self._surface_at(ds, active), active)
@@ -118,19 +134,21 @@ class FsptSurface(mi.Emitter):
         """Radiance [W/mm²/sr] that arrives at `it` from the surface point of `ds`."""
         si = self._surface_at(ds, active)
         si.wavelengths = it.wavelengths
-        outward = active & (dr.dot(ds.d, ds.n) < 0)
-        return mi.depolarizer(dr.select(outward, self._radiance(si, outward), 0))
+        return mi.depolarizer(self._radiance(si, -ds.d, active))
 
     def sample_wavelengths(
         self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
     ) -> tuple[mi.Wavelength, mi.Spectrum]:
-        """Wavelengths, and the radiance at `si` over their density; light tracers learn the radiance here."""
+        """Wavelengths, and the radiance at `si` over their density; light tracers learn the radiance here.
+
+        `si.wi` is a direction of the world: Mitsuba's `ptracer`, the one caller, sets it so, without `to_local`.
+        """
         ps = mi.PositionSample3f(si)
         ps.n = si.n
         wavelengths, weight = sample_wavelengths(sample)
         here = self._surface_at(ps, active)
         here.wavelengths = wavelengths
-        return wavelengths, mi.depolarizer(self._radiance(here, active) * weight)
+        return wavelengths, mi.depolarizer(self._radiance(here, si.wi, active) * weight)
 
     # ------------------------------------------------------------------ the surface itself
 
@@ -169,7 +187,7 @@ class FsptSurface(mi.Emitter):
         return self.get_shape().bbox()
 
     def to_string(self) -> str:
-        return f"FsptSurface[\n  exitance = {self.exitance}\n]"
+        return f"FsptSurface[\n  exitance = {self.exitance},\n  emission = {self.law}\n]"
 
 
 def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedSpectrum]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsuba_fspt.compare import compare
+from mitsuba_fspt.comparison import compare
 from mitsuba_fspt.errors import ImageError
 from mitsuba_fspt.image import Image
 
