@@ -48,7 +48,7 @@ class FsptSurface(mi.Emitter):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        if not props.has_property("exitance"):
+        if "exitance" not in props:
             raise ExitanceError("fspt_surface: 'exitance' is missing. Give J_n in W/mm² as a float or a texture.")
         self.exitance = props.get_emissive_texture("exitance")
         self.law = law_of(props)
