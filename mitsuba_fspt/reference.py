@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .errors import OpticsError
 from .reference_shapes import Array, Shape, unit_disc
@@ -92,6 +93,16 @@ class Camera:
     def in_world(self, points: Array) -> Array:
         """Camera frame points in the world, shape (n, 3)."""
         return points @ self.to_world[:3, :3].T + self.to_world[:3, 3]
+
+
+def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
+    """`to_world` of a camera at `origin` that sees `target` in the middle and `up` upwards, (4, 4)."""
+    forward = np.subtract(target, origin) / np.linalg.norm(np.subtract(target, origin))
+    left = np.cross(np.asarray(up), forward)
+    left /= np.linalg.norm(left)
+    to_world = np.eye(4)
+    to_world[:3] = np.stack([left, np.cross(forward, left), forward, np.asarray(origin)], axis=1)
+    return to_world
 
 
 @dataclass(frozen=True)

@@ -109,9 +109,9 @@ def mesh_truth(
 
     Notes
     -----
-    Silhouettes converge about like (nodes · samples²)^(−3/4), the rest faster. The pixels share the shifts, so that even
-    the RMS of the error over the film is known only to about a third with 4 replicas, a fifth with 8. Memory: some 100
-    bytes for each sample of one node that sees the mesh; a large film can be done region by region.
+    Silhouettes converge about like (nodes · samples²)^(−3/4), the rest faster. The pixels share
+    the shifts, so even the RMS of the error over the film is uncertain: by a third with 4 replicas, a fifth with 8.
+    Memory: some 100 bytes for each sample of one node that sees the mesh; do a large film region by region.
     """
     wanted = np.ones((camera.height, camera.width), bool) if region is None else np.array(region, dtype=bool)
     power, error = np.full((2, *wanted.shape), np.nan)

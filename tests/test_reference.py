@@ -16,7 +16,7 @@ from reference_cases import EXITANCE, camera, pose, rms, sheet, uniform, wavy
 
 from mitsuba_fspt import reference
 from mitsuba_fspt.errors import OpticsError
-from mitsuba_fspt.reference import collected_power, pupil_form, surface_form
+from mitsuba_fspt.reference import collected_power, look_at, pupil_form, surface_form
 from mitsuba_fspt.reference_shapes import Cylinder, Disc, Rectangle, Sphere
 
 
@@ -117,6 +117,14 @@ def test_a_dark_back_hides_what_lies_behind():
 def test_picture_is_upright_and_not_mirrored():
     """Rationale: +y of the camera frame is up, +x left, as in Mitsuba; row 0 is at the top."""
     power, _ = pupil_form(camera(), [Sphere([5.0, 4.0, 165.0], 1.0)], uniform, 256, "lattice")
+    assert np.unravel_index(power.argmax(), power.shape) == (0, 0)
+
+
+def test_look_at_sees_the_target_upright():
+    """Rationale: from +x, with z up, the world's +y is to the right and +z above: off to the left, -y, and above."""
+    lens = camera(to_world=look_at([180, 0, 0], [0, 0, 0], [0, 0, 2]))
+    np.testing.assert_allclose(lens.from_world(np.array([[15.0, -5, 4]])), [[5, 4, 165]], atol=1e-12)
+    power, _ = pupil_form(lens, [Sphere([15.0, -5, 4], 1.0)], uniform, 256, "lattice")
     assert np.unravel_index(power.argmax(), power.shape) == (0, 0)
 
 

@@ -99,7 +99,7 @@ def test_fine_mesh_of_a_ball_converges_to_the_ball():
     exact, _ = pupil_form(lens, [Sphere(centre, 4.0)], wavy, 2**15, "lattice")
     off = []
     for subdivisions in (2, 3, 4):
-        power, _ = mesh_truth(lens, ball_mesh(centre, 4.0, subdivisions, wavy), levels=((256, 8),))
+        power, _ = mesh_truth(lens, ball_mesh(centre, 4.0, subdivisions, wavy), levels=((128, 8),))
         off.append(1 - power.sum() / exact.sum())
     assert 0 < off[2] < 1e-3
     assert rms(power - exact) < 1e-3 * exact.max()
@@ -124,13 +124,13 @@ def test_mesh_truth_states_its_error():
     """
     lens = camera(width=24, height=20, pixel_pitch=0.25)
     mesh = joined(ball_mesh([0, 0, 180.0], 4.0, 3), ball_mesh([2.0, 1, 150.0], 1.0, 2))
-    truth, bound = mesh_truth(lens, mesh, levels=((256, 3),), seed=1)
+    truth, bound = mesh_truth(lens, mesh, levels=((512, 3),), replicas=4, seed=1)
     stated = []
-    for levels in (((32, 3),), ((32, 3), (128, 3))):
-        power, error = mesh_truth(lens, mesh, levels=levels)
+    for levels in (((64, 3),), ((64, 3), (256, 3))):
+        power, error = mesh_truth(lens, mesh, levels=levels, replicas=4)
         stated.append(rms(error) / truth.max())
         assert 0.5 < rms(power - truth) / rms(error) < 2
-    assert rms(bound) / truth.max() < stated[1] < stated[0] / 2 < 2e-3
+    assert rms(bound) / truth.max() < stated[1] < stated[0] / 2 < 1e-3
 
 
 def test_mesh_truth_of_a_region_is_that_of_the_whole():
