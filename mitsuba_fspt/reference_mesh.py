@@ -99,6 +99,7 @@ def mesh_truth(
     ----------
     levels : (pupil nodes of one lattice, a power of two; sample points along a pixel's side) of each level.
         A level computes afresh the pixels whose own or neighbour's error exceeds `tolerance` × the brightest
+        pixel wanted
     region : (height, width) mask of the pixels wanted, None for all; the others come back as nan
     replicas : independently shifted lattices, ≥ 2; the result is their mean, the error its standard error
     seed : of the shifts
