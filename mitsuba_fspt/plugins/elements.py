@@ -56,8 +56,7 @@ class MeshElements(Elements):
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         self.shape = shape
-        buffers = mi.traverse(shape)
-        self._positions, self._faces = buffers["vertex_positions"], buffers["faces"]
+        self._positions, self._faces = shape.vertex_positions_buffer(), shape.faces_buffer()
         faces = dr.width(self._faces) // 3
         self.k = math.ceil(math.sqrt(minimum / max(1, faces)))
         self.count = faces * self.k**2

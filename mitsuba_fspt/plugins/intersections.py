@@ -34,7 +34,7 @@ def loses_rays(scene: mi.Scene, lens: mi.Sensor) -> bool:
 
 
 def _loses_rays(scene: mi.Scene, lens: mi.Sensor, mesh: mi.Shape) -> bool:
-    positions = mi.traverse(mesh)["vertex_positions"]
+    positions = mesh.vertex_positions_buffer()
     count = dr.width(positions) // 3
     index = dr.arange(mi.UInt32, min(count, PROBES)) * max(1, count // PROBES)
     target = dr.gather(mi.Point3f, positions, index)
