@@ -23,7 +23,9 @@ UNIFORM_SHARE = 1e-3
 
 def elements_of(shape: mi.Shape, minimum: int = MIN_ELEMENTS) -> Elements:
     """The elements of `shape`, at least `minimum` of them."""
-    return MeshElements(shape, minimum) if shape.is_mesh() else ParameterElements(shape, minimum)
+    # A rectangle is a mesh inside, but tells of no vertices.
+    has_vertices = "vertex_positions" in mi.traverse(shape)
+    return MeshElements(shape, minimum) if has_vertices else ParameterElements(shape, minimum)
 
 
 class Elements:
@@ -56,7 +58,8 @@ class MeshElements(Elements):
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         self.shape = shape
-        self._positions, self._faces = shape.vertex_positions_buffer(), shape.faces_buffer()
+        buffers = mi.traverse(shape)
+        self._positions, self._faces = buffers["vertex_positions"], buffers["faces"]
         faces = dr.width(self._faces) // 3
         self.k = math.ceil(math.sqrt(minimum / max(1, faces)))
         self.count = faces * self.k**2
