@@ -16,7 +16,28 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
 FRESNEL = {"emission": "fresnel", "int_ior": 1.37}
-LAWS = ({}, FRESNEL)
+MUA, MUSP = 0.0138, 0.91
+
+
+def sloping(at, slope, half=60.0, cells=16):
+    """A volume of the cube of ±`half` mm: fluence `at` in the middle, changing by `slope` per mm, without error."""
+    middle = (np.arange(cells) + 0.5) * (2 * half / cells) - half
+    z, y, x = np.meshgrid(middle, middle, middle, indexing="ij")
+    values = at + slope[0] * x + slope[1] * y + slope[2] * z
+    box = mi.ScalarTransform4f().translate([-half] * 3).scale(2 * half)
+    grid = mi.VolumeGrid(values[..., None].astype(np.float32))
+    return {"type": "gridvolume", "grid": grid, "to_world": box, "accel": False}
+
+
+def last_flight(at, slope, **changes):
+    law = {"emission": "last_flight", "int_ior": 1.37, "mua": MUA, "musp": MUSP}
+    return law | {"fluence": sloping(at, slope)} | changes
+
+
+# Dark enough on one side of the sphere that the law differs from all others by tens of percent.
+SLOPING = (1.0, (0.015, 0.01, -0.006))
+LAWS = (lambda: {}, lambda: FRESNEL, lambda: last_flight(*SLOPING))
+NAMES = ["lambert", "fresnel", "last_flight"]
 
 
 def glowing_sphere(law, exitance=2e-3):
@@ -63,14 +84,21 @@ def profile(mu, n):
     return (2 * a + 3 * inner) * t / (4 * np.pi * n**2), a
 
 
-def towards(mu, azimuth=0.3):
-    """Surface records at the top of the sphere (normal +z), seen from directions of the given outer cosines."""
-    sine = np.sqrt(1 - mu**2)
-    si = dr.zeros(mi.SurfaceInteraction3f, len(mu))
-    si.p, si.n = mi.Point3f(0, 0, 3), mi.Normal3f(0, 0, 1)
+def seen(points, directions):
+    """Surface records at points (3, N) of the sphere, seen from unit vectors (3, N)."""
+    points, directions = np.broadcast_arrays(points, directions)
+    si = dr.zeros(mi.SurfaceInteraction3f, points.shape[1])
+    si.p, si.n = mi.Point3f(points), mi.Normal3f(points / 3)
+    si.uv = mi.Point2f(np.arctan2(points[1], points[0]) / (2 * np.pi) % 1, np.arccos(points[2] / 3) / np.pi)
     si.sh_frame = mi.Frame3f(si.n)
-    si.wi = si.to_local(mi.Vector3f(sine * np.cos(azimuth), sine * np.sin(azimuth), mu))
+    si.wi = si.to_local(mi.Vector3f(directions))
     return si
+
+
+def towards(mu, azimuth=0.3):
+    """Records at the top of the sphere (normal +z), seen from directions of the given outer cosines."""
+    sine, azimuth = np.sqrt(1 - mu**2), np.broadcast_to(azimuth, mu.shape)
+    return seen(np.array([[0.0], [0.0], [3.0]]), np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), mu]))
 
 
 @pytest.mark.parametrize("n", [1.0, 1.1, 1.37, 1.53, 2.4])
@@ -96,28 +124,25 @@ def test_fresnel_law_at_the_paper_s_index():
     assert emitter.eval(towards(np.full(1, -0.5)))[0, 0] == 0
 
 
-@pytest.mark.parametrize("law", LAWS, ids=["lambert", "fresnel"])
+@pytest.mark.parametrize("law", LAWS, ids=NAMES)
 def test_every_question_gets_the_same_radiance(law):
     """eval, eval_direction, sample_direction, sample_ray and sample_wavelengths, from all round the sphere.
 
     With the profile left out of any one of them, or taken towards the local instead of the world's direction in
     sample_wavelengths, the Fresnel case fails.
     """
-    _scene, emitter = glowing_sphere(law)
+    _scene, emitter = glowing_sphere(law())
     rng = np.random.default_rng(4)
     sample = mi.Point2f(rng.random((2, 500)))
 
-    def radiance_towards(point, normal, direction):
-        si = dr.zeros(mi.SurfaceInteraction3f, 500)
-        si.p, si.n = point, normal
-        si.sh_frame = mi.Frame3f(si.n)
-        si.wi = si.to_local(direction)
-        return emitter.eval(si).numpy().ravel()
+    def radiance_towards(point, direction):
+        point = point.numpy()
+        return emitter.eval(seen(3 * point / np.linalg.norm(point, axis=0), direction.numpy())).numpy().ravel()
 
     it = dr.zeros(mi.Interaction3f, 500)
     it.p = mi.Point3f(rng.normal(scale=9, size=(3, 500)))
     ds, weight = emitter.sample_direction(it, sample)
-    expected = radiance_towards(ds.p, ds.n, -ds.d)
+    expected = radiance_towards(ds.p, -ds.d)
     pdf = ds.pdf.numpy()
     assert (expected > 0).sum() > 100
     np.testing.assert_allclose(weight.numpy().ravel() * pdf, np.where(pdf > 0, expected, 0), rtol=2e-4, atol=1e-9)
@@ -127,27 +152,27 @@ def test_every_question_gets_the_same_radiance(law):
     si = mi.SurfaceInteraction3f(ps, mi.Color0f())
     si.wi = -ds.d  # of the world, as ptracer has it
     told = emitter.sample_wavelengths(si, 0.5)[1].numpy().ravel()
-    np.testing.assert_allclose(told, radiance_towards(ps.p, ps.n, -ds.d), rtol=2e-4, atol=1e-8)
+    np.testing.assert_allclose(told, radiance_towards(ps.p, -ds.d), rtol=2e-4, atol=1e-8)
 
     ray, power = emitter.sample_ray(0, 0.5, sample, mi.Point2f(rng.random((2, 500))))
-    normal = dr.normalize(mi.Vector3f(ray.o))
-    radiance = radiance_towards(ray.o, mi.Normal3f(normal), ray.d)
+    radiance = radiance_towards(ray.o, ray.d)
     np.testing.assert_allclose(power.numpy().ravel(), radiance * np.pi * area.numpy(), rtol=1e-3)
 
 
-@pytest.mark.parametrize("law", LAWS, ids=["lambert", "fresnel"])
+@pytest.mark.parametrize("law", LAWS, ids=NAMES)
 def test_power_of_sampled_rays(law):
     """The mean weight of `sample_ray` is the power, J_n times the area."""
-    _scene, emitter = glowing_sphere(law)
+    _scene, emitter = glowing_sphere(law())
     rng = np.random.default_rng(1)
     _, power = emitter.sample_ray(0, 0.5, mi.Point2f(rng.random((2, 400_000))), mi.Point2f(rng.random((2, 400_000))))
     power = power.numpy().ravel()
     assert abs(power.mean() - 2e-3 * 36 * np.pi) < 4 * power.std() / np.sqrt(power.size) + 1e-6
 
 
-def test_three_independent_ways_agree():
-    """Integral path and ptracer on the Fresnel law, per pixel: no |z| > 5, no bias in the sum."""
-    scene = glowing_sphere(FRESNEL)[0]
+@pytest.mark.parametrize("law", LAWS[1:], ids=NAMES[1:])
+def test_three_independent_ways_agree(law):
+    """Integral, path and ptracer, per pixel: no |z| > 5, no bias in the sum."""
+    scene = glowing_sphere(law())[0]
     exact = fspt.render(scene, method="integral")
     assert exact.power.sum() > 0
     for method, spp in (("path", 256), ("ptracer", 1024)):
@@ -157,21 +182,93 @@ def test_three_independent_ways_agree():
         assert np.abs(z).max() < 5, method
         sums = sampled.power.sum(), np.sqrt((sampled.error**2).sum())
         assert abs(sums[0] - exact.power.sum()) < 4 * sums[1], method
-    lambert = fspt.render(glowing_sphere({})[0], method="integral")
+
+
+def test_fresnel_pixels_over_lambert_pixels():
+    """In the middle of the picture their ratio is the profile's."""
+    exact, lambert = (fspt.render(glowing_sphere(law)[0], method="integral", max_nodes=16) for law in (FRESNEL, {}))
     tilt = np.sqrt(1 - 2 * 0.7**2 / 3 / 9)  # the mean over a pixel of 0.7 mm beside the middle
     ratio = exact.power[5:7, 5:7] / lambert.power[5:7, 5:7]
     np.testing.assert_allclose(ratio, np.pi * float(profile(tilt, 1.37)[0]), rtol=1e-3)
 
 
+def test_last_flight_over_a_slope():
+    """Over a linear fluence the integral along the line is exact: L ∝ T (Φ − ∇Φ·ω_i/µt), the rest is carrying J_n.
+
+    With the direction not refracted, or T left out, off by more than 3 %.
+    """
+    at, slope = SLOPING
+    _scene, emitter = glowing_sphere(last_flight(at, slope), exitance=1.0)
+    x, w = np.polynomial.legendre.leggauss(40)
+    mu, w = ((x + 1) / 2) ** 2, (x + 1) / 2 * w  # µ = x²; w = dµ
+    azimuth = np.arange(12) * 2 * np.pi / 12
+    mu, azimuth = (a.ravel() for a in np.meshgrid(mu, azimuth, indexing="ij"))
+    w = np.repeat(w, 12) * 2 * np.pi / 12
+    t, inner = transmittance(mu, 1.37)
+    sine = np.sqrt(1 - mu**2) / 1.37
+    climb = slope[0] * sine * np.cos(azimuth) + slope[1] * sine * np.sin(azimuth) + slope[2] * inner
+    expected = t * (at + 3 * slope[2] - climb / (MUA + MUSP))  # at the top of the sphere, 3 mm up
+    expected /= (expected * mu * w).sum()
+    radiance = emitter.eval(towards(mu, azimuth)).numpy().ravel()
+    assert (radiance * mu * w).sum() == pytest.approx(1, abs=2e-4)
+    np.testing.assert_allclose(radiance, expected, rtol=3e-4, atol=1e-4)
+
+
+def test_last_flight_on_a_half_space_is_the_fresnel_law():
+    """With the slope of the boundary condition, Φ + 2AD ∂Φ/∂n = 0, the two laws are one: 1/(D µt) = 3."""
+    diffusion = 1 / (3 * (MUA + MUSP))
+    top = 2.0  # Φ at the top of the sphere, z = 3
+    slope = -top / (2 * haskell_a(1.37) * diffusion)
+    mu = np.linspace(0.02, 1, 60)
+    _one, flight = glowing_sphere(last_flight(top - 3 * slope, (0, 0, slope)))
+    _two, fresnel = glowing_sphere(FRESNEL)
+    told, expected = (emitter.eval(towards(mu)).numpy().ravel() for emitter in (flight, fresnel))
+    np.testing.assert_allclose(told, expected, rtol=3e-4)
+
+
+def test_last_flight_carries_the_exitance_everywhere():
+    """∫ L µ dΩ = J_n all over the sphere, between the points where it was tabulated too."""
+    points = np.random.default_rng(2).normal(size=(3, 50))
+    points *= 3 / np.linalg.norm(points, axis=0)
+    _scene, emitter = glowing_sphere(last_flight(*SLOPING), exitance=1.0)
+    x, w = np.polynomial.legendre.leggauss(24)
+    mu, w = ((x + 1) / 2) ** 2, (x + 1) / 2 * w
+    azimuth = np.arange(10) * 2 * np.pi / 10
+    cosine, azimuth = (a.ravel() for a in np.meshgrid(mu, azimuth, indexing="ij"))
+    sine = np.sqrt(1 - cosine**2)
+    local = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
+    si = seen(np.repeat(points, cosine.size, axis=1), np.ones((3, 1)))
+    si.wi = mi.Vector3f(np.tile(local, 50))
+    radiance = emitter.eval(si).numpy().reshape(50, cosine.size)
+    carried = radiance @ (cosine * np.repeat(w, 10) * 2 * np.pi / 10)
+    np.testing.assert_allclose(carried, 1, rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        ({"emission": "phong"}, "'emission' must be one of lambert, fresnel.*got 'phong'"),
+        ({"emission": "phong"}, "'emission' must be one of lambert, fresnel, last_flight, got 'phong'"),
         ({"emission": "fresnel"}, "emission 'fresnel' needs 'int_ior'"),
         ({"emission": "fresnel", "int_ior": 0.9}, "'int_ior' must be >= 1 and finite, got 0.9"),
         ({"emission": "fresnel", "int_ior": float("inf")}, "'int_ior' must be >= 1 and finite, got inf"),
+        ({"emission": "last_flight", "int_ior": 1.37, "mua": 0.1, "musp": 1.0}, "needs 'fluence'.*as a volume"),
+        ({"emission": "last_flight", "int_ior": 1.37, "mua": 0.1}, "needs 'musp'"),
+        (
+            {"emission": "last_flight", "int_ior": 1.37, "mua": -0.1, "musp": 1.0, "fluence": {"type": "constvolume"}},
+            "'mua' must be >= 0",
+        ),
     ],
 )
 def test_bad_laws_are_refused(law, message):
     with pytest.raises((ExitanceError, RuntimeError), match=message):
         glowing_sphere(law)
+
+
+def test_fluence_that_does_not_fit_the_shape_is_refused():
+    small = sloping(1.0, (0, 0, 0)) | {"to_world": mi.ScalarTransform4f().translate([-2, -2, -2]).scale(4)}
+    scene = glowing_sphere(last_flight(1.0, (0, 0, 0), fluence=small))[0]
+    with pytest.raises(ExitanceError, match=r"'fluence', from \(-2, -2, -2\) to \(2, 2, 2\) mm, does not hold"):
+        fspt.render(scene, method="integral")
+    scene = glowing_sphere(last_flight(0.0, (1, 0, 0)))[0]
+    with pytest.raises(ExitanceError, match="'fluence' has values <= 0"):
+        fspt.render(scene, method="integral")

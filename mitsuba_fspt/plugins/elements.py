@@ -32,6 +32,7 @@ class Elements:
     """Patches of one shape: `count` of them, element `index` placed by a point of the unit square."""
 
     count: int
+    corners: tuple[tuple[int, int], ...]  # the samples at which `place` puts an element's corners
 
     def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
         """Surface point of element `index` at `sample` of [0, 1]², and dA/d(sample) there [mm²]."""
@@ -39,6 +40,10 @@ class Elements:
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
         """Element that holds `si`, and dA/d(sample) of `place` there [mm²]."""
+        raise NotImplementedError
+
+    def weigh(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, tuple[mi.Float, ...]]:
+        """Element that holds `si`, and the weights by which values at its corners are interpolated there."""
         raise NotImplementedError
 
     def areas(self) -> mi.Float:
@@ -55,6 +60,8 @@ _FIVE_POINTS = ((0.5, 0.5), (0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))
 
 class MeshElements(Elements):
     """Faces of a triangle mesh, each cut into k² congruent triangles."""
+
+    corners = ((0, 0), (1, 0), (0, 1))
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         self.shape = shape
@@ -77,15 +84,24 @@ class MeshElements(Elements):
         return self._interaction(face, mi.Point2f(x - y, y) / k)
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
-        k = self.k
         p0, e1, e2 = self._corners(si.prim_index)
-        b = _barycentric(si.p - p0, e1, e2)
+        return self._part(si.prim_index, _barycentric(si.p - p0, e1, e2))[0], self._area(e1, e2)
+
+    def weigh(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, tuple[mi.Float, ...]]:
+        p0, e1, e2 = self._corners(si.prim_index)
+        index, b = self._part(si.prim_index, _barycentric(si.p - p0, e1, e2))
+        return index, (1 - b.x - b.y, b.x, b.y)
+
+    def _part(self, face: mi.UInt32, b: mi.Point2f) -> tuple[mi.UInt32, mi.Point2f]:
+        """The part of a face at its coordinates (b1, b2), and the coordinates in that part."""
+        k = self.k
         x, y = k * (b.x + b.y), k * b.y
         row, half = dr.clip(dr.floor(x), 0, k - 1), dr.floor(y)
-        upside_down = dr.select(y - half > x - row, 1, 0)
-        column = dr.clip(2 * half + upside_down, 0, 2 * row)
-        index = si.prim_index * (k * k) + mi.UInt32(row * row + column)
-        return index, self._area(e1, e2)
+        upside_down = y - half > x - row
+        column = dr.clip(2 * half + dr.select(upside_down, 1, 0), 0, 2 * row)
+        x, y = x - row, y - half
+        within = dr.select(upside_down, mi.Point2f(x, y - x), mi.Point2f(x - y, y))
+        return face * (k * k) + mi.UInt32(row * row + column), within
 
     def _interaction(self, face: mi.UInt32, uv: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
         p0, e1, e2 = self._corners(face)
@@ -106,6 +122,8 @@ class MeshElements(Elements):
 class ParameterElements(Elements):
     """Grid of equal cells in the surface parameters (u, v) of an analytic shape."""
 
+    corners = ((0, 0), (1, 0), (0, 1), (1, 1))
+
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         self.shape = shape
         self.side = math.ceil(math.sqrt(minimum))
@@ -117,8 +135,17 @@ class ParameterElements(Elements):
         return si, self._area(si)
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
-        cell = mi.Point2u(dr.clip(si.uv * self.side, 0, self.side - 1))
+        cell = self._cell(si)
         return cell.x + cell.y * self.side, self._area(si)
+
+    def weigh(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, tuple[mi.Float, ...]]:
+        cell = self._cell(si)
+        x = si.uv * self.side - mi.Point2f(cell)
+        weights = ((1 - x.x) * (1 - x.y), x.x * (1 - x.y), (1 - x.x) * x.y, x.x * x.y)
+        return cell.x + cell.y * self.side, weights
+
+    def _cell(self, si: mi.SurfaceInteraction3f) -> mi.Point2u:
+        return mi.Point2u(dr.clip(si.uv * self.side, 0, self.side - 1))
 
     def _area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / self.count

@@ -5,19 +5,24 @@ A law's `profile` is L/J_n [1/sr], with ∫ L cosθ dΩ = J_n. Laws do not look 
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 
 from ..boundary import haskell_a
 from ..errors import ExitanceError, FluxError
+from ..medium import Medium
+from .last_flight import LastFlight
 
-LAWS = ("lambert", "fresnel")
+LAWS = ("lambert", "fresnel", "last_flight")
 
 
 class Law(Protocol):
     """What `fspt_surface` asks of a law of emission."""
+
+    def prepare(self, shape: mi.Shape) -> None:
+        """Look at the surface once before the first `profile`; ExitanceError where the law does not fit it."""
 
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """L/J_n [1/sr] at the surface point `si` towards the outward unit vector `direction` of the world."""
@@ -25,6 +30,9 @@ class Law(Protocol):
 
 class Lambert:
     """The same radiance in all directions, L = J_n/π (Eq. 1)."""
+
+    def prepare(self, shape: mi.Shape) -> None:
+        pass
 
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         return mi.Float(dr.inv_pi)
@@ -56,6 +64,9 @@ class Fresnel:
         self.n = n
         self._n, self._a = dr.opaque(mi.Float, n), dr.opaque(mi.Float, a)
 
+    def prepare(self, shape: mi.Shape) -> None:
+        pass
+
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         # Transmittance is the same both ways: the border is looked through from outside.
         reflectance, cos_inner, _, _ = mi.fresnel(dr.dot(si.n, direction), self._n)
@@ -67,17 +78,26 @@ class Fresnel:
 
 
 def law_of(props: mi.Properties) -> Law:
-    """The law that a plugin's `emission` and its parameters name; ExitanceError where there is none such."""
+    """The law that a plugin's `emission` and its parameters name.
+
+    Raises
+    ------
+    ExitanceError, FluxError : there is no such law, or a parameter is missing or out of its range.
+    """
     name = str(props.get("emission", "lambert"))
     if name == "lambert":
         return Lambert()
     if name not in LAWS:
         raise ExitanceError(f"fspt_surface: 'emission' must be one of {', '.join(LAWS)}, got '{name}'.")
-    return Fresnel(required(props, name, "int_ior"))
+    n = float(_required(props, name, "int_ior", "a float"))
+    if name == "fresnel":
+        return Fresnel(n)
+    mua, musp = (float(_required(props, name, key, "a float [1/mm]")) for key in ("mua", "musp"))
+    return LastFlight(Medium(mua, musp, n), _required(props, name, "fluence", "a volume, such as a gridvolume"))
 
 
-def required(props: mi.Properties, law: str, name: str) -> float:
-    """The number `name` that a law cannot do without."""
+def _required(props: mi.Properties, law: str, name: str, kind: str) -> Any:
+    """The parameter `name`, which the law cannot do without."""
     if name not in props:
-        raise ExitanceError(f"fspt_surface: emission '{law}' needs '{name}'. Give it as a float.")
-    return float(props[name])
+        raise ExitanceError(f"fspt_surface: emission '{law}' needs '{name}'. Give it as {kind}.")
+    return props[name]

@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import ExitanceError
 from .elements import ElementDistribution, elements_of, scalar
 from .emission import law_of
+from .last_flight import LastFlight
 
 
 class FsptSurface(mi.Emitter):
@@ -30,10 +31,16 @@ class FsptSurface(mi.Emitter):
          Updatable, differentiable.
      * - emission
        - |string|
-       - How the radiance depends on the direction: lambert (Default) | fresnel.
+       - How the radiance depends on the direction: lambert (Default) | fresnel | last_flight.
      * - int_ior
        - |float|
-       - Refractive index n >= 1 of the tissue relative to outside; only with emission fresnel.
+       - Refractive index n >= 1 of the tissue relative to outside; not with lambert.
+     * - mua, musp
+       - |float| [1/mm]
+       - Absorption µa >= 0 and reduced scattering µs' > 0; only with last_flight.
+     * - fluence
+       - |volume|
+       - Fluence Φ > 0 in the tissue, in any unit, a gridvolume that holds the shape; only with last_flight. Updatable.
 
     The radiance is 0 on the inward side, the side away from the geometric normal; on the outward side, with µ the
     cosine to the normal, ∫ L µ dΩ = J_n and
@@ -41,7 +48,11 @@ class FsptSurface(mi.Emitter):
     - lambert (Eq. 1, the paper's): L = J_n/π [W/mm²/sr];
     - fresnel: L = J_n/(4π) · (2A + 3µ_i) · T(µ)/n², the diffusion approximation's radiance refracted at a smooth
       border; µ_i = √(1 − (1 − µ²)/n²), T the unpolarised Fresnel transmittance, A of Haskell et al. (1994). At
-      n = 1.37 it is 1.11 × J_n/π face-on and falls to 0 at the limb.
+      n = 1.37 it is 1.11 × J_n/π face-on and falls to 0 at the limb;
+    - last_flight: L = C · T(µ)/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds. What leaves is what scatters
+      last, on the refracted line of sight ω_i; it sees the slope of the fluence along the surface and its bend above a
+      shallow source, which the other laws do not. C(r) is such that the hemisphere carries J_n(r). The volume is what
+      'fspt flux solve --volume' writes; turn it along with the shape.
 
     Positions are sampled ∝ J_n, directions ∝ µ.
     """
@@ -61,6 +72,8 @@ class FsptSurface(mi.Emitter):
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
         cb.put("exitance", self.exitance, mi.ParamFlags.Differentiable)
+        if isinstance(self.law, LastFlight):
+            cb.put("fluence", self.law.fluence, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
         super().parameters_changed(keys)
@@ -71,11 +84,11 @@ class FsptSurface(mi.Emitter):
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         """Radiance [W/mm²/sr] towards `si.wi`, 0 on the inward side."""
-        self.check()
         return mi.depolarizer(self._radiance(si, si.to_world(si.wi), active))
 
     def _radiance(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Radiance [W/mm²/sr] towards a unit vector of the world, 0 on the inward side."""
+        self.check()
         outward = active & (dr.dot(si.n, direction) > 0)
         radiance = self.exitance.eval(si, outward) * self.law.profile(si, direction, outward)
         return dr.select(outward, radiance, 0)
@@ -153,11 +166,16 @@ class FsptSurface(mi.Emitter):
     # ------------------------------------------------------------------ the surface itself
 
     def check(self) -> None:
-        """Raise ExitanceError where J_n is missing, negative, not finite or zero everywhere; once a change."""
+        """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
         if self._checked:
             return
         self._checked = True
-        aside(lambda shape: check_values(shape, exitance_on(shape, self.exitance)), self.get_shape())
+
+        def look(shape: mi.Shape) -> None:
+            check_values(shape, exitance_on(shape, self.exitance))
+            self.law.prepare(shape)
+
+        aside(look, self.get_shape())
 
     def _distribution(self) -> ElementDistribution:
         self.check()
