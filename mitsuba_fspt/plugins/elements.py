@@ -167,7 +167,7 @@ class ElementDistribution:
         power = dr.zeros(mi.Float, elements.count)
         for point in _FIVE_POINTS:
             si, area = elements.place(index, mi.Point2f(*point))
-            power += area * exitance(si)
+            power += area * dr.maximum(exitance(si), 0)
         share = power + (UNIFORM_SHARE * dr.mean(power) / dr.mean(elements.areas())) * elements.areas()
         # A row of elements, then one of the row: the 24 bits of one random number cannot tell 10⁵ elements apart
         # evenly (1% of the power of each goes astray), those of two can.

@@ -15,6 +15,8 @@ from .elements import ElementDistribution, elements_of, scalar
 from .emission import law_of
 from .last_flight import LastFlight
 
+ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
+
 
 class FsptSurface(mi.Emitter):
     r"""
@@ -258,7 +260,7 @@ def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], 
     name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
     if not np.isfinite(values).all():
         raise ExitanceError(f"{name} has NaN or infinite values. Mend the data before rendering.")
-    if values.min() < 0:
+    if values.min() < -ROUNDING * values.max(initial=0):
         raise ExitanceError(
             f"{name} must be >= 0 W/mm², its lowest value is {values.min():.4g}. Clip it on import: "
             "'fspt flux import --clip'."
