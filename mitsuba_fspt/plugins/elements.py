@@ -23,9 +23,17 @@ UNIFORM_SHARE = 1e-3
 
 def elements_of(shape: mi.Shape, minimum: int = MIN_ELEMENTS) -> Elements:
     """The elements of `shape`, at least `minimum` of them."""
-    # A rectangle is a mesh inside, but tells of no vertices.
-    has_vertices = "vertex_positions" in mi.traverse(shape)
-    return MeshElements(shape, minimum) if has_vertices else ParameterElements(shape, minimum)
+    return MeshElements(shape, minimum) if shape.is_mesh() else ParameterElements(shape, minimum)
+
+
+def triangles(shape: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
+    """Vertex positions and face indices of a mesh, flat as Mitsuba keeps them."""
+    buffers = mi.traverse(shape)
+    if "vertex_positions" in buffers:
+        return buffers["vertex_positions"], buffers["faces"]
+    # A rectangle is a mesh, too, of which only the place is told.
+    corners = mi.Transform4f(buffers["to_world"]) @ mi.Point3f([-1, 1, -1, 1], [-1, -1, 1, 1], 0)
+    return dr.ravel(corners), mi.UInt32(1, 2, 0, 1, 3, 2)
 
 
 class Elements:
@@ -65,8 +73,7 @@ class MeshElements(Elements):
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         self.shape = shape
-        buffers = mi.traverse(shape)
-        self._positions, self._faces = buffers["vertex_positions"], buffers["faces"]
+        self._positions, self._faces = triangles(shape)
         faces = dr.width(self._faces) // 3
         self.k = math.ceil(math.sqrt(minimum / max(1, faces)))
         self.count = faces * self.k**2

@@ -9,6 +9,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .elements import triangles
+
 PROBES = 4096
 STEP = 1e-4  # of the distance, from a probed vertex to its four neighbours in the test
 
@@ -34,7 +36,7 @@ def loses_rays(scene: mi.Scene, lens: mi.Sensor) -> bool:
 
 
 def _loses_rays(scene: mi.Scene, lens: mi.Sensor, mesh: mi.Shape) -> bool:
-    positions = mesh.vertex_positions_buffer()
+    positions, _ = triangles(mesh)
     count = dr.width(positions) // 3
     index = dr.arange(mi.UInt32, min(count, PROBES)) * max(1, count // PROBES)
     target = dr.gather(mi.Point3f, positions, index)
