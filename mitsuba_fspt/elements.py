@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from .free_field import FreeField
 from .tetrahedra import Tetrahedra
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 # Relative residual of the linear system. Far from the sources φ is nine decades below its peak; this leaves
 # it digits.
@@ -33,7 +33,7 @@ MOST_ITERATIONS = 5000
 BORDER_DEGREE = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solved:
     """The rest w at the nodes [W/mm²], the powers absorbed inside and leaving through the border [W]."""
 
@@ -66,7 +66,7 @@ class System:
         self.element = skfem.ElementTetP2() if order == 2 else skfem.ElementTetP1()
         grid = _grid(skfem, mesh, order)
         self.basis = skfem.Basis(grid, self.element, intorder=2 * order)
-        self.border = skfem.FacetBasis(grid, self.element, intorder=BORDER_DEGREE)
+        self.border = _border_basis(skfem, grid, self.element)
         # One row a cell or facet, to broadcast over its quadrature points.
         self.diffusion = np.asarray(diffusion)[mesh.region][:, None]
         self.mua = np.asarray(mua)[mesh.region][:, None]
@@ -109,21 +109,40 @@ class System:
         """∫ [(D - D_f) ∇φ_f·∇v + (µa - µ_f) φ_f v] dV of every test function, and ∫ (µa - µ_f) φ_f dV [W]."""
         changed = (self.diffusion != field.diffusion) | (self.mua != field.mua)
         other = np.flatnonzero(changed[:, 0])
-        if len(other) == 0:
-            return np.zeros(self.basis.N), 0.0
-        basis = type(self.basis)(self.basis.mesh, self.element, intorder=2 * self.basis.elem.maxdeg, elements=other)
-        points = np.asarray(basis.global_coordinates())
-        fluence, gradient, _ = field.with_gradient(points.reshape(3, -1).T)
-        fluence = (self.mua[other] - field.mua) * fluence.reshape(points.shape[1:])
-        gradient = (self.diffusion[other] - field.diffusion) * gradient.T.reshape(points.shape)
-        load = self._integrate(basis, fluence, gradient)
-        return load, float((fluence * basis.dx).sum())
+        load, power = np.zeros(self.basis.N), 0.0
+        # ∇φ_f is steep beside a source: a rule of many small tetrahedra there.
+        near = self._near(other, field.centres)
+        skfem = import_skfem()
+        degree = 2 * self.element.maxdeg
+        for cells, rule in (
+            (other[~near], skfem.quadrature.get_quadrature(self.element, degree)),
+            (other[near], _split_rule(degree)),
+        ):
+            if len(cells) == 0:
+                continue
+            basis = skfem.Basis(self.basis.mesh, self.element, quadrature=rule, elements=cells)
+            points = np.asarray(basis.global_coordinates())
+            fluence, gradient, _ = field.with_gradient(points.reshape(3, -1).T)
+            fluence = (self.mua[cells] - field.mua) * fluence.reshape(points.shape[1:])
+            gradient = (self.diffusion[cells] - field.diffusion) * gradient.T.reshape(points.shape)
+            load += self._integrate(basis, fluence, gradient)
+            power += float((fluence * basis.dx).sum())
+        return load, power
+
+    def _near(self, cells: Index, centres: Array) -> NDArray[np.bool_]:
+        """Which of the cells have a centre within two radii of their middle."""
+        from scipy.spatial import cKDTree
+
+        corners = self.basis.mesh.p[:, self.basis.mesh.t[:, cells]]
+        middle = corners.mean(axis=1)
+        size = np.linalg.norm(corners - middle[:, None], axis=0).max(axis=0)
+        return np.asarray(cKDTree(centres).query(middle.T)[0] < 2 * size)
 
     def _conjugate_gradients(self, load: Array) -> tuple[Array, int]:
         """Solution of the linear system and the number of iterations, with a Jacobi preconditioner.
 
-        SciPy's own takes dot products by threaded BLAS, where the threads of a busy machine wait for each other:
-        five times the time, and other last bits each run.
+        SciPy's own takes dot products by threaded BLAS, whose threads wait for each other on a busy machine:
+        five times the time.
         """
         matrix = self._matrix()
         jacobi = 1 / matrix.diagonal()
@@ -182,6 +201,13 @@ def import_skfem() -> Any:
     return skfem
 
 
+def _split_rule(degree: int) -> tuple[Array, Array]:
+    """Points (3, Q) and weights (Q,) of the reference tetrahedron cut into 64, each with a rule of the degree."""
+    skfem = import_skfem()
+    parts = skfem.Basis(skfem.MeshTet1.init_refdom().refined(2), skfem.ElementTetP1(), intorder=degree)
+    return np.asarray(parts.global_coordinates()).reshape(3, -1), parts.dx.ravel()
+
+
 def _grid(skfem: Any, mesh: Tetrahedra, order: int) -> Any:
     """The mesh for scikit-fem; for order 2 with the midpoints of its edges on the true border, if curved."""
     straight = skfem.MeshTet1(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.cells.T))
@@ -191,14 +217,30 @@ def _grid(skfem: Any, mesh: Tetrahedra, order: int) -> Any:
     middle = curved.dofs.edge_dofs[0, np.unique(curved.f2e[:, curved.boundary_facets()])]
     before = curved.doflocs[:, middle]
     curved.doflocs[:, middle] = mesh.snap(before.T).T
-    # A flat cell can turn over; all its edges stay straight.
+    # A flat cell can turn over, or nearly; all its edges stay straight.
     points = skfem.ElementTetP2.doflocs.T
     bent = skfem.MappingIsoparametric(curved, skfem.ElementTetP2()).detDF(points)
-    turned = (bent / straight.mapping().detDF(points)).min(axis=1) < 0.2
+    turned = (bent / straight.mapping().detDF(points)).min(axis=1) < 0.5
     back = np.isin(middle, curved.dofs.element_dofs[:, turned])
     curved.doflocs[:, middle[back]] = before[:, back]
-    # The default tolerance of scikit-fem's Newton steps, 1e-12 of a cell, is below round-off far from the
-    # origin.
-    mapping = curved.mapping()
-    mapping.invF = partial(mapping.invF, newton_tol=1e-9)
     return curved
+
+
+def _border_basis(skfem: Any, grid: Any, element: Any) -> Any:
+    """The basis of the boundary facets, with their points' places in the cells known exactly.
+
+    scikit-fem finds those of curved cells by Newton steps, which flat cells and round-off far from the origin stop.
+    """
+    if grid.affine:
+        return skfem.FacetBasis(grid, element, intorder=BORDER_DEGREE)
+    points, weights = skfem.quadrature.get_quadrature(skfem.ElementTriP1(), BORDER_DEGREE)
+    facets = grid.boundary_facets()
+    mapping = grid.mapping()
+
+    def places(_: Array, tind: Index) -> Array:
+        corners = np.argmax(grid.t[:, None, tind] == grid.facets[:, facets], axis=0)
+        reference = skfem.refdom.RefTet.p[:, corners]
+        return np.einsum("dkf,kq->dfq", reference, np.stack([1 - points[0] - points[1], *points]))
+
+    mapping.invF = places
+    return skfem.FacetBasis(grid, element, mapping, quadrature=(points, weights), facets=facets)

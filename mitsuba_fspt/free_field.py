@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 # Below this decay [1/mm] the factor exp(-kr) is 1 over any phantom; it stands for tissue without absorption,
 # where the closed form of the ball is 0/0.
 SMALLEST_DECAY = 1e-7
-PAIRS_AT_ONCE = 2_000_000
+PAIRS_AT_ONCE = 500_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FreeField:
     """Field of K balls of light in endless tissue.
 
@@ -55,11 +55,8 @@ class FreeField:
 
         The last one is what -D ∇φ would be outside the balls if nothing were absorbed.
         """
-        fluence, gradient, outflow = (
-            np.empty(len(points)),
-            np.empty((len(points), 3)),
-            np.empty((len(points), 3)),
-        )
+        fluence, gradient = np.empty(len(points)), np.empty((len(points), 3))
+        outflow = np.empty_like(gradient)
         for part, distance in self._distances(points):
             value = self._fluence_of_balls(distance)
             fluence[part] = value.sum(axis=1)

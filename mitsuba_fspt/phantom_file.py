@@ -1,9 +1,13 @@
 """The description of a phantom in TOML, lengths in mm, powers in W.
 
 [geometry]
-shape = "cylinder"       # about the z axis, centred at the origin; or file = "mouse.msh" (or any closed
-surface) radius = 15
+shape = "cylinder"       # about the z axis, centred at the origin
+radius = 15
 height = 30
+# Or, in place of these three: tetrahedra or a closed surface in a file beside this one, any format of fspt flux import,
+# file = "mouse.vtu"
+# length_unit = "cm"     # mm where left out
+# labels = "tissue"      # the field of whole numbers that labels the tetrahedra
 
 [optical]
 mua = 0.0138             # absorption, 1/mm
@@ -11,12 +15,12 @@ musp = 0.91              # reduced scattering, 1/mm
 n = 1.37                 # refractive index relative to outside
 a = "robin"              # boundary factor: robin, haskell or a number
 
-[[regions]]              # optional; a shape, or label = 3 of a file's [geometry] labels
+[[regions]]              # optional; sphere, cylinder, or label = 3 in place of a shape
 shape = "sphere"
 centre = [-5, 0, 0]
 radius = 3
 mua = 0.05
-musp = 1.2
+musp = 1.2               # and n, where it is another
 
 [[sources]]              # shape: point, sphere or cylinder
 shape = "cylinder"
@@ -27,7 +31,7 @@ axis = [0, 0, 1]
 power = 1
 
 [mesh]
-edge = 1.5
+edge = 1.5               # of the tetrahedra
 order = 2                # 1 or 2
 
 [output]
@@ -45,6 +49,7 @@ import numpy as np
 
 from .boundary import boundary_a
 from .cylinder import cylinder_tetrahedra
+from .elements import import_skfem
 from .errors import FluxError
 from .medium import Medium, Source
 from .mesher import read_tetrahedra
@@ -158,6 +163,7 @@ class PhantomFile:
 
     def solve(self, progress: Progress | None = None) -> Solution:
         """Mesh the phantom and solve it; see `tissue.solve`."""
+        import_skfem()  # before the mesher's minutes
         if progress:
             progress("mesh")
         media = (self.medium, *(part.medium for part in self.regions))

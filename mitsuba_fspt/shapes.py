@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Nodes:
     """Small uniform balls that together stand for a shape.
 

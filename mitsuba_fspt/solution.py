@@ -45,14 +45,14 @@ class Solution:
 
     @property
     def balance(self) -> float:
-        """(absorbed + exit power)/source power - 1, no unit: the quadrature's error at the border."""
+        """(absorbed + exit power)/source power - 1, no unit: what quadrature on the border misses of the sources."""
         return (self.solved.absorbed + self.solved.exited) / self.source_power - 1
 
     def report(self) -> dict[str, float | int]:
         """Power balance and size, ready for JSON.
 
-        source_power, absorbed_power, exit_power [W]; exit_fraction; balance = (absorbed + exit)/source - 1,
-        which the linear solver leaves over; nodes (unknowns), cells, iterations.
+        source_power, absorbed_power, exit_power [W]; exit_fraction; balance (see there); nodes (unknowns), cells,
+        iterations.
         """
         absorbed, leaving = self.solved.absorbed, self.solved.exited
         return {
@@ -175,7 +175,10 @@ class Solution:
         near = np.flatnonzero(depth(local) > -0.5)
         if self.basis.mesh.affine or len(near) == 0:
             return cells, local
-        local[near] = self._curved_local(points[near], cells[near])
+        there = self._curved_local(points[near], cells[near])
+        converged = depth(there) > -0.5
+        near = near[converged]
+        local[near] = there[converged]
         for _ in range(CURVED_STEPS):
             # A facet that ends in a curved edge is curved too: the point can be in the next cell.
             behind = self.mesh.behind(cells[near], local[near])

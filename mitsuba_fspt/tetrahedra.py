@@ -20,7 +20,7 @@ MOST_STEPS = 200
 ROUND_OFF = 1e-9  # of a barycentric coordinate
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tetrahedra:
     """Tetrahedral mesh.
 

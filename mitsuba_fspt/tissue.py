@@ -8,7 +8,7 @@ that both orders of element reach their full rate and the mesh need not know whe
 
     mesh = cylinder_tetrahedra(radius=15, height=30, edge=1.5)
     solution = solve(mesh, [Medium(0.0138, 0.91, 1.37)], [Source(Ball((8, 0, 0)))])
-    solution.exit_power                                   # 0.3128 W of 1 W
+    solution.solved.exited                                # 0.3128 W of 1 W
     solution.phantom(edge=0.35).write("phantom.ply")
 """
 

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
+from mitsuba_fspt import phantom_file
 from mitsuba_fspt.cylinder import cylinder_tetrahedra
 from mitsuba_fspt.errors import BackendError, FluxError
 from mitsuba_fspt.flux_cli import app
@@ -66,8 +67,17 @@ def test_the_papers_phantoms() -> None:
         assert source.shape.centre[2] - length / 2 == -1.5
 
 
+def test_the_documented_example(tmp_path: Path) -> None:
+    """The docstring's file is one, and says what the defaults are."""
+    assert phantom_file.__doc__
+    phantom = described(tmp_path, phantom_file.__doc__.split("\n", 1)[1])
+    plain = PhantomFile(phantom.geometry, phantom.medium, phantom.sources, phantom.regions)
+    assert phantom == plain
+    assert phantom.regions[0].medium == Medium(0.05, 1.2, 1.37)
+
+
 def test_everything_a_file_can_say(tmp_path: Path) -> None:
-    """The example of the module's docstring, and every kind of source."""
+    """Every kind of source and region, and all that has a default."""
     text = SMALL.replace("musp = 1", 'musp = 1\nn = 1.4\na = "haskell"') + (
         '[[sources]]\nshape = "sphere"\ncentre = [0, 0.5, 1]\nradius = 0.5\n'
         '[[sources]]\nshape = "cylinder"\ncentre = [0, 0, 0]\nradius = 0\nlength = 2\naxis = [0, 1, 0]\npower = 3\n'

@@ -9,6 +9,7 @@ import pytest
 from closed_forms import ball_exitance, layers_fluence
 from numpy.typing import NDArray
 
+from mitsuba_fspt import elements
 from mitsuba_fspt.boundary import robin_a
 from mitsuba_fspt.cylinder import cylinder_tetrahedra
 from mitsuba_fspt.errors import FluxError
@@ -326,6 +327,12 @@ def test_cylinder_mesh() -> None:
 def test_sources_refused(sources: list[Source], message: str) -> None:
     with pytest.raises(FluxError, match=message):
         solve(cylinder_tetrahedra(15, 30, 5), [NYLON], sources)
+
+
+def test_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(elements, "MOST_ITERATIONS", 3)
+    with pytest.raises(FluxError, match="did not converge in 3 iterations"):
+        solve(cylinder_tetrahedra(15, 30, 5), [NYLON], [POINT])
 
 
 def test_arguments_refused() -> None:
