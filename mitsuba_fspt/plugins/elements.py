@@ -42,6 +42,15 @@ class Elements:
     count: int
     corners: tuple[tuple[int, int], ...]  # the samples at which `place` puts an element's corners
 
+    def __init__(self, shape: mi.Shape) -> None:
+        # Emitters keep elements and shapes their emitter: elements that kept the shape would close a circle through
+        # C++, which nobody ever frees. A circle of emitter and elements is Python's own to free.
+        self._emitter = shape.emitter()
+
+    @property
+    def shape(self) -> mi.Shape:
+        return self._emitter.get_shape()
+
     def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
         """Surface point of element `index` at `sample` of [0, 1]², and dA/d(sample) there [mm²]."""
         raise NotImplementedError
@@ -72,7 +81,7 @@ class MeshElements(Elements):
     corners = ((0, 0), (1, 0), (0, 1))
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
-        self.shape = shape
+        super().__init__(shape)
         self._positions, self._faces = triangles(shape)
         faces = dr.width(self._faces) // 3
         self.k = math.ceil(math.sqrt(minimum / max(1, faces)))
@@ -132,7 +141,7 @@ class ParameterElements(Elements):
     corners = ((0, 0), (1, 0), (0, 1), (1, 1))
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
-        self.shape = shape
+        super().__init__(shape)
         self.side = math.ceil(math.sqrt(minimum))
         self.count = self.side**2
 

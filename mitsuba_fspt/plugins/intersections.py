@@ -6,6 +6,8 @@ mode it was built in, so the loss itself is looked for.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,8 +26,26 @@ def robust_scene(scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         "fspt_integral: this scene loses rays that meet mesh edges, so its shapes are set up anew. Put <boolean "
         'name="embree_use_robust_intersections" value="true"/> into the scene, or load it with mitsuba_fspt.load.',
     )
-    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.shapes())}
-    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **shapes})
+    return traced_robustly(scene.shapes())
+
+
+def traced_robustly(shapes: Sequence[mi.Shape]) -> mi.Scene:
+    """A scene of these shapes in Embree's robust mode; `mi.load_dict` would give the shapes other names."""
+    props = mi.Properties("scene")
+    props["embree_use_robust_intersections"] = True
+    for number, shape in enumerate(shapes):
+        props[f"shape_{number}"] = shape
+    return mi.Scene(props)
+
+
+def twin(mesh: mi.Shape) -> mi.Mesh:
+    """The triangles of a mesh and nothing else of it."""
+    positions, faces = triangles(mesh)
+    copy = mi.Mesh("twin", dr.width(positions) // 3, dr.width(faces) // 3)
+    parameters = mi.traverse(copy)
+    parameters["vertex_positions"], parameters["faces"] = positions, faces
+    parameters.update()
+    return copy
 
 
 def loses_rays(scene: mi.Scene, lens: mi.Sensor) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import ExitanceError
 from .elements import ElementDistribution, elements_of, scalar
 from .emission import law_of
+from .intersections import traced_robustly, twin
 from .last_flight import LastFlight
 
 ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
@@ -171,13 +172,13 @@ class FsptSurface(mi.Emitter):
         """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
         if self._checked:
             return
-        self._checked = True
 
         def look(shape: mi.Shape) -> None:
             check_values(shape, exitance_on(shape, self.exitance))
             self.law.prepare(shape)
 
         aside(look, self.get_shape())
+        self._checked = True
 
     def _distribution(self) -> ElementDistribution:
         self.check()
@@ -194,14 +195,12 @@ class FsptSurface(mi.Emitter):
         if not shape.is_mesh():
             return shape.eval_parameterization(ps.uv, active=active)
         if self._probe is None:
-            self._probe = aside(
-                lambda shape: mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "s": shape}),
-                shape,
-            )
+            self._probe = aside(lambda shape: traced_robustly([twin(shape)]), shape)
         reach = 1e-4 * (dr.max(dr.abs(ps.p)) + 1e-3)
         ray = mi.Ray3f(ps.p + reach * ps.n, -ps.n)
         ray.maxt = 2 * reach
-        return self._probe.ray_intersect(ray, active)
+        pi = self._probe.ray_intersect_preliminary(ray, active=active)
+        return shape.compute_surface_interaction(ray, pi, active=active)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         return self.get_shape().bbox()
