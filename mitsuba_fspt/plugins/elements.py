@@ -43,13 +43,13 @@ class Elements:
     corners: tuple[tuple[int, int], ...]  # the samples at which `place` puts an element's corners
 
     def __init__(self, shape: mi.Shape) -> None:
-        # Emitters keep elements and shapes their emitter: elements that kept the shape would close a circle through
-        # C++, which nobody ever frees. A circle of emitter and elements is Python's own to free.
-        self._emitter = shape.emitter()
+        # A pointer array does not keep what it points at. Emitters keep elements and shapes their emitter: elements
+        # that kept the shape would close a circle through C++, which nobody ever frees.
+        self._shape = mi.ShapePtr(shape)
 
     @property
     def shape(self) -> mi.Shape:
-        return self._emitter.get_shape()
+        return self._shape[0]
 
     def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
         """Surface point of element `index` at `sample` of [0, 1]², and dA/d(sample) there [mm²]."""
