@@ -125,7 +125,7 @@ def _sample(
         samples += lens.sampler().sample_count()
     mean = total / passes
     variance = np.maximum(squares / passes - mean * mean, 0) * passes / (passes - 1)
-    name = {"PathIntegrator": "path", "ParticleTracerIntegrator": "ptracer"}
+    name = {"PathIntegrator": "path", "ParticleTracerIntegrator": "ptracer", "VolumetricPathIntegrator": "volpath"}
     how = {
         "method": name.get(integrator.class_name(), integrator.class_name()),
         "sampler": lens.sampler().class_name(),

@@ -39,14 +39,17 @@ class Window:
 def visible_window(scene: mi.Scene, lens: mi.Sensor) -> Window:
     """Window of the pixels with a line of sight into the bounding box of what glows; all if it surrounds the lens.
 
-    Perspective keeps straight lines straight, so that the box's corners bound its blurred image.
+    Light of other emitters than `fspt_surface` can come from any surface of the scene. Perspective keeps straight
+    lines straight, so that the box's corners bound its blurred image.
     """
     film = lens.film()
     width, height = (int(n) for n in film.crop_size())
     offset = (int(film.crop_offset()[0]), int(film.crop_offset()[1]))
+    emitters = scene.emitters()
+    direct = all(type(emitter).__name__ == "FsptSurface" for emitter in emitters)
     corners = [
         np.array([bbox.min, bbox.max])[list(pick), range(3)]
-        for bbox in (emitter.bbox() for emitter in scene.emitters())
+        for bbox in ([emitter.bbox() for emitter in emitters] if direct else [scene.bbox()])
         for pick in itertools.product((0, 1), repeat=3)
     ]
     low, high = lens.film_bounds(np.array(corners).reshape(-1, 3))
