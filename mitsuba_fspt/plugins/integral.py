@@ -46,7 +46,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             pixel=str(props.get("pixel", defaults.pixel)),
             max_nodes=int(props.get("max_nodes", defaults.max_nodes)),
         )
-        self._sound: mi.Scene | None = None
+        # The emitters of the last scene that lost no rays; the scene itself, whose child this is, must not be kept.
+        self._sound: list[mi.Emitter] = []
 
     def solve(self, scene: mi.Scene, sensor: mi.Sensor) -> Solution:
         """Power, error and coverage of the sensor's crop window; errors as in `check_scene`."""
@@ -56,11 +57,11 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""
-        if scene is not self._sound:
+        if scene.emitters() != self._sound:
             robust = robust_scene(scene, lens)
             if robust is not scene:
                 return robust
-            self._sound = scene
+            self._sound = scene.emitters()
         return scene
 
     def render(
