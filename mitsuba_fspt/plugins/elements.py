@@ -203,7 +203,7 @@ class ElementDistribution:
         """Density of `sample` at `si` [1/mm²]."""
         index, area = self.elements.locate(si)
         chance = self._choice.pdf(mi.Point2u(index % self._side, index // self._side), active)
-        return dr.select(active & (area > 0), chance / area, 0)
+        return dr.select(active & si.is_valid() & (area > 0), chance / area, 0)
 
 
 def scalar(spectrum: mi.Spectrum) -> mi.Float:

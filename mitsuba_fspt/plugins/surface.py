@@ -200,7 +200,11 @@ class FsptSurface(mi.Emitter):
         ray = mi.Ray3f(ps.p + reach * ps.n, -ps.n)
         ray.maxt = 2 * reach
         pi = self._probe.ray_intersect_preliminary(ray, active=active)
-        return shape.compute_surface_interaction(ray, pi, active=active)
+        hit = pi.is_valid()
+        pi.prim_index = dr.select(hit, pi.prim_index, 0)
+        si = shape.compute_surface_interaction(ray, pi, active=hit)
+        si.t = dr.select(hit, si.t, dr.inf)
+        return si
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         return self.get_shape().bbox()
