@@ -93,7 +93,10 @@ def law_of(props: mi.Properties) -> Law:
     if name == "fresnel":
         return Fresnel(n)
     mua, musp = (float(_required(props, name, key, "a float [1/mm]")) for key in ("mua", "musp"))
-    return LastFlight(Medium(mua, musp, n), _required(props, name, "fluence", "a volume, such as a gridvolume"))
+    fluence = _required(props, name, "fluence", "a volume, such as a gridvolume")
+    if not isinstance(fluence, mi.Volume):
+        raise ExitanceError(f"fspt_surface: 'fluence' must be a volume, got {fluence!r}. Give a gridvolume.")
+    return LastFlight(Medium(mua, musp, n), fluence)
 
 
 def _required(props: mi.Properties, law: str, name: str, kind: str) -> Any:
