@@ -151,10 +151,11 @@ def draw(path: Path, pictures: dict[str, dict[str, fspt.Image]], pitch: float) -
         top.set_title(view)
         bottom.axhline(1, color="k", linewidth=0.6)
         bottom.set_ylim(0.6, 1.8)
+        bottom.set_xlim(-18, 18)
         bottom.set_xlabel("mm on the object plane")
     axes[0, 0].set_ylabel("W per pixel per W of source")
     axes[1, 0].set_ylabel("law / Monte Carlo")
-    axes[0, 0].legend(fontsize="small")
+    axes[0, 1].legend(fontsize="small", loc="upper left")
     figure.savefig(path, dpi=120)
 
 
