@@ -28,9 +28,11 @@ def dilate(mask: Mask, radius: int) -> Mask:
 def spread_max(image: Image) -> Image:
     """Largest value among the 3 × 3 pixels around each."""
     for axis in (0, 1):
-        wide = np.pad(image, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        n = image.shape[axis]
-        image = np.max([wide.take(range(k, k + n), axis) for k in range(3)], axis=0)
+        image = np.moveaxis(image, axis, 0)
+        spread = image.copy()
+        np.maximum(spread[1:], image[:-1], out=spread[1:])
+        np.maximum(spread[:-1], image[1:], out=spread[:-1])
+        image = np.moveaxis(spread, 0, axis)
     return image
 
 

@@ -19,7 +19,7 @@ SCAN, GAUSS = 4, 3
 
 
 def rays_per_chord(bisections: int) -> int:
-    """Lines of sight that `integrate_chord` looks along."""
+    """Lines of sight that `integrate_chord` looks along at most."""
     return SCAN + 1 + bisections + 2 * GAUSS
 
 
@@ -93,7 +93,8 @@ def apply_rule(scene: mi.Scene, lens: mi.Sensor, centre: mi.Point2f, rule: rules
 def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, bisections: mi.UInt32) -> tuple[mi.Float, mi.Float]:
     """Mean of the integrand and of the hits along a chord, split at its largest jump.
 
-    The jump is looked for between neighbours of `SCAN` + 1 points, then bisected towards the larger difference.
+    The jump is looked for between neighbours of `SCAN` + 1 points, then bisected towards the larger difference; each
+    lit side gets `GAUSS` nodes, a chord without a jump gets them once.
     """
 
     def look(s: mi.Float) -> tuple[mi.Float, mi.Float]:
@@ -104,7 +105,16 @@ def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, bisections: 
         # An outline outranks whatever steep but smooth change lies elsewhere on the chord.
         return dr.abs(f.y - f.x) + dr.select(body.x != body.y, chord.outline, 0)
 
-    def scan(k: mi.UInt32, best: mi.Float, at: mi.Point2f, f: mi.Point2f, body: mi.Point2f, *last: mi.Float) -> tuple:
+    def scan(
+        k: mi.UInt32,
+        best: mi.Float,
+        total: mi.Float,
+        at: mi.Point2f,
+        f: mi.Point2f,
+        body: mi.Point2f,
+        lit: mi.Point2f,
+        *last: mi.Float,
+    ) -> tuple:
         s = 2 * mi.Float(k + 1) / SCAN - 1
         f_s, body_s = look(s)
         f_new, body_new = mi.Point2f(last[0], f_s), mi.Point2f(last[1], body_s)
@@ -112,9 +122,11 @@ def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, bisections: 
         larger = size > best
         return (
             dr.select(larger, size, best),
+            total + size,
             dr.select(larger, mi.Point2f(s - 2 / SCAN, s), at),
             dr.select(larger, f_new, f),
             dr.select(larger, body_new, body),
+            dr.select(body_s > 0, mi.Point2f(dr.minimum(lit.x, s), s), lit),
             f_s,
             body_s,
         )
@@ -131,20 +143,30 @@ def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, bisections: 
             dr.select(left, body_left, body_right),
         )
 
+    zero, pair = mi.Float(0), mi.Point2f(0)
+    f_first, body_first = look(mi.Float(-1))
+    lit = dr.select(body_first > 0, mi.Point2f(-1, -1), mi.Point2f(2, -2))
+    best, total, at, f, body, lit, *_ = repeat(SCAN, scan, zero, zero, pair, pair, pair, lit, f_first, body_first)
+    # One step that is not much larger than the others is a slope: the chord stays whole.
+    jumps = best > 2 * (total - best) / (SCAN - 1)
+    at, *_ = repeat(bisections, bisect, at, f, body, while_true=lambda at, f, body: jumps & (jump(f, body) > 0))
+    split = dr.select(jumps, 0.5 * (at.x + at.y), -1)
+    # A side on which every point looked past the phantom is dark.
+    left, right = jumps & (lit.x <= split), lit.y >= split
+
     nodes, weights = (mi.Float(column) for column in rules.gauss(GAUSS))
 
-    def integrate(k: mi.UInt32, value: mi.Float, hits: mi.Float, split: mi.Float) -> tuple:
-        # With s = split ± length x² a silhouette's √ (of the cosine, of the place on the surface) becomes linear.
-        length = dr.select(k < GAUSS, -1, 1) - split
+    def integrate(k: mi.UInt32, value: mi.Float, hits: mi.Float) -> tuple:
+        length = dr.select(left & (k < GAUSS), -1, 1) - split
         x = dr.gather(mi.Float, nodes, k % GAUSS)
-        weight = dr.gather(mi.Float, weights, k % GAUSS) * x * dr.abs(length)
-        f, body = look(split + length * dr.square(x))
-        return value + weight * f, hits + dr.select(body > 0, weight, 0), split
+        # With s = split ± length x² a silhouette's √ (of the cosine, of the place on the surface) becomes linear.
+        place, slope = dr.select(jumps, dr.square(x), x), dr.select(jumps, 2 * x, 1)
+        weight = dr.gather(mi.Float, weights, k % GAUSS) * 0.5 * slope * dr.abs(length)
+        f, body = look(split + length * place)
+        return value + weight * f, hits + dr.select(body > 0, weight, 0)
 
-    zero, pair = mi.Float(0), mi.Point2f(0)
-    _, at, f, body, *_ = repeat(SCAN, scan, zero, pair, pair, pair, *look(mi.Float(-1)))
-    at, *_ = repeat(bisections, bisect, at, f, body, while_true=lambda at, f, body: jump(f, body) > 0)
-    value, hits, _ = repeat(2 * GAUSS, integrate, zero, zero, 0.5 * (at.x + at.y))
+    count = dr.select(left, GAUSS, 0) + dr.select(right, GAUSS, 0)
+    value, hits = repeat(mi.UInt32(count), integrate, zero, zero)
     return chord.weight * value, chord.weight * hits
 
 
