@@ -40,6 +40,10 @@ LAWS = (lambda: {}, lambda: FRESNEL, lambda: last_flight(*SLOPING))
 NAMES = ["lambert", "fresnel", "last_flight"]
 
 
+def emitting(law, exitance=1.0):
+    return {"type": "fspt_surface", "exitance": exitance, **law}
+
+
 def glowing_sphere(law, exitance=2e-3):
     """A scene of one sphere, radius 3, with a camera that sees it all, and its emitter (alive while the scene is)."""
     scene = mi.load_dict(
@@ -58,7 +62,7 @@ def glowing_sphere(law, exitance=2e-3):
             "sphere": {
                 "type": "sphere",
                 "radius": 3.0,
-                "emitter": {"type": "fspt_surface", "exitance": exitance, **law},
+                "emitter": emitting(law, exitance),
             },
         }
     )
@@ -226,22 +230,40 @@ def test_last_flight_on_a_half_space_is_the_fresnel_law():
     np.testing.assert_allclose(told, expected, rtol=3e-4)
 
 
+def carried(emitter, si, count):
+    """∫ L µ dΩ by a fine rule at surface records that hold each of `count` points once a direction."""
+    local, weight = hemisphere()
+    si.wi = mi.Vector3f(np.tile(local, count))
+    return emitter.eval(si).numpy().reshape(count, weight.size) @ weight
+
+
+def hemisphere():
+    """Directions (3, N) about the normal and their weights for ∫ f µ dΩ."""
+    x, w = np.polynomial.legendre.leggauss(24)
+    mu, w = ((x + 1) / 2) ** 2, (x + 1) / 2 * w
+    cosine, azimuth = (a.ravel() for a in np.meshgrid(mu, np.arange(10) * 2 * np.pi / 10, indexing="ij"))
+    sine = np.sqrt(1 - cosine**2)
+    return np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine]), cosine * np.repeat(w, 10) * np.pi / 5
+
+
 def test_last_flight_carries_the_exitance_everywhere():
     """∫ L µ dΩ = J_n all over the sphere, between the points where it was tabulated too."""
     points = np.random.default_rng(2).normal(size=(3, 50))
     points *= 3 / np.linalg.norm(points, axis=0)
     _scene, emitter = glowing_sphere(last_flight(*SLOPING), exitance=1.0)
-    x, w = np.polynomial.legendre.leggauss(24)
-    mu, w = ((x + 1) / 2) ** 2, (x + 1) / 2 * w
-    azimuth = np.arange(10) * 2 * np.pi / 10
-    cosine, azimuth = (a.ravel() for a in np.meshgrid(mu, azimuth, indexing="ij"))
-    sine = np.sqrt(1 - cosine**2)
-    local = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
-    si = seen(np.repeat(points, cosine.size, axis=1), np.ones((3, 1)))
-    si.wi = mi.Vector3f(np.tile(local, 50))
-    radiance = emitter.eval(si).numpy().reshape(50, cosine.size)
-    carried = radiance @ (cosine * np.repeat(w, 10) * 2 * np.pi / 10)
-    np.testing.assert_allclose(carried, 1, rtol=1e-3)
+    si = seen(np.repeat(points, hemisphere()[1].size, axis=1), np.ones((3, 1)))
+    np.testing.assert_allclose(carried(emitter, si, 50), 1, rtol=1e-3)
+
+
+def test_last_flight_carries_the_exitance_on_a_mesh():
+    """Likewise on the faces of a cube, each with thousands of table entries; one off by an entry: 1e-2 away."""
+    steep = (1.0, (0.12, 0.1, -0.06))
+    cube = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(3)}
+    scene = mi.load_dict({"type": "scene", "cube": cube | {"emitter": emitting(last_flight(*steep))}})
+    where = np.random.default_rng(3).uniform(-2.9, 2.9, (2, 50))
+    where = np.repeat(where, hemisphere()[1].size, axis=1)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(where[0], where[1], 9.0), mi.Vector3f(0, 0, -1)))
+    np.testing.assert_allclose(carried(scene.emitters()[0], si, 50), 1, rtol=2e-4)
 
 
 @pytest.mark.parametrize(
