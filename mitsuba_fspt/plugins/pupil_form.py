@@ -27,6 +27,7 @@ FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot re
 # it cuts off up to this share of the light.
 GAP = {4: 0.5, 12: 0.2}
 CUT = {4: 0.2, 12: 0.06}
+LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more than to shrink to this
 
 Image = NDArray[np.float64]
 
@@ -89,7 +90,7 @@ class _Ladder:
         if self.area:
             bend += pixels.bend(value) / 6
             self.value = np.maximum(value + pixels.laplacian(value) / 24, 0)
-        self.error = np.maximum(bend, self._cut_off(4))
+        self.error = np.maximum(pixels.spread_max(bend), self._cut_off(4))
         rough = self.error > self.tolerance
         if self.area:
             rough |= pixels.border(rough.shape)
@@ -99,12 +100,13 @@ class _Ladder:
         """Twelve nodes over pupil and pixel on the rough pixels; returns the pixels they do not settle either."""
         value, _, _, _, hits, nearest, _ = self._apply(rules.twelve(self.area), rough)
         difference = np.abs(value - self.value)
-        # Where the ladder converges, each rung gains as much as the one before; a jump gains nothing.
+        # Where the ladder converges, each rung gains as much as the one before, on a kinked J_n less, on a jump nothing.
         gain = np.divide(8 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
         self.value = np.where(rough, value, self.value)
         self.hits = np.where(rough, hits, self.hits)
         self.nearest = np.minimum(self.nearest, nearest)
-        error = np.maximum(difference * np.minimum(gain, 1), self._cut_off(12))
+        error = pixels.spread_max(difference * np.clip(gain, LEAST_GAIN, 1))
+        error = np.maximum(error, self._cut_off(12))
         self.error = np.where(rough, error, self.error)
         rougher = rough & (self.error > self.tolerance)
         return rough & pixels.dilate(rougher, self._reach(12))
