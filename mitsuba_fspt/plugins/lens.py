@@ -170,8 +170,8 @@ class FsptLens(mi.Sensor):
         """Radius [pixels] of the blur disc of a point at `depth` z [mm] from the lens plane; inf at z <= 0."""
         disc, u = self.optics.discs[0], self.optics.focus_distance
         back = (u - np.asarray(depth, np.float64)) / u
-        scale = 1 - (1 - disc.shift) * back
         with np.errstate(divide="ignore", invalid="ignore"):
+            scale = 1 - (1 - disc.shift) * back
             radius = self._spread * disc.radius * np.abs(back) / (scale * self.virtual_pitch)
         return np.where(scale > 0, np.nan_to_num(radius, nan=np.inf), np.inf)
 
