@@ -21,12 +21,12 @@ from .window import Window, visible_window
 
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 FIRST_BISECTIONS = 4
-SAFETY = 3.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
+SAFETY = 2.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
-# A silhouette can pass between a rule's outermost nodes and the rim of the pupil: that far in (blur radii), where
-# it cuts off up to this share of the light.
+# A silhouette can pass between a rule's outermost nodes and the rim of the pupil: that far in (blur radii). Near one,
+# a rule is wrong by up to this share of the light.
 GAP = {4: 0.5, 12: 0.2}
-CUT = {4: 0.2, 12: 0.06}
+CUT = {4: 0.3, 12: 0.3}
 LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more than to shrink to this
 
 Image = NDArray[np.float64]
@@ -112,7 +112,7 @@ class _Ladder:
         return rough & pixels.dilate(rougher, self._reach(12))
 
     def _cut_off(self, nodes: int) -> Image:
-        """Light that a silhouette may cut off unseen between a rule's nodes and the rim of the pupil."""
+        """What a rule may be wrong by where a silhouette crosses or hides between its nodes and the pupil's rim."""
         return np.where(pixels.outline(self.hits, self._reach(nodes)), CUT[nodes] * self.value, 0)
 
     def _apply(self, rule: rules.Rule, where: NDArray[np.bool_]) -> list[Image]:
