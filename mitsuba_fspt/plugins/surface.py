@@ -64,7 +64,7 @@ class FsptSurface(mi.Emitter):
         super().__init__(props)
         if "exitance" not in props:
             raise ExitanceError("fspt_surface: 'exitance' is missing. Give J_n in W/mm² as a float or a texture.")
-        self.exitance = props.get_emissive_texture("exitance")
+        self.exitance = _texture(props)
         self.law = law_of(props)
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
@@ -211,6 +211,16 @@ class FsptSurface(mi.Emitter):
 
     def to_string(self) -> str:
         return f"FsptSurface[\n  exitance = {self.exitance},\n  emission = {self.law}\n]"
+
+
+def _texture(props: mi.Properties) -> mi.Texture:
+    """J_n as a texture; a number is the same at all wavelengths, where Mitsuba would make it white light."""
+    value = props["exitance"]
+    if not isinstance(value, int | float):
+        return props.get_emissive_texture("exitance")
+    uniform = mi.Properties("uniform")
+    uniform["value"] = float(value)
+    return mi.PluginManager.instance().create_object(uniform)
 
 
 def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedSpectrum]:
