@@ -26,7 +26,7 @@ class Quadrature:
     rtol: float = 1e-3
     domain: str = "pupil"
     pixel: str = "area"
-    max_nodes: int = 1 << 15
+    max_nodes: int = 1 << 17
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
@@ -36,7 +36,7 @@ class Quadrature:
         if self.pixel not in PIXELS:
             raise SceneError(f"fspt_integral: 'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
         if self.max_nodes < 1:
-            raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 32768.")
+            raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 131072.")
 
 
 @dataclass(frozen=True)

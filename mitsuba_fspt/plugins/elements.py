@@ -52,8 +52,13 @@ class Elements:
     def shape(self) -> mi.Shape:
         return self._shape[0]
 
-    def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        """Surface point of element `index` at `sample` of [0, 1]², and dA/d(sample) there [mm²]."""
+    def place(
+        self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        """Surface point of element `index` at `sample` of [0, 1]², and dA/d(sample) there [mm²].
+
+        With `cut` > 1 that of the element's part number `part` of cut².
+        """
         raise NotImplementedError
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
@@ -88,17 +93,13 @@ class MeshElements(Elements):
         self.k = math.ceil(math.sqrt(minimum / max(1, faces)))
         self.count = faces * self.k**2
 
-    def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        k = self.k
-        face, part = index // (k * k), index % (k * k)
-        # Part r² + c of a face lies in row r of its k rows; odd c are the triangles that stand upside down.
-        row = mi.UInt32(dr.sqrt(mi.Float(part) + 0.5))
-        column = part - row * row
-        i, j, upright = mi.Float(row), mi.Float(column // 2), (column % 2) == 0
-        b = mi.warp.square_to_uniform_triangle(sample)
-        x = i + dr.select(upright, b.x + b.y, b.x)
-        y = j + dr.select(upright, b.y, b.x + b.y)
-        return self._interaction(face, mi.Point2f(x - y, y) / k)
+    def place(
+        self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        face, own = index // (self.k * self.k), index % (self.k * self.k)
+        within = _of_part(mi.UInt32(part), mi.UInt32(cut), mi.warp.square_to_uniform_triangle(sample))
+        si, area = self._interaction(face, _of_part(own, mi.UInt32(self.k), within))
+        return si, area / dr.square(mi.Float(cut))
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
         p0, e1, e2 = self._corners(si.prim_index)
@@ -146,10 +147,16 @@ class ParameterElements(Elements):
         self.side = math.ceil(math.sqrt(minimum))
         self.count = self.side**2
 
-    def place(self, index: mi.UInt32, sample: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        cell = mi.Point2f(mi.Float(index % self.side), mi.Float(index // self.side))
-        si = self.shape.eval_parameterization((cell + sample) / self.side)
-        return si, self._area(si)
+    def place(
+        self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        cell = mi.Point2f(mi.Point2u(index % self.side, index // self.side))
+        number, cut = mi.UInt32(part), mi.UInt32(cut)
+        within = (mi.Point2f(mi.Point2u(number % cut, number // cut)) + sample) / mi.Float(cut)
+        # A hair inside: at their very ends the parameters of a disk miss it.
+        uv = dr.clip((cell + within) / self.side, 2.0**-21, 1 - 2.0**-21)
+        si = self.shape.eval_parameterization(uv)
+        return si, self._area(si) / dr.square(mi.Float(cut))
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
         cell = self._cell(si)
@@ -166,6 +173,19 @@ class ParameterElements(Elements):
 
     def _area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / self.count
+
+
+def _of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:
+    """Coordinates (b1, b2) in a triangle of the point `b` of one of its k² parts.
+
+    Part r² + c lies in row r of k rows; odd c are the triangles that stand upside down.
+    """
+    row = mi.UInt32(dr.sqrt(mi.Float(part) + 0.5))
+    column = part - row * row
+    i, j, upright = mi.Float(row), mi.Float(column // 2), (column % 2) == 0
+    x = i + dr.select(upright, b.x + b.y, b.x)
+    y = j + dr.select(upright, b.y, b.x + b.y)
+    return mi.Point2f(x - y, y) / mi.Float(k)
 
 
 def _barycentric(d: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Point2f:
@@ -204,6 +224,15 @@ class ElementDistribution:
         index, area = self.elements.locate(si)
         chance = self._choice.pdf(mi.Point2u(index % self._side, index // self._side), active)
         return dr.select(active & si.is_valid() & (area > 0), chance / area, 0)
+
+
+WAVELENGTH_NM = 550.0  # where spectral variants look at spectrally flat quantities
+
+
+def at_one_wavelength(record: mi.Ray3f | mi.SurfaceInteraction3f) -> None:
+    """Give a ray or a surface point a wavelength; without one spectral variants read 0 everywhere."""
+    if mi.is_spectral:
+        record.wavelengths = type(record.wavelengths)(WAVELENGTH_NM)
 
 
 def scalar(spectrum: mi.Spectrum) -> mi.Float:

@@ -32,7 +32,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
        - area: integrate over the pixel (Default). centre: the value at its centre times its area, as in the paper.
      * - max_nodes
        - |int|
-       - Lines of sight a pixel may take at most (Default: 32768).
+       - Lines of sight a pixel may take at most (Default: 131072).
 
     Needs an `fspt_lens`. Deterministic: the same bits every run; sampler, samples per pixel and seed are not used.
     """

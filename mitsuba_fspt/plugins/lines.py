@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import rules
-from .elements import scalar
+from .elements import at_one_wavelength, scalar
 
 SCAN, GAUSS = 4, 3
 
@@ -31,6 +31,7 @@ def radiance_on_film(
 ) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; the number of the body that is met, 0 for none; its depth z [mm]."""
     ray, weight, cos_theta = lens.line_of_sight(position, pupil)
+    at_one_wavelength(ray)
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     radiance = scalar(si.emitter(scene).eval(si))
     body = mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))

@@ -100,7 +100,7 @@ class _Ladder:
         """Twelve nodes over pupil and pixel on the rough pixels; returns the pixels they do not settle either."""
         value, _, _, _, hits, nearest, _ = self._apply(rules.twelve(self.area), rough)
         difference = np.abs(value - self.value)
-        # Where the ladder converges, each rung gains as much as the one before, on a kinked J_n less, on a jump nothing.
+        # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
         gain = np.divide(8 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
         self.value = np.where(rough, value, self.value)
         self.hits = np.where(rough, hits, self.hits)

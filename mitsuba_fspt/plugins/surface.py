@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import ExitanceError
-from .elements import ElementDistribution, elements_of, scalar
+from .elements import ElementDistribution, at_one_wavelength, elements_of, scalar
 from .emission import law_of
 from .intersections import traced_robustly, twin
 from .last_flight import LastFlight
@@ -223,6 +223,14 @@ def _texture(props: mi.Properties) -> mi.Texture:
     return mi.PluginManager.instance().create_object(uniform)
 
 
+def _exitance(props: mi.Properties) -> mi.Texture:
+    """The texture of J_n; a number is spectrally flat, where spectral variants would take it for daylight."""
+    number = props["exitance"]
+    if isinstance(number, (int, float)):
+        return mi.load_dict({"type": "uniform", "value": float(number)})
+    return props.get_emissive_texture("exitance")
+
+
 def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedSpectrum]:
     """Wavelengths [nm] and the inverse of their density, in spectral variants; nothing and 1 elsewhere."""
     if not mi.is_spectral:
@@ -251,7 +259,12 @@ def exitance_on(shape: mi.Shape, exitance: mi.Texture) -> Callable[[mi.SurfaceIn
     A mesh attribute the shape does not have would render black without a word.
     """
     if exitance.class_name() != "MeshAttribute":
-        return lambda si: scalar(exitance.eval(si))
+
+        def value(si: mi.SurfaceInteraction3f) -> mi.Float:
+            at_one_wavelength(si)
+            return scalar(exitance.eval(si))
+
+        return value
     name = str(exitance).split('name = "', 1)[1].split('"', 1)[0]
     if not dr.all(shape.has_attribute(name)):
         kind, _, plain = name.partition("_")
