@@ -24,6 +24,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+INTERRUPTED = 130
+
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")]
 Parameters = Annotated[
     list[str] | None,
@@ -166,6 +168,8 @@ def run(arguments: list[str]) -> int:
     """Exit code of `fspt` with these arguments; errors are one line on stderr and leave nothing behind."""
     try:
         code = app(args=arguments, standalone_mode=False)
+        if code == INTERRUPTED:  # typer's own answer to Ctrl-C
+            raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except FsptError as error:
         return _fail(str(error))
@@ -173,7 +177,7 @@ def run(arguments: list[str]) -> int:
         message = getattr(error, "format_message", error.__str__)()
         return _fail(f"{message.rstrip('.')}. See 'fspt --help'.")
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted; nothing was written.", 130)
+        return _fail("interrupted; nothing was written.", INTERRUPTED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

@@ -21,6 +21,9 @@ Metadata = dict[str, str | int | float]
 PREFIX = "fspt:"
 
 
+STREAM_BUFFER = 1 << 16  # bytes, more than any C++ library holds back
+
+
 def write_exr(
     path: str | os.PathLike[str], channels: Mapping[str, NDArray], metadata: Mapping[str, str | int | float]
 ) -> None:
@@ -44,6 +47,9 @@ def write_exr(
     with atomic_path(path, ImageError) as temporary:
         try:
             OpenEXR.File(header, pixels).write(str(temporary))
+            if os.path.getsize(temporary) < STREAM_BUFFER:
+                # All of it waited in the stream's buffer, whose failing flush at the close nobody reports.
+                OpenEXR.File(str(temporary))
         except (RuntimeError, ValueError) as cause:
             reason = _one_line(cause).replace(str(temporary), str(path))
             raise ImageError(f"image file '{path}': {reason} Make room or give another place for it.") from cause

@@ -135,9 +135,7 @@ def path_settings() -> list[Setting]:
 
         return Setting(f"path, {sampler}", spp, run)
 
-    return [
-        setting(sampler, cylinder, spp) for sampler in SPP for cylinder in [scene(sampler)] for spp in SPP[sampler]
-    ]
+    return [setting(sampler, cylinder, spp) for sampler in SPP for cylinder in [scene(sampler)] for spp in SPP[sampler]]
 
 
 def measure(settings: list[Setting], truth: Picture, masks: dict[str, NDArray[np.bool_]], rounds: int) -> None:

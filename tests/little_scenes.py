@@ -71,3 +71,37 @@ def scene_of(*shapes, sensor=None, integrator=None, robust=True):
 def ball(exitance=1e-3, radius=5.0, center=(0.0, 0.0, 0.0)):
     """A glowing sphere."""
     return {"type": "sphere", "radius": radius, "center": list(center), "emitter": glow(exitance)}
+
+
+LENS_XML = """
+    <sensor type="fspt_lens">
+        <float name="focal_length" value="55"/>
+        <float name="f_number" value="$f_number"/>
+        <float name="magnification" value="0.5"/>
+        <float name="pixel_pitch" value="0.8"/>
+        <transform name="to_world"><lookat origin="$distance, 0, 0" target="0, 0, 0" up="0, 0, 1"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="8"/>
+            <integer name="height" value="6"/>
+            <string name="pixel_format" value="luminance"/>
+        </film>
+    </sensor>"""
+
+BALL_XML = """
+    <shape type="sphere">
+        <float name="radius" value="3"/>
+        <emitter type="fspt_surface"><float name="exitance" value="1e-3"/></emitter>
+    </shape>"""
+
+
+def write_scene(path, *, sensor=LENS_XML, shapes=BALL_XML, integrator='<integrator type="fspt_integral"/>', more=""):
+    """Path of a scene file with the parameters f_number and distance, of these parts."""
+    path.write_text(
+        f"""<scene version="3.0.0">
+    <default name="f_number" value="8"/>
+    <default name="distance" value="165"/>
+    {integrator}{sensor}{shapes}{more}
+</scene>
+"""
+    )
+    return path

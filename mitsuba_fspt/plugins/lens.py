@@ -71,7 +71,7 @@ class FsptLens(mi.Sensor):
         _own_film(props)
         _default_sampler(props)
         super().__init__(props)
-        self._numbers = {n: mi.Float64(float(props[n])) for n in REQUIRED + OPTIONAL if props.has_property(n)}
+        self._numbers = {n: mi.Float64(float(props[n])) for n in REQUIRED + OPTIONAL if n in props}
         missing = [name for name in REQUIRED if name not in self._numbers]
         if missing:
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
@@ -133,29 +133,38 @@ class FsptLens(mi.Sensor):
         ray = mi.Ray3f(self.m_to_world @ mi.Point3f(a.x, a.y, 0), self.m_to_world @ d)
         return ray, weight, d.z
 
-    def arrival(
-        self, point: mi.Point3f, pupil: mi.Point2f
-    ) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
+    def blur_disc(self, point: mi.Point3f) -> tuple[mi.Point2f, mi.Float, mi.Float]:
+        """Blur disc of a world point: centre and signed radius [film pixels]; side of a pixel at its depth [mm].
+
+        Its light that heads for `pupil` [unit disc] arrives at centre + radius · pupil: r = x + (a − x)(u − z)/u with
+        a = shift·x + ρ, solved for the virtual point x of the line through r and ρ.
+        """
+        p = self.m_to_world.inverse() @ point
+        back, disc = (self._u - p.z) / self._u, self._discs[0]
+        scale = (1 - (1 - disc.shift) * back) * self._pitch
+        centre = 0.5 * mi.Vector2f(self.film().size()) - mi.Vector2f(p.x, p.y) / scale
+        return mi.Point2f(centre), disc.radius * self._spread * back / scale, scale
+
+    def arrival(self, point: mi.Point3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
         """Where light of a world point that heads for `pupil` [unit disc] arrives: film position [pixels], lens point.
 
         Third (da/dρ)² cosθ u²/d², by which A_pupil/u² turns into the solid angle of the pupil [sr], 0 where no light
         passes; fourth cosθ of the line of sight to the optical axis.
         """
-        p = self.m_to_world.inverse() @ point
-        disc, rho = self._discs[0], pupil * (self._discs[0].radius * self._spread)
-        # r = x + (a − x)(u − z)/u with a = shift·x + ρ: solve for the virtual point x of the line through r and ρ.
-        back = (self._u - p.z) / self._u
-        scale = 1 - (1 - disc.shift) * back
-        x = (mi.Point2f(p.x, p.y) - rho * back) / scale
-        a = disc.shift * x + rho
-        d = mi.Vector3f(a.x - p.x, a.y - p.y, -p.z)
-        distance = dr.norm(d)
-        cos_theta = p.z / distance
+        centre, radius, _ = self.blur_disc(point)
+        position, disc = centre + radius * pupil, self._discs[0]
+        x = self.virtual_point(position)
+        a = disc.shift * x + (disc.radius * self._spread) * pupil
+        lens_point = self.m_to_world @ mi.Point3f(a.x, a.y, 0)
+        depth = (self.m_to_world.inverse() @ point).z
+        distance = dr.norm(lens_point - point)
+        cos_theta = depth / distance
         # dA_a = (da/dρ)² dA_ρ: the pupil point moves along with x unless the disc is fixed in the lens plane.
-        weight = dr.square((1 - disc.shift * back / scale) * self._u / distance) * cos_theta
-        position = 0.5 * mi.Vector2f(self.film().size()) - x / self._pitch
-        weight = dr.select((p.z > 0) & (scale != 0) & self._open(x, a), weight, 0)
-        return position, self.m_to_world @ mi.Point3f(a.x, a.y, 0), weight, cos_theta
+        back = (self._u - depth) / self._u
+        growth = 1 - disc.shift * back / (1 - (1 - disc.shift) * back)
+        weight = dr.square(growth * self._u / distance) * cos_theta
+        passes = (depth > 0) & dr.isfinite(weight) & self._open(x, a)
+        return position, lens_point, dr.select(passes, weight, 0), cos_theta
 
     def _open(self, x: mi.Point2f, a: mi.Point2f) -> mi.Bool:
         """True where the line through virtual point x and lens point a passes every further border (Eq. 5)."""
@@ -258,7 +267,7 @@ def _own_film(props: mi.Properties) -> None:
     for name, child in props.objects():
         if isinstance(child, mi.Film):
             size, crop_offset, crop_size = child.size(), child.crop_offset(), child.crop_size()
-            props.remove_property(name)
+            del props[name]
             break
     crop_size = size if crop_size is None else crop_size
     film = mi.Properties("hdrfilm")

@@ -281,9 +281,12 @@ def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], 
     elements = elements_of(shape, minimum=1 << 14)
     index = dr.arange(mi.UInt32, elements.count)
     corners_and_centre = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
-    values = [exitance(elements.place(index, mi.Point2f(*point))[0]) for point in corners_and_centre]
-    values = np.concatenate([value.numpy() for value in values])
+    points = [elements.place(index, mi.Point2f(*point)) for point in corners_and_centre]
+    everywhere = [np.broadcast_arrays(exitance(si).numpy(), area.numpy()) for si, area in points]
+    values = np.concatenate([value[area > 0] for value, area in everywhere])  # a face without area emits nothing
     name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
+    if not values.size:
+        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has no area to glow. Mend its mesh.")
     if not np.isfinite(values).all():
         raise ExitanceError(f"{name} has NaN or infinite values. Mend the data before rendering.")
     if values.min() < -ROUNDING * values.max(initial=0):

@@ -1,0 +1,121 @@
+"""Footprints: polygons of light on the film, shared out among the pixels they overlap, exactly.
+
+An edge adds, within every pixel it crosses, the area to its right; running sums along the rows turn the edges of a
+polygon into its overlap with every pixel, however large or small it is. All sums are of whole numbers, so that they
+come out alike in whatever order threads add, and that nothing is left beside a polygon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+GRID = 2.0**-20  # corners lie on a grid this fine [pixels], where differences of coordinates are exact
+SPECK = 2.0**-10  # half the side of the square that stands for a polygon too thin to have an inside
+
+
+class Canvas:
+    """Film of `shape` (h, w) on which light of several kinds is laid, in whole multiples of each kind's quantum.
+
+    `centres` False: a pixel gets the light on its area; True: the density at its centre times that area. The sums
+    hold as long as the light on a pixel, and the density of any one polygon, stay below 2⁶² quanta.
+    """
+
+    def __init__(self, shape: tuple[int, int], quanta: Sequence[float], centres: bool) -> None:
+        self.shape, self.quanta, self.centres = shape, quanta, centres
+        self.layers = [dr.zeros(mi.UInt64, shape[0] * shape[1]) for _ in quanta]
+        # Opaque: another film is the same kernel.
+        self._scales = [dr.opaque(mi.Float64, 1 / quantum) for quantum in quanta]
+        self._height, self._width = (dr.opaque(mi.Float64, side) for side in shape)
+
+    def pictures(self) -> list[NDArray[np.float64]]:
+        """All light of each kind laid so far, shape (h, w)."""
+        steps = [mi.Int64(layer).numpy().reshape(self.shape) for layer in self.layers]
+        return [np.cumsum(step, axis=1) * quantum for step, quantum in zip(steps, self.quanta, strict=True)]
+
+    def lay(self, lights: Sequence[mi.Float64], polygon: Sequence[mi.Point2f], active: mi.Bool) -> None:
+        """Spread `lights` evenly over a polygon of four corners [pixels]; what lies beside the canvas is lost.
+
+        A polygon that is not convex or has no area is taken for a speck in its middle.
+        """
+        ring, active = _sound(polygon), mi.Bool(active)
+        if self.centres:  # at whole numbers from here on, and half a grid step off, so that no corner is level with one
+            ring = [corner - mi.Point2d(0.5, 0.5 + GRID / 2) for corner in ring]
+        area = 0.5 * _cross(ring[2] - ring[0], ring[3] - ring[1])
+        # A path all around adds up Σ dy (w - x) = -area.
+        densities = [-light * scale / area for light, scale in zip(lights, self._scales, strict=True)]
+        low, high = _bound(dr.minimum, ring), _bound(dr.maximum, ring)
+        # False also where a corner is not finite.
+        active &= (low.x < self._width) & (low.y < self._height) & (high.y > 0) & (low.x > -dr.inf) & (high.x < dr.inf)
+        border = mi.Point2d(self._width, self._height)
+        add = self._add_crossing if self.centres else self._add_area
+
+        def step(k: mi.UInt32, edge: mi.UInt32, a: mi.Point2d, q: mi.Point2d, *rest: mi.Point2d) -> tuple:
+            """From a towards the corner q as far as the next line between pixels."""
+            d = q - a
+            line = dr.clip(dr.select(d > 0, dr.floor(a) + 1, dr.ceil(a) - 1), 0, border)
+            until = dr.select((line - a) * d > 0, (line - a) / d, dr.inf)
+            t = dr.minimum(until.x, until.y)
+            b = a + t * d
+            b = dr.select(until < dr.inf, dr.select(d > 0, dr.minimum(b, line), dr.maximum(b, line)), b)
+            b = dr.select(until <= t, line, b)
+            arrived = ~(t < 1)
+            b = dr.select(arrived, q, b)
+            add(densities, a, b, ~arrived & (until.y <= t))
+            rest = [dr.select(arrived, new, old) for new, old in zip((*rest, q), (q, *rest), strict=True)]
+            return k + 1, edge + dr.select(arrived, 1, 0), b, *rest
+
+        edges = dr.select(active, mi.UInt32(4), 0)
+        most = mi.UInt32(4 * (self._width + self._height + 8))
+        start = (mi.UInt32(0), mi.UInt32(0), ring[0], *ring[1:], ring[0])
+        dr.while_loop(start, lambda k, edge, *_: (edge < edges) & (k < most), step)
+
+    def _add_area(self, densities: Sequence[mi.Float64], a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> None:
+        """Add the area to the right of ab, within one pixel, to this pixel and to all beyond in its row."""
+        column, row = (dr.floor(dr.minimum(a[n], b[n])) for n in (0, 1))
+        beyond = 0.5 * (a.x + b.x) - column
+        for layer, density in zip(self.layers, densities, strict=True):
+            # A difference of two rounded heights, each a function of one point: around a polygon they cancel.
+            rise = dr.round(density * (b.y - row)) - dr.round(density * (a.y - row))
+            second = dr.round(density * (b.y - a.y) * beyond)
+            self._add(layer, column, row, rise - second)
+            self._add(layer, column + 1, row, second)
+
+    def _add_crossing(self, densities: Sequence[mi.Float64], a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> None:
+        """Where ab ends on a line of centres, add the density to all centres to the right."""
+        for layer, density in zip(self.layers, densities, strict=True):
+            rise = dr.round(dr.select(b.y > a.y, density, -density))
+            self._add(layer, dr.ceil(b.x), b.y, dr.select(crosses, rise, 0))
+
+    def _add(self, layer: mi.UInt64, column: mi.Float64, row: mi.Float64, amount: mi.Float64) -> None:
+        """Add to all pixels of a row from a column on."""
+        column = dr.maximum(column, 0)
+        on = (column < self._width) & (row >= 0) & (row < self._height) & (amount != 0)
+        at = mi.UInt32(dr.select(on, row * self._width + column, 0))
+        # Unsigned, because that wraps around below zero and every backend can add it.
+        dr.scatter_add(layer, mi.UInt64(mi.Int64(amount)), at, on)
+
+
+def _sound(polygon: Sequence[mi.Point2f]) -> list[mi.Point2d]:
+    """The corners on the grid, or those of a speck where they enclose nothing or their edges cross."""
+    ring = [mi.Point2d(dr.round(mi.Point2d(corner) / GRID) * GRID) for corner in polygon]
+    turns = [_cross(ring[k - 1] - ring[k - 2], ring[k] - ring[k - 1]) for k in range(4)]
+    convex = (_bound(dr.minimum, turns) >= 0) | (_bound(dr.maximum, turns) <= 0)
+    wide = dr.abs(_cross(ring[2] - ring[0], ring[3] - ring[1])) > GRID
+    middle = mi.Point2d(dr.round(0.25 * (ring[0] + ring[1] + ring[2] + ring[3]) / GRID) * GRID)
+    speck = [middle + SPECK * mi.Vector2d(x, y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return [dr.select(convex & wide, own, other) for own, other in zip(ring, speck, strict=True)]
+
+
+def _cross(a: mi.Vector2d, b: mi.Vector2d) -> mi.Float64:
+    return a.x * b.y - a.y * b.x
+
+
+def _bound(pick: Callable[..., Any], values: Sequence[Any]) -> Any:
+    """Least or largest of four, component by component."""
+    return pick(pick(values[0], values[1]), pick(values[2], values[3]))
