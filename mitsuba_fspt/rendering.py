@@ -49,7 +49,7 @@ def render(
     sensor : number of the sensor, an `fspt_lens`
     rtol, domain, pixel, max_nodes : accuracy of the integral, see `Quadrature`; None takes the scene's own
     spp : Monte Carlo samples a pixel, >= 2 (default 256); their error is the standard error of independent passes
-    seed : of the Monte Carlo, >= 0 (default 0)
+    seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
     progress : called with what is being done and the share done
 
     Raises
@@ -69,7 +69,8 @@ def render(
     if deterministic:
         power, error, coverage, how = _integrate(scene, lens, integrator, accuracy, progress)
     else:
-        power, error, coverage, how = _sample(scene, lens, integrator, spp or 256, seed or 0, progress)
+        spp, seed = 256 if spp is None else spp, seed or 0
+        power, error, coverage, how = _sample(scene, lens, integrator, spp, seed, progress)
     how["wall_time"] = time.perf_counter() - start
     return Image(power, error, coverage, {"scene": scene.id(), **how, **_lens_numbers(lens), **_versions()})
 
@@ -109,8 +110,8 @@ def _sample(
     check_scene(scene, lens)
     if spp < 2:
         raise SceneError(f"render: 'spp' must be >= 2 for a standard error, got {spp}. Give for example 256.")
-    if seed < 0:
-        raise SceneError(f"render: 'seed' must be >= 0, got {seed}.")
+    if not 0 <= seed < 1 << 32:
+        raise SceneError(f"render: 'seed' must be in 0 … 2^32 - 1, got {seed}. Give for example 1.")
     pixels = math.prod(int(n) for n in lens.film().crop_size())
     passes = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
     total = squares = 0.0
@@ -119,7 +120,8 @@ def _sample(
         if progress:
             progress("sampling", k / passes)
         with dr.suspend_grad():
-            image = integrator.render(scene, lens, seed=seed * 65537 + k, spp=math.ceil(spp / passes))
+            (of_pass,) = np.random.SeedSequence((seed, k)).generate_state(1)
+            image = integrator.render(scene, lens, seed=int(of_pass), spp=math.ceil(spp / passes))
         power = np.array(image, np.float64)[..., 0]
         total, squares = total + power, squares + power * power
         samples += lens.sampler().sample_count()

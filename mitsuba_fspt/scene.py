@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import xml.etree.ElementTree as ElementTree
@@ -41,6 +42,7 @@ def load(path: str | os.PathLike[str], **parameters: object) -> mi.Scene:
             raise SceneError(f"{path}: the root is <{state.root.props.plugin_name()}>, a scene file has <scene>.")
         state.root.props["embree_use_robust_intersections"] = True
         state.root.props.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in texts.items())]))
+        _name_children(state)
         mi.parser.transform_all(config, state)
         scene = mi.parser.instantiate(config, state)
     except (RuntimeError, ValueError) as error:
@@ -78,14 +80,33 @@ def _text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
+def _name_children(state: mi.parser.ParserState) -> None:
+    """Give sensors and shapes without an id one, 'fspt_lens', 'sphere', 'sphere_2', …: errors and `mi.traverse` use it."""
+    import mitsuba as mi
+
+    taken = {node.props.id() for node in state.nodes}
+    for node in state.nodes:
+        if node.type in (mi.ObjectType.Sensor, mi.ObjectType.Shape) and not node.props.id():
+            plain = node.props.plugin_name()
+            names = itertools.chain([plain], (f"{plain}_{number}" for number in itertools.count(2)))
+            node.props.set_id(next(name for name in names if name not in taken))
+            taken.add(node.props.id())
+
+
 def _one_line(message: str) -> str:
     """The place and the cause out of Mitsuba's message, without its source lines and Python's traceback."""
-    message = re.sub(r"\[\w+\.cpp:\d+\] ", "", message)
-    place = re.match(
-        r"(?:At|Error while loading|While loading|Parsing of XML file) ?(.*?\(line \d+, col \d+\))", message
-    )
-    errors = [line for line in message.splitlines() if re.match(r"(\w+\.)*\w*Error: ", line)]
-    if errors:
-        cause = errors[-1].split("Error: ", 1)[1]
-        return f"{place[1]}: {cause}" if place else cause
-    return " ".join(line.strip() for line in message.splitlines() if line.strip())
+    lines = [re.sub(r"\[[\w.]+:\d+\] ", "", line).strip() for line in message.splitlines()]
+    text = " ".join(filter(None, lines))
+    found = re.match(r"(?:At|Error while loading|While loading|Parsing of XML file) (.*?\(line \d+, col \d+\)):? (.*)", text)
+    place, cause = (found[1] + ": ", found[2]) if found else ("", text)
+    ours = [line for line in lines if re.match(r"(\w+\.)*\w*Error: ", line)]
+    unknown = re.match(r'Found \d+ unreferenced .* plugin of type "(\w+)": ', cause)
+    broken = re.match(r'failed to instantiate (\w+) plugin of type "(\w+)": (.*)', cause)
+    if ours:
+        cause = ours[-1].split("Error: ", 1)[1]
+    elif unknown:
+        names = ", ".join(re.findall(r'- \w+ "(\w+)"', cause))
+        cause = f"'{unknown[1]}' has no parameter {names}. Correct its name or leave it out."
+    elif broken:
+        cause = f"cannot load the {broken[1]} '{broken[2]}': {broken[3].rstrip('.!')}. Check its file and parameters."
+    return place + cause

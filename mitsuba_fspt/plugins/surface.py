@@ -223,14 +223,6 @@ def _texture(props: mi.Properties) -> mi.Texture:
     return mi.PluginManager.instance().create_object(uniform)
 
 
-def _exitance(props: mi.Properties) -> mi.Texture:
-    """The texture of J_n; a number is spectrally flat, where spectral variants would take it for daylight."""
-    number = props["exitance"]
-    if isinstance(number, (int, float)):
-        return mi.load_dict({"type": "uniform", "value": float(number)})
-    return props.get_emissive_texture("exitance")
-
-
 def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedSpectrum]:
     """Wavelengths [nm] and the inverse of their density, in spectral variants; nothing and 1 elsewhere."""
     if not mi.is_spectral:
