@@ -97,7 +97,9 @@ def _one_line(message: str) -> str:
     """The place and the cause out of Mitsuba's message, without its source lines and Python's traceback."""
     lines = [re.sub(r"\[[\w.]+:\d+\] ", "", line).strip() for line in message.splitlines()]
     text = " ".join(filter(None, lines))
-    found = re.match(r"(?:At|Error while loading|While loading|Parsing of XML file) (.*?\(line \d+, col \d+\)):? (.*)", text)
+    found = re.match(
+        r"(?:At|Error while loading|While loading|Parsing of XML file) (.*?\(line \d+, col \d+\)):? (.*)", text
+    )
     place, cause = (found[1] + ": ", found[2]) if found else ("", text)
     ours = [line for line in lines if re.match(r"(\w+\.)*\w*Error: ", line)]
     unknown = re.match(r'Found \d+ unreferenced .* plugin of type "(\w+)": ', cause)

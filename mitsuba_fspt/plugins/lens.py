@@ -185,7 +185,7 @@ class FsptLens(mi.Sensor):
         return np.where(scale > 0, np.nan_to_num(radius, nan=np.inf), np.inf)
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels], inf where nothing bounds it."""
+        """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; inf: nothing bounds it."""
         to_camera = np.linalg.inv(np.array(self.m_to_world.matrix, np.float64).reshape(4, 4))
         p = points @ to_camera[:3, :3].T + to_camera[:3, 3]
         disc, u = self.optics.discs[0], self.optics.focus_distance

@@ -26,7 +26,7 @@ from .footprint import Canvas
 from .window import Window, visible_window
 
 FIRST_LINES, GROWTH = 16, 4  # lines of sight a pixel of the image at the first level; times this each level
-MIN_ELEMENTS, PIXELS_PER_ELEMENT = 1 << 14, 16
+MIN_ELEMENTS, MOST_ELEMENTS, PIXELS_PER_ELEMENT = 1 << 10, 1 << 20, 4
 UNBOUNDED_SIDE = 4.0  # what an element counts for that reaches through the lens plane [pixels]: its image has no size
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 SAFETY = 2.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
@@ -37,7 +37,7 @@ COVERAGE_QUANTUM = 2.0**-50
 # Steps of a Kronecker sequence in four dimensions, 1/g … 1/g⁴ with g⁵ = g + 1, and from element to element (golden
 # ratio), in units of 2⁻³²: whole numbers, so that the sequence stays exact however long it gets.
 STEPS, STRIDE = (3679390609, 3152041523, 2700274807, 2313257605), 2654435769
-CELLS = 1.5
+CELLS = 2.0
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 
 Image = NDArray[np.float64]
@@ -235,7 +235,10 @@ def _glow(emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol) -> _Glow:
             f"fspt_integral: domain 'surface' needs surfaces, but the emitter {emitter.class_name()} has none. Give "
             "domain = pupil."
         )
-    elements = elements_of(emitter.get_shape(), max(MIN_ELEMENTS, math.prod(window.shape) // PIXELS_PER_ELEMENT))
+    shape = emitter.get_shape()
+    pixel = lens.blur_disc(mi.Point3f(shape.bbox().center()))[2][0]
+    ideal = float(shape.surface_area()[0]) / (PIXELS_PER_ELEMENT * pixel**2)
+    elements = elements_of(shape, int(min(max(ideal, MIN_ELEMENTS), MOST_ELEMENTS)))
     count = elements.count
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     least, most = np.full(count, np.inf), np.full(count, -np.inf)
@@ -249,6 +252,8 @@ def _glow(emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol) -> _Glow:
         least, most = np.minimum(least, front.numpy()), np.maximum(most, front.numpy())
         axes += (np.array([x, y]) - 0.5)[:, None, None] * centre
         blur = np.maximum(blur, radius[:, 0])
+    bulge = 0.1 * (high - low)
+    low, high = low - bulge, high + bulge
     # Curved elements bulge beyond their corners: there is light unless `front` stays below 0 by as much as it varies.
     dark = 2 * most - least <= 0
     low[dark], high[dark] = np.inf, -np.inf
