@@ -81,7 +81,7 @@ def _text(value: object) -> str:
 
 
 def _name_children(state: mi.parser.ParserState) -> None:
-    """Give sensors and shapes without an id one, 'fspt_lens', 'sphere', 'sphere_2', …: errors and `mi.traverse` use it."""
+    """Give sensors and shapes without an id one, 'fspt_lens', 'sphere', 'sphere_2', for errors and `mi.traverse`."""
     import mitsuba as mi
 
     taken = {node.props.id() for node in state.nodes}
