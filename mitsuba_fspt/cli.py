@@ -167,14 +167,14 @@ def main() -> None:
 def run(arguments: list[str]) -> int:
     """Exit code of `fspt` with these arguments; errors are one line on stderr and leave nothing behind."""
     try:
-        code = app(args=arguments, standalone_mode=False)
+        code = app(args=arguments, prog_name="fspt", standalone_mode=False)
         if code == INTERRUPTED:  # typer's own answer to Ctrl-C
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except FsptError as error:
         return _fail(str(error))
     except TyperException as error:
-        message = getattr(error, "format_message", error.__str__)()
+        message = getattr(error, "format_message", error.__str__)() or "Missing command"
         return _fail(f"{message.rstrip('.')}. See 'fspt --help'.")
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted; nothing was written.", INTERRUPTED)

@@ -71,7 +71,7 @@ class FsptLens(mi.Sensor):
         _own_film(props)
         _default_sampler(props)
         super().__init__(props)
-        self._numbers = {n: mi.Float64(float(props[n])) for n in REQUIRED + OPTIONAL if n in props}
+        self._numbers = {n: _number(props, n) for n in REQUIRED + OPTIONAL if n in props}
         missing = [name for name in REQUIRED if name not in self._numbers]
         if missing:
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
@@ -259,6 +259,13 @@ class _OpaqueDisc:
 
     def __init__(self, disc: Disc) -> None:
         self.shift, self.radius = dr.opaque(mi.Float, disc.shift), dr.opaque(mi.Float, disc.radius)
+
+
+def _number(props: mi.Properties, name: str) -> mi.Float64:
+    try:
+        return mi.Float64(float(props[name]))
+    except (TypeError, ValueError) as error:
+        raise OpticsError(f"fspt_lens: '{name}' must be a number, got {props[name]!r}. Give it as a float.") from error
 
 
 def _own_film(props: mi.Properties) -> None:

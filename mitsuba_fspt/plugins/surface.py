@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import ExitanceError
-from .elements import ElementDistribution, at_one_wavelength, elements_of, scalar
+from .elements import ElementDistribution, at_one_wavelength, elements_of, scalar, triangles
 from .emission import law_of
 from .intersections import traced_robustly, twin
 from .last_flight import LastFlight
@@ -270,6 +270,8 @@ def exitance_on(shape: mi.Shape, exitance: mi.Texture) -> Callable[[mi.SurfaceIn
 
 def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
     """Raise ExitanceError where J_n is negative, not finite or zero everywhere, at every corner and centre."""
+    if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):
+        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has vertices that are not finite. Mend its mesh.")
     elements = elements_of(shape, minimum=1 << 14)
     index = dr.arange(mi.UInt32, elements.count)
     corners_and_centre = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
