@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 
-def load(path: str | os.PathLike[str], **parameters: object) -> mi.Scene:
+def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     """Mitsuba scene of an XML file; keywords replace the file's `<default>` values.
 
     Sets a variant where none is set (see `backend.ensure_variant`), and turns Embree's robust mode on. The scene's
@@ -74,6 +74,8 @@ def _check_parameters(path: Path, parameters: dict[str, object]) -> None:
         if name not in known:
             names = ", ".join(known) or "none"
             raise SceneError(f"{path}: the scene has no parameter '{name}'. Its <default> parameters: {names}.")
+        if name in ("config", "filename"):  # what Mitsuba calls the arguments of its parser
+            raise SceneError(f"{path}: Mitsuba cannot set a parameter '{name}'. Give the <default> another name.")
 
 
 def _text(value: object) -> str:
