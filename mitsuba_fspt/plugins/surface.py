@@ -8,15 +8,13 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..errors import ExitanceError
-from .elements import ElementDistribution, at_one_wavelength, elements_of, scalar, triangles
+from . import exitance
+from .elements import ElementDistribution, elements_of
 from .emission import law_of
 from .intersections import traced_robustly, twin
 from .last_flight import LastFlight
-
-ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
 
 
 class FsptSurface(mi.Emitter):
@@ -64,13 +62,14 @@ class FsptSurface(mi.Emitter):
         super().__init__(props)
         if "exitance" not in props:
             raise ExitanceError("fspt_surface: 'exitance' is missing. Give J_n in W/mm² as a float or a texture.")
-        self.exitance = _texture(props)
+        self.exitance = exitance.texture_of(props)
         self.law = law_of(props)
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
         self._positions: ElementDistribution | None = None
         self._probe: mi.Scene | None = None
         self._checked = False
+        self._attribute: mi.Float | None = None
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
@@ -170,21 +169,25 @@ class FsptSurface(mi.Emitter):
 
     def check(self) -> None:
         """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
+        attribute = exitance.attribute_of(self.get_shape(), self.exitance)
+        # Mitsuba does not tell an emitter of new values on its mesh.
+        if attribute is not None and self._attribute is not None and attribute.index != self._attribute.index:
+            self.parameters_changed([])
         if self._checked:
             return
 
         def look(shape: mi.Shape) -> None:
-            check_values(shape, exitance_on(shape, self.exitance))
+            exitance.check_values(shape, exitance.function_on(shape, self.exitance))
             self.law.prepare(shape)
 
         aside(look, self.get_shape())
-        self._checked = True
+        self._checked, self._attribute = True, attribute
 
     def _distribution(self) -> ElementDistribution:
         self.check()
         if self._positions is None:
             self._positions = aside(
-                lambda shape: ElementDistribution(elements_of(shape), exitance_on(shape, self.exitance)),
+                lambda shape: ElementDistribution(elements_of(shape), exitance.function_on(shape, self.exitance)),
                 self.get_shape(),
             )
         return self._positions
@@ -213,16 +216,6 @@ class FsptSurface(mi.Emitter):
         return f"FsptSurface[\n  exitance = {self.exitance},\n  emission = {self.law}\n]"
 
 
-def _texture(props: mi.Properties) -> mi.Texture:
-    """J_n as a texture; a number is the same at all wavelengths, where Mitsuba would make it white light."""
-    value = props["exitance"]
-    if not isinstance(value, int | float):
-        return props.get_emissive_texture("exitance")
-    uniform = mi.Properties("uniform")
-    uniform["value"] = float(value)
-    return mi.PluginManager.instance().create_object(uniform)
-
-
 def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedSpectrum]:
     """Wavelengths [nm] and the inverse of their density, in spectral variants; nothing and 1 elsewhere."""
     if not mi.is_spectral:
@@ -243,53 +236,6 @@ def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
 
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(run).result()
-
-
-def exitance_on(shape: mi.Shape, exitance: mi.Texture) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
-    """J_n [W/mm²] on one shape as a function that calls no pointer; ExitanceError where an attribute is missing.
-
-    A mesh attribute the shape does not have would render black without a word.
-    """
-    if exitance.class_name() != "MeshAttribute":
-
-        def value(si: mi.SurfaceInteraction3f) -> mi.Float:
-            at_one_wavelength(si)
-            return scalar(exitance.eval(si))
-
-        return value
-    name = str(exitance).split('name = "', 1)[1].split('"', 1)[0]
-    if not dr.all(shape.has_attribute(name)):
-        kind, _, plain = name.partition("_")
-        raise ExitanceError(
-            f"fspt_surface: shape '{shape.id()}' has no mesh attribute '{name}'. In a PLY name the {kind} property "
-            f"'{plain}_x', or bring the values in with 'fspt flux import'."
-        )
-    scale = float(mi.traverse(exitance)["scale"])
-    return lambda si: shape.eval_attribute_1(name, si) * scale
-
-
-def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
-    """Raise ExitanceError where J_n is negative, not finite or zero everywhere, at every corner and centre."""
-    if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):
-        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has vertices that are not finite. Mend its mesh.")
-    elements = elements_of(shape, minimum=1 << 14)
-    index = dr.arange(mi.UInt32, elements.count)
-    corners_and_centre = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
-    points = [elements.place(index, mi.Point2f(*point)) for point in corners_and_centre]
-    everywhere = [np.broadcast_arrays(exitance(si).numpy(), area.numpy()) for si, area in points]
-    values = np.concatenate([value[area > 0] for value, area in everywhere])  # a face without area emits nothing
-    name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
-    if not values.size:
-        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has no area to glow. Mend its mesh.")
-    if not np.isfinite(values).all():
-        raise ExitanceError(f"{name} has NaN or infinite values. Mend the data before rendering.")
-    if values.min() < -ROUNDING * values.max(initial=0):
-        raise ExitanceError(
-            f"{name} must be >= 0 W/mm², its lowest value is {values.min():.4g}. Clip it on import: "
-            "'fspt flux import --clip'."
-        )
-    if values.max() == 0:
-        raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
 
 
 def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:

@@ -1,0 +1,85 @@
+"""J_n on the surface: the texture a scene gives for it, its values on one shape, and what they must be."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import ExitanceError
+from .elements import at_one_wavelength, elements_of, scalar, triangles
+
+ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
+
+
+def texture_of(props: mi.Properties) -> mi.Texture:
+    """J_n as a texture; a number is the same at all wavelengths, where Mitsuba would make it white light."""
+    value = props["exitance"]
+    if not isinstance(value, int | float):
+        return props.get_emissive_texture("exitance")
+    uniform = mi.Properties("uniform")
+    uniform["value"] = float(value)
+    return mi.PluginManager.instance().create_object(uniform)
+
+
+def attribute_of(shape: mi.Shape, texture: mi.Texture) -> mi.Float | None:
+    """The values of the mesh attribute that `texture` reads; None where it reads none, or the mesh has none such."""
+    name = _attribute_name(texture)
+    values = mi.traverse(shape)
+    return mi.Float(values[name]) if name in values else None
+
+
+def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
+    """J_n [W/mm²] on one shape as a function that calls no pointer; ExitanceError where an attribute is missing.
+
+    A mesh attribute the shape does not have would render black without a word.
+    """
+    name = _attribute_name(texture)
+    if name is None:
+
+        def value(si: mi.SurfaceInteraction3f) -> mi.Float:
+            at_one_wavelength(si)
+            return scalar(texture.eval(si))
+
+        return value
+    if not dr.all(shape.has_attribute(name)):
+        kind, _, plain = name.partition("_")
+        raise ExitanceError(
+            f"fspt_surface: shape '{shape.id()}' has no mesh attribute '{name}'. In a PLY name the {kind} property "
+            f"'{plain}_x', or bring the values in with 'fspt flux import'."
+        )
+    scale = float(mi.traverse(texture)["scale"])
+    return lambda si: shape.eval_attribute_1(name, si) * scale
+
+
+def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
+    """Raise ExitanceError where J_n is negative, not finite or zero everywhere, at every corner and centre."""
+    if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):
+        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has vertices that are not finite. Mend its mesh.")
+    elements = elements_of(shape, minimum=1 << 14)
+    index = dr.arange(mi.UInt32, elements.count)
+    corners_and_centre = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
+    points = [elements.place(index, mi.Point2f(*point)) for point in corners_and_centre]
+    everywhere = [np.broadcast_arrays(exitance(si).numpy(), area.numpy()) for si, area in points]
+    values = np.concatenate([value[area > 0] for value, area in everywhere])  # a face without area emits nothing
+    name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
+    if not values.size:
+        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has no area to glow. Mend its mesh.")
+    if not np.isfinite(values).all():
+        raise ExitanceError(f"{name} has NaN or infinite values. Mend the data before rendering.")
+    if values.min() < -ROUNDING * values.max(initial=0):
+        raise ExitanceError(
+            f"{name} must be >= 0 W/mm², its lowest value is {values.min():.4g}. Clip it on import: "
+            "'fspt flux import --clip'."
+        )
+    if values.max() == 0:
+        raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
+
+
+def _attribute_name(texture: mi.Texture) -> str | None:
+    """The mesh attribute a texture reads, which only its description tells."""
+    found = re.match(r'MeshAttribute\[\s*name = "([^"]*)"', str(texture))
+    return found[1] if found else None
