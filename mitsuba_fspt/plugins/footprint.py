@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 GRID = 2.0**-20  # corners lie on a grid this fine [pixels], where differences of coordinates are exact
-SPECK = 2.0**-10  # half the side of the square that stands for a polygon too thin to have an inside
+SPECK = 2.0**-4  # half the side [pixels] of the square that stands for a polygon folded over
+DENSEST = 2.0**57  # quanta a pixel of an honest polygon at the most
 
 
 class Canvas:
     """Film of `shape` (h, w) on which light of several kinds is laid, in whole multiples of each kind's quantum.
 
-    `centres` False: a pixel gets the light on its area; True: the density at its centre times that area. The sums
-    hold as long as the light on a pixel, and the density of any one polygon, stay below 2⁶² quanta.
+    `centres` False: a pixel gets the light on its area; True: the density at its centre times that area. A pixel
+    holds up to 2⁶² quanta, a polygon `DENSEST` quanta a pixel.
     """
 
     def __init__(self, shape: tuple[int, int], quanta: Sequence[float], centres: bool) -> None:
@@ -41,14 +42,15 @@ class Canvas:
     def lay(self, lights: Sequence[mi.Float64], polygon: Sequence[mi.Point2f], active: mi.Bool) -> None:
         """Spread `lights` evenly over a polygon of four corners [pixels]; what lies beside the canvas is lost.
 
-        A polygon that is not convex or has no area is taken for a speck in its middle.
+        A polygon that is not convex or too small for its light is folded over: a speck in its middle stands for it.
         """
-        ring, active = _sound(polygon), mi.Bool(active)
+        lights = [light * scale for light, scale in zip(lights, self._scales, strict=True)]
+        ring, active = _sound(polygon, lights), mi.Bool(active)
         if self.centres:  # at whole numbers from here on, and half a grid step off, so that no corner is level with one
             ring = [corner - mi.Point2d(0.5, 0.5 + GRID / 2) for corner in ring]
         area = 0.5 * _cross(ring[2] - ring[0], ring[3] - ring[1])
         # A path all around adds up Σ dy (w - x) = -area.
-        densities = [-light * scale / area for light, scale in zip(lights, self._scales, strict=True)]
+        densities = [-light / area for light in lights]
         low, high = _bound(dr.minimum, ring), _bound(dr.maximum, ring)
         # False also where a corner is not finite.
         active &= (low.x < self._width) & (low.y < self._height) & (high.y > 0) & (low.x > -dr.inf) & (high.x < dr.inf)
@@ -101,15 +103,17 @@ class Canvas:
         dr.scatter_add(layer, mi.UInt64(mi.Int64(amount)), at, on)
 
 
-def _sound(polygon: Sequence[mi.Point2f]) -> list[mi.Point2d]:
-    """The corners on the grid, or those of a speck where they enclose nothing or their edges cross."""
+def _sound(polygon: Sequence[mi.Point2f], lights: Sequence[mi.Float64]) -> list[mi.Point2d]:
+    """The corners on the grid, or those of a speck."""
     ring = [mi.Point2d(dr.round(mi.Point2d(corner) / GRID) * GRID) for corner in polygon]
     turns = [_cross(ring[k - 1] - ring[k - 2], ring[k] - ring[k - 1]) for k in range(4)]
-    convex = (_bound(dr.minimum, turns) >= 0) | (_bound(dr.maximum, turns) <= 0)
-    wide = dr.abs(_cross(ring[2] - ring[0], ring[3] - ring[1])) > GRID
+    honest = (_bound(dr.minimum, turns) >= 0) | (_bound(dr.maximum, turns) <= 0)
+    area = 0.5 * dr.abs(_cross(ring[2] - ring[0], ring[3] - ring[1]))
+    for light in lights:
+        honest &= (area > GRID) & (light < DENSEST * area)
     middle = mi.Point2d(dr.round(0.25 * (ring[0] + ring[1] + ring[2] + ring[3]) / GRID) * GRID)
     speck = [middle + SPECK * mi.Vector2d(x, y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return [dr.select(convex & wide, own, other) for own, other in zip(ring, speck, strict=True)]
+    return [dr.select(honest, own, other) for own, other in zip(ring, speck, strict=True)]
 
 
 def _cross(a: mi.Vector2d, b: mi.Vector2d) -> mi.Float64:

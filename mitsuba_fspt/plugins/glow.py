@@ -1,0 +1,152 @@
+"""Glowing shapes as the surface form sends light from them: element by element, piece by piece."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SceneError
+from .elements import Elements, elements_of
+from .window import Window
+
+CELLS = 2.0  # balances the cells of the pupil with the size of the pieces, see `cells_of`
+LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
+PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
+BULGE = 0.1  # how far a curved element may reach beyond its corners, in units of their distance
+UNBOUNDED = 4.0  # side [pixels] counted for an element that reaches through the lens plane and has no image
+CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))  # of an element, once around
+
+Image = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Lines of sight of one launch: from `cuts`² pieces of each element through `cells`² cells of the pupil."""
+
+    glow: Glow
+    index: Index
+    cuts: Index
+    cells: Index
+
+    @property
+    def lines(self) -> Index:
+        return (self.cuts * self.cells) ** 2
+
+    def lanes(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32, mi.UInt32]:
+        """Of every line of sight the element, its cuts, its cells and the line's number within the element."""
+        ends = np.cumsum(self.lines)
+        number = np.arange(ends[-1]) - np.repeat(ends - self.lines, self.lines)
+        row = mi.UInt32(np.repeat(np.arange(len(self.index)), self.lines).astype(np.uint32))
+        columns = [mi.UInt32(column.astype(np.uint32)) for column in (self.index, self.cuts, self.cells)]
+        index, cuts, cells = (dr.gather(mi.UInt32, column, row) for column in columns)
+        # Lanes beyond the last one gather 0, and whole numbers divided by 0 end the process.
+        return index, dr.maximum(cuts, 1), dr.maximum(cells, 1), mi.UInt32(number.astype(np.uint32))
+
+
+@dataclass(frozen=True)
+class Glow:
+    """A glowing shape and, for each of its elements, where its light can arrive [pixels of the window].
+
+    sides, blur (count,): longer side of its image, radius of its blur disc; low, high (count, 2): bounds of its
+    light in x and y, empty where it faces away from the lens.
+    """
+
+    emitter: mi.Emitter
+    elements: Elements
+    sides: Image
+    blur: Image
+    low: Image
+    high: Image
+
+    def batches(self, lines: int, mark: NDArray[np.bool_]) -> Iterator[Batch]:
+        """The lines of sight of all elements with light on a marked pixel, some `LANES` at a time."""
+        index = self._touching(mark)
+        cells = cells_of(lines, self.blur[index])
+        cuts = np.ceil(self.sides[index] * math.sqrt(lines) / cells).astype(np.int64)
+        cuts = cuts.clip(1, np.maximum(math.isqrt(LANES) // cells, 1))
+        ends = np.cumsum((cuts * cells) ** 2)
+        first = 0
+        while first < len(index):
+            done = ends[first - 1] if first else 0
+            last = max(first + 1, int(np.searchsorted(ends, done + LANES, side="right")))
+            yield Batch(self, index[first:last], cuts[first:last], cells[first:last])
+            first = last
+
+    def _touching(self, mark: NDArray[np.bool_]) -> Index:
+        """Elements with a marked pixel in their bounds, by the sums over all rectangles that begin at pixel (0, 0)."""
+        total = np.zeros((mark.shape[0] + 1, mark.shape[1] + 1), np.int64)
+        total[1:, 1:] = mark.cumsum(0).cumsum(1)
+        size = np.array(mark.shape[::-1])
+        left, top = np.clip(np.floor(self.low), 0, size).astype(np.int64).T
+        right, bottom = np.clip(np.floor(self.high) + 1, 0, size).astype(np.int64).T
+        marked = total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left]
+        return np.flatnonzero((marked > 0) & (right > left) & (bottom > top))
+
+    @classmethod
+    def seen(cls, emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol: float) -> Glow:
+        """What `lens` sees of an emitter's shape in `window`; SceneError where the emitter has no surface."""
+        if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
+            raise SceneError(
+                f"fspt_integral: domain 'surface' needs surfaces, but emitter {emitter.class_name()} has none. Set "
+                "domain to 'pupil'."
+            )
+        elements = _elements(emitter.get_shape(), lens)
+        count = elements.count
+        low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+        least, most = np.full(count, np.inf), np.full(count, -np.inf)
+        axes, blur = np.zeros((2, count, 2)), np.zeros(count)
+        for corner in CORNERS:
+            si, _ = elements.place(dr.arange(mi.UInt32, count), mi.Point2f(*corner))
+            front = _front(si, lens)
+            dr.eval(si.p, front)
+            centre, radius = lens.film_discs(si.p.numpy().T.astype(np.float64))
+            low, high = np.minimum(low, centre - radius), np.maximum(high, centre + radius)
+            least, most = np.minimum(least, front.numpy()), np.maximum(most, front.numpy())
+            axes += (np.array(corner) - 0.5)[:, None, None] * centre
+            blur = np.maximum(blur, radius[:, 0])
+        sides = np.where(np.isfinite(blur), np.hypot(*axes.transpose(2, 0, 1)).max(axis=0), UNBOUNDED)
+        margin = BULGE * sides[:, None]
+        low, high = low - margin - film_corner(window), high + margin - film_corner(window)
+        # Away for certain: between its corners a curved element may turn to the lens as far again as they differ.
+        away = 2 * most - least <= 0
+        low[away], high[away] = np.inf, -np.inf
+        # An element below a pixel would stay in one piece for some levels, and what that costs would not be seen to
+        # change. A piece of side s misplaces about s²/8 of a step in J_n: small enough, it may stay.
+        sides = np.where(sides > math.sqrt(8 * rtol), np.maximum(sides, 1), sides)
+        return cls(emitter, elements, sides, np.minimum(blur, math.hypot(*window.shape)), low, high)
+
+
+def cells_of(lines: int, blur: Image) -> Index:
+    """Cells M along the pupil, a power of two, for blur discs of these radii [pixels] at so many lines a pixel.
+
+    Balanced: through neighbouring cells a piece's images lie about half its own size apart. At least 4, and no more
+    than leave pieces of a pixel.
+    """
+    ideal = np.ceil(np.log2(np.maximum(CELLS * lines**0.25 * np.sqrt(blur), 4)))
+    return (2 ** np.minimum(ideal, math.log2(lines) // 2)).astype(np.int64)
+
+
+def film_corner(window: Window) -> tuple[int, int]:
+    """Film position (x, y) [pixels] of the window's first pixel."""
+    return window.left + window.crop_offset[0], window.top + window.crop_offset[1]
+
+
+def _elements(shape: mi.Shape, lens: mi.Sensor) -> Elements:
+    """Elements of a few pixels each, so that what one pixel needs concerns few others."""
+    pixel = float(lens.blur_disc(mi.Point3f(shape.bbox().center()))[2][0])
+    ideal = float(shape.surface_area()[0]) / (PIXELS_PER_ELEMENT * pixel**2)
+    return elements_of(shape, int(min(max(ideal, FEWEST_ELEMENTS), MOST_ELEMENTS)))
+
+
+def _front(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Float:
+    """n·(a − r) at the most for any point a of the pupil [mm]: positive where the pupil can see the surface point."""
+    _, middle, _, _ = lens.arrival(si.p, mi.Point2f(0))
+    _, rim, _, _ = lens.arrival(si.p, mi.Point2f(1, 0))
+    return dr.dot(si.n, middle - si.p) + dr.norm(rim - middle)
