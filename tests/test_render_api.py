@@ -1,0 +1,171 @@
+"""`fspt.render`: what may be asked for, what comes back, and that the error it states is its error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsuba_fspt import backend
+
+backend.ensure_variant()
+
+import mitsuba as mi  # noqa: E402
+from little_scenes import ball, lens, scene_of, write_scene  # noqa: E402
+
+import mitsuba_fspt as fspt  # noqa: E402
+from mitsuba_fspt.errors import SceneError  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Two cameras on one ball: 0 sees it as in every test here, 1 is stopped down and has another film."""
+    second = lens(size=(5, 4), f_number=16.0)
+    return mi.load_dict(
+        {"type": "scene", "integrator": {"type": "fspt_integral", "rtol": 1e-2}, "a": lens(size=8), "b": second}
+        | {"ball": ball(radius=3.0)}
+    )
+
+
+def test_a_picture_has_power_error_coverage_and_its_story(scene):
+    image = fspt.render(scene)
+    assert image.power.shape == image.error.shape == image.coverage.shape == (8, 8)
+    assert 0 < image.error.max() < 2e-2 * image.power.max()
+    assert image.coverage.min() == 0
+    assert image.coverage.max() == pytest.approx(1)
+    assert image.power[image.coverage == 0].max() == 0
+    told = image.metadata
+    assert told["method"] == "integral"
+    assert told["rtol"] == 1e-2
+    assert told["domain"] == "pupil"
+    assert told["nodes"] > 0
+    assert told["wall_time"] > 0
+    assert told["variant"] == mi.variant()
+
+
+def test_the_integral_gives_the_same_bits_every_time(scene):
+    first, again = fspt.render(scene), fspt.render(scene)
+    np.testing.assert_array_equal(first.power, again.power)
+    np.testing.assert_array_equal(first.error, again.error)
+
+
+def test_a_scene_file_may_be_given_in_place_of_a_scene(tmp_path):
+    path = write_scene(tmp_path / "s.xml")
+    image = fspt.render(str(path), max_nodes=4)
+    np.testing.assert_array_equal(image.power, fspt.render(fspt.load(path), max_nodes=4).power)
+    assert image.metadata["scene"] == str(path)
+
+
+def test_settings_overrule_the_scenes_own(scene):
+    tight = fspt.render(scene, rtol=1e-3)
+    assert tight.metadata["rtol"] == 1e-3
+    assert tight.metadata["nodes"] > fspt.render(scene).metadata["nodes"]
+    for settings in ({"domain": "surface"}, {"pixel": "centre"}, {"max_nodes": 4}):
+        ((name, value),) = settings.items()
+        assert fspt.render(scene, **settings).metadata[name] == value
+    assert fspt.render(scene).metadata["rtol"] == 1e-2  # the scene is as it was
+
+
+def test_any_sensor_of_the_scene(scene):
+    images = [fspt.render(scene, sensor=number, rtol=1e-2) for number in (0, 1)]
+    assert images[1].shape == (4, 5)
+    assert images[1].metadata["f_number"] == 16
+    # A quarter of the light through half the aperture.
+    assert images[1].power.sum() == pytest.approx(images[0].power.sum() / 4, rel=1e-2)
+    for number in (2, -1):
+        with pytest.raises(SceneError, match=f"sensor {number} does not exist, the scene has 2"):
+            fspt.render(scene, sensor=number)
+
+
+@pytest.mark.parametrize("method", ["path", "ptracer"])
+def test_monte_carlo_repeats_by_its_seed(scene, method):
+    options = {"method": method, "spp": 64}
+    first, again, other = (fspt.render(scene, seed=seed, **options) for seed in (5, 5, 6))
+    # Light tracers add to the film in any order; paths do not.
+    np.testing.assert_allclose(first.power, again.power, rtol=1e-6 * (method == "ptracer"))
+    assert np.abs(first.power - other.power).max() > 1e-3 * first.power.max()
+    assert first.metadata["seed"] == 5
+    assert first.metadata["spp"] == 64
+    assert first.metadata["passes"] == 32
+    assert fspt.render(scene, seed=(1 << 32) - 1, **options).metadata["seed"] == (1 << 32) - 1
+
+
+@pytest.mark.parametrize("method", ["path", "ptracer"])
+def test_the_standard_error_of_monte_carlo_is_its_scatter(scene, method):
+    """Mean z² between independent pictures is near 1 (1.07 for errors from 32 passes)."""
+    images = [fspt.render(scene, method=method, spp=64, seed=seed) for seed in range(8)]
+    power = np.array([image.power for image in images])
+    error = np.array([image.error for image in images])
+    lit = error.min(axis=0) > 1e-3 * power.max()  # leaves out what does not scatter
+    assert lit.sum() >= 8
+    mean_square = (power[:, lit].var(axis=0, ddof=1) / np.square(error[:, lit]).mean(axis=0)).mean()
+    assert 0.6 < mean_square < 1.6
+
+
+def test_samples_may_be_few(scene):
+    image = fspt.render(scene, method="path", spp=2)
+    assert image.metadata["passes"] == 2
+    assert image.error.max() > 0
+
+
+def test_a_scene_without_integrator_takes_the_integral():
+    scene = mi.load_dict({"type": "scene", "lens": lens(), "ball": ball()})
+    assert fspt.render(scene, max_nodes=4).metadata["method"] == "integral"
+
+
+def test_the_scenes_own_monte_carlo_is_taken():
+    scene = scene_of(ball(), integrator={"type": "path", "max_depth": 1}, sensor=lens(sampler={"type": "independent"}))
+    image = fspt.render(scene, spp=4)
+    assert image.metadata["method"] == "path"
+    assert "Independent" in image.metadata["sampler"]
+    assert fspt.render(scene, method="integral", max_nodes=4).metadata["method"] == "integral"
+
+
+@pytest.mark.parametrize("options", [{"max_nodes": 40}, {"method": "path", "spp": 4}])
+def test_progress_is_told(scene, options):
+    told = []
+    fspt.render(scene, progress=lambda what, share: told.append((what, share)), **options)
+    assert {what for what, _ in told} == ({"integrating"} if "max_nodes" in options else {"sampling"})
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert min(shares) >= 0
+    assert max(shares) <= 1
+
+
+def test_exitance_scales_the_picture_and_nothing_clips():
+    """Twelve decades."""
+    sums = [fspt.render(scene_of(ball(j)), max_nodes=4).power.sum() / j for j in (1e-6, 1.0, 1e6)]
+    np.testing.assert_allclose(sums, sums[0], rtol=1e-5)
+
+
+WRONG = {
+    "unknown method": ({"method": "raytrace"}, "'method' must be one of integral, path, ptracer, got 'raytrace'"),
+    "samples for the integral": ({"spp": 4}, "'spp' = 4 has no meaning for integral"),
+    "seed for the integral": ({"seed": 4}, "'seed' = 4 has no meaning for integral"),
+    "accuracy for path": ({"method": "path", "rtol": 1e-3}, "'rtol' = 0.001 has no meaning for Monte Carlo"),
+    "no samples": ({"method": "path", "spp": 0}, "'spp' must be >= 2 for a standard error, got 0"),
+    "one sample": ({"method": "path", "spp": 1}, "'spp' must be >= 2 for a standard error, got 1"),
+    "negative seed": ({"method": "path", "seed": -1}, "'seed' must be in 0"),
+    "huge seed": ({"method": "ptracer", "seed": 1 << 32}, "'seed' must be in 0"),
+    "rtol 0": ({"rtol": 0.0}, "'rtol' must be in (0, 1), got 0"),
+    "rtol 1": ({"rtol": 1.0}, "'rtol' must be in (0, 1), got 1"),
+    "rtol nan": ({"rtol": float("nan")}, "'rtol' must be in (0, 1), got nan"),
+    "domain": ({"domain": "sphere"}, "'domain' must be one of pupil, surface, got 'sphere'"),
+    "pixel": ({"pixel": "corner"}, "'pixel' must be one of area, centre, got 'corner'"),
+    "max_nodes": ({"max_nodes": 0}, "'max_nodes' must be >= 1, got 0"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_settings_that_mean_nothing_are_refused(scene, name):
+    options, message = WRONG[name]
+    with pytest.raises(SceneError) as refused:
+        fspt.render(scene, **options)
+    assert message in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_only_a_lens_makes_watts():
+    scene = mi.load_dict({"type": "scene", "eye": {"type": "perspective"}, "ball": ball()})
+    for options in ({}, {"method": "path", "spp": 4}):
+        with pytest.raises(SceneError, match="power on a pixel needs a lens. Use a sensor of type 'fspt_lens'"):
+            fspt.render(scene, **options)
