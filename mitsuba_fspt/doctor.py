@@ -26,7 +26,13 @@ from .errors import BackendError
 CORE = ("mitsuba-fspt", "mitsuba", "drjit", "numpy", "trimesh", "OpenEXR", "typer", "rich")
 
 # Optional packages, each with the extra that brings it.
-OPTIONAL = {"matplotlib": "plot", "meshio": "mesh", "scikit-fem": "tissue", "scipy": "tissue"}
+OPTIONAL = {
+    "matplotlib": "plot",
+    "meshio": "mesh",
+    "h5py": "mesh",
+    "scikit-fem": "tissue",
+    "scipy": "tissue",
+}
 
 VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
 

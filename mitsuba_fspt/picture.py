@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -155,8 +154,10 @@ def _png(path: str | os.PathLike[str]) -> Path:
 
 def require_matplotlib() -> None:
     """Raise BackendError where matplotlib is missing."""
-    if find_spec("matplotlib") is None:
-        raise BackendError("picture: matplotlib is not installed. pip install 'mitsuba-fspt[plot]'.")
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError as cause:
+        raise BackendError("picture: matplotlib is not installed. pip install 'mitsuba-fspt[plot]'.") from cause
 
 
 def _figure(width: float, height: float) -> Figure:

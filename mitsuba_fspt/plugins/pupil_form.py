@@ -21,7 +21,7 @@ from .window import Window, visible_window
 
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 FIRST_BISECTIONS = 4
-SAFETY = 2.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
+SAFETY = 3.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
 # A silhouette can pass between a rule's outermost nodes and the rim of the pupil: that far in (blur radii). Near one,
 # a rule is wrong by up to this share of the light.
