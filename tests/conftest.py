@@ -21,8 +21,8 @@ def mono():
     mi.set_log_level(level)
 
 
-# What the integral does not yet keep, each with its test: see "Known shortfalls" in the README. A test that passes again
-# leaves this list.
+# What the integral does not yet keep, each with its test: see "Known shortfalls" in the README. A test that passes
+# again leaves this list.
 KNOWN_SHORTFALLS = (
     "test_accuracy.py::test_every_pixel_is_as_accurate_as_asked[('textured_sphere', 0, 2.8, (16, 12, 8, 7))]",
     "test_accuracy.py::test_error_bounds_the_error",

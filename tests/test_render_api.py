@@ -167,5 +167,5 @@ def test_settings_that_mean_nothing_are_refused(scene, name):
 def test_only_a_lens_makes_watts():
     scene = mi.load_dict({"type": "scene", "eye": {"type": "perspective"}, "ball": ball()})
     for options in ({}, {"method": "path", "spp": 4}):
-        with pytest.raises(SceneError, match="power on a pixel needs a lens. Use a sensor of type 'fspt_lens'"):
+        with pytest.raises(SceneError, match=r"power on a pixel needs a lens. Use a sensor of type 'fspt_lens'"):
             fspt.render(scene, **options)

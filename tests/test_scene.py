@@ -84,7 +84,7 @@ def test_included_files_and_their_defaults_count(tmp_path):
     path.write_text(f'<scene version="3.0.0"><include filename="camera.xml"/>{BALL_XML}</scene>')
     assert fspt.load(path).sensors()[0].optics.f_number == 4
     assert fspt.load(path, f_number=5.6).sensors()[0].optics.f_number == pytest.approx(5.6)
-    with pytest.raises(SceneError, match="no parameter 'iso'. Its <default> parameters: f_number"):
+    with pytest.raises(SceneError, match=r"no parameter 'iso'. Its <default> parameters: f_number"):
         fspt.load(path, iso=100)
 
 
