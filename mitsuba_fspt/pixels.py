@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 Image = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+ROUNDING = 1e-4  # of a share of hits: a sum of float32 weights
+
 
 def box_sum(image: Image, radius: int) -> Image:
     """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
@@ -36,22 +38,28 @@ def spread_max(image: Image) -> Image:
     return image
 
 
-def laplacian(image: Image) -> Image:
-    """Sum of the four neighbours minus four times the pixel; 0 on the border."""
-    result = np.zeros_like(image)
-    middle = image[1:-1, 1:-1]
-    result[1:-1, 1:-1] = image[:-2, 1:-1] + image[2:, 1:-1] + image[1:-1, :-2] + image[1:-1, 2:] - 4 * middle
-    return result
+def lattice(shape: tuple[int, int]) -> Mask:
+    """True on one pixel of sixteen, in every row and column at other places than in the next (a rank-1 lattice)."""
+    y, x = np.ogrid[: shape[0], : shape[1]]
+    return (x - 5 * y) % 16 == 0
 
 
-def bend(image: Image) -> Image:
-    """Size of the second differences along rows and columns; an outermost pixel takes its neighbour's."""
-    total = np.zeros_like(image)
-    for axis in (0, 1):
-        if image.shape[axis] > 2:
-            inner = np.abs(np.diff(image, 2, axis))
-            total += np.pad(inner, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-    return total
+def spread_over_lattice(image: Image) -> Image:
+    """Largest value among the 3 × 3 blocks of 4 × 4 pixels around each pixel's block: some lie on the lattice."""
+    h, w = image.shape
+    padded = np.pad(image, ((0, -h % 4), (0, -w % 4)))
+    blocks = padded.reshape(padded.shape[0] // 4, 4, padded.shape[1] // 4, 4).max(axis=(1, 3))
+    return spread_max(blocks).repeat(4, axis=0).repeat(4, axis=1)[:h, :w]
+
+
+def second_differences(image: Image) -> tuple[Image, Image]:
+    """P(k - 1) - 2 P(k) + P(k + 1) along x and y; an outermost pixel takes its neighbour's, 0 on less than three."""
+    along = []
+    for axis in (1, 0):
+        inner = np.diff(image, 2, axis) if image.shape[axis] > 2 else np.zeros_like(image)
+        rim = (image.shape[axis] - inner.shape[axis]) // 2
+        along.append(np.pad(inner, [(rim, rim) if a == axis else (0, 0) for a in (0, 1)], mode="edge"))
+    return along[0], along[1]
 
 
 def gradient(image: Image) -> tuple[Image, Image]:
@@ -62,14 +70,7 @@ def gradient(image: Image) -> tuple[Image, Image]:
 
 def outline(hits: Image, reach: int) -> Mask:
     """True within `reach` pixels of both a hit and a miss, where lines of sight may pass a silhouette."""
-    return dilate(hits > 0, reach) & dilate(hits < 1, reach)
-
-
-def border(shape: tuple[int, int]) -> Mask:
-    """True on the outermost pixels."""
-    mask = np.ones(shape, bool)
-    mask[1:-1, 1:-1] = False
-    return mask
+    return dilate(hits > ROUNDING, reach) & dilate(hits < 1 - ROUNDING, reach)
 
 
 def principal_angle(x: Image, y: Image, radius: int) -> Image:

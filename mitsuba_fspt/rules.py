@@ -65,6 +65,26 @@ def twelve(area: bool) -> Rule:
 # these balance the error of the two, which falls like (chords)^-1.2.
 CHORD_LEVELS = ((4, 1), (4, 2), (8, 2), (8, 3), (16, 3), (16, 4), (24, 5), (32, 6), (48, 8), (64, 11))
 CHORD_ORDER = 1.2
+
+
+@dataclass(frozen=True)
+class AlongChord:
+    """How far a chord is looked into: `scan` intervals, `bisections` of a jump, `gauss` nodes a smooth piece."""
+
+    scan: int
+    bisections: int
+    gauss: int
+
+    @property
+    def rays(self) -> int:
+        """Lines of sight at most: both jumps bisected, three pieces lit."""
+        return self.scan + 1 + 2 * self.bisections + 3 * self.gauss
+
+
+def along_chord(level: int) -> AlongChord:
+    """Every level looks further along its chords too, or what all levels miss there would pass for converged."""
+    return AlongChord(scan=4 + level, bisections=4 + level, gauss=3 + level)
+
 GOLDEN = 0.6180339887498949
 PLASTIC = (0.7548776662466927, 0.5698402909980532)
 

@@ -184,5 +184,5 @@ def test_integral_agrees_with_the_reference_on_a_mesh_with_exitance_at_its_verti
     picture = power(scene(ball, crop=MIDDLE), rtol=1e-3)
     body = TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), glow[mesh.faces])
     truth, error = mesh_truth(camera(*MIDDLE[2:]), body, levels=((512, 3),))
-    assert error.max() < 1e-3 * truth.max()
+    assert error.max() < 1.5e-3 * truth.max()
     np.testing.assert_allclose(picture, truth, atol=1e-3 * truth.max() + 3 * error.max())

@@ -41,25 +41,29 @@ def test_spread_max_is_the_largest_of_nine(shape):
     np.testing.assert_array_equal(pixels.spread_max(values), expected)
 
 
-def test_laplacian_and_bend_of_a_paraboloid():
-    """Second differences of 3x² − 5y² + xy + 2x are 6 and −10 everywhere: sum −4, sizes 16."""
+def test_second_differences_of_a_paraboloid():
+    """Of 3x² − 5y² + xy + 2x they are 6 and −10 everywhere, the rim included."""
     y, x = np.mgrid[0:6, 0:8].astype(float)
-    paraboloid = 3 * x**2 - 5 * y**2 + x * y + 2 * x
-    np.testing.assert_allclose(pixels.laplacian(paraboloid)[1:-1, 1:-1], -4, atol=1e-12)
-    np.testing.assert_allclose(pixels.bend(paraboloid), 16, atol=1e-12)
+    xx, yy = pixels.second_differences(3 * x**2 - 5 * y**2 + x * y + 2 * x)
+    np.testing.assert_allclose(xx, 6, atol=1e-12)
+    np.testing.assert_allclose(yy, -10, atol=1e-12)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_no_film_is_too_small(shape):
-    for function in (pixels.laplacian, pixels.bend, pixels.spread_max):
-        assert np.isfinite(function(image(shape))).all()
-        assert function(image(shape)).shape == shape
+    planes = (*pixels.second_differences(image(shape)), pixels.spread_max(image(shape)))
+    for plane in (*planes, pixels.spread_over_lattice(image(shape))):
+        assert np.isfinite(plane).all()
+        assert plane.shape == shape
 
 
-def test_border_is_the_outermost_ring():
-    assert pixels.border((5, 7)).sum() == 5 * 7 - 3 * 5
-    assert not pixels.border((5, 7))[1:-1, 1:-1].any()
-    assert pixels.border((1, 4)).all()
+def test_lattice_takes_one_pixel_of_sixteen_and_is_near_to_all():
+    """Expected: in every row and column of 16, at all places modulo 4, and within two pixels' reach of every block."""
+    mask = pixels.lattice((32, 48))
+    assert mask.sum() == 32 * 48 // 16
+    assert mask.sum(axis=0).tolist() == [2] * 48
+    assert mask.sum(axis=1).tolist() == [3] * 32
+    assert pixels.spread_over_lattice(mask.astype(float)).min() == 1
 
 
 @pytest.mark.parametrize("angle", [-1.2, -0.4, 0.0, 0.3, 1.0, 1.5])

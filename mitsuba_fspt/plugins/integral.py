@@ -9,6 +9,7 @@ from ..quadrature import Quadrature, Solution
 from . import pupil_form, surface_form
 from .checks import check_scene
 from .intersections import robust_scene
+from .recording import nothing_collected
 
 
 class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
@@ -53,7 +54,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         """Power, error and coverage of the sensor's crop window; errors as in `check_scene`."""
         check_scene(scene, sensor)
         form = surface_form if self.quadrature.domain == "surface" else pupil_form
-        return form.solve(self._traced(scene, sensor), sensor, self.quadrature)
+        with nothing_collected():
+            return form.solve(self._traced(scene, sensor), sensor, self.quadrature)
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""

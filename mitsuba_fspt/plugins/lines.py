@@ -15,24 +15,17 @@ import mitsuba as mi
 from .. import rules
 from .elements import at_one_wavelength, scalar
 
-SCAN, GAUSS = 4, 3
-
-
-def rays_per_chord(bisections: int) -> int:
-    """Lines of sight that `integrate_chord` looks along at most."""
-    return SCAN + 1 + bisections + 2 * GAUSS
-
-
 # ---------------------------------------------------------------------- one line of sight
 
 
 def radiance_on_film(
     scene: mi.Scene, lens: mi.Sensor, position: mi.Point2f, pupil: mi.Point2f
 ) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; the number of the body that is met, 0 for none; its depth z [mm]."""
+    """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; number of the body met, 0 for none or no passage; its depth z [mm]."""
     ray, weight, cos_theta = lens.line_of_sight(position, pupil)
     at_one_wavelength(ray)
-    si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    # Embree traces packets of neighbouring lines of sight three times slower than single rays.
+    si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=weight > 0)
     radiance = scalar(si.emitter(scene).eval(si))
     body = mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))
     return weight * radiance, body, si.t * cos_theta
@@ -91,84 +84,98 @@ def apply_rule(scene: mi.Scene, lens: mi.Sensor, centre: mi.Point2f, rule: rules
 # ---------------------------------------------------------------------- chords where the picture jumps
 
 
-def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, bisections: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Mean of the integrand and of the hits along a chord, split at its largest jump.
+def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, along: rules.AlongChord) -> tuple[mi.Float, ...]:
+    """Mean of the integrand and of the hits along a chord, split at its two largest jumps; 1 if it has any, else 0.
 
-    The jump is looked for between neighbours of `SCAN` + 1 points, then bisected towards the larger difference; each
-    lit side gets `GAUSS` nodes, a chord without a jump gets them once.
+    A jump is looked for between neighbours of `along.scan` + 1 points, then bisected towards the larger difference;
+    every piece that is not dark gets `along.gauss` nodes, a chord without a jump is one piece.
     """
+    intervals = dr.opaque(mi.UInt32, along.scan)
+    step = 2 / mi.Float(intervals)
 
     def look(s: mi.Float) -> tuple[mi.Float, mi.Float]:
         f, body, _ = radiance_on_film(scene, lens, chord.position(s), chord.pupil(s))
         return f, body
 
-    def jump(f: mi.Point2f, body: mi.Point2f) -> mi.Float:
+    def size(jump: _Jump) -> mi.Float:
         # An outline outranks whatever steep but smooth change lies elsewhere on the chord.
-        return dr.abs(f.y - f.x) + dr.select(body.x != body.y, chord.outline, 0)
+        return dr.abs(jump.f.y - jump.f.x) + dr.select(jump.body.x != jump.body.y, chord.outline, 0)
 
-    def scan(
-        k: mi.UInt32,
-        best: mi.Float,
-        total: mi.Float,
-        at: mi.Point2f,
-        f: mi.Point2f,
-        body: mi.Point2f,
-        lit: mi.Point2f,
-        *last: mi.Float,
-    ) -> tuple:
-        s = 2 * mi.Float(k + 1) / SCAN - 1
-        f_s, body_s = look(s)
-        f_new, body_new = mi.Point2f(last[0], f_s), mi.Point2f(last[1], body_s)
-        size = jump(f_new, body_new)
-        larger = size > best
-        return (
-            dr.select(larger, size, best),
-            total + size,
-            dr.select(larger, mi.Point2f(s - 2 / SCAN, s), at),
-            dr.select(larger, f_new, f),
-            dr.select(larger, body_new, body),
-            dr.select(body_s > 0, mi.Point2f(dr.minimum(lit.x, s), s), lit),
-            f_s,
-            body_s,
-        )
+    def scan(k: mi.UInt32, first: _Jump, second: _Jump, total: mi.Float, lit: mi.Point2f, last: mi.Point2f) -> tuple:
+        s = step * mi.Float(k + 1) - 1
+        f, body = look(s)
+        new = _Jump(mi.Point2f(s - step, s), mi.Point2f(last.x, f), mi.Point2f(last.y, body))
+        largest, larger = size(new) > size(first), size(new) > size(second)
+        second = dr.select(largest, first, dr.select(larger, new, second))
+        first = dr.select(largest, new, first)
+        lit = dr.select(body > 0, mi.Point2f(dr.minimum(lit.x, s), s), lit)
+        return first, second, total + size(new), lit, mi.Point2f(f, body)
 
-    def bisect(k: mi.UInt32, at: mi.Point2f, f: mi.Point2f, body: mi.Point2f) -> tuple:
-        s = 0.5 * (at.x + at.y)
-        f_s, body_s = look(s)
-        f_left, body_left = mi.Point2f(f.x, f_s), mi.Point2f(body.x, body_s)
-        f_right, body_right = mi.Point2f(f_s, f.y), mi.Point2f(body_s, body.y)
-        left = jump(f_left, body_left) >= jump(f_right, body_right)
-        return (
-            dr.select(left, mi.Point2f(at.x, s), mi.Point2f(s, at.y)),
-            dr.select(left, f_left, f_right),
-            dr.select(left, body_left, body_right),
-        )
+    def bisect(k: mi.UInt32, jump: _Jump) -> tuple:
+        s = 0.5 * (jump.at.x + jump.at.y)
+        f, body = look(s)
+        left = _Jump(mi.Point2f(jump.at.x, s), mi.Point2f(jump.f.x, f), mi.Point2f(jump.body.x, body))
+        right = _Jump(mi.Point2f(s, jump.at.y), mi.Point2f(f, jump.f.y), mi.Point2f(body, jump.body.y))
+        return (dr.select(size(left) >= size(right), left, right),)
 
-    zero, pair = mi.Float(0), mi.Point2f(0)
-    f_first, body_first = look(mi.Float(-1))
-    lit = dr.select(body_first > 0, mi.Point2f(-1, -1), mi.Point2f(2, -2))
-    best, total, at, f, body, lit, *_ = repeat(SCAN, scan, zero, zero, pair, pair, pair, lit, f_first, body_first)
-    # One step that is not much larger than the others is a slope: the chord stays whole.
-    jumps = best > 2 * (total - best) / (SCAN - 1)
-    at, *_ = repeat(bisections, bisect, at, f, body, while_true=lambda at, f, body: jumps & (jump(f, body) > 0))
-    split = dr.select(jumps, 0.5 * (at.x + at.y), -1)
-    # A side on which every point looked past the phantom is dark.
-    left, right = jumps & (lit.x <= split), lit.y >= split
+    def place(jump: _Jump, is_jump: mi.Bool) -> mi.Float:
+        (jump,) = repeat(bisections, bisect, jump, while_true=lambda jump: is_jump & (size(jump) > 0))
+        return 0.5 * (jump.at.x + jump.at.y)
 
-    nodes, weights = (mi.Float(column) for column in rules.gauss(GAUSS))
+    bisections = dr.opaque(mi.UInt32, along.bisections)
+    f, body = look(mi.Float(-1))
+    lit = dr.select(body > 0, mi.Point2f(-1, -1), mi.Point2f(2, -2))
+    first, second, total, lit, _ = repeat(
+        intervals, scan, dr.zeros(_Jump), dr.zeros(_Jump), mi.Float(0), lit, mi.Point2f(f, body)
+    )
+    # A step that is not much larger than the others is a slope.
+    one, two = size(first), size(second)
+    jumps = one > 2 * (total - one) / (mi.Float(intervals) - 1)
+    both = jumps & (two > 2 * (total - one - two) / (mi.Float(intervals) - 2))
+    s_first, s_second = place(first, jumps), place(second, both)
+    left = dr.select(jumps, dr.select(both, dr.minimum(s_first, s_second), s_first), 1)
+    right = dr.select(both, dr.maximum(s_first, s_second), 1)
+
+    # Pieces 0 … last between -1, left, right, 1; an outer one on which every point looked past the phantom is dark.
+    last = dr.select(both, 2, dr.select(jumps, 1, 0))
+    begin = dr.select(jumps & (lit.x > left), 1, 0)
+    end = dr.select(lit.y >= dr.select(both, right, dr.select(jumps, left, -1)), last + 1, last)
+    gauss = dr.opaque(mi.UInt32, along.gauss)
+    nodes, weights = (mi.Float(column) for column in rules.gauss(along.gauss))
 
     def integrate(k: mi.UInt32, value: mi.Float, hits: mi.Float) -> tuple:
-        length = dr.select(left & (k < GAUSS), -1, 1) - split
-        x = dr.gather(mi.Float, nodes, k % GAUSS)
-        # With s = split ± length x² a silhouette's √ (of the cosine, of the place on the surface) becomes linear.
-        place, slope = dr.select(jumps, dr.square(x), x), dr.select(jumps, 2 * x, 1)
-        weight = dr.gather(mi.Float, weights, k % GAUSS) * 0.5 * slope * dr.abs(length)
-        f, body = look(split + length * place)
+        piece = mi.Int(k // gauss) + begin
+        low = dr.select(piece == 0, -1, dr.select(piece == 1, left, right))
+        high = dr.select(piece == last, 1, dr.select(piece == 0, left, right))
+        x = dr.gather(mi.Float, nodes, k % gauss)
+        share, slope = _towards_jumps(x, piece > 0, piece < last)
+        weight = dr.gather(mi.Float, weights, k % gauss) * slope * 0.5 * (high - low)
+        f, body = look(low + (high - low) * share)
         return value + weight * f, hits + dr.select(body > 0, weight, 0)
 
-    count = dr.select(left, GAUSS, 0) + dr.select(right, GAUSS, 0)
-    value, hits = repeat(mi.UInt32(count), integrate, zero, zero)
-    return chord.weight * value, chord.weight * hits
+    count = mi.UInt32(dr.maximum(end - begin, 0)) * gauss
+    value, hits = repeat(count, integrate, mi.Float(0), mi.Float(0))
+    return chord.weight * value, chord.weight * hits, dr.select(jumps, mi.Float(1), 0)
+
+
+def _towards_jumps(x: mi.Float, at_start: mi.Bool, at_end: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """Place in a piece, x in [0, 1] drawn towards the ends that are jumps, and its derivative.
+
+    There a silhouette's square root (of the cosine, of the place on the surface) becomes linear.
+    """
+    y = 1 - x
+    place = dr.select(at_start, dr.select(at_end, x * x * (3 - 2 * x), x * x), dr.select(at_end, 1 - y * y, x))
+    slope = dr.select(at_start, dr.select(at_end, 6 * x * y, 2 * x), dr.select(at_end, 2 * y, 1))
+    return place, slope
+
+
+@dataclass
+class _Jump:
+    """Two neighbouring points of a chord: places `at`, integrand `f`, numbers of the bodies met."""
+
+    at: mi.Point2f
+    f: mi.Point2f
+    body: mi.Point2f
 
 
 @dataclass

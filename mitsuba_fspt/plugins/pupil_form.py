@@ -16,17 +16,16 @@ from numpy.typing import NDArray
 
 from .. import pixels, rules
 from ..quadrature import Quadrature, Solution
-from .lines import apply_rule, chords_across, integrate_chord, rays_per_chord
+from .lines import apply_rule, chords_across, integrate_chord
 from .window import Window, visible_window
 
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
-FIRST_BISECTIONS = 4
 SAFETY = 3.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
 # A silhouette can pass between a rule's outermost nodes and the rim of the pupil: that far in (blur radii). Near one,
 # a rule is wrong by up to this share of the light.
 GAP = {4: 0.5, 12: 0.2}
-CUT = {4: 0.3, 12: 0.3}
+CUT = {4: 1.0, 12: 0.3}
 LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more than to shrink to this
 
 Image = NDArray[np.float64]
@@ -62,7 +61,7 @@ class _Ladder:
     def climb(self) -> Solution:
         if self.value.size:
             rough = self._four_nodes()
-            if self.quadrature.max_nodes >= 16 and rough.any():
+            if self.quadrature.max_nodes >= 16:
                 rough = self._twelve_nodes(rough)
                 if rough.any():
                     self._chords(rough)
@@ -88,32 +87,49 @@ class _Ladder:
         slope = 4 * np.hypot(mx, my)
         bend = np.abs(contrast) + np.divide(slope**4, 4 * value**3, out=np.zeros_like(value), where=value > 0)
         if self.area:
-            bend += pixels.bend(value) / 6
-            self.value = np.maximum(value + pixels.laplacian(value) / 24, 0)
+            xx, yy = pixels.second_differences(value)
+            bend += (np.abs(xx) + np.abs(yy)) / 6
+            self.value = np.maximum(value + (xx + yy) / 24, 0)
         self.error = np.maximum(pixels.spread_max(bend), self._cut_off(4))
         rough = self.error > self.tolerance
-        if self.area:
-            rough |= pixels.border(rough.shape)
+        if self.area and min(rough.shape) < 3:
+            rough[:] = True  # no neighbour tells how the picture bends
         return pixels.dilate(rough, self._reach(4))
 
     def _twelve_nodes(self, rough: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Twelve nodes over pupil and pixel on the rough pixels; returns the pixels they do not settle either."""
-        value, _, _, _, hits, nearest, _ = self._apply(rules.twelve(self.area), rough)
-        difference = np.abs(value - self.value)
-        # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
-        gain = np.divide(8 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
-        self.value = np.where(rough, value, self.value)
-        self.hits = np.where(rough, hits, self.hits)
-        self.nearest = np.minimum(self.nearest, nearest)
-        error = pixels.spread_max(difference * np.clip(gain, LEAST_GAIN, 1))
-        error = np.maximum(error, self._cut_off(12))
-        self.error = np.where(rough, error, self.error)
+        """Twelve nodes over pupil and pixel on the rough pixels and their surroundings where four mislead.
+
+        Returns the pixels that twelve do not settle either. Four nodes cannot see all that they miss, so a lattice of
+        pixels is probed with twelve: what four were off by there counts for the pixels around.
+        """
+        probes = pixels.lattice(rough.shape) & (self.hits > 0) & ~rough
+        difference = self._refine(rough | probes)
+        doubt = pixels.spread_over_lattice(np.where(probes, difference, 0))
+        self.error = np.where(rough, self.error, np.maximum(self.error, doubt))
+        misled = ~rough & (self.hits > 0) & (self.error > self.tolerance)
+        if misled.any():
+            self._refine(misled & ~probes)
+        rough = rough | misled
         rougher = rough & (self.error > self.tolerance)
         return rough & pixels.dilate(rougher, self._reach(12))
 
+    def _refine(self, where: NDArray[np.bool_]) -> Image:
+        """Twelve nodes on the marked pixels; returns how far four were off there, 0 elsewhere."""
+        value, _, _, _, hits, nearest, _ = self._apply(rules.twelve(self.area), where)
+        difference = np.where(where, np.abs(value - self.value), 0)
+        # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
+        gain = np.divide(8 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
+        self.value = np.where(where, value, self.value)
+        self.hits = np.where(where, hits, self.hits)
+        self.nearest = np.minimum(self.nearest, nearest)
+        error = pixels.spread_max(difference * np.clip(gain, LEAST_GAIN, 1))
+        self.error = np.where(where, np.maximum(error, self._cut_off(12)), self.error)
+        return difference
+
     def _cut_off(self, nodes: int) -> Image:
         """What a rule may be wrong by where a silhouette crosses or hides between its nodes and the pupil's rim."""
-        return np.where(pixels.outline(self.hits, self._reach(nodes)), CUT[nodes] * self.value, 0)
+        brightest = pixels.spread_max(self.value)
+        return np.where(pixels.outline(self.hits, self._reach(nodes)), CUT[nodes] * brightest, 0)
 
     def _apply(self, rule: rules.Rule, where: NDArray[np.bool_]) -> list[Image]:
         """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
@@ -136,23 +152,28 @@ class _Ladder:
         angle = pixels.principal_angle(*pixels.gradient(self.value), 1 + math.ceil(self.blur / 2)).ravel()
         across_pupil = self._across_pupil().ravel()
         value, hits, error = self.value.ravel(), self.hits.ravel(), self.error.ravel()
-        change, count = np.zeros_like(value), 1
+        change, split, count = np.zeros_like(value), np.zeros(value.shape, bool), 1
         for level, (m, q) in enumerate(rules.CHORD_LEVELS):
-            rule = rules.chords(m, q, self.area)
-            bisections = FIRST_BISECTIONS + level
-            rays = len(rule) * rays_per_chord(bisections)
+            rule, along = rules.chords(m, q, self.area), rules.along_chord(level)
+            rays = len(rule) * along.rays
             if not len(index) or 16 + rays > self.quadrature.max_nodes:
                 break
             # What the change before this one should have become by now, lest two wrong values agree by chance.
             change *= (count / len(rule)) ** rules.CHORD_ORDER
             count = len(rule)
             for part in _chunks(index, max(1, LANES // count)):
-                mean, met = self._chord_means(part, angle[part], across_pupil[part], rule, bisections)
+                mean, met, jumps = self._chord_means(part, angle[part], across_pupil[part], rule, along)
                 change[part] = np.maximum(np.abs(mean - value[part]), change[part])
-                value[part], hits[part] = mean, met
+                # Where the first chords meet no jump after all, twelve nodes were the better rule.
+                better = (jumps > 0) | (level > 0)
+                value[part], hits[part] = np.where(better, mean, value[part]), np.where(better, met, hits[part])
+                split[part] = jumps > 0
             self._count(f"{count} chords", len(index), rays)
             error[index] = SAFETY * pixels.spread_max(change.reshape(self.value.shape)).ravel()[index]
             index = index[error[index] > self.tolerance]
+            if level == 0:
+                # Across the pupil all other directions have Gauss nodes: right for smooth pixels, sharp or not.
+                across_pupil |= self._calm(split.reshape(self.value.shape)).ravel()
 
     def _chord_means(
         self,
@@ -160,9 +181,9 @@ class _Ladder:
         angle: Image,
         across_pupil: NDArray[np.bool_],
         rule: rules.Chords,
-        bisections: int,
+        along: rules.AlongChord,
     ) -> list[Image]:
-        """Mean radiance on film and share of hits over the chords of each listed pixel, in one launch."""
+        """Mean radiance on film, share of hits and number of split chords of each listed pixel, in one launch."""
         count = dr.opaque(mi.UInt32, len(rule))
         lane = dr.arange(mi.UInt32, len(part) * len(rule))
         pixel, number = lane // count, lane % count
@@ -174,7 +195,7 @@ class _Ladder:
             dr.gather(mi.Bool, mi.Bool(across_pupil), pixel),
             dr.opaque(mi.Float, 2 * float(self.value.max())),
         )
-        means = integrate_chord(self.scene, self.lens, chord, dr.opaque(mi.UInt32, bisections))
+        means = integrate_chord(self.scene, self.lens, chord, along)
         means = [mi.Float64(mean) for mean in means]
         dr.eval(means)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
         sums = [dr.block_sum(mean, len(rule)) for mean in means]
@@ -187,6 +208,10 @@ class _Ladder:
             return np.ones(self.value.shape, bool)
         nearest = -pixels.spread_max(-self.nearest)
         return self.lens.blur_radius(nearest) > 0.5
+
+    def _calm(self, split: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """True where neither a pixel nor its neighbours jump: no chord of theirs was split, no outline passes."""
+        return ~pixels.dilate(split | pixels.outline(self.hits, 1), 1)
 
     def _largest_blur(self, nearest: Image, far: Image) -> float:
         seen = np.isfinite(nearest)
