@@ -51,8 +51,8 @@ def write_exr(
                 # All of it waited in the stream's buffer, whose failing flush at the close nobody reports.
                 OpenEXR.File(str(temporary))
         except (RuntimeError, ValueError) as cause:
-            reason = _one_line(cause).replace(str(temporary), str(path))
-            raise ImageError(f"image file '{path}': {reason} Make room or give another place for it.") from cause
+            reason = _one_line(cause).replace(str(temporary), str(path)).rstrip(".")
+            raise ImageError(f"image file '{path}': {reason}. Make room or give another place for it.") from cause
 
 
 def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], Metadata]:

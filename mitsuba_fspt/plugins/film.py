@@ -1,0 +1,39 @@
+"""The film and the sampler of `fspt_lens`: a power on a pixel is one float32 number gathered by that pixel alone."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+
+def own_film(props: mi.Properties) -> None:
+    """Replace the film of the scene file by one of its size that stores power: monochrome, float32, box filter."""
+    size, crop_offset, crop_size = (256, 256), (0, 0), None
+    for name, child in props.objects():
+        if isinstance(child, mi.Film):
+            size, crop_offset, crop_size = child.size(), child.crop_offset(), child.crop_size()
+            del props[name]
+            break
+    crop_size = size if crop_size is None else crop_size
+    film = mi.Properties("hdrfilm")
+    film["width"], film["height"] = int(size[0]), int(size[1])
+    film["crop_offset_x"], film["crop_offset_y"] = int(crop_offset[0]), int(crop_offset[1])
+    film["crop_width"], film["crop_height"] = int(crop_size[0]), int(crop_size[1])
+    film["pixel_format"], film["component_format"] = "luminance", "float32"
+    film["rfilter"] = _make(mi.Properties("box"))
+    props["film"] = _make(film)
+
+
+def default_sampler(props: mi.Properties) -> None:
+    """The best stock sampler for one bounce, where the scene file names none."""
+    if not any(isinstance(child, mi.Sampler) for _, child in props.objects()):
+        sampler = mi.Properties("multijitter")
+        sampler["sample_count"] = 64
+        props["sampler"] = _make(sampler)
+
+
+def _make(props: mi.Properties) -> mi.Object:
+    """A plugin made without `mi.load_dict`, which sets the process's file resolver aside for a moment.
+
+    Scenes load on several threads, and one that looks for a file in that moment reads freed memory.
+    """
+    return mi.PluginManager.instance().create_object(props)

@@ -1,0 +1,312 @@
+"""Bad input: by the API an error of its class, by the command line exit code 2, one line, nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from little_scenes import BALL_XML, LENS_XML, write_ply, write_scene
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt import cli
+from mitsuba_fspt.errors import ExitanceError, FsptError, ImageError, OpticsError, SceneError
+
+SQUARE = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
+FACES = [(0, 1, 2), (0, 2, 3)]
+
+
+def lens(old="", new=""):
+    """The lens with one thing put otherwise."""
+    assert old in LENS_XML
+    return {"sensor": LENS_XML.replace(old, new)}
+
+
+def with_number(name, value):
+    return lens("<transform", f'<float name="{name}" value="{value}"/><transform')
+
+
+def with_model(name):
+    return lens("<transform", f'<string name="model" value="{name}"/><transform')
+
+
+def focus(tag):
+    return lens('<float name="magnification" value="0.5"/>', tag)
+
+
+def of_ball(old, new):
+    assert old in BALL_XML
+    return {"shapes": BALL_XML.replace(old, new)}
+
+
+def integral(tag):
+    return {"integrator": f'<integrator type="fspt_integral">{tag}</integrator>'}
+
+
+def mesh(name, kind="vertex"):
+    return {
+        "shapes": f"""
+    <shape type="ply" id="mouse"><string name="filename" value="{name}"/><boolean name="face_normals" value="true"/>
+        <emitter type="fspt_surface"><texture type="mesh_attribute" name="exitance">
+            <string name="name" value="{kind}_exitance"/></texture></emitter></shape>"""
+    }
+
+
+def write_meshes(folder):
+    write_ply(folder / "negative.ply", SQUARE, FACES, vertex=[1, 1, -2, 1])
+    write_ply(folder / "negative_face.ply", SQUARE, FACES, face=[1, -2])
+    write_ply(folder / "dark.ply", SQUARE, FACES, vertex=[0, 0, 0, 0])
+    write_ply(folder / "plain.ply", SQUARE, FACES)
+    write_ply(folder / "point.ply", [(1, 1, 1)] * 4, FACES, vertex=[1] * 4)
+    write_ply(folder / "line.ply", [(0, 0, z) for z in range(4)], FACES, vertex=[1] * 4)
+    write_ply(folder / "no_faces.ply", SQUARE, [], vertex=[1] * 4)
+    write_ply(folder / "empty.ply", [], [], vertex=[])
+    (folder / "words.ply").write_text("no mesh at all\n")
+    (folder / "cut.ply").write_text("\n".join((folder / "plain.ply").read_text().splitlines()[:11]))
+    # NaN has no spelling in an ASCII PLY.
+    for name, bad in (("nan.ply", 3), ("nan_vertex.ply", 0), ("inf.ply", 3)):
+        vertices = np.array([(*p, 1) for p in SQUARE], "<f4")
+        vertices[2, bad] = np.inf if name == "inf.ply" else np.nan
+        properties = "".join(f"property float {p}\n" for p in ("x", "y", "z", "exitance_x"))
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex 4\n{properties}"
+        header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        faces = b"".join(struct.pack("<B3i", 3, *face) for face in FACES)
+        (folder / name).write_bytes(header.encode() + vertices.tobytes() + faces)
+
+
+LENSES = {
+    "u below F": (
+        focus('<float name="focus_distance" value="40"/>'),
+        "'focus_distance' must be > focal_length = 55 mm",
+    ),
+    "u equal to F": (focus('<float name="focus_distance" value="55"/>'), "'focus_distance' must be > focal_length"),
+    "v below F": (focus('<float name="image_distance" value="50"/>'), "'image_distance' must be > focal_length"),
+    "no focus": (focus(""), "'image_distance' sets the focus, got none"),
+    "two focuses": (with_number("focus_distance", 165), "got 'focus_distance' and 'magnification'"),
+    "f_number 0": (lens("$f_number", "0"), "'f_number' must be > 0 and finite, got 0"),
+    "f_number negative": (lens("$f_number", "-2.8"), "'f_number' must be > 0 and finite, got -2.8"),
+    "f_number nan": (lens("$f_number", "nan"), "'f_number' must be > 0 and finite, got nan"),
+    "f_number missing": (lens('<float name="f_number" value="$f_number"/>', ""), "'f_number' is missing"),
+    "focal_length 0": (lens('value="55"', 'value="0"'), "'focal_length' must be > 0"),
+    "small lens": (with_number("lens_diameter", 3), "'lens_diameter' = 3 mm is smaller than the diaphragm D"),
+    "pitch 0": (lens('value="0.8"', 'value="0"'), "'pixel_pitch' must be > 0 and finite, got 0"),
+    "pitch negative": (lens('value="0.8"', 'value="-0.8"'), "'pixel_pitch' must be > 0 and finite, got -0.8"),
+    "pitch in words": (
+        lens('<float name="pixel_pitch" value="0.8"/>', '<string name="pixel_pitch" value="big"/>'),
+        "'pixel_pitch' must be a number, got 'big'",
+    ),
+    "unknown model": (with_model("zoom"), "'model' must be one of diaphragm, hrrt, pinhole, ripoll, got 'zoom'"),
+    "hrrt without a border": (with_model("hrrt"), "needs 'lens_diameter'"),
+    "ripoll without its cone": (with_model("ripoll"), "needs 'numerical_aperture' in"),
+    "a camera that scales": (lens("<lookat", '<scale value="2"/><lookat'), "'to_world' scales lengths"),
+}
+
+SURFACES = {
+    "negative": (
+        of_ball("1e-3", "-1e-3"),
+        "'exitance' of shape 'sphere' must be >= 0 W/mm², its lowest value is -0.001",
+    ),
+    "nan": (of_ball("1e-3", "nan"), "'exitance' of shape 'sphere' has NaN or infinite values"),
+    "infinite": (of_ball("1e-3", "inf"), "has NaN or infinite values"),
+    "zero": (of_ball("1e-3", "0"), "'exitance' of shape 'sphere' is 0 everywhere"),
+    "missing": (of_ball('<float name="exitance" value="1e-3"/>', ""), "'exitance' is missing"),
+    "a vertex negative": (
+        mesh("negative.ply"),
+        "'exitance' of shape 'mouse' must be >= 0 W/mm², its lowest value is -2",
+    ),
+    "a face negative": (mesh("negative_face.ply", "face"), "its lowest value is -2"),
+    "a vertex nan": (mesh("nan.ply"), "'exitance' of shape 'mouse' has NaN or infinite values"),
+    "a vertex infinite": (mesh("inf.ply"), "has NaN or infinite values"),
+    "all vertices 0": (mesh("dark.ply"), "'exitance' of shape 'mouse' is 0 everywhere"),
+    "no such attribute": (mesh("plain.ply"), "shape 'mouse' has no mesh attribute 'vertex_exitance'. In a PLY name"),
+    "attribute on the faces": (mesh("negative_face.ply"), "has no mesh attribute 'vertex_exitance'"),
+    "mesh of one point": (mesh("point.ply"), "shape 'mouse' has no area to glow"),
+    "mesh on a line": (mesh("line.ply"), "shape 'mouse' has no area to glow"),
+}
+
+FILES = {
+    "another camera": ({"sensor": '<sensor type="perspective"/>'}, "Use a sensor of type 'fspt_lens'"),
+    "no camera": ({"sensor": ""}, "sensor 0 does not exist, the scene has 0"),
+    "camera inside": (of_ball('value="3"', 'value="300"'), "the lens stands inside the phantom"),
+    "nothing glows": ({"shapes": '<shape type="sphere"/>'}, "nothing glows"),
+    "nothing there": ({"shapes": ""}, "nothing glows"),
+    "no mesh file": (mesh("gone.ply"), '"gone.ply": file not found'),
+    "words for a mesh": (mesh("words.ply"), '"words.ply": invalid PLY header'),
+    "half a mesh": (mesh("cut.ply"), '"cut.ply": could not parse'),
+    "mesh without faces": (mesh("no_faces.ply"), "cannot load the shape 'ply'"),
+    "empty mesh": (mesh("empty.ply"), "cannot load the shape 'ply'"),
+    "a vertex that is nowhere": (mesh("nan_vertex.ply"), "mesh contains invalid vertex position data"),
+    "unknown lens parameter": (with_number("fnumber", 3), "'fspt_lens' has no parameter fnumber. Correct its name"),
+    "unknown surface parameter": (
+        of_ball('<float name="exitance"', '<float name="excitance" value="1"/><float name="exitance"'),
+        "'fspt_surface' has no parameter excitance",
+    ),
+    "unknown integral parameter": (
+        integral('<float name="rtoll" value="1"/>'),
+        "'fspt_integral' has no parameter rtoll",
+    ),
+    "unknown plugin": ({"integrator": '<integrator type="fspt_integrall"/>'}, 'Plugin "fspt_integrall" not found'),
+    "rtol in the file": (integral('<float name="rtol" value="-1"/>'), "'rtol' must be in (0, 1), got -1"),
+    "domain in the file": (integral('<string name="domain" value="x"/>'), "'domain' must be one of pupil, surface"),
+    "a number in words": (lens('value="0.8"', 'value="big"'), 'could not parse floating point value "big"'),
+    "a parameter without a value": (lens("$f_number", "$aperture"), "undefined parameter: $aperture"),
+    "a tag that is none": ({"more": '<lense type="fspt_lens"/>'}, "lense"),
+}
+
+SCENES = {
+    f"{kind.__name__}: {name}": (parts, kind, message)
+    for kind, table in ((OpticsError, LENSES), (ExitanceError, SURFACES), (SceneError, FILES))
+    for name, (parts, message) in table.items()
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bad")
+    write_meshes(folder)
+    return folder
+
+
+@pytest.fixture
+def refused(folder, capfd, monkeypatch):
+    """The one line on stderr of a call that must end with exit code 2 and leave the folder as it was."""
+    monkeypatch.chdir(folder)
+
+    def refused(*arguments):
+        before = {name: os.path.getmtime(name) for name in os.listdir()}
+        capfd.readouterr()
+        code = cli.run([str(argument) for argument in arguments])
+        out, err = capfd.readouterr()
+        assert code == 2, err
+        assert re.fullmatch(r"fspt: [^\n]+\n", err)
+        assert out == ""
+        assert {name: os.path.getmtime(name) for name in os.listdir()} == before
+        return err
+
+    return refused
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_that_cannot_be(folder, refused, name):
+    parts, kind, message = SCENES[name]
+    write_scene(folder / "s.xml", **parts)
+    err = refused("render", "s.xml", "-o", "o.exr")
+    assert message in err
+    with pytest.raises(FsptError) as raised:
+        fspt.render(fspt.load("s.xml"))
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)
+    if kind is ExitanceError:
+        assert message in refused("render", "s.xml", "--method", "path", "--spp", "2", "-o", "o.exr")
+    # Mitsuba's loader passes on text, no class: what it refuses, with the place in the file, is a SceneError.
+    assert isinstance(raised.value, SceneError if "(line " in err else kind)
+
+
+# --- the command line itself ---
+
+RENDER = ("render", "s.xml")
+MONTE_CARLO = (*RENDER, "--method", "path")
+EXPOSE = ("expose", "gone.exr", "-o", "e.exr", "--exposure-time", "1", "--wavelength-nm", "600")
+COMMANDS = {
+    "unknown parameter": ((*RENDER, "-D", "iso=100"), "no parameter 'iso'. Its <default> parameters: f_number, dist"),
+    "parameter without =": ((*RENDER, "-D", "f_number"), "-D f_number: must be NAME=VALUE"),
+    "parameter without name": ((*RENDER, "-D", "=8"), "-D =8: must be NAME=VALUE"),
+    "parameter without value": ((*RENDER, "-D", "f_number="), "-D f_number=: must be NAME=VALUE"),
+    "parameter in words": ((*RENDER, "-D", "f_number=wide"), 'could not parse floating point value "wide"'),
+    "parameter that cannot be": ((*RENDER, "-D", "f_number=0"), "'f_number' must be > 0 and finite, got 0"),
+    "no such folder": ((*RENDER, "-o", "gone/o.exr"), "the folder 'gone' does not exist"),
+    "another format": ((*RENDER, "-o", "o.png"), "images are written as .exr"),
+    "a folder for a file": ((*RENDER, "-o", "folder.exr"), "'folder.exr' is a folder"),
+    "rtol 0": ((*RENDER, "--rtol", "0"), "'rtol' must be in (0, 1), got 0"),
+    "rtol negative": ((*RENDER, "--rtol", "-1"), "'rtol' must be in (0, 1), got -1"),
+    "rtol nan": ((*RENDER, "--rtol", "nan"), "'rtol' must be in (0, 1), got nan"),
+    "rtol in words": ((*RENDER, "--rtol", "fine"), "Invalid value for '--rtol'"),
+    "rtol for path": ((*MONTE_CARLO, "--rtol", "1e-3"), "'rtol' = 0.001 has no meaning for Monte Carlo"),
+    "spp 0": ((*MONTE_CARLO, "--spp", "0"), "'spp' must be >= 2 for a standard error, got 0"),
+    "spp negative": ((*MONTE_CARLO, "--spp", "-3"), "'spp' must be >= 2 for a standard error, got -3"),
+    "spp broken": ((*MONTE_CARLO, "--spp", "1.5"), "Invalid value for '--spp'"),
+    "spp for the integral": ((*RENDER, "--spp", "4"), "'spp' = 4 has no meaning for integral"),
+    "seed negative": ((*MONTE_CARLO, "--seed", "-1"), "'seed' must be in 0"),
+    "seed too large": ((*MONTE_CARLO, "--seed", "99999999999"), "'seed' must be in 0"),
+    "unknown method": ((*RENDER, "--method", "radiosity"), "'method' must be one of integral, path, ptracer, got"),
+    "unknown option": ((*RENDER, "--fast"), "No such option: --fast"),
+    "unknown verb": (("paint",), "No such command 'paint'"),
+    "no scene named": (("render",), "Missing argument 'SCENE.xml'"),
+    "no scene file": (("render", "gone.xml"), "gone.xml: cannot read the scene file"),
+    "a folder for a scene": (("render", "folder.exr", "-o", "o.exr"), "folder.exr: cannot read the scene file"),
+    "broken XML": (("render", "broken.xml"), "broken.xml: not valid XML: "),
+    "not a scene": (("render", "bsdf.xml"), "bsdf.xml: the root is <diffuse>, a scene file has <scene>"),
+    "no version": (("render", "old.xml"), "missing version attribute"),
+    "include of nothing": (("render", "include.xml"), 'included file "gone.xml" not found'),
+    "compare: no file": (("compare", "gone.exr", "gone.exr"), "image file 'gone.exr' does not exist"),
+    "compare: no image": (("compare", "broken.xml", "broken.xml"), "no readable OpenEXR file"),
+    "expose: no file": (EXPOSE, "image file 'gone.exr' does not exist"),
+    "flux: no mesh": (("flux", "import", "gone.ply", "-o", "p.ply"), "mesh 'gone.ply' does not exist"),
+}
+
+
+@pytest.fixture(scope="module")
+def files(folder):
+    """The files that are no scenes; a good one, `s.xml`, is written by each test."""
+    (folder / "folder.exr").mkdir()
+    (folder / "broken.xml").write_text('<scene version="3.0.0"><')
+    (folder / "bsdf.xml").write_text('<bsdf version="3.0.0" type="diffuse"/>')
+    (folder / "old.xml").write_text("<scene></scene>")
+    (folder / "include.xml").write_text('<scene version="3.0.0"><include filename="gone.xml"/></scene>')
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_commands_that_cannot_be(folder, files, refused, name):
+    arguments, message = COMMANDS[name]
+    write_scene(folder / "s.xml")
+    assert message in refused(*arguments)
+
+
+def test_a_folder_that_may_not_be_written_is_refused_before_the_work(folder, refused, monkeypatch):
+    """Told by os.access, which root passes everywhere; the scene is not even looked at."""
+    (folder / "locked.exr").touch()
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert "is not writable. Write elsewhere with -o" in refused("render", "gone.xml", "-o", "o.exr")
+    with pytest.raises(ImageError, match=r"locked\.exr' is write-protected"):
+        fspt.Image(np.ones((2, 2))).write(folder / "locked.exr")
+
+
+def test_a_disk_full_half_way_leaves_the_old_file_and_nothing_else(tmp_path):
+    """From the moment of writing files may grow to 300 bytes, which no image fits into."""
+    write_scene(tmp_path / "s.xml")
+    (tmp_path / "o.exr").write_bytes(b"the old one")
+    code = """
+import resource, signal, sys
+from mitsuba_fspt import cli, image
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+write = image.write_exr
+def write_to_full_disk(*arguments):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
+    write(*arguments)
+image.write_exr = write_to_full_disk
+sys.exit(cli.run(["render", "s.xml", "-o", "o.exr"]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    assert re.fullmatch(r"fspt: image file 'o\.exr': [^\n]+\. Make room or give another place for it\.\n", done.stderr)
+    assert done.stdout == ""
+    assert sorted(os.listdir(tmp_path)) == ["o.exr", "s.xml"]
+    assert (tmp_path / "o.exr").read_bytes() == b"the old one"
+
+
+# --- odd, but not bad ---
+
+
+def test_two_surfaces_and_faces_without_area_are_fine(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    write_ply(folder / "spike.ply", [*SQUARE, (0, 0, 0)], [*FACES, (4, 4, 4)], vertex=[1e-3] * 5)
+    write_ply(folder / "square.ply", SQUARE, FACES, vertex=[1e-3] * 4)
+    alone = fspt.render(write_scene(folder / "s.xml", **mesh("square.ply")), max_nodes=4)
+    spiked = fspt.render(write_scene(folder / "s.xml", **mesh("spike.ply")), max_nodes=4)
+    np.testing.assert_allclose(spiked.power, alone.power, atol=1e-6 * alone.power.max())
+    both = mesh("square.ply")["shapes"] + BALL_XML
+    assert fspt.render(write_scene(folder / "s.xml", shapes=both), max_nodes=4).power.sum() >= alone.power.sum()
