@@ -237,4 +237,6 @@ def at_one_wavelength(record: mi.Ray3f | mi.SurfaceInteraction3f) -> None:
 
 def scalar(spectrum: mi.Spectrum) -> mi.Float:
     """The one number of a spectrally flat, unpolarised quantity, whatever the variant stores it in."""
-    return dr.mean(mi.unpolarized_spectrum(spectrum)) if mi.is_polarized else dr.mean(spectrum)
+    flat = mi.unpolarized_spectrum(spectrum) if mi.is_polarized else spectrum
+    # `dr.mean` would write the number of lanes into the kernel, which then compiles anew for every picture.
+    return dr.sum(flat, axis=0) * (1 / len(flat))

@@ -76,7 +76,7 @@ def apply_rule(scene: mi.Scene, lens: mi.Sensor, centre: mi.Point2f, rule: rules
 
     zero = mi.Float(0)
     value, contrast, moment, hits, nearest, farthest = repeat(
-        len(rule), node, zero, zero, mi.Vector2f(0), zero, mi.Float(dr.inf), zero
+        dr.opaque(mi.UInt32, len(rule)), node, zero, zero, mi.Vector2f(0), zero, mi.Float(dr.inf), zero
     )
     return value, contrast, moment.x, moment.y, hits, nearest, farthest
 
