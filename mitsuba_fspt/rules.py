@@ -85,6 +85,7 @@ def along_chord(level: int) -> AlongChord:
     """Every level looks further along its chords too, or what all levels miss there would pass for converged."""
     return AlongChord(scan=4 + level, bisections=4 + level, gauss=3 + level)
 
+
 GOLDEN = 0.6180339887498949
 PLASTIC = (0.7548776662466927, 0.5698402909980532)
 

@@ -19,4 +19,3 @@ def mono():
     mi.set_log_level(mi.LogLevel.Error)
     yield mi
     mi.set_log_level(level)
-

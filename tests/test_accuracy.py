@@ -59,9 +59,7 @@ def test_every_pixel_is_as_accurate_as_asked(case):
 
 def test_error_bounds_the_error():
     """Rationale: `error` is the estimated absolute error of each pixel. Expected: a bound for 99 pixels of 100."""
-    bounded = [
-        np.abs(image.power - truth.power) <= image.error for image, truth in (pictures(*case) for case in CASES)
-    ]
+    bounded = [np.abs(image.power - truth.power) <= image.error for image, truth in (pictures(*case) for case in CASES)]
     assert np.concatenate(bounded, axis=None).mean() >= 0.99
 
 

@@ -85,10 +85,11 @@ def apply_rule(scene: mi.Scene, lens: mi.Sensor, centre: mi.Point2f, rule: rules
 
 
 def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, along: rules.AlongChord) -> tuple[mi.Float, ...]:
-    """Mean of the integrand and of the hits along a chord, split at its two largest jumps; 1 if it has any, else 0.
+    """Mean of the integrand and of the hits along a chord, number of jumps and of lines of sight it took.
 
-    A jump is looked for between neighbours of `along.scan` + 1 points, then bisected towards the larger difference;
-    every piece that is not dark gets `along.gauss` nodes, a chord without a jump is one piece.
+    It is split at its two largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points, then
+    bisected towards the larger difference; every piece that is not dark gets `along.gauss` nodes, a chord without a
+    jump is one piece.
     """
     intervals = dr.opaque(mi.UInt32, along.scan)
     step = 2 / mi.Float(intervals)
@@ -155,7 +156,8 @@ def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, along: rules
 
     count = mi.UInt32(dr.maximum(end - begin, 0)) * gauss
     value, hits = repeat(count, integrate, mi.Float(0), mi.Float(0))
-    return chord.weight * value, chord.weight * hits, dr.select(jumps, mi.Float(1), 0)
+    looks = intervals + 1 + mi.UInt32(last) * bisections + count
+    return chord.weight * value, chord.weight * hits, mi.Float(last), mi.Float(looks)
 
 
 def _towards_jumps(x: mi.Float, at_start: mi.Bool, at_end: mi.Bool) -> tuple[mi.Float, mi.Float]:

@@ -141,7 +141,7 @@ class _Ladder:
             dr.eval(sums)
             for image, column in zip(images, sums, strict=True):
                 image[part] = column.numpy()
-        self._count(f"{len(rule)} nodes", len(index), len(rule))
+        self._count(f"{len(rule)} nodes", len(index), len(index) * len(rule))
         return [image.reshape(where.shape) for image in images]
 
     # ------------------------------------------------------------------ jumps
@@ -155,20 +155,21 @@ class _Ladder:
         change, split, count = np.zeros_like(value), np.zeros(value.shape, bool), 1
         for level, (m, q) in enumerate(rules.CHORD_LEVELS):
             rule, along = rules.chords(m, q, self.area), rules.along_chord(level)
-            rays = len(rule) * along.rays
-            if not len(index) or 16 + rays > self.quadrature.max_nodes:
+            if not len(index) or 16 + len(rule) * along.rays > self.quadrature.max_nodes:
                 break
+            rays = 0.0
             # What the change before this one should have become by now, lest two wrong values agree by chance.
             change *= (count / len(rule)) ** rules.CHORD_ORDER
             count = len(rule)
             for part in _chunks(index, max(1, LANES // count)):
-                mean, met, jumps = self._chord_means(part, angle[part], across_pupil[part], rule, along)
+                mean, met, jumps, looks = self._chord_means(part, angle[part], across_pupil[part], rule, along)
+                rays += looks.sum()
                 change[part] = np.maximum(np.abs(mean - value[part]), change[part])
                 # Where the first chords meet no jump after all, twelve nodes were the better rule.
                 better = (jumps > 0) | (level > 0)
                 value[part], hits[part] = np.where(better, mean, value[part]), np.where(better, met, hits[part])
                 split[part] = jumps > 0
-            self._count(f"{count} chords", len(index), rays)
+            self._count(f"{count} chords", len(index), int(rays))
             error[index] = SAFETY * pixels.spread_max(change.reshape(self.value.shape)).ravel()[index]
             index = index[error[index] > self.tolerance]
             if level == 0:
@@ -183,7 +184,7 @@ class _Ladder:
         rule: rules.Chords,
         along: rules.AlongChord,
     ) -> list[Image]:
-        """Mean radiance on film, share of hits and number of split chords of each listed pixel, in one launch."""
+        """Of each listed pixel mean radiance on film, share of hits, jumps and lines of sight, in one launch."""
         count = dr.opaque(mi.UInt32, len(rule))
         lane = dr.arange(mi.UInt32, len(part) * len(rule))
         pixel, number = lane // count, lane % count
@@ -221,8 +222,8 @@ class _Ladder:
     def _reach(self, nodes: int) -> int:
         return 1 + math.ceil(min(GAP[nodes] * self.blur, max(self.value.shape)))
 
-    def _count(self, what: str, count: int, rays_each: int) -> None:
-        self.rays += count * rays_each
+    def _count(self, what: str, count: int, rays: int) -> None:
+        self.rays += rays
         self.levels.append(f"{what}: {count} pixels")
 
 

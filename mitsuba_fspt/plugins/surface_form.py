@@ -22,7 +22,7 @@ from .glow import CORNERS, Batch, Glow, film_corner
 from .window import visible_window
 
 FIRST_LINES, GROWTH = 16, 4  # lines of sight a pixel of the image at the first level; times this each level
-SAFETY = 2.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
+SAFETY = 4.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 lines of sight cannot resolve
 # No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
 # bits, and thousands of roundings on a pixel stay below 1e-9 of any but the faintest.
