@@ -26,6 +26,7 @@ FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot re
 # a rule is wrong by up to this share of the light.
 GAP = {4: 0.5, 12: 0.2}
 CUT = {4: 1.0, 12: 0.3}
+MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
 LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more than to shrink to this
 
 Image = NDArray[np.float64]
@@ -122,7 +123,7 @@ class _Ladder:
         self.value = np.where(where, value, self.value)
         self.hits = np.where(where, hits, self.hits)
         self.nearest = np.minimum(self.nearest, nearest)
-        error = pixels.spread_max(difference * np.clip(gain, LEAST_GAIN, 1))
+        error = np.maximum(pixels.spread_max(difference * np.clip(gain, LEAST_GAIN, 1)), self.error / MOST_GAIN)
         self.error = np.where(where, np.maximum(error, self._cut_off(12)), self.error)
         return difference
 
