@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,20 +13,27 @@ Mask = NDArray[np.bool_]
 ROUNDING = 1e-4  # of a share of hits: a sum of float32 weights
 
 
-def box_sum(image: Image, radius: int) -> Image:
+def box_sum(image: NDArray[Any], radius: int) -> NDArray[Any]:
     """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
     for axis in (0, 1):
         n = image.shape[axis]
-        total = np.concatenate([np.zeros_like(image.take([0], axis)), np.cumsum(image, axis)], axis)
+        sums = np.cumsum(image, axis, dtype=image.dtype)
+        total = np.concatenate([np.zeros_like(sums.take([0], axis)), sums], axis)
         index = np.arange(n)
         upper, lower = np.minimum(index + radius + 1, n), np.maximum(index - radius, 0)
         image = total.take(upper, axis) - total.take(lower, axis)
     return image
 
 
+def mean_where(image: Image, mask: Mask, radius: int) -> Image:
+    """Mean of the marked pixels among the (2 radius + 1)² around each; 0 where there is none."""
+    total, count = box_sum(np.where(mask, image, 0), radius), box_sum(mask.astype(np.float64), radius)
+    return np.divide(total, count, out=np.zeros_like(total), where=count > 0.5)
+
+
 def dilate(mask: Mask, radius: int) -> Mask:
     """True within `radius` pixels (square) of a marked pixel."""
-    return box_sum(mask.astype(np.int64), radius) > 0 if mask.any() else mask
+    return box_sum(mask.astype(np.int32), radius) > 0 if mask.any() else mask
 
 
 def spread_max(image: Image) -> Image:

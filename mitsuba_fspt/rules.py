@@ -32,11 +32,26 @@ def pinhole() -> Rule:
     return Rule(np.zeros((1, 2)), np.zeros((1, 2)), np.ones(1), np.zeros(1))
 
 
-def four() -> Rule:
-    """Four nodes on the pupil, exact to degree 3 there, all at the pixel's centre."""
+def four(area: bool) -> Rule:
+    """Four nodes, exact to degree 3 on the pupil; with `area` also over the pixel, for what blurs like a picture.
+
+    Over the pixel each node takes a step of length 1/√6 at right angles to its place on the pupil: so the second
+    moments of any sum of pupil and pixel offset, whatever the blur, are those of disc and square.
+    """
     angle = np.pi / 4 + np.arange(4) * np.pi / 2
-    pupil = _polar(np.sqrt(0.5), angle)
-    return Rule(pupil, np.zeros((4, 2)), np.full(4, 0.25), np.array([0.5, -0.5, 0.5, -0.5]))
+    step = np.sqrt(1 / 6) if area else 0.0
+    contrast = np.array([0.5, -0.5, 0.5, -0.5])
+    return Rule(_polar(np.sqrt(0.5), angle), _polar(step, angle + np.pi / 2), np.full(4, 0.25), contrast)
+
+
+def four_turn(curl: NDArray[np.float64], laplacian: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What `four` has too much where the blur changes over the picture; `curl` is ∂M_x/∂y - ∂M_y/∂x of its moments.
+
+    Steps at right angles leave c (∂²f/∂a_x∂y - ∂²f/∂a_y∂x), c = Σ w a_x y = √3/12, of pupil a and pixel (x, y). The
+    moments over the pupil are M = ¼ ∂f/∂a + c (∂f/∂y, -∂f/∂x), so that their curl over the picture holds it.
+    """
+    c = np.sqrt(3) / 12
+    return 4 * c * (curl - c * laplacian)
 
 
 def twelve(area: bool) -> Rule:

@@ -34,7 +34,7 @@ from mitsuba_fspt.reference_mesh import load_ply, mesh_truth
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 ROUNDS = 5
-RTOL = (0.2, 0.02, 0.01, 7e-3, 5e-3, 3e-3, 2e-3, 1e-3, 3e-4, 1e-4)
+RTOL = (0.2, 0.05, 0.02, 0.014, 0.01, 5e-3, 2e-3, 1e-3, 3e-4, 1e-4)
 SPP = {"multijitter": (4, 16, 36, 64, 100, 144, 256, 529), "independent": (16, 64, 256)}
 SPP |= {"stratified": (16, 64, 256), "orthogonal": (25, 121, 289), "ldsampler": (16, 64, 256)}
 TARGETS = (("all", 1e-4), ("full", 3e-5), ("all", 3e-5), ("all", 1e-5))
@@ -62,7 +62,7 @@ def main() -> None:
     arguments = parser.parse_args()
     truth, truth_error = read_truth(arguments.truth)
     settings = integral_settings() + path_settings()
-    full = fspt.render(scene("multijitter"), rtol=1e-4).coverage == 1
+    full = fspt.render(scene("multijitter"), rtol=1e-4).coverage > 1 - 1e-4
     measure(settings, truth, {"all": np.ones_like(full), "full": full}, arguments.rounds)
     arguments.out.mkdir(exist_ok=True)
     write_csv(settings, arguments.out / "work_precision.csv")

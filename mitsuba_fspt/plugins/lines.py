@@ -15,6 +15,8 @@ import mitsuba as mi
 from .. import rules
 from .elements import at_one_wavelength, scalar
 
+STEEP = 4.0  # a jump is so many times larger than the mean of the chord's other steps
+
 # ---------------------------------------------------------------------- one line of sight
 
 
@@ -129,10 +131,10 @@ def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, along: rules
     first, second, total, lit, _ = repeat(
         intervals, scan, dr.zeros(_Jump), dr.zeros(_Jump), mi.Float(0), lit, mi.Point2f(f, body)
     )
-    # A step that is not much larger than the others is a slope.
+    # A step that is not much larger than the others is a slope; on a parabola one is at most 3 times their mean.
     one, two = size(first), size(second)
-    jumps = one > 2 * (total - one) / (mi.Float(intervals) - 1)
-    both = jumps & (two > 2 * (total - one - two) / (mi.Float(intervals) - 2))
+    jumps = one > dr.maximum(STEEP * (total - one) / (mi.Float(intervals) - 1), chord.least)
+    both = jumps & (two > dr.maximum(STEEP * (total - one - two) / (mi.Float(intervals) - 2), chord.least))
     s_first, s_second = place(first, jumps), place(second, both)
     left = dr.select(jumps, dr.select(both, dr.minimum(s_first, s_second), s_first), 1)
     right = dr.select(both, dr.maximum(s_first, s_second), 1)
@@ -182,7 +184,10 @@ class _Jump:
 
 @dataclass
 class Chord:
-    """Segment s ∈ [-1, 1] through pixel × pupil: across the pupil at a fixed pixel point, or across the pixel."""
+    """Segment s ∈ [-1, 1] through pixel × pupil: across the pupil at a fixed pixel point, or across the pixel.
+
+    In units of the integrand an `outline` counts so much as a jump, and less than `least` does not.
+    """
 
     pixel_middle: mi.Point2f
     pixel_half: mi.Vector2f
@@ -190,6 +195,7 @@ class Chord:
     pupil_half: mi.Vector2f
     weight: mi.Float
     outline: mi.Float
+    least: mi.Float
 
     def position(self, s: mi.Float) -> mi.Point2f:
         return self.pixel_middle + s * self.pixel_half
@@ -199,7 +205,13 @@ class Chord:
 
 
 def chords_across(
-    rule: rules.Chords, number: mi.UInt32, centre: mi.Point2f, angle: mi.Float, across_pupil: mi.Bool, outline: mi.Float
+    rule: rules.Chords,
+    number: mi.UInt32,
+    centre: mi.Point2f,
+    angle: mi.Float,
+    across_pupil: mi.Bool,
+    outline: mi.Float,
+    least: mi.Float,
 ) -> Chord:
     """Chord `number` of a rule for pixels whose picture changes along `angle`.
 
@@ -223,4 +235,5 @@ def chords_across(
         pupil_half=dr.select(across_pupil, cosine * n, mi.Vector2f(0)),
         weight=dr.select(across_pupil, 2 * dr.square(cosine) * weight, dr.opaque(mi.Float, 1 / len(rule))),
         outline=outline,
+        least=least,
     )

@@ -26,6 +26,9 @@ FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot re
 # a rule is wrong by up to this share of the light.
 GAP = {4: 0.5, 12: 0.2}
 CUT = {4: 1.0, 12: 0.3}
+LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
+TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
+FIRST_GAIN = 0.3  # what is left of the difference between four and twelve nodes once the first chords are in
 MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
 LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more than to shrink to this
 
@@ -53,7 +56,7 @@ class _Ladder:
         self.area = quadrature.pixel == "area"
         self.window: Window = visible_window(scene, lens)
         shape = self.window.shape
-        self.value, self.error, self.hits = (np.zeros(shape) for _ in range(3))
+        self.value, self.error, self.hits, self.change = (np.zeros(shape) for _ in range(4))
         self.nearest = np.full(shape, np.inf)
         self.blur = 0.0  # largest blur radius in the picture [pixels]
         self.rays = 0
@@ -79,18 +82,21 @@ class _Ladder:
     # ------------------------------------------------------------------ smooth pixels
 
     def _four_nodes(self) -> NDArray[np.bool_]:
-        """Four nodes at every pixel's centre; over its area the mean of a smooth picture is P + ΔP/24."""
+        """Four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
         everything = np.ones(self.window.shape, bool)
-        value, contrast, mx, my, self.hits, self.nearest, far = self._apply(rules.four(), everything)
+        value, contrast, mx, my, self.hits, self.nearest, far = self._apply(rules.four(self.area), everything)
         self.value = value
-        self.blur = self._largest_blur(self.nearest, far)
+        self.blur = self._largest_blur(far)
         # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
         slope = 4 * np.hypot(mx, my)
         bend = np.abs(contrast) + np.divide(slope**4, 4 * value**3, out=np.zeros_like(value), where=value > 0)
         if self.area:
             xx, yy = pixels.second_differences(value)
-            bend += (np.abs(xx) + np.abs(yy)) / 6
-            self.value = np.maximum(value + (xx + yy) / 24, 0)
+            xxxx, yyyy = pixels.second_differences(xx)[0], pixels.second_differences(yy)[1]
+            bend += (np.abs(xxxx) + np.abs(yyyy)) / 12
+            curl = pixels.gradient(mx)[1] - pixels.gradient(my)[0]
+            turned = pixels.mean_where(rules.four_turn(curl, xx + yy), ~pixels.outline(self.hits, 1), TURN_REACH)
+            self.value = np.maximum(value - np.where(self.hits > 1 - pixels.ROUNDING, turned, 0), 0)
         self.error = np.maximum(pixels.spread_max(bend), self._cut_off(4))
         rough = self.error > self.tolerance
         if self.area and min(rough.shape) < 3:
@@ -118,6 +124,7 @@ class _Ladder:
         """Twelve nodes on the marked pixels; returns how far four were off there, 0 elsewhere."""
         value, _, _, _, hits, nearest, _ = self._apply(rules.twelve(self.area), where)
         difference = np.where(where, np.abs(value - self.value), 0)
+        self.change = np.maximum(self.change, difference)
         # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
         gain = np.divide(8 * difference, self.error, out=np.ones_like(value), where=self.error > 0)
         self.value = np.where(where, value, self.value)
@@ -153,14 +160,14 @@ class _Ladder:
         angle = pixels.principal_angle(*pixels.gradient(self.value), 1 + math.ceil(self.blur / 2)).ravel()
         across_pupil = self._across_pupil().ravel()
         value, hits, error = self.value.ravel(), self.hits.ravel(), self.error.ravel()
-        change, split, count = np.zeros_like(value), np.zeros(value.shape, bool), 1
+        change, split, count = self.change.ravel(), np.zeros(value.shape, bool), 0
         for level, (m, q) in enumerate(rules.CHORD_LEVELS):
             rule, along = rules.chords(m, q, self.area), rules.along_chord(level)
             if not len(index) or 16 + len(rule) * along.rays > self.quadrature.max_nodes:
                 break
             rays = 0.0
             # What the change before this one should have become by now, lest two wrong values agree by chance.
-            change *= (count / len(rule)) ** rules.CHORD_ORDER
+            change *= (count / len(rule)) ** rules.CHORD_ORDER if count else FIRST_GAIN
             count = len(rule)
             for part in _chunks(index, max(1, LANES // count)):
                 mean, met, jumps, looks = self._chord_means(part, angle[part], across_pupil[part], rule, along)
@@ -174,6 +181,7 @@ class _Ladder:
             error[index] = SAFETY * pixels.spread_max(change.reshape(self.value.shape)).ravel()[index]
             index = index[error[index] > self.tolerance]
             if level == 0:
+                change[~split] = 0  # nothing changed there yet
                 # Across the pupil all other directions have Gauss nodes: right for smooth pixels, sharp or not.
                 across_pupil |= self._calm(split.reshape(self.value.shape)).ravel()
 
@@ -196,6 +204,7 @@ class _Ladder:
             dr.gather(mi.Float, mi.Float(angle), pixel),
             dr.gather(mi.Bool, mi.Bool(across_pupil), pixel),
             dr.opaque(mi.Float, 2 * float(self.value.max())),
+            dr.opaque(mi.Float, LEAST_JUMP * self.tolerance),
         )
         means = integrate_chord(self.scene, self.lens, chord, along)
         means = [mi.Float64(mean) for mean in means]
@@ -215,10 +224,11 @@ class _Ladder:
         """True where neither a pixel nor its neighbours jump: no chord of theirs was split, no outline passes."""
         return ~pixels.dilate(split | pixels.outline(self.hits, 1), 1)
 
-    def _largest_blur(self, nearest: Image, far: Image) -> float:
-        seen = np.isfinite(nearest)
-        depths = np.concatenate([nearest[seen], far[seen]])
-        return float(self.lens.blur_radius(depths).max(initial=0.0))
+    def _largest_blur(self, far: Image) -> float:
+        """Of what is nearest or farthest: from the sharp plane on, blur grows either way."""
+        seen = np.isfinite(self.nearest)
+        depths = np.array([self.nearest[seen].min(initial=np.inf), far[seen].max(initial=0.0)])
+        return float(self.lens.blur_radius(depths).max()) if seen.any() else 0.0
 
     def _reach(self, nodes: int) -> int:
         return 1 + math.ceil(min(GAP[nodes] * self.blur, max(self.value.shape)))
