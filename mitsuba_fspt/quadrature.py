@@ -44,6 +44,7 @@ class Solution:
     """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
 
     `rays` counts all lines of sight, `levels` what each rung of the refinement did (for humans and the EXR header).
+    A partial solution is the whole picture only on the pixels `where`.
     """
 
     power: NDArray[np.float64]
@@ -51,3 +52,4 @@ class Solution:
     coverage: NDArray[np.float64]
     rays: int
     levels: tuple[str, ...] = field(default=())
+    where: NDArray[np.bool_] | None = None

@@ -79,16 +79,11 @@ def _integrate(
     scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress | None
 ) -> tuple:
     """Arrays and metadata of the deterministic integral."""
-    import mitsuba as mi
-
     own = asdict(integrator.quadrature)
     wanted = own | {name: value for name, value in accuracy.items() if value is not None}
-    Quadrature(**wanted)  # says what is wrong better than the plugin can
-    if wanted != own:
-        integrator = mi.load_dict({"type": "fspt_integral", **wanted})
     if progress:
         progress("integrating", 0.0)
-    solution = integrator.solve(scene, lens)
+    solution = integrator.solve(scene, lens, Quadrature(**wanted))
     how = {"method": "integral", **wanted, "nodes": solution.rays, "levels": "; ".join(solution.levels)}
     return solution.power, solution.error, solution.coverage, how
 

@@ -14,6 +14,7 @@ Writes work_precision.csv and work_precision.png, prints the time each method ne
 from __future__ import annotations
 
 import argparse
+import copy
 import csv
 import os
 import platform
@@ -61,8 +62,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     arguments = parser.parse_args()
     truth, truth_error = read_truth(arguments.truth)
-    settings = integral_settings() + path_settings()
-    full = fspt.render(scene("multijitter"), rtol=1e-4).coverage > 1 - 1e-4
+    cylinder = scene()
+    settings = integral_settings(cylinder) + path_settings(cylinder)
+    full = fspt.render(cylinder, rtol=1e-4).coverage > 1 - 1e-4  # a sum of float32 weights
     measure(settings, truth, {"all": np.ones_like(full), "full": full}, arguments.rounds)
     arguments.out.mkdir(exist_ok=True)
     write_csv(settings, arguments.out / "work_precision.csv")
@@ -89,13 +91,17 @@ def read_truth(path: Path) -> tuple[Picture, Picture]:
 # ---------------------------------------------------------------------- methods
 
 
-def scene(sampler: str) -> object:
-    """The cylinder at f/2.8 with a stock sampler of that name."""
+def scene() -> object:
+    """The cylinder at f/2.8 before one camera a stock sampler: one scene, since every living one costs all kernels."""
     tree = ElementTree.parse(SCENES / "nylon_cylinder.xml")
     sensor = next(tree.iter("sensor"))
     for node in sensor.findall("sampler"):
         sensor.remove(node)
-    ElementTree.SubElement(sensor, "sampler", type=sampler)
+    for sampler in SPP:
+        camera = copy.deepcopy(sensor)
+        ElementTree.SubElement(camera, "sampler", type=sampler)
+        tree.getroot().append(camera)
+    tree.getroot().remove(sensor)
     mesh = next(node for node in tree.iter("string") if node.get("name") == "filename")
     mesh.set("value", str(SCENES / mesh.get("value", "")))
     with tempfile.TemporaryDirectory() as folder:
@@ -104,11 +110,10 @@ def scene(sampler: str) -> object:
         return fspt.load(path, f_number=2.8)
 
 
-def integral_settings() -> list[Setting]:
+def integral_settings(cylinder: object) -> list[Setting]:
     """The integral over rtol, and with four lines of sight a pixel and no more."""
     import mitsuba as mi
 
-    cylinder = scene("multijitter")
     lens = cylinder.sensors()[0]
 
     def setting(method: str, knob: float, **accuracy: float) -> Setting:
@@ -120,14 +125,13 @@ def integral_settings() -> list[Setting]:
     ]
 
 
-def path_settings() -> list[Setting]:
+def path_settings(cylinder: object) -> list[Setting]:
     """Mitsuba's `path` of depth 1 over the samples a pixel, with each sampler."""
     import mitsuba as mi
 
     integrator = mi.load_dict({"type": "path", "max_depth": 1})
 
-    def setting(sampler: str, cylinder: object, spp: int) -> Setting:
-        sensor = cylinder.sensors()[0]
+    def setting(sampler: str, sensor: object, spp: int) -> Setting:
         seed = iter(range(1, 1 << 30))
 
         def run() -> Picture:
@@ -135,7 +139,8 @@ def path_settings() -> list[Setting]:
 
         return Setting(f"path, {sampler}", spp, run)
 
-    return [setting(sampler, cylinder, spp) for sampler in SPP for cylinder in [scene(sampler)] for spp in SPP[sampler]]
+    cameras = zip(SPP, cylinder.sensors(), strict=True)
+    return [setting(sampler, sensor, spp) for sampler, sensor in cameras for spp in SPP[sampler]]
 
 
 def measure(settings: list[Setting], truth: Picture, masks: dict[str, NDArray[np.bool_]], rounds: int) -> None:

@@ -25,10 +25,11 @@ def load(name, **parameters):
     return fspt.load(SCENES / f"{name}.xml", **whole | parameters)
 
 
-def scene(*shapes, exitance=1.0, crop=None, **lens):
+def scene(*shapes, exitance=1.0, crop=None, lamp=None, **lens):
     """Scene of shapes that glow with `exitance` [W/mm²], unless they bring their own 'glow', before the lens.
 
     `lens`: parameters of fspt_lens, by default 55 mm f/2.8 at magnification 1/2. `crop`: x, y, width, height.
+    `lamp`: another emitter.
     """
     import mitsuba as mi
 
@@ -42,6 +43,7 @@ def scene(*shapes, exitance=1.0, crop=None, **lens):
     glow = {"type": "fspt_surface", "exitance": exitance}
     bodies = {f"shape_{k}": {"glow": dict(glow), **shape} for k, shape in enumerate(shapes)}
     sensor = {"type": "fspt_lens", "film": film, **lens}
+    bodies |= {"lamp": lamp} if lamp else {}
     whole = {"type": "scene", "embree_use_robust_intersections": True, "sensor": sensor, **bodies}
     return mi.load_dict(whole, optimize=False)
 

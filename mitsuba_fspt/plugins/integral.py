@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..optics import Lens
 from ..quadrature import Quadrature, Solution
 from . import pupil_form, surface_form
 from .checks import check_scene
 from .intersections import robust_scene
+from .narrow import NarrowLight, narrow_light
 from .recording import nothing_collected
+from .window import visible_window
+
+NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
 
 
 class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
@@ -27,7 +33,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
      * - domain
        - |string|
        - pupil: lines of sight from every pixel (Default). surface: the power of every surface element is spread
-         over the pixels its blur disc covers. Two ways of writing Eq. 9.
+         over the pixels its blur disc covers. Two ways of writing Eq. 9. Light from bodies and spots far below a
+         pixel, which lines of sight from the pixels would miss, is spread in either case.
      * - pixel
        - |string|
        - area: integrate over the pixel (Default). centre: the value at its centre times its area, as in the paper.
@@ -47,15 +54,27 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             pixel=str(props.get("pixel", defaults.pixel)),
             max_nodes=int(props.get("max_nodes", defaults.max_nodes)),
         )
-        # The emitters of the last scene that lost no rays; the scene itself, whose child this is, must not be kept.
+        # What was found out about the last scene; the scene itself, whose child this is, must not be kept.
         self._sound: list[mi.Emitter] = []
+        self._narrow: tuple[object, Lens, NarrowLight] | None = None
 
-    def solve(self, scene: mi.Scene, sensor: mi.Sensor) -> Solution:
-        """Power, error and coverage of the sensor's crop window; errors as in `check_scene`."""
+    def solve(self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None) -> Solution:
+        """Power, error and coverage of the sensor's crop window, with another `quadrature` than the integrator's own.
+
+        Raises SceneError or ExitanceError as in `check_scene`.
+        """
+        quadrature = quadrature or self.quadrature
         check_scene(scene, sensor)
-        form = surface_form if self.quadrature.domain == "surface" else pupil_form
-        with nothing_collected():
-            return form.solve(self._traced(scene, sensor), sensor, self.quadrature)
+        with nothing_collected(), dr.suspend_grad():
+            traced = self._traced(scene, sensor)
+            if quadrature.domain == "surface":
+                return surface_form.solve(traced, sensor, quadrature)
+            narrow = self._narrow_light(scene, sensor)
+            where = narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest
+            known = None
+            if where.any():
+                known = surface_form.solve(traced, sensor, quadrature, where, narrow.brightest / 2)
+            return pupil_form.solve(traced, sensor, quadrature, known)
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""
@@ -65,6 +84,15 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 return robust
             self._sound = scene.emitters()
         return scene
+
+    def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor) -> NarrowLight:
+        """`narrow_light`, found once for as long as neither surfaces nor lens nor film change."""
+        emitters, window = scene.emitters(), visible_window(scene, lens)
+        state = (emitters, [getattr(emitter, "edition", 0) for emitter in emitters], window)
+        # A lens makes new optics with every change, if only of its place.
+        if self._narrow is None or self._narrow[0] != state or self._narrow[1] is not lens.optics:
+            self._narrow = (state, lens.optics, narrow_light(emitters, lens, window))
+        return self._narrow[2]
 
     def render(
         self,

@@ -35,9 +35,21 @@ LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more th
 Image = NDArray[np.float64]
 
 
-def solve(scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
-    """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised."""
-    return _Ladder(scene, lens, quadrature).climb()
+def solve(scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, known: Solution | None = None) -> Solution:
+    """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
+
+    Where a partial solution is `known` it is taken over.
+    """
+    found = _Ladder(scene, lens, quadrature, known).climb()
+    if known is None:
+        return found
+    power, error, coverage = (
+        np.where(known.where, ours, own)
+        for ours, own in zip(
+            (known.power, known.error, known.coverage), (found.power, found.error, found.coverage), strict=True
+        )
+    )
+    return Solution(power, error, coverage, known.rays + found.rays, known.levels + found.levels)
 
 
 def coverage(scene: mi.Scene, lens: mi.Sensor) -> Image:
@@ -51,12 +63,16 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> Image:
 class _Ladder:
     """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
 
-    def __init__(self, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> None:
+    def __init__(self, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, known: Solution | None = None) -> None:
         self.scene, self.lens, self.quadrature = scene, lens, quadrature
         self.area = quadrature.pixel == "area"
         self.window: Window = visible_window(scene, lens)
         shape = self.window.shape
         self.value, self.error, self.hits, self.change = (np.zeros(shape) for _ in range(4))
+        self.open = np.ones(shape, bool)  # pixels that are not known from elsewhere
+        self.known = np.zeros(shape)
+        if known is not None:
+            self.open, self.known = ~self.window.cut(known.where), self.window.cut(known.power) / lens.etendue
         self.nearest = np.full(shape, np.inf)
         self.blur = 0.0  # largest blur radius in the picture [pixels]
         self.rays = 0
@@ -85,8 +101,8 @@ class _Ladder:
         """Four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
         everything = np.ones(self.window.shape, bool)
         value, contrast, mx, my, self.hits, self.nearest, far = self._apply(rules.four(self.area), everything)
-        self.value = value
         self.blur = self._largest_blur(far)
+        self.value = value = np.where(self.open, value, self.known)
         # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
         slope = 4 * np.hypot(mx, my)
         bend = np.abs(contrast) + np.divide(slope**4, 4 * value**3, out=np.zeros_like(value), where=value > 0)
@@ -101,7 +117,7 @@ class _Ladder:
         rough = self.error > self.tolerance
         if self.area and min(rough.shape) < 3:
             rough[:] = True  # no neighbour tells how the picture bends
-        return pixels.dilate(rough, self._reach(4))
+        return pixels.dilate(rough & self.open, self._reach(4)) & self.open
 
     def _twelve_nodes(self, rough: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Twelve nodes over pupil and pixel on the rough pixels and their surroundings where four mislead.
@@ -109,11 +125,11 @@ class _Ladder:
         Returns the pixels that twelve do not settle either. Four nodes cannot see all that they miss, so a lattice of
         pixels is probed with twelve: what four were off by there counts for the pixels around.
         """
-        probes = pixels.lattice(rough.shape) & (self.hits > 0) & ~rough
+        probes = pixels.lattice(rough.shape) & (self.hits > 0) & ~rough & self.open
         difference = self._refine(rough | probes)
         doubt = pixels.spread_over_lattice(np.where(probes, difference, 0))
         self.error = np.where(rough, self.error, np.maximum(self.error, doubt))
-        misled = ~rough & (self.hits > 0) & (self.error > self.tolerance)
+        misled = ~rough & (self.hits > 0) & (self.error > self.tolerance) & self.open
         if misled.any():
             self._refine(misled & ~probes)
         rough = rough | misled

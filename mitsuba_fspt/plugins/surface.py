@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -70,6 +71,7 @@ class FsptSurface(mi.Emitter):
         self._probe: mi.Scene | None = None
         self._checked = False
         self._attribute: mi.Float | None = None
+        self.edition = 0  # counts the changes of J_n, for those who remember something about it
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
@@ -81,6 +83,7 @@ class FsptSurface(mi.Emitter):
         super().parameters_changed(keys)
         self._positions = self._probe = None
         self._checked = False
+        self.edition += 1
 
     # ------------------------------------------------------------------ radiance
 
@@ -182,6 +185,11 @@ class FsptSurface(mi.Emitter):
 
         aside(look, self.get_shape())
         self._checked, self._attribute = True, attribute
+
+    def texels(self) -> int:
+        """Number of pixels of the bitmap that J_n is, 1 where it is none."""
+        values = mi.traverse(self.exitance)
+        return math.prod(values["data"].shape[:2]) if "data" in values else 1
 
     def _distribution(self) -> ElementDistribution:
         self.check()

@@ -23,6 +23,7 @@ from .window import visible_window
 
 FIRST_LINES, GROWTH = 16, 4  # lines of sight a pixel of the image at the first level; times this each level
 SAFETY = 4.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
+LEAST_CLAIM = 0.05  # two levels say little about what both miss: no error is said to be so much smaller than asked
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 lines of sight cannot resolve
 # No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
 # bits, and thousands of roundings on a pixel stay below 1e-9 of any but the faintest.
@@ -34,15 +35,23 @@ STEPS, STRIDE = (3679390609, 3152041523, 2700274807, 2313257605), 2654435769
 Image = NDArray[np.float64]
 
 
-def solve(scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
+def solve(
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    quadrature: Quadrature,
+    where: NDArray[np.bool_] | None = None,
+    least_peak: float = 0.0,
+) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
+
+    With `where`, of the shape of `visible_window`, only the pixels marked there are the whole picture; 0 elsewhere.
+    `least_peak`: mean radiance on film [W/mm²/sr] that the brightest pixel is known to have at least.
 
     `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
     Coverage counts the lines of sight that meet a glowing surface, not those that meet a dark one. Raises SceneError
     where an emitter has no surface.
     """
-    with dr.suspend_grad():
-        return _Refinement(scene, lens, quadrature).run()
+    return _Refinement(scene, lens, quadrature).run(where, least_peak)
 
 
 class _Refinement:
@@ -57,11 +66,11 @@ class _Refinement:
         self.rays = 0
         self.levels: list[str] = []
 
-    def run(self) -> Solution:
-        mark = np.ones(self.window.shape, bool)
+    def run(self, where: NDArray[np.bool_] | None, least_peak: float) -> Solution:
+        mark = where = np.ones(self.window.shape, bool) if where is None else where
         lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * GROWTH)
         if mark.any():
-            self.value, self.hits = self._level(lines, mark)
+            self.value, self.hits = (np.where(where, image, 0) for image in self._level(lines, mark))
         recent = np.zeros_like(self.value)
         while mark.any() and (lines := lines * GROWTH) <= most:
             value, hits = self._level(lines, mark)
@@ -71,12 +80,14 @@ class _Refinement:
             estimate = np.maximum(recent, 0.5 * last)
             # All elements with light on a marked pixel were refined: only there is the new picture whole.
             self.error[mark], self.value[mark], self.hits[mark] = estimate[mark], value[mark], hits[mark]
-            mark = self.error > self.quadrature.rtol * self.value.max()
-        error = np.maximum(self.error, FLOAT32_FLOOR * self.value.max(initial=0.0))
+            mark = self.error > self.quadrature.rtol * max(self.value.max(), least_peak)
+        floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
+        error = np.maximum(self.error, floor * self.value.max(initial=0.0))
         error[self.hits == 0] = self.error[self.hits == 0]
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.hits, 0, 1))
-        return Solution(power, error, coverage, self.rays, tuple(self.levels))
+        known = self.window.expand(where.astype(np.float64)) > 0
+        return Solution(power, error, coverage, self.rays, tuple(self.levels), known)
 
     def _level(self, lines: int, mark: NDArray[np.bool_]) -> list[Image]:
         """Value and hits from all elements with light on a marked pixel, at so many lines of sight a pixel."""

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+# So far in (blur radii) a silhouette can pass unseen between the nodes of a pixel and the rim of its pupil, and no
+# further than so many pixels is looked beyond the crop window for one.
+GAP, MOST_RIM = 0.5, 16
+
 
 @dataclass(frozen=True)
 class Window:
-    """Rectangle of the crop window: `top`, `left` of its first pixel and `shape` (h, w), inside `full` (h, w)."""
+    """Rectangle of pixels: `top`, `left` of its first one from that of the crop window, `shape` (h, w); `full` (h, w).
+
+    It may reach a rim of pixels beyond the crop window, which are computed but not shown: their neighbours inside have
+    to know of a silhouette there.
+    """
 
     top: int
     left: int
@@ -30,10 +40,27 @@ class Window:
         return mi.Point2f(left + mi.Float(number % width), top + mi.Float(number // width))
 
     def expand(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
-        """`image` of the window within the crop window, 0 around it."""
+        """The crop window with `image` of this window in its place, 0 around it."""
         whole = np.zeros(self.full)
-        whole[self.top : self.top + self.shape[0], self.left : self.left + self.shape[1]] = image
+        here, there = self._common()
+        whole[there] = image[here]
         return whole
+
+    def cut(self, image: NDArray[Any]) -> NDArray[Any]:
+        """This window's part of an image of the crop window, 0 beyond it."""
+        part = np.zeros(self.shape, image.dtype)
+        here, there = self._common()
+        part[here] = image[there]
+        return part
+
+    def _common(self) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+        """What both windows have, in this one and in the crop window."""
+        ends = [
+            (max(start, 0), max(min(start + size, most), max(start, 0)))
+            for start, size, most in zip((self.top, self.left), self.shape, self.full, strict=True)
+        ]
+        here = tuple(slice(a - start, b - start) for (a, b), start in zip(ends, (self.top, self.left), strict=True))
+        return here, tuple(slice(a, b) for a, b in ends)
 
 
 def visible_window(scene: mi.Scene, lens: mi.Sensor) -> Window:
@@ -52,9 +79,18 @@ def visible_window(scene: mi.Scene, lens: mi.Sensor) -> Window:
         for bbox in ([emitter.bbox() for emitter in emitters] if direct else [scene.bbox()])
         for pick in itertools.product((0, 1), repeat=3)
     ]
-    low, high = lens.film_bounds(np.array(corners).reshape(-1, 3))
+    points = np.array(corners).reshape(-1, 3)
+    low, high = lens.film_bounds(points)
+    blur = lens.film_discs(points)[1].max(initial=0.0)
+    rim = 1 + math.ceil(min(GAP * blur, MOST_RIM - 1))
     # One pixel more than needed on each side keeps second differences and rounding inside.
-    left, top = (int(np.clip(np.floor(low[k]) - offset[k] - 1, 0, (width, height)[k])) for k in (0, 1))
-    right, bottom = (int(np.clip(np.ceil(high[k]) - offset[k] + 1, 0, (width, height)[k])) for k in (0, 1))
-    shape = (max(0, bottom - top), max(0, right - left))
-    return Window(top, left, shape, (height, width), offset)
+    (left, right), (top, bottom) = (
+        (
+            int(np.clip(np.floor(low[k]) - offset[k] - 1, -rim, size + rim)),
+            int(np.clip(np.ceil(high[k]) - offset[k] + 1, -rim, size + rim)),
+        )
+        for k, size in enumerate((width, height))
+    )
+    if left >= width or top >= height or right <= 0 or bottom <= 0:  # only the rim sees it
+        right, bottom = left, top
+    return Window(top, left, (max(0, bottom - top), max(0, right - left)), (height, width), offset)
