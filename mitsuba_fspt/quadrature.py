@@ -52,4 +52,10 @@ class Solution:
     coverage: NDArray[np.float64]
     rays: int
     levels: tuple[str, ...] = field(default=())
-    where: NDArray[np.bool_] | None = None
+    where: NDArray[np.bool_] = field(default_factory=lambda: np.ones((), bool))
+
+    def completed_by(self, rest: Solution) -> Solution:
+        """This partial solution on its own pixels, `rest` elsewhere."""
+        planes = zip((self.power, self.error, self.coverage), (rest.power, rest.error, rest.coverage), strict=True)
+        power, error, coverage = (np.where(self.where, own, other) for own, other in planes)
+        return Solution(power, error, coverage, self.rays + rest.rays, self.levels + rest.levels)

@@ -71,10 +71,10 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 return surface_form.solve(traced, sensor, quadrature)
             narrow = self._narrow_light(scene, sensor)
             where = narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest
-            known = None
-            if where.any():
-                known = surface_form.solve(traced, sensor, quadrature, where, narrow.brightest / 2)
-            return pupil_form.solve(traced, sensor, quadrature, known)
+            if not where.any():
+                return pupil_form.solve(traced, sensor, quadrature)
+            known = surface_form.solve(traced, sensor, quadrature, where, narrow.brightest / 2)
+            return known.completed_by(pupil_form.solve(traced, sensor, quadrature, known))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""

@@ -1,8 +1,8 @@
 """Eq. 9 in its pupil form: P = étendue · mean over pixel and pupil of cos⁴θ · L(first surface point on the line).
 
-A ladder of three rules. Four nodes on the pupil serve every pixel; where the picture bends, twelve nodes over pupil
-and pixel; where the line of sight jumps (a silhouette, an occluder, an edge of J_n), chords: along each the jump is
-found by bisection and both sides are integrated on their own, so that only smooth averages are left to sample.
+A ladder of three rules. Four nodes over pupil and pixel serve every pixel; where the picture bends, twelve; where the
+line of sight jumps (a silhouette, an occluder, an edge of J_n), chords: along each the jumps are found by bisection and
+the pieces between them are integrated on their own, so that only smooth averages are left to sample.
 """
 
 from __future__ import annotations
@@ -38,18 +38,9 @@ Image = NDArray[np.float64]
 def solve(scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, known: Solution | None = None) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
-    Where a partial solution is `known` it is taken over.
+    Where a partial solution is `known` no work is done, and what comes back is rough.
     """
-    found = _Ladder(scene, lens, quadrature, known).climb()
-    if known is None:
-        return found
-    power, error, coverage = (
-        np.where(known.where, ours, own)
-        for ours, own in zip(
-            (known.power, known.error, known.coverage), (found.power, found.error, found.coverage), strict=True
-        )
-    )
-    return Solution(power, error, coverage, known.rays + found.rays, known.levels + found.levels)
+    return _Ladder(scene, lens, quadrature, known).climb()
 
 
 def coverage(scene: mi.Scene, lens: mi.Sensor) -> Image:
