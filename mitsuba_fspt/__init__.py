@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .phantom import Phantom as Phantom
     from .rendering import render as render
     from .scene import load as load
+    from .sweeping import sweep as sweep
 
 _HOMES = {
     "load": "scene",
@@ -41,6 +42,7 @@ _HOMES = {
     "Exposure": "detector",
     "Phantom": "phantom",
     "import_flux": "flux_import",
+    "sweep": "sweeping",
     "FsptError": "errors",
 }
 __all__ = list(_HOMES)

@@ -15,6 +15,7 @@ from rich.console import Console
 from typer.exceptions import TyperException
 
 from .errors import FsptError, ImageError, SceneError
+from .sweep_cli import Interrupted
 
 app = typer.Typer(
     name="fspt",
@@ -150,13 +151,45 @@ def doctor() -> None:
     raise typer.Exit(0 if diagnosis.usable else 2)
 
 
+@app.command()
+def stability(
+    everything: Annotated[bool, typer.Option("--all", help="Also the row of 3 million triangles.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
+) -> None:
+    """Try stiff and extreme cases against the truth: each must be right to its tolerance, or refused."""
+    from .stability import check
+    from .stiff_cases import cases
+
+    _quiet_mitsuba()
+    rows = [case for case in cases() if everything or not case.slow]
+    results = []
+    for row in rows:
+        results.append(check(row))
+        if not as_json:
+            typer.echo(results[-1].render_text())
+    failed = sum(not result.ok for result in results)
+    if as_json:
+        typer.echo(json.dumps([result.to_dict() for result in results]))
+    else:
+        seconds = sum(result.seconds for result in results)
+        typer.echo(f"{len(rows) - failed} of {len(rows)} hold, {seconds:.0f} s")
+    raise typer.Exit(1 if failed else 0)
+
+
 def _add_flux() -> None:
     from .flux_cli import app as flux
 
     app.add_typer(flux, name="flux")
 
 
+def _add_sweep() -> None:
+    from .sweep_cli import sweep
+
+    app.command()(sweep)
+
+
 _add_flux()
+_add_sweep()
 
 
 def main() -> None:
@@ -171,6 +204,8 @@ def run(arguments: list[str]) -> int:
         if code == INTERRUPTED:  # typer's own answer to Ctrl-C
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
+    except Interrupted as error:
+        return _fail(str(error), INTERRUPTED)
     except FsptError as error:
         return _fail(str(error))
     except TyperException as error:

@@ -309,4 +309,5 @@ def test_two_surfaces_and_faces_without_area_are_fine(folder, monkeypatch):
     spiked = fspt.render(write_scene(folder / "s.xml", **mesh("spike.ply")), max_nodes=4)
     np.testing.assert_allclose(spiked.power, alone.power, atol=1e-6 * alone.power.max())
     both = mesh("square.ply")["shapes"] + BALL_XML
-    assert fspt.render(write_scene(folder / "s.xml", shapes=both), max_nodes=4).power.sum() >= alone.power.sum()
+    together = fspt.render(write_scene(folder / "s.xml", shapes=both), max_nodes=4)
+    assert together.power.sum() >= alone.power.sum() * (1 - 1e-6)

@@ -15,8 +15,16 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 NAMES = [str(path.relative_to(PACKAGE)) for path in FILES]
 
 # The rooms that know the renderer.
-KNOWS_MITSUBA = {"backend.py", "scene.py", "rendering.py", "doctor.py", "cli.py"}
-PRINTS = {"cli.py", "flux_cli.py"}
+KNOWS_MITSUBA = {
+    "backend.py",
+    "scene.py",
+    "rendering.py",
+    "doctor.py",
+    "cli.py",
+    "sweep_studio.py",
+    "stiff_cases_scenes.py",
+}
+PRINTS = {"cli.py", "flux_cli.py", "sweep_cli.py"}
 PUBLIC = [
     "Comparison",
     "Detector",
@@ -29,6 +37,7 @@ PUBLIC = [
     "load",
     "read",
     "render",
+    "sweep",
 ]
 
 
@@ -100,8 +109,8 @@ def test_input_is_not_checked_by_assert_nor_refused_by_a_bare_exception(name):
 def test_nothing_imports_the_command_line(name):
     for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.ImportFrom) and node.level:
-            assert (node.module or "").split(".")[-1] not in ("cli", "flux_cli")
-            assert not {alias.name for alias in node.names} & {"cli", "flux_cli"}
+            assert (node.module or "").split(".")[-1] not in ("cli", "flux_cli", "sweep_cli")
+            assert not {alias.name for alias in node.names} & {"cli", "flux_cli", "sweep_cli"}
 
 
 def test_plugins_load_nothing_in_their_constructors():

@@ -1,24 +1,38 @@
-"""What a scene must be before anything is traced: something glows, J_n is sane, the camera stands outside."""
+"""What a scene must be before anything is traced: float32 can tell its lengths and its light apart, something glows,
+J_n is sane, the camera stands outside, no surface lies in another."""
 
 from __future__ import annotations
 
 import itertools
+import math
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import SceneError
+from ..errors import ExitanceError, SceneError
+from . import exitance
+from .elements import elements_of, triangles
+
+COARSEST = 0.1  # virtual pixels by which float32 may move a line of sight
+# W/mm² and W that leave room in float32 for the shares and the faint parts of a picture.
+EXITANCES, FAINTEST = (1e-32, 1e32), 1e-36
+PROBES = 1 << 10  # surface points of a shape at which another one is looked for
+LIFT = 1e-6  # of the largest coordinate: what lies no further before a surface cannot be told from it
 
 
 def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
     """Raise SceneError or ExitanceError where the scene cannot give a picture; the message says how to mend it."""
     check_lens(sensor)
+    check_rounding(sensor)
     if not scene.emitters():
         raise SceneError("scene: nothing glows. Give a shape an emitter of type 'fspt_surface' with its 'exitance'.")
     for emitter in scene.emitters():
         if type(emitter).__name__ == "FsptSurface":
             emitter.check()
+            with dr.suspend_grad():
+                check_range(emitter, sensor)
+                check_alone(scene, emitter.get_shape())
     check_outside(scene, sensor)
 
 
@@ -29,6 +43,86 @@ def check_lens(sensor: mi.Sensor) -> None:
             f"scene: the sensor is a {sensor.class_name()}, power on a pixel needs a lens. Use a sensor of type "
             "'fspt_lens'."
         )
+
+
+def check_rounding(lens: mi.Sensor) -> None:
+    """Raise SceneError where float32 cannot tell the lines of sight of neighbouring pixels apart."""
+    if lens.rounding <= COARSEST:
+        return
+    side = lens.virtual_pitch
+    raise SceneError(
+        f"fspt_lens: single precision places lines of sight to {lens.rounding * side:.2g} mm, a pixel is {side:.2g} mm "
+        f"wide on the virtual plane and must be at least {1 / COARSEST:g} times that. Give a larger 'pixel_pitch' or, "
+        "where the scene lies far from the world's origin, move it there."
+    )
+
+
+def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
+    """Raise ExitanceError where J_n or the power that comes of it leaves the range of float32."""
+    shape = emitter.get_shape()
+    elements = elements_of(shape, PROBES)
+    si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(0.5))
+    brightest = float(dr.max(exitance.function_on(shape, emitter.exitance)(si))[0])
+    if brightest == 0:
+        return  # it glows between the places looked at, and is of no size that could be told
+    name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
+    if not EXITANCES[0] <= brightest <= EXITANCES[1]:
+        raise ExitanceError(
+            f"{name} reaches {brightest:.3g} W/mm², single precision needs {EXITANCES[0]:g} … {EXITANCES[1]:g}. Give "
+            "J_n on another scale and rescale the picture, which is linear in it."
+        )
+    power = brightest / math.pi * lens.etendue
+    if power < FAINTEST:
+        raise ExitanceError(
+            f"{name} reaches {brightest:.3g} W/mm², of which a pixel gets {power:.1g} W; single precision needs "
+            f"{FAINTEST:g}. Give larger pixels, a smaller f_number, or J_n on another scale."
+        )
+
+
+def check_alone(scene: mi.Scene, shape: mi.Shape) -> None:
+    """Raise SceneError where a second surface lies in this one: which of them is seen would be chance."""
+    doubled = _doubled_faces(shape) if shape.is_mesh() else 0
+    if doubled:
+        raise SceneError(
+            f"scene: shape '{shape.id()}' has {doubled} faces more than once, its light would count as often. Merge "
+            "them, for example with trimesh: mesh.update_faces(mesh.unique_faces())."
+        )
+    if len(scene.shapes()) < 2:
+        return
+    elements = elements_of(shape, PROBES)
+    count = min(elements.count, PROBES)
+    index = dr.arange(mi.UInt32, count) * (elements.count // count)
+    si, area = elements.place(index, mi.Point2f(0.5))
+    lift = LIFT * dr.max(dr.abs(si.p))
+    ray = mi.Ray3f(si.p + lift * si.n, -si.n)
+    ray.maxt = 2 * lift
+    other = scene.ray_intersect(ray, active=area > 0)
+    shared = other.is_valid() & (other.shape != mi.ShapePtr(shape)) & (dr.dot(other.n, si.n) > 0)
+    if dr.any(shared):
+        second = other.shape[int(np.argmax(shared.numpy()))]
+        raise SceneError(
+            f"scene: shapes '{shape.id()}' and '{second.id()}' lie in the same place in part; which of them is seen "
+            "there would be chance. Move them apart or leave one out."
+        )
+
+
+def _doubled_faces(mesh: mi.Shape) -> int:
+    """How many faces with an area have the same three corners, in any order, as one before."""
+    positions, faces = triangles(mesh)
+    corner = positions.numpy().reshape(-1, 3) + np.float32(0)  # -0 becomes 0
+    face = faces.numpy().reshape(-1, 3)
+    # One number a place, alike for all vertices there; three of them add up to the face's, in any order.
+    number = np.zeros(len(corner), np.uint64)
+    for bits in corner.view(np.uint32).T:
+        number = (number ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+        number ^= number >> np.uint64(29)
+    number *= np.uint64(0xBF58476D1CE4E5B9)
+    number ^= number >> np.uint64(32)
+    keys = number[face[:, 0]] + number[face[:, 1]] + number[face[:, 2]]
+    order = np.argsort(keys)
+    again = order[1:][np.diff(keys[order]) == 0]
+    a, b, c = (corner[face[again, k]] for k in range(3))
+    return int((np.cross(b - a, c - a) != 0).any(axis=1).sum())
 
 
 def check_outside(scene: mi.Scene, lens: mi.Sensor) -> None:

@@ -22,6 +22,8 @@ OPTIONAL = (
     "diaphragm_distance",
     "numerical_aperture",
 )
+STRETCH = 1e-5  # by which float32 may make a rotation's matrix differ from one
+EPSILON = 2.0**-23  # float32's rounding of a length, relative to the largest one it comes from
 
 
 class FsptLens(mi.Sensor):
@@ -96,8 +98,11 @@ class FsptLens(mi.Sensor):
             raise OpticsError(
                 f"fspt_lens: 'pixel_pitch' must be > 0 and finite, got {pitch:g}. Give mm, for example 0.0135."
             )
-        if dr.any(self.m_to_world.has_scale()):
-            raise OpticsError("fspt_lens: 'to_world' scales lengths. Give a rotation and a translation only.")
+        axes = np.array(self.m_to_world.matrix, np.float64).reshape(4, 4)[:3, :3]
+        if not np.allclose(axes @ axes.T, np.eye(3), atol=STRETCH) or np.linalg.det(axes) < 0:
+            raise OpticsError(
+                "fspt_lens: 'to_world' scales lengths or mirrors. Give a rotation and a translation only."
+            )
         self.optics = Lens.focused(model=self._model, **numbers)
         self.pixel_pitch = pitch
         self.virtual_pitch = pitch / self.optics.magnification
@@ -105,6 +110,8 @@ class FsptLens(mi.Sensor):
         self._spread = 0.0 if self._model == "pinhole" else 1.0
         self._u = dr.opaque(mi.Float, self.optics.focus_distance)
         self._pitch = dr.opaque(mi.Float, self.virtual_pitch)
+        # Opaque: another film is the same kernel.
+        self._middle = mi.Point2f(*(dr.opaque(mi.Float, 0.5 * int(n)) for n in self.film().size()))
         # A_vd A_pupil/u² in double first: far away and stopped down, its factors leave the range of float32.
         self.etendue = self.virtual_pitch**2 * math.pi * (self.optics.discs[0].radius / self.optics.focus_distance) ** 2
         self._etendue = dr.opaque(mi.Float, self.etendue)
@@ -118,8 +125,7 @@ class FsptLens(mi.Sensor):
 
         Mitsuba's camera frame has +x to the left and +y up of the upright picture.
         """
-        size = mi.ScalarVector2f(self.film().size())
-        return (0.5 * mi.Vector2f(size) - position) * self._pitch
+        return mi.Point2f(self._middle - position) * self._pitch
 
     def line_of_sight(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
         """Ray from the pupil point through the virtual point, its weight cos⁴θ and its cosθ to the optical axis.
@@ -129,10 +135,14 @@ class FsptLens(mi.Sensor):
         """
         disc, x = self._discs[0], self.virtual_point(position)
         a = disc.shift * x + (disc.radius * self._spread) * pupil
-        d = dr.normalize(mi.Vector3f(x.x - a.x, x.y - a.y, self._u))
-        weight = dr.select(self._open(x, a), dr.square(dr.square(d.z)), 0)
-        ray = mi.Ray3f(self.m_to_world @ mi.Point3f(a.x, a.y, 0), self.m_to_world @ d)
-        return ray, weight, d.z
+        towards = mi.Vector3f(x.x - a.x, x.y - a.y, self._u)
+        cos_theta = self._u * dr.rcp(dr.norm(towards))
+        weight = dr.select(self._open(x, a), dr.square(dr.square(cos_theta)), 0)
+        # Far from the world's origin the lens point is rounded: from where it lies then, aim at the same virtual point.
+        centre, offset = mi.Point3f(self.m_to_world.translation()), self.m_to_world @ mi.Vector3f(a.x, a.y, 0)
+        origin = centre + offset
+        lost = offset - (origin - centre)
+        return mi.Ray3f(origin, dr.normalize(self.m_to_world @ towards + lost)), weight, cos_theta
 
     def blur_disc(self, point: mi.Point3f) -> tuple[mi.Point2f, mi.Float, mi.Float]:
         """Blur disc of a world point: centre and signed radius [film pixels]; side of a pixel at its depth [mm].
@@ -140,10 +150,10 @@ class FsptLens(mi.Sensor):
         Its light that heads for `pupil` [unit disc] arrives at centre + radius · pupil: r = x + (a − x)(u − z)/u with
         a = shift·x + ρ, solved for the virtual point x of the line through r and ρ.
         """
-        p = self.m_to_world.inverse() @ point
+        p = self._in_camera(point)
         back, disc = (self._u - p.z) / self._u, self._discs[0]
         scale = (1 - (1 - disc.shift) * back) * self._pitch
-        centre = 0.5 * mi.Vector2f(self.film().size()) - mi.Vector2f(p.x, p.y) / scale
+        centre = self._middle - mi.Vector2f(p.x, p.y) / scale
         return mi.Point2f(centre), disc.radius * self._spread * back / scale, scale
 
     def arrival(self, point: mi.Point3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
@@ -157,7 +167,7 @@ class FsptLens(mi.Sensor):
         x = self.virtual_point(position)
         a = disc.shift * x + (disc.radius * self._spread) * pupil
         lens_point = self.m_to_world @ mi.Point3f(a.x, a.y, 0)
-        depth = (self.m_to_world.inverse() @ point).z
+        depth = self._in_camera(point).z
         distance = dr.norm(lens_point - point)
         cos_theta = depth / distance
         # dA_a = (da/dρ)² dA_ρ: the pupil point moves along with x unless the disc is fixed in the lens plane.
@@ -167,6 +177,10 @@ class FsptLens(mi.Sensor):
         passes = (depth > 0) & dr.isfinite(weight) & self._open(x, a)
         return position, lens_point, dr.select(passes, weight, 0), cos_theta
 
+    def _in_camera(self, point: mi.Point3f) -> mi.Vector3f:
+        """A world point in the camera frame; the difference first, which is exact where the world is far off."""
+        return self.m_to_world.inverse() @ mi.Vector3f(point - mi.Point3f(self.m_to_world.translation()))
+
     def _open(self, x: mi.Point2f, a: mi.Point2f) -> mi.Bool:
         """True where the line through virtual point x and lens point a passes every further border (Eq. 5)."""
         passes = mi.Bool(True)
@@ -175,6 +189,12 @@ class FsptLens(mi.Sensor):
         return passes
 
     # ------------------------------------------------------------------ what the film can see, in double precision
+
+    @property
+    def rounding(self) -> float:
+        """How far float32 may move a line of sight on the virtual plane [virtual pixels]."""
+        place = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
+        return EPSILON * (place + self.optics.focus_distance) / self.virtual_pitch
 
     def blur_radius(self, depth: NDArray[np.float64]) -> NDArray[np.float64]:
         """Radius [pixels] of the blur disc of a point at `depth` z [mm] from the lens plane; inf at z <= 0."""

@@ -47,16 +47,16 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     parts = [_seen(emitter, lens) for emitter in emitters if type(emitter).__name__ == "FsptSurface"]
     if not parts or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, blur, x, y = np.concatenate(parts, axis=1)
+    radiance, area, reach, blur, x, y = np.concatenate(parts, axis=1)
     x, y = x - window.left - window.crop_offset[0], y - window.top - window.crop_offset[1]
     height, width = window.shape
     near = (x > -blur) & (x < width + blur) & (y > -blur) & (y < height + blur) & (radiance * area > 0)
     if not near.any():
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, blur, x, y = (column[near] for column in (radiance, area, blur, x, y))
+    radiance, area, reach, blur, x, y = (column[near] for column in (radiance, area, reach, blur, x, y))
     # A blur disc spreads an element's light over so many pixels; discs that overlap add up.
     light = radiance * area / (math.pi * blur**2 + 1)
-    hidden = _hidden(radiance, area, x, y)
+    hidden = _hidden(radiance, area, x, y) & (reach < 1)
     level = np.ceil(np.log2(np.maximum(blur, 1)))
     brightest = 0.0
     for k in np.unique(level):
@@ -95,10 +95,14 @@ def _spread(light: Column, x: Column, y: Column, reach: int, shape: tuple[int, i
 
 
 def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
-    """Of each element radiance to the lens, area of its sharp image [pixels²], blur radius, x, y [pixels]; (5, n)."""
+    """Of each element radiance to the lens, area of its sharp image [pixels²], reach, blur, x, y [pixels]; (6, n).
+
+    `reach`: how far its corners lie from its middle; infinite where a corner lies beside or behind the lens.
+    """
     shape = emitter.get_shape()
     elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
-    si, area = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(0.5))
+    index = dr.arange(mi.UInt32, elements.count)
+    si, area = elements.place(index, mi.Point2f(0.5))
     to_lens = dr.normalize(lens.world_transform() @ mi.Point3f(0) - si.p)
     si.initialize_sh_frame()
     si.wi = si.to_local(to_lens)
@@ -106,8 +110,12 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     centre, blur, scale = lens.blur_disc(si.p)
     axis = lens.world_transform() @ mi.Vector3f(0, 0, 1)
     image = area * dr.abs(dr.dot(si.n, to_lens) / (dr.dot(axis, to_lens) * dr.square(scale)))
-    columns = (scalar(emitter.eval(si)), image, dr.abs(blur), centre.x, centre.y)
+    reach = dr.zeros(mi.Float, elements.count)
+    for corner in elements.corners:
+        there, _, side = lens.blur_disc(elements.place(index, mi.Point2f(*corner))[0].p)
+        reach = dr.maximum(reach, dr.select(side * scale > 0, dr.norm(there - centre), dr.inf))
+    columns = (scalar(emitter.eval(si)), image, reach, dr.abs(blur), centre.x, centre.y)
     dr.eval(columns)
     seen = np.array([column.numpy() for column in columns], np.float64)
-    seen[0, ~np.isfinite(seen).all(axis=0)] = 0
-    return np.nan_to_num(seen, posinf=0, neginf=0)
+    seen[0, ~np.isfinite(np.delete(seen, 2, axis=0)).all(axis=0)] = 0
+    return np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)

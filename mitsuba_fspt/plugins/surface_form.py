@@ -130,6 +130,12 @@ class _Refinement:
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in film_corner(self.window)))
         middle = _middle(i, j, m)
         polygon = [centre - origin + radius * middle for centre, radius, _ in discs]
+        # The image of a piece through the cell's middle or, where that is larger, of the cell through a point of the
+        # piece: either way what lies side by side on the surface and on the pupil lies side by side on the film.
+        centre, radius, _ = lens.blur_disc(si.p)
+        cell = [centre - origin + radius * _on_pupil(i, j, m, *corner) for corner in CORNERS]
+        tiny = _size(polygon) < _size(cell)
+        polygon = [dr.select(tiny, own, other) for own, other in zip(cell, polygon, strict=True)]
         for _, _, scale in discs:  # no image where a piece reaches through the lens plane
             active &= scale * discs[0][2] > 0
         lights = (mi.Float64(radiance) * mi.Float64(etendue), mi.Float64(etendue / dr.square(dr.square(cos_theta))))
@@ -158,5 +164,15 @@ def _middle(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32) -> mi.Point2f:
 
     Their mean r² would be ½ - 1/M², what a cell spreads around its middle is missing.
     """
-    square = mi.Point2f(mi.Float(i) + 0.5, mi.Float(j) + 0.5) / mi.Float(m)
-    return mi.warp.square_to_uniform_disk_concentric(square) * dr.rsqrt(1 - 2 / dr.square(mi.Float(m)))
+    return _on_pupil(i, j, m, 0.5, 0.5) * dr.rsqrt(1 - 2 / dr.square(mi.Float(m)))
+
+
+def _on_pupil(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, x: float, y: float) -> mi.Point2f:
+    """Point (x, y) of [0, 1]² in the cell (i, j) of the pupil, in the unit disc."""
+    return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(mi.Float(i) + x, mi.Float(j) + y) / mi.Float(m))
+
+
+def _size(polygon: list[mi.Point2f]) -> mi.Float:
+    """The longer diagonal, squared."""
+    a, b, c, d = polygon
+    return dr.maximum(dr.squared_norm(c - a), dr.squared_norm(d - b))

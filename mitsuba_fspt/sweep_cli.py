@@ -1,0 +1,88 @@
+"""`fspt sweep`: a scene over all combinations of some parameters' values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .errors import BackendError, FsptError, SceneError
+
+
+class Interrupted(FsptError):
+    """Ctrl-C where what is done stays: the message says how to go on."""
+
+
+def sweep(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")],
+    define: Annotated[
+        list[str] | None,
+        typer.Option("-D", "--define", metavar="NAME=V1,V2,…", help="Values for a <default> of the scene; repeatable."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for the images, SCENE_sweep if left out.")
+    ] = None,
+    method: Annotated[str | None, typer.Option(help="integral, path or ptracer; the scene's own if left out.")] = None,
+    rtol: Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")] = None,
+    spp: Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")] = None,
+    jobs: Annotated[int | None, typer.Option(help="Processes on this machine.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
+    ] = None,
+) -> None:
+    """Render all combinations of values: an EXR each, index.csv and a contact sheet.
+
+    Run again, it renders only what is missing or was made from something
+    else: another scene, data file, value, setting or version.
+    """
+    from .cli import _progress, _quiet_mitsuba
+    from .sweeping import INDEX, sweep
+
+    folder = output or Path(f"{scene.stem}_sweep")
+    values = _values(define)
+    try:
+        with _progress() as progress:
+            _quiet_mitsuba()
+            rows = sweep(
+                scene,
+                values,
+                folder,
+                method=method,
+                rtol=rtol,
+                spp=spp,
+                seed=seed,
+                jobs=jobs,
+                scheduler=scheduler,
+                progress=progress,
+            )
+    except KeyboardInterrupt as cause:
+        raise Interrupted(
+            f"interrupted; finished images stay in {folder}, the same command goes on from there."
+        ) from cause
+    total = sum(row.wall_time for row in rows)
+    typer.echo(f"{folder / INDEX}: {len(rows)} points, {total:.3g} s of rendering")
+    _write_sheet(rows, folder / "contact_sheet.png")
+
+
+def _write_sheet(rows: list, path: Path) -> None:
+    from .sweep_sheet import write_contact_sheet
+
+    try:
+        write_contact_sheet(rows, path)
+        typer.echo(f"{path}: all of them to look at")
+    except BackendError as error:
+        typer.echo(f"fspt: no contact sheet: {error}", err=True)
+
+
+def _values(define: list[str] | None) -> dict[str, list[str]]:
+    values: dict[str, list[str]] = {}
+    for text in define or ():
+        name, equals, several = text.partition("=")
+        if not (name and equals):
+            raise SceneError(f"-D {text}: must be NAME=V1,V2,…, for example -D f_number=2.8,5.6.")
+        if name in values:
+            raise SceneError(f"-D {text}: '{name}' is given twice. Put all values into one, -D {name}=1,2.")
+        values[name] = several.split(",")
+    return values

@@ -1,0 +1,124 @@
+"""The XML of a scene as a sweep reads it: what a parameter feeds, which files the scene names, what the lens is."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from .errors import SceneError
+from .optics import Lens
+from .scene import defaults
+
+LENS_NUMBERS = {
+    *("focal_length", "f_number", "focus_distance", "magnification", "image_distance"),
+    *("lens_diameter", "diaphragm_distance", "numerical_aperture"),
+}
+REFERENCE = re.compile(r"\$(\w+)")
+
+
+class Source:
+    """A scene file and the files it includes, as they were when read.
+
+    Raises
+    ------
+    SceneError : the file or one that it includes cannot be read or is not valid XML.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.defaults = defaults(path)
+        self._files = list(_with_includes(path))
+        self._nodes = [node for file in self._files for node in ElementTree.parse(file).getroot().iter()]
+        sensors = [node for node in self._nodes if node.tag == "sensor"]
+        # Children of the lens, where there is one and no other sensor.
+        self._lens = list(sensors[0]) if [node.get("type") for node in sensors] == ["fspt_lens"] else []
+        self._digests: dict[str, str] = {}
+
+    def lens_parameters(self) -> dict[str, tuple[str, ...]]:
+        """Parameters that set numbers of the only `fspt_lens` and nothing else, with the names of these numbers."""
+        found: dict[str, tuple[str, ...]] = {}
+        ours = []
+        for node in self._lens:
+            reference = REFERENCE.fullmatch(node.get("value", ""))
+            if reference and node.tag == "float" and node.get("name") in LENS_NUMBERS | {"pixel_pitch"}:
+                found[reference[1]] = (*found.get(reference[1], ()), node.get("name", ""))
+                ours.append(node)
+        elsewhere = " ".join(text for node in self._nodes if node not in ours for text in node.attrib.values())
+        return {name: numbers for name, numbers in found.items() if f"${name}" not in elsewhere}
+
+    def check(self, parameters: Mapping[str, str]) -> None:
+        """Raise SceneError or OpticsError for a value that is no number where one is due, or that no lens can have."""
+        for node in self._nodes:
+            for attribute, text in node.attrib.items():
+                reference = REFERENCE.fullmatch(text)
+                if reference and reference[1] in parameters and _is_number_due(node, attribute):
+                    _require_number(reference[1], parameters[reference[1]])
+        self._check_lens(parameters)
+
+    def _check_lens(self, parameters: Mapping[str, str]) -> None:
+        """Before the work, not after half of it; what the scene file does not say in so many words is left to it."""
+        given = {node.get("name", ""): self._fill_in(node.get("value", ""), parameters) for node in self._lens}
+        numbers = {name: text for name, text in given.items() if name in LENS_NUMBERS}
+        plain = all(map(_is_number, numbers.values())) and "include" not in {node.tag for node in self._lens}
+        if plain and {"focal_length", "f_number"} <= set(numbers):
+            model = given.get("model", "diaphragm")
+            Lens.focused(model=model, **{name: float(text) for name, text in numbers.items()})  # type: ignore[arg-type]
+
+    def digests(self, parameters: Mapping[str, str]) -> list[tuple[str, str]]:
+        """Name and SHA-256 of the scene file, of what it includes and of every file that its attributes name."""
+        folders = [self.path.parent, *(file.parent for file in self._files), Path()]
+        folders += [self.path.parent / node.get("value", "") for node in self._nodes if node.tag == "path"]
+        found = {str(file): self._digest(file) for file in self._files}
+        for text in {text for node in self._nodes for text in node.attrib.values()}:
+            name = self._fill_in(text, parameters)
+            file = next((folder / name for folder in folders if os.path.isfile(folder / name)), None)
+            if file is not None:
+                found[str(file)] = self._digest(file)
+        # A scene that moved with its data is the same scene.
+        return sorted((os.path.relpath(name, self.path.parent), digest) for name, digest in found.items())
+
+    def _digest(self, file: Path) -> str:
+        if str(file) not in self._digests:
+            self._digests[str(file)] = _sha256(file)
+        return self._digests[str(file)]
+
+    def _fill_in(self, text: str, parameters: Mapping[str, str]) -> str:
+        values = {**self.defaults, **parameters}
+        return REFERENCE.sub(lambda found: values.get(found[1], found[0]), text)
+
+
+def _with_includes(path: Path) -> Iterator[Path]:
+    yield path
+    for include in ElementTree.parse(path).getroot().iter("include"):
+        inner = path.parent / include.get("filename", "")
+        if inner.is_file():
+            yield from _with_includes(inner)
+
+
+def _is_number_due(node: ElementTree.Element, attribute: str) -> bool:
+    return attribute in ("x", "y", "z", "angle") or (attribute == "value" and node.tag in ("float", "integer"))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text)) and "_" not in text
+    except ValueError:
+        return False
+
+
+def _require_number(name: str, text: str) -> None:
+    if not _is_number(text):
+        raise SceneError(f"sweep: parameter '{name}' must be a finite number, got '{text}'. Correct this value.")
+
+
+def _sha256(file: Path) -> str:
+    digest = hashlib.sha256()
+    with file.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

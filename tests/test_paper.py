@@ -1,0 +1,155 @@
+"""The pure functions of scripts/paper.py: its sums, finders and tables do what docs/paper.md says."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mitsuba_fspt as fspt
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "scripts"))
+
+import paper_common  # noqa: E402
+import paper_models  # noqa: E402
+import paper_stops  # noqa: E402
+import paper_vignetting  # noqa: E402
+from paper_common import FOCUS, Table  # noqa: E402
+
+
+def patch(depth, side=2.0, count=150):
+    """Points on a square patch that faces the lens, `depth` from it; normals; 1 W/mm² on each one's share [W]."""
+    line = (np.arange(count) + 0.5) / count * side - side / 2
+    x, y = (axis.ravel() for axis in np.meshgrid(line, line))
+    points = np.column_stack([x, y, np.full(x.size, float(depth))])
+    return points, np.broadcast_to([0.0, 0, -1], points.shape), np.full(x.size, side**2 / x.size)
+
+
+# --- the sum over surface points ---
+
+
+@pytest.mark.parametrize("depth", [150.0, 180.0])
+def test_sum_over_points_carries_what_enters_the_diaphragm(depth):
+    """Rationale: fine enough, the sum is Eq. 9, before and behind the sharp plane: Σ P = J_n A sin²θ on the axis.
+
+    Expected: 1 %, by pixel centres in a blur disc of nine pixels; cos⁴ over a patch of 2 mm is 1e-4.
+    Seen to fail with D for D/2.
+    """
+    diameter = 20.0
+    power = paper_stops.eq9_sum(*patch(depth), diameter=diameter, shape=(40, 40))
+    expected = 4.0 * (diameter / 2) ** 2 / ((diameter / 2) ** 2 + depth**2)
+    assert power.sum() == pytest.approx(expected, rel=1e-2)
+
+
+def test_sum_over_points_is_sparse_beside_the_sharp_plane_and_misses_what_lies_in_it():
+    """Rationale: the blur disc shrinks below a pixel and hits a centre by luck; in the plane itself it never does."""
+    near = paper_stops.eq9_sum(*patch(FOCUS + 1, count=12), diameter=2.5, shape=(40, 40))
+    inside = near[16:24, 16:24]
+    assert (inside == 0).mean() > 0.5
+    assert paper_stops.eq9_sum(*patch(FOCUS), diameter=2.5, shape=(40, 40)).max() == 0
+
+
+def test_sum_over_points_sees_no_point_that_faces_away():
+    points, normals, watts = patch(180.0, count=40)
+    assert paper_stops.eq9_sum(points, -normals, watts, diameter=20.0, shape=(40, 40)).max() == 0
+
+
+def test_picture_of_a_point_is_upright():
+    """A point up and to the right (x, y > 0) shines above and to the right of the middle: small row, large column."""
+    power = paper_stops.eq9_sum(
+        np.array([[2.0, 3.0, 180.0]]), np.array([[0.0, 0, -1]]), np.ones(1), diameter=20.0, shape=(40, 60)
+    )
+    row, column = np.argwhere(power).mean(axis=0)
+    assert column == pytest.approx(29.5 + 2 * FOCUS / 180 / 0.216, abs=0.5)
+    assert row == pytest.approx(19.5 - 3 * FOCUS / 180 / 0.216, abs=0.5)
+
+
+# --- stops ---
+
+
+def test_half_per_full_stop_whatever_the_nominal_numbers():
+    f = np.array(paper_stops.F_NUMBERS)
+    np.testing.assert_allclose(paper_stops.ratio_per_stop(f, 3e-9 / f**2), 0.5)
+    np.testing.assert_allclose(paper_stops.ratio_per_stop(f, np.full(len(f), 2.0)), 1.0)
+
+
+def disc(centre, radius, blur):
+    """Picture of a disc, brightest in its middle at the column `centre` [pixels], its edge a ramp of width `blur`."""
+    y, x = np.mgrid[0:61, 0:91]
+    away = np.hypot(x - centre, y - 30)
+    return np.clip((radius - away) / blur + 0.5, 0, 1) * (1 - 1e-3 * away**2 / radius**2)
+
+
+@pytest.mark.parametrize("radius", [12.3, 20.0])
+def test_border_of_a_disc_lies_at_its_radius(radius):
+    """Expected: at half of the peak the radius, at 5 % that and 0.45 of the ramp more, the peak between the pixels.
+
+    At 5 % to a quarter of a pixel: a straight line between pixels cuts off the corner where the ramp ends.
+    """
+    power = disc(40.3, radius, 4.0)
+    peak, half = paper_stops.peak_to_border(power, 0.5)
+    assert peak == pytest.approx(40.3, abs=0.01)
+    assert half == pytest.approx(radius, abs=0.05)
+    assert paper_stops.peak_to_border(power, 0.05)[1] == pytest.approx(radius + 1.8, abs=0.25)
+
+
+def test_the_nearer_border_counts_and_one_outside_the_picture_does_not():
+    power = disc(40.0, 10.0, 2.0)
+    power[:, :40] = np.maximum(power[:, :40], 0.9)  # light up to the left edge
+    assert paper_stops.peak_to_border(power, 0.5)[1] == pytest.approx(10.0, abs=0.05)
+
+
+# --- vignetting ---
+
+
+def test_circles_that_overlap():
+    """Expected: apart nothing, one inside the other the smaller; equal ones a radius apart 2π/3 − √3/2, its middle."""
+    area, aside = paper_vignetting.overlap(2.0, 2.0, np.array([1e-9, 2.0, 4.0 - 1e-9]))
+    np.testing.assert_allclose(area / 4, [np.pi, 2 * np.pi / 3 - np.sqrt(3) / 2, 0], atol=1e-6)
+    np.testing.assert_allclose(aside[:2], [0, 1], atol=1e-6)
+    area, aside = paper_vignetting.overlap(1.0, 3.0, np.array([0.5]))
+    assert (area[0], aside[0]) == pytest.approx((np.pi, 0), abs=1e-6)
+
+
+def test_illumination_falls_from_one():
+    light = paper_vignetting.illumination(np.linspace(0, 38, 20), 55 / 4)
+    assert light[0] == pytest.approx(1)
+    assert (np.diff(light) < 0).all()
+
+
+# --- the exposure, tables ---
+
+
+def test_exposure_gives_the_power_back():
+    """Expected: within three standard errors of the shot noise over all pixels."""
+    image = fspt.Image(np.full((64, 64), 3e-9), metadata={"pixel_pitch": 0.216, "magnification": 0.5})
+    found, electrons = paper_models.expose(image)
+    error = found.power.std() / 64
+    assert 0 < error < 1e-3 * 3e-9
+    assert found.power.mean() == pytest.approx(3e-9, abs=3 * error)
+    assert electrons > 1000
+
+
+def test_binning_sums_and_keeps_the_scale():
+    image = fspt.Image(np.arange(36.0).reshape(6, 6), metadata={"pixel_pitch": 0.1, "magnification": 0.5})
+    found = paper_common.binned(image, 3)
+    np.testing.assert_array_equal(found.power, [[63, 90], [225, 252]])
+    assert found.metadata["pixel_pitch"] == pytest.approx(0.3)
+    np.testing.assert_allclose(paper_common.places(found), [-0.3, 0.3])
+
+
+def test_tables_fill_their_places_in_a_text(tmp_path):
+    table = Table("one", {"view": "", "ME": ".3f"}, [("left", 0.12345), ("back", None)])
+    text = tmp_path / "text.md"
+    text.write_text("before\n<!-- one -->\nold\n<!-- /one -->\nafter\n", encoding="utf-8")
+    for _ in range(2):
+        paper_common.fill(text, [table])
+    filled = (
+        "before\n<!-- one -->\n\n| view | ME |\n|---|---|\n| left | 0.123 |\n| back | – |\n\n<!-- /one -->\nafter\n"
+    )
+    assert text.read_text(encoding="utf-8") == filled
+    paper_common.write_csv([table], tmp_path / "values.csv")
+    assert (tmp_path / "values.csv").read_text().splitlines() == ["table,case,quantity,value", "one,left,ME,0.12345"]
