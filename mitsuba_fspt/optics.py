@@ -169,6 +169,15 @@ class Lens:
         return self.focal_length / self.f_number
 
     @property
+    def clear_field(self) -> float:
+        """How far [mm] off the axis virtual points still see the whole pupil; inf where only one disc bounds it."""
+        if len(self.discs) == 1:
+            return math.inf
+        pupil, border = self.discs
+        gap, shift = border.radius - pupil.radius, abs(border.shift - pupil.shift)
+        return gap / shift if shift else math.copysign(math.inf, gap)
+
+    @property
     def discs(self) -> tuple[Disc, ...]:
         """The one or two discs of the lens plane a line of sight has to pass; their overlap is the open pupil.
 

@@ -60,6 +60,8 @@ class _Ladder:
         self.window: Window = visible_window(scene, lens)
         shape = self.window.shape
         self.value, self.error, self.hits, self.change = (np.zeros(shape) for _ in range(4))
+        # Pixels for which a second border of the lens cuts the pupil, whatever is sharp.
+        self.clipped = self.window.off_axis(lens) > lens.optics.clear_field
         self.open = np.ones(shape, bool)  # pixels that are not known from elsewhere
         self.known = np.zeros(shape)
         if known is not None:
@@ -142,9 +144,12 @@ class _Ladder:
         return difference
 
     def _cut_off(self, nodes: int) -> Image:
-        """What a rule may be wrong by where a silhouette crosses or hides between its nodes and the pupil's rim."""
+        """What a rule may be wrong by where an edge crosses or hides between its nodes and the pupil's rim.
+
+        A silhouette, or the border of the lens.
+        """
         brightest = pixels.spread_max(self.value)
-        return np.where(pixels.outline(self.hits, self._reach(nodes)), CUT[nodes] * brightest, 0)
+        return np.where(pixels.outline(self.hits, self._reach(nodes)) | self.clipped, CUT[nodes] * brightest, 0)
 
     def _apply(self, rule: rules.Rule, where: NDArray[np.bool_]) -> list[Image]:
         """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
@@ -225,7 +230,7 @@ class _Ladder:
         if not self.area:
             return np.ones(self.value.shape, bool)
         nearest = -pixels.spread_max(-self.nearest)
-        return self.lens.blur_radius(nearest) > 0.5
+        return (self.lens.blur_radius(nearest) > 0.5) | self.clipped
 
     def _calm(self, split: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """True where neither a pixel nor its neighbours jump: no chord of theirs was split, no outline passes."""

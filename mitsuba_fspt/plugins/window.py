@@ -39,6 +39,13 @@ class Window:
         top = dr.opaque(mi.Float, self.top + self.crop_offset[1] + 0.5)
         return mi.Point2f(left + mi.Float(number % width), top + mi.Float(number // width))
 
+    def off_axis(self, lens: mi.Sensor) -> NDArray[np.float64]:
+        """Largest distance [mm] from the optical axis to a point of each virtual pixel, (h, w)."""
+        width, height = (int(n) for n in lens.film().size())
+        x = self.left + self.crop_offset[0] + np.arange(self.shape[1]) + 0.5 - width / 2
+        y = self.top + self.crop_offset[1] + np.arange(self.shape[0]) + 0.5 - height / 2
+        return (np.hypot(x, y[:, None]) + np.sqrt(0.5)) * lens.virtual_pitch
+
     def expand(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
         """The crop window with `image` of this window in its place, 0 around it."""
         whole = np.zeros(self.full)
