@@ -101,7 +101,7 @@ def _sample(
 
     from .plugins.checks import check_scene
     from .plugins.pupil_form import coverage
-    from .plugins.recording import nothing_collected
+    from .plugins.recording import recording
 
     check_scene(scene, lens)
     if spp < 2:
@@ -115,7 +115,7 @@ def _sample(
     for k in range(passes):
         if progress:
             progress("sampling", k / passes)
-        with dr.suspend_grad(), nothing_collected():
+        with dr.suspend_grad(), recording():
             (of_pass,) = np.random.SeedSequence((seed, k)).generate_state(1)
             image = integrator.render(scene, lens, seed=int(of_pass), spp=math.ceil(spp / passes))
         power = np.array(image, np.float64)[..., 0]

@@ -91,9 +91,12 @@ def test_pixels_that_see_nothing_cost_nothing():
 
 @pytest.mark.parametrize("pixel", ["centre", "area"])
 def test_smooth_pixels_take_four_lines_of_sight(pixel):
-    """Expected: 4 at every pixel of a uniform disk, and twelve more at the one of sixteen that is probed."""
+    """Expected: 4 at every pixel of a uniform disk, and twelve more at the one of sixteen that is probed.
+
+    The unseen rim of two pixels around the film counts, too.
+    """
     picture = fspt.render(scene(disk(FOCUS), f_number=8.0), pixel=pixel)
-    assert picture.metadata["nodes"] == (4 + 12 / 16) * WIDTH * HEIGHT
+    assert picture.metadata["nodes"] == (4 + 12 / 16) * (WIDTH + 4) * (HEIGHT + 4)
     assert picture.coverage.min() == 1
 
 

@@ -146,6 +146,9 @@ class ParameterElements(Elements):
         super().__init__(shape)
         self.side = math.ceil(math.sqrt(minimum))
         self.count = self.side**2
+        self._round = _ROUND.get(shape.class_name())
+        if self._round:
+            self._to_world = mi.Transform4f(mi.traverse(shape)["to_world"])
 
     def place(
         self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
@@ -155,7 +158,7 @@ class ParameterElements(Elements):
         within = (mi.Point2f(mi.Point2u(number % cut, number // cut)) + sample) / mi.Float(cut)
         # A hair inside: at their very ends the parameters of a disk miss it.
         uv = dr.clip((cell + within) / self.side, 2.0**-21, 1 - 2.0**-21)
-        si = self.shape.eval_parameterization(uv)
+        si = self.at(uv)
         return si, self._area(si) / dr.square(mi.Float(cut))
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
@@ -168,11 +171,42 @@ class ParameterElements(Elements):
         weights = ((1 - x.x) * (1 - x.y), x.x * (1 - x.y), (1 - x.x) * x.y, x.x * x.y)
         return cell.x + cell.y * self.side, weights
 
+    def at(self, uv: mi.Point2f) -> mi.SurfaceInteraction3f:
+        """The surface record at (u, v) of [0, 1]².
+
+        Mitsuba's spheres and cylinders look for their own points along the normal they would have unturned, and past
+        some of them when turned by 90°.
+        """
+        if not self._round:
+            return self.shape.eval_parameterization(uv)
+        local, normal = self._round(uv)
+        p, n = self._to_world @ local, dr.normalize(self._to_world @ normal)
+        pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(uv))
+        pi.valid, pi.t = True, 1.0
+        return self.shape.compute_surface_interaction(mi.Ray3f(p + n, -n), pi, mi.RayFlags.All)
+
     def _cell(self, si: mi.SurfaceInteraction3f) -> mi.Point2u:
         return mi.Point2u(dr.clip(si.uv * self.side, 0, self.side - 1))
 
     def _area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / self.count
+
+
+def _on_sphere(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
+    """Point and normal of the unit sphere at its parameters: longitude/2π from +x, polar angle/π from +z."""
+    sin_phi, cos_phi = dr.sincos(dr.two_pi * uv.x)
+    sin_theta, cos_theta = dr.sincos(dr.pi * uv.y)
+    local = mi.Vector3f(cos_phi * sin_theta, sin_phi * sin_theta, cos_theta)
+    return mi.Point3f(local), mi.Normal3f(local)
+
+
+def _on_cylinder(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
+    """Point and normal of the unit cylinder from z = 0 to 1 at its parameters: longitude/2π from +x, height."""
+    sin_phi, cos_phi = dr.sincos(dr.two_pi * uv.x)
+    return mi.Point3f(cos_phi, sin_phi, uv.y), mi.Normal3f(cos_phi, sin_phi, 0)
+
+
+_ROUND = {"Sphere": _on_sphere, "Cylinder": _on_cylinder}
 
 
 def _of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:

@@ -12,7 +12,7 @@ from . import pupil_form, surface_form
 from .checks import check_scene
 from .intersections import robust_scene
 from .narrow import NarrowLight, narrow_light
-from .recording import nothing_collected
+from .recording import recording
 from .window import visible_window
 
 NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
@@ -65,7 +65,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         """
         quadrature = quadrature or self.quadrature
         check_scene(scene, sensor)
-        with nothing_collected(), dr.suspend_grad():
+        with recording(), dr.suspend_grad():
             traced = self._traced(scene, sensor)
             if quadrature.domain == "surface":
                 return surface_form.solve(traced, sensor, quadrature)

@@ -208,7 +208,10 @@ class FsptLens(mi.Sensor):
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; inf: nothing bounds it."""
         to_camera = np.linalg.inv(np.array(self.m_to_world.matrix, np.float64).reshape(4, 4))
-        p = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+        # A turned sphere does not find a few of its own points: they may be anywhere, z = -inf.
+        lost = ~np.isfinite(points).all(axis=-1, keepdims=True)
+        p = np.where(lost, 0, points) @ to_camera[:3, :3].T + to_camera[:3, 3]
+        p[..., 2:][lost] = -np.inf
         disc, u = self.optics.discs[0], self.optics.focus_distance
         scale = 1 - (1 - disc.shift) * (u - p[..., 2:]) / u
         scale = np.where(scale > 0, scale, 1)  # there the radius is infinite
