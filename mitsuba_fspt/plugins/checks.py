@@ -32,7 +32,7 @@ def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
             emitter.check()
             with dr.suspend_grad():
                 check_range(emitter, sensor)
-                check_alone(scene, emitter.get_shape())
+                check_alone(scene, emitter)
     check_outside(scene, sensor)
 
 
@@ -79,9 +79,16 @@ def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
         )
 
 
-def check_alone(scene: mi.Scene, shape: mi.Shape) -> None:
+def check_alone(scene: mi.Scene, emitter: mi.Emitter) -> None:
     """Raise SceneError where a second surface lies in this one: which of them is seen would be chance."""
-    doubled = _doubled_faces(shape) if shape.is_mesh() else 0
+    shape = emitter.get_shape()
+    doubled = 0
+    if shape.is_mesh():
+        buffers = triangles(shape)
+        # Looked at once for as long as the mesh stays the same.
+        if [b.index for b in buffers] != [b.index for b in emitter.single_faces]:
+            doubled = _doubled_faces(*buffers)
+            emitter.single_faces = () if doubled else buffers
     if doubled:
         raise SceneError(
             f"scene: shape '{shape.id()}' has {doubled} faces more than once, its light would count as often. Merge "
@@ -106,9 +113,8 @@ def check_alone(scene: mi.Scene, shape: mi.Shape) -> None:
         )
 
 
-def _doubled_faces(mesh: mi.Shape) -> int:
+def _doubled_faces(positions: mi.Float, faces: mi.UInt32) -> int:
     """How many faces with an area have the same three corners, in any order, as one before."""
-    positions, faces = triangles(mesh)
     corner = positions.numpy().reshape(-1, 3) + np.float32(0)  # -0 becomes 0
     face = faces.numpy().reshape(-1, 3)
     # One number a place, alike for all vertices there; three of them add up to the face's, in any order.

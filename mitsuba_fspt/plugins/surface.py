@@ -72,6 +72,7 @@ class FsptSurface(mi.Emitter):
         self._probe: mi.Scene | None = None
         self._checked = False
         self._attribute: mi.Float | None = None
+        self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
         self.edition = 0  # counts the changes of J_n, for those who remember something about it
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
