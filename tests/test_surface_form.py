@@ -31,7 +31,7 @@ def both(of, rtol=RTOL, **accuracy):
 def test_both_forms_are_one_integral(case):
     """Expected: the accuracy asked for at every pixel, a bound on 99 of 100.
 
-    Seen to fail with the half angle of the cells' middles left out (blur too small) and with 1/M² → 1/M.
+    Seen to fail with the cosine at the surface dropped, and on the cylinder with blur discs of half the radius.
     """
     name, f_number = case
     surface, pupil = both(load(name, f_number=f_number))
@@ -45,7 +45,7 @@ def test_both_forms_are_one_integral(case):
 def test_all_power_arrives_at_every_focus(focus):
     """Rationale: images are shared out exactly among pixels, whatever is in focus. Expected: ∫ J_n f dS to 2e-3.
 
-    Seen to fail with the last column of a footprint dropped.
+    Seen to fail with the cosine at the surface dropped.
     """
     pitch = 0.8 * 55 / (focus - 55)
     sharp = scene(sphere(180.0, 8.0), focus_distance=focus, pixel_pitch=pitch)
