@@ -16,12 +16,13 @@ ROUNDING = 1e-4  # of a share of hits: a sum of float32 weights
 def box_sum(image: NDArray[Any], radius: int) -> NDArray[Any]:
     """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
     for axis in (0, 1):
-        n = image.shape[axis]
-        sums = np.cumsum(image, axis, dtype=image.dtype)
-        total = np.concatenate([np.zeros_like(sums.take([0], axis)), sums], axis)
-        index = np.arange(n)
-        upper, lower = np.minimum(index + radius + 1, n), np.maximum(index - radius, 0)
-        image = total.take(upper, axis) - total.take(lower, axis)
+        image = np.moveaxis(image, axis, 0)
+        reach = min(radius, len(image))
+        # Sums from the border on, each of them over a window that slides in from outside.
+        sums = np.zeros((len(image) + 2 * reach + 1, *image.shape[1:]), image.dtype)
+        np.cumsum(image, 0, out=sums[reach + 1 : len(image) + reach + 1])
+        sums[len(image) + reach + 1 :] = sums[len(image) + reach]
+        image = np.moveaxis(sums[2 * reach + 1 :] - sums[: len(image)], 0, axis)
     return image
 
 
@@ -33,16 +34,32 @@ def mean_where(image: Image, mask: Mask, radius: int) -> Image:
 
 def dilate(mask: Mask, radius: int) -> Mask:
     """True within `radius` pixels (square) of a marked pixel."""
-    return box_sum(mask.astype(np.int32), radius) > 0 if mask.any() else mask
+    return spread_max(mask, radius)
 
 
-def spread_max(image: Image) -> Image:
-    """Largest value among the 3 × 3 pixels around each."""
+def grow(mask: Mask, reach: NDArray[np.int64]) -> Mask:
+    """True within `reach` (h, w) pixels (square) of a marked pixel, each with its own; up to 1.5 times as far."""
+    grown = np.zeros_like(mask)
+    left, radius = mask, 1
+    while left.any():
+        near = left & (reach <= radius)
+        grown |= dilate(near, radius)
+        left = left & ~near
+        radius += max(1, radius // 2)
+    return grown
+
+
+def spread_max(image: NDArray[Any], radius: int = 1) -> NDArray[Any]:
+    """Largest value within `radius` pixels (square) of each."""
     for axis in (0, 1):
-        image = np.moveaxis(image, axis, 0)
-        spread = image.copy()
-        np.maximum(spread[1:], image[:-1], out=spread[1:])
-        np.maximum(spread[:-1], image[1:], out=spread[:-1])
+        spread, reach = np.moveaxis(image, axis, 0).copy(), 0
+        while reach < min(radius, len(spread) - 1):
+            # As far as it goes already once more, and no gap opens.
+            step = min(reach + 1, radius - reach, len(spread) - 1)
+            before = spread.copy()
+            np.maximum(spread[step:], before[:-step], out=spread[step:])
+            np.maximum(spread[:-step], before[step:], out=spread[:-step])
+            reach += step
         image = np.moveaxis(spread, 0, axis)
     return image
 
@@ -75,6 +92,11 @@ def gradient(image: Image) -> tuple[Image, Image]:
     """Central differences along x and y, one-sided at the border; 0 along an axis of a single pixel."""
     along = [np.gradient(image, axis=axis) if image.shape[axis] > 1 else np.zeros_like(image) for axis in (1, 0)]
     return along[0], along[1]
+
+
+def parted(hits: Image) -> Mask:
+    """True where some lines of sight of a pixel hit and some miss."""
+    return (hits > ROUNDING) & (hits < 1 - ROUNDING)
 
 
 def outline(hits: Image, reach: int) -> Mask:

@@ -127,8 +127,9 @@ class Chords:
 def chords(m: int, q: int, area: bool = True) -> Chords:
     """m · q² chords: across the pupil m equidistant ones for each of q × q Gauss points, shifted from point to point.
 
-    Without `area` all belong to the pixel's centre. Across the pixel they are equidistant, and their pupil points
-    fill the disc evenly, whatever run of them is taken (R₂ sequence).
+    Without `area` all belong to the pixel's centre; four chords share 2 × 2 points, such that one as far on the other
+    side of the middle has the opposite point. Across the pixel they are equidistant, and their pupil points fill the
+    disc evenly, whatever run of them is taken (R₂ sequence).
     """
     if not area:
         m, q = m * q * q, 1
@@ -137,6 +138,8 @@ def chords(m: int, q: int, area: bool = True) -> Chords:
     shift = np.mod(0.5 + GOLDEN * np.arange(q * q), 1.0)
     across = (np.arange(m)[:, None] + shift) / m
     pixel = np.broadcast_to(np.stack([px, py], axis=-1), (m, q * q, 2))
+    if area and (m, q) == (4, 1):
+        pixel = np.sqrt(1 / 12) * np.array([[[1, 1]], [[1, -1]], [[-1, 1]], [[-1, -1]]])
     weight = np.broadcast_to(np.outer(w, w).ravel() / m, (m, q * q))
     number = np.arange(m * q * q) + 0.5
     radius, turn = np.mod(np.outer(PLASTIC, number), 1.0)

@@ -55,8 +55,8 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
     return lambda si: shape.eval_attribute_1(name, si) * scale
 
 
-def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
-    """Raise ExitanceError where J_n is negative, not finite or zero everywhere, at every corner and centre."""
+def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> float:
+    """Largest J_n [W/mm²] of all corners and centres; ExitanceError if one is negative or not finite, or all are 0."""
     if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):
         raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has vertices that are not finite. Mend its mesh.")
     elements = elements_of(shape, minimum=1 << 14)
@@ -77,6 +77,7 @@ def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], 
         )
     if values.max() == 0:
         raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
+    return float(values.max())
 
 
 def _attribute_name(texture: mi.Texture) -> str | None:

@@ -13,7 +13,7 @@ from .checks import check_scene
 from .intersections import robust_scene
 from .narrow import NarrowLight, narrow_light
 from .recording import recording
-from .window import visible_window
+from .window import Window, visible_window
 
 NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
 
@@ -66,15 +66,15 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         quadrature = quadrature or self.quadrature
         check_scene(scene, sensor)
         with recording(), dr.suspend_grad():
-            traced = self._traced(scene, sensor)
+            traced, window = self._traced(scene, sensor), visible_window(scene, sensor)
             if quadrature.domain == "surface":
-                return surface_form.solve(traced, sensor, quadrature)
-            narrow = self._narrow_light(scene, sensor)
+                return surface_form.solve(traced, sensor, window, quadrature)
+            narrow = self._narrow_light(scene, sensor, window)
             where = narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest
             if not where.any():
-                return pupil_form.solve(traced, sensor, quadrature)
-            known = surface_form.solve(traced, sensor, quadrature, where, narrow.brightest / 2)
-            return known.completed_by(pupil_form.solve(traced, sensor, quadrature, known))
+                return pupil_form.solve(traced, sensor, window, quadrature)
+            known = surface_form.solve(traced, sensor, window, quadrature, where, narrow.brightest / 2)
+            return known.completed_by(pupil_form.solve(traced, sensor, window, quadrature, known))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""
@@ -85,9 +85,9 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             self._sound = scene.emitters()
         return scene
 
-    def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor) -> NarrowLight:
+    def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
         """`narrow_light`, found once for as long as neither surfaces nor lens nor film change."""
-        emitters, window = scene.emitters(), visible_window(scene, lens)
+        emitters = scene.emitters()
         state = (emitters, [getattr(emitter, "edition", 0) for emitter in emitters], window)
         # A lens makes new optics with every change, if only of its place.
         if self._narrow is None or self._narrow[0] != state or self._narrow[1] is not lens.optics:

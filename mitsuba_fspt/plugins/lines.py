@@ -105,37 +105,38 @@ def integrate_chord(scene: mi.Scene, lens: mi.Sensor, chord: Chord, along: rules
         return dr.abs(jump.f.y - jump.f.x) + dr.select(jump.body.x != jump.body.y, chord.outline, 0)
 
     def scan(k: mi.UInt32, first: _Jump, second: _Jump, total: mi.Float, lit: mi.Point2f, last: mi.Point2f) -> tuple:
-        s = step * mi.Float(k + 1) - 1
+        s = step * mi.Float(k) - 1
         f, body = look(s)
         new = _Jump(mi.Point2f(s - step, s), mi.Point2f(last.x, f), mi.Point2f(last.y, body))
-        largest, larger = size(new) > size(first), size(new) > size(second)
+        new_size = dr.select(k > 0, size(new), 0)
+        largest, larger = new_size > size(first), new_size > size(second)
         second = dr.select(largest, first, dr.select(larger, new, second))
         first = dr.select(largest, new, first)
         lit = dr.select(body > 0, mi.Point2f(dr.minimum(lit.x, s), s), lit)
-        return first, second, total + size(new), lit, mi.Point2f(f, body)
+        return first, second, total + new_size, lit, mi.Point2f(f, body)
 
-    def bisect(k: mi.UInt32, jump: _Jump) -> tuple:
+    def bisect(k: mi.UInt32, jump: _Jump, other: _Jump) -> tuple:
+        # Half of the rounds for the first jump, then the two change places.
+        turn = k == bisections
+        jump, other = dr.select(turn, other, jump), dr.select(turn, jump, other)
         s = 0.5 * (jump.at.x + jump.at.y)
         f, body = look(s)
         left = _Jump(mi.Point2f(jump.at.x, s), mi.Point2f(jump.f.x, f), mi.Point2f(jump.body.x, body))
         right = _Jump(mi.Point2f(s, jump.at.y), mi.Point2f(f, jump.f.y), mi.Point2f(body, jump.body.y))
-        return (dr.select(size(left) >= size(right), left, right),)
-
-    def place(jump: _Jump, is_jump: mi.Bool) -> mi.Float:
-        (jump,) = repeat(bisections, bisect, jump, while_true=lambda jump: is_jump & (size(jump) > 0))
-        return 0.5 * (jump.at.x + jump.at.y)
+        return dr.select(size(left) >= size(right), left, right), other
 
     bisections = dr.opaque(mi.UInt32, along.bisections)
-    f, body = look(mi.Float(-1))
-    lit = dr.select(body > 0, mi.Point2f(-1, -1), mi.Point2f(2, -2))
     first, second, total, lit, _ = repeat(
-        intervals, scan, dr.zeros(_Jump), dr.zeros(_Jump), mi.Float(0), lit, mi.Point2f(f, body)
+        intervals + 1, scan, dr.zeros(_Jump), dr.zeros(_Jump), mi.Float(0), mi.Point2f(2, -2), mi.Point2f(0)
     )
     # A step that is not much larger than the others is a slope; on a parabola one is at most 3 times their mean.
     one, two = size(first), size(second)
     jumps = one > dr.maximum(STEEP * (total - one) / (mi.Float(intervals) - 1), chord.least)
     both = jumps & (two > dr.maximum(STEEP * (total - one - two) / (mi.Float(intervals) - 2), chord.least))
-    s_first, s_second = place(first, jumps), place(second, both)
+    rounds = dr.select(both, 2, dr.select(jumps, 1, 0)) * bisections
+    found, other = repeat(rounds, bisect, first, second)
+    first, second = dr.select(both, other, found), dr.select(both, found, other)
+    s_first, s_second = 0.5 * (first.at.x + first.at.y), 0.5 * (second.at.x + second.at.y)
     left = dr.select(jumps, dr.select(both, dr.minimum(s_first, s_second), s_first), 1)
     right = dr.select(both, dr.maximum(s_first, s_second), 1)
 

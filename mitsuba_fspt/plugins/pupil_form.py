@@ -22,25 +22,30 @@ from .window import Window, visible_window
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 SAFETY = 3.0  # the last change of a chord level and of its neighbours, times this, bounds what is left
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
-# A silhouette can pass between a rule's outermost nodes and the rim of the pupil: that far in (blur radii). Near one,
-# a rule is wrong by up to this share of the light.
-GAP = {4: 0.5, 12: 0.2}
-CUT = {4: 1.0, 12: 0.3}
+# A silhouette can pass between the outermost of a rule's nodes, or of the first four chords, and the rim of the pupil:
+# that far in (blur radii). A straight one makes them wrong by at most this share of the light, where it parts the nodes
+# and where it does not.
+GAP = {4: 0.6, 12: 0.25, "chords": 0.1}
+CUT = {4: 0.35, 12: 0.3}
+UNSEEN = {4: 0.25, 12: 0.15, "chords": 0.0125}
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
 TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
-FIRST_GAIN = 0.3  # what is left of the difference between four and twelve nodes once the first chords are in
+FIRST_GAIN = 0.3  # what is left of the difference to twelve nodes once the first chords are in, at most
 MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
 LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more than to shrink to this
 
 Image = NDArray[np.float64]
 
 
-def solve(scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, known: Solution | None = None) -> Solution:
+def solve(
+    scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, known: Solution | None = None
+) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
-    Where a partial solution is `known` no work is done, and what comes back is rough.
+    Only pixels of the `window` are looked at, the others are dark. Where a partial solution is `known` no work is done,
+    and what comes back is rough.
     """
-    return _Ladder(scene, lens, quadrature, known).climb()
+    return _Ladder(scene, lens, window, quadrature, known).climb()
 
 
 def coverage(scene: mi.Scene, lens: mi.Sensor) -> Image:
@@ -54,20 +59,22 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> Image:
 class _Ladder:
     """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
 
-    def __init__(self, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, known: Solution | None = None) -> None:
-        self.scene, self.lens, self.quadrature = scene, lens, quadrature
+    def __init__(
+        self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, known: Solution | None
+    ) -> None:
+        self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
         self.area = quadrature.pixel == "area"
-        self.window: Window = visible_window(scene, lens)
-        shape = self.window.shape
-        self.value, self.error, self.hits, self.change = (np.zeros(shape) for _ in range(4))
+        shape = window.shape
+        self.value, self.error, self.hits, self.change, self.angle = (np.zeros(shape) for _ in range(5))
         # Pixels for which a second border of the lens cuts the pupil, whatever is sharp.
         self.clipped = self.window.off_axis(lens) > lens.optics.clear_field
+        self.across_pupil = np.ones(shape, bool)
         self.open = np.ones(shape, bool)  # pixels that are not known from elsewhere
         self.known = np.zeros(shape)
         if known is not None:
             self.open, self.known = ~self.window.cut(known.where), self.window.cut(known.power) / lens.etendue
         self.nearest = np.full(shape, np.inf)
-        self.blur = 0.0  # largest blur radius in the picture [pixels]
+        self.blur = np.zeros(shape)  # largest blur radius of what a pixel or a neighbour sees [pixels]
         self.rays = 0
         self.levels: list[str] = []
 
@@ -94,7 +101,7 @@ class _Ladder:
         """Four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
         everything = np.ones(self.window.shape, bool)
         value, contrast, mx, my, self.hits, self.nearest, far = self._apply(rules.four(self.area), everything)
-        self.blur = self._largest_blur(far)
+        self.blur = self._blur(far)
         self.value = value = np.where(self.open, value, self.known)
         # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
         slope = 4 * np.hypot(mx, my)
@@ -110,7 +117,7 @@ class _Ladder:
         rough = self.error > self.tolerance
         if self.area and min(rough.shape) < 3:
             rough[:] = True  # no neighbour tells how the picture bends
-        return pixels.dilate(rough & self.open, self._reach(4)) & self.open
+        return self._grown(rough & self.open, 4) & self.open
 
     def _twelve_nodes(self, rough: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Twelve nodes over pupil and pixel on the rough pixels and their surroundings where four mislead.
@@ -127,7 +134,7 @@ class _Ladder:
             self._refine(misled & ~probes)
         rough = rough | misled
         rougher = rough & (self.error > self.tolerance)
-        return rough & pixels.dilate(rougher, self._reach(12))
+        return rough & self._grown(rougher, 12)
 
     def _refine(self, where: NDArray[np.bool_]) -> Image:
         """Twelve nodes on the marked pixels; returns how far four were off there, 0 elsewhere."""
@@ -148,8 +155,15 @@ class _Ladder:
 
         A silhouette, or the border of the lens.
         """
-        brightest = pixels.spread_max(self.value)
-        return np.where(pixels.outline(self.hits, self._reach(nodes)) | self.clipped, CUT[nodes] * brightest, 0)
+        reach = self._reach(nodes)
+        share = np.where(pixels.grow(pixels.outline(self.hits, 1), reach - 1), UNSEEN[nodes], 0.0)
+        share[pixels.parted(self.hits) | self.clipped] = CUT[nodes]
+        return share * self._whole(reach.max())
+
+    def _whole(self, reach: int) -> Image:
+        """Largest value within `reach` pixels, if no line of sight missed."""
+        whole = np.divide(self.value, self.hits, out=np.zeros_like(self.value), where=self.hits > pixels.ROUNDING)
+        return pixels.spread_max(whole, reach)
 
     def _apply(self, rule: rules.Rule, where: NDArray[np.bool_]) -> list[Image]:
         """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
@@ -169,43 +183,49 @@ class _Ladder:
     def _chords(self, rough: NDArray[np.bool_]) -> None:
         """More chords each round on the pixels that the last round still moved, or moved a neighbour of."""
         index = np.flatnonzero(rough).astype(np.uint32)
-        angle = pixels.principal_angle(*pixels.gradient(self.value), 1 + math.ceil(self.blur / 2)).ravel()
-        across_pupil = self._across_pupil().ravel()
-        value, hits, error = self.value.ravel(), self.hits.ravel(), self.error.ravel()
-        change, split, count = self.change.ravel(), np.zeros(value.shape, bool), 0
+        self.angle = pixels.principal_angle(*pixels.gradient(self.value), 1 + math.ceil(self.blur.max() / 2))
+        self.across_pupil = self._across_pupil()
+        count = 0
         for level, (m, q) in enumerate(rules.CHORD_LEVELS):
             rule, along = rules.chords(m, q, self.area), rules.along_chord(level)
             if not len(index) or 16 + len(rule) * along.rays > self.quadrature.max_nodes:
                 break
-            rays = 0.0
-            # What the change before this one should have become by now, lest two wrong values agree by chance.
-            change *= (count / len(rule)) ** rules.CHORD_ORDER if count else FIRST_GAIN
-            count = len(rule)
-            for part in _chunks(index, max(1, LANES // count)):
-                mean, met, jumps, looks = self._chord_means(part, angle[part], across_pupil[part], rule, along)
-                rays += looks.sum()
-                change[part] = np.maximum(np.abs(mean - value[part]), change[part])
-                # Where the first chords meet no jump after all, twelve nodes were the better rule.
-                better = (jumps > 0) | (level > 0)
-                value[part], hits[part] = np.where(better, mean, value[part]), np.where(better, met, hits[part])
-                split[part] = jumps > 0
-            self._count(f"{count} chords", len(index), int(rays))
-            error[index] = SAFETY * pixels.spread_max(change.reshape(self.value.shape)).ravel()[index]
-            index = index[error[index] > self.tolerance]
+            columns = [self._chord_means(part, rule, along) for part in _chunks(index, max(1, LANES // len(rule)))]
+            mean, met, jumps, looks, odds = np.concatenate(columns, axis=1)
+            self._count(f"{len(rule)} chords", len(index), int(looks.sum()))
             if level == 0:
-                change[~split] = 0  # nothing changed there yet
-                # Across the pupil all other directions have Gauss nodes: right for smooth pixels, sharp or not.
-                across_pupil |= self._calm(split.reshape(self.value.shape)).ravel()
+                self._first_chords(index, mean, met, jumps, odds)
+            else:
+                # What the change before this one should have become by now, lest two wrong values agree by chance.
+                self.change *= (count / len(rule)) ** rules.CHORD_ORDER
+                self.change.flat[index] = np.maximum(np.abs(mean - self.value.flat[index]), self.change.flat[index])
+                self.value.flat[index], self.hits.flat[index] = mean, met
+                self.error.flat[index] = SAFETY * pixels.spread_max(self.change).flat[index]
+            count = len(rule)
+            index = index[self.error.flat[index] > self.tolerance]
 
-    def _chord_means(
-        self,
-        part: NDArray[np.uint32],
-        angle: Image,
-        across_pupil: NDArray[np.bool_],
-        rule: rules.Chords,
-        along: rules.AlongChord,
-    ) -> list[Image]:
-        """Of each listed pixel mean radiance on film, share of hits, jumps and lines of sight, in one launch."""
+    def _first_chords(self, index: NDArray[np.uint32], mean: Image, met: Image, jumps: Image, odds: Image) -> None:
+        """Far better than nodes where there is a jump, as long as their two halves agree; elsewhere nodes were."""
+        moved = np.maximum(np.abs(mean - self.value.flat[index]), FIRST_GAIN * self.change.flat[index])
+        self.change[:] = 0
+        self.change.flat[index] = np.maximum(FIRST_GAIN * moved, np.abs(odds) / 2)
+        split = np.zeros(self.value.shape, bool)
+        split.flat[index] = jumps > 0
+        chords = index[jumps > 0]
+        self.value.flat[chords], self.hits.flat[chords] = mean[jumps > 0], met[jumps > 0]
+        reach = self._reach("chords")
+        near = pixels.grow(split, reach) & ~split
+        unseen = np.where(near, UNSEEN["chords"] * self._whole(reach.max()), 0)
+        self.error.flat[index] = np.maximum(SAFETY * pixels.spread_max(self.change), unseen).flat[index]
+        self.change[~split] = 0  # nothing changed there yet
+        # Across the pupil all other directions have Gauss nodes: right for smooth pixels, sharp or not.
+        self.across_pupil |= self._calm(split)
+
+    def _chord_means(self, part: NDArray[np.uint32], rule: rules.Chords, along: rules.AlongChord) -> list[Image]:
+        """Of each listed pixel mean radiance on film, share of hits, jumps and lines of sight, in one launch.
+
+        Last what every other chord has more of the mean than the rest.
+        """
         count = dr.opaque(mi.UInt32, len(rule))
         lane = dr.arange(mi.UInt32, len(part) * len(rule))
         pixel, number = lane // count, lane % count
@@ -213,13 +233,14 @@ class _Ladder:
             rule,
             number,
             dr.gather(mi.Point2f, self.window.centres(part), pixel),
-            dr.gather(mi.Float, mi.Float(angle), pixel),
-            dr.gather(mi.Bool, mi.Bool(across_pupil), pixel),
+            dr.gather(mi.Float, mi.Float(self.angle.flat[part]), pixel),
+            dr.gather(mi.Bool, mi.Bool(self.across_pupil.flat[part]), pixel),
             dr.opaque(mi.Float, 2 * float(self.value.max())),
             dr.opaque(mi.Float, LEAST_JUMP * self.tolerance),
         )
         means = integrate_chord(self.scene, self.lens, chord, along)
         means = [mi.Float64(mean) for mean in means]
+        means.append(dr.select(number % 2 == 0, means[0], -means[0]))
         dr.eval(means)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
         sums = [dr.block_sum(mean, len(rule)) for mean in means]
         dr.eval(sums)
@@ -236,14 +257,19 @@ class _Ladder:
         """True where neither a pixel nor its neighbours jump: no chord of theirs was split, no outline passes."""
         return ~pixels.dilate(split | pixels.outline(self.hits, 1), 1)
 
-    def _largest_blur(self, far: Image) -> float:
+    def _blur(self, farthest: Image) -> Image:
         """Of what is nearest or farthest: from the sharp plane on, blur grows either way."""
         seen = np.isfinite(self.nearest)
-        depths = np.array([self.nearest[seen].min(initial=np.inf), far[seen].max(initial=0.0)])
-        return float(self.lens.blur_radius(depths).max()) if seen.any() else 0.0
+        blur = np.zeros(seen.shape)
+        blur[seen] = self.lens.blur_radius(np.array([self.nearest[seen], farthest[seen]])).max(axis=0)
+        return pixels.spread_max(np.minimum(blur, max(seen.shape)))
 
-    def _reach(self, nodes: int) -> int:
-        return 1 + math.ceil(min(GAP[nodes] * self.blur, max(self.value.shape)))
+    def _grown(self, rough: NDArray[np.bool_], nodes: int) -> NDArray[np.bool_]:
+        """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `_cut_off` knows."""
+        return rough | pixels.grow(rough & ~pixels.outline(self.hits, 1), self._reach(nodes))
+
+    def _reach(self, nodes: int | str) -> NDArray[np.int64]:
+        return 1 + np.ceil(GAP[nodes] * self.blur).astype(np.int64)
 
     def _count(self, what: str, count: int, rays: int) -> None:
         self.rays += rays

@@ -73,6 +73,7 @@ class FsptSurface(mi.Emitter):
         self._checked = False
         self._attribute: mi.Float | None = None
         self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
+        self.brightest = 0.0  # largest J_n [W/mm²], known after `check`
         self.edition = 0  # counts the changes of J_n, for those who remember something about it
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
@@ -182,15 +183,18 @@ class FsptSurface(mi.Emitter):
         if self._checked:
             return
 
-        def look(shape: mi.Shape) -> None:
-            exitance.check_values(shape, exitance.function_on(shape, self.exitance))
+        def look(shape: mi.Shape) -> float:
+            brightest = exitance.check_values(shape, exitance.function_on(shape, self.exitance))
             self.law.prepare(shape)
+            return brightest
 
-        aside(look, self.get_shape())
+        self.brightest = aside(look, self.get_shape())
         self._checked, self._attribute = True, attribute
 
     def _sound(self) -> bool:
         """True after `check`; False where it fails in a recording for another scene, which must not care."""
+        if self._checked and scene_is_checked():
+            return True
         try:
             self.check()
         except ExitanceError:

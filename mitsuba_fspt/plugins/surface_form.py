@@ -19,7 +19,7 @@ from ..quadrature import Quadrature, Solution
 from .elements import scalar
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow, film_corner
-from .window import visible_window
+from .window import Window
 
 FIRST_LINES, GROWTH = 16, 4  # lines of sight a pixel of the image at the first level; times this each level
 SAFETY = 4.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
@@ -38,28 +38,28 @@ Image = NDArray[np.float64]
 def solve(
     scene: mi.Scene,
     lens: mi.Sensor,
+    window: Window,
     quadrature: Quadrature,
     where: NDArray[np.bool_] | None = None,
     least_peak: float = 0.0,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
-    With `where`, of the shape of `visible_window`, only the pixels marked there are the whole picture; 0 elsewhere.
-    `least_peak`: mean radiance on film [W/mm²/sr] that the brightest pixel is known to have at least.
+    Only pixels of the `window` are looked at, the others are dark. With `where`, of its shape, only the pixels marked
+    there are the whole picture; 0 elsewhere. `least_peak`: mean radiance on film [W/mm²/sr] that the brightest pixel is known to have at least.
 
     `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
     Coverage counts the lines of sight that meet a glowing surface, not those that meet a dark one. Raises SceneError
     where an emitter has no surface.
     """
-    return _Refinement(scene, lens, quadrature).run(where, least_peak)
+    return _Refinement(scene, lens, window, quadrature).run(where, least_peak)
 
 
 class _Refinement:
     """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
 
-    def __init__(self, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> None:
-        self.scene, self.lens, self.quadrature = scene, lens, quadrature
-        self.window = visible_window(scene, lens)
+    def __init__(self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature) -> None:
+        self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
         self.glows = [Glow.seen(emitter, lens, self.window, quadrature.rtol) for emitter in scene.emitters()]
         self.value, self.error, self.hits = (np.zeros(self.window.shape) for _ in range(3))
         self.peak = float(np.finfo(np.float32).tiny)
