@@ -16,13 +16,13 @@ ROUNDING = 1e-4  # of a share of hits: a sum of float32 weights
 def box_sum(image: NDArray[Any], radius: int) -> NDArray[Any]:
     """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
     for axis in (0, 1):
-        image = np.moveaxis(image, axis, 0)
+        image = image.swapaxes(0, axis)
         reach = min(radius, len(image))
         # Sums from the border on, each of them over a window that slides in from outside.
         sums = np.zeros((len(image) + 2 * reach + 1, *image.shape[1:]), image.dtype)
         np.cumsum(image, 0, out=sums[reach + 1 : len(image) + reach + 1])
         sums[len(image) + reach + 1 :] = sums[len(image) + reach]
-        image = np.moveaxis(sums[2 * reach + 1 :] - sums[: len(image)], 0, axis)
+        image = (sums[2 * reach + 1 :] - sums[: len(image)]).swapaxes(0, axis)
     return image
 
 
@@ -52,7 +52,7 @@ def grow(mask: Mask, reach: NDArray[np.int64]) -> Mask:
 def spread_max(image: NDArray[Any], radius: int = 1) -> NDArray[Any]:
     """Largest value within `radius` pixels (square) of each."""
     for axis in (0, 1):
-        spread, reach = np.moveaxis(image, axis, 0).copy(), 0
+        spread, reach = image.swapaxes(0, axis).copy(), 0
         while reach < min(radius, len(spread) - 1):
             # As far as it goes already once more, and no gap opens.
             step = min(reach + 1, radius - reach, len(spread) - 1)
@@ -60,7 +60,7 @@ def spread_max(image: NDArray[Any], radius: int = 1) -> NDArray[Any]:
             np.maximum(spread[step:], before[:-step], out=spread[step:])
             np.maximum(spread[:-step], before[step:], out=spread[:-step])
             reach += step
-        image = np.moveaxis(spread, 0, axis)
+        image = spread.swapaxes(0, axis)
     return image
 
 

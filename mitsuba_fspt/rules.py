@@ -6,6 +6,7 @@ A rule integrates over the unit disc (pupil) times the square [-½, ½]² (pixel
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +125,7 @@ class Chords:
         return len(self.weight)
 
 
+@cache
 def chords(m: int, q: int, area: bool = True) -> Chords:
     """m · q² chords: across the pupil m equidistant ones for each of q × q Gauss points, shifted from point to point.
 
@@ -152,6 +154,7 @@ def chords(m: int, q: int, area: bool = True) -> Chords:
     )
 
 
+@cache
 def gauss(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gauss–Legendre nodes in [0, 1] and weights of sum 1."""
     x, w = np.polynomial.legendre.leggauss(n)

@@ -46,7 +46,8 @@ def solve(
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
     Only pixels of the `window` are looked at, the others are dark. With `where`, of its shape, only the pixels marked
-    there are the whole picture; 0 elsewhere. `least_peak`: mean radiance on film [W/mm²/sr] that the brightest pixel is known to have at least.
+    there are the whole picture; 0 elsewhere. `least_peak`: mean radiance on film [W/mm²/sr] that the brightest pixel is
+    known to have at least.
 
     `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
     Coverage counts the lines of sight that meet a glowing surface, not those that meet a dark one. Raises SceneError
