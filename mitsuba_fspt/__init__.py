@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .detector import Detector as Detector
     from .detector import Exposure as Exposure
     from .errors import FsptError as FsptError
+    from .explanation import explain as explain
     from .flux_import import import_flux as import_flux
     from .image import Image as Image
     from .image import read as read
@@ -43,6 +44,7 @@ _HOMES = {
     "Phantom": "phantom",
     "import_flux": "flux_import",
     "sweep": "sweeping",
+    "explain": "explanation",
     "FsptError": "errors",
 }
 __all__ = list(_HOMES)

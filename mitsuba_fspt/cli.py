@@ -54,6 +54,7 @@ def render(
     seed: Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")] = None,
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
+    shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
 ) -> None:
     """Render a scene to an EXR with the power [W], its error and the coverage of every pixel."""
     output = output or Path(scene.stem + ".exr")
@@ -71,6 +72,7 @@ def render(
             load(scene, **_parameters(define)),
             method=method,
             rtol=rtol,
+            shortcuts=shortcuts,
             spp=spp,
             seed=seed,
             progress=progress,
@@ -174,6 +176,28 @@ def stability(
         seconds = sum(result.seconds for result in results)
         typer.echo(f"{len(rows) - failed} of {len(rows)} hold, {seconds:.0f} s")
     raise typer.Exit(1 if failed else 0)
+
+
+@app.command()
+def explain(
+    scene: SceneFile,
+    define: Parameters = None,
+    rtol: Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")] = None,
+    domain: Annotated[str | None, typer.Option(help="pupil or surface; the scene's own if left out.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
+) -> None:
+    """Tell what the integral leaves out of a scene, why, and what that saves: 'render --no-shortcuts' goes without."""
+    with _progress():
+        from .explanation import HEADER, explain
+        from .scene import load
+
+        _quiet_mitsuba()
+        rows = explain(load(scene, **_parameters(define)), rtol=rtol, domain=domain)
+    if as_json:
+        typer.echo(json.dumps([row.to_dict() for row in rows]))
+        return
+    for line in (HEADER, *(row.render_text() for row in rows)):
+        typer.echo(line)
 
 
 def _add_flux() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import SceneError
+from .shortcuts import SHORTCUTS, Finding
 
 DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
 
@@ -21,12 +22,14 @@ class Quadrature:
     domain : 'pupil' (lines of sight from the pixel) or 'surface' (power spread from surface elements)
     pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
     max_nodes : lines of sight a pixel may take at most; bounds the time, and where it is reached the error says so
+    without : names of `SHORTCUTS` that are not taken; they change no more than the error asked for
     """
 
     rtol: float = 1e-3
     domain: str = "pupil"
     pixel: str = "area"
     max_nodes: int = 1 << 17
+    without: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
@@ -37,6 +40,12 @@ class Quadrature:
             raise SceneError(f"fspt_integral: 'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
         if self.max_nodes < 1:
             raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 131072.")
+        if unknown := set(self.without) - set(SHORTCUTS):
+            raise SceneError(f"fspt_integral: 'without' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}.")
+
+    def takes(self, shortcut: str) -> bool:
+        """True unless this one of `SHORTCUTS` is switched off."""
+        return shortcut not in self.without
 
 
 @dataclass(frozen=True)
@@ -44,7 +53,7 @@ class Solution:
     """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
 
     `rays` counts all lines of sight, `levels` what each rung of the refinement did (for humans and the EXR header).
-    A partial solution is the whole picture only on the pixels `where`.
+    A partial solution is the whole picture only on the pixels `where`. `findings`: what was left out, and why.
     """
 
     power: NDArray[np.float64]
@@ -53,9 +62,17 @@ class Solution:
     rays: int
     levels: tuple[str, ...] = field(default=())
     where: NDArray[np.bool_] = field(default_factory=lambda: np.ones((), bool))
+    findings: tuple[Finding, ...] = field(default=())
 
     def completed_by(self, rest: Solution) -> Solution:
         """This partial solution on its own pixels, `rest` elsewhere."""
         planes = zip((self.power, self.error, self.coverage), (rest.power, rest.error, rest.coverage), strict=True)
         power, error, coverage = (np.where(self.where, own, other) for own, other in planes)
-        return Solution(power, error, coverage, self.rays + rest.rays, self.levels + rest.levels)
+        return Solution(
+            power,
+            error,
+            coverage,
+            self.rays + rest.rays,
+            self.levels + rest.levels,
+            findings=self.findings + rest.findings,
+        )

@@ -17,6 +17,7 @@ from .errors import SceneError
 from .image import Image
 from .quadrature import Quadrature
 from .scene import load
+from .shortcuts import SHORTCUTS
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -36,6 +37,7 @@ def render(
     domain: str | None = None,
     pixel: str | None = None,
     max_nodes: int | None = None,
+    shortcuts: bool = True,
     spp: int | None = None,
     seed: int | None = None,
     progress: Progress | None = None,
@@ -48,6 +50,7 @@ def render(
     method : 'integral' (Eq. 9, deterministic), 'path' or 'ptracer' (Monte Carlo); None takes the scene's own
     sensor : number of the sensor, an `fspt_lens`
     rtol, domain, pixel, max_nodes : accuracy of the integral, see `Quadrature`; None takes the scene's own
+    shortcuts : False to leave out nothing of the integral, see `SHORTCUTS`; True takes the scene's own
     spp : Monte Carlo samples a pixel, >= 2 (default 256); their error is the standard error of independent passes
     seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
     progress : called with what is being done and the share done
@@ -59,9 +62,10 @@ def render(
     if not _is_scene(scene):
         scene = load(scene)
     backend.ensure_variant()
-    lens = _sensor(scene, sensor)
-    integrator = _integrator(scene, method)
+    lens = sensor_of(scene, sensor)
+    integrator = integrator_of(scene, method)
     accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
+    accuracy["without"] = None if shortcuts else frozenset(SHORTCUTS)
     sampling = {"spp": spp, "seed": seed}
     deterministic = type(integrator).__name__ == "FsptIntegral"
     _refuse(sampling if deterministic else accuracy, "integral" if deterministic else "Monte Carlo")
@@ -85,6 +89,8 @@ def _integrate(
         progress("integrating", 0.0)
     solution = integrator.solve(scene, lens, Quadrature(**wanted))
     how = {"method": "integral", **wanted, "nodes": solution.rays, "levels": "; ".join(solution.levels)}
+    how["without"] = ", ".join(sorted(wanted["without"])) or "nothing"
+    how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
     return solution.power, solution.error, solution.coverage, how
 
 
@@ -138,14 +144,16 @@ def _is_scene(scene: object) -> bool:
     return not isinstance(scene, (str, os.PathLike))
 
 
-def _sensor(scene: mi.Scene, number: int) -> mi.Sensor:
+def sensor_of(scene: mi.Scene, number: int) -> mi.Sensor:
+    """Sensor `number` of a scene; SceneError where there is none."""
     sensors = scene.sensors()
     if not 0 <= number < len(sensors):
         raise SceneError(f"scene: sensor {number} does not exist, the scene has {len(sensors)}. Give an 'fspt_lens'.")
     return sensors[number]
 
 
-def _integrator(scene: mi.Scene, method: str | None) -> mi.Integrator:
+def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
+    """The integrator of a method, see `METHODS`, the scene's own where it is that; SceneError where there is none."""
     import mitsuba as mi
 
     own = scene.integrator()

@@ -28,8 +28,8 @@ class Rule:
         return len(self.weight)
 
 
-def pinhole() -> Rule:
-    """The one line of sight through the middle."""
+def one() -> Rule:
+    """The one line of sight through the middle of pupil and pixel, exact to degree 1."""
     return Rule(np.zeros((1, 2)), np.zeros((1, 2)), np.ones(1), np.zeros(1))
 
 
@@ -43,6 +43,14 @@ def four(area: bool) -> Rule:
     step = np.sqrt(1 / 6) if area else 0.0
     contrast = np.array([0.5, -0.5, 0.5, -0.5])
     return Rule(_polar(np.sqrt(0.5), angle), _polar(step, angle + np.pi / 2), np.full(4, 0.25), contrast)
+
+
+def one_spread(laplacian: NDArray[np.float64], blur: NDArray[np.float64], area: bool) -> NDArray[np.float64]:
+    """What `one` has too little: half the second moments of pixel and blur disc along each axis, 1/12 and r²/4.
+
+    `laplacian` of the picture [1/pixels²], `blur` r [pixels].
+    """
+    return (float(area) / 24 + blur**2 / 8) * laplacian
 
 
 def four_turn(curl: NDArray[np.float64], laplacian: NDArray[np.float64]) -> NDArray[np.float64]:

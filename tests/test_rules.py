@@ -40,7 +40,7 @@ def moment_errors(rule, degree, pupil_only=False):
 
 
 RULES = {
-    "pinhole": rules.pinhole(),
+    "one": rules.one(),
     "four": rules.four(area=False),
     "four over area": rules.four(area=True),
     "twelve": rules.twelve(area=False),

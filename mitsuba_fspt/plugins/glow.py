@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import SceneError
 from .elements import Elements, elements_of
+from .exitance import function_on
 from .window import Window
 
 CELLS = 2.0  # balances the cells of the pupil with the size of the pieces, see `cells_of`
@@ -55,7 +56,7 @@ class Glow:
     """A glowing shape and, for each of its elements, where its light can arrive [pixels of the window].
 
     sides, blur (count,): longer side of its image, radius of its blur disc; low, high (count, 2): bounds of its
-    light in x and y, empty where it faces away from the lens.
+    light in x and y, empty where it faces away from the lens or is one of those left out because they are `dark`.
     """
 
     emitter: mi.Emitter
@@ -64,6 +65,11 @@ class Glow:
     blur: Image
     low: Image
     high: Image
+    dark: int
+
+    @property
+    def count(self) -> int:
+        return self.elements.count
 
     def batches(self, lines: int, mark: NDArray[np.bool_]) -> Iterator[Batch]:
         """The lines of sight of all elements with light on a marked pixel, some `LANES` at a time."""
@@ -90,7 +96,7 @@ class Glow:
         return np.flatnonzero((marked > 0) & (right > left) & (bottom > top))
 
     @classmethod
-    def seen(cls, emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol: float) -> Glow:
+    def seen(cls, emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol: float, without_dark: bool) -> Glow:
         """What `lens` sees of an emitter's shape in `window`; SceneError where the emitter has no surface."""
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
             raise SceneError(
@@ -116,11 +122,12 @@ class Glow:
         low, high = low - margin - film_corner(window), high + margin - film_corner(window)
         # Away for certain: between its corners a curved element may turn to the lens as far again as they differ.
         away = 2 * most - least <= 0
-        low[away], high[away] = np.inf, -np.inf
+        dark = _dark(emitter, elements) if without_dark else np.zeros(count, bool)
+        low[away | dark], high[away | dark] = np.inf, -np.inf
         # An element below a pixel would stay in one piece for some levels, and what that costs would not be seen to
         # change. A piece of side s misplaces about s²/8 of a step in J_n: small enough, it may stay.
         sides = np.where(sides > math.sqrt(8 * rtol), np.maximum(sides, 1), sides)
-        return cls(emitter, elements, sides, np.minimum(blur, math.hypot(*window.shape)), low, high)
+        return cls(emitter, elements, sides, np.minimum(blur, math.hypot(*window.shape)), low, high, int(dark.sum()))
 
 
 def cells_of(lines: int, blur: Image) -> Index:
@@ -143,6 +150,17 @@ def _elements(shape: mi.Shape, lens: mi.Sensor) -> Elements:
     pixel = float(lens.blur_disc(mi.Point3f(shape.bbox().center()))[2][0])
     ideal = float(shape.surface_area()[0]) / (PIXELS_PER_ELEMENT * pixel**2)
     return elements_of(shape, int(min(max(ideal, FEWEST_ELEMENTS), MOST_ELEMENTS)))
+
+
+def _dark(emitter: mi.Emitter, elements: Elements) -> NDArray[np.bool_]:
+    """True of elements on which J_n is 0: at all corners, between which a mesh attribute is linear."""
+    if type(emitter).__name__ != "FsptSurface" or not emitter.is_linear():
+        return np.zeros(elements.count, bool)
+    exitance = function_on(emitter.get_shape(), emitter.exitance)
+    index = dr.arange(mi.UInt32, elements.count)
+    corners = [exitance(elements.place(index, mi.Point2f(*corner))[0]) for corner in elements.corners]
+    dr.eval(corners)
+    return np.max([np.broadcast_to(corner.numpy(), elements.count) for corner in corners], axis=0) == 0
 
 
 def _front(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Float:

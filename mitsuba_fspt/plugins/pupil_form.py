@@ -1,8 +1,9 @@
 """Eq. 9 in its pupil form: P = étendue · mean over pixel and pupil of cos⁴θ · L(first surface point on the line).
 
-A ladder of three rules. Four nodes over pupil and pixel serve every pixel; where the picture bends, twelve; where the
-line of sight jumps (a silhouette, an occluder, an edge of J_n), chords: along each the jumps are found by bisection and
-the pieces between them are integrated on their own, so that only smooth averages are left to sample.
+A ladder of three rules. Four nodes over pupil and pixel serve every pixel, one where the pupil is as good as a point,
+and blur stays in the pixel; where the picture bends, twelve; where the line of sight jumps (a silhouette, an occluder,
+an edge of J_n), chords: along each the jumps are found by bisection and the pieces between them are integrated on their
+own, so that only smooth averages are left to sample.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from .. import pixels, rules
 from ..quadrature import Quadrature, Solution
+from ..shortcuts import Finding
 from .lines import apply_rule, chords_across, integrate_chord
 from .window import Window, visible_window
 
@@ -25,9 +27,12 @@ FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot re
 # A silhouette can pass between the outermost of a rule's nodes, or of the first four chords, and the rim of the pupil:
 # that far in (blur radii). A straight one makes them wrong by at most this share of the light, where it parts the nodes
 # and where it does not.
-GAP = {4: 0.6, 12: 0.25, "chords": 0.1}
-CUT = {4: 0.35, 12: 0.3}
-UNSEEN = {4: 0.25, 12: 0.15, "chords": 0.0125}
+GAP = {1: 1.0, 4: 0.6, 12: 0.25, "chords": 0.1}
+CUT = {1: 0.5, 4: 0.35, 12: 0.3}
+UNSEEN = {1: 0.5, 4: 0.25, 12: 0.15, "chords": 0.0125}
+POINT = 0.1  # of rtol: what the curvature of cos⁴θ over the pupil may make
+IN_PIXEL = 0.5  # blur radius that stays in the pixel
+SETTLED = 0.25  # of the tolerance: where the picture bends less, more nodes would change it by less than a tenth
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
 TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
 FIRST_GAIN = 0.3  # what is left of the difference to twelve nodes once the first chords are in, at most
@@ -77,10 +82,11 @@ class _Ladder:
         self.blur = np.zeros(shape)  # largest blur radius of what a pixel or a neighbour sees [pixels]
         self.rays = 0
         self.levels: list[str] = []
+        self.findings: list[Finding] = []
 
     def climb(self) -> Solution:
         if self.value.size:
-            rough = self._four_nodes()
+            rough = self._first_nodes(rules.one() if self._one_will_do() else rules.four(self.area))
             if self.quadrature.max_nodes >= 16:
                 rough = self._twelve_nodes(rough)
                 if rough.any():
@@ -89,7 +95,7 @@ class _Ladder:
         error[self.hits == 0] = self.error[self.hits == 0]
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.hits, 0, 1))
-        return Solution(power, error, coverage, self.rays, tuple(self.levels))
+        return Solution(power, error, coverage, self.rays, tuple(self.levels), findings=tuple(self.findings))
 
     @property
     def tolerance(self) -> float:
@@ -97,27 +103,47 @@ class _Ladder:
 
     # ------------------------------------------------------------------ smooth pixels
 
-    def _four_nodes(self) -> NDArray[np.bool_]:
-        """Four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
+    def _one_will_do(self) -> bool:
+        """True where lines of sight differ over the pupil, if at all, like the picture over the pixel."""
+        lens, blur = self.lens.optics, self.window.blur
+        curvature = 0.0 if lens.model == "pinhole" else 2 * (lens.discs[0].radius / lens.focus_distance) ** 2
+        will_do = curvature <= POINT * self.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
+        taken = will_do and self.quadrature.takes("one line")
+        why = f"cos⁴θ differs by {curvature:.1e} over the pupil, blur discs reach {blur:.2g} pixels"
+        self.findings.append(Finding("one line", taken, why))
+        return taken
+
+    def _first_nodes(self, rule: rules.Rule) -> NDArray[np.bool_]:
+        """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
         everything = np.ones(self.window.shape, bool)
-        value, contrast, mx, my, self.hits, self.nearest, far = self._apply(rules.four(self.area), everything)
+        value, contrast, mx, my, self.hits, self.nearest, far = self._apply(rule, everything)
         self.blur = self._blur(far)
         self.value = value = np.where(self.open, value, self.known)
         # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
         slope = 4 * np.hypot(mx, my)
         bend = np.abs(contrast) + np.divide(slope**4, 4 * value**3, out=np.zeros_like(value), where=value > 0)
-        if self.area:
+        neighbours = self.area or len(rule) == 1  # tell how the picture bends
+        if neighbours:
             xx, yy = pixels.second_differences(value)
             xxxx, yyyy = pixels.second_differences(xx)[0], pixels.second_differences(yy)[1]
             bend += (np.abs(xxxx) + np.abs(yyyy)) / 12
-            curl = pixels.gradient(mx)[1] - pixels.gradient(my)[0]
-            turned = pixels.mean_where(rules.four_turn(curl, xx + yy), ~pixels.outline(self.hits, 1), TURN_REACH)
-            self.value = np.maximum(value - np.where(self.hits > 1 - pixels.ROUNDING, turned, 0), 0)
-        self.error = np.maximum(pixels.spread_max(bend), self._cut_off(4))
-        rough = self.error > self.tolerance
-        if self.area and min(rough.shape) < 3:
-            rough[:] = True  # no neighbour tells how the picture bends
-        return self._grown(rough & self.open, 4) & self.open
+            if len(rule) == 1:
+                more = rules.one_spread(xx + yy, self.blur, self.area)
+            else:
+                curl = pixels.gradient(mx)[1] - pixels.gradient(my)[0]
+                turn = rules.four_turn(curl, xx + yy)
+                more = -pixels.mean_where(turn, ~pixels.outline(self.hits, 1), TURN_REACH)
+            self.value = np.maximum(value + np.where(self.hits > 1 - pixels.ROUNDING, more, 0), 0)
+        bend = pixels.spread_max(bend)
+        self.error = np.maximum(bend, self._cut_off(len(rule)))
+        rough = (self.error > self.tolerance) | (bend > SETTLED * self.tolerance)
+        if (neighbours and min(rough.shape) < 3) or not self.quadrature.takes("smooth"):
+            rough[:] = True
+        rough = self._grown(rough & self.open, len(rule)) & self.open
+        smooth = int(np.count_nonzero(~rough & (self.hits > 0)))
+        why = f"{smooth} of {rough.size} pixels see the surface, smooth and no edge of it"
+        self.findings.append(Finding("smooth", smooth > 0, why))
+        return rough
 
     def _twelve_nodes(self, rough: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Twelve nodes over pupil and pixel on the rough pixels and their surroundings where four mislead.

@@ -203,6 +203,14 @@ class FsptSurface(mi.Emitter):
             raise
         return True
 
+    def is_uniform(self) -> bool:
+        """True where J_n is one number."""
+        return self.exitance.class_name() == "UniformSpectrum"
+
+    def is_linear(self) -> bool:
+        """True where J_n is linear on every face of a mesh: an attribute of it."""
+        return self._attribute is not None and self.get_shape().is_mesh()
+
     def texels(self) -> int:
         """Number of pixels of the bitmap that J_n is, 1 where it is none."""
         values = mi.traverse(self.exitance)

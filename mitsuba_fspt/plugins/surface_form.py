@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from .. import pixels
 from ..quadrature import Quadrature, Solution
+from ..shortcuts import Finding
+from .convexity import hides_nothing
 from .elements import scalar
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow, film_corner
@@ -61,13 +63,16 @@ class _Refinement:
 
     def __init__(self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature) -> None:
         self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
-        self.glows = [Glow.seen(emitter, lens, self.window, quadrature.rtol) for emitter in scene.emitters()]
+        dark = quadrature.takes("dark")
+        self.glows = [Glow.seen(emitter, lens, window, quadrature.rtol, dark) for emitter in scene.emitters()]
         self.value, self.error, self.hits = (np.zeros(self.window.shape) for _ in range(3))
         self.peak = float(np.finfo(np.float32).tiny)
         self.rays = 0
         self.levels: list[str] = []
 
     def run(self, where: NDArray[np.bool_] | None, least_peak: float) -> Solution:
+        # To look for what may hide is quicker for a few pixels than to make sure that nothing does.
+        self.hidden = where is not None or not self._hides_nothing()
         mark = where = np.ones(self.window.shape, bool) if where is None else where
         lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * GROWTH)
         if mark.any():
@@ -88,7 +93,18 @@ class _Refinement:
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.hits, 0, 1))
         known = self.window.expand(where.astype(np.float64)) > 0
-        return Solution(power, error, coverage, self.rays, tuple(self.levels), known)
+        return Solution(power, error, coverage, self.rays, tuple(self.levels), known, self._findings())
+
+    def _hides_nothing(self) -> bool:
+        return self.quadrature.takes("occlusion") and hides_nothing(self.scene)
+
+    def _findings(self) -> tuple[Finding, ...]:
+        dark, count = (sum(getattr(glow, name) for glow in self.glows) for name in ("dark", "count"))
+        seen = "one surface may hide another" if self.hidden else "one convex body hides nothing of itself"
+        return (
+            Finding("occlusion", not self.hidden, seen),
+            Finding("dark", dark > 0, f"{dark} of {count} elements are dark"),
+        )
 
     def _level(self, lines: int, mark: NDArray[np.bool_]) -> list[Image]:
         """Value and hits from all elements with light on a marked pixel, at so many lines of sight a pixel."""
@@ -119,7 +135,8 @@ class _Refinement:
         to_lens = dr.normalize(lens_point - si.p)
         cos_s = dr.dot(si.n, to_lens)
         active = (cos_s > 0) & (weight > 0)
-        active &= ~self.scene.ray_test(si.spawn_ray_to(lens_point), active)
+        if self.hidden:
+            active &= ~self.scene.ray_test(si.spawn_ray_to(lens_point), active)
         si.initialize_sh_frame()
         si.wi = si.to_local(to_lens)
         radiance = dr.select(active, scalar(batch.glow.emitter.eval(si, active)), 0)

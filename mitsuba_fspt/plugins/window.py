@@ -22,7 +22,7 @@ class Window:
     """Rectangle of pixels: `top`, `left` of its first one from that of the crop window, `shape` (h, w); `full` (h, w).
 
     It may reach a rim of pixels beyond the crop window, which are computed but not shown: their neighbours inside have
-    to know of a silhouette there.
+    to know of a silhouette there. `blur`: the largest radius of a blur disc of what glows [pixels].
     """
 
     top: int
@@ -30,6 +30,7 @@ class Window:
     shape: tuple[int, int]
     full: tuple[int, int]
     crop_offset: tuple[int, int]
+    blur: float
 
     def centres(self, index: NDArray[np.uint32]) -> mi.Point2f:
         """Film positions [pixels] of the centres of the window's pixels with flat number `index`."""
@@ -70,11 +71,11 @@ class Window:
         return here, tuple(slice(a, b) for a, b in ends)
 
 
-def visible_window(scene: mi.Scene, lens: mi.Sensor) -> Window:
+def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -> Window:
     """Window of the pixels with a line of sight into the bounding box of what glows; all if it surrounds the lens.
 
-    Light of other emitters than `fspt_surface` can come from any surface of the scene. Perspective keeps straight
-    lines straight, so that the box's corners bound its blurred image.
+    Or all `everywhere`. Light of other emitters than `fspt_surface` can come from any surface of the scene. Perspective
+    keeps straight lines straight, so that the box's corners bound its blurred image.
     """
     film = lens.film()
     width, height = (int(n) for n in film.crop_size())
@@ -87,7 +88,7 @@ def visible_window(scene: mi.Scene, lens: mi.Sensor) -> Window:
         for pick in itertools.product((0, 1), repeat=3)
     ]
     points = np.array(corners).reshape(-1, 3)
-    low, high = lens.film_bounds(points)
+    low, high = lens.film_bounds(points[:0] if everywhere else points)
     blur = lens.film_discs(points)[1].max(initial=0.0)
     rim = 1 + math.ceil(min(GAP * blur, MOST_RIM - 1))
     # One pixel more than needed on each side keeps second differences and rounding inside.
@@ -100,4 +101,4 @@ def visible_window(scene: mi.Scene, lens: mi.Sensor) -> Window:
     )
     if left >= width or top >= height or right <= 0 or bottom <= 0:  # only the rim sees it
         right, bottom = left, top
-    return Window(top, left, (max(0, bottom - top), max(0, right - left)), (height, width), offset)
+    return Window(top, left, (max(0, bottom - top), max(0, right - left)), (height, width), offset, float(blur))

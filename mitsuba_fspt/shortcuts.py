@@ -1,0 +1,25 @@
+"""What the integral leaves out because a scene does not need it: names, and what was found about a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SHORTCUTS = {
+    "outside": "pixels outside the effective virtual space (Eq. 4)",
+    "one line": "three of the first four lines of sight of a pixel",
+    "smooth": "all further lines of sight of a pixel",
+    "occlusion": "rays that look for an occluder",
+    "dark": "surface elements that do not glow",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Whether shortcut `name` was taken, and `why` or why not, in a few words with the numbers that decided."""
+
+    name: str
+    taken: bool
+    why: str
+
+    def __str__(self) -> str:
+        return f"{SHORTCUTS[self.name]}: {'left out' if self.taken else 'kept'}, {self.why}"
