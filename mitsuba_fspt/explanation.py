@@ -16,6 +16,8 @@ from .scene import load
 from .shortcuts import SHORTCUTS, Finding
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import mitsuba as mi
 
     from .quadrature import Quadrature, Solution
@@ -68,7 +70,7 @@ def explain(
     """
     if isinstance(scene, (str, os.PathLike)):
         scene = load(scene)
-    backend.ensure_variant()
+    variant = backend.ensure_variant()
     lens, integrator = sensor_of(scene, sensor), integrator_of(scene, "integral")
     wanted = {name: value for name, value in (("rtol", rtol), ("domain", domain)) if value is not None}
     quadrature = replace(integrator.quadrature, **wanted)
@@ -84,10 +86,12 @@ def explain(
         without = replace(quadrature, without=quadrature.without | {finding.name})
         saved = _saved(solve, quadrature, without) if finding.taken else (None, None)
         rows.append(_row(finding, *saved))
-    return rows + _never_done(scene)
+    return rows + _never_done(scene, variant)
 
 
-def _saved(solve, quadrature: Quadrature, without: Quadrature) -> tuple[float, float]:
+def _saved(
+    solve: Callable[[Quadrature], tuple[Solution, float]], quadrature: Quadrature, without: Quadrature
+) -> tuple[float, float]:
     """Shares of the lines of sight and of the time that a shortcut saves, by rounds in pairs after a first one."""
     long, seconds = solve(without)
     rounds = ROUNDS if seconds < LONG else 1
@@ -100,15 +104,13 @@ def _row(finding: Finding, lines: float | None, seconds: float | None) -> Row:
     return Row(SHORTCUTS[finding.name], finding.taken, finding.why, lines, seconds)
 
 
-def _never_done(scene: mi.Scene) -> list[Row]:
+def _never_done(scene: mi.Scene, variant: str) -> list[Row]:
     """What costs nothing because it is never begun."""
-    import mitsuba as mi
-
     loaded = [name for name in OPTIONAL if name in sys.modules]
     uniform = [type(emitter).__name__ == "FsptSurface" and emitter.is_uniform() for emitter in scene.emitters()]
     return [
         Row("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),
         Row("gradients", True, "a picture asks for none"),
         Row("optional packages", not loaded, f"imported: {', '.join(loaded) or 'none'}"),
-        Row("further variants", True, f"{mi.variant()} alone is set"),
+        Row("further variants", True, f"{variant} alone is set"),
     ]

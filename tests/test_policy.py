@@ -33,6 +33,7 @@ PUBLIC = [
     "Image",
     "Phantom",
     "compare",
+    "explain",
     "import_flux",
     "load",
     "read",

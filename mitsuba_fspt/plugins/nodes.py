@@ -1,0 +1,108 @@
+"""Nodes over pupil and pixel: one or four at every pixel, twelve where the picture bends or four are seen to mislead."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+from .. import pixels, rules
+from ..shortcuts import Finding
+from .draft import LANES, Draft, Image, Mask, chunks
+from .lines import apply_rule
+
+POINT = 0.1  # of rtol: what the curvature of cos⁴θ over the pupil may make
+IN_PIXEL = 0.5  # blur radius that stays in the pixel
+SETTLED = 0.25  # of the tolerance: where the picture bends less, more nodes would change it by less than a tenth
+TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
+MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
+LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more than to shrink to this
+
+
+def first_nodes(draft: Draft) -> Mask:
+    """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
+    rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
+    everything = np.ones(draft.window.shape, bool)
+    value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule, everything)
+    draft.set_blur(farthest)
+    draft.value = value = np.where(draft.open, value, draft.known)
+    # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
+    slope = 4 * np.hypot(mx, my)
+    bend = np.abs(contrast) + np.divide(slope**4, 4 * value**3, out=np.zeros_like(value), where=value > 0)
+    neighbours = draft.area or len(rule) == 1  # tell how the picture bends
+    if neighbours:
+        xx, yy = pixels.second_differences(value)
+        xxxx, yyyy = pixels.second_differences(xx)[0], pixels.second_differences(yy)[1]
+        bend += (np.abs(xxxx) + np.abs(yyyy)) / 12
+        if len(rule) == 1:
+            more = rules.one_spread(xx + yy, draft.blur, draft.area)
+        else:
+            turn = rules.four_turn(pixels.gradient(mx)[1] - pixels.gradient(my)[0], xx + yy)
+            more = -pixels.mean_where(turn, ~pixels.outline(draft.hits, 1), TURN_REACH)
+        draft.value = np.maximum(value + np.where(draft.hits > 1 - pixels.ROUNDING, more, 0), 0)
+    bend = pixels.spread_max(bend)
+    draft.error = np.maximum(bend, draft.cut_off(len(rule)))
+    rough = (draft.error > draft.tolerance) | (bend > SETTLED * draft.tolerance)
+    if (neighbours and min(rough.shape) < 3) or not draft.quadrature.takes("smooth"):
+        rough[:] = True
+    rough = draft.grown(rough & draft.open, len(rule)) & draft.open
+    smooth = int(np.count_nonzero(~rough & (draft.hits > 0)))
+    why = f"{smooth} of {rough.size} pixels see the surface, smooth and no edge of it"
+    draft.findings.append(Finding("smooth", smooth > 0, why))
+    return rough
+
+
+def twelve_nodes(draft: Draft, rough: Mask) -> Mask:
+    """Twelve nodes over pupil and pixel on the rough pixels and their surroundings where four mislead.
+
+    Returns the pixels that twelve do not settle either. Four nodes cannot see all that they miss, so a lattice of
+    pixels is probed with twelve: what four were off by there counts for the pixels around.
+    """
+    probes = pixels.lattice(rough.shape) & (draft.hits > 0) & ~rough & draft.open
+    difference = _refine(draft, rough | probes)
+    doubt = pixels.spread_over_lattice(np.where(probes, difference, 0))
+    draft.error = np.where(rough, draft.error, np.maximum(draft.error, doubt))
+    misled = ~rough & (draft.hits > 0) & (draft.error > draft.tolerance) & draft.open
+    if misled.any():
+        _refine(draft, misled & ~probes)
+    rough = rough | misled
+    return rough & draft.grown(rough & (draft.error > draft.tolerance), 12)
+
+
+def _one_will_do(draft: Draft) -> bool:
+    """True where lines of sight differ over the pupil, if at all, like the picture over the pixel."""
+    lens, blur = draft.lens.optics, draft.window.blur
+    curvature = 0.0 if lens.model == "pinhole" else 2 * (lens.discs[0].radius / lens.focus_distance) ** 2
+    will_do = curvature <= POINT * draft.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
+    taken = will_do and draft.quadrature.takes("one line")
+    why = f"cos⁴θ differs by {curvature:.1e} over the pupil, blur discs reach {blur:.2g} pixels"
+    draft.findings.append(Finding("one line", taken, why))
+    return taken
+
+
+def _refine(draft: Draft, where: Mask) -> Image:
+    """Twelve nodes on the marked pixels; returns how far the first ones were off there, 0 elsewhere."""
+    value, _, _, _, hits, nearest, _ = _apply(draft, rules.twelve(draft.area), where)
+    difference = np.where(where, np.abs(value - draft.value), 0)
+    draft.change = np.maximum(draft.change, difference)
+    # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
+    gain = np.divide(8 * difference, draft.error, out=np.ones_like(value), where=draft.error > 0)
+    draft.value = np.where(where, value, draft.value)
+    draft.hits = np.where(where, hits, draft.hits)
+    draft.nearest = np.minimum(draft.nearest, nearest)
+    error = np.maximum(pixels.spread_max(difference * np.clip(gain, LEAST_GAIN, 1)), draft.error / MOST_GAIN)
+    draft.error = np.where(where, np.maximum(error, draft.cut_off(12)), draft.error)
+    return difference
+
+
+def _apply(draft: Draft, rule: rules.Rule, where: Mask) -> list[Image]:
+    """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
+    index = np.flatnonzero(where).astype(np.uint32)
+    fills = (0, 0, 0, 0, 0, np.inf, 0)
+    images = [np.full(where.size, fill, dtype=np.float64) for fill in fills]
+    for part in chunks(index, LANES):
+        sums = apply_rule(draft.scene, draft.lens, draft.window.centres(part), rule)
+        dr.eval(sums)
+        for image, column in zip(images, sums, strict=True):
+            image[part] = column.numpy()
+    draft.count(f"{len(rule)} nodes", len(index), len(index) * len(rule))
+    return [image.reshape(where.shape) for image in images]
