@@ -1,4 +1,4 @@
-"""Chords through pupil and pixel where the line of sight jumps: more of them until no pixel of a neighbourhood moves."""
+"""Chords through pupil and pixel where the line of sight jumps: more of them until no pixel around moves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nodes over pupil and pixel: one or four at every pixel, twelve where the picture bends or four are seen to mislead."""
+"""Nodes over pupil and pixel: one or four at every pixel, twelve where the picture bends or four mislead."""
 
 from __future__ import annotations
 
