@@ -384,6 +384,20 @@ def test_the_power_is_differentiable_in_the_exitance():
     assert dr.grad(parameters[key]).numpy() == pytest.approx(4.0, rel=1e-3)
 
 
+@pytest.mark.parametrize("domain", ["pupil", "surface"])
+def test_slivers_on_which_no_place_is_found_are_no_harm(domain, tmp_path):
+    """Seen to fail, refused, with every NaN between vertices taken for bad data."""
+    square = [(0, -5, -5), (0, 5, -5), (0, 5, 5), (0, -5, 5), (0, 0, 5), (0, 1e-15, 0), (0, 0, 0)]
+    faces = [(0, 1, 2), (0, 2, 3)]
+
+    def power(faces):
+        mesh = {"type": "ply", "filename": str(write_ply(tmp_path / "sheet.ply", square, faces, vertex=[1e-3] * 7))}
+        scene = scene_of(mesh | {"emitter": glow(attribute())}, integrator={"type": "fspt_integral", "domain": domain})
+        return np.array(mi.render(scene))
+
+    assert power([*faces, (4, 5, 6)]) == pytest.approx(power(faces), rel=1e-3, abs=0)
+
+
 @pytest.mark.parametrize("integrator", ["fspt_integral", "path", "ptracer"])
 def test_a_rendered_scene_can_be_freed_and_keeps_its_names(integrator, tmp_path):
     """Each scene once stayed in memory for good after its first picture, and its shapes were renamed."""

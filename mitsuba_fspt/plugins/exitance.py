@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import ExitanceError
 from .elements import at_one_wavelength, elements_of, scalar, triangles
 
+SLIVER = 1e-6  # of the mean area: on a smaller face single precision may find no place to interpolate at
 ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
 
 
@@ -64,12 +65,15 @@ def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], 
     corners_and_centre = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
     points = [elements.place(index, mi.Point2f(*point)) for point in corners_and_centre]
     everywhere = [np.broadcast_arrays(exitance(si).numpy(), area.numpy()) for si, area in points]
-    values = np.concatenate([value[area > 0] for value, area in everywhere])  # a face without area emits nothing
+    values, areas = (np.concatenate(columns) for columns in zip(*everywhere, strict=True))
+    values, areas = values[areas > 0], areas[areas > 0]  # a face without area emits nothing
     name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
     if not values.size:
         raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has no area to glow. Mend its mesh.")
-    if not np.isfinite(values).all():
+    finite = np.isfinite(values)
+    if not finite[areas > SLIVER * areas.mean()].all():
         raise ExitanceError(f"{name} has NaN or infinite values. Mend the data before rendering.")
+    values = values[finite]
     if values.min() < -ROUNDING * values.max(initial=0):
         raise ExitanceError(
             f"{name} must be >= 0 W/mm², its lowest value is {values.min():.4g}. Clip it on import: "

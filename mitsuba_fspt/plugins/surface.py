@@ -100,7 +100,8 @@ class FsptSurface(mi.Emitter):
             return mi.UnpolarizedSpectrum(0)
         outward = active & (dr.dot(si.n, direction) > 0)
         radiance = self.exitance.eval(si, outward) * self.law.profile(si, direction, outward)
-        return dr.select(outward, radiance, 0)
+        # On a sliver, where single precision finds no place to interpolate at, J_n is not a number.
+        return dr.select(outward & dr.isfinite(radiance), radiance, 0)
 
     # ------------------------------------------------------------------ sampling
 

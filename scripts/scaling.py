@@ -1,0 +1,157 @@
+"""Cost of the integral against the number of pixels and of triangles.
+
+    python scripts/scaling.py [--out docs] [--rounds 5] [--rtol 1e-2]
+
+A ball with a smooth J_n, its front in focus, f/2.8. First the same field on ever more pixels, 128 x 128 to 2048 x 2048;
+then on 256 x 256 pixels the same ball in ever more triangles, 10 thousand to 3 million. Warm, in one process, in rounds
+that go through all settings in turn; medians. Writes scaling.csv and scaling.png and prints the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt import backend
+from mitsuba_fspt.atomic import atomic_path
+
+SIDES = (128, 256, 512, 1024, 2048)
+TRIANGLES = (10_000, 100_000, 1_000_000, 3_000_000)
+FIELD, RADIUS = 27.648, 15.0  # mm: the detector's width, the ball's radius
+
+
+@dataclass
+class Setting:
+    """One film and one mesh, and what the runs gave."""
+
+    side: int
+    triangles: int
+    seconds: list[float] = field(default_factory=list)
+    rays: int = 0
+
+    @property
+    def nanoseconds(self) -> float:
+        """Median time a pixel [ns]."""
+        return 1e9 * float(np.median(self.seconds)) / self.side**2
+
+
+def main() -> None:
+    """Measure, write the files, print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("docs"))
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rtol", type=float, default=1e-2)
+    arguments = parser.parse_args()
+    by_pixels = [Setting(side, TRIANGLES[1]) for side in SIDES]
+    by_triangles = [Setting(256, triangles) for triangles in TRIANGLES]
+    with tempfile.TemporaryDirectory() as folder:
+        for settings in (by_pixels, by_triangles):
+            measure(settings, Path(folder), arguments.rounds, arguments.rtol)
+    arguments.out.mkdir(exist_ok=True)
+    write_csv(by_pixels + by_triangles, arguments.out / "scaling.csv")
+    draw(by_pixels, by_triangles, arguments.out / "scaling.png")
+    report(by_pixels, by_triangles)
+
+
+def ball(triangles: int, path: Path) -> None:
+    """A ball of about so many triangles around the origin, its J_n smooth, as a PLY."""
+    rings = round(math.sqrt(triangles / 2))
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.arange(rings) * 2 * np.pi / rings, indexing="ij")
+    normal = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1).reshape(-1, 3)
+    row, column = (grid.ravel() for grid in np.meshgrid(np.arange(rings), np.arange(rings), indexing="ij"))
+    corner = [(row + i) * rings + (column + j) % rings for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    faces = np.concatenate([np.stack([corner[k] for k in pick], -1) for pick in ((0, 1, 2), (0, 2, 3))])
+    fspt.Phantom(RADIUS * normal, faces, 1e-3 * np.exp(2 * normal[:, 0]), "vertex").write(path)
+
+
+def scene(setting: Setting, folder: Path) -> object:
+    """The ball of a setting before its film, in the camera of the nylon cylinder."""
+    import mitsuba as mi
+
+    path = folder / f"ball_{setting.triangles}.ply"
+    if not path.exists():
+        ball(setting.triangles, path)
+    exitance = {"type": "mesh_attribute", "name": "vertex_exitance"}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "embree_use_robust_intersections": True,
+            "camera": {
+                "type": "fspt_lens",
+                "focal_length": 55.0,
+                "f_number": 2.8,
+                "magnification": 0.5,
+                "pixel_pitch": FIELD / setting.side,
+                "to_world": mi.ScalarTransform4f().look_at([180, 0, 0], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": setting.side, "height": setting.side, "pixel_format": "luminance"},
+            },
+            "ball": {
+                "type": "ply",
+                "filename": str(path),
+                "face_normals": True,
+                "emitter": {"type": "fspt_surface", "exitance": exitance},
+            },
+        }
+    )
+
+
+def measure(settings: list[Setting], folder: Path, rounds: int, rtol: float) -> None:
+    """Time all settings in turn, `rounds` times after a first run that compiles and is not counted."""
+    backend.ensure_variant()
+    import mitsuba as mi
+
+    integrator = mi.load_dict({"type": "fspt_integral", "rtol": rtol})
+    for setting in settings:  # one scene alive at a time: every living one costs all kernels
+        of = scene(setting, folder)
+        for k in range(rounds + 1):
+            start = time.perf_counter()
+            setting.rays = integrator.solve(of, of.sensors()[0]).rays
+            if k:
+                setting.seconds.append(time.perf_counter() - start)
+        del of
+
+
+def write_csv(settings: list[Setting], path: Path) -> None:
+    """One row a setting: pixels a side, triangles, median, least and largest time [s], lines of sight."""
+    with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["side", "triangles", "seconds_median", "seconds_min", "seconds_max", "lines_of_sight"])
+        for s in settings:
+            times = [f"{f(s.seconds):.5f}" for f in (np.median, min, max)]
+            rows.writerow([s.side, s.triangles, *times, s.rays])
+
+
+def draw(by_pixels: list[Setting], by_triangles: list[Setting], path: Path) -> None:
+    """Time a pixel against both."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.semilogx([s.side for s in by_pixels], [s.nanoseconds for s in by_pixels], "o-", base=2)
+    left.set(xlabel="pixels a side", ylabel="time a pixel [ns]", ylim=(0, None))
+    right.semilogx([s.triangles for s in by_triangles], [s.nanoseconds for s in by_triangles], "o-")
+    right.set(xlabel="triangles", ylim=(0, None))
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=130)
+
+
+def report(by_pixels: list[Setting], by_triangles: list[Setting]) -> None:
+    """Both tables, as Markdown."""
+    print("| pixels | triangles | time | a pixel | lines of sight a pixel |\n|---|---|---|---|---|")
+    for s in by_pixels + by_triangles:
+        seconds = float(np.median(s.seconds))
+        print(f"| {s.side}² | {s.triangles} | {seconds:.3g} s | {s.nanoseconds:.0f} ns | {s.rays / s.side**2:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
