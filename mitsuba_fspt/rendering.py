@@ -15,6 +15,7 @@ import numpy as np
 from . import backend
 from .errors import SceneError
 from .image import Image
+from .interrupt import ctrl_c_noted
 from .quadrature import Quadrature
 from .scene import load
 from .shortcuts import SHORTCUTS
@@ -70,23 +71,30 @@ def render(
     deterministic = type(integrator).__name__ == "FsptIntegral"
     _refuse(sampling if deterministic else accuracy, "integral" if deterministic else "Monte Carlo")
     start = time.perf_counter()
-    if deterministic:
-        power, error, coverage, how = _integrate(scene, lens, integrator, accuracy, progress)
-    else:
-        spp, seed = 256 if spp is None else spp, seed or 0
-        power, error, coverage, how = _sample(scene, lens, integrator, spp, seed, progress)
+    with ctrl_c_noted() as check_interrupt:
+
+        def tell(what: str, share: float) -> None:
+            check_interrupt()
+            if progress:
+                progress(what, share)
+
+        if deterministic:
+            power, error, coverage, how = _integrate(scene, lens, integrator, accuracy, tell)
+        else:
+            spp, seed = 256 if spp is None else spp, seed or 0
+            power, error, coverage, how = _sample(scene, lens, integrator, spp, seed, tell)
+        check_interrupt()
     how["wall_time"] = time.perf_counter() - start
     return Image(power, error, coverage, {"scene": scene.id(), **how, **_lens_numbers(lens), **_versions()})
 
 
 def _integrate(
-    scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress | None
+    scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress
 ) -> tuple:
     """Arrays and metadata of the deterministic integral."""
     own = asdict(integrator.quadrature)
     wanted = own | {name: value for name, value in accuracy.items() if value is not None}
-    if progress:
-        progress("integrating", 0.0)
+    progress("integrating", 0.0)
     solution = integrator.solve(scene, lens, Quadrature(**wanted))
     how = {"method": "integral", **wanted, "nodes": solution.rays, "levels": "; ".join(solution.levels)}
     how["without"] = ", ".join(sorted(wanted["without"])) or "nothing"
@@ -100,7 +108,7 @@ def _sample(
     integrator: mi.Integrator,
     spp: int,
     seed: int,
-    progress: Progress | None,
+    progress: Progress,
 ) -> tuple:
     """Mean and standard error of independent Monte Carlo passes, summed in double precision."""
     import drjit as dr
@@ -119,8 +127,7 @@ def _sample(
     total = squares = 0.0
     samples = 0
     for k in range(passes):
-        if progress:
-            progress("sampling", k / passes)
+        progress("sampling", k / passes)
         with dr.suspend_grad(), recording():
             (of_pass,) = np.random.SeedSequence((seed, k)).generate_state(1)
             image = integrator.render(scene, lens, seed=int(of_pass), spp=math.ceil(spp / passes))
