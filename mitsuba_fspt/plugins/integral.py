@@ -8,7 +8,9 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
+from .. import pixels
 from ..optics import Lens
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import SHORTCUTS, Finding
@@ -19,6 +21,7 @@ from .narrow import NarrowLight, narrow_light
 from .recording import recording
 from .window import Window, visible_window
 
+ROUNDING = 1e-3  # pixels; more only far from the world's origin
 NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
 
 
@@ -77,7 +80,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             traced = self._traced(scene, sensor)
             window = visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
             solution = self._solve_in(window, traced, sensor, quadrature)
-        return replace(solution, findings=(_outside(window), *solution.findings))
+        error = solution.error + _moved(solution.power, sensor.rounding)
+        return replace(solution, error=error, findings=(_outside(window), *solution.findings))
 
     def _solve_in(self, window: Window, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
         """The form of Eq. 9 asked for; pixels with light of narrow spots take the surface form in any case."""
@@ -125,6 +129,13 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
     def to_string(self) -> str:
         return f"FsptIntegral[{self.quadrature}]"
+
+
+def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
+    """What lines of sight that float32 moves by `rounding` [pixels] may change; by less they move at random."""
+    if rounding < ROUNDING or min(power.shape) == 0:
+        return np.zeros_like(power)
+    return rounding * pixels.spread_max(np.hypot(*pixels.gradient(power)))
 
 
 def _outside(window: Window) -> Finding:
