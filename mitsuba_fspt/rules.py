@@ -139,7 +139,7 @@ def chords(m: int, q: int, area: bool = True) -> Chords:
 
     Without `area` all belong to the pixel's centre; four chords share 2 × 2 points, such that one as far on the other
     side of the middle has the opposite point. Across the pixel they are equidistant, and their pupil points fill the
-    disc evenly, whatever run of them is taken (R₂ sequence).
+    disc evenly, whatever run of them is taken (R₂ sequence, folded in the radius: so it has no seam there).
     """
     if not area:
         m, q = m * q * q, 1
@@ -152,13 +152,13 @@ def chords(m: int, q: int, area: bool = True) -> Chords:
         pixel = np.sqrt(1 / 12) * np.array([[[1, 1]], [[1, -1]], [[-1, 1]], [[-1, -1]]])
     weight = np.broadcast_to(np.outer(w, w).ravel() / m, (m, q * q))
     number = np.arange(m * q * q) + 0.5
-    radius, turn = np.mod(np.outer(PLASTIC, number), 1.0)
+    square, turn = np.mod(np.outer(PLASTIC, number), 1.0)
     return Chords(
         across=across.ravel(),
         pixel=pixel.reshape(-1, 2),
         weight=weight.ravel(),
         side=number / len(number) - 0.5,
-        pupil=_polar(np.sqrt(radius), 2 * np.pi * turn),
+        pupil=_polar(np.sqrt(1 - np.abs(2 * square - 1)), 2 * np.pi * turn),
     )
 
 
