@@ -42,7 +42,11 @@ def integrate_by_chords(draft: Draft, rough: Mask) -> None:
             draft.change *= (count / len(rule)) ** rules.CHORD_ORDER
             draft.change.flat[index] = np.maximum(np.abs(mean - draft.value.flat[index]), draft.change.flat[index])
             draft.value.flat[index], draft.hits.flat[index] = mean, met
-            draft.error.flat[index] = SAFETY * pixels.spread_max(draft.change).flat[index]
+            # A jump that no chord met before: what was moved until now says nothing of it.
+            fresh = (jumps > 0) & ~split.flat[index]
+            split.flat[index] |= jumps > 0
+            error = SAFETY * pixels.spread_max(draft.change).flat[index]
+            draft.error.flat[index] = np.where(fresh, np.maximum(error, 2 * draft.tolerance), error)
         count = len(rule)
         index = index[draft.error.flat[index] > draft.tolerance]
 
