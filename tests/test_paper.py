@@ -19,7 +19,6 @@ import paper_stops  # noqa: E402
 import paper_vignetting  # noqa: E402
 from paper_common import Table  # noqa: E402
 
-
 # --- stops ---
 
 
