@@ -141,7 +141,7 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
             **numbers,
             "model": lens.optics.model,
             "to_world": mi.ScalarTransform4f(np.array(lens.world_transform().matrix, np.float64).reshape(4, 4)),
-            "film": {"type": "hdrfilm", **dict(zip(names, sizes, strict=True))},
+            "film": {"type": "hdrfilm", "pixel_format": "luminance", **dict(zip(names, sizes, strict=True))},
             "sampler": {"type": sampler},
         }
     )

@@ -30,7 +30,7 @@ COLUMNS = (
     "rms_all",
     "rms_full",
     "largest",
-    "arrays_mib",
+    "drjit_mib",
 )
 GREY, MARKERS = "0.55", "sD^vP"
 # The methods the figure is about; what is not here is one of several of its kind, thin and grey.

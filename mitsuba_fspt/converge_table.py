@@ -36,7 +36,7 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 
 def _methods(found: Convergence) -> list[list[str]]:
     """A row a method; rates of the finest setting, memory of the largest, what a first picture takes longer."""
-    head = ["method", "order", *(f"to {target:g}" for target in TARGETS), "cold +", "Mrays/s", "of raw", "arrays"]
+    head = ["method", "order", *(f"to {target:g}" for target in TARGETS), "cold +", "Mrays/s", "of raw", "Dr.Jit"]
     rows = [head]
     for method in found.methods:
         of = found.of(method)
@@ -50,7 +50,7 @@ def _methods(found: Convergence) -> list[list[str]]:
                 _time(max(compiling, 0.0)),
                 f"{fine.rate / 1e6:.3g}" if fine.rays else NONE,
                 f"{fine.rate / found.raw_rate:.0%}" if fine.rays else NONE,
-                f"{max(row.memory for row in of):.0f} MiB",
+                f"{max(row.memory for row in of):.2g} MiB",
             ]
         )
     return rows

@@ -23,7 +23,7 @@ class Row:
     rays : lines of sight; for the sum over points, pairs of a point and a pixel
     rms, rms_full : RMS error over all pixels and over those whose whole cone sees the phantom (NaN: there are none)
     largest : largest error of a pixel; of Monte Carlo the median over the runs, whose squares `rms` averages
-    memory : peak of the arrays that Dr.Jit and NumPy held [MiB], the scene's own included, Embree's tree not
+    memory : peak of the arrays that Dr.Jit held for it [MiB], beside the scene; NumPy's and Embree's are not counted
     """
 
     method: str

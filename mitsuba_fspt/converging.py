@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import time
-import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,8 +55,8 @@ def converge(
     through all settings by turns: a slow moment of the machine meets them all, and medians count. `converge_sheet`
     writes the CSV file, the figure and the table.
 
-    Cold is the first run of a setting after Dr.Jit forgot its kernels: tracing, compiling, and what is found out once
-    about a scene. Kernels that Dr.Jit keeps on disk would be read, not compiled; so give their folder.
+    Cold is the first run of a setting: tracing, compiling, and what an integrator finds out once about a scene. Kernels
+    that Dr.Jit has, in memory or on disk, are not compiled again, unless `kernels` lets it forget them.
 
     Parameters
     ----------
@@ -65,14 +65,14 @@ def converge(
     rounds : timed runs of every setting, >= 1
     budget : longest time of one picture [s], > 0; finer settings are left out. About rounds × 20 × budget in all.
     reference : EXR file with error.Y, or NPZ file with arrays power and error [W]; None makes one, see `own_reference`
-    kernels : DRJIT_CACHE_DIR of this process, if it may be emptied before every cold run; None leaves it as it is
+    kernels : DRJIT_CACHE_DIR of this process, if all kernels may be forgotten before every cold run; else None
     progress : called with what is being done and the share done
 
     Raises
     ------
     SceneError, OpticsError, ExitanceError, ImageError, BackendError : what is wrong and how to mend it.
     """
-    if not (rounds >= 1 and budget > 0):
+    if not (rounds >= 1 and 0 < budget < math.inf):
         raise SceneError(f"converge: 'rounds' must be >= 1 and 'budget' > 0 s, got {rounds} and {budget:g}.")
     if isinstance(scene, (str, os.PathLike)):
         scene = load(scene)
@@ -184,29 +184,28 @@ class Bench:
             self.trials.append(Trial(method, run, cold, memory, shot))
 
     def _forget_kernels(self) -> None:
+        if self.kernels is None:
+            return
         import drjit as dr
 
         dr.sync_thread()
         dr.flush_kernel_cache()
-        for path in self.kernels.glob("*.bin") if self.kernels else ():
+        for path in self.kernels.glob("*.bin"):
             path.unlink(missing_ok=True)
 
 
 def _with_memory(run: Callable[[], Shot]) -> tuple[float, float, Shot]:
-    """Seconds, peak of the arrays [MiB], and the picture. The two peaks, NumPy's and Dr.Jit's, may not coincide."""
+    """Seconds, peak of Dr.Jit's arrays beside what lived before [MiB], and the picture."""
     import drjit as dr
     import mitsuba as mi
 
     device = dr.JitBackend.CUDA if mi.variant().startswith("cuda") else dr.JitBackend.LLVM
+    dr.sync_thread()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
-    tracemalloc.start()
-    try:
-        seconds, shot = _seconds(run)
-        numpy_peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    return seconds, (dr.detail.malloc_watermark(device) + numpy_peak) / MIB, shot
+    before = dr.detail.malloc_watermark(device)
+    seconds, shot = _seconds(run)
+    return seconds, (dr.detail.malloc_watermark(device) - before) / MIB, shot
 
 
 def _seconds(run: Callable[[], Any]) -> tuple[float, Any]:
