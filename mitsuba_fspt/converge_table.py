@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from .convergence import TARGETS, Convergence
 
 # Pixels ('full': those whose whole cone sees the phantom) and RMS errors at which the integral is set against `path`.
@@ -35,19 +33,18 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _methods(found: Convergence) -> list[list[str]]:
-    """A row a method; rates of the finest setting, memory of the largest, what a first picture takes longer."""
-    head = ["method", "order", *(f"to {target:g}" for target in TARGETS), "cold +", "Mrays/s", "of raw", "Dr.Jit"]
+    """A row a method: rates of the finest setting, the largest memory, the coarsest setting's first run."""
+    head = ["method", "order", *(f"to {target:g}" for target in TARGETS), "cold start", "Mrays/s", "of raw", "Dr.Jit"]
     rows = [head]
     for method in found.methods:
         of = found.of(method)
         order, fine = found.order(method), of[-1]
-        compiling = float(np.median([row.cold - row.median for row in of]))
         rows.append(
             [
                 method,
                 NONE if order is None else f"{order:.2f}",
                 *(_time(found.time_to(method, target)) for target in TARGETS),
-                _time(max(compiling, 0.0)),
+                _time(of[0].cold),
                 f"{fine.rate / 1e6:.3g}" if fine.rays else NONE,
                 f"{fine.rate / found.raw_rate:.0%}" if fine.rays else NONE,
                 f"{max(row.memory for row in of):.2g} MiB",
