@@ -20,6 +20,8 @@ from . import backend
 if TYPE_CHECKING:
     from .comparison import Comparison as Comparison
     from .comparison import compare as compare
+    from .convergence import Convergence as Convergence
+    from .converging import converge as converge
     from .detector import Detector as Detector
     from .detector import Exposure as Exposure
     from .errors import FsptError as FsptError
@@ -39,6 +41,8 @@ _HOMES = {
     "read": "image",
     "compare": "comparison",
     "Comparison": "comparison",
+    "converge": "converging",
+    "Convergence": "convergence",
     "Detector": "detector",
     "Exposure": "detector",
     "Phantom": "phantom",

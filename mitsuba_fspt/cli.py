@@ -212,8 +212,15 @@ def _add_sweep() -> None:
     app.command()(sweep)
 
 
+def _add_converge() -> None:
+    from .converge_cli import converge
+
+    app.command()(converge)
+
+
 _add_flux()
 _add_sweep()
+_add_converge()
 
 
 def main() -> None:

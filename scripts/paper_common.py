@@ -102,6 +102,14 @@ def solve(name: str, folder: Path, **finer: Any) -> Path:
 
 
 def photograph(
+    phantom: Path, view: float, lens: dict[str, Any], *, law: str = "lambert", **settings: Any
+) -> fspt.Image:
+    """Picture of `stage`; `settings` of it, and of fspt.render."""
+    own = {name: settings.pop(name) for name in ("size", "pitch") if name in settings}
+    return fspt.render(stage(phantom, view, lens, law=law, **own), **settings)
+
+
+def stage(
     phantom: Path,
     view: float,
     lens: dict[str, Any],
@@ -109,12 +117,10 @@ def photograph(
     law: str = "lambert",
     size: int = SIZE,
     pitch: float = PITCH,
-    **settings: Any,
-) -> fspt.Image:
-    """Picture of a phantom turned by `view` degrees, as scenes/nylon_cylinder.xml sees it.
+) -> Any:
+    """Scene of a phantom turned by `view` degrees, as scenes/nylon_cylinder.xml sees it.
 
-    `lens`: parameters of fspt_lens beside the focal length, the focus and the pixel pitch; `law`: its emission;
-    `settings`: of fspt.render.
+    `lens`: parameters of fspt_lens beside the focal length, the focus and the pixel pitch; `law`: its emission.
     """
     import mitsuba as mi
 
@@ -126,7 +132,7 @@ def photograph(
         volume = {"type": "gridvolume", "filename": str(phantom.with_name("fluence.vol")), "use_grid_bbox": True}
         emitter |= {"mua": MUA, "musp": MUSP, "fluence": volume | {"to_world": turn, "accel": False}}
     body = {"type": "ply", "filename": str(phantom), "face_normals": True, "emitter": emitter, "to_world": turn}
-    return fspt.render(camera(body, lens, (size, size), pitch), **settings)
+    return camera(body, lens, (size, size), pitch)
 
 
 def camera(body: dict[str, Any], lens: dict[str, Any], size: tuple[int, int], pitch: float) -> Any:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from paper_common import DISTANCE, FOCAL, FOCUS, MAGNIFICATION, Array, Table, figure, panel, photograph, save, solve
+from paper_common import MAGNIFICATION, Array, Table, figure, panel, save, solve, stage
 
 import mitsuba_fspt as fspt
 
@@ -19,76 +21,20 @@ HALF = 0.5
 def stops(folder: Path, output: Path) -> list[Table]:
     """Tables of power and extent against f-number; writes paper_fig6.png and paper_fig78.png into `output`."""
     phantom = solve("nylon_cylinder_6mm", folder)
-    images = {f: photograph(phantom, LEFT, {"f_number": f}, rtol=1e-3) for f in F_NUMBERS}
-    points = surface_points(phantom, LEFT)
-    naive = {
-        f: _as_image(eq9_sum(*points, diameter=FOCAL / f, shape=image.shape), image) for f, image in images.items()
-    }
+    scenes = {f: stage(phantom, LEFT, {"f_number": f}) for f in F_NUMBERS}
+    images = {f: fspt.render(scene, rtol=1e-3) for f, scene in scenes.items()}
+    naive = {f: replace(naive_sum(scene), metadata=images[f].metadata) for f, scene in scenes.items()}
     _draw_pictures(images, naive, output / "paper_fig6.png")
     rows = [(f, *_numbers(image)) for f, image in images.items()]
     _draw_curves(np.array(rows), output / "paper_fig78.png")
     return [_intensity(rows), _distance(rows), _sparse(images, naive)]
 
 
-# ---------------------------------------------------------------------- the sum over surface points
+def naive_sum(scene: Any) -> fspt.Image:
+    """Eq. 9 summed over the centres of the phantom's faces, as the paper does it."""
+    from mitsuba_fspt.plugins import point_sum
 
-
-def surface_points(phantom: Path, view: float) -> tuple[Array, Array, Array]:
-    """Centres (N, 3) [mm] and normals (N, 3) of the triangles in the camera's frame, and J_n dS (N,) [W].
-
-    The frame: x to the right of the picture, y up, z from the lens to the phantom.
-    """
-    found = fspt.import_flux(phantom)
-    corners = found.vertices[found.faces]
-    turn = np.radians(view)
-    world = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-    frame = np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]]) @ world
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ frame.T
-    double = np.linalg.norm(normals, axis=1)  # twice the area [mm²]
-    watts = found.exitance[found.faces].mean(axis=1) * double / 2
-    return corners.mean(axis=1) @ frame.T + [0, 0, DISTANCE], normals / double[:, None], watts
-
-
-def eq9_sum(
-    points: Array,
-    normals: Array,
-    watts: Array,
-    *,
-    diameter: float,
-    shape: tuple[int, int],
-    side: float = 0.108 / MAGNIFICATION,
-    focus: float = FOCUS,
-) -> Array:
-    """Eq. 9 summed over surface points at the middle of each pixel, as the paper does it: power, shape (h, w) [W].
-
-    A point adds J_n dS/π · cosθ_s cosθ_d/|r_vd − r|² · A_vd to the pixels r_vd whose line to it meets the diaphragm
-    (β), that is, to those inside its blur disc on the sharp plane, if it faces the lens along that line (α; a convex
-    body hides no more).
-
-    points, normals : (N, 3) in the camera's frame [mm]; watts : J_n dS, (N,) [W]; diameter : D [mm]; side : of a
-    virtual pixel [mm]; focus : u [mm]
-    """
-    depth, defocus = points[:, 2], points[:, 2] - focus
-    centre = points[:, :2] * (focus / depth)[:, None]
-    radius = diameter / 2 * np.abs(defocus) / depth
-    middle = np.array([shape[1] - 1, shape[0] - 1]) / 2
-    nearest = np.rint(centre * [1, -1] / side + middle).astype(int)
-    power = np.zeros(shape)
-    reach = int(np.ceil(radius.max() / side + 0.5))
-    for offset in np.ndindex(2 * reach + 1, 2 * reach + 1):
-        pixel = nearest + np.array(offset) - reach
-        virtual = (pixel - middle) * side * [1, -1]
-        lit = (np.hypot(*(virtual - centre).T) <= radius) & (defocus != 0)
-        lit &= ((pixel >= 0) & (pixel < shape[::-1])).all(axis=1)
-        line = np.column_stack([virtual[lit] - points[lit, :2], -defocus[lit]]) * np.sign(defocus[lit])[:, None]
-        square = (line**2).sum(axis=1)  # of the way from r to r_vd, pointing towards the lens
-        cosines = np.maximum((normals[lit] * line).sum(axis=1), 0) * np.abs(defocus[lit]) / square
-        np.add.at(power, tuple(pixel[lit, ::-1].T), watts[lit] / np.pi * cosines / square * side**2)
-    return power
-
-
-def _as_image(power: Array, like: fspt.Image) -> fspt.Image:
-    return fspt.Image(power, None, like.coverage, like.metadata)
+    return fspt.Image(point_sum.solve(scene, scene.sensors()[0])[0])
 
 
 # ---------------------------------------------------------------------- numbers

@@ -223,9 +223,9 @@ def test_version_and_help(run):
     assert re.fullmatch(r"mitsuba-fspt \d+\.\d+\.\d+\S*\n", out)
     code, out, err = run("--help")
     assert (code, err) == (0, "")
-    for verb in ("render", "compare", "expose", "doctor", "flux"):
+    for verb in ("render", "compare", "expose", "doctor", "flux", "converge"):
         assert verb in out
-    for verb in ("render", "compare", "expose", "doctor", "flux"):
+    for verb in ("render", "compare", "expose", "doctor", "flux", "converge"):
         code, out, err = run(verb, "--help")
         assert (code, err) == (0, "")
         assert "Usage: fspt " + verb in out

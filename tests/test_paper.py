@@ -17,55 +17,7 @@ import paper_common  # noqa: E402
 import paper_models  # noqa: E402
 import paper_stops  # noqa: E402
 import paper_vignetting  # noqa: E402
-from paper_common import FOCUS, Table  # noqa: E402
-
-
-def patch(depth, side=2.0, count=150):
-    """Points on a square patch that faces the lens, `depth` from it; normals; 1 W/mm² on each one's share [W]."""
-    line = (np.arange(count) + 0.5) / count * side - side / 2
-    x, y = (axis.ravel() for axis in np.meshgrid(line, line))
-    points = np.column_stack([x, y, np.full(x.size, float(depth))])
-    return points, np.broadcast_to([0.0, 0, -1], points.shape), np.full(x.size, side**2 / x.size)
-
-
-# --- the sum over surface points ---
-
-
-@pytest.mark.parametrize("depth", [150.0, 180.0])
-def test_sum_over_points_carries_what_enters_the_diaphragm(depth):
-    """Rationale: fine enough, the sum is Eq. 9, before and behind the sharp plane: Σ P = J_n A sin²θ on the axis.
-
-    Expected: 1 %, by pixel centres in a blur disc of nine pixels; cos⁴ over a patch of 2 mm is 1e-4.
-    Seen to fail with D for D/2.
-    """
-    diameter = 20.0
-    power = paper_stops.eq9_sum(*patch(depth), diameter=diameter, shape=(40, 40))
-    expected = 4.0 * (diameter / 2) ** 2 / ((diameter / 2) ** 2 + depth**2)
-    assert power.sum() == pytest.approx(expected, rel=1e-2)
-
-
-def test_sum_over_points_is_sparse_beside_the_sharp_plane_and_misses_what_lies_in_it():
-    """Rationale: the blur disc shrinks below a pixel and hits a centre by luck; in the plane itself it never does."""
-    near = paper_stops.eq9_sum(*patch(FOCUS + 1, count=12), diameter=2.5, shape=(40, 40))
-    inside = near[16:24, 16:24]
-    assert (inside == 0).mean() > 0.5
-    assert paper_stops.eq9_sum(*patch(FOCUS), diameter=2.5, shape=(40, 40)).max() == 0
-
-
-def test_sum_over_points_sees_no_point_that_faces_away():
-    points, normals, watts = patch(180.0, count=40)
-    assert paper_stops.eq9_sum(points, -normals, watts, diameter=20.0, shape=(40, 40)).max() == 0
-
-
-def test_picture_of_a_point_is_upright():
-    """A point up and to the right (x, y > 0) shines above and to the right of the middle: small row, large column."""
-    power = paper_stops.eq9_sum(
-        np.array([[2.0, 3.0, 180.0]]), np.array([[0.0, 0, -1]]), np.ones(1), diameter=20.0, shape=(40, 60)
-    )
-    row, column = np.argwhere(power).mean(axis=0)
-    assert column == pytest.approx(29.5 + 2 * FOCUS / 180 / 0.216, abs=0.5)
-    assert row == pytest.approx(19.5 - 3 * FOCUS / 180 / 0.216, abs=0.5)
-
+from paper_common import Table  # noqa: E402
 
 # --- stops ---
 

@@ -22,17 +22,22 @@ KNOWS_MITSUBA = {
     "doctor.py",
     "cli.py",
     "sweep_studio.py",
+    "converge_methods.py",
+    "converge_reference.py",
+    "converging.py",
     "stiff_cases_scenes.py",
 }
-PRINTS = {"cli.py", "flux_cli.py", "sweep_cli.py"}
+PRINTS = {"cli.py", "flux_cli.py", "sweep_cli.py", "converge_cli.py"}
 PUBLIC = [
     "Comparison",
+    "Convergence",
     "Detector",
     "Exposure",
     "FsptError",
     "Image",
     "Phantom",
     "compare",
+    "converge",
     "explain",
     "import_flux",
     "load",
@@ -110,8 +115,8 @@ def test_input_is_not_checked_by_assert_nor_refused_by_a_bare_exception(name):
 def test_nothing_imports_the_command_line(name):
     for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.ImportFrom) and node.level:
-            assert (node.module or "").split(".")[-1] not in ("cli", "flux_cli", "sweep_cli")
-            assert not {alias.name for alias in node.names} & {"cli", "flux_cli", "sweep_cli"}
+            assert (node.module or "").split(".")[-1] not in ("cli", "flux_cli", "sweep_cli", "converge_cli")
+            assert not {alias.name for alias in node.names} & {"cli", "flux_cli", "sweep_cli", "converge_cli"}
 
 
 def test_plugins_load_nothing_in_their_constructors():

@@ -1,0 +1,77 @@
+"""`fspt converge`: error against run time of every method on a scene."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+CACHE = "DRJIT_CACHE_DIR"
+
+
+def converge(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")],
+    define: Annotated[
+        list[str] | None,
+        typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for SCENE_converge.csv and .png, which must exist.")
+    ] = Path("."),
+    rounds: Annotated[int, typer.Option(min=1, help="Timed runs of every setting.")] = 5,
+    budget: Annotated[float, typer.Option(help="Longest time of one picture [s]; finer settings are left out.")] = 2.0,
+    reference: Annotated[
+        Path | None, typer.Option(metavar="FILE.npz|.exr", help="Power and its error [W]; made where not given.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Measure error against run time of every method: both forms of the integral, the paper's sum, Monte Carlo.
+
+    Writes SCENE_converge.csv and SCENE_converge.png, prints the fitted orders
+    and the times to an error. Takes about rounds x 20 x budget.
+    """
+    from .cli import _parameters, _progress, _quiet_mitsuba, _require_writable
+    from .converge_sheet import write_csv, write_png
+    from .converge_table import render_text
+    from .picture import require_matplotlib
+
+    figure = output / f"{scene.stem}_converge.png"
+    _require_writable(figure, ".png")
+    require_matplotlib()
+    with _progress() as progress, _empty_kernel_cache() as kernels:
+        from .converging import converge
+        from .scene import load
+
+        _quiet_mitsuba()
+        loaded = load(scene, **_parameters(define))
+        found = converge(loaded, rounds=rounds, budget=budget, reference=reference, kernels=kernels, progress=progress)
+    write_csv(found, figure.with_suffix(".csv"))
+    write_png(found, figure)
+    if as_json:
+        typer.echo(json.dumps(found.to_dict(), allow_nan=False))
+        return
+    typer.echo(render_text(found))
+    typer.echo(f"\n{figure.with_suffix('.csv')}: every setting; {figure}: the same to look at")
+
+
+@contextmanager
+def _empty_kernel_cache() -> Iterator[Path | None]:
+    """A folder of our own for Dr.Jit's kernels, so that cold is cold; None where Dr.Jit has chosen one already."""
+    if "drjit" in sys.modules:
+        yield None
+        return
+    before = os.environ.get(CACHE)
+    with tempfile.TemporaryDirectory(prefix="fspt-kernels-", ignore_cleanup_errors=True) as folder:
+        os.environ[CACHE] = folder
+        try:
+            yield Path(folder)
+        finally:
+            os.environ.pop(CACHE)
+            os.environ.update({CACHE: before} if before is not None else {})
