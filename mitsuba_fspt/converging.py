@@ -77,7 +77,7 @@ def converge(
     if isinstance(scene, (str, os.PathLike)):
         scene = load(scene)
     variant = backend.ensure_variant()
-    lens = rendering._sensor(scene, sensor)
+    lens = rendering.sensor_of(scene, sensor)
     tell = progress or (lambda what, share: None)
     width, height = (int(n) for n in _film(scene, lens).crop_size())
     known = read_reference(reference, (height, width)) if reference is not None else None
