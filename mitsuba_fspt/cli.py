@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from typer.exceptions import TyperException
 
+from .backend import quiet_mitsuba
 from .errors import FsptError, ImageError, SceneError
 from .sweep_cli import Interrupted
+from .terminal import progress_bar
 
 app = typer.Typer(
     name="fspt",
@@ -62,11 +61,11 @@ def render(
         from .picture import require_matplotlib
 
         require_matplotlib()
-    with _progress() as progress:
+    with progress_bar() as progress:
         from .rendering import render
         from .scene import load
 
-        _quiet_mitsuba()
+        quiet_mitsuba()
         image = render(
             load(scene, **_parameters(define)),
             method=method,
@@ -160,7 +159,7 @@ def stability(
     from .stability import check
     from .stiff_cases import cases
 
-    _quiet_mitsuba()
+    quiet_mitsuba()
     rows = [case for case in cases() if everything or not case.slow]
     results = []
     for row in rows:
@@ -244,25 +243,3 @@ def _require_writable(path: Path, suffix: str) -> None:
         raise ImageError(f"{path}: the folder '{folder}' does not exist. Make it, or write elsewhere with -o.")
     if not os.access(folder, os.W_OK):
         raise ImageError(f"{path}: the folder '{folder}' is not writable. Write elsewhere with -o.")
-
-
-def _quiet_mitsuba() -> None:
-    """Mitsuba's warnings would break the one line that errors promise."""
-    from .backend import ensure_variant
-
-    ensure_variant()
-    import mitsuba as mi
-
-    mi.set_log_level(mi.LogLevel.Error)
-
-
-@contextmanager
-def _progress() -> Iterator[object]:
-    """A progress bar on a terminal, nothing in a pipe."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("loading", total=None)
-        yield lambda what, share: bar.update(task, description=what, total=1.0, completed=share)
