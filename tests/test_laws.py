@@ -243,7 +243,7 @@ def test_diaphragm_tends_to_the_pinhole_through_five_decades_without_a_jump():
 
     Expected: of the peak, 1e-4 and what the blur changes in truth, ∝ D² here, 0.0055 (D/mm)² at most; and 1e-4 between
     two D that differ by 1e-4 of themselves, silhouettes and covered silhouettes included.
-    Seen to fail with the blur disc wider by 0.02 mm, with D² → D^1.9999 in the étendue, and without bisection.
+    Seen to fail with a pupil 0.2 mm wider in radius than its étendue, and with D² → D^1.9999 in that.
     """
     pinhole = over_etendue(13.75, model="pinhole")
     assert pinhole.max() > 1.5 / np.pi
@@ -258,7 +258,7 @@ def test_diaphragm_tends_to_the_pinhole_through_five_decades_without_a_jump():
 def test_diaphragm_tends_to_hrrt_as_it_opens_to_the_lens_border():
     """Rationale: lim D → lens diameter is the model without a diaphragm.
 
-    Expected: of the peak, 1e-4 and what the blur changes in truth, in proportion to what is left to open (0.42 times here).
+    Expected: of the peak, 1e-4 and what the blur changes in truth, ∝ what is left to open, 0.42 times here.
     Seen to fail with the border 0.01 mm wider than it is.
     """
     open_ = over_etendue(20.0, model="hrrt", lens_diameter=20.0)
