@@ -106,7 +106,7 @@ def _mean_distance(exact: fspt.Image, draws: Iterable[Array]) -> tuple[float, fl
 
 
 def _total(pictures: dict[str, Pictures]) -> Table:
-    """Power on the CCD, and how many of the paper's photons that is. Errors add up before the mirror images are taken."""
+    """Power on the CCD, and how many of the paper's photons that is; errors add up before any mirroring."""
     rows = []
     for view, images in pictures.items():
         everywhere = np.ones((COARSE, COARSE), bool)

@@ -66,15 +66,23 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         quadrature = quadrature or self.quadrature
         check_scene(scene, sensor)
         with recording(), dr.suspend_grad():
-            traced = self._traced(scene, sensor)
-            if quadrature.domain == "surface":
-                return surface_form.solve(traced, sensor, quadrature)
-            narrow = self._narrow_light(scene, sensor)
-            where = narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest
-            if not where.any():
-                return pupil_form.solve(traced, sensor, quadrature)
-            known = surface_form.solve(traced, sensor, quadrature, where, narrow.brightest / 2)
-            return known.completed_by(pupil_form.solve(traced, sensor, quadrature, known))
+            return self._solve(scene, sensor, quadrature)
+
+    def _solve(self, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
+        traced = self._traced(scene, lens)
+        # Light from the surface knows no border on the film: pixels that the image-plane stop cuts take lines of sight.
+        inside, cut = visible_window(scene, lens).stopped(lens)
+        if quadrature.domain == "surface":
+            if not cut.any():
+                return surface_form.solve(traced, lens, quadrature)
+            known = surface_form.solve(traced, lens, quadrature, inside)
+            return known.completed_by(pupil_form.solve(traced, lens, quadrature, known))
+        narrow = self._narrow_light(scene, lens)
+        where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest)
+        if not where.any():
+            return pupil_form.solve(traced, lens, quadrature)
+        known = surface_form.solve(traced, lens, quadrature, where, narrow.brightest / 2)
+        return known.completed_by(pupil_form.solve(traced, lens, quadrature, known))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""

@@ -62,6 +62,9 @@ class _Ladder:
         self.value, self.error, self.hits, self.change = (np.zeros(shape) for _ in range(4))
         # Pixels for which a second border of the lens cuts the pupil, whatever is sharp.
         self.clipped = self.window.off_axis(lens) > lens.optics.clear_field
+        # Pixels that the border of the image-plane stop cuts: a jump across the pixel, wherever the light comes from.
+        inside, cut = self.window.stopped(lens)
+        self.stopped, self.beyond = cut & self.area, ~(inside | cut)
         self.open = np.ones(shape, bool)  # pixels that are not known from elsewhere
         self.known = np.zeros(shape)
         if known is not None:
@@ -80,6 +83,7 @@ class _Ladder:
                     self._chords(rough)
         error = np.maximum(self.error, FLOAT32_FLOOR * self.value.max(initial=0.0))
         error[self.hits == 0] = self.error[self.hits == 0]
+        error[self.beyond] = 0
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.hits, 0, 1))
         return Solution(power, error, coverage, self.rays, tuple(self.levels))
@@ -149,7 +153,9 @@ class _Ladder:
         A silhouette, or the border of the lens.
         """
         brightest = pixels.spread_max(self.value)
-        return np.where(pixels.outline(self.hits, self._reach(nodes)) | self.clipped, CUT[nodes] * brightest, 0)
+        return np.where(
+            pixels.outline(self.hits, self._reach(nodes)) | self.clipped | self.stopped, CUT[nodes] * brightest, 0
+        )
 
     def _apply(self, rule: rules.Rule, where: NDArray[np.bool_]) -> list[Image]:
         """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
@@ -230,7 +236,7 @@ class _Ladder:
         if not self.area:
             return np.ones(self.value.shape, bool)
         nearest = -pixels.spread_max(-self.nearest)
-        return (self.lens.blur_radius(nearest) > 0.5) | self.clipped
+        return ((self.lens.blur_radius(nearest) > 0.5) | self.clipped) & ~self.stopped
 
     def _calm(self, split: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """True where neither a pixel nor its neighbours jump: no chord of theirs was split, no outline passes."""
