@@ -133,6 +133,14 @@ def ensure_variant() -> str:
     return active
 
 
+def quiet_mitsuba() -> None:
+    """A variant, and none of Mitsuba's warnings: they would break the one line that the command line promises."""
+    ensure_variant()
+    import mitsuba
+
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+
+
 def require_working_llvm(variant: str) -> None:
     """Raise BackendError if `variant` is one of LLVM's and Dr.Jit is bound to an LLVM that does not work."""
     problem = llvm_problem() if variant.startswith("llvm_") else None

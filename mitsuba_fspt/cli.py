@@ -5,17 +5,17 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from typer.exceptions import TyperException
 
-from .errors import FsptError, ImageError, SceneError
+from .arguments import definitions, require_writable
+from .backend import quiet_mitsuba
+from .errors import FsptError
 from .sweep_cli import Interrupted
+from .terminal import progress_bar
 
 app = typer.Typer(
     name="fspt",
@@ -58,18 +58,18 @@ def render(
 ) -> None:
     """Render a scene to an EXR with the power [W], its error and the coverage of every pixel."""
     output = output or Path(scene.stem + ".exr")
-    _require_writable(output, ".exr")
+    require_writable(output, ".exr")
     if png:
         from .picture import require_matplotlib
 
         require_matplotlib()
-    with _progress() as progress:
+    with progress_bar() as progress:
         from .rendering import render
         from .scene import load
 
-        _quiet_mitsuba()
+        quiet_mitsuba()
         image = render(
-            load(scene, **_parameters(define)),
+            load(scene, **definitions(define)),
             method=method,
             rtol=rtol,
             shortcuts=shortcuts,
@@ -162,7 +162,7 @@ def stability(
     from .stability import check
     from .stiff_cases import cases
 
-    _quiet_mitsuba()
+    quiet_mitsuba()
     rows = [case for case in cases() if everything or not case.slow]
     results = []
     for row in rows:
@@ -187,12 +187,12 @@ def explain(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
 ) -> None:
     """Tell what the integral leaves out of a scene, why, and what that saves: 'render --no-shortcuts' goes without."""
-    with _progress():
+    with progress_bar():
         from .explanation import HEADER, explain
         from .scene import load
 
-        _quiet_mitsuba()
-        rows = explain(load(scene, **_parameters(define)), rtol=rtol, domain=domain)
+        quiet_mitsuba()
+        rows = explain(load(scene, **definitions(define)), rtol=rtol, domain=domain)
     if as_json:
         typer.echo(json.dumps([row.to_dict() for row in rows]))
         return
@@ -256,44 +256,3 @@ def run(arguments: list[str]) -> int:
 def _fail(message: str, code: int = 2) -> int:
     typer.echo(f"fspt: {' '.join(message.split())}", err=True)
     return code
-
-
-def _parameters(define: list[str] | None) -> dict[str, str]:
-    pairs = dict(text.partition("=")[::2] for text in define or ())
-    for text in define or ():
-        if "=" not in text.strip("="):
-            raise SceneError(f"-D {text}: must be NAME=VALUE, for example -D f_number=8.")
-    return pairs
-
-
-def _require_writable(path: Path, suffix: str) -> None:
-    """Refuse an output that cannot be written before the work, not after it."""
-    if path.suffix != suffix:
-        raise ImageError(f"{path}: images are written as {suffix}. Give a name that ends in {suffix}.")
-    folder = path.parent
-    if not folder.is_dir():
-        raise ImageError(f"{path}: the folder '{folder}' does not exist. Make it, or write elsewhere with -o.")
-    if not os.access(folder, os.W_OK):
-        raise ImageError(f"{path}: the folder '{folder}' is not writable. Write elsewhere with -o.")
-
-
-def _quiet_mitsuba() -> None:
-    """Mitsuba's warnings would break the one line that errors promise."""
-    from .backend import ensure_variant
-
-    ensure_variant()
-    import mitsuba as mi
-
-    mi.set_log_level(mi.LogLevel.Error)
-
-
-@contextmanager
-def _progress() -> Iterator[object]:
-    """A progress bar on a terminal, nothing in a pipe."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("loading", total=None)
-        yield lambda what, share: bar.update(task, description=what, total=1.0, completed=share)

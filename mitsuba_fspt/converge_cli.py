@@ -13,6 +13,10 @@ from typing import Annotated
 
 import typer
 
+from .arguments import definitions, require_writable
+from .backend import quiet_mitsuba
+from .terminal import progress_bar
+
 CACHE = "DRJIT_CACHE_DIR"
 
 
@@ -37,20 +41,19 @@ def converge(
     Writes SCENE_converge.csv and SCENE_converge.png, prints the fitted orders
     and the times to an error. Takes about rounds x 20 x budget.
     """
-    from .cli import _parameters, _progress, _quiet_mitsuba, _require_writable
     from .converge_sheet import write_csv, write_png
     from .converge_table import render_text
     from .picture import require_matplotlib
 
     figure = output / f"{scene.stem}_converge.png"
-    _require_writable(figure, ".png")
+    require_writable(figure, ".png")
     require_matplotlib()
-    with _progress() as progress, _empty_kernel_cache() as kernels:
+    with progress_bar() as progress, _empty_kernel_cache() as kernels:
         from .converging import converge
         from .scene import load
 
-        _quiet_mitsuba()
-        loaded = load(scene, **_parameters(define))
+        quiet_mitsuba()
+        loaded = load(scene, **definitions(define))
         found = converge(loaded, rounds=rounds, budget=budget, reference=reference, kernels=kernels, progress=progress)
     write_csv(found, figure.with_suffix(".csv"))
     write_png(found, figure)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import picture
@@ -85,14 +84,14 @@ def write_png(found: Convergence, path: str | os.PathLike[str]) -> None:
     ImageError : the suffix is not .png or the file cannot be written.
     BackendError : matplotlib is not installed.
     """
-    file = picture._png(Path(path))
+    file = picture.require_png(path)
     panels = [
         ("RMS error, all pixels", found.stated, [row.rms for row in found.rows]),
         ("RMS error, pixels whose whole cone\nsees the phantom", found.stated, [row.rms_full for row in found.rows]),
         ("largest error of a pixel", found.stated_largest, [row.largest for row in found.rows]),
     ]
     panels = [panel for panel in panels if not all(map(math.isnan, panel[2]))]
-    figure = picture._figure(width=1.0 + 3.9 * len(panels), height=5.6)
+    figure = picture.empty_figure(width=1.0 + 3.9 * len(panels), height=5.6)
     every = figure.subplots(1, len(panels), sharey=True)
     bottom = found.stated / 4
     for axes, (title, stated, errors) in zip(every, panels, strict=True):
@@ -105,7 +104,7 @@ def write_png(found: Convergence, path: str | os.PathLike[str]) -> None:
     handles, labels = every[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize="small")
     figure.suptitle(found.scene, fontsize="large")
-    picture._save(figure, file)
+    picture.save_figure(figure, file)
 
 
 def _draw(axes: Axes, found: Convergence, errors: list[float], stated: float, bottom: float) -> None:

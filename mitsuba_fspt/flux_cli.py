@@ -42,7 +42,7 @@ def import_(
     values: Annotated[Path | None, typer.Option(help="File of one value per vertex or face.")] = None,
     field: Annotated[str | None, typer.Option(help="Array, property or column that holds the values.")] = None,
     per: Annotated[Per | None, typer.Option(help="What the values stand on, where that is open.")] = None,
-    format: Annotated[str, typer.Option(help="auto, mmc, nirfast, meshio, trimesh, ply, obj or npz.")] = "auto",
+    format: Annotated[str, typer.Option(help="auto, mmc, nirfast, meshio, trimesh, ply, obj, off or npz.")] = "auto",
     length_unit: Annotated[
         LengthUnit, typer.Option(help="Of the mesh; the values are W per square of it.")
     ] = LengthUnit.mm,

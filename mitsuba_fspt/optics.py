@@ -36,6 +36,7 @@ class Lens:
     focus_distance : u [mm], > F, from the lens plane to the virtual detector plane
     lens_diameter : the lens border [mm]; None leaves the diaphragm as the only border
     diaphragm_distance : from the lens plane to the diaphragm [mm]; > 0 behind the lens (detector side), < 0 in front
+    image_stop_diameter : circular stop on the detector, centred on the optical axis [mm]; None leaves the film's border
     model : 'diaphragm' (this paper), 'hrrt' (lens border only), 'pinhole' (one line of sight a point), 'ripoll'
         (acceptance cone of `numerical_aperture` about the detector normal)
     numerical_aperture : sine of the half angle of that cone, in (0, 1); only for 'ripoll'
@@ -52,6 +53,7 @@ class Lens:
     diaphragm_distance: float = 0.0
     model: str = "diaphragm"
     numerical_aperture: float | None = None
+    image_stop_diameter: float | None = None
 
     @classmethod
     def focused(
@@ -126,6 +128,8 @@ class Lens:
             )
         if self.model == "hrrt" and self.lens_diameter is None:
             raise OpticsError("fspt_lens: model 'hrrt' needs 'lens_diameter', the border that stops its light.")
+        if self.image_stop_diameter is not None:
+            _require_positive("image_stop_diameter", self.image_stop_diameter, "mm on the detector, for example 20")
         if self.lens_diameter is not None:
             _require_positive("lens_diameter", self.lens_diameter, "mm, for example 20")
             # Float32 parameters pass through here: D = F/f_num computed twice may differ by its last bit.
@@ -167,6 +171,11 @@ class Lens:
     def diaphragm_diameter(self) -> float:
         """D = F/f_num [mm] (Eq. 3)."""
         return self.focal_length / self.f_number
+
+    @property
+    def seen_field(self) -> float:
+        """How far [mm] off the axis virtual points lie inside the image-plane stop; inf without one."""
+        return math.inf if self.image_stop_diameter is None else self.image_stop_diameter / 2 / self.magnification
 
     @property
     def clear_field(self) -> float:

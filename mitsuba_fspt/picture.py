@@ -34,13 +34,13 @@ def write_png(image: Image, path: str | os.PathLike[str]) -> None:
     ImageError : the suffix is not .png or the file cannot be written.
     BackendError : matplotlib is not installed.
     """
-    path = _png(path)
-    figure = _figure(width=6.0, height=0.7 + 4.4 * _aspect(image))
+    path = require_png(path)
+    figure = empty_figure(width=6.0, height=0.7 + 4.4 * _aspect(image))
     axes = figure.add_subplot()
-    scale, unit = _unit(image.power)
-    _show(axes, image.power / scale, image, f"power [{unit}]", (0.0, float(image.power.max() / scale)))
+    scale, unit = scale_and_unit(image.power)
+    draw_picture(axes, image.power / scale, image, f"power [{unit}]", (0.0, float(image.power.max() / scale)))
     axes.set_title(caption(image))
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def write_comparison_png(calculated: Image, standard: Image, path: str | os.PathLike[str]) -> None:
@@ -49,14 +49,14 @@ def write_comparison_png(calculated: Image, standard: Image, path: str | os.Path
     The profile runs along the row through the standard's brightest pixel; bands show ± `error` where known.
     Raises as `write_png` and `compare` do.
     """
-    path = _png(path)
+    path = require_png(path)
     comparison = compare(calculated, standard)
-    figure = _figure(width=10.0, height=1.8 + 6.8 * _aspect(standard))
+    figure = empty_figure(width=10.0, height=1.8 + 6.8 * _aspect(standard))
     (top_left, top_right), (bottom_left, bottom_right) = figure.subplots(2, 2)
-    scale, unit = _unit(np.maximum(calculated.power, standard.power))
+    scale, unit = scale_and_unit(np.maximum(calculated.power, standard.power))
     high = max(calculated.power.max(), standard.power.max()) / scale
     for axes, image, name in ((top_left, calculated, "calculated"), (top_right, standard, "standard")):
-        _show(axes, image.power / scale, image, f"power [{unit}]", (0.0, high))
+        draw_picture(axes, image.power / scale, image, f"power [{unit}]", (0.0, high))
         axes.set_title(f"{name}\n{caption(image)}".strip(), fontsize="medium")
     _show_difference(bottom_left, calculated, standard)
     row = comparison.profiles[0].index
@@ -71,7 +71,7 @@ def write_comparison_png(calculated: Image, standard: Image, path: str | os.Path
         f"ME {comparison.me:.3g},  CF {comparison.cf:.5g},  ratio of powers {comparison.ratio:.5g},  "
         f"of the peak: rms {comparison.rms:.2g}, largest error {comparison.max_error:.2g}"
     )
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def caption(image: Image) -> str:
@@ -86,7 +86,7 @@ def caption(image: Image) -> str:
     return ",  ".join(form.format(known[key]) for key, form in forms if key in known)
 
 
-def _show(
+def draw_picture(
     axes: Axes,
     values: NDArray,
     image: Image,
@@ -105,9 +105,9 @@ def _show(
 
 def _show_difference(axes: Axes, calculated: Image, standard: Image) -> None:
     difference = calculated.power.astype(np.float64) - standard.power
-    scale, unit = _unit(difference)
+    scale, unit = scale_and_unit(difference)
     reach = float(np.abs(difference).max() / scale) or 1.0
-    _show(axes, difference / scale, standard, f"difference [{unit}]", (-reach, reach), DIFFERENCES)
+    draw_picture(axes, difference / scale, standard, f"difference [{unit}]", (-reach, reach), DIFFERENCES)
     axes.set_title("calculated − standard", fontsize="medium")
 
 
@@ -138,14 +138,14 @@ def _aspect(image: Image) -> float:
     return min(2.0, max(0.5, image.shape[0] / image.shape[1]))
 
 
-def _unit(values: NDArray) -> tuple[float, str]:
+def scale_and_unit(values: NDArray) -> tuple[float, str]:
     """Power of 1000 that brings the largest of `values` [W] to 1 … 1000, and the unit with that factor."""
     peak = float(np.abs(values).max())
     exponent = 3 * math.floor(math.log10(peak) / 3) if peak > 0 else 0
     return 10.0**exponent, "W/pixel" if exponent == 0 else rf"$10^{{{exponent}}}$ W/pixel"
 
 
-def _png(path: str | os.PathLike[str]) -> Path:
+def require_png(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ImageError(f"picture file '{path}': pictures are written as PNG. Give a name that ends in .png.")
@@ -160,7 +160,7 @@ def require_matplotlib() -> None:
         raise BackendError("picture: matplotlib is not installed. pip install 'mitsuba-fspt[plot]'.") from cause
 
 
-def _figure(width: float, height: float) -> Figure:
+def empty_figure(width: float, height: float) -> Figure:
     """An empty figure [inches], free of pyplot's windows and global state."""
     require_matplotlib()
     from matplotlib.figure import Figure
@@ -168,6 +168,6 @@ def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
     with atomic_path(path, ImageError) as temporary:
         figure.savefig(temporary, dpi=150)

@@ -193,6 +193,7 @@ def _lens_numbers(lens: mi.Sensor) -> dict[str, float | int | str]:
         "lens_diameter": optics.lens_diameter,
         "diaphragm_distance": optics.diaphragm_distance,
         "numerical_aperture": optics.numerical_aperture,
+        "image_stop_diameter": optics.image_stop_diameter,
         "pixel_pitch": lens.pixel_pitch,
     }
     return {name: value for name, value in numbers.items() if value is not None}

@@ -30,8 +30,8 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     backend.ensure_variant()
     import mitsuba as mi
 
-    _check_parameters(path, parameters)
-    texts = {name: _text(value) for name, value in parameters.items()}
+    check_parameters(path, parameters)
+    texts = {name: parameter_text(value) for name, value in parameters.items()}
     config = mi.parser.ParserConfig(mi.variant())
     resolver = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(resolver))
@@ -68,7 +68,7 @@ def defaults(path: str | os.PathLike[str]) -> dict[str, str]:
     return found | {node.get("name", ""): node.get("value", "") for node in root.iter("default")}
 
 
-def _check_parameters(path: Path, parameters: dict[str, object]) -> None:
+def check_parameters(path: Path, parameters: dict[str, object]) -> None:
     known = defaults(path)
     for name in parameters:
         if name not in known:
@@ -78,7 +78,7 @@ def _check_parameters(path: Path, parameters: dict[str, object]) -> None:
             raise SceneError(f"{path}: Mitsuba cannot set a parameter '{name}'. Give the <default> another name.")
 
 
-def _text(value: object) -> str:
+def parameter_text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 

@@ -129,10 +129,11 @@ def _inside_out(points: Points, faces: Indices) -> tuple[int, int]:
     """Number of pieces of a closed surface that are inside out, and of all pieces."""
     label = _pieces(len(points), faces)[faces[:, 0]]
     _, first, piece = np.unique(label, return_index=True, return_inverse=True)
-    corners = points[faces]
+    corners, normals = points[faces], face_normals(points, faces)
     # About a corner of the piece: far from the origin the volume would cancel.
-    volumes = np.bincount(piece, weights=np.linalg.det(corners - corners[first, 0][piece][:, None])) / 6
-    areas = np.bincount(piece, weights=face_areas(points, faces))
+    heights = corners[:, 0] - corners[first, 0][piece]
+    volumes = np.bincount(piece, weights=np.einsum("ij,ij->i", normals, heights)) / 3
+    areas = np.bincount(piece, weights=np.linalg.norm(normals, axis=1))
     # A sheet with a face on either side has no volume, only rounding, and is right as it is.
     hollow = np.flatnonzero(volumes < -1e-9 * areas**1.5)  # few: cavities and mistakes
     if len(hollow) == 0:

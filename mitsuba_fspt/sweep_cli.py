@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
+from .backend import quiet_mitsuba
 from .errors import BackendError, FsptError, SceneError
+from .terminal import progress_bar
 
 
 class Interrupted(FsptError):
@@ -37,14 +39,13 @@ def sweep(
     Run again, it renders only what is missing or was made from something
     else: another scene, data file, value, setting or version.
     """
-    from .cli import _progress, _quiet_mitsuba
     from .sweeping import INDEX, sweep
 
     folder = output or Path(f"{scene.stem}_sweep")
     values = _values(define)
     try:
-        with _progress() as progress:
-            _quiet_mitsuba()
+        with progress_bar() as progress:
+            quiet_mitsuba()
             rows = sweep(
                 scene,
                 values,

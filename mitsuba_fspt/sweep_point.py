@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from .errors import SceneError
-from .scene import _check_parameters, _text
+from .scene import check_parameters, parameter_text
 from .sweep_source import Source
 
 Setting = str | int | float | None
@@ -64,7 +64,7 @@ def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Set
     texts = {name: _texts(name, given) for name, given in values.items()}
     if not texts:
         raise SceneError(f"sweep: no parameter to vary over {scene}. Give one, for example -D f_number=2.8,5.6.")
-    _check_parameters(scene, dict(texts))
+    check_parameters(scene, dict(texts))
     source = Source(scene)
     lens = source.lens_parameters()
     return [
@@ -90,7 +90,7 @@ def _texts(name: str, given: object) -> list[str]:
     """Values of a parameter as the scene file would spell them; one alone need not be in a list."""
     several = isinstance(given, Iterable) and not isinstance(given, (str, bytes))
     values = list(given) if several else [given]  # type: ignore[call-overload]
-    texts = [_text(value).strip() for value in values]
+    texts = [parameter_text(value).strip() for value in values]
     if not texts or "" in texts:
         raise SceneError(f"sweep: parameter '{name}' has an empty value. Give values between commas: -D {name}=1,2.")
     twice = [text for text in texts if texts.count(text) > 1]

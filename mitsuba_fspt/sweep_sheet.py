@@ -28,19 +28,19 @@ def write_contact_sheet(rows: Sequence[Row], path: str | os.PathLike[str]) -> No
     ImageError : no rows, an image that cannot be read, the suffix is not .png or the file cannot be written.
     BackendError : matplotlib is not installed.
     """
-    file = picture._png(path)
+    file = picture.require_png(path)
     picture.require_matplotlib()
     if not rows:
         raise ImageError("contact sheet: a sweep without points. Give the rows that sweep returned.")
     powers = [read(row.file).power for row in rows]
-    scale, unit = picture._unit(np.array([power.max() for power in powers]))
+    scale, unit = picture.scale_and_unit(np.array([power.max() for power in powers]))
     height, width = (max(power.shape[side] for power in powers) for side in (0, 1))
     varied, same = _parameters(rows)
     columns = len(varied[-1][1]) if len(varied) > 1 else min(len(rows), WIDEST)
     lines = -(-len(rows) // columns)
     gap, caption = (int(np.ceil(share * max(height, width))) for share in (GAP, CAPTION))
     sheet = np.full((lines * (height + caption), columns * (width + gap) - gap), np.nan, np.float32)
-    figure = picture._figure(width=1.5 + 1.8 * columns, height=0.5 + 1.8 * sheet.shape[0] / (width + gap))
+    figure = picture.empty_figure(width=1.5 + 1.8 * columns, height=0.5 + 1.8 * sheet.shape[0] / (width + gap))
     axes = figure.add_subplot()
     for number, (row, power) in enumerate(zip(rows, powers, strict=True)):
         line, column = divmod(number, columns)
@@ -52,7 +52,7 @@ def write_contact_sheet(rows: Sequence[Row], path: str | os.PathLike[str]) -> No
     axes.axis("off")
     axes.set_title("  ".join(f"{name}={value}" for name, (value,) in same), fontsize="small")
     figure.colorbar(shown, ax=axes, label=f"power [{unit}]", shrink=min(1.0, 3 / lines), aspect=20)
-    picture._save(figure, file)
+    picture.save_figure(figure, file)
 
 
 def _parameters(rows: Sequence[Row]) -> tuple[list, list]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from paper_common import SCENES, Array, Table, binned, figure, panel, photograph, places, save
-from tissue_crosscheck import VIEWS, glowing, ratio, solve, timed
+from tissue_batches import LEFT_RIGHT, mirrored
+from tissue_crosscheck import VIEWS, ratio, solve
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.phantom_file import PhantomFile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,36 +32,31 @@ def agreement(folder: Path, output: Path, tissue_spp: int) -> list[Table]:
 
     `folder`: for the solved phantom; `tissue_spp`: paths a pixel of 1 mm for the Monte Carlo from the source on.
     """
-    told, _ = solve(folder)
+    solve(PhantomFile.read(SCENES / "nylon_cylinder.toml"), folder)
     pictures = {}
     for view, angle in VIEWS.items():
-        pictures[view] = _pictures(folder, told, view, angle, tissue_spp)
+        pictures[view] = _pictures(folder, view, angle, tissue_spp)
     _draw(pictures, output / "paper_fig5.png")
     return [_free_space(pictures), _tissue(pictures), _total(pictures)]
 
 
-def _pictures(folder: Path, told: Any, view: str, angle: float, tissue_spp: int) -> Pictures:
+def _pictures(folder: Path, view: str, angle: float, tissue_spp: int) -> Pictures:
     """One view by the integral, by Monte Carlo from J_n on and by Monte Carlo from the source on."""
     phantom, lens = folder / "phantom.ply", {"f_number": 8.0}
     fine, coarse = {"size": FINE, "pitch": 1 / BIN}, {"size": COARSE, "pitch": 1.0}
     film = {"width": COARSE, "height": COARSE, "pixel_pitch": 1.0, "f_number": 8.0}
     tissue = fspt.load(SCENES / "nylon_cylinder_tissue.xml", view=angle, **film)
-    truth = timed(tissue, spp=round(tissue_spp * TISSUE_SHARE[view]), seed=3)
+    truth = fspt.render(tissue, spp=round(tissue_spp * TISSUE_SHARE[view]), seed=3)
     integral = photograph(phantom, angle, lens, **fine)
     return {
         "integral": integral,
         "binned": binned(integral, BIN),
         "path": photograph(phantom, angle, lens, **fine, method="path", spp=512, seed=1),
         "ptracer": photograph(phantom, angle, lens, **coarse, method="ptracer", spp=2048, seed=2),
-        "tissue": truth if view == "left" else mirrored(truth),
-        "last flight": timed(glowing(folder, told, "last_flight", angle, film)),
+        "counted": truth,
+        "tissue": truth if view == "left" else mirrored(truth, [LEFT_RIGHT]),
+        "last flight": photograph(phantom, angle, lens, law="last_flight", **coarse),
     }
-
-
-def mirrored(image: fspt.Image) -> fspt.Image:
-    """Mean of a Monte Carlo picture and its mirror image: the phantom has a symmetric front and back."""
-    power, error = (image.power + image.power[:, ::-1]) / 2, np.hypot(image.error, image.error[:, ::-1]) / 2
-    return fspt.Image(power, error, image.coverage, image.metadata)
 
 
 def _free_space(pictures: dict[str, Pictures]) -> Table:
@@ -109,14 +106,14 @@ def _mean_distance(exact: fspt.Image, draws: Iterable[Array]) -> tuple[float, fl
 
 
 def _total(pictures: dict[str, Pictures]) -> Table:
-    """Power on the CCD, and how many of the paper's photons that is."""
+    """Power on the CCD, and how many of the paper's photons that is; errors add up before any mirroring."""
     rows = []
     for view, images in pictures.items():
         everywhere = np.ones((COARSE, COARSE), bool)
         power = images["integral"].power.sum()
         row = [view, power, PHOTONS * power]
         for image in (images["binned"], images["last flight"]):
-            value, error = ratio(image, images["tissue"], everywhere)
+            value, error = ratio(image, images["counted"], everywhere)
             row.append(f"{value:.3f} ± {error:.3f}")
         found = images["tissue"].metadata
         rows.append([*row, float(found["spp"]) * COARSE**2, float(found["wall_time"])])

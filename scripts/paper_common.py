@@ -171,11 +171,11 @@ def figure(width: float, height: float) -> Figure:
 
 def panel(axes: Axes, image: fspt.Image, title: str, reach: float, high: float | None = None) -> None:
     """A picture with its colour bar, ± `reach` [mm on the object plane] of it; `high` [W/pixel]: end of the bar."""
-    from mitsuba_fspt.picture import _show, _unit
+    from mitsuba_fspt.picture import draw_picture, scale_and_unit
 
     high = float(image.power.max()) if high is None else high
-    scale, unit = _unit(np.array([high]))
-    _show(axes, image.power / scale, image, unit, (0.0, high / scale))
+    scale, unit = scale_and_unit(np.array([high]))
+    draw_picture(axes, image.power / scale, image, unit, (0.0, high / scale))
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     axes.set_title(title, fontsize="medium")
 

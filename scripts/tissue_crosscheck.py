@@ -1,92 +1,124 @@
 """Monte Carlo from the source in the tissue to the CCD against diffusion, the three laws of emission and the integral.
 
-    python scripts/tissue_crosscheck.py [--spp 16384] [--size 32] [--f-number 2.8] [-o tissue_crosscheck]
+    python scripts/tissue_crosscheck.py [--until-error 0.005] [--batches out/tissue] [-o docs]
 
-The phantom is nylon_cylinder.toml, solved once (`fspt flux solve`), and nylon_cylinder_tissue.xml, the same tissue for
-Mitsuba's `volpath`. Prints a table, writes it as CSV and a picture (PNG) of the power across the middle, seen from
-the front, the left and the back. `ratio` is Σ P/Σ P of Monte Carlo over the picture, `peak` over the pixels above half
-of the calculated maximum, `limb` over the outermost pixel that the phantom fills, left and right; each with the
-standard error of the Monte Carlo.
+The phantom is nylon_cylinder.toml with its source at mid-height, (8, 0, 0), solved once (`fspt flux solve`), and
+nylon_cylinder_tissue.xml, the same tissue for Mitsuba's `volpath`, with the same source. Batches of the Monte Carlo
+are added to each view until the standard error of Σ P is below `--until-error`; they stay in the folder `--batches`,
+from which the next run goes on.
+
+With the source at mid-height the exact pictures are their own mirror images: top to bottom in every view, in front
+and from the back left to right also. ME, CF and the profiles are therefore taken of the mean of the Monte Carlo picture
+and its mirror images (columns *raw*: without); the ratios of powers are the same with and without.
+
+`ratio` is Σ P/Σ P of the law over the Monte Carlo, `peak` over the pixels above half of the calculated maximum, `limb`
+over the outermost pixel that the phantom fills, left and right; each with the standard error of the Monte Carlo.
+Pictures have pixels of 1 mm. A profile is the power along a band 2 mm high about z_d = 0, 2 and 4 mm on the detector
+(the paper's Fig. 5), in steps of 1 mm across the CCD's 27 mm; its CF is Pearson's over those 27 values. `noise`: the
+CF that the standard errors leave of a law without fault.
+
+*transport* is last_flight on a diffusion equation whose light falls off as transport's does. Diffusion's falls as
+exp(-k r), k = √(3 µa (µa + µs')), transport's with isotropic scattering by the root κ of
+µs'/κ · artanh(κ/(µa + µs')) = 1 (Case's asymptotic mode), and D = µa/κ² in place of 1/(3 (µa + µs')) mends that alone.
+
+Writes tissue_crosscheck.csv and .png into the folder `-o` and the tables into its emission.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import tempfile
 import time
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from paper_common import MAGNIFICATION, SCENES, Array, Table, figure, fill, photograph, save, write_csv
+from tissue_batches import LEFT_RIGHT, TOP_BOTTOM, Batches, mirrored, summed
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt import backend
+from mitsuba_fspt.medium import Medium
 from mitsuba_fspt.phantom_file import PhantomFile
+from mitsuba_fspt.solution import Solution
 
-SCENES = Path(__file__).resolve().parent.parent / "scenes"
+ROOT = Path(__file__).resolve().parent.parent
 VIEWS = {"front": 0, "left": 90, "back": 180}
-LAWS = ("lambert", "fresnel", "last_flight")
-CAMERA = 2048 * 0.0135  # mm, the CCD's width
+SYMMETRY = {"front": (TOP_BOTTOM, LEFT_RIGHT), "left": (TOP_BOTTOM,), "back": (TOP_BOTTOM, LEFT_RIGHT)}
+LAWS = ("lambert", "fresnel", "last_flight", "transport")
+SOURCE, RADIUS = (8.0, 0.0, 0.0), 15.0  # mm; radius of the cylinder
+LENS = {"f_number": 2.8}
+FINE, PITCH = 54, 0.5  # pixels a side, mm: 27 mm of the CCD
+BIN = 2  # to pixels of 1 mm
+HEIGHTS = (0, 2, 4)  # mm on the detector, z_d of Fig. 5; bands of 2 mm
 
-Row = dict[str, Any]
+Pictures = dict[str, dict[str, fspt.Image]]
 
 
-def solve(folder: Path) -> tuple[PhantomFile, float]:
-    """The solved phantom as phantom.ply and fluence.vol in a folder; its description and the seconds it took."""
-    start = time.perf_counter()
-    told = PhantomFile.read(SCENES / "nylon_cylinder.toml")
+@dataclass(frozen=True)
+class Transport(Medium):
+    """A medium whose diffusion falls off as transport with isotropic scattering does."""
+
+    @property
+    def diffusion(self) -> float:
+        """D = µa/κ² [mm]."""
+        return self.mua / decay(self.mua, self.musp) ** 2
+
+
+def decay(mua: float, musp: float) -> float:
+    """Transport's decay constant κ [1/mm] for isotropic scattering: µs'/κ artanh(κ/(µa + µs')) = 1, by bisection."""
+    low, high = 0.0, mua + musp
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if musp / middle * math.atanh(middle / (mua + musp)) < 1 else (low, middle)
+    return (low + high) / 2
+
+
+def solve(told: PhantomFile, folder: Path) -> Solution:
+    """The phantom solved, and in a folder phantom.ply and fluence.vol of it."""
     solution = told.solve()
     solution.phantom(told.surface_edge).write(folder / "phantom.ply")
     solution.volume(told.voxel).write(folder / "fluence.vol")
-    return told, time.perf_counter() - start
+    return solution
 
 
-def glowing(folder: Path, told: PhantomFile, law: str, view: float, camera: Row) -> Any:
-    """The scene of the solved phantom that shines after a law; the camera of nylon_cylinder.xml."""
-    import mitsuba as mi
-
-    turn = mi.ScalarTransform4f().rotate([0, 0, 1], view)
-    emitter = {"type": "fspt_surface", "exitance": {"type": "mesh_attribute", "name": "vertex_exitance"}}
-    if law != "lambert":
-        emitter |= {"emission": law, "int_ior": told.medium.n}
-    if law == "last_flight":
-        volume = {"type": "gridvolume", "filename": str(folder / "fluence.vol"), "use_grid_bbox": True}
-        emitter |= {"mua": told.medium.mua, "musp": told.medium.musp}
-        emitter |= {"fluence": volume | {"to_world": turn, "accel": False}}
-    film = {"type": "hdrfilm", "width": camera["width"], "height": camera["height"], "pixel_format": "luminance"}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "embree_use_robust_intersections": True,
-            "sensor": {
-                "type": "fspt_lens",
-                "focal_length": 55.0,
-                "f_number": camera["f_number"],
-                "magnification": 0.5,
-                "pixel_pitch": camera["pixel_pitch"],
-                "to_world": mi.ScalarTransform4f().look_at([180, 0, 0], [0, 0, 0], [0, 0, 1]),
-                "film": film,
-            },
-            "phantom": {
-                "type": "ply",
-                "filename": str(folder / "phantom.ply"),
-                "face_normals": True,
-                "to_world": turn,
-                "emitter": emitter,
-            },
-        }
-    )
-
-
-def timed(scene: Any, **settings: Any) -> fspt.Image:
-    """An image whose `wall_time` has the emitters' tables in it."""
+def calculated(folder: Path, law: str, view: str) -> fspt.Image:
+    """Picture of the solved phantom under a law; its time has the emitters' tables in it."""
     start = time.perf_counter()
-    image = fspt.render(scene, **settings)
+    emission = "last_flight" if law == "transport" else law
+    image = photograph(folder / "phantom.ply", VIEWS[view], LENS, law=emission, size=FINE, pitch=PITCH)
     image.metadata["wall_time"] = time.perf_counter() - start
     return image
+
+
+# ---------------------------------------------------------------------- what is compared
+
+
+def coarse(image: fspt.Image) -> fspt.Image:
+    """The picture in pixels of 1 mm."""
+    parts = [slice(k, k + BIN) for k in range(0, FINE, BIN)]
+    return summed(image, parts, parts)
+
+
+def bands(image: fspt.Image) -> fspt.Image:
+    """Power along bands 2 mm high about z_d = 4, 2, 0, -2, -4 mm, from above, in steps of 1 mm."""
+    half = round(1 / PITCH)
+    rows = [round(FINE / 2 - z / PITCH) for z in (*HEIGHTS[:0:-1], *(-z for z in HEIGHTS))]
+    return summed(image, [slice(r - half, r + half) for r in rows], [slice(k, k + BIN) for k in range(0, FINE, BIN)])
+
+
+def profile(image: fspt.Image, height: float) -> tuple[Array, Array]:
+    """Power and error along one of the `bands`."""
+    row = len(HEIGHTS) - 1 - HEIGHTS.index(height)
+    return np.float64(image.power[row]), np.float64(image.error[row])
+
+
+def noise_cf(power: Array, error: Array) -> float:
+    """CF that independent errors leave of a picture without fault, 1/√(1 + ⟨σ²⟩/var P)."""
+    return float(1 / math.sqrt(1 + np.square(error).mean() / power.var()))
 
 
 def ratio(image: fspt.Image, truth: fspt.Image, where: NDArray[np.bool_]) -> tuple[float, float]:
@@ -105,99 +137,126 @@ def limb(image: fspt.Image) -> NDArray[np.bool_]:
     return full & ~inside
 
 
-def judge(view: str, law: str, image: fspt.Image, truth: fspt.Image) -> Row:
-    """One line of the table."""
-    found = fspt.compare(image, truth)
-    row: Row = {"view": view, "law": law, "ME": found.me, "CF": found.cf}
-    places = {"ratio": image.power >= 0, "peak": image.power > image.power.max() / 2, "limb": limb(image)}
-    for name, where in places.items():
-        row[name], row[f"{name}_error"] = ratio(image, truth, where)
-    chi2 = found.z_test.chi2 if found.z_test else math.nan
-    noise = math.sqrt((truth.error**2).sum()) / truth.power.sum()
-    return row | {
-        "chi2": chi2,
-        "power": image.power.sum(),
-        "seconds": image.metadata["wall_time"],
-        "lines_of_sight": image.metadata["nodes"],
-        "mc_power": truth.power.sum(),
-        "mc_error": noise * truth.power.sum(),
-        "mc_seconds": truth.metadata["wall_time"],
-        "mc_paths": truth.metadata["spp"] * truth.power.size,
-    }
+def powers(view: str, law: str, image: fspt.Image, truth: fspt.Image) -> list[str]:
+    """A line of the table of powers; of the raw Monte Carlo, whose pixels are independent."""
+    places = (image.power >= 0, image.power > image.power.max() / 2, limb(image))
+    shares = ("{:.4f} ± {:.4f}".format(*ratio(image, truth, where)) for where in places)
+    return [f"{view}, {law}", *shares]
 
 
-def draw(path: Path, pictures: dict[str, dict[str, fspt.Image]], pitch: float) -> None:
-    """Power in the middle quarter of the rows, their mean, and each law over the Monte Carlo."""
-    import matplotlib
+def shapes(view: str, law: str, image: fspt.Image, truth: fspt.Image) -> list[Any]:
+    """A line of the table of ME and CF, of pictures and of profiles; `image` and `truth` in the pixels of the film."""
+    axes = SYMMETRY[view]
+    raw, even = coarse(truth), mirrored(coarse(truth), axes)
+    found = fspt.compare(coarse(image), even)
+    line = [f"{view}, {law}", found.me, fspt.compare(coarse(image), raw).cf, found.cf]
+    line.append(noise_cf(coarse(image).power, even.error))
+    own, others = bands(image), mirrored(bands(truth), axes)
+    noise = []
+    for height in HEIGHTS:
+        power, error = profile(own, height)[0], profile(others, height)[1]
+        line.append(float(np.corrcoef(power, profile(others, height)[0])[0, 1]))
+        noise.append(noise_cf(power, error))
+    return [*line, min(noise)]
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(2, len(pictures), figsize=(4.2 * len(pictures), 6), sharex=True, layout="constrained")
+def tables(pictures: Pictures) -> list[Table]:
+    """Powers, shapes, costs."""
+    pairs = [(view, law, images[law], images["volpath"]) for view, images in pictures.items() for law in LAWS]
+    share = {"view, law": "", "total": "", "peak": "", "limb": ""}
+    shape = {"view, law": "", "ME": ".4f", "CF, raw": ".5f", "CF": ".5f", "noise": ".5f"}
+    shape |= {f"profile at {z} mm": ".5f" for z in HEIGHTS} | {"profiles' noise": ".5f"}
+    cost = {"view": "", "ΣP [W/W]": ".4e", "standard error": ".1e", "paths": ".2e", "Monte Carlo [s]": ".0f"}
+    cost |= {"integral [s]": ".1f", "lines of sight": ".1e"}
+    costs = []
+    for view, images in pictures.items():
+        truth, own = images["volpath"], images["last_flight"]
+        total, error = truth.power.sum(), math.sqrt((truth.error**2).sum())
+        made = (truth.metadata["spp"] * truth.power.size, truth.metadata["wall_time"])
+        costs.append([view, total, error, *made, own.metadata["wall_time"], own.metadata["nodes"]])
+    return [
+        Table("crosscheck-power", share, [powers(v, law, coarse(i), coarse(t)) for v, law, i, t in pairs]),
+        Table("crosscheck-shape", shape, [shapes(*pair) for pair in pairs]),
+        Table("crosscheck-cost", cost, costs),
+    ]
+
+
+def decays(medium: Medium, exits: dict[str, float]) -> Table:
+    """How fast light falls off, what that makes at the far side, and what leaves the phantom in all."""
+    diffusion, transport = math.sqrt(medium.mua / medium.diffusion), decay(medium.mua, medium.musp)
+    far = SOURCE[0] + RADIUS
+    rows = [
+        ["diffusion", diffusion, math.exp(-(diffusion - transport) * far), exits["last_flight"]],
+        ["transport", transport, 1.0, exits["transport"]],
+    ]
+    columns = {"": "", "k [1/mm]": ".5f", f"over {far:g} mm, to transport": ".4f", "exit fraction": ".4f"}
+    return Table("crosscheck-decay", columns, rows)
+
+
+# ---------------------------------------------------------------------- output
+
+
+def draw(path: Path, pictures: Pictures) -> None:
+    """The profile about z_d = 0 in each view, and each law over the Monte Carlo."""
+    drawn = figure(4.2 * len(pictures), 6.0)
+    axes = drawn.subplots(2, len(pictures), sharex=True)
+    x = (np.arange(FINE // BIN) + 0.5 - FINE / BIN / 2) * BIN * PITCH / MAGNIFICATION
     for (view, images), (top, bottom) in zip(pictures.items(), axes.T, strict=True):
-        truth = images["volpath"]
-        height, width = truth.power.shape
-        rows = slice(height // 2 - height // 8, height // 2 + height // 8)
-        x = (np.arange(width) + 0.5 - width / 2) * pitch / 0.5
-        mean, error = truth.power[rows].mean(axis=0), np.sqrt((truth.error[rows] ** 2).sum(axis=0)) / (height // 4)
-        seen = (truth.coverage[rows].min(axis=0) > 0.999) & (mean > 0)
+        truth = mirrored(bands(images["volpath"]), SYMMETRY[view])
+        mean, error = profile(truth, 0)
+        seen = truth.coverage[len(HEIGHTS) - 1] > 0.999
         top.errorbar(x, mean, error, fmt="k.", capsize=2, label="Monte Carlo, source to CCD")
         noise = error[seen] / mean[seen]
         bottom.fill_between(x[seen], 1 - noise, 1 + noise, color="0.85")
         for law in LAWS:
-            line = images[law].power[rows].mean(axis=0)
+            line = profile(bands(images[law]), 0)[0]
             top.plot(x, line, label=law)
             bottom.plot(x[seen], line[seen] / mean[seen], label=law)
         top.set_title(view)
         bottom.axhline(1, color="k", linewidth=0.6)
-        bottom.set_ylim(0.6, 1.8)
-        bottom.set_xlim(-18, 18)
-        bottom.set_xlabel("mm on the object plane")
-    axes[0, 0].set_ylabel("W per pixel per W of source")
+        bottom.set(ylim=(0.7, 1.4), xlim=(-18, 18), xlabel="mm on the object plane")
+    axes[0, 0].set_ylabel("W per mm of the band")
     axes[1, 0].set_ylabel("law / Monte Carlo")
     axes[0, 1].legend(fontsize="small", loc="upper left")
-    figure.savefig(path, dpi=120)
+    save(drawn, path, dpi=90)
 
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--spp", type=int, default=16384, help="paths a pixel")
-    options.add_argument("--size", type=int, default=32, help="pixels a side")
-    options.add_argument("--f-number", type=float, default=2.8)
-    options.add_argument("--seed", type=int, default=0)
-    options.add_argument("-o", "--output", type=Path, default=Path("tissue_crosscheck"), help="without extension")
+    options.add_argument("--until-error", type=float, default=0.005, help="of the power in each view, relative")
+    options.add_argument("--batches", type=Path, default=ROOT / "out" / "tissue", help="folder of the Monte Carlo")
+    options.add_argument("--spp", type=int, default=2048, help="paths a pixel of (0.5 mm)² in a batch")
+    options.add_argument(
+        "-o", "--output", type=Path, default=ROOT / "docs", help="folder of the tables and the picture"
+    )
     given = options.parse_args()
     backend.ensure_variant()
-    size, pitch = given.size, CAMERA / given.size
-    camera: Row = {"width": size, "height": size, "pixel_pitch": pitch, "f_number": given.f_number}
-    rows: list[Row] = []
-    pictures: dict[str, dict[str, fspt.Image]] = {}
+    film = {"width": FINE, "height": FINE, "pixel_pitch": PITCH, "source_z": SOURCE[2], **LENS}
+    pictures: Pictures = {}
+    for view, angle in VIEWS.items():
+        batches = Batches(given.batches, view, given.spp, film | {"view": angle})
+        while (error := batches.error()) > given.until_error:
+            print(f"{view}: standard error {error:.2%}", flush=True)
+            batches.add()
+        pictures[view] = {"volpath": batches.mean()}
+    exits = {}
+    told = PhantomFile.read(SCENES / "nylon_cylinder.toml")
+    source = replace(told.sources[0], shape=replace(told.sources[0].shape, centre=SOURCE))
+    told = replace(told, sources=(source,))
     with tempfile.TemporaryDirectory() as folder:
-        told, seconds = solve(Path(folder))
-        print(f"finite elements: {seconds:.1f} s")
-        for view, angle in VIEWS.items():
-            tissue = fspt.load(SCENES / "nylon_cylinder_tissue.xml", view=angle, **camera)
-            truth = timed(tissue, spp=given.spp, seed=given.seed)
-            pictures[view] = {"volpath": truth}
-            for law in LAWS:
-                image = timed(glowing(Path(folder), told, law, angle, camera))
-                pictures[view][law] = image
-                rows.append(judge(view, law, image, truth))
-                print(line(rows[-1]))
-    with given.output.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    draw(given.output.with_suffix(".png"), pictures, pitch)
-
-
-def line(row: Row) -> str:
-    shares = "  ".join(f"{name} {row[name]:.3f} ± {row[f'{name}_error']:.3f}" for name in ("ratio", "peak", "limb"))
-    return (
-        f"{row['view']:<6}{row['law']:<12}ME {row['ME']:.4f}  CF {row['CF']:.5f}  {shares}  chi2 {row['chi2']:.2f}  "
-        f"{row['lines_of_sight']:.2g} lines {row['seconds']:.1f} s, Monte Carlo {row['mc_paths']:.2g} paths "
-        f"{row['mc_seconds']:.1f} s"
-    )
+        for medium, laws in ((told.medium, LAWS[:-1]), (Transport(*astuple(told.medium)), LAWS[-1:])):
+            solution = solve(replace(told, medium=medium), Path(folder))
+            for law in laws:
+                exits[law] = solution.solved.exited
+                for view, images in pictures.items():
+                    images[law] = calculated(Path(folder), law, view)
+    made = [*tables(pictures), decays(told.medium, exits)]
+    for table in made:
+        print(f"\n{table.markdown()}")
+    write_csv(made, given.output / "tissue_crosscheck.csv")
+    if (text := given.output / "emission.md").exists():
+        fill(text, made)
+    draw(given.output / "tissue_crosscheck.png", pictures)
 
 
 if __name__ == "__main__":

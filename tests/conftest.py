@@ -1,4 +1,4 @@
-"""What the tests that render share: one variant of Mitsuba, the same however the tests are chosen and ordered."""
+"""What tests share: one variant of Mitsuba, the same however they are chosen and ordered, and the command line."""
 
 from __future__ import annotations
 
@@ -19,3 +19,16 @@ def mono():
     mi.set_log_level(mi.LogLevel.Error)
     yield mi
     mi.set_log_level(level)
+
+
+@pytest.fixture
+def run(capfd):
+    """`run("render", …)`: exit code, stdout and stderr of the command line, whatever in the process wrote to them."""
+    from mitsuba_fspt import cli
+
+    def run(*arguments):
+        capfd.readouterr()
+        code = cli.run([str(argument) for argument in arguments])
+        return code, *capfd.readouterr()
+
+    return run

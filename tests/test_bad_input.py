@@ -93,6 +93,8 @@ LENSES = {
     "f_number missing": (lens('<float name="f_number" value="$f_number"/>', ""), "'f_number' is missing"),
     "focal_length 0": (lens('value="55"', 'value="0"'), "'focal_length' must be > 0"),
     "small lens": (with_number("lens_diameter", 3), "'lens_diameter' = 3 mm is smaller than the diaphragm D"),
+    "image stop 0": (with_number("image_stop_diameter", 0), "'image_stop_diameter' must be > 0 and finite, got 0"),
+    "image stop nan": (with_number("image_stop_diameter", "nan"), "'image_stop_diameter' must be > 0 and finite"),
     "pitch 0": (lens('value="0.8"', 'value="0"'), "'pixel_pitch' must be > 0 and finite, got 0"),
     "pitch negative": (lens('value="0.8"', 'value="-0.8"'), "'pixel_pitch' must be > 0 and finite, got -0.8"),
     "pitch in words": (

@@ -18,7 +18,7 @@ import pytest
 from little_scenes import SCENES, write_ply, write_scene
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt import cli, doctor
+from mitsuba_fspt import doctor
 
 SMALL = ["-D", "width=12", "-D", "height=10", "-D", "pixel_pitch=2.304", "--rtol", "1e-2"]
 
@@ -26,18 +26,6 @@ SMALL = ["-D", "width=12", "-D", "height=10", "-D", "pixel_pitch=2.304", "--rtol
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def run(capfd):
-    """`run("render", …)`: exit code, stdout and stderr, whatever in the process wrote to them."""
-
-    def run(*arguments):
-        capfd.readouterr()
-        code = cli.run([str(argument) for argument in arguments])
-        return code, *capfd.readouterr()
-
-    return run
 
 
 def header(path):

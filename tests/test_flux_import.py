@@ -11,6 +11,7 @@ import trimesh
 
 from mitsuba_fspt.errors import FluxError
 from mitsuba_fspt.flux_import import import_flux
+from mitsuba_fspt.formats import surface_files
 from mitsuba_fspt.surface import face_normals
 
 SPHERE = trimesh.creation.icosphere(subdivisions=2, radius=4.0)
@@ -96,6 +97,44 @@ def test_obj_of_a_modeller_keeps_the_order_of_its_lines(tmp_path):
     mesh = write(tmp_path / "mesh.obj", text + "\n".join(faces) + "\n")
     assert_law(import_flux(mesh, law(VERTICES)), SPHERE.area)
     assert_law(import_flux(mesh, law(centroids(VERTICES, FACES[turned]))), SPHERE.area)
+
+
+def off(counts="OFF\n{} {} 0\n", point="{} {} {}\n", face="3 {} {} {}\n"):
+    text = counts.format(len(VERTICES), len(FACES)) + "".join(point.format(*v) for v in VERTICES.tolist())
+    return text + "".join(face.format(*f) for f in FACES.tolist())
+
+
+@pytest.mark.parametrize("counts", ["OFF\n{} {} 0\n", "# made\n\nOFF # by\n# hand\n{} {} 960\n", "OFF {} {} 0\r\n"])
+def test_off_of_points_and_triangles_is_read_at_once(tmp_path, monkeypatch, counts):
+    """Without trimesh, which takes seconds for 400,000 faces, and every bit as it stands in the text."""
+    monkeypatch.setattr(surface_files, "load_triangles", None)
+    phantom = import_flux(write(tmp_path / "mesh.off", off(counts)), law(VERTICES))
+    np.testing.assert_array_equal(phantom.vertices, VERTICES)
+    np.testing.assert_array_equal(phantom.faces, FACES)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        off(face="3 {} {} {} 255 0 0\n"),
+        off("OFF\n{} {} 0\n").replace("OFF", "COFF", 1).replace("\n3 ", " 0 0 0 1\n3 ", 1),
+        off() + "0 0 0\n",
+    ],
+    ids=["colours", "header", "more"],
+)
+def test_off_with_more_in_it_is_left_to_trimesh(tmp_path, monkeypatch, text):
+    asked = []
+    monkeypatch.setattr(surface_files, "load_triangles", lambda *args: asked.append(args) or SPHERE)
+    assert_law(import_flux(write(tmp_path / "mesh.off", text), law(VERTICES)), SPHERE.area)
+    assert asked == [(tmp_path / "mesh.off", "off")]
+
+
+def test_off_of_four_sided_faces(tmp_path):
+    """A box of six squares, which trimesh makes triangles of."""
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    sides = ["0 1 3 2", "4 6 7 5", "0 4 5 1", "2 3 7 6", "0 2 6 4", "1 5 7 3"]
+    mesh = write(tmp_path / "box.off", "OFF\n8 6 12\n" + rows(corners) + "".join(f"4 {side}\n" for side in sides))
+    assert import_flux(mesh, np.ones(8)).area == pytest.approx(6)
 
 
 @pytest.mark.parametrize("per", ["vertex", "face"])

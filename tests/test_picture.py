@@ -33,7 +33,7 @@ def spot(height: int = 8, width: int = 12, power: float = 2.5e-10, **metadata) -
 def drawn(monkeypatch):
     """The figures that would have been saved."""
     figures = []
-    monkeypatch.setattr(picture, "_save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(picture, "save_figure", lambda figure, path: figures.append(figure))
     return figures
 
 

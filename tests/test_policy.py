@@ -119,6 +119,18 @@ def test_nothing_imports_the_command_line(name):
             assert not {alias.name for alias in node.names} & {"cli", "flux_cli", "sweep_cli", "converge_cli"}
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_nobody_uses_the_private_names_of_another_file(name):
+    """Neither `from .other import _name` nor `other._name` of a module imported from the package."""
+    nodes = list(ast.walk(tree_of(name)))
+    taken = [alias for node in nodes if isinstance(node, ast.ImportFrom) and node.level for alias in node.names]
+    modules = {alias.asname or alias.name for alias in taken} & {Path(other).stem for other in NAMES}
+    assert not [alias.name for alias in taken if alias.name.startswith("_")]
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            assert not node.attr.startswith("_"), f"line {node.lineno}"
+
+
 def test_plugins_load_nothing_in_their_constructors():
     """`mi.load_dict` there races with the other threads of Mitsuba's loader: see the tests of scenes."""
     for path in (PACKAGE / "plugins").glob("*.py"):

@@ -19,7 +19,7 @@ import pytest
 from little_scenes import BALL_XML, LENS_XML, write_ply, write_scene
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt import cli, picture, sweep_pool, sweep_studio, sweeping
+from mitsuba_fspt import picture, sweep_pool, sweep_studio, sweeping
 from mitsuba_fspt.errors import BackendError, ImageError, SceneError
 from mitsuba_fspt.sweep_sheet import write_contact_sheet
 from mitsuba_fspt.sweep_source import Source
@@ -61,18 +61,6 @@ def calls(monkeypatch):
     monkeypatch.setattr(sweep_studio.Studio, "image", counting_image)
     monkeypatch.setattr(sweep_studio, "load", counting_load)
     return rendered, loaded
-
-
-@pytest.fixture
-def run(capfd):
-    """`run("sweep", …)`: exit code, stdout and stderr."""
-
-    def run(*arguments):
-        capfd.readouterr()
-        code = cli.run([str(argument) for argument in arguments])
-        return code, *capfd.readouterr()
-
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -151,11 +139,11 @@ def test_values_that_no_file_name_holds_stay_apart(tmp_path):
 def test_the_contact_sheet_shows_all_on_one_scale(scene, monkeypatch):
     rows = fspt.sweep(scene, VALUES, "o")
     figures = []
-    monkeypatch.setattr(picture, "_save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(picture, "save_figure", lambda figure, path: figures.append(figure))
     write_contact_sheet(rows, "sheet.png")
     axes, bar = figures[0].axes
     (shown,) = axes.images
-    scale, unit = picture._unit(np.array([max(row.peak for row in rows)]))
+    scale, unit = picture.scale_and_unit(np.array([max(row.peak for row in rows)]))
     assert bar.get_ylabel() == f"power [{unit}]"
     assert "W/pixel" in unit
     assert shown.get_clim() == pytest.approx((0, max(row.peak for row in rows) / scale))

@@ -17,7 +17,7 @@ from .mmc import mmc_mesh, read_mmc
 from .nirfast import nirfast_mesh, read_nirfast
 from .ply import read_ply
 from .raw import Field, RawMesh, SurfaceValues, surface_values
-from .surface_files import read_arrays, read_obj, read_trimesh
+from .surface_files import read_arrays, read_obj, read_off, read_trimesh
 from .table import column, read_values
 
 MeshLike = str | os.PathLike[str] | tuple[NDArray, NDArray]
@@ -29,6 +29,7 @@ READERS: dict[str, Callable[[Path], RawMesh]] = {
     "trimesh": read_trimesh,
     "ply": lambda path: read_ply(path)[0],
     "obj": read_obj,
+    "off": read_off,
     "npz": read_arrays,
 }
 FORMATS = ("auto", "mmc", *READERS)
@@ -76,7 +77,7 @@ def _detect(path: Path) -> str:
         return "mmc"
     if suffix in (".node", ".elem"):
         return "nirfast"
-    if suffix in (".ply", ".obj", ".npz"):
+    if suffix in (".ply", ".obj", ".off", ".npz"):
         return suffix[1:]
     return "meshio" if suffix in MESHIO else "trimesh"
 

@@ -1,19 +1,22 @@
-"""Surface meshes: `.npz`, OBJ, and what trimesh loads (STL, OFF, GLB, ...), with the fields they carry."""
+"""Surface meshes: `.npz`, OBJ, OFF, and what trimesh loads (STL, GLB, ...), with the fields they carry."""
 
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from ..errors import FluxError
 from ..surface import merge
 from .raw import Field, RawMesh, scalars
 from .table import one_line, read_npz
+
+if TYPE_CHECKING:
+    import trimesh
 
 # What trimesh reads by itself; other kinds it would pass on to meshio.
 KINDS = ("stl", "off", "glb", "gltf", "3mf", "dae", "zae", "3dxml", "xaml", "ctm", "step", "stp")
@@ -69,6 +72,34 @@ def read_obj(path: Path) -> RawMesh:
     return RawMesh(points, cells - 1, path.name)
 
 
+def read_off(path: Path) -> RawMesh:
+    """Vertices and triangles of an OFF in its order; one with more in it (colours, polygons) as trimesh loads it."""
+    return _plain_off(path) or read_trimesh(path)
+
+
+def _plain_off(path: Path) -> RawMesh | None:
+    """An OFF that holds nothing but points and triangles, which trimesh reads line by line, many times slower."""
+    try:
+        text = re.sub(rb"#[^\r\n]*", b"", path.read_bytes()).lstrip()
+    except OSError as cause:
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # what NumPy gives where a word is no number
+            numbers = np.fromstring(text[3:], sep=" ")
+    except (DeprecationWarning, ValueError):
+        return None
+    if not re.match(rb"OFF\s", text) or len(numbers) < 3:
+        return None
+    points, triangles = (int(n) if 0 < n < len(numbers) else 0 for n in numbers[:2])
+    if not triangles or len(numbers) != 3 + 3 * points + 4 * triangles:
+        return None
+    cells = numbers[3 + 3 * points :].reshape(-1, 4)
+    if not np.array_equal(cells, np.floor(cells)) or (cells[:, 0] != 3).any():
+        return None
+    return RawMesh(numbers[3 : 3 + 3 * points].reshape(-1, 3), cells[:, 1:].astype(np.int64), path.name)
+
+
 def read_trimesh(path: Path) -> RawMesh:
     """A mesh that trimesh loads, unchanged in order, with its scalar fields on vertices and faces.
 
@@ -94,6 +125,8 @@ def read_trimesh(path: Path) -> RawMesh:
 
 def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
     """trimesh's mesh of a file, its vertices and faces as they are; refused where there are no faces."""
+    import trimesh  # takes longer to load than most meshes
+
     try:
         mesh = trimesh.load_scene(path, process=False, **options).to_mesh()
         count = len(mesh.faces)

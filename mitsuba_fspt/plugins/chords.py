@@ -101,7 +101,7 @@ def _across_pupil(draft: Draft) -> Mask:
     if not draft.area:
         return np.ones(draft.value.shape, bool)
     nearest = -pixels.spread_max(-draft.nearest)
-    return (draft.lens.blur_radius(nearest) > 0.5) | draft.clipped
+    return ((draft.lens.blur_radius(nearest) > 0.5) | draft.clipped) & ~draft.stopped
 
 
 def _calm(draft: Draft, split: Mask) -> Mask:

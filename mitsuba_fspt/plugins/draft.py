@@ -32,6 +32,7 @@ class Draft:
     nearest : depth of what is nearest [mm], inf where nothing is met
     blur : largest blur radius of what a pixel or a neighbour sees [pixels]
     clipped : a second border of the lens cuts the pupil, whatever is sharp
+    stopped, beyond : the border of the image-plane stop cuts the pixel, wherever its light comes from; or leaves it out
     open, known : False where the value is known from elsewhere, and that value
     """
 
@@ -44,6 +45,8 @@ class Draft:
         self.value, self.error, self.hits, self.change, self.blur = (np.zeros(shape) for _ in range(5))
         self.nearest = np.full(shape, np.inf)
         self.clipped = window.off_axis(lens) > lens.optics.clear_field
+        inside, cut = window.stopped(lens)
+        self.stopped, self.beyond = cut & self.area, ~(inside | cut)
         self.open, self.known = np.ones(shape, bool), np.zeros(shape)
         if known is not None:
             self.open, self.known = ~window.cut(known.where), window.cut(known.power) / lens.etendue
@@ -60,6 +63,7 @@ class Draft:
         """The picture as it is, on the crop window."""
         error = np.maximum(self.error, FLOAT32_FLOOR * self.value.max(initial=0.0))
         error[self.hits == 0] = self.error[self.hits == 0]
+        error[self.beyond] = 0
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.hits, 0, 1))
         return Solution(power, error, coverage, self.rays, tuple(self.levels), findings=tuple(self.findings))
@@ -89,11 +93,11 @@ class Draft:
     def cut_off(self, nodes: int) -> Image:
         """What a rule may be wrong by where an edge crosses or hides between its nodes and the pupil's rim.
 
-        A silhouette, or the border of the lens.
+        A silhouette, a second border of the lens, or the image-plane stop.
         """
         reach = self.reach(nodes)
         share = np.where(pixels.grow(pixels.outline(self.hits, 1), reach - 1), UNSEEN[nodes], 0.0)
-        share[pixels.parted(self.hits) | self.clipped] = CUT[nodes]
+        share[pixels.parted(self.hits) | self.clipped | self.stopped] = CUT[nodes]
         return share * self._whole(reach.max())
 
     def unseen_by_chords(self, split: Mask) -> Image:

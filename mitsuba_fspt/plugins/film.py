@@ -1,8 +1,10 @@
-"""The film and the sampler of `fspt_lens`: a power on a pixel is one float32 number gathered by that pixel alone."""
+"""What `fspt_lens` is given: numbers, sampler, and a film whose pixels each gather one float32 number alone."""
 
 from __future__ import annotations
 
 import mitsuba as mi
+
+from ..errors import OpticsError
 
 
 def own_film(props: mi.Properties) -> None:
@@ -37,3 +39,11 @@ def _make(props: mi.Properties) -> mi.Object:
     Scenes load on several threads, and one that looks for a file in that moment reads freed memory.
     """
     return mi.PluginManager.instance().create_object(props)
+
+
+def number(props: mi.Properties, name: str) -> mi.Float64:
+    """A parameter of the lens, in double precision; OpticsError where it is no number."""
+    try:
+        return mi.Float64(float(props[name]))
+    except (TypeError, ValueError) as error:
+        raise OpticsError(f"fspt_lens: '{name}' must be a number, got {props[name]!r}. Give it as a float.") from error

@@ -85,10 +85,15 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
     def _solve_in(self, window: Window, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
         """The form of Eq. 9 asked for; pixels with light of narrow spots take the surface form in any case."""
+        # Light from the surface knows no border on the film: pixels that the image-plane stop cuts take lines of sight.
+        inside, cut = window.stopped(lens)
         if quadrature.domain == "surface":
-            return surface_form.solve(scene, lens, window, quadrature)
+            if not cut.any():
+                return surface_form.solve(scene, lens, window, quadrature)
+            known = surface_form.solve(scene, lens, window, quadrature, inside)
+            return known.completed_by(pupil_form.solve(scene, lens, window, quadrature, known))
         narrow = self._narrow_light(scene, lens, window)
-        where = narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest
+        where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest)
         if not where.any():
             return pupil_form.solve(scene, lens, window, quadrature)
         known = surface_form.solve(scene, lens, window, quadrature, where, narrow.brightest / 2)

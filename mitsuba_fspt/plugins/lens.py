@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import OpticsError
 from ..optics import Disc, Lens
-from .film import default_sampler, own_film
+from .film import default_sampler, number, own_film
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
 OPTIONAL = (
@@ -21,6 +21,7 @@ OPTIONAL = (
     "lens_diameter",
     "diaphragm_distance",
     "numerical_aperture",
+    "image_stop_diameter",
 )
 STRETCH = 1e-5  # by which float32 may make a rotation's matrix differ from one
 EPSILON = 2.0**-23  # float32's rounding of a length, relative to the largest one it comes from
@@ -60,6 +61,10 @@ class FsptLens(mi.Sensor):
      * - numerical_aperture
        - |float|
        - Sine of the half angle of that cone, in (0, 1); only with model ripoll.
+     * - image_stop_diameter
+       - |float| [mm]
+       - Optional circular stop on the detector, centred on the optical axis: light beside it reaches no pixel, a pixel
+         that its border cuts gets what falls on the part inside. Updatable.
      * - to_world
        - |transform|
        - Rotation and translation. Puts the lens centre at the origin looking along +z. Updatable.
@@ -74,7 +79,7 @@ class FsptLens(mi.Sensor):
         own_film(props)
         default_sampler(props)
         super().__init__(props)
-        self._numbers = {n: _number(props, n) for n in REQUIRED + OPTIONAL if n in props}
+        self._numbers = {n: number(props, n) for n in REQUIRED + OPTIONAL if n in props}
         missing = [name for name in REQUIRED if name not in self._numbers]
         if missing:
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
@@ -108,6 +113,7 @@ class FsptLens(mi.Sensor):
         self.virtual_pitch = pitch / self.optics.magnification
         self._discs = [_OpaqueDisc(disc) for disc in self.optics.discs]
         self._spread = 0.0 if self._model == "pinhole" else 1.0
+        self._seen = dr.opaque(mi.Float, self.optics.seen_field)
         self._u = dr.opaque(mi.Float, self.optics.focus_distance)
         self._pitch = dr.opaque(mi.Float, self.virtual_pitch)
         # Opaque: another film is the same kernel.
@@ -130,14 +136,15 @@ class FsptLens(mi.Sensor):
     def line_of_sight(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
         """Ray from the pupil point through the virtual point, its weight cos⁴θ and its cosθ to the optical axis.
 
-        `position` [film pixels], `pupil` [unit disc]. The weight is 0 where a second border clips the ray. The mean
-        of weight × radiance over a pixel and the pupil, times `etendue`, is the power on the pixel [W] (Eq. 9).
+        `position` [film pixels], `pupil` [unit disc]. The weight is 0 where a second border clips the ray and
+        beside the image-plane stop. The mean of weight × radiance over a pixel and the pupil, times `etendue`, is the
+        power on the pixel [W] (Eq. 9).
         """
         disc, x = self._discs[0], self.virtual_point(position)
         a = disc.shift * x + (disc.radius * self._spread) * pupil
         towards = mi.Vector3f(x.x - a.x, x.y - a.y, self._u)
         cos_theta = self._u * dr.rcp(dr.norm(towards))
-        weight = dr.select(self._open(x, a), dr.square(dr.square(cos_theta)), 0)
+        weight = dr.select(self._open(x, a) & self._through_stop(x), dr.square(dr.square(cos_theta)), 0)
         # Far from the world's origin the lens point is rounded: from where it lies then, aim at the same virtual point.
         centre, offset = mi.Point3f(self.m_to_world.translation()), self.m_to_world @ mi.Vector3f(a.x, a.y, 0)
         origin = centre + offset
@@ -160,7 +167,7 @@ class FsptLens(mi.Sensor):
         """Where light of a world point that heads for `pupil` [unit disc] arrives: film position [pixels], lens point.
 
         Third (da/dρ)² cosθ u²/d², by which A_pupil/u² turns into the solid angle of the pupil [sr], 0 where no light
-        passes; fourth cosθ of the line of sight to the optical axis.
+        passes the lens (an image-plane stop has no say); fourth cosθ of the line of sight to the optical axis.
         """
         centre, radius, _ = self.blur_disc(point)
         position, disc = centre + radius * pupil, self._discs[0]
@@ -187,6 +194,10 @@ class FsptLens(mi.Sensor):
         for disc in self._discs[1:]:
             passes &= dr.squared_norm(a - disc.shift * x) <= dr.square(disc.radius)
         return passes
+
+    def _through_stop(self, x: mi.Point2f) -> mi.Bool:
+        """True where the image of virtual point x lies inside the image-plane stop."""
+        return dr.squared_norm(x) <= dr.square(self._seen)
 
     # ------------------------------------------------------------------ what the film can see, in double precision
 
@@ -253,6 +264,7 @@ class FsptLens(mi.Sensor):
         film = self.film()
         pupil = mi.warp.square_to_uniform_disk_concentric(sample)
         position, lens_point, weight, _ = self.arrival(it.p, pupil)
+        active = active & self._through_stop(self.virtual_point(position))
         position -= mi.Vector2f(film.crop_offset())
         size = mi.Vector2f(film.crop_size())
         inside = active & (weight > 0) & dr.all((position >= 0) & (position < size))
@@ -283,13 +295,6 @@ class _OpaqueDisc:
 
     def __init__(self, disc: Disc) -> None:
         self.shift, self.radius = dr.opaque(mi.Float, disc.shift), dr.opaque(mi.Float, disc.radius)
-
-
-def _number(props: mi.Properties, name: str) -> mi.Float64:
-    try:
-        return mi.Float64(float(props[name]))
-    except (TypeError, ValueError) as error:
-        raise OpticsError(f"fspt_lens: '{name}' must be a number, got {props[name]!r}. Give it as a float.") from error
 
 
 mi.register_sensor("fspt_lens", FsptLens)

@@ -47,6 +47,15 @@ class Window:
         y = self.top + self.crop_offset[1] + np.arange(self.shape[0]) + 0.5 - height / 2
         return (np.hypot(x, y[:, None]) + np.sqrt(0.5)) * lens.virtual_pitch
 
+    def stopped(self, lens: mi.Sensor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Pixels (h, w) that lie inside the image-plane stop, and those that its border cuts."""
+        width, height = (int(n) for n in lens.film().size())
+        x = np.abs(self.left + self.crop_offset[0] + np.arange(self.shape[1]) + 0.5 - width / 2)
+        y = np.abs(self.top + self.crop_offset[1] + np.arange(self.shape[0]) + 0.5 - height / 2)[:, None]
+        radius = lens.optics.seen_field / lens.virtual_pitch
+        inside = np.hypot(x + 0.5, y + 0.5) <= radius
+        return inside, ~inside & (np.hypot(np.maximum(x - 0.5, 0), np.maximum(y - 0.5, 0)) < radius)
+
     def expand(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
         """The crop window with `image` of this window in its place, 0 around it."""
         whole = np.zeros(self.full)
@@ -89,6 +98,8 @@ def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -
     ]
     points = np.array(corners).reshape(-1, 3)
     low, high = lens.film_bounds(points[:0] if everywhere else points)
+    middle, radius = 0.5 * np.array(film.size(), np.float64), lens.optics.seen_field / lens.virtual_pitch
+    low, high = np.maximum(low, middle - radius), np.minimum(high, middle + radius)
     blur = lens.film_discs(points)[1].max(initial=0.0)
     rim = 1 + math.ceil(min(GAP * blur, MOST_RIM - 1))
     # One pixel more than needed on each side keeps second differences and rounding inside.

@@ -1,0 +1,28 @@
+"""What the verbs of the command line make of their arguments before they begin."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from .errors import ImageError, SceneError
+
+
+def definitions(define: list[str] | None) -> dict[str, str]:
+    """Values by name of the options -D NAME=VALUE; SceneError for one that is none."""
+    pairs = dict(text.partition("=")[::2] for text in define or ())
+    for text in define or ():
+        if "=" not in text.strip("="):
+            raise SceneError(f"-D {text}: must be NAME=VALUE, for example -D f_number=8.")
+    return pairs
+
+
+def require_writable(path: Path, suffix: str) -> None:
+    """Refuse an output that cannot be written before the work, not after it."""
+    if path.suffix != suffix:
+        raise ImageError(f"{path}: images are written as {suffix}. Give a name that ends in {suffix}.")
+    folder = path.parent
+    if not folder.is_dir():
+        raise ImageError(f"{path}: the folder '{folder}' does not exist. Make it, or write elsewhere with -o.")
+    if not os.access(folder, os.W_OK):
+        raise ImageError(f"{path}: the folder '{folder}' is not writable. Write elsewhere with -o.")
