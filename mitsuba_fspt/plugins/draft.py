@@ -44,7 +44,7 @@ class Draft:
         shape = window.shape
         self.value, self.error, self.hits, self.change, self.blur = (np.zeros(shape) for _ in range(5))
         self.nearest = np.full(shape, np.inf)
-        self.clipped = window.off_axis(lens) > lens.optics.clear_field
+        self.clipped = window.clipped(lens)
         inside, cut = window.stopped(lens)
         self.stopped, self.beyond = cut & self.area, ~(inside | cut)
         self.open, self.known = np.ones(shape, bool), np.zeros(shape)

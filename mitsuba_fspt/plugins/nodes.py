@@ -26,8 +26,9 @@ def first_nodes(draft: Draft) -> Mask:
     draft.set_blur(farthest)
     draft.value = value = np.where(draft.open, value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
-    slope = 4 * np.hypot(mx, my)
-    bend = np.abs(contrast) + np.divide(slope**4, 4 * value**3, out=np.zeros_like(value), where=value > 0)
+    square = 16 * (mx * mx + my * my)
+    bend = np.abs(contrast)
+    bend += np.divide(square * square, 4 * value * value * value, out=np.zeros_like(value), where=value > 0)
     neighbours = draft.area or len(rule) == 1  # tell how the picture bends
     if neighbours:
         xx, yy = pixels.second_differences(value)
