@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +16,13 @@ from .window import Window
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
 # A silhouette can pass between the outermost of a rule's nodes, or of the first four chords, and the rim of the pupil:
-# that far in (blur radii). A straight one makes them wrong by at most this share of the light, where it parts the nodes
-# and where it does not.
+# that far in (blur radii). A straight one makes them wrong by at most this share of the light, sharp or blurred, where
+# it parts the nodes and where it does not.
 GAP = {1: 1.0, 4: 0.6, 12: 0.25, "chords": 0.1}
-CUT = {1: 0.5, 4: 0.35, 12: 0.3}
-UNSEEN = {1: 0.5, 4: 0.25, 12: 0.15, "chords": 0.0125}
+CUT = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
+UNSEEN = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
+UNSEEN_BY_CHORDS = 0.0125
+SHARP = 0.3  # blur radius [pixels]
 
 Image = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -30,7 +34,7 @@ class Draft:
 
     change : by which the last rule moved the value
     nearest : depth of what is nearest [mm], inf where nothing is met
-    blur : largest blur radius of what a pixel or a neighbour sees [pixels]
+    blur : largest blur radius of what a pixel or a neighbour sees [pixels]; sharp : True where the least one is small
     clipped : a second border of the lens cuts the pupil, whatever is sharp
     stopped, beyond : the border of the image-plane stop cuts the pixel, wherever its light comes from; or leaves it out
     open, known : False where the value is known from elsewhere, and that value
@@ -43,6 +47,7 @@ class Draft:
         self.area = quadrature.pixel == "area"
         shape = window.shape
         self.value, self.error, self.hits, self.change, self.blur = (np.zeros(shape) for _ in range(5))
+        self.sharp = np.zeros(shape, bool)
         self.nearest = np.full(shape, np.inf)
         self.clipped = window.clipped(lens)
         inside, cut = window.stopped(lens)
@@ -78,9 +83,11 @@ class Draft:
     def set_blur(self, farthest: Image) -> None:
         """From depths: of what is nearest or farthest, for from the sharp plane on blur grows either way."""
         seen = np.isfinite(self.nearest)
-        blur = np.zeros(seen.shape)
-        blur[seen] = self.lens.blur_radius(np.array([self.nearest[seen], farthest[seen]])).max(axis=0)
+        blur, sharp = np.zeros(seen.shape), np.zeros(seen.shape, bool)
+        both = self.lens.blur_radius(np.array([self.nearest[seen], farthest[seen]]))
+        blur[seen], sharp[seen] = both.max(axis=0), both.min(axis=0) < SHARP
         self.blur = pixels.spread_max(np.minimum(blur, max(seen.shape)))
+        self.sharp = pixels.dilate(sharp, 1 + math.ceil(SHARP))
 
     def reach(self, rule: int | str) -> NDArray[np.int64]:
         """How far from where a rule sees an edge it may hide from it [pixels]."""
@@ -88,7 +95,8 @@ class Draft:
 
     def grown(self, rough: Mask, nodes: int) -> Mask:
         """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `cut_off` knows."""
-        return rough | pixels.grow(rough & ~pixels.outline(self.hits, 1), self.reach(nodes))
+        source = rough & (self.error > self.tolerance) & ~pixels.outline(self.hits, 1)
+        return rough | pixels.grow(source, self.reach(nodes))
 
     def cut_off(self, nodes: int) -> Image:
         """What a rule may be wrong by where an edge crosses or hides between its nodes and the pupil's rim.
@@ -96,15 +104,16 @@ class Draft:
         A silhouette, a second border of the lens, or the image-plane stop.
         """
         reach = self.reach(nodes)
-        share = np.where(pixels.grow(pixels.outline(self.hits, 1), reach - 1), UNSEEN[nodes], 0.0)
-        share[pixels.parted(self.hits) | self.clipped | self.stopped] = CUT[nodes]
+        cut, unseen = (np.where(self.sharp, *share[nodes]) for share in (CUT, UNSEEN))
+        share = np.where(pixels.grow(pixels.outline(self.hits, 1), reach - 1), unseen, 0.0)
+        share = np.where(pixels.parted(self.hits) | self.clipped | self.stopped, cut, share)
         return share * self._whole(reach.max())
 
     def unseen_by_chords(self, split: Mask) -> Image:
         """What four chords may be wrong by near pixels they are `split` on and where they meet no jump themselves."""
         reach = self.reach("chords")
         near = pixels.grow(split, reach) & ~split
-        return np.where(near, UNSEEN["chords"] * self._whole(reach.max()), 0)
+        return np.where(near, UNSEEN_BY_CHORDS * self._whole(reach.max()), 0)
 
     def _whole(self, reach: int) -> Image:
         """Largest value within `reach` pixels, if no line of sight missed."""
