@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import pytest
 
 
@@ -32,3 +34,9 @@ def run(capfd):
         return code, *capfd.readouterr()
 
     return run
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_scene_of_another_file():
+    """Kernels record every living emitter, and one of a scene that was meant to be bad refuses."""
+    gc.collect()

@@ -34,9 +34,9 @@ def half_dark(path):
 
 def soft_spot(path):
     """A sheet in focus that glows like a Gauss curve, 8 pixels wide: the lens is stopped down far."""
-    y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-24, 24, 49), np.linspace(-24, 24, 49)))
-    corner = np.arange(49 * 48).reshape(48, 49)[:, :-1].ravel()[:, None]
-    faces = np.concatenate([corner + np.array(other) for other in ((0, 1, 50), (0, 50, 49))])
+    y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-24, 24, 193), np.linspace(-24, 24, 193)))
+    corner = np.arange(193 * 192).reshape(192, 193)[:, :-1].ravel()[:, None]
+    faces = np.concatenate([corner + np.array(other) for other in ((0, 1, 194), (0, 194, 193))])
     sheet = trimesh.Trimesh(np.column_stack([0 * y, y, z]), faces, process=False)
     return scene_of(mesh_of(sheet, path, vertex=np.exp(-(y**2 + z**2) / 12.8**2 / 2)), sensor=lens(24, f_number=100.0))
 

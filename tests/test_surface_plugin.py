@@ -403,6 +403,7 @@ def test_a_rendered_scene_can_be_freed_and_keeps_its_names(integrator, tmp_path)
     """Each scene once stayed in memory for good after its first picture, and its shapes were renamed."""
     vertices = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
     path = write_ply(tmp_path / "sheet.ply", vertices, [(0, 1, 2), (0, 2, 3)], vertex=[1, 2, 3, 4])
+    gc.collect()
     kept = sum(type(thing).__name__ == "FsptSurface" for thing in gc.get_objects())
     depth = {} if integrator == "fspt_integral" else {"max_depth": 1}
     scene = scene_of(
