@@ -123,6 +123,9 @@ class FsptLens(mi.Sensor):
         self._etendue = dr.opaque(mi.Float, self.etendue)
         self._pupil = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
         dr.make_opaque(self.m_to_world)
+        # How far float32 may move a line of sight on the virtual plane [virtual pixels].
+        place = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
+        self.rounding = EPSILON * (place + self.optics.focus_distance) / self.virtual_pitch
 
     # ------------------------------------------------------------------ lines of sight
 
@@ -201,12 +204,6 @@ class FsptLens(mi.Sensor):
 
     # ------------------------------------------------------------------ what the film can see, in double precision
 
-    @property
-    def rounding(self) -> float:
-        """How far float32 may move a line of sight on the virtual plane [virtual pixels]."""
-        place = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
-        return EPSILON * (place + self.optics.focus_distance) / self.virtual_pitch
-
     def blur_radius(self, depth: NDArray[np.float64]) -> NDArray[np.float64]:
         """Radius [pixels] of the blur disc of a point at `depth` z [mm] from the lens plane; inf at z <= 0."""
         disc, u = self.optics.discs[0], self.optics.focus_distance
@@ -228,13 +225,6 @@ class FsptLens(mi.Sensor):
         scale = np.where(scale > 0, scale, 1)  # there the radius is infinite
         centre = 0.5 * np.array(self.film().size(), np.float64) - p[..., :2] / (scale * self.virtual_pitch)
         return centre, self.blur_radius(p[..., 2:])
-
-    def film_bounds(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and largest film position (x, y) [pixels] at which light of the convex hull of `points` arrives."""
-        if len(points) == 0:
-            return np.full(2, -np.inf), np.full(2, np.inf)
-        centre, radius = self.film_discs(points)
-        return (centre - radius).min(axis=0), (centre + radius).max(axis=0)
 
     # ------------------------------------------------------------------ Mitsuba's sensor interface
 

@@ -101,10 +101,13 @@ def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -
         for pick in itertools.product((0, 1), repeat=3)
     ]
     points = np.array(corners).reshape(-1, 3)
-    low, high = lens.film_bounds(points[:0] if everywhere else points)
+    discs, radii = lens.film_discs(points)
+    blur = radii.max(initial=0.0)
+    low, high = (discs - radii).min(axis=0, initial=np.inf), (discs + radii).max(axis=0, initial=-np.inf)
+    if everywhere or not len(points):
+        low, high = np.full(2, -np.inf), np.full(2, np.inf)
     middle, radius = 0.5 * np.array(film.size(), np.float64), lens.optics.seen_field / lens.virtual_pitch
     low, high = np.maximum(low, middle - radius), np.minimum(high, middle + radius)
-    blur = lens.film_discs(points)[1].max(initial=0.0)
     rim = 1 + math.ceil(min(GAP * blur, MOST_RIM - 1))
     # One pixel more than needed on each side keeps second differences and rounding inside.
     (left, right), (top, bottom) = (
