@@ -39,7 +39,7 @@ def converge(
     """Measure error against run time of every method: both forms of the integral, the paper's sum, Monte Carlo.
 
     Writes SCENE_converge.csv and SCENE_converge.png, prints the fitted orders
-    and the times to an error. Takes about rounds x 20 x budget.
+    and the times to an error. Takes about rounds x 20 x budget and two minutes.
     """
     from .converge_sheet import write_csv, write_png
     from .converge_table import render_text

@@ -86,7 +86,7 @@ def _arrays(path: Path) -> tuple[Picture, Picture]:
     except OSError as cause:
         raise ImageError(f"reference '{path}' cannot be read: {cause.strerror or cause}. Check the name.") from cause
     except Exception as cause:  # whatever a damaged archive makes NumPy and zipfile raise
-        raise ImageError(f"reference '{path}' is no NPZ file with 'power' and 'error': {cause}.") from cause
+        raise ImageError(f"reference '{path}' is no NPZ file with arrays 'power' and 'error' [W].") from cause
     if power.ndim != 2 or {power.dtype.kind, error.dtype.kind} - set("fiu"):
         raise ImageError(f"reference '{path}': 'power' and 'error' must be numbers of shape (h, w), in W.")
     return power, error

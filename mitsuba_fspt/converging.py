@@ -63,7 +63,8 @@ def converge(
     scene : Mitsuba scene (see `load`) or the name of a scene file
     sensor : number of the sensor, an `fspt_lens`
     rounds : timed runs of every setting, >= 1
-    budget : longest time of one picture [s], > 0; finer settings are left out. About rounds × 20 × budget in all.
+    budget : longest time of one picture [s], > 0; finer settings are left out. About rounds × 20 × budget in all,
+        and some seconds a setting for its first runs.
     reference : EXR file with error.Y, or NPZ file with arrays power and error [W]; None makes one, see `own_reference`
     kernels : DRJIT_CACHE_DIR of this process, if all kernels may be forgotten before every cold run; else None
     progress : called with what is being done and the share done
@@ -73,7 +74,7 @@ def converge(
     SceneError, OpticsError, ExitanceError, ImageError, BackendError : what is wrong and how to mend it.
     """
     if not (rounds >= 1 and 0 < budget < math.inf):
-        raise SceneError(f"converge: 'rounds' must be >= 1 and 'budget' > 0 s, got {rounds} and {budget:g}.")
+        raise SceneError(f"converge: 'rounds' must be >= 1 and 'budget' > 0 s and finite, got {rounds} and {budget:g}.")
     if isinstance(scene, (str, os.PathLike)):
         scene = load(scene)
     variant = backend.ensure_variant()

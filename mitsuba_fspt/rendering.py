@@ -66,10 +66,11 @@ def render(
     lens = sensor_of(scene, sensor)
     integrator = integrator_of(scene, method)
     accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
-    accuracy["without"] = None if shortcuts else frozenset(SHORTCUTS)
     sampling = {"spp": spp, "seed": seed}
     deterministic = type(integrator).__name__ == "FsptIntegral"
-    _refuse(sampling if deterministic else accuracy, "integral" if deterministic else "Monte Carlo")
+    refused = sampling if deterministic else accuracy | {"shortcuts": None if shortcuts else False}
+    _refuse(refused, "integral" if deterministic else "Monte Carlo")
+    accuracy["without"] = None if shortcuts else frozenset(SHORTCUTS)
     start = time.perf_counter()
     with ctrl_c_noted() as check_interrupt:
 

@@ -59,12 +59,12 @@ def truth(stop):
 
 
 @pytest.mark.parametrize("domain", ["pupil", "surface"])
-@pytest.mark.parametrize("stop", [STOP, 6.26, 0.3])
+@pytest.mark.parametrize("stop", [STOP, 6.26, 0.5])
 def test_uniform_disk_meets_the_closed_form_on_the_pixels_the_border_cuts(stop, domain):
     """Rationale: ∫ over the part of each pixel inside the stop, whose area and cos⁴ the closed form knows.
 
     Expected: a tenth of what is asked for at each pixel and in all; the whole power is that of the circle in polar
-    coordinates. A stop of 0.3 mm lies in four pixels. Seen to fail with the stop left out in 'surface'.
+    coordinates. A stop of 0.5 mm lies in four pixels. Seen to fail with the stop left out in 'surface'.
     """
     image = fspt.render(scene(disk(SHARP, 200.0), image_stop_diameter=stop), rtol=1e-3, domain=domain)
     expected = truth(stop)
@@ -175,3 +175,9 @@ def test_a_stop_that_cannot_be_is_refused(diameter):
 def test_the_stop_is_as_much_larger_on_the_virtual_plane_as_the_pixels():
     assert Lens.focused(55.0, 8.0, magnification=0.5, image_stop_diameter=STOP).seen_field == pytest.approx(STOP)
     assert Lens(55.0, 8.0, 165.0).seen_field == np.inf
+
+
+def test_a_stop_below_a_pixel_is_refused():
+    """The first lines of sight of a pixel would all miss it."""
+    with pytest.raises(RuntimeError, match=r"image_stop_diameter.* = 0.3 mm is below a pixel. Give at least 0.4 mm"):
+        scene(disk(SHARP, 200.0), image_stop_diameter=0.3)

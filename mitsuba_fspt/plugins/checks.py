@@ -36,12 +36,16 @@ def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
 
 def check_lens(sensor: mi.Sensor) -> None:
-    """Raise SceneError unless the sensor is an `fspt_lens`."""
+    """Raise SceneError unless the sensor is an `fspt_lens` with a film."""
     if type(sensor).__name__ != "FsptLens":
         raise SceneError(
             f"scene: the sensor is a {sensor.class_name()}, power on a pixel needs a lens. Use a sensor of type "
             "'fspt_lens'."
         )
+
+    width, height = (int(n) for n in sensor.film().crop_size())
+    if not (width and height):
+        raise SceneError(f"scene: the film has {width} x {height} pixels. Give it at least one.")
 
 
 def check_rounding(lens: mi.Sensor) -> None:

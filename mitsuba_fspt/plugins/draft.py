@@ -14,6 +14,9 @@ from ..shortcuts import Finding
 from .window import Window
 
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
+LEAST_CLAIM = (
+    0.05  # rules that agree say little about what all miss: no error is said to be so much below the tolerance
+)
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
 # A silhouette can pass between the outermost of a rule's nodes, or of the first four chords, and the rim of the pupil:
 # that far in (blur radii). A straight one makes them wrong by at most this share of the light, sharp or blurred, where
@@ -66,7 +69,8 @@ class Draft:
 
     def solution(self) -> Solution:
         """The picture as it is, on the crop window."""
-        error = np.maximum(self.error, FLOAT32_FLOOR * self.value.max(initial=0.0))
+        floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
+        error = np.maximum(self.error, floor * self.value.max(initial=0.0))
         error[self.hits == 0] = self.error[self.hits == 0]
         error[self.beyond] = 0
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))

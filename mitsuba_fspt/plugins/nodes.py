@@ -23,6 +23,9 @@ def first_nodes(draft: Draft) -> Mask:
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
     everything = np.ones(draft.window.shape, bool)
     value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule, everything)
+    if len(rule) == 1 and not draft.hits.any():  # what glows is thinner than a pixel
+        rule = rules.four(draft.area)
+        value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule, everything)
     draft.set_blur(farthest)
     draft.value = value = np.where(draft.open, value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
@@ -43,7 +46,8 @@ def first_nodes(draft: Draft) -> Mask:
     bend = pixels.spread_max(bend)
     draft.error = np.maximum(bend, draft.cut_off(len(rule)))
     rough = (draft.error > draft.tolerance) | (bend > SETTLED * draft.tolerance)
-    if (neighbours and min(rough.shape) < 3) or not draft.quadrature.takes("smooth"):
+    unmet = not draft.hits.any()  # what glows is on the film, or may be
+    if (neighbours and min(rough.shape) < 3) or unmet or not draft.quadrature.takes("smooth"):
         rough[:] = True
     rough = draft.grown(rough & draft.open, len(rule)) & draft.open
     smooth = int(np.count_nonzero(~rough & (draft.hits > 0)))
@@ -66,6 +70,8 @@ def twelve_nodes(draft: Draft, rough: Mask) -> Mask:
     if misled.any():
         _refine(draft, misled & ~probes)
     rough = rough | misled
+    if not draft.hits.any():
+        return rough
     return rough & draft.grown(rough & (draft.error > draft.tolerance), 12)
 
 
@@ -74,8 +80,10 @@ def _one_will_do(draft: Draft) -> bool:
     lens, blur = draft.lens.optics, draft.window.blur
     curvature = 0.0 if lens.model == "pinhole" else 2 * (lens.discs[0].radius / lens.focus_distance) ** 2
     will_do = curvature <= POINT * draft.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
-    taken = will_do and draft.quadrature.takes("one line")
+    lambert = all(getattr(emitter, "is_lambertian", bool)() for emitter in draft.scene.emitters())
+    taken = will_do and lambert and draft.quadrature.takes("one line")
     why = f"cos⁴θ differs by {curvature:.1e} over the pupil, blur discs reach {blur:.2g} pixels"
+    why += "" if lambert else ", the radiance depends on direction"
     draft.findings.append(Finding("one line", taken, why))
     return taken
 

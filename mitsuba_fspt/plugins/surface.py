@@ -13,7 +13,7 @@ import mitsuba as mi
 from ..errors import ExitanceError
 from . import exitance
 from .elements import ElementDistribution, elements_of
-from .emission import law_of
+from .emission import Lambert, law_of
 from .intersections import traced_robustly, twin
 from .last_flight import LastFlight
 from .recording import scene_is_checked
@@ -203,6 +203,10 @@ class FsptSurface(mi.Emitter):
                 return False
             raise
         return True
+
+    def is_lambertian(self) -> bool:
+        """True where the radiance is the same in all outward directions."""
+        return isinstance(self.law, Lambert)
 
     def is_uniform(self) -> bool:
         """True where J_n is one number."""
