@@ -103,17 +103,16 @@ class FsptLens(mi.Sensor):
             raise OpticsError(
                 f"fspt_lens: 'pixel_pitch' must be > 0 and finite, got {pitch:g}. Give mm, for example 0.0135."
             )
-        stop = numbers.get("image_stop_diameter", np.inf)
-        if stop < pitch:
-            raise OpticsError(
-                f"fspt_lens: 'image_stop_diameter' = {stop:g} mm is below a pixel. Give at least {pitch:g} mm."
-            )
         axes = np.array(self.m_to_world.matrix, np.float64).reshape(4, 4)[:3, :3]
         if not np.allclose(axes @ axes.T, np.eye(3), atol=STRETCH) or np.linalg.det(axes) < 0:
             raise OpticsError(
                 "fspt_lens: 'to_world' scales lengths or mirrors. Give a rotation and a translation only."
             )
         self.optics = Lens.focused(model=self._model, **numbers)
+        if (stop := numbers.get("image_stop_diameter", pitch)) < pitch:
+            raise OpticsError(
+                f"fspt_lens: 'image_stop_diameter' = {stop:g} mm is below a pixel. Give at least {pitch:g} mm."
+            )
         self.pixel_pitch = pitch
         self.virtual_pitch = pitch / self.optics.magnification
         self._discs = [_OpaqueDisc(disc) for disc in self.optics.discs]
