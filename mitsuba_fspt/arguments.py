@@ -1,11 +1,20 @@
-"""What the verbs of the command line make of their arguments before they begin."""
+"""Arguments that several verbs of the command line have, and what is made of them before the work begins."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from .errors import ImageError, SceneError
+
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")]
+Parameters = Annotated[
+    list[str] | None,
+    typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
+]
 
 
 def definitions(define: list[str] | None) -> dict[str, str]:

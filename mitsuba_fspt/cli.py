@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from .arguments import definitions, require_writable
+from .arguments import Parameters, SceneFile, definitions, require_writable
 from .backend import quiet_mitsuba
 from .errors import FsptError
 from .sweep_cli import Interrupted
@@ -26,12 +26,6 @@ app = typer.Typer(
 )
 
 INTERRUPTED = 130
-
-SceneFile = Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")]
-Parameters = Annotated[
-    list[str] | None,
-    typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
-]
 
 
 @app.callback(invoke_without_command=True)

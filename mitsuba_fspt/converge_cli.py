@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from .arguments import definitions, require_writable
+from .arguments import Parameters, SceneFile, definitions, require_writable
 from .backend import quiet_mitsuba
 from .terminal import progress_bar
 
@@ -21,11 +21,8 @@ CACHE = "DRJIT_CACHE_DIR"
 
 
 def converge(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")],
-    define: Annotated[
-        list[str] | None,
-        typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
-    ] = None,
+    scene: SceneFile,
+    define: Parameters = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for SCENE_converge.csv and .png, which must exist.")
     ] = Path("."),

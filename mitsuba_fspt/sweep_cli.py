@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .arguments import SceneFile
 from .backend import quiet_mitsuba
 from .errors import BackendError, FsptError, SceneError
 from .terminal import progress_bar
@@ -17,7 +18,7 @@ class Interrupted(FsptError):
 
 
 def sweep(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")],
+    scene: SceneFile,
     define: Annotated[
         list[str] | None,
         typer.Option("-D", "--define", metavar="NAME=V1,V2,…", help="Values for a <default> of the scene; repeatable."),
