@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING, Any
 
+import drjit as dr
 import mitsuba as mi
-import numpy as np
-from numpy.typing import NDArray
 
-from .. import pixels
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import Finding
+from .grid import ROUNDING, Grid, parted
 from .window import Window
+
+if TYPE_CHECKING:
+    from .grid import Image, Mask
+
+    Index = mi.UInt32  # numbers of pixels, row by row
 
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 LEAST_CLAIM = (
@@ -27,13 +32,9 @@ UNSEEN = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
 UNSEEN_BY_CHORDS = 0.0125
 SHARP = 0.3  # blur radius [pixels]
 
-Image = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Index = NDArray[np.uint32]
-
 
 class Draft:
-    """Of each pixel of the window, shape (h, w): `value`, mean radiance on film [W/mm²/sr], its `error` and `hits`.
+    """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `hits`.
 
     change : by which the last rule moved the value
     nearest : depth of what is nearest [mm], inf where nothing is met
@@ -48,33 +49,39 @@ class Draft:
     ) -> None:
         self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
         self.area = quadrature.pixel == "area"
-        shape = window.shape
-        self.value, self.error, self.hits, self.change, self.blur = (np.zeros(shape) for _ in range(5))
-        self.sharp = np.zeros(shape, bool)
-        self.nearest = np.full(shape, np.inf)
-        self.clipped = window.clipped(lens)
+        self.grid = grid = Grid(window.shape)
+        self.value, self.error, self.hits, self.change, self.blur = (grid.full(mi.Float64, 0) for _ in range(5))
+        self.sharp = grid.full(mi.Bool, False)
+        self.nearest = grid.full(mi.Float64, dr.inf)
+        self.clipped = grid.lanes(window.clipped(lens))
         inside, cut = window.stopped(lens)
-        self.stopped, self.beyond = cut & self.area, ~(inside | cut)
-        self.open, self.known = np.ones(shape, bool), np.zeros(shape)
+        self.stopped, self.beyond = grid.lanes(cut & self.area), grid.lanes(~(inside | cut))
+        self.open, self.known = grid.full(mi.Bool, True), grid.full(mi.Float64, 0)
         if known is not None:
-            self.open, self.known = ~window.cut(known.where), window.cut(known.power) / lens.etendue
+            self.open = grid.lanes(~window.cut(known.where))
+            self.known = grid.lanes(window.cut(known.power) / lens.etendue)
         self.rays = 0
         self.levels: list[str] = []
         self.findings: list[Finding] = []
 
     @property
-    def tolerance(self) -> float:
-        """The error asked for [W/mm²/sr]."""
-        return self.quadrature.rtol * float(self.value.max(initial=0.0))
+    def peak(self) -> Image:
+        """The largest value [W/mm²/sr], one lane."""
+        return dr.max(self.value)
+
+    @property
+    def tolerance(self) -> Image:
+        """The error asked for [W/mm²/sr], one lane."""
+        return dr.opaque(mi.Float64, self.quadrature.rtol) * self.peak
 
     def solution(self) -> Solution:
         """The picture as it is, on the crop window."""
         floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
-        error = np.maximum(self.error, floor * self.value.max(initial=0.0))
-        error[self.hits == 0] = self.error[self.hits == 0]
-        error[self.beyond] = 0
-        power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
-        coverage = self.window.expand(np.clip(self.hits, 0, 1))
+        error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, dr.opaque(mi.Float64, floor) * self.peak))
+        images = (self.value, dr.select(self.beyond, 0, error), dr.clip(self.hits, 0, 1))
+        dr.eval(images)
+        power, error, coverage = (self.window.expand(self.grid.array(image)) for image in images)
+        power, error = power * self.lens.etendue, error * self.lens.etendue
         return Solution(power, error, coverage, self.rays, tuple(self.levels), findings=tuple(self.findings))
 
     def count(self, what: str, pixels_touched: int, rays: int) -> None:
@@ -86,21 +93,20 @@ class Draft:
 
     def set_blur(self, farthest: Image) -> None:
         """From depths: of what is nearest or farthest, for from the sharp plane on blur grows either way."""
-        seen = np.isfinite(self.nearest)
-        blur, sharp = np.zeros(seen.shape), np.zeros(seen.shape, bool)
-        both = self.lens.blur_radius(np.array([self.nearest[seen], farthest[seen]]))
-        blur[seen], sharp[seen] = both.max(axis=0), both.min(axis=0) < SHARP
-        self.blur = pixels.spread_max(np.minimum(blur, max(seen.shape)))
-        self.sharp = pixels.dilate(sharp, 1 + math.ceil(SHARP))
+        seen = dr.isfinite(self.nearest)
+        front, back = self.lens.blur_radius(self.nearest), self.lens.blur_radius(farthest)
+        most = dr.opaque(mi.Float64, max(self.grid.shape))
+        self.blur = self.grid.spread_max(dr.select(seen, dr.minimum(dr.maximum(front, back), most), 0))
+        self.sharp = self.grid.dilate(seen & (dr.minimum(front, back) < SHARP), 1 + math.ceil(SHARP))
 
-    def reach(self, rule: int | str) -> NDArray[np.int64]:
+    def reach(self, rule: int | str) -> mi.Int:
         """How far from where a rule sees an edge it may hide from it [pixels]."""
-        return 1 + np.ceil(GAP[rule] * self.blur).astype(np.int64)
+        return 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, GAP[rule]) * self.blur))
 
     def grown(self, rough: Mask, nodes: int) -> Mask:
         """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `cut_off` knows."""
-        source = rough & (self.error > self.tolerance) & ~pixels.outline(self.hits, 1)
-        return rough | pixels.grow(source, self.reach(nodes))
+        source = rough & (self.error > self.tolerance) & ~self.grid.outline(self.hits, 1)
+        return rough | self.grid.grow(source, self.reach(nodes))
 
     def cut_off(self, nodes: int) -> Image:
         """What a rule may be wrong by where an edge crosses or hides between its nodes and the pupil's rim.
@@ -108,23 +114,31 @@ class Draft:
         A silhouette, a second border of the lens, or the image-plane stop.
         """
         reach = self.reach(nodes)
-        cut, unseen = (np.where(self.sharp, *share[nodes]) for share in (CUT, UNSEEN))
-        share = np.where(pixels.grow(pixels.outline(self.hits, 1), reach - 1), unseen, 0.0)
-        share = np.where(pixels.parted(self.hits) | self.clipped | self.stopped, cut, share)
-        return share * self._whole(reach.max())
+        cut, unseen = (
+            dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[nodes])) for share in (CUT, UNSEEN)
+        )
+        share = dr.select(self.grid.grow(self.grid.outline(self.hits, 1), reach - 1), unseen, 0)
+        share = dr.select(parted(self.hits) | self.clipped | self.stopped, cut, share)
+        return share * self._whole(reach)
 
     def unseen_by_chords(self, split: Mask) -> Image:
         """What four chords may be wrong by near pixels they are `split` on and where they meet no jump themselves."""
         reach = self.reach("chords")
-        near = pixels.grow(split, reach) & ~split
-        return np.where(near, UNSEEN_BY_CHORDS * self._whole(reach.max()), 0)
+        near = self.grid.grow(split, reach) & ~split
+        return dr.select(near, UNSEEN_BY_CHORDS * self._whole(reach), 0)
 
-    def _whole(self, reach: int) -> Image:
-        """Largest value within `reach` pixels, if no line of sight missed."""
-        whole = np.divide(self.value, self.hits, out=np.zeros_like(self.value), where=self.hits > pixels.ROUNDING)
-        return pixels.spread_max(whole, reach)
+    def _whole(self, reach: mi.Int) -> Image:
+        """Largest value within the largest `reach`, if no line of sight missed."""
+        whole = dr.select(self.hits > ROUNDING, self.value / self.hits, 0)
+        return self.grid.spread_max(whole, int(dr.max(reach)[0]))
 
 
 def chunks(index: Index, size: int) -> list[Index]:
     """Runs of at most `size` of the listed pixels."""
-    return [index[k : k + size] for k in range(0, len(index), size)]
+    count = dr.width(index)
+    if count <= size:
+        return [index] if count else []
+    starts = range(0, count, size)
+    return [
+        dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, min(size, count - k)) + dr.opaque(mi.UInt32, k)) for k in starts
+    ]

@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import pixels
 from ..optics import Lens
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import SHORTCUTS, Finding
 from . import pupil_form, surface_form
 from .checks import check_scene
+from .grid import Grid
 from .intersections import robust_scene
 from .narrow import NarrowLight, narrow_light
 from .recording import recording
@@ -140,7 +140,9 @@ def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
     """What lines of sight that float32 moves by `rounding` [pixels] may change; by less they move at random."""
     if rounding < ROUNDING or min(power.shape) == 0:
         return np.zeros_like(power)
-    return rounding * pixels.spread_max(np.hypot(*pixels.gradient(power)))
+    grid = Grid(power.shape)
+    x, y = grid.gradient(grid.lanes(power))
+    return rounding * grid.array(grid.spread_max(dr.sqrt(x * x + y * y)))
 
 
 def _outside(window: Window) -> Finding:

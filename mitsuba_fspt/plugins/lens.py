@@ -208,14 +208,14 @@ class FsptLens(mi.Sensor):
 
     # ------------------------------------------------------------------ what the film can see, in double precision
 
-    def blur_radius(self, depth: NDArray[np.float64]) -> NDArray[np.float64]:
+    def blur_radius(self, depth: mi.Float64) -> mi.Float64:
         """Radius [pixels] of the blur disc of a point at `depth` z [mm] from the lens plane; inf at z <= 0."""
-        disc, u = self.optics.discs[0], self.optics.focus_distance
-        back = (u - np.asarray(depth, np.float64)) / u
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1 - (1 - disc.shift) * back
-            radius = self._spread * disc.radius * np.abs(back) / (scale * self.virtual_pitch)
-        return np.where(scale > 0, np.nan_to_num(radius, nan=np.inf), np.inf)
+        disc = self.optics.discs[0]
+        u, shift, radius = (dr.opaque(mi.Float64, n) for n in (self.optics.focus_distance, disc.shift, disc.radius))
+        back = (u - depth) / u
+        scale = 1 - (1 - shift) * back
+        blur = dr.opaque(mi.Float64, self._spread) * radius * dr.abs(back) / (scale * dr.opaque(mi.Float64, self.virtual_pitch))
+        return dr.select((scale > 0) & ~dr.isnan(blur), blur, dr.inf)
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; inf: nothing bounds it."""
@@ -228,7 +228,7 @@ class FsptLens(mi.Sensor):
         scale = 1 - (1 - disc.shift) * (u - p[..., 2:]) / u
         scale = np.where(scale > 0, scale, 1)  # there the radius is infinite
         centre = 0.5 * np.array(self.film().size(), np.float64) - p[..., :2] / (scale * self.virtual_pitch)
-        return centre, self.blur_radius(p[..., 2:])
+        return centre, self.blur_radius(mi.Float64(p[..., 2].ravel())).numpy().reshape(p[..., 2:].shape)
 
     # ------------------------------------------------------------------ Mitsuba's sensor interface
 

@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import pixels
 from .elements import Elements, at_one_wavelength, elements_of, scalar
+from .grid import Grid
 from .window import Window
 
 OUTSHINES = 2.0  # an element is narrow if it is so many times brighter than any pixel around, seen sharp
@@ -71,8 +71,9 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
 def _hidden(radiance: Column, area: Column, x: Column, y: Column) -> NDArray[np.bool_]:
     """True of elements that outshine the pixels around, few enough for all lines of sight to miss them."""
     power, row, column = _grid(radiance * area, x, y)
-    narrow = radiance > OUTSHINES * pixels.spread_max(power)[row, column]
-    spots = pixels.box_sum(_grid(area * narrow, x, y)[0], AROUND)
+    grid = Grid(power.shape)
+    narrow = radiance > OUTSHINES * grid.array(grid.spread_max(grid.lanes(power)))[row, column]
+    spots = grid.array(grid.box_sum(grid.lanes(_grid(area * narrow, x, y)[0]), AROUND))
     return narrow & (spots[row, column] < SEEN)
 
 
@@ -91,7 +92,8 @@ def _spread(light: Column, x: Column, y: Column, reach: int, shape: tuple[int, i
     on = (row >= 0) & (row < height + 2 * reach) & (column >= 0) & (column < width + 2 * reach)
     sums = np.zeros((height + 2 * reach, width + 2 * reach))
     np.add.at(sums, (row[on], column[on]), light[on])
-    return pixels.box_sum(sums, reach)[reach : reach + height, reach : reach + width]
+    grid = Grid(sums.shape)
+    return grid.array(grid.box_sum(grid.lanes(sums), reach))[reach : reach + height, reach : reach + width]
 
 
 def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-import drjit as dr
-import numpy as np
+from typing import TYPE_CHECKING
 
-from .. import pixels, rules
+import drjit as dr
+import mitsuba as mi
+
+from .. import rules
 from ..shortcuts import Finding
-from .draft import LANES, Draft, Image, Mask, chunks
+from .draft import LANES, Draft, chunks
+from .grid import ROUNDING
 from .lines import apply_rule
+
+if TYPE_CHECKING:
+    from .grid import Image, Mask
 
 POINT = 0.1  # of rtol: what the curvature of cos⁴θ over the pupil may make
 IN_PIXEL = 0.5  # blur radius that stays in the pixel
@@ -20,38 +26,39 @@ LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more th
 
 def first_nodes(draft: Draft) -> Mask:
     """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
+    grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
-    everything = np.ones(draft.window.shape, bool)
+    everything = grid.full(mi.Bool, True)
     value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule, everything)
-    if len(rule) == 1 and not draft.hits.any():  # what glows is thinner than a pixel
+    if len(rule) == 1 and not dr.any(draft.hits > 0):  # what glows is thinner than a pixel
         rule = rules.four(draft.area)
         value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule, everything)
     draft.set_blur(farthest)
-    draft.value = value = np.where(draft.open, value, draft.known)
+    draft.value = value = dr.select(draft.open, value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
     square = 16 * (mx * mx + my * my)
-    bend = np.abs(contrast)
-    bend += np.divide(square * square, 4 * value * value * value, out=np.zeros_like(value), where=value > 0)
+    bend = dr.abs(contrast) + dr.select(value > 0, square * square / (4 * value * value * value), 0)
     neighbours = draft.area or len(rule) == 1  # tell how the picture bends
     if neighbours:
-        xx, yy = pixels.second_differences(value)
-        xxxx, yyyy = pixels.second_differences(xx)[0], pixels.second_differences(yy)[1]
-        bend += (np.abs(xxxx) + np.abs(yyyy)) / 12
+        xx, yy = grid.second_differences(value)
+        xxxx, yyyy = grid.second_differences(xx)[0], grid.second_differences(yy)[1]
+        bend += (dr.abs(xxxx) + dr.abs(yyyy)) / 12
         if len(rule) == 1:
             more = rules.one_spread(xx + yy, draft.blur, draft.area)
         else:
-            turn = rules.four_turn(pixels.gradient(mx)[1] - pixels.gradient(my)[0], xx + yy)
-            more = -pixels.mean_where(turn, ~pixels.outline(draft.hits, 1), TURN_REACH)
-        draft.value = np.maximum(value + np.where(draft.hits > 1 - pixels.ROUNDING, more, 0), 0)
-    bend = pixels.spread_max(bend)
-    draft.error = np.maximum(bend, draft.cut_off(len(rule)))
-    rough = (draft.error > draft.tolerance) | (bend > SETTLED * draft.tolerance)
-    unmet = not draft.hits.any()  # what glows is on the film, or may be
-    if (neighbours and min(rough.shape) < 3) or unmet or not draft.quadrature.takes("smooth"):
-        rough[:] = True
+            turn = rules.four_turn(grid.gradient(mx)[1] - grid.gradient(my)[0], xx + yy)
+            more = -grid.mean_where(turn, ~grid.outline(draft.hits, 1), TURN_REACH)
+        draft.value = dr.maximum(value + dr.select(draft.hits > 1 - ROUNDING, more, 0), 0)
+    bend = grid.spread_max(bend)
+    draft.error = dr.maximum(bend, draft.cut_off(len(rule)))
+    tolerance = draft.tolerance
+    rough = (draft.error > tolerance) | (bend > SETTLED * tolerance)
+    unmet = not dr.any(draft.hits > 0)  # what glows is on the film, or may be
+    if (neighbours and min(grid.shape) < 3) or unmet or not draft.quadrature.takes("smooth"):
+        rough = everything
     rough = draft.grown(rough & draft.open, len(rule)) & draft.open
-    smooth = int(np.count_nonzero(~rough & (draft.hits > 0)))
-    why = f"{smooth} of {rough.size} pixels see the surface, smooth and no edge of it"
+    smooth = int(dr.count(~rough & (draft.hits > 0))[0])
+    why = f"{smooth} of {len(grid)} pixels see the surface, smooth and no edge of it"
     draft.findings.append(Finding("smooth", smooth > 0, why))
     return rough
 
@@ -62,15 +69,15 @@ def twelve_nodes(draft: Draft, rough: Mask) -> Mask:
     Returns the pixels that twelve do not settle either. Four nodes cannot see all that they miss, so a lattice of
     pixels is probed with twelve: what four were off by there counts for the pixels around.
     """
-    probes = pixels.lattice(rough.shape) & (draft.hits > 0) & ~rough & draft.open
+    probes = draft.grid.lattice() & (draft.hits > 0) & ~rough & draft.open
     difference = _refine(draft, rough | probes)
-    doubt = pixels.spread_over_lattice(np.where(probes, difference, 0))
-    draft.error = np.where(rough, draft.error, np.maximum(draft.error, doubt))
+    doubt = draft.grid.spread_over_lattice(dr.select(probes, difference, 0))
+    draft.error = dr.select(rough, draft.error, dr.maximum(draft.error, doubt))
     misled = ~rough & (draft.hits > 0) & (draft.error > draft.tolerance) & draft.open
-    if misled.any():
+    if dr.any(misled):
         _refine(draft, misled & ~probes)
     rough = rough | misled
-    if not draft.hits.any():
+    if not dr.any(draft.hits > 0):
         return rough
     return rough & draft.grown(rough & (draft.error > draft.tolerance), 12)
 
@@ -91,27 +98,29 @@ def _one_will_do(draft: Draft) -> bool:
 def _refine(draft: Draft, where: Mask) -> Image:
     """Twelve nodes on the marked pixels; returns how far the first ones were off there, 0 elsewhere."""
     value, _, _, _, hits, nearest, _ = _apply(draft, rules.twelve(draft.area), where)
-    difference = np.where(where, np.abs(value - draft.value), 0)
-    draft.change = np.maximum(draft.change, difference)
+    difference = dr.select(where, dr.abs(value - draft.value), 0)
+    draft.change = dr.maximum(draft.change, difference)
     # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
-    gain = np.divide(8 * difference, draft.error, out=np.ones_like(value), where=draft.error > 0)
-    draft.value = np.where(where, value, draft.value)
-    draft.hits = np.where(where, hits, draft.hits)
-    draft.nearest = np.minimum(draft.nearest, nearest)
-    error = np.maximum(pixels.spread_max(difference * np.clip(gain, LEAST_GAIN, 1)), draft.error / MOST_GAIN)
-    draft.error = np.where(where, np.maximum(error, draft.cut_off(12)), draft.error)
+    gain = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
+    draft.value = dr.select(where, value, draft.value)
+    draft.hits = dr.select(where, hits, draft.hits)
+    draft.nearest = dr.minimum(draft.nearest, nearest)
+    error = dr.maximum(
+        draft.grid.spread_max(difference * dr.clip(gain, LEAST_GAIN, 1)), draft.error / MOST_GAIN
+    )
+    draft.error = dr.select(where, dr.maximum(error, draft.cut_off(12)), draft.error)
     return difference
 
 
 def _apply(draft: Draft, rule: rules.Rule, where: Mask) -> list[Image]:
     """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
-    index = np.flatnonzero(where).astype(np.uint32)
-    fills = (0, 0, 0, 0, 0, np.inf, 0)
-    images = [np.full(where.size, fill, dtype=np.float64) for fill in fills]
+    index = dr.compress(where)
+    images = [draft.grid.full(mi.Float64, fill) for fill in (0, 0, 0, 0, 0, dr.inf, 0)]
     for part in chunks(index, LANES):
         sums = apply_rule(draft.scene, draft.lens, draft.window.centres(part), rule)
-        dr.eval(sums)
         for image, column in zip(images, sums, strict=True):
-            image[part] = column.numpy()
-    draft.count(f"{len(rule)} nodes", len(index), len(index) * len(rule))
-    return [image.reshape(where.shape) for image in images]
+            dr.scatter(image, mi.Float64(column), part)
+        dr.eval(images)
+    count = dr.width(index)
+    draft.count(f"{len(rule)} nodes", count, count * len(rule))
+    return images

@@ -8,19 +8,23 @@ own, so that only smooth averages are left to sample.
 
 from __future__ import annotations
 
-import math
+from typing import TYPE_CHECKING
 
+import drjit as dr
 import mitsuba as mi
-import numpy as np
-from numpy.typing import NDArray
 
 from .. import rules
 from ..quadrature import Quadrature, Solution
 from .chords import integrate_by_chords
 from .draft import LANES, Draft, chunks
+from .grid import Grid
 from .lines import apply_rule
 from .nodes import first_nodes, twelve_nodes
 from .window import Window, visible_window
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 FEWEST = 16  # lines of sight a pixel, without which four must do
 
@@ -34,11 +38,11 @@ def solve(
     and what comes back is rough.
     """
     draft = Draft(scene, lens, window, quadrature, known)
-    if draft.value.size:
+    if len(draft.grid):
         rough = first_nodes(draft)
         if quadrature.max_nodes >= FEWEST:
             rough = twelve_nodes(draft, rough)
-            if rough.any():
+            if dr.any(rough):
                 integrate_by_chords(draft, rough)
     return draft.solution()
 
@@ -46,6 +50,9 @@ def solve(
 def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
     """Share of each pixel's lines of sight that meet a surface, by twelve of them; shape (h, w)."""
     window = visible_window(scene, lens)
-    index = np.arange(math.prod(window.shape), dtype=np.uint32)
-    hits = [apply_rule(scene, lens, window.centres(part), rules.twelve(True))[4] for part in chunks(index, LANES)]
-    return window.expand(np.concatenate([np.zeros(0), *(h.numpy() for h in hits)]).reshape(window.shape))
+    grid = Grid(window.shape)
+    image = grid.full(mi.Float64, 0)
+    for part in chunks(grid.number, LANES):
+        hits = apply_rule(scene, lens, window.centres(part), rules.twelve(True))[4]
+        dr.scatter(image, mi.Float64(hits), part)
+    return window.expand(grid.array(image))

@@ -14,13 +14,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import pixels
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import Finding
 from .convexity import hides_nothing
 from .elements import scalar
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow, film_corner
+from .grid import Grid
 from .window import Window
 
 FIRST_LINES, GROWTH = 16, 4  # lines of sight a pixel of the image at the first level; times this each level
@@ -77,11 +77,11 @@ class _Refinement:
         lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * GROWTH)
         if mark.any():
             self.value, self.hits = (np.where(where, image, 0) for image in self._level(lines, mark))
-        recent = np.zeros_like(self.value)
+        recent, grid = np.zeros_like(self.value), Grid(self.window.shape)
         while mark.any() and (lines := lines * GROWTH) <= most:
             value, hits = self._level(lines, mark)
             change = np.where(mark, np.abs(value - self.value), 0)
-            recent, last = SAFETY * pixels.spread_max(change), recent
+            recent, last = SAFETY * grid.array(grid.spread_max(grid.lanes(change))), recent
             # Levels refine pieces and cells by turns: half of what the level before changed may yet be to come.
             estimate = np.maximum(recent, 0.5 * last)
             # All elements with light on a marked pixel were refined: only there is the new picture whole.

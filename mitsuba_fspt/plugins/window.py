@@ -32,9 +32,8 @@ class Window:
     crop_offset: tuple[int, int]
     blur: float
 
-    def centres(self, index: NDArray[np.uint32]) -> mi.Point2f:
-        """Film positions [pixels] of the centres of the window's pixels with flat number `index`."""
-        number = mi.UInt32(index)
+    def centres(self, number: mi.UInt32) -> mi.Point2f:
+        """Film positions [pixels] of the centres of the window's pixels of so much `number`, row by row."""
         width = dr.opaque(mi.UInt32, self.shape[1])
         left = dr.opaque(mi.Float, self.left + self.crop_offset[0] + 0.5)
         top = dr.opaque(mi.Float, self.top + self.crop_offset[1] + 0.5)

@@ -1,0 +1,162 @@
+"""Neighbourhoods on the pixel grid: which pixels lie near marked ones, and which way an image changes."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    Image = mi.Float64  # of h · w lanes, row by row; masks likewise
+    Mask = mi.Bool
+
+ROUNDING = 1e-4  # of a share of hits: a sum of float32 weights
+BLOCK = 4  # side of the blocks of pixels, each of which holds one of the lattice
+
+
+class Grid:
+    """The pixels of a picture of `shape` (h, w); an image on it is one array of h · w lanes, row by row.
+
+    Sizes and radii reach kernels as data: pictures of all shapes share them.
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.shape = shape
+        self.number = dr.arange(mi.UInt32, math.prod(shape))
+        self._height, self._width = (dr.opaque(mi.Int, side) for side in shape)
+        self.y = mi.Int(self.number) // self._width
+        self.x = mi.Int(self.number) - self.y * self._width
+        dr.eval(self.number, self.x, self.y)
+
+    def __len__(self) -> int:
+        return math.prod(self.shape)
+
+    def full(self, kind: type, value: Any) -> Any:
+        """An image that has the same value everywhere."""
+        return dr.full(kind, value, len(self))
+
+    def lanes(self, array: NDArray[Any]) -> Any:
+        """Image or mask from an array (h, w)."""
+        flat = np.ascontiguousarray(array).ravel()
+        return mi.Bool(flat) if flat.dtype == bool else mi.Float64(flat)
+
+    def array(self, image: Any) -> NDArray[Any]:
+        """Array (h, w) of an image or mask."""
+        return np.asarray(image.numpy()).reshape(self.shape)
+
+    # ------------------------------------------------------------------ neighbours
+
+    def at(self, image: Any, x: mi.Int, y: mi.Int) -> Any:
+        """Values of an image at pixels (x, y); beside the grid that of the nearest one on it."""
+        x, y = dr.clip(x, 0, self._width - 1), dr.clip(y, 0, self._height - 1)
+        return dr.gather(type(image), image, mi.UInt32(y * self._width + x))
+
+    def spread_max(self, image: Any, radius: int = 1) -> Any:
+        """Largest value within `radius` pixels (square) of each."""
+        larger = operator.or_ if dr.is_mask_v(image) else dr.maximum
+        for (dx, dy), side in (((1, 0), self.shape[1]), ((0, 1), self.shape[0])):
+            reach = 0
+            while reach < min(radius, side - 1):
+                # As far as it goes already once more, and no gap opens.
+                step = min(reach + 1, radius - reach)
+                k = dr.opaque(mi.Int, step)
+                sides = (self.at(image, self.x + s * dx * k, self.y + s * dy * k) for s in (-1, 1))
+                image = larger(image, larger(*sides))
+                dr.eval(image)
+                reach += step
+        return image
+
+    def dilate(self, mask: Mask, radius: int) -> Mask:
+        """True within `radius` pixels (square) of a marked pixel."""
+        return self.spread_max(mask, radius)
+
+    def grow(self, mask: Mask, reach: mi.Int) -> Mask:
+        """True within `reach` pixels (square) of a marked pixel, each with its own; up to 1.5 times as far."""
+        grown = self.full(mi.Bool, False)
+        most, radius, last = int(dr.max(dr.select(mask, reach, -1))[0]), 1, -1
+        while last < most:
+            near = mask & (reach > dr.opaque(mi.Int, last)) & (reach <= dr.opaque(mi.Int, radius))
+            grown |= self.dilate(near, radius)
+            last, radius = radius, radius + max(1, radius // 2)
+        return grown
+
+    def box_sum(self, image: Image, radius: int) -> Image:
+        """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
+        reach = dr.opaque(mi.Int, radius)
+        rows = _sliding_sum(image, self.y * self._width, self.x, self._width, reach)
+        number = mi.Int(self.number)
+        column = number // self._height
+        turned = dr.gather(mi.Float64, rows, mi.UInt32((number - column * self._height) * self._width + column))
+        return _sliding_sum(turned, self.x * self._height, self.y, self._height, reach)
+
+    def mean_where(self, image: Image, mask: Mask, radius: int) -> Image:
+        """Mean of the marked pixels among the (2 radius + 1)² around each; 0 where there is none."""
+        total = self.box_sum(dr.select(mask, image, 0), radius)
+        count = self.box_sum(dr.select(mask, mi.Float64(1), 0), radius)
+        return dr.select(count > 0.5, total / count, 0)
+
+    # ------------------------------------------------------------------ one pixel of sixteen
+
+    def lattice(self) -> Mask:
+        """True on one pixel of sixteen, in every row and column at other places than in the next (rank-1 lattice)."""
+        return ((self.x - 5 * self.y) & (BLOCK * BLOCK - 1)) == 0
+
+    def spread_over_lattice(self, image: Image) -> Image:
+        """Largest value among the 3 × 3 blocks of 4 × 4 pixels around each pixel's block: some lie on the lattice."""
+        blocks = Grid((-(-self.shape[0] // BLOCK), -(-self.shape[1] // BLOCK)))
+
+        def largest(k: mi.Int, value: Image) -> tuple:
+            x, y = BLOCK * blocks.x + k % BLOCK, BLOCK * blocks.y + k // BLOCK
+            return k + 1, dr.maximum(value, self.at(image, x, y))
+
+        start = (mi.Int(0), blocks.full(mi.Float64, -dr.inf))
+        _, most = dr.while_loop(start, lambda k, value: k < BLOCK * BLOCK, largest)
+        return blocks.at(blocks.spread_max(most), self.x // BLOCK, self.y // BLOCK)
+
+    # ------------------------------------------------------------------ how an image changes
+
+    def gradient(self, image: Image) -> tuple[Image, Image]:
+        """Central differences along x and y, one-sided at the border; 0 along an axis of a single pixel."""
+        x, y = self.x, self.y
+        left, right = dr.maximum(x - 1, 0), dr.minimum(x + 1, self._width - 1)
+        top, bottom = dr.maximum(y - 1, 0), dr.minimum(y + 1, self._height - 1)
+        along_x = (self.at(image, right, y) - self.at(image, left, y)) / mi.Float64(dr.maximum(right - left, 1))
+        along_y = (self.at(image, x, bottom) - self.at(image, x, top)) / mi.Float64(dr.maximum(bottom - top, 1))
+        return along_x, along_y
+
+    def second_differences(self, image: Image) -> tuple[Image, Image]:
+        """P(k - 1) - 2 P(k) + P(k + 1) along x and y; an outermost pixel takes its neighbour's, 0 on less than three."""
+        x, y = dr.clip(self.x, 1, self._width - 2), dr.clip(self.y, 1, self._height - 2)
+        along_x = self.at(image, x - 1, self.y) - 2 * self.at(image, x, self.y) + self.at(image, x + 1, self.y)
+        along_y = self.at(image, self.x, y - 1) - 2 * self.at(image, self.x, y) + self.at(image, self.x, y + 1)
+        return dr.select(self._width > 2, along_x, 0), dr.select(self._height > 2, along_y, 0)
+
+    def principal_angle(self, x: Image, y: Image, radius: int) -> Image:
+        """Angle of the axis along which the vectors (x, y) of a neighbourhood mostly point (structure tensor)."""
+        cross, along = self.box_sum(x * y, radius), self.box_sum(x * x - y * y, radius)
+        return 0.5 * dr.atan2(2 * cross, along)
+
+    # ------------------------------------------------------------------ silhouettes
+
+    def outline(self, hits: Image, reach: int) -> Mask:
+        """True within `reach` pixels of both a hit and a miss, where lines of sight may pass a silhouette."""
+        return self.dilate(hits > ROUNDING, reach) & self.dilate(hits < 1 - ROUNDING, reach)
+
+
+def parted(hits: Image) -> Mask:
+    """True where some lines of sight of a pixel hit and some miss."""
+    return (hits > ROUNDING) & (hits < 1 - ROUNDING)
+
+
+def _sliding_sum(image: Image, start: mi.Int, place: mi.Int, length: mi.Int, reach: mi.Int) -> Image:
+    """Sums within `reach` of a `place` along lines of pixels that are stored from `start` on and have a `length`."""
+    total = dr.cumsum(image)
+    last = start + dr.minimum(place + reach, length - 1)
+    before = start + dr.maximum(place - reach, 0) - 1
+    upto = dr.gather(mi.Float64, total, mi.UInt32(dr.maximum(before, 0)), before >= 0)
+    return dr.gather(mi.Float64, total, mi.UInt32(last)) - upto
