@@ -1,15 +1,19 @@
-"""Node rules of the pupil form: where lines of sight cross pupil and pixel, and their weights. Pure NumPy.
+"""Node rules of the pupil form: where lines of sight cross pupil and pixel, and their weights.
 
 A rule integrates over the unit disc (pupil) times the square [-½, ½]² (pixel), both with measure 1.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+Image = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ def four(area: bool) -> Rule:
     return Rule(_polar(np.sqrt(0.5), angle), _polar(step, angle + np.pi / 2), np.full(4, 0.25), contrast)
 
 
-def one_spread(laplacian: NDArray[np.float64], blur: NDArray[np.float64], area: bool) -> NDArray[np.float64]:
+def one_spread(laplacian: Image, blur: Image, area: bool) -> Image:
     """What `one` has too little: half the second moments of pixel and blur disc along each axis, 1/12 and r²/4.
 
     `laplacian` of the picture [1/pixels²], `blur` r [pixels].
@@ -53,13 +57,13 @@ def one_spread(laplacian: NDArray[np.float64], blur: NDArray[np.float64], area: 
     return (float(area) / 24 + blur**2 / 8) * laplacian
 
 
-def four_turn(curl: NDArray[np.float64], laplacian: NDArray[np.float64]) -> NDArray[np.float64]:
+def four_turn(curl: Image, laplacian: Image) -> Image:
     """What `four` has too much where the blur changes over the picture; `curl` is ∂M_x/∂y - ∂M_y/∂x of its moments.
 
     Steps at right angles leave c (∂²f/∂a_x∂y - ∂²f/∂a_y∂x), c = Σ w a_x y = √3/12, of pupil a and pixel (x, y). The
     moments over the pupil are M = ¼ ∂f/∂a + c (∂f/∂y, -∂f/∂x), so that their curl over the picture holds it.
     """
-    c = np.sqrt(3) / 12
+    c = math.sqrt(3) / 12
     return 4 * c * (curl - c * laplacian)
 
 

@@ -131,6 +131,8 @@ def _doubled_faces(positions: mi.Float, faces: mi.UInt32) -> int:
 
 def check_outside(scene: mi.Scene, lens: mi.Sensor) -> None:
     """Raise SceneError where the lens centre is inside a closed surface: all around it shows its inward side."""
+    if not scene.bbox().contains(mi.ScalarPoint3f(lens.placement[3:12:4])):
+        return
     directions = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], np.float32)
     # Turned a little, so that no direction runs along the faces of an axis-aligned box.
     rays = mi.Ray3f(lens.world_transform() @ mi.Point3f(0, 0, 0), dr.normalize(mi.Vector3f(directions.T + 0.1234)))

@@ -25,9 +25,7 @@ LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
 def integrate_by_chords(draft: Draft, rough: Mask) -> None:
     """More chords each round on the pixels that the last round still moved, or moved a neighbour of."""
     where = rough
-    angle = draft.grid.principal_angle(
-        *draft.grid.gradient(draft.value), 1 + math.ceil(dr.max(draft.blur)[0] / 2)
-    )
+    angle = draft.grid.principal_angle(*draft.grid.gradient(draft.value), 1 + math.ceil(dr.max(draft.blur)[0] / 2))
     across_pupil = _across_pupil(draft)
     split, count = draft.grid.full(mi.Bool, False), 0
     for level, (m, q) in enumerate(rules.CHORD_LEVELS):

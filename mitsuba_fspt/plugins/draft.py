@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -140,5 +140,6 @@ def chunks(index: Index, size: int) -> list[Index]:
         return [index] if count else []
     starts = range(0, count, size)
     return [
-        dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, min(size, count - k)) + dr.opaque(mi.UInt32, k)) for k in starts
+        dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, min(size, count - k)) + dr.opaque(mi.UInt32, k))
+        for k in starts
     ]

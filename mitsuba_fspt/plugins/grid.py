@@ -1,9 +1,11 @@
-"""Neighbourhoods on the pixel grid: which pixels lie near marked ones, and which way an image changes."""
+"""Neighbourhoods on the pixel grid as kernels: which pixels lie near marked ones, and which way an image changes."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -16,11 +18,12 @@ if TYPE_CHECKING:
     Mask = mi.Bool
 
 ROUNDING = 1e-4  # of a share of hits: a sum of float32 weights
+AROUND = [(dx, dy) for dx, dy in itertools.product((-1, 0, 1), repeat=2) if (dx, dy) != (0, 0)]
 BLOCK = 4  # side of the blocks of pixels, each of which holds one of the lattice
 
 
 class Grid:
-    """The pixels of a picture of `shape` (h, w); an image on it is one array of h · w lanes, row by row.
+    """The pixels of a picture of `shape` (h, w), at least one; an image on it is one array of h · w lanes, row by row.
 
     Sizes and radii reach kernels as data: pictures of all shapes share them.
     """
@@ -31,7 +34,9 @@ class Grid:
         self._height, self._width = (dr.opaque(mi.Int, side) for side in shape)
         self.y = mi.Int(self.number) // self._width
         self.x = mi.Int(self.number) - self.y * self._width
-        dr.eval(self.number, self.x, self.y)
+        # Numbers of the neighbours, which are asked for again and again.
+        self._around = {(dx, dy): self._index(self.x + dx, self.y + dy) for dx, dy in AROUND}
+        dr.eval(self.number, self.x, self.y, self._around)
 
     def __len__(self) -> int:
         return math.prod(self.shape)
@@ -53,22 +58,28 @@ class Grid:
 
     def at(self, image: Any, x: mi.Int, y: mi.Int) -> Any:
         """Values of an image at pixels (x, y); beside the grid that of the nearest one on it."""
-        x, y = dr.clip(x, 0, self._width - 1), dr.clip(y, 0, self._height - 1)
-        return dr.gather(type(image), image, mi.UInt32(y * self._width + x))
+        return dr.gather(type(image), image, self._index(x, y))
+
+    def _index(self, x: mi.Int, y: mi.Int) -> mi.UInt32:
+        return mi.UInt32(dr.clip(y, 0, self._height - 1) * self._width + dr.clip(x, 0, self._width - 1))
+
+    def _neighbours(self, image: Any, step: int = 1) -> dict[tuple[int, int], Any]:
+        """Values `step` pixels away along (dx, dy), all eight."""
+        if step == 1:
+            return {way: dr.gather(type(image), image, index) for way, index in self._around.items()}
+        k = dr.opaque(mi.Int, step)
+        return {(dx, dy): self.at(image, self.x + dx * k, self.y + dy * k) for dx, dy in AROUND}
 
     def spread_max(self, image: Any, radius: int = 1) -> Any:
         """Largest value within `radius` pixels (square) of each."""
         larger = operator.or_ if dr.is_mask_v(image) else dr.maximum
-        for (dx, dy), side in (((1, 0), self.shape[1]), ((0, 1), self.shape[0])):
-            reach = 0
-            while reach < min(radius, side - 1):
-                # As far as it goes already once more, and no gap opens.
-                step = min(reach + 1, radius - reach)
-                k = dr.opaque(mi.Int, step)
-                sides = (self.at(image, self.x + s * dx * k, self.y + s * dy * k) for s in (-1, 1))
-                image = larger(image, larger(*sides))
-                dr.eval(image)
-                reach += step
+        reach, most = 0, min(radius, max(self.shape) - 1)
+        while reach < most:
+            # As far as it goes already once more, and no gap opens.
+            step = min(reach + 1, most - reach)
+            image = reduce(larger, self._neighbours(image, step).values(), image)
+            dr.eval(image)
+            reach += step
         return image
 
     def dilate(self, mask: Mask, radius: int) -> Mask:
@@ -76,13 +87,17 @@ class Grid:
         return self.spread_max(mask, radius)
 
     def grow(self, mask: Mask, reach: mi.Int) -> Mask:
-        """True within `reach` pixels (square) of a marked pixel, each with its own; up to 1.5 times as far."""
+        """True within `reach` pixels (square) of a marked pixel, each with its own; at least 1, up to 1.5 times it."""
+        most = int(dr.max(dr.select(mask, reach, 0))[0])
+        radii = [0, 1]
+        while radii[-1] < most:
+            radii.append(radii[-1] + max(1, radii[-1] // 2))
+        # The farthest begin, and go on together with those that reach less far.
         grown = self.full(mi.Bool, False)
-        most, radius, last = int(dr.max(dr.select(mask, reach, -1))[0]), 1, -1
-        while last < most:
-            near = mask & (reach > dr.opaque(mi.Int, last)) & (reach <= dr.opaque(mi.Int, radius))
-            grown |= self.dilate(near, radius)
-            last, radius = radius, radius + max(1, radius // 2)
+        for low, high in reversed(list(itertools.pairwise(radii))):
+            more = reach > dr.opaque(mi.Int, low if low else -1)
+            grown |= mask & more & (reach <= dr.opaque(mi.Int, high))
+            grown = self.dilate(grown, high - low)
         return grown
 
     def box_sum(self, image: Image, radius: int) -> Image:
@@ -96,9 +111,22 @@ class Grid:
 
     def mean_where(self, image: Image, mask: Mask, radius: int) -> Image:
         """Mean of the marked pixels among the (2 radius + 1)² around each; 0 where there is none."""
-        total = self.box_sum(dr.select(mask, image, 0), radius)
-        count = self.box_sum(dr.select(mask, mi.Float64(1), 0), radius)
-        return dr.select(count > 0.5, total / count, 0)
+        sums = dr.select(mask, image, 0), dr.select(mask, mi.Float64(1), 0)
+        for dx, dy in ((1, 0), (0, 1)):
+            dr.eval(sums)
+            near = [self._beside(sums, k * dx, k * dy) for k in range(-radius, radius + 1)]
+            sums = tuple(sum(column) for column in zip(*near, strict=True))
+        total, count = sums
+        mean = dr.select(count > 0, total / count, 0)
+        dr.eval(mean)
+        return mean
+
+    def _beside(self, images: tuple[Image, ...], dx: int, dy: int) -> list[Image]:
+        """Values (dx, dy) pixels away, 0 beside the grid."""
+        x, y = self.x + dx, self.y + dy
+        here = (x >= 0) & (x < self._width) & (y >= 0) & (y < self._height)
+        index = self._index(x, y)
+        return [dr.gather(mi.Float64, image, index, here) for image in images]
 
     # ------------------------------------------------------------------ one pixel of sixteen
 
@@ -122,15 +150,13 @@ class Grid:
 
     def gradient(self, image: Image) -> tuple[Image, Image]:
         """Central differences along x and y, one-sided at the border; 0 along an axis of a single pixel."""
-        x, y = self.x, self.y
-        left, right = dr.maximum(x - 1, 0), dr.minimum(x + 1, self._width - 1)
-        top, bottom = dr.maximum(y - 1, 0), dr.minimum(y + 1, self._height - 1)
-        along_x = (self.at(image, right, y) - self.at(image, left, y)) / mi.Float64(dr.maximum(right - left, 1))
-        along_y = (self.at(image, x, bottom) - self.at(image, x, top)) / mi.Float64(dr.maximum(bottom - top, 1))
-        return along_x, along_y
+        near = self._neighbours(image)
+        at_border = [(n == 0) | (n == side - 1) for n, side in ((self.x, self._width), (self.y, self._height))]
+        along_x, along_y = near[1, 0] - near[-1, 0], near[0, 1] - near[0, -1]
+        return along_x * dr.select(at_border[0], 1.0, 0.5), along_y * dr.select(at_border[1], 1.0, 0.5)
 
     def second_differences(self, image: Image) -> tuple[Image, Image]:
-        """P(k - 1) - 2 P(k) + P(k + 1) along x and y; an outermost pixel takes its neighbour's, 0 on less than three."""
+        """P(k - 1) - 2 P(k) + P(k + 1) along x and y; the outermost take their neighbours', 0 on less than three."""
         x, y = dr.clip(self.x, 1, self._width - 2), dr.clip(self.y, 1, self._height - 2)
         along_x = self.at(image, x - 1, self.y) - 2 * self.at(image, x, self.y) + self.at(image, x + 1, self.y)
         along_y = self.at(image, self.x, y - 1) - 2 * self.at(image, self.x, y) + self.at(image, self.x, y + 1)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optics import Lens
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import SHORTCUTS, Finding
 from . import pupil_form, surface_form
@@ -19,7 +20,7 @@ from .grid import Grid
 from .intersections import robust_scene
 from .narrow import NarrowLight, narrow_light
 from .recording import recording
-from .window import Window, visible_window
+from .window import Window, glowing_boxes, window_of
 
 ROUNDING = 1e-3  # pixels; more only far from the world's origin
 NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
@@ -67,7 +68,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         )
         # What was found out about the last scene; the scene itself, whose child this is, must not be kept.
         self._sound: list[mi.Emitter] = []
-        self._narrow: tuple[object, Lens, NarrowLight] | None = None
+        self._window, self._narrow = Memory(), Memory()
 
     def solve(self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None) -> Solution:
         """Power, error and coverage of the sensor's crop window, with another `quadrature` than the integrator's own.
@@ -78,13 +79,15 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         check_scene(scene, sensor)
         with recording(), dr.suspend_grad():
             traced = self._traced(scene, sensor)
-            window = visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
+            window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
             solution = self._solve_in(window, traced, sensor, quadrature)
         error = solution.error + _moved(solution.power, sensor.rounding)
         return replace(solution, error=error, findings=(_outside(window), *solution.findings))
 
     def _solve_in(self, window: Window, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
         """The form of Eq. 9 asked for; pixels with light of narrow spots take the surface form in any case."""
+        if 0 in window.shape:
+            return Solution(*np.zeros((3, *window.full)), rays=0)
         # Light from the surface knows no border on the film: pixels that the image-plane stop cuts take lines of sight.
         inside, cut = window.stopped(lens)
         if quadrature.domain == "surface":
@@ -108,14 +111,15 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             self._sound = scene.emitters()
         return scene
 
+    def _visible_window(self, scene: mi.Scene, lens: mi.Sensor, everywhere: bool) -> Window:
+        boxes = glowing_boxes(scene)
+        return self._window.recall((boxes, _view(lens), everywhere), lambda: window_of(boxes, lens, everywhere))
+
     def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
-        """`narrow_light`, found once for as long as neither surfaces nor lens nor film change."""
         emitters = scene.emitters()
-        state = (emitters, [getattr(emitter, "edition", 0) for emitter in emitters], window)
-        # A lens makes new optics with every change, if only of its place.
-        if self._narrow is None or self._narrow[0] != state or self._narrow[1] is not lens.optics:
-            self._narrow = (state, lens.optics, narrow_light(emitters, lens, window))
-        return self._narrow[2]
+        editions = [getattr(emitter, "edition", 0) for emitter in emitters]
+        state = (emitters, editions, glowing_boxes(scene), _view(lens), window)
+        return self._narrow.recall(state, lambda: narrow_light(emitters, lens, window))
 
     def render(
         self,
@@ -134,6 +138,28 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
     def to_string(self) -> str:
         return f"FsptIntegral[{self.quadrature}]"
+
+
+class Memory:
+    """The last thing found out, for as long as the `state` that it follows from is the same."""
+
+    def __init__(self) -> None:
+        self._state: object = None
+        self._found: Any = None
+
+    def recall(self, state: object, find: Callable[[], Any]) -> Any:
+        """What `find` gave for this state."""
+        if state != self._state:
+            self._found = find()
+            self._state = state
+        return self._found
+
+
+def _view(lens: mi.Sensor) -> tuple[object, ...]:
+    """All of a lens and its film that a picture depends on."""
+    film = lens.film()
+    sizes = (int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
+    return (lens.optics, lens.pixel_pitch, lens.placement, *sizes)
 
 
 def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:

@@ -103,7 +103,9 @@ class FsptLens(mi.Sensor):
             raise OpticsError(
                 f"fspt_lens: 'pixel_pitch' must be > 0 and finite, got {pitch:g}. Give mm, for example 0.0135."
             )
-        axes = np.array(self.m_to_world.matrix, np.float64).reshape(4, 4)[:3, :3]
+        matrix = np.array(self.m_to_world.matrix, np.float64).reshape(4, 4)
+        self.placement = tuple(matrix.ravel())
+        axes = matrix[:3, :3]
         if not np.allclose(axes @ axes.T, np.eye(3), atol=STRETCH) or np.linalg.det(axes) < 0:
             raise OpticsError(
                 "fspt_lens: 'to_world' scales lengths or mirrors. Give a rotation and a translation only."
@@ -211,10 +213,11 @@ class FsptLens(mi.Sensor):
     def blur_radius(self, depth: mi.Float64) -> mi.Float64:
         """Radius [pixels] of the blur disc of a point at `depth` z [mm] from the lens plane; inf at z <= 0."""
         disc = self.optics.discs[0]
-        u, shift, radius = (dr.opaque(mi.Float64, n) for n in (self.optics.focus_distance, disc.shift, disc.radius))
+        numbers = (self.optics.focus_distance, disc.shift, self._spread * disc.radius, self.virtual_pitch)
+        u, shift, radius, pitch = (dr.opaque(mi.Float64, n) for n in numbers)
         back = (u - depth) / u
         scale = 1 - (1 - shift) * back
-        blur = dr.opaque(mi.Float64, self._spread) * radius * dr.abs(back) / (scale * dr.opaque(mi.Float64, self.virtual_pitch))
+        blur = radius * dr.abs(back) / (scale * pitch)
         return dr.select((scale > 0) & ~dr.isnan(blur), blur, dr.inf)
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

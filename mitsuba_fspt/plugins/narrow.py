@@ -18,11 +18,11 @@ from .elements import Elements, at_one_wavelength, elements_of, scalar
 from .grid import Grid
 from .window import Window
 
-OUTSHINES = 2.0  # an element is narrow if it is so many times brighter than any pixel around, seen sharp
-# So much of a pixel in narrow light no further apart than that some of the four nodes a pixel are sure to meet, and to
-# find what belongs to it.
-SEEN, AROUND = 0.5, 10
+OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any pixel around, seen sharp
+SLANTED, COVERED = 0.5, 0.5  # cosine to the lens, share of a pixel: at the limb of a wide body chords look closely
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
+MOST_POINTS = 1 << 12  # of an element; one that needs more is wider than narrow, or seen in parts
+PLASTIC = (0.7548776662466927, 0.5698402909980532)  # steps of the R₂ sequence, even in the unit square
 LARGEST_GRID = 1 << 12  # pixels along each side that are told apart
 
 Column = NDArray[np.float64]
@@ -47,16 +47,16 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     parts = [_seen(emitter, lens) for emitter in emitters if type(emitter).__name__ == "FsptSurface"]
     if not parts or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, reach, blur, x, y = np.concatenate(parts, axis=1)
+    radiance, area, slant, blur, x, y = np.concatenate(parts, axis=1)
     x, y = x - window.left - window.crop_offset[0], y - window.top - window.crop_offset[1]
     height, width = window.shape
-    near = (x > -blur) & (x < width + blur) & (y > -blur) & (y < height + blur) & (radiance * area > 0)
-    if not near.any():
+    near = (x > -blur) & (x < width + blur) & (y > -blur) & (y < height + blur) & (area > 0) & (slant > 0)
+    if not (near & (radiance > 0)).any():
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, reach, blur, x, y = (column[near] for column in (radiance, area, reach, blur, x, y))
-    # A blur disc spreads an element's light over so many pixels; discs that overlap add up.
+    radiance, area, slant, blur, x, y = (column[near] for column in (radiance, area, slant, blur, x, y))
+    # A blur disc spreads a point's light over so many pixels; discs that overlap add up.
     light = radiance * area / (math.pi * blur**2 + 1)
-    hidden = _hidden(radiance, area, x, y) & (reach < 1)
+    hidden = _hidden(radiance, area, slant, x, y)
     level = np.ceil(np.log2(np.maximum(blur, 1)))
     brightest = 0.0
     for k in np.unique(level):
@@ -68,13 +68,13 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     return NarrowLight(on_pixels, float(brightest))
 
 
-def _hidden(radiance: Column, area: Column, x: Column, y: Column) -> NDArray[np.bool_]:
-    """True of elements that outshine the pixels around, few enough for all lines of sight to miss them."""
+def _hidden(radiance: Column, area: Column, slant: Column, x: Column, y: Column) -> NDArray[np.bool_]:
+    """True of points that outshine the pixels around, and are not the limb of something wide."""
     power, row, column = _grid(radiance * area, x, y)
+    cover, _, _ = _grid(area, x, y)
     grid = Grid(power.shape)
-    narrow = radiance > OUTSHINES * grid.array(grid.spread_max(grid.lanes(power)))[row, column]
-    spots = grid.array(grid.box_sum(grid.lanes(_grid(area * narrow, x, y)[0]), AROUND))
-    return narrow & (spots[row, column] < SEEN)
+    around, most = (grid.array(grid.spread_max(grid.lanes(image)))[row, column] for image in (power, cover))
+    return (radiance > OUTSHINES * around) & ~((slant < SLANTED) & (most > COVERED))
 
 
 def _grid(weight: Column, x: Column, y: Column) -> tuple[Image, Index, Index]:
@@ -97,27 +97,41 @@ def _spread(light: Column, x: Column, y: Column, reach: int, shape: tuple[int, i
 
 
 def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
-    """Of each element radiance to the lens, area of its sharp image [pixels²], reach, blur, x, y [pixels]; (6, n).
+    """Of points all over a surface radiance to the lens, area of the sharp image they stand for [pixels²], slant, blur,
+    x, y; (6, n).
 
-    `reach`: how far its corners lie from its middle; infinite where a corner lies beside or behind the lens.
+    Radiance 0 where a point has no image. `slant`: cosine of the normal to the lens.
     """
     shape = emitter.get_shape()
     elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
-    index = dr.arange(mi.UInt32, elements.count)
-    si, area = elements.place(index, mi.Point2f(0.5))
+    # Points a quarter of a pixel apart along the longest extent: enough where the other one is below a pixel.
+    counts = np.ceil(4 * _reach(elements, lens)).clip(1, MOST_POINTS).astype(np.int64)
+    index = mi.UInt32(np.repeat(np.arange(elements.count), counts).astype(np.uint32))
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    sample = np.mod(0.5 + np.outer(PLASTIC, number), 1.0)
+    si, area = elements.place(index, mi.Point2f(sample.astype(np.float32)))
     to_lens = dr.normalize(lens.world_transform() @ mi.Point3f(0) - si.p)
     si.initialize_sh_frame()
     si.wi = si.to_local(to_lens)
     at_one_wavelength(si)
     centre, blur, scale = lens.blur_disc(si.p)
     axis = lens.world_transform() @ mi.Vector3f(0, 0, 1)
-    image = area * dr.abs(dr.dot(si.n, to_lens) / (dr.dot(axis, to_lens) * dr.square(scale)))
+    slant = dr.dot(si.n, to_lens)
+    image = area * dr.abs(slant / (dr.dot(axis, to_lens) * dr.square(scale)))
+    columns = (scalar(emitter.eval(si)), image, slant, dr.abs(blur), centre.x, centre.y)
+    dr.eval(columns)
+    seen = np.array([column.numpy() for column in columns], np.float64)
+    seen[1] /= np.repeat(counts, counts)
+    seen[0, ~np.isfinite(seen).all(axis=0)] = 0
+    return np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+
+
+def _reach(elements: Elements, lens: mi.Sensor) -> Column:
+    """How far the corners of each element lie from its middle on the film [pixels]; 0 where one has no image."""
+    index = dr.arange(mi.UInt32, elements.count)
+    centre, _, scale = lens.blur_disc(elements.place(index, mi.Point2f(0.5))[0].p)
     reach = dr.zeros(mi.Float, elements.count)
     for corner in elements.corners:
         there, _, side = lens.blur_disc(elements.place(index, mi.Point2f(*corner))[0].p)
         reach = dr.maximum(reach, dr.select(side * scale > 0, dr.norm(there - centre), dr.inf))
-    columns = (scalar(emitter.eval(si)), image, reach, dr.abs(blur), centre.x, centre.y)
-    dr.eval(columns)
-    seen = np.array([column.numpy() for column in columns], np.float64)
-    seen[0, ~np.isfinite(np.delete(seen, 2, axis=0)).all(axis=0)] = 0
-    return np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    return np.nan_to_num(reach.numpy().astype(np.float64), posinf=0)

@@ -28,11 +28,10 @@ def first_nodes(draft: Draft) -> Mask:
     """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
-    everything = grid.full(mi.Bool, True)
-    value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule, everything)
+    value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule)
     if len(rule) == 1 and not dr.any(draft.hits > 0):  # what glows is thinner than a pixel
         rule = rules.four(draft.area)
-        value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule, everything)
+        value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule)
     draft.set_blur(farthest)
     draft.value = value = dr.select(draft.open, value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
@@ -55,7 +54,7 @@ def first_nodes(draft: Draft) -> Mask:
     rough = (draft.error > tolerance) | (bend > SETTLED * tolerance)
     unmet = not dr.any(draft.hits > 0)  # what glows is on the film, or may be
     if (neighbours and min(grid.shape) < 3) or unmet or not draft.quadrature.takes("smooth"):
-        rough = everything
+        rough = grid.full(mi.Bool, True)
     rough = draft.grown(rough & draft.open, len(rule)) & draft.open
     smooth = int(dr.count(~rough & (draft.hits > 0))[0])
     why = f"{smooth} of {len(grid)} pixels see the surface, smooth and no edge of it"
@@ -105,17 +104,19 @@ def _refine(draft: Draft, where: Mask) -> Image:
     draft.value = dr.select(where, value, draft.value)
     draft.hits = dr.select(where, hits, draft.hits)
     draft.nearest = dr.minimum(draft.nearest, nearest)
-    error = dr.maximum(
-        draft.grid.spread_max(difference * dr.clip(gain, LEAST_GAIN, 1)), draft.error / MOST_GAIN
-    )
+    error = dr.maximum(draft.grid.spread_max(difference * dr.clip(gain, LEAST_GAIN, 1)), draft.error / MOST_GAIN)
     draft.error = dr.select(where, dr.maximum(error, draft.cut_off(12)), draft.error)
     return difference
 
 
-def _apply(draft: Draft, rule: rules.Rule, where: Mask) -> list[Image]:
-    """Images of `apply_rule`'s sums at the marked pixels, 0 (depths: inf, 0) elsewhere."""
-    index = dr.compress(where)
-    images = [draft.grid.full(mi.Float64, fill) for fill in (0, 0, 0, 0, 0, dr.inf, 0)]
+def _apply(draft: Draft, rule: rules.Rule, where: Mask | None = None) -> list[Image]:
+    """Images of `apply_rule`'s sums at all or at the marked pixels, 0 (depths: inf, 0) elsewhere."""
+    if where is None:
+        index = draft.grid.number
+        images = [dr.empty(mi.Float64, len(draft.grid)) for _ in range(7)]
+    else:
+        index = dr.compress(where)
+        images = [draft.grid.full(mi.Float64, fill) for fill in (0, 0, 0, 0, 0, dr.inf, 0)]
     for part in chunks(index, LANES):
         sums = apply_rule(draft.scene, draft.lens, draft.window.centres(part), rule)
         for image, column in zip(images, sums, strict=True):

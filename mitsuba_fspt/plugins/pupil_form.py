@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .. import rules
 from ..quadrature import Quadrature, Solution
@@ -23,7 +24,6 @@ from .nodes import first_nodes, twelve_nodes
 from .window import Window, visible_window
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
 FEWEST = 16  # lines of sight a pixel, without which four must do
@@ -38,18 +38,19 @@ def solve(
     and what comes back is rough.
     """
     draft = Draft(scene, lens, window, quadrature, known)
-    if len(draft.grid):
-        rough = first_nodes(draft)
-        if quadrature.max_nodes >= FEWEST:
-            rough = twelve_nodes(draft, rough)
-            if dr.any(rough):
-                integrate_by_chords(draft, rough)
+    rough = first_nodes(draft)
+    if quadrature.max_nodes >= FEWEST:
+        rough = twelve_nodes(draft, rough)
+        if dr.any(rough):
+            integrate_by_chords(draft, rough)
     return draft.solution()
 
 
 def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
     """Share of each pixel's lines of sight that meet a surface, by twelve of them; shape (h, w)."""
     window = visible_window(scene, lens)
+    if 0 in window.shape:
+        return np.zeros(window.full)
     grid = Grid(window.shape)
     image = grid.full(mi.Float64, 0)
     for part in chunks(grid.number, LANES):

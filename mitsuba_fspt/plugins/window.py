@@ -12,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+Boxes = tuple[tuple[float, ...], ...]
+
 # So far in (blur radii) a silhouette can pass unseen between the nodes of a pixel and the rim of its pupil, and no
 # further than so many pixels is looked beyond the crop window for one.
 GAP, MOST_RIM = 0.5, 16
@@ -86,20 +88,26 @@ class Window:
 def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -> Window:
     """Window of the pixels with a line of sight into the bounding box of what glows; all if it surrounds the lens.
 
-    Or all `everywhere`. Light of other emitters than `fspt_surface` can come from any surface of the scene. Perspective
-    keeps straight lines straight, so that the box's corners bound its blurred image.
+    Or all `everywhere`. Light of other emitters than `fspt_surface` can come from any surface of the scene.
     """
+    return window_of(glowing_boxes(scene), lens, everywhere)
+
+
+def glowing_boxes(scene: mi.Scene) -> Boxes:
+    """Corners of the bounding boxes of what glows, as numbers: xyz of the lowest and of the highest."""
+    emitters = scene.emitters()
+    direct = all(type(emitter).__name__ == "FsptSurface" for emitter in emitters)
+    boxes = [emitter.bbox() for emitter in emitters] if direct else [scene.bbox()]
+    return tuple((*map(float, box.min), *map(float, box.max)) for box in boxes)
+
+
+def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False) -> Window:
+    """As `visible_window`. Perspective keeps straight lines straight, so that corners bound a box's blurred image."""
     film = lens.film()
     width, height = (int(n) for n in film.crop_size())
     offset = (int(film.crop_offset()[0]), int(film.crop_offset()[1]))
-    emitters = scene.emitters()
-    direct = all(type(emitter).__name__ == "FsptSurface" for emitter in emitters)
-    corners = [
-        np.array([bbox.min, bbox.max])[list(pick), range(3)]
-        for bbox in ([emitter.bbox() for emitter in emitters] if direct else [scene.bbox()])
-        for pick in itertools.product((0, 1), repeat=3)
-    ]
-    points = np.array(corners).reshape(-1, 3)
+    ends = np.array(boxes, np.float64).reshape(-1, 2, 3)
+    points = np.array([ends[:, list(pick), range(3)] for pick in itertools.product((0, 1), repeat=3)]).reshape(-1, 3)
     discs, radii = lens.film_discs(points)
     blur = radii.max(initial=0.0)
     low, high = (discs - radii).min(axis=0, initial=np.inf), (discs + radii).max(axis=0, initial=-np.inf)
