@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_scenes import FOCUS, HEIGHT, MAGNIFICATION, PITCH, RADIUS, WIDTH, disk, load, scene, sphere
+from small_scenes import FOCUS, HEIGHT, MAGNIFICATION, PITCH, RADIUS, SIDE, WIDTH, disk, load, scene, sphere
 from test_laws import collected, filled
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.errors import SceneError
+from mitsuba_fspt.reference import lattice
+from mitsuba_fspt.reference_shapes import unit_disc
 
 pytestmark = pytest.mark.usefixtures("mono")
 
@@ -116,6 +118,49 @@ def test_a_spot_much_smaller_than_its_blur_keeps_its_power(domain):
     inside = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < blur - 1.5
     assert inside.any()
     assert np.ptp(picture[inside]) < 0.03 * picture.max()
+
+
+# Width and length of a bar, and the radius of its blur disc, all in pixels.
+BARS = [(0.03, 12.0, 0.0), (0.1, 15.0, 0.5), (0.3, 14.0, 2.0), (0.9, 9.0, 8.0), (3.0, 3.0, 8.0)]
+
+
+@pytest.mark.parametrize("bar", BARS, ids=str)
+def test_a_bar_thinner_than_a_pixel_or_than_its_blur_is_seen_all_along(bar):
+    """Rationale: lines of sight from the pixels meet it by chance; here its two triangles are long, and only thin.
+
+    Expected: the accuracy asked for on every pixel, against four million points of bar × pupil summed into the pixels,
+    and a bound. Seen to fail, by the whole peak, where one point stands for each triangle.
+    """
+    width, length, blur = bar
+    depth = FOCUS * RADIUS / (RADIUS + blur * SIDE)
+    size = np.array([length, width]) * SIDE * depth / FOCUS
+    picture = fspt.render(scene(rectangle(depth, *size, angle=27.0)), rtol=RTOL)
+    expected = summed_points(depth, *size, angle=27.0)
+    off = np.abs(picture.power - expected) / expected.max()
+    assert off.max() < RTOL
+    assert np.mean(off <= picture.error / expected.max() + 5e-3) >= 0.99
+
+
+def rectangle(depth, width, height, angle):
+    """Rectangle that faces the lens from the axis, turned about it by `angle` degrees."""
+    import mitsuba as mi
+
+    turn = mi.ScalarTransform4f().translate([0, 0, depth]).rotate([0, 0, 1], angle).rotate([0, 1, 0], 180)
+    return {"type": "rectangle", "to_world": turn.scale([width / 2, height / 2, 1])}
+
+
+def summed_points(depth, width, height, angle, n=1 << 22):
+    """Power of a rectangle on every pixel [W] at 1 W/mm²: points of it and of the pupil, each pair on its pixel."""
+    nodes = lattice(n, (0.1, 0.2, 0.3, 0.4))
+    along, across = ((nodes[:, :2] - 0.5) * (width, height)).T
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    x, y = c * along - s * across, s * along + c * across
+    a, b = RADIUS * unit_disc(nodes[:, 2:]).T
+    pairs = depth**2 / (depth**2 + (x - a) ** 2 + (y - b) ** 2) ** 2 / np.pi
+    column = WIDTH / 2 - (a + (x - a) * FOCUS / depth) / SIDE
+    row = HEIGHT / 2 - (b + (y - b) * FOCUS / depth) / SIDE
+    power = np.histogram2d(row, column, (np.arange(HEIGHT + 1), np.arange(WIDTH + 1)), weights=pairs)[0]
+    return power * (width * height * np.pi * RADIUS**2 / n)
 
 
 def test_a_spot_before_a_body_adds_its_power_where_it_is_blurred():

@@ -57,6 +57,7 @@ class Glow:
 
     sides, blur (count,): longer side of its image, radius of its blur disc; low, high (count, 2): bounds of its
     light in x and y, empty where it faces away from the lens or is one of those left out because they are `dark`.
+    small: a blur disc is larger than all that shines.
     """
 
     emitter: mi.Emitter
@@ -66,6 +67,7 @@ class Glow:
     low: Image
     high: Image
     dark: int
+    small: bool
 
     @property
     def count(self) -> int:
@@ -74,7 +76,7 @@ class Glow:
     def batches(self, lines: int, mark: NDArray[np.bool_]) -> Iterator[Batch]:
         """The lines of sight of all elements with light on a marked pixel, some `LANES` at a time."""
         index = self._touching(mark)
-        cells = cells_of(lines, self.blur[index])
+        cells = cells_of(lines, self.blur[index], self.small)
         cuts = np.ceil(self.sides[index] * math.sqrt(lines) / cells).astype(np.int64)
         cuts = cuts.clip(1, np.maximum(math.isqrt(LANES) // cells, 1))
         ends = np.cumsum((cuts * cells) ** 2)
@@ -108,6 +110,7 @@ class Glow:
         low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
         least, most = np.full(count, np.inf), np.full(count, -np.inf)
         axes, blur = np.zeros((2, count, 2)), np.zeros(count)
+        centres = []
         for corner in CORNERS:
             si, _ = elements.place(dr.arange(mi.UInt32, count), mi.Point2f(*corner))
             front = _front(si, lens)
@@ -116,6 +119,7 @@ class Glow:
             low, high = np.minimum(low, centre - radius), np.maximum(high, centre + radius)
             least, most = np.minimum(least, front.numpy()), np.maximum(most, front.numpy())
             axes += (np.array(corner) - 0.5)[:, None, None] * centre
+            centres.append(centre)
             blur = np.maximum(blur, radius[:, 0])
         sides = np.where(np.isfinite(blur), np.hypot(*axes.transpose(2, 0, 1)).max(axis=0), UNBOUNDED)
         margin = BULGE * sides[:, None]
@@ -124,19 +128,37 @@ class Glow:
         away = 2 * most - least <= 0
         dark = _dark(emitter, elements) if without_dark else np.zeros(count, bool)
         low[away | dark], high[away | dark] = np.inf, -np.inf
+        small = _area(*centres)[~(away | dark)].sum() < math.pi * blur.min(initial=np.inf) ** 2
         # An element below a pixel would stay in one piece for some levels, and what that costs would not be seen to
         # change. A piece of side s misplaces about s²/8 of a step in J_n: small enough, it may stay.
         sides = np.where(sides > math.sqrt(8 * rtol), np.maximum(sides, 1), sides)
-        return cls(emitter, elements, sides, np.minimum(blur, math.hypot(*window.shape)), low, high, int(dark.sum()))
+        return cls(
+            emitter,
+            elements,
+            sides,
+            np.minimum(blur, math.hypot(*window.shape)),
+            low,
+            high,
+            int(dark.sum()),
+            bool(small),
+        )
 
 
-def cells_of(lines: int, blur: Image) -> Index:
+def _area(a: Image, b: Image, c: Image, d: Image) -> Image:
+    """Areas of quadrangles (count,), from their corners (count, 2) once around."""
+    across, along = c - a, d - b
+    return 0.5 * np.abs(across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0])
+
+
+def cells_of(lines: int, blur: Image, small: bool) -> Index:
     """Cells M along the pupil, a power of two, for blur discs of these radii [pixels] at so many lines a pixel.
 
-    Balanced: through neighbouring cells a piece's images lie about half its own size apart. At least 4, and no more
-    than leave pieces of a pixel.
+    Balanced: through neighbouring cells a piece's images lie about half its own size apart; the middles of a `small`
+    body's pieces are as coarse as the cells' chords along the disc's rim. At least 4, and no more than leave pieces of
+    a pixel.
     """
-    ideal = np.ceil(np.log2(np.maximum(CELLS * lines**0.25 * np.sqrt(blur), 4)))
+    power = np.where((blur < 1) | (not small), 0.5, 0.25)
+    ideal = np.ceil(np.log2(np.maximum(CELLS * lines**0.25 * blur**power, 4)))
     return (2 ** np.minimum(ideal, math.log2(lines) // 2)).astype(np.int64)
 
 

@@ -1,7 +1,8 @@
 """Light too narrow for lines of sight from the pixels: what is far below a pixel and outshines all around it.
 
-Four nodes a pixel find what is as large as a pixel at the phantom, in focus or blurred. Smaller bodies and spots they
-meet by chance or not at all, and no estimate made of them knows; the surface form starts where the light does.
+Four nodes a pixel find what is as large as a pixel at the phantom, or as its blur disc where that is larger. Smaller
+bodies and spots they meet by chance or not at all, and no estimate made of them knows; the surface form starts where
+the light does.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from .elements import Elements, at_one_wavelength, elements_of, scalar
 from .grid import Grid
 from .window import Window
 
-OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any pixel around, seen sharp
+OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
 SLANTED, COVERED = 0.5, 0.5  # cosine to the lens, share of a pixel: at the limb of a wide body chords look closely
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
 MOST_POINTS = 1 << 12  # of an element; one that needs more is wider than narrow, or seen in parts
@@ -47,31 +48,30 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     parts = [_seen(emitter, lens) for emitter in emitters if type(emitter).__name__ == "FsptSurface"]
     if not parts or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, slant, blur, x, y = np.concatenate(parts, axis=1)
+    radiance, area, slant, apart, blur, x, y = np.concatenate(parts, axis=1)
     x, y = x - window.left - window.crop_offset[0], y - window.top - window.crop_offset[1]
     height, width = window.shape
     near = (x > -blur) & (x < width + blur) & (y > -blur) & (y < height + blur) & (area > 0) & (slant > 0)
     if not (near & (radiance > 0)).any():
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, slant, blur, x, y = (column[near] for column in (radiance, area, slant, blur, x, y))
+    radiance, area, slant, apart, blur, x, y = (column[near] for column in (radiance, area, slant, apart, blur, x, y))
     # A blur disc spreads a point's light over so many pixels; discs that overlap add up.
     light = radiance * area / (math.pi * blur**2 + 1)
-    hidden = _hidden(radiance, area, slant, x, y)
     level = np.ceil(np.log2(np.maximum(blur, 1)))
     brightest = 0.0
     for k in np.unique(level):
         here = level == k
         brightest = max(brightest, _grid(light[here], x[here] / 2**k, y[here] / 2**k)[0].max())
-        here &= hidden
+        here &= (apart < 1) & _hidden(radiance, area, slant, x, y, 2**k)
         if here.any():
             on_pixels += _spread(light[here], x[here], y[here], int(2**k) + 1, window.shape)
     return NarrowLight(on_pixels, float(brightest))
 
 
-def _hidden(radiance: Column, area: Column, slant: Column, x: Column, y: Column) -> NDArray[np.bool_]:
-    """True of points that outshine the pixels around, and are not the limb of something wide."""
-    power, row, column = _grid(radiance * area, x, y)
-    cover, _, _ = _grid(area, x, y)
+def _hidden(radiance: Column, area: Column, slant: Column, x: Column, y: Column, side: float) -> NDArray[np.bool_]:
+    """True of points that outshine the squares of a `side` [pixels] around, and are not the limb of a wide body."""
+    power, row, column = _grid(radiance * area / side**2, x / side, y / side)
+    cover, _, _ = _grid(area / side**2, x / side, y / side)
     grid = Grid(power.shape)
     around, most = (grid.array(grid.spread_max(grid.lanes(image)))[row, column] for image in (power, cover))
     return (radiance > OUTSHINES * around) & ~((slant < SLANTED) & (most > COVERED))
@@ -97,15 +97,16 @@ def _spread(light: Column, x: Column, y: Column, reach: int, shape: tuple[int, i
 
 
 def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
-    """Of points all over a surface radiance to the lens, area of the sharp image they stand for [pixels²], slant, blur,
-    x, y; (6, n).
+    """Of points all over a surface radiance to the lens, area of the sharp image they stand for [pixels²], slant,
+    how far they are apart, blur, x, y [pixels]; (7, n).
 
     Radiance 0 where a point has no image. `slant`: cosine of the normal to the lens.
     """
     shape = emitter.get_shape()
     elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
     # Points a quarter of a pixel apart along the longest extent: enough where the other one is below a pixel.
-    counts = np.ceil(4 * _reach(elements, lens)).clip(1, MOST_POINTS).astype(np.int64)
+    reach = _reach(elements, lens)
+    counts = np.ceil(np.where(np.isfinite(reach), 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     index = mi.UInt32(np.repeat(np.arange(elements.count), counts).astype(np.uint32))
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     sample = np.mod(0.5 + np.outer(PLASTIC, number), 1.0)
@@ -123,15 +124,16 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     seen = np.array([column.numpy() for column in columns], np.float64)
     seen[1] /= np.repeat(counts, counts)
     seen[0, ~np.isfinite(seen).all(axis=0)] = 0
-    return np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    seen = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    return np.insert(seen, 3, np.repeat(reach / counts, counts), axis=0)
 
 
 def _reach(elements: Elements, lens: mi.Sensor) -> Column:
-    """How far the corners of each element lie from its middle on the film [pixels]; 0 where one has no image."""
+    """How far the corners of each element lie from its middle on the film [pixels]; inf where one has no image."""
     index = dr.arange(mi.UInt32, elements.count)
     centre, _, scale = lens.blur_disc(elements.place(index, mi.Point2f(0.5))[0].p)
     reach = dr.zeros(mi.Float, elements.count)
     for corner in elements.corners:
         there, _, side = lens.blur_disc(elements.place(index, mi.Point2f(*corner))[0].p)
         reach = dr.maximum(reach, dr.select(side * scale > 0, dr.norm(there - centre), dr.inf))
-    return np.nan_to_num(reach.numpy().astype(np.float64), posinf=0)
+    return np.nan_to_num(reach.numpy().astype(np.float64), nan=np.inf, posinf=np.inf)

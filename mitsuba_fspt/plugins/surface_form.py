@@ -23,7 +23,10 @@ from .glow import CORNERS, Batch, Glow, film_corner
 from .grid import Grid
 from .window import Window
 
-FIRST_LINES, GROWTH = 16, 4  # lines of sight a pixel of the image at the first level; times this each level
+# Lines of sight a pixel of the image at the first level, and how many times more at each further one. Pieces and cells
+# are refined by turns; by the second level both are, or what one of them does wrong would pass for converged.
+FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
+BLURRED = 0.5  # of the blur radius: a piece of a small body that is smaller is sent as one point
 SAFETY = 4.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
 LEAST_CLAIM = 0.05  # two levels say little about what both miss: no error is said to be so much smaller than asked
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 lines of sight cannot resolve
@@ -74,16 +77,17 @@ class _Refinement:
         # To look for what may hide is quicker for a few pixels than to make sure that nothing does.
         self.hidden = where is not None or not self._hides_nothing()
         mark = where = np.ones(self.window.shape, bool) if where is None else where
-        lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * GROWTH)
+        lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * FIRST_GROWTH)
         if mark.any():
             self.value, self.hits = (np.where(where, image, 0) for image in self._level(lines, mark))
-        recent, grid = np.zeros_like(self.value), Grid(self.window.shape)
-        while mark.any() and (lines := lines * GROWTH) <= most:
+        recent, grid = None, Grid(self.window.shape)
+        while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
             value, hits = self._level(lines, mark)
             change = np.where(mark, np.abs(value - self.value), 0)
             recent, last = SAFETY * grid.array(grid.spread_max(grid.lanes(change))), recent
-            # Levels refine pieces and cells by turns: half of what the level before changed may yet be to come.
-            estimate = np.maximum(recent, 0.5 * last)
+            # Two levels may agree by chance. Later ones refine pieces and cells by turns: half of what the level before
+            # changed may yet be to come.
+            estimate = 2 * recent if last is None else np.maximum(recent, 0.5 * last)
             # All elements with light on a marked pixel were refined: only there is the new picture whole.
             self.error[mark], self.value[mark], self.hits[mark] = estimate[mark], value[mark], hits[mark]
             mark = self.error > self.quadrature.rtol * max(self.value.max(), least_peak)
@@ -142,20 +146,24 @@ class _Refinement:
         radiance = dr.select(active, scalar(batch.glow.emitter.eval(si, active)), 0)
         # dΩ dS |cosθ_s| over A_vd A_pupil/u², that the film's value is a mean radiance whatever the lengths.
         virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
-        etendue = dr.select(active, cos_s * weight * area / (dr.square(mi.Float(m)) * virtual_pixel), 0)
+        cell = [_corner(i + x, j + y, m) for x, y in CORNERS]
+        etendue = dr.select(active, cos_s * weight * area * _area(cell) / (dr.pi * virtual_pixel), 0)
 
-        discs = [lens.blur_disc(elements.place(index, mi.Point2f(*corner), cut, part)[0].p) for corner in CORNERS]
+        discs = {at: lens.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in film_corner(self.window)))
         middle = _middle(i, j, m)
-        polygon = [centre - origin + radius * middle for centre, radius, _ in discs]
-        # The image of a piece through the cell's middle or, where that is larger, of the cell through a point of the
-        # piece: either way what lies side by side on the surface and on the pupil lies side by side on the film.
-        centre, radius, _ = lens.blur_disc(si.p)
-        cell = [centre - origin + radius * _on_pupil(i, j, m, *corner) for corner in CORNERS]
-        tiny = _size(polygon) < _size(cell)
-        polygon = [dr.select(tiny, own, other) for own, other in zip(cell, polygon, strict=True)]
-        for _, _, scale in discs:  # no image where a piece reaches through the lens plane
-            active &= scale * discs[0][2] > 0
+        images = [centre - origin + radius * middle for centre, radius, _ in discs.values()]
+        # The image of a piece through the cell's middle or, where that is smaller than a cell's or a body's own blur
+        # disc holds all of it, of the cell through the piece's middle: either way what lies side by side, on the
+        # surface or on the pupil, lies side by side on the film.
+        share = 1 / len(elements.corners)
+        centre = sum((discs[at][0] for at in elements.corners), mi.Point2f(0)) * share - origin
+        radius = sum((discs[at][1] for at in elements.corners), mi.Float(0)) * share
+        least = dr.opaque(mi.Float, BLURRED**2 if batch.glow.small else 0)
+        blurred = _size(images) < dr.square(radius) * dr.maximum(dr.two_pi / dr.square(mi.Float(m)), least)
+        polygon = [dr.select(blurred, centre + radius * own, other) for own, other in zip(cell, images, strict=True)]
+        for _, _, scale in discs.values():  # no image where a piece reaches through the lens plane
+            active &= scale * discs[CORNERS[0]][2] > 0
         lights = (mi.Float64(radiance) * mi.Float64(etendue), mi.Float64(etendue / dr.square(dr.square(cos_theta))))
         canvas.lay(lights, polygon, active)
         dr.eval(radiance, canvas.layers)
@@ -185,9 +193,26 @@ def _middle(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32) -> mi.Point2f:
     return _on_pupil(i, j, m, 0.5, 0.5) * dr.rsqrt(1 - 2 / dr.square(mi.Float(m)))
 
 
+def _corner(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32) -> mi.Point2f:
+    """Corner (i, j) of the pupil's cells in the unit disc, moved outwards for polygons to have the areas of rings.
+
+    The corners of ring k are those of a regular polygon of 8 k sides, but for its arcs as large as the disc inside.
+    """
+    half = mi.Int(m // 2)
+    ring = dr.maximum(dr.abs(mi.Int(i) - half), dr.abs(mi.Int(j) - half))
+    turn = dr.pi / (4 * mi.Float(dr.maximum(ring, 1)))
+    return _on_pupil(i, j, m, 0, 0) * dr.sqrt(turn / dr.sin(turn))
+
+
 def _on_pupil(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, x: float, y: float) -> mi.Point2f:
     """Point (x, y) of [0, 1]² in the cell (i, j) of the pupil, in the unit disc."""
     return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(mi.Float(i) + x, mi.Float(j) + y) / mi.Float(m))
+
+
+def _area(polygon: list[mi.Point2f]) -> mi.Float:
+    a, b, c, d = polygon
+    across, along = mi.Vector2f(c - a), mi.Vector2f(d - b)
+    return 0.5 * dr.abs(across.x * along.y - across.y * along.x)
 
 
 def _size(polygon: list[mi.Point2f]) -> mi.Float:
