@@ -41,8 +41,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
      * - domain
        - |string|
        - pupil: lines of sight from every pixel (Default). surface: the power of every surface element is spread
-         over the pixels its blur disc covers. Two ways of writing Eq. 9. Light from bodies and spots far below a
-         pixel, which lines of sight from the pixels would miss, is spread in either case.
+         over the pixels its blur disc covers. Two ways of writing Eq. 9. Light from bodies and spots thinner than
+         half a pixel or half their blur disc, which lines of sight from the pixels would miss, is spread in any case.
      * - pixel
        - |string|
        - area: integrate over the pixel (Default). centre: the value at its centre times its area, as in the paper.

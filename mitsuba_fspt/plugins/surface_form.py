@@ -1,10 +1,11 @@
 """Eq. 9 in its surface form: P = ∫ L |cosθ_s| dS dΩ over the surface and over the pupil as a surface point sees it.
 
-The surface is cut into pieces, the pupil into M × M cells of equal area. What a piece sends through a cell is found
-along one line of sight and laid on the film where the image of the piece through the cell's middle lies: a polygon,
-shared out exactly among the pixels. Neighbours share the cells' middles, so that their images tile the film without
-gap or overlap, and all power lands, once. What makes the form stiff where pixels look for surface points, the blur
-disc that shrinks to nothing at z = u, is here only a small shift of images.
+The surface is cut into pieces, the pupil into M × M cells. What a piece sends through a cell is found along one line of
+sight and laid on the film where the image of the piece through the cell's middle lies: a polygon, shared out exactly
+among the pixels. Neighbours share the cells' middles, so that their images tile the film without gap or overlap, and
+all power lands, once. What makes the form stiff where pixels look for surface points, the blur disc that shrinks to
+nothing at z = u, is here only a small shift of images. Of a body smaller than its blur disc it is the other way round:
+there the cells, seen through the piece's middle, tile the disc.
 """
 
 from __future__ import annotations
