@@ -121,7 +121,7 @@ def test_a_spot_much_smaller_than_its_blur_keeps_its_power(domain):
 
 
 # Width and length of a bar, and the radius of its blur disc, all in pixels.
-BARS = [(0.03, 12.0, 0.0), (0.1, 15.0, 0.5), (0.3, 14.0, 2.0), (0.9, 9.0, 8.0), (3.0, 3.0, 8.0)]
+BARS = [(0.03, 12.0, 0.0), (0.3, 14.0, 2.0), (0.9, 9.0, 8.0)]
 
 
 @pytest.mark.parametrize("bar", BARS, ids=str)

@@ -128,10 +128,14 @@ class Glow:
         away = 2 * most - least <= 0
         dark = _dark(emitter, elements) if without_dark else np.zeros(count, bool)
         low[away | dark], high[away | dark] = np.inf, -np.inf
-        small = _area(*centres)[~(away | dark)].sum() < math.pi * blur.min(initial=np.inf) ** 2
+        lit = ~(away | dark)
+        area, extent = _area(*centres)[lit].sum(), _extent(np.concatenate([corner[lit] for corner in centres]))
+        small = area < math.pi * blur.min(initial=np.inf) ** 2
         # An element below a pixel would stay in one piece for some levels, and what that costs would not be seen to
-        # change. A piece of side s misplaces about s²/8 of a step in J_n: small enough, it may stay.
-        sides = np.where(sides > math.sqrt(8 * rtol), np.maximum(sides, 1), sides)
+        # change. A piece of side s misplaces about s²/8 of a step in J_n, less of what a thick body blurs: if that is
+        # little, it may stay.
+        thickness = max(1, area / extent) if small and extent > 0 else 1
+        sides = np.where(sides > math.sqrt(8 * rtol * thickness), np.maximum(sides, 1), sides)
         return cls(
             emitter,
             elements,
@@ -148,6 +152,11 @@ def _area(a: Image, b: Image, c: Image, d: Image) -> Image:
     """Areas of quadrangles (count,), from their corners (count, 2) once around."""
     across, along = c - a, d - b
     return 0.5 * np.abs(across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0])
+
+
+def _extent(points: Image) -> float:
+    """Longer side of the box around points (count, 2)."""
+    return float((points.max(axis=0) - points.min(axis=0)).max()) if len(points) else 0.0
 
 
 def cells_of(lines: int, blur: Image, small: bool) -> Index:

@@ -22,7 +22,7 @@ from .window import Window
 OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
 SLANTED, COVERED = 0.5, 0.5  # cosine to the lens, share of a pixel: at the limb of a wide body chords look closely
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
-MOST_POINTS = 1 << 12  # of an element; one that needs more is wider than narrow, or seen in parts
+WIDE, MOST_POINTS = 2.0, 1 << 12  # so thick [pixels, blur radii] no element is narrow; points of a thin one
 PLASTIC = (0.7548776662466927, 0.5698402909980532)  # steps of the R₂ sequence, even in the unit square
 LARGEST_GRID = 1 << 12  # pixels along each side that are told apart
 
@@ -57,14 +57,17 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     radiance, area, slant, apart, blur, x, y = (column[near] for column in (radiance, area, slant, apart, blur, x, y))
     # A blur disc spreads a point's light over so many pixels; discs that overlap add up.
     light = radiance * area / (math.pi * blur**2 + 1)
-    level = np.ceil(np.log2(np.maximum(blur, 1)))
+    level = np.round(np.log2(np.maximum(blur, 1)))
     brightest = 0.0
     for k in np.unique(level):
-        here = level == k
+        here, reach = level == k, math.ceil(2 ** (k + 0.5))
         brightest = max(brightest, _grid(light[here], x[here] / 2**k, y[here] / 2**k)[0].max())
-        here &= (apart < 1) & _hidden(radiance, area, slant, x, y, 2**k)
+        far = reach + 2 * 2**k  # beyond that the points of this level have no neighbours
+        there = (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
+        here[there] &= _hidden(radiance[there], area[there], slant[there], x[there], y[there], 2**k)
+        here &= there & (apart < 1)
         if here.any():
-            on_pixels += _spread(light[here], x[here], y[here], int(2**k) + 1, window.shape)
+            on_pixels += _spread(light[here], x[here], y[here], reach, window.shape)
     return NarrowLight(on_pixels, float(brightest))
 
 
@@ -100,17 +103,34 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     """Of points all over a surface radiance to the lens, area of the sharp image they stand for [pixels²], slant,
     how far they are apart, blur, x, y [pixels]; (7, n).
 
-    Radiance 0 where a point has no image. `slant`: cosine of the normal to the lens.
+    Radiance 0 where a point has no image. `slant`: cosine of the normal to the lens. How far apart: in pixels, or in
+    blur radii where they are larger.
     """
     shape = emitter.get_shape()
     elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
-    # Points a quarter of a pixel apart along the longest extent: enough where the other one is below a pixel.
-    reach = _reach(elements, lens)
-    counts = np.ceil(np.where(np.isfinite(reach), 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
+    whole = dr.arange(mi.UInt32, elements.count)
+    _, area, _, blur, _ = (column.numpy() for column in _look(emitter, elements, lens, whole, mi.Point2f(0.5)))
+    unit = np.maximum(blur, 1)
+    reach = _reach(elements, lens) / unit
+    # A long and thin element is many points, a quarter of a unit apart; one that is wide may be wide at one.
+    thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach)
+    counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     index = mi.UInt32(np.repeat(np.arange(elements.count), counts).astype(np.uint32))
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     sample = np.mod(0.5 + np.outer(PLASTIC, number), 1.0)
-    si, area = elements.place(index, mi.Point2f(sample.astype(np.float32)))
+    *columns, centre = _look(emitter, elements, lens, index, mi.Point2f(sample.astype(np.float32)))
+    seen = np.array([column.numpy() for column in (*columns, centre.x, centre.y)], np.float64)
+    seen[1] /= np.repeat(counts, counts)
+    seen[0, ~np.isfinite(seen).all(axis=0)] = 0
+    seen = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    return np.insert(seen, 3, np.repeat(reach / counts, counts), axis=0)
+
+
+def _look(
+    emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, index: mi.UInt32, sample: mi.Point2f
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f]:
+    """At a point of each element radiance to the lens, area of all the element's image, slant, blur, place on film."""
+    si, area = elements.place(index, sample)
     to_lens = dr.normalize(lens.world_transform() @ mi.Point3f(0) - si.p)
     si.initialize_sh_frame()
     si.wi = si.to_local(to_lens)
@@ -119,13 +139,9 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     axis = lens.world_transform() @ mi.Vector3f(0, 0, 1)
     slant = dr.dot(si.n, to_lens)
     image = area * dr.abs(slant / (dr.dot(axis, to_lens) * dr.square(scale)))
-    columns = (scalar(emitter.eval(si)), image, slant, dr.abs(blur), centre.x, centre.y)
+    columns = (scalar(emitter.eval(si)), image, slant, dr.abs(blur), centre)
     dr.eval(columns)
-    seen = np.array([column.numpy() for column in columns], np.float64)
-    seen[1] /= np.repeat(counts, counts)
-    seen[0, ~np.isfinite(seen).all(axis=0)] = 0
-    seen = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
-    return np.insert(seen, 3, np.repeat(reach / counts, counts), axis=0)
+    return columns
 
 
 def _reach(elements: Elements, lens: mi.Sensor) -> Column:
