@@ -141,7 +141,7 @@ def test_what_is_thinner_than_a_pixel_and_between_two_rows_is_seen():
     place = mi.ScalarTransform4f().rotate([0, 0, 1], 20).scale([6, 6, 0.02])
     plate = {"type": "cube", "to_world": place, "emitter": glow()}
     scene = scene_of(plate, sensor=lens(28, pitch=0.216))
-    by_light = fspt.render(scene, method="ptracer", spp=4096, seed=1)
+    by_light = fspt.render(scene, method="ptracer", spp=1024, seed=1)
     noise = np.sqrt((by_light.error**2).sum())
     assert noise < 0.05 * by_light.power.sum()
     assert solved(scene).power.sum() == pytest.approx(by_light.power.sum(), abs=4 * noise)
