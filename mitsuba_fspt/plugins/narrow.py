@@ -129,7 +129,7 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
 def _look(
     emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, index: mi.UInt32, sample: mi.Point2f
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f]:
-    """At a point of each element radiance to the lens, area of all the element's image, slant, blur, place on film."""
+    """At a point of each element radiance to the lens, area of the element's image, slant, blur, place on film."""
     si, area = elements.place(index, sample)
     to_lens = dr.normalize(lens.world_transform() @ mi.Point3f(0) - si.p)
     si.initialize_sh_frame()
