@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+GOLDEN = 0.6180339887498949
+
 Image = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
 
 
@@ -89,81 +91,111 @@ def twelve(area: bool) -> Rule:
     return Rule(pupil, pixel, weights, contrast)
 
 
-# Chords a level: m across the pupil times q × q points of the pixel. Found on straight edges of every blur and angle:
-# these balance the error of the two, which falls like (chords)^-1.2.
-CHORD_LEVELS = ((4, 1), (4, 2), (8, 2), (8, 3), (16, 3), (16, 4), (24, 5), (32, 6), (48, 8), (64, 11))
-CHORD_ORDER = 1.2
+def product(level: int, area: bool) -> Rule:
+    """Rings × spokes over the pupil, with `area` times Gauss nodes over the pixel: finer with the level, for what is
+    smooth.
+    """
+    rings, spokes, side = (level + 1, 4 * level + 3, level + 1) if area else (2 * level + 1, 8 * level + 1, 1)
+    square, ring_weight = gauss(rings)
+    turn = 2 * np.pi * (np.arange(spokes) + GOLDEN * np.arange(rings)[:, None]) / spokes
+    pupil = _polar(np.sqrt(square)[:, None], turn).reshape(-1, 2)
+    x, w = gauss(side)
+    pixel = np.stack(np.meshgrid(x - 0.5, x - 0.5), axis=-1).reshape(-1, 2)
+    weight = np.outer(np.repeat(ring_weight / spokes, spokes), np.outer(w, w)).ravel()
+    pupil, pixel = np.repeat(pupil, len(pixel), axis=0), np.tile(pixel, (len(pupil), 1))
+    return Rule(pupil, pixel, weight, np.zeros(len(weight)))
 
 
-@dataclass(frozen=True)
-class AlongChord:
-    """How far a chord is looked into: `scan` intervals, `bisections` of a jump, `gauss` nodes a smooth piece."""
-
-    scan: int
-    bisections: int
-    gauss: int
-
-    @property
-    def rays(self) -> int:
-        """Lines of sight at most: both jumps bisected, three pieces lit."""
-        return self.scan + 1 + 2 * self.bisections + 3 * self.gauss
-
-
-def along_chord(level: int) -> AlongChord:
-    """Every level looks further along its chords too, or what all levels miss there would pass for converged."""
-    return AlongChord(scan=4 + level, bisections=4 + level, gauss=3 + level)
-
-
-GOLDEN = 0.6180339887498949
+# Transects a level: the first ones for what is smooth but for one edge, then a net for what is not.
+TRANSECT_LEVELS = (4, 8, 27, 64, 256, 1024)
+SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
+TRANSECT_ORDER = 1.5  # by which the error falls at least, whatever two levels agree on
 PLASTIC = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(frozen=True)
-class Chords:
-    """Chords of disc × square, n of each kind, every array with the weights or measure 1 in all.
+class AlongTransect:
+    """How far a transect is looked into: `scan` intervals, `bisections` of a jump, `nodes` on a smooth piece."""
 
-    Across the pupil: `across` (n,) in (0, 1) numbers the chord, `pixel` (n, 2) in [-½, ½]² is its pixel point, with
-    `weight` (n,). Across the pixel: `side` (n,) in [-½, ½] numbers the chord, `pupil` (n, 2) in the unit disc is its
-    pupil point, all with weight 1/n.
+    scan: int
+    bisections: int
+    nodes: int
+
+    @property
+    def rays(self) -> int:
+        """Lines of sight at most: both jumps bisected, three pieces lit."""
+        return self.scan + 1 + 2 * self.bisections + 3 * self.nodes
+
+
+def along_transect(level: int, rtol: float) -> AlongTransect:
+    """So far that the first transects know a jump's place to `rtol`.
+
+    Every level looks further along its transects too, or what all levels miss there would pass for converged.
+    """
+    bisections = math.ceil(math.log2(max(0.25 / rtol, 16)))
+    nodes = 3 + math.ceil(math.log10(max(1e-3 / rtol, 1)))
+    return AlongTransect(scan=SCANS[level], bisections=bisections + level, nodes=nodes + level)
+
+
+@dataclass(frozen=True)
+class Transects:
+    """Places in [0, 1]³ of n transects through pixel × pupil, (n, 3), for sharp edges and for blurred ones.
+
+    `sharp` lie evenly in the pixel, each on a line of its own, where the edge leaves it with a kink; all of weight 1/n.
+    `blurred` have the `weight` (n,) of sum 1. `phase` (n,) in [0, 1) is where between two of a transect's even nodes
+    they begin: were it the same on all, all would miss the same.
     """
 
-    across: NDArray[np.float64]
-    pixel: NDArray[np.float64]
+    sharp: NDArray[np.float64]
+    blurred: NDArray[np.float64]
     weight: NDArray[np.float64]
-    side: NDArray[np.float64]
-    pupil: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.weight)
 
+    @property
+    def phase(self) -> NDArray[np.float64]:
+        """Even over any run of them (golden ratio)."""
+        return np.mod(GOLDEN * (np.arange(len(self)) + 0.5), 1.0)
+
 
 @cache
-def chords(m: int, q: int, area: bool = True) -> Chords:
-    """m · q² chords: across the pupil m equidistant ones for each of q × q Gauss points, shifted from point to point.
+def transects(count: int) -> Transects:
+    """4 (exact to degree 2), 8 or 27 (to degree 3 and 5) transects by Gauss; of a larger power of two a net."""
+    if count <= 27:
+        blurred, weight = _gauss_cube(count)
+    else:
+        blurred, weight = _net(count), np.full(count, 1 / count)
+    number = np.arange(count) + 0.5
+    sharp = np.column_stack([np.mod(np.outer(number, PLASTIC), 1.0), number / count])  # R₂ sequence and even lines
+    # Points opposite each other, so that what is odd about the middle cancels.
+    sharp[(count + 1) // 2 :] = 1 - sharp[: count // 2][::-1]
+    if count % 2:
+        sharp[count // 2] = 0.5
+    return Transects(sharp, blurred, weight)
 
-    Without `area` all belong to the pixel's centre; four chords share 2 × 2 points, such that one as far on the other
-    side of the middle has the opposite point. Across the pixel they are equidistant, and their pupil points fill the
-    disc evenly, whatever run of them is taken (R₂ sequence, folded in the radius: so it has no seam there).
-    """
-    if not area:
-        m, q = m * q * q, 1
-    x, w = gauss(q)
-    px, py = (grid.ravel() for grid in np.meshgrid(x - 0.5, x - 0.5))
-    shift = np.mod(0.5 + GOLDEN * np.arange(q * q), 1.0)
-    across = (np.arange(m)[:, None] + shift) / m
-    pixel = np.broadcast_to(np.stack([px, py], axis=-1), (m, q * q, 2))
-    if area and (m, q) == (4, 1):
-        pixel = np.sqrt(1 / 12) * np.array([[[1, 1]], [[1, -1]], [[-1, 1]], [[-1, -1]]])
-    weight = np.broadcast_to(np.outer(w, w).ravel() / m, (m, q * q))
-    number = np.arange(m * q * q) + 0.5
-    square, turn = np.mod(np.outer(PLASTIC, number), 1.0)
-    return Chords(
-        across=across.ravel(),
-        pixel=pixel.reshape(-1, 2),
-        weight=weight.ravel(),
-        side=number / len(number) - 0.5,
-        pupil=_polar(np.sqrt(1 - np.abs(2 * square - 1)), 2 * np.pi * turn),
-    )
+
+def _gauss_cube(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Nodes (n, 3) and weights (n,) of Gauss in the cube; 4 are every other one of 8."""
+    x, w = gauss(3 if count == 27 else 2)
+    place = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
+    weight = np.multiply.outer(np.outer(w, w), w).ravel()
+    if count == 4:
+        corners = [0, 3, 5, 6]
+        return place[corners], 2 * weight[corners]
+    return place, weight
+
+
+def _net(count: int) -> NDArray[np.float64]:
+    """(0, m, 3)-net of count = 2^m points: one in every box of 2^-m whose sides are powers of ½ (Niederreiter 1987)."""
+    number = np.arange(count)
+    bits = [(number >> j) & 1 for j in range(count.bit_length() - 1)]
+    mirrored, sobol, column = np.zeros_like(number), np.zeros_like(number), count >> 1
+    for j, bit in enumerate(bits):
+        mirrored ^= bit * (count >> (j + 1))
+        sobol ^= bit * column
+        column ^= column >> 1
+    return (np.stack([number, sobol, mirrored], axis=-1) + 0.5) / count
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
@@ -131,21 +132,57 @@ def test_gauss_rule_is_exact_to_degree_2n_minus_1(n):
     assert weight @ node ** (2 * n) != pytest.approx(1 / (2 * n + 1), abs=1e-6)
 
 
-@pytest.mark.parametrize(("m", "q"), rules.CHORD_LEVELS)
-def test_chords_lie_in_disc_and_pixel_and_have_sum_one(m, q):
-    chords = rules.chords(m, q)
-    assert len(chords) == m * q * q
-    assert chords.weight.sum() == pytest.approx(1, abs=1e-13)
-    assert np.all((chords.across > 0) & (chords.across < 1))
-    assert np.all(np.abs(chords.pixel) <= 0.5)
-    # Any pixel point, were it alone, would still be served by evenly spaced chords.
-    for point in np.unique(chords.pixel, axis=0):
-        mine = np.sort(chords.across[(chords.pixel == point).all(axis=1)])
-        np.testing.assert_allclose(np.diff(mine), 1 / m, atol=1e-12)
+@pytest.mark.parametrize("count", rules.TRANSECT_LEVELS)
+def test_places_of_transects_lie_in_the_cube_and_are_as_many_as_asked(count):
+    places = rules.transects(count)
+    assert len(places) == count
+    assert places.weight.sum() == pytest.approx(1, abs=1e-13)
+    for place in (places.sharp, places.blurred):
+        assert place.shape == (count, 3)
+        assert np.all((place > 0) & (place < 1))
 
 
-def test_chords_double_from_level_to_level():
+@pytest.mark.parametrize(("count", "degree"), [(4, 2), (8, 3), (27, 5)])
+def test_few_places_are_exact_for_polynomials(count, degree):
+    """Expected: means of x^i y^j z^k over the cube, 1/((i+1)(j+1)(k+1)), up to the degree in all and no further."""
+    places = rules.transects(count)
+
+    def off(i: int, j: int, k: int) -> float:
+        return places.weight @ np.prod(places.blurred ** [i, j, k], axis=1) - 1 / ((i + 1) * (j + 1) * (k + 1))
+
+    powers = [p for p in itertools.product(range(degree + 2), repeat=3) if sum(p) <= degree]
+    assert max(abs(off(*p)) for p in powers) < 1e-15
+    beyond = [p for p in itertools.product(range(degree + 2), repeat=3) if sum(p) == degree + 1]
+    assert max(abs(off(*p)) for p in beyond) > 1e-5
+
+
+@pytest.mark.parametrize("count", [64, 256])
+def test_many_places_are_a_net(count):
+    """One place in every box of volume 1/n whose sides are powers of ½: 2^i × 2^j × 2^k boxes in all."""
+    place = rules.transects(count).blurred
+    m = count.bit_length() - 1
+    for i in range(m + 1):
+        for j in range(m + 1 - i):
+            box = np.floor(place * [2**i, 2**j, 2 ** (m - i - j)]).astype(int)
+            assert len(np.unique(box, axis=0)) == count
+
+
+@pytest.mark.parametrize("count", rules.TRANSECT_LEVELS)
+def test_places_for_sharp_edges_are_even_lines_and_opposite_in_pairs(count):
+    sharp = rules.transects(count).sharp
+    np.testing.assert_allclose(np.sort(sharp[:, 2]), (np.arange(count) + 0.5) / count, atol=1e-12)
+    np.testing.assert_allclose(sharp + sharp[::-1], 1, atol=1e-12)
+
+
+def test_transects_at_least_double_from_level_to_level():
     """So that the change from the last level says what is left."""
-    count = [m * q * q for m, q in rules.CHORD_LEVELS]
-    assert np.all(np.diff(count) > 0)
-    assert np.all(np.divide(count[1:], count[:-1]) >= 16 / 9)
+    assert np.all(np.divide(rules.TRANSECT_LEVELS[1:], rules.TRANSECT_LEVELS[:-1]) >= 2)
+
+
+def test_every_level_looks_further_along_its_transects_and_so_does_a_smaller_rtol():
+    levels = [dataclasses.astuple(rules.along_transect(level, 1e-3)) for level in range(4)]
+    assert np.all(np.diff(levels, axis=0) > 0)
+    coarse, fine = rules.along_transect(0, 1e-2), rules.along_transect(0, 1e-5)
+    assert fine.bisections > coarse.bisections and fine.nodes > coarse.nodes
+    # s goes from -1 to 1, and the jump is said to be in the middle of the last interval.
+    assert 1 / fine.scan * 0.5**fine.bisections <= 1e-5

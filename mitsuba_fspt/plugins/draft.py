@@ -23,20 +23,19 @@ LEAST_CLAIM = (
     0.05  # rules that agree say little about what all miss: no error is said to be so much below the tolerance
 )
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
-# A silhouette can pass between the outermost of a rule's nodes, or of the first four chords, and the rim of the pupil:
-# that far in (blur radii). A straight one makes them wrong by at most this share of the light, sharp or blurred, where
-# it parts the nodes and where it does not.
-GAP = {1: 1.0, 4: 0.6, 12: 0.25, "chords": 0.1}
+# A silhouette can pass between the outermost of a rule's nodes, or of the first transects, and the rim of the pupil: that
+# far in (blur radii). A straight one makes them wrong by at most this share of the light, sharp or blurred, where it
+# parts the nodes and where it does not.
+GAP = {1: 1.0, 4: 0.6, 12: 0.25, "transects": 0.1}
 CUT = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
 UNSEEN = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
-UNSEEN_BY_CHORDS = 0.0125
+UNSEEN_BY_TRANSECTS = 0.0125
 SHARP = 0.3  # blur radius [pixels]
 
 
 class Draft:
     """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `hits`.
 
-    change : by which the last rule moved the value
     nearest : depth of what is nearest [mm], inf where nothing is met
     blur : largest blur radius of what a pixel or a neighbour sees [pixels]; sharp : True where the least one is small
     clipped : a second border of the lens cuts the pupil, whatever is sharp
@@ -50,7 +49,7 @@ class Draft:
         self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
         self.area = quadrature.pixel == "area"
         self.grid = grid = Grid(window.shape)
-        self.value, self.error, self.hits, self.change, self.blur = (grid.full(mi.Float64, 0) for _ in range(5))
+        self.value, self.error, self.hits, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
         self.clipped = grid.lanes(window.clipped(lens))
@@ -78,7 +77,8 @@ class Draft:
         """The picture as it is, on the crop window."""
         floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
         error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, dr.opaque(mi.Float64, floor) * self.peak))
-        images = (self.value, dr.select(self.beyond, 0, error), dr.clip(self.hits, 0, 1))
+        hits = dr.select(self.hits > 1 - FLOAT32_FLOOR, 1, dr.maximum(self.hits, 0))
+        images = (self.value, dr.select(self.beyond, 0, error), hits)
         dr.eval(images)
         power, error, coverage = (self.window.expand(self.grid.array(image)) for image in images)
         power, error = power * self.lens.etendue, error * self.lens.etendue
@@ -94,7 +94,7 @@ class Draft:
     def set_blur(self, farthest: Image) -> None:
         """From depths: of what is nearest or farthest, for from the sharp plane on blur grows either way."""
         seen = dr.isfinite(self.nearest)
-        front, back = self.lens.blur_radius(self.nearest), self.lens.blur_radius(farthest)
+        front, back = (dr.abs(self.lens.blur_radius(depth)) for depth in (self.nearest, farthest))
         most = dr.opaque(mi.Float64, max(self.grid.shape))
         self.blur = self.grid.spread_max(dr.select(seen, dr.minimum(dr.maximum(front, back), most), 0))
         self.sharp = self.grid.dilate(seen & (dr.minimum(front, back) < SHARP), 1 + math.ceil(SHARP))
@@ -121,11 +121,14 @@ class Draft:
         share = dr.select(parted(self.hits) | self.clipped | self.stopped, cut, share)
         return share * self._whole(reach)
 
-    def unseen_by_chords(self, split: Mask) -> Image:
-        """What four chords may be wrong by near pixels they are `split` on and where they meet no jump themselves."""
-        reach = self.reach("chords")
-        near = self.grid.grow(split, reach) & ~split
-        return dr.select(near, UNSEEN_BY_CHORDS * self._whole(reach), 0)
+    def unseen_by_transects(self, split: Mask) -> Image:
+        """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump themselves."""
+        reach = self.reach("transects")
+        return dr.select(self.grid.grow(split, reach), UNSEEN_BY_TRANSECTS * self._whole(reach), 0)
+
+    def near_edge(self, image: Image) -> Image:
+        """Largest value around, as far as transects may pass an edge by."""
+        return self.grid.spread_max(image, int(dr.max(self.reach("transects"))[0]))
 
     def _whole(self, reach: mi.Int) -> Image:
         """Largest value within the largest `reach`, if no line of sight missed."""

@@ -211,13 +211,13 @@ class FsptLens(mi.Sensor):
     # ------------------------------------------------------------------ what the film can see, in double precision
 
     def blur_radius(self, depth: mi.Float64) -> mi.Float64:
-        """Radius [pixels] of the blur disc of a point at `depth` z [mm] from the lens plane; inf at z <= 0."""
+        """Radius [pixels] of the blur disc of a point at `depth` z [mm], < 0 beyond the sharp plane; inf at z <= 0."""
         disc = self.optics.discs[0]
         numbers = (self.optics.focus_distance, disc.shift, self._spread * disc.radius, self.virtual_pitch)
         u, shift, radius, pitch = (dr.opaque(mi.Float64, n) for n in numbers)
         back = (u - depth) / u
         scale = 1 - (1 - shift) * back
-        blur = radius * dr.abs(back) / (scale * pitch)
+        blur = radius * back / (scale * pitch)
         return dr.select((scale > 0) & ~dr.isnan(blur), blur, dr.inf)
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -231,7 +231,8 @@ class FsptLens(mi.Sensor):
         scale = 1 - (1 - disc.shift) * (u - p[..., 2:]) / u
         scale = np.where(scale > 0, scale, 1)  # there the radius is infinite
         centre = 0.5 * np.array(self.film().size(), np.float64) - p[..., :2] / (scale * self.virtual_pitch)
-        return centre, self.blur_radius(mi.Float64(p[..., 2].ravel())).numpy().reshape(p[..., 2:].shape)
+        blur = self.blur_radius(mi.Float64(p[..., 2].ravel())).numpy()
+        return centre, np.abs(blur).reshape(p[..., 2:].shape)
 
     # ------------------------------------------------------------------ Mitsuba's sensor interface
 

@@ -28,10 +28,10 @@ def first_nodes(draft: Draft) -> Mask:
     """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
-    value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule)
+    value, contrast, mx, my, draft.hits, draft.nearest, farthest = apply_nodes(draft, rule)
     if len(rule) == 1 and not dr.any(draft.hits > 0):  # what glows is thinner than a pixel
         rule = rules.four(draft.area)
-        value, contrast, mx, my, draft.hits, draft.nearest, farthest = _apply(draft, rule)
+        value, contrast, mx, my, draft.hits, draft.nearest, farthest = apply_nodes(draft, rule)
     draft.set_blur(farthest)
     draft.value = value = dr.select(draft.open, value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
@@ -96,9 +96,8 @@ def _one_will_do(draft: Draft) -> bool:
 
 def _refine(draft: Draft, where: Mask) -> Image:
     """Twelve nodes on the marked pixels; returns how far the first ones were off there, 0 elsewhere."""
-    value, _, _, _, hits, nearest, _ = _apply(draft, rules.twelve(draft.area), where)
+    value, _, _, _, hits, nearest, _ = apply_nodes(draft, rules.twelve(draft.area), where)
     difference = dr.select(where, dr.abs(value - draft.value), 0)
-    draft.change = dr.maximum(draft.change, difference)
     # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
     gain = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
     draft.value = dr.select(where, value, draft.value)
@@ -109,7 +108,7 @@ def _refine(draft: Draft, where: Mask) -> Image:
     return difference
 
 
-def _apply(draft: Draft, rule: rules.Rule, where: Mask | None = None) -> list[Image]:
+def apply_nodes(draft: Draft, rule: rules.Rule, where: Mask | None = None) -> list[Image]:
     """Images of `apply_rule`'s sums at all or at the marked pixels, 0 (depths: inf, 0) elsewhere."""
     if where is None:
         index = draft.grid.number

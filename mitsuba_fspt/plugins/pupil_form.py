@@ -2,8 +2,9 @@
 
 A ladder of three rules. Four nodes over pupil and pixel serve every pixel, one where the pupil is as good as a point
 and blur stays in the pixel; where the picture bends, twelve; where the line of sight jumps (a silhouette, an occluder,
-an edge of J_n), chords: along each the jumps are found by bisection and the pieces between them are integrated on their
-own, so that only smooth averages are left to sample.
+an edge of J_n), transects: curves across the edge through pixel and pupil together. Along each the jumps are found by
+bisection and the pieces between them are integrated on their own, so that only what changes along the edge is left to
+sample.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ import numpy as np
 
 from .. import rules
 from ..quadrature import Quadrature, Solution
-from .chords import integrate_by_chords
 from .draft import LANES, Draft, chunks
 from .grid import Grid
 from .lines import apply_rule
 from .nodes import first_nodes, twelve_nodes
+from .transects import integrate_by_transects
 from .window import Window, visible_window
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def solve(
     if quadrature.max_nodes >= FEWEST:
         rough = twelve_nodes(draft, rough)
         if dr.any(rough):
-            integrate_by_chords(draft, rough)
+            integrate_by_transects(draft, rough)
     return draft.solution()
 
 

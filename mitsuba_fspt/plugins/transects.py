@@ -1,0 +1,188 @@
+"""Transects through pixel × pupil where the line of sight jumps: more of them until no pixel around moves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from .. import rules
+from .draft import LANES, Draft, chunks
+from .jumps import integrate_transect
+from .nodes import apply_nodes
+from .transect import transect
+
+if TYPE_CHECKING:
+    from .draft import Index
+    from .grid import Image, Mask
+
+# Of the difference to twelve nodes may be left in the first transects, and in nodes that no transect parts.
+FIRST_GAIN, NODES_GAIN = 0.2, 0.9
+LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be left
+# What a kink may hide from transects that differ, in units of their deviation over their number, level by level.
+SCATTER = (3.0, 2.0, 1.0, 1.0)
+# On so many levels nodes may do yet where nothing jumps, as long as they do not move the value by such a share.
+SMOOTH_LEVELS, BUMPY = 3, 1e-2
+STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
+CORNER = 1 / 16  # of the light, over the number of transects squared, is in a corner that none of them crosses
+LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
+SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
+
+
+def integrate_by_transects(draft: Draft, rough: Mask) -> None:
+    """More transects each round on the pixels that the last round still moved, or moved a neighbour of."""
+    where, edges = rough, _edges(draft)
+    split, left = draft.grid.full(mi.Bool, False), draft.grid.full(mi.Float64, 0)
+    smooth, fewer = draft.grid.full(mi.Bool, True), 0
+    for level, many in enumerate(rules.TRANSECT_LEVELS):
+        rule, along = rules.transects(many), rules.along_transect(level, draft.quadrature.rtol)
+        if 16 + many * along.rays > draft.quadrature.max_nodes or not dr.any(where):
+            break
+        means = _apply(draft, where, edges, rule, along)
+        fresh = where & means.jumps & ~split  # a jump that no transect met before
+        split |= fresh
+        smooth = smooth & where & ~split
+        value, hits, scatter = means.value, means.hits, SCATTER[min(level, len(SCATTER) - 1)] * means.scatter
+        if 0 < level <= SMOOTH_LEVELS and dr.any(smooth):
+            nodes, _, _, _, seen, *_ = apply_nodes(draft, rules.product(level, draft.area), smooth)
+            value, hits = dr.select(smooth, nodes, value), dr.select(smooth, seen, hits)
+            scatter = dr.select(smooth, 0, scatter)
+        moved = dr.abs(value - draft.value)
+        if level == 0:
+            # Where nothing jumps nodes are as good or better.
+            better = fresh
+            more = dr.select(fresh, dr.maximum(FIRST_GAIN * moved, scatter), NODES_GAIN * moved)
+            unseen = draft.unseen_by_transects(fresh)
+        else:
+            better = where
+            more = dr.maximum(_left_after(moved, left, fewer / many), scatter)
+            if level <= SMOOTH_LEVELS:
+                # On what is smooth each step of the node rules gains more than it moves.
+                more = dr.select(smooth, STEP_GAIN * moved, more)
+                smooth = smooth & (moved < BUMPY * value)
+            # What was moved until now says nothing of a fresh jump.
+            more = dr.select(fresh, dr.maximum(more, 2 * draft.tolerance), more)
+            unseen = draft.near_edge(dr.select(fresh, moved, 0))
+        # Whose neighbour meets a jump at last may pass it by, settled or not, and be as wrong as that one was.
+        unseen = dr.select(split | ~draft.open, 0, unseen)
+        left = dr.select(where, more, left)
+        draft.value = dr.select(better, value, draft.value)
+        draft.hits = dr.select(better, hits, draft.hits)
+        draft.error = dr.maximum(dr.select(where, draft.grid.spread_max(left), draft.error), unseen)
+        edges.blur = dr.select(
+            means.jumps & ~draft.clipped & ~draft.stopped, draft.lens.blur_radius(means.depth), edges.blur
+        )
+        edges.sharp = (dr.abs(edges.blur) < SHARP) & draft.grid.dilate(
+            split | draft.grid.outline(draft.hits, 1), 1
+        )  # smooth pixels take Gauss's
+        where = (where | (unseen > 0)) & (draft.error > draft.tolerance)
+        fewer = many
+        dr.eval(draft.value, draft.hits, draft.error, split, left, edges.blur, edges.sharp, where)
+
+
+def _left_after(moved: Image, left: Image, ratio: float) -> Image:
+    """What may be left after a level that `moved` the value, where so much was `left` before; `ratio` of their numbers.
+
+    The less it moved of what was expected the less is left, but lest two wrong values agree by chance no less than the
+    order of convergence grants.
+    """
+    change = dr.maximum(moved, left * dr.opaque(mi.Float64, ratio**rules.TRANSECT_ORDER))
+    return change * dr.clip(dr.select(left > 0, MOST_GAIN * change / left, MOST_GAIN), LEAST_GAIN, MOST_GAIN)
+
+
+# ---------------------------------------------------------------------- which way transects go
+
+
+@dataclass
+class _Edges:
+    """Of the edge that a pixel may see: its `angle`, signed `blur` radius [pixels] and whether it counts as `sharp`."""
+
+    angle: Image
+    blur: Image
+    sharp: Mask
+
+
+def _edges(draft: Draft) -> _Edges:
+    """Across the change of the picture around, with the blur of what is nearest to the lens.
+
+    A second border of the lens is so blurred that only the pupil sees it, the image-plane stop is sharp.
+    """
+    grid = draft.grid
+    angle = grid.principal_angle(*grid.gradient(draft.value), 1 + math.ceil(dr.max(draft.blur)[0] / 2))
+    nearest = -grid.spread_max(-draft.nearest)
+    # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
+    farther = -grid.spread_max(-draft.nearest, int(dr.max(draft.reach(12))[0]))
+    nearest = dr.select(grid.outline(draft.hits, 1) & dr.isfinite(nearest), nearest, farther)
+    blur = dr.select(draft.clipped, dr.inf, draft.lens.blur_radius(nearest))
+    blur = dr.select(draft.stopped, 0, blur)
+    return _Edges(angle, blur, dr.abs(blur) < SHARP)
+
+
+# ---------------------------------------------------------------------- many transects in one launch
+
+
+@dataclass(frozen=True)
+class _Means:
+    """Of each marked pixel mean radiance on film, share of hits, whether a transect is split by a jump.
+
+    scatter : deviation of the transects over their number
+    depth : of the edges, mean over transects that meet one [mm]
+    """
+
+    value: Image
+    hits: Image
+    jumps: Mask
+    scatter: Image
+    depth: Image
+
+
+def _apply(draft: Draft, where: Mask, edges: _Edges, rule: rules.Transects, along: rules.AlongTransect) -> _Means:
+    """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
+    index = dr.compress(where)
+    images = [draft.grid.full(mi.Float64, 0) for _ in range(5)]
+    rays = 0
+    for part in chunks(index, max(1, LANES // len(rule))):
+        *sums, looks = _transect_sums(draft, part, edges, rule, along)
+        for image, column in zip(images, sums, strict=True):
+            dr.scatter(image, column, part)
+        dr.eval(images)
+        rays += int(dr.sum(looks)[0])
+    draft.count(f"{len(rule)} transects", dr.width(index), rays)
+    value, hits, squares, parted, depth = images
+    number = dr.opaque(mi.Float64, len(rule))
+    # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
+    scatter = dr.safe_sqrt(squares - value * value) / dr.select(edges.sharp, number * dr.sqrt(number), number)
+    scatter = dr.maximum(scatter, dr.select(edges.sharp, CORNER * value / (number * number), 0))
+    return _Means(value, hits, parted > 0, scatter, depth / parted)
+
+
+def _transect_sums(
+    draft: Draft, part: Index, edges: _Edges, rule: rules.Transects, along: rules.AlongTransect
+) -> list[Image]:
+    """Of each listed pixel means over its transects of value, hits and value squared; how many jump, and sums over
+    them of the depth of the edge; lines of sight taken.
+    """
+    count = dr.opaque(mi.UInt32, len(rule))
+    lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
+    pixel, number = dr.gather(mi.UInt32, part, lane // count), lane % count
+    angle, blur = (mi.Float(dr.gather(mi.Float64, image, pixel)) for image in (edges.angle, edges.blur))
+    sharp = dr.gather(mi.Bool, edges.sharp, pixel)
+    even, gauss = (
+        mi.Point3f(*(dr.gather(mi.Float, mi.Float(column), number) for column in place.T))
+        for place in (rule.sharp, rule.blurred)
+    )
+    weight, phase = (dr.gather(mi.Float, mi.Float(column), number) for column in (rule.weight, rule.phase))
+    weight = dr.select(sharp, dr.opaque(mi.Float, 1 / len(rule)), weight)
+    area = dr.opaque(mi.Float, float(draft.area))
+    place = dr.select(sharp, even, gauss)
+    curve = transect(draft.window.centres(pixel), angle, blur, place, area)
+    outline, least = mi.Float(2 * draft.peak), mi.Float(LEAST_JUMP * draft.tolerance)
+    found = integrate_transect(draft.scene, draft.lens, curve, phase, along, outline, least)
+    value, hits, jumps, depth, looks = (mi.Float64(column) for column in found)
+    share = mi.Float64(weight) * value
+    columns = [share, mi.Float64(weight) * hits, share * value, dr.minimum(jumps, 1), depth, looks]
+    dr.eval(columns)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
+    return [dr.block_sum(column, len(rule)) for column in columns]
