@@ -14,6 +14,7 @@ from .stiff_cases_scenes import (
     FOCAL,
     FOCUS,
     REFUSAL,
+    ROUNDED,
     SAME,
     SHARP,
     SIDE,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 def light_cases() -> list[Case]:
     """J_n over all that float32 holds."""
     rows = [
-        Case(f"J_n {j:g} W/mm²", SAME, partial(_times, j), EXACT if 1e-32 < j < 1e32 else None)
+        Case(f"J_n {j:g} W/mm²", SAME, partial(_times, j), ROUNDED if 1e-32 < j < 1e32 else None)
         for j in (1e-37, 1e-30, 1e30, 1e37)
     ]
     return [

@@ -32,6 +32,7 @@ OTHER = "the other domain"
 REFUSAL = "a refusal"
 # Float32 reaches 4e-7 with filled cones; with edges the accuracy asked for, 1e-3, counts.
 EXACT, SHARP, AGREED = 1e-5, 5e-4, 2e-3
+ROUNDED = 1e-4  # at the usual rtol: float32 that rounds otherwise lets a bisection end beside where it did
 
 Image = NDArray[np.float64]
 

@@ -132,6 +132,20 @@ def test_gauss_rule_is_exact_to_degree_2n_minus_1(n):
     assert weight @ node ** (2 * n) != pytest.approx(1 / (2 * n + 1), abs=1e-6)
 
 
+@pytest.mark.parametrize("area", [True, False])
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_product_rule_is_exact_where_the_pupil_matters(level, area):
+    """Expected: moments of disc and square to degree 2 level + 1 in each, and none of the square at its centre."""
+    rule = rules.product(level, area)
+    assert rule.weight.sum() == pytest.approx(1, abs=1e-14)
+    degree = 2 * level + 1
+    for a, b in itertools.product(range(degree + 1), repeat=2):
+        if a + b <= degree:
+            assert rule.weight @ np.prod(rule.pupil ** [a, b], axis=1) == pytest.approx(disc_moment(a, b), abs=1e-13)
+    square = rule.weight @ np.prod(rule.pixel**2, axis=1)
+    assert square == pytest.approx(1 / 144 if area else 0, abs=1e-14)
+
+
 @pytest.mark.parametrize("count", rules.TRANSECT_LEVELS)
 def test_places_of_transects_lie_in_the_cube_and_are_as_many_as_asked(count):
     places = rules.transects(count)
@@ -183,6 +197,7 @@ def test_every_level_looks_further_along_its_transects_and_so_does_a_smaller_rto
     levels = [dataclasses.astuple(rules.along_transect(level, 1e-3)) for level in range(4)]
     assert np.all(np.diff(levels, axis=0) > 0)
     coarse, fine = rules.along_transect(0, 1e-2), rules.along_transect(0, 1e-5)
-    assert fine.bisections > coarse.bisections and fine.nodes > coarse.nodes
+    assert fine.bisections > coarse.bisections
+    assert fine.nodes > coarse.nodes
     # s goes from -1 to 1, and the jump is said to be in the middle of the last interval.
     assert 1 / fine.scan * 0.5**fine.bisections <= 1e-5

@@ -23,9 +23,9 @@ LEAST_CLAIM = (
     0.05  # rules that agree say little about what all miss: no error is said to be so much below the tolerance
 )
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
-# A silhouette can pass between the outermost of a rule's nodes, or of the first transects, and the rim of the pupil: that
-# far in (blur radii). A straight one makes them wrong by at most this share of the light, sharp or blurred, where it
-# parts the nodes and where it does not.
+# A silhouette can pass between the outermost of a rule's nodes and the rim of the pupil, or beside the first transects:
+# that far in (blur radii). A straight one makes them wrong by at most this share of the light, sharp or blurred, where
+# it parts the nodes and where it does not.
 GAP = {1: 1.0, 4: 0.6, 12: 0.25, "transects": 0.1}
 CUT = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
 UNSEEN = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
@@ -122,7 +122,7 @@ class Draft:
         return share * self._whole(reach)
 
     def unseen_by_transects(self, split: Mask) -> Image:
-        """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump themselves."""
+        """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump."""
         reach = self.reach("transects")
         return dr.select(self.grid.grow(split, reach), UNSEEN_BY_TRANSECTS * self._whole(reach), 0)
 

@@ -12,7 +12,7 @@ from .lines import radiance_on_film, repeat
 from .transect import Transect
 
 STEEP = 4.0  # a jump is so many times larger than the mean of the transect's other steps
-SHIFT = 0.2  # of an interval: by which scanned points are moved, as the phase wants
+SHIFT = 0.1  # of an interval: by which scanned points are moved, as the phase wants
 SHORTEST = 1e-6  # half of a piece, lest its moments are divided by nothing
 FLAT = 1e-4  # variance of z over nodes that lie in one place
 
@@ -26,21 +26,21 @@ def integrate_transect(
     outline: mi.Float,
     least: mi.Float,
 ) -> tuple[mi.Float, ...]:
-    """Of a transect mean of integrand and hits, number of jumps, depth of the edge at the largest, lines of sight taken.
+    """Of a transect means of integrand and hits, number of jumps, depth of the edge at the largest, lines of sight.
 
     It is split at its two largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points, then
     bisected towards the larger difference; every piece that is not dark gets `along.nodes` at even distances, the first
     of them at `phase` of one; a transect without a jump is one piece. In units of the integrand an `outline` counts so
-    much as a jump, and less than `least` does not.
+    much as a jump of the radiance, and less than `least` does not.
     """
     intervals = dr.opaque(mi.UInt32, along.scan)
     step = 2 / mi.Float(intervals)
     # Where edges run along pixels they would lie on points to bisect, and rounding choose the side.
     shift = SHIFT * (phase - 0.5)
 
-    def look(s: mi.Float) -> tuple[mi.Point3f, mi.Float]:
-        position, pupil, density = transect.at(s)
-        return mi.Point3f(*radiance_on_film(scene, lens, position, pupil)), density
+    def look(s: mi.Float) -> mi.Point3f:
+        position, pupil, _ = transect.at(s)
+        return mi.Point3f(*radiance_on_film(scene, lens, position, pupil)[1:])
 
     def size(jump: _Jump) -> mi.Float:
         # An outline outranks whatever steep but smooth change lies elsewhere on the transect.
@@ -49,7 +49,7 @@ def integrate_transect(
     def scan(k: mi.UInt32, first: _Jump, second: _Jump, total: mi.Float, lit: mi.Point2f, last: _Jump) -> tuple:
         inside = (k > 0) & (k < intervals)
         s = dr.select(inside, step * (mi.Float(k) + shift), dr.select(k > 0, 2, 0)) - 1
-        seen, _ = look(s)
+        seen = look(s)
         new = _Jump(mi.Point2f(last.at.y, s), last.after, seen)
         new_size = dr.select(k > 0, size(new), 0)
         largest, larger = new_size > size(first), new_size > size(second)
@@ -63,7 +63,7 @@ def integrate_transect(
         turn = k == bisections
         jump, other = dr.select(turn, other, jump), dr.select(turn, jump, other)
         s = 0.5 * (jump.at.x + jump.at.y)
-        seen, _ = look(s)
+        seen = look(s)
         left = _Jump(mi.Point2f(jump.at.x, s), jump.before, seen)
         right = _Jump(mi.Point2f(s, jump.at.y), seen, jump.after)
         return dr.select(size(left) >= size(right), left, right), other
@@ -97,8 +97,9 @@ def integrate_transect(
         middle, half = 0.5 * (low + high), dr.maximum(0.5 * (high - low), SHORTEST)
         share, slope = _towards_jumps((mi.Float(number) + phase) / mi.Float(nodes), at_start, at_end)
         s = low + (high - low) * share
-        seen, density = look(s)
-        sums = dr.select(number == 0, dr.zeros(_Sums), sums).plus(slope * density, (s - middle) / half, seen.x, seen.y)
+        position, pupil, density = transect.at(s)
+        f, _, body, _ = radiance_on_film(scene, lens, position, pupil)
+        sums = dr.select(number == 0, dr.zeros(_Sums), sums).plus(slope * density, (s - middle) / half, f, body)
         until = dr.select(at_end, dr.select(piece == 0, to_left, to_right), to_end)
         since = dr.select(at_start, dr.select(piece == 1, to_left, to_right), mi.Vector2d(0))
         more_value, more_hits = sums.corrected(_about(until - since, middle, half))
@@ -124,7 +125,7 @@ def _towards_jumps(x: mi.Float, at_start: mi.Bool, at_end: mi.Bool) -> tuple[mi.
 
 @dataclass
 class _Jump:
-    """Two neighbouring points of a transect: their places `at`, and integrand, number of the body and depth at each."""
+    """Two neighbouring points of a transect: their places `at`, and radiance, number of the body and depth at each."""
 
     at: mi.Point2f
     before: mi.Point3f

@@ -19,15 +19,15 @@ from .elements import at_one_wavelength, scalar
 
 def radiance_on_film(
     scene: mi.Scene, lens: mi.Sensor, position: mi.Point2f, pupil: mi.Point2f
-) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; number of the body met, 0 for none or no passage; its depth z [mm]."""
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+    """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; L; number of the body met, 0 for none or no passage; its depth [mm]."""
     ray, weight, cos_theta = lens.line_of_sight(position, pupil)
     at_one_wavelength(ray)
     # Embree traces packets of neighbouring lines of sight three times slower than single rays.
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=weight > 0)
     radiance = scalar(si.emitter(scene).eval(si))
     body = mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))
-    return weight * radiance, body, si.t * cos_theta
+    return weight * radiance, radiance, body, si.t * cos_theta
 
 
 def repeat(
@@ -62,7 +62,7 @@ def apply_rule(scene: mi.Scene, lens: mi.Sensor, centre: mi.Point2f, rule: rules
         farthest: mi.Float,
     ) -> tuple:
         ax, ay, dx, dy, weight, null = (dr.gather(mi.Float, column, k) for column in table)
-        f, body, depth = radiance_on_film(scene, lens, centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
+        f, _, body, depth = radiance_on_film(scene, lens, centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
         hit = body > 0
         return (
             value + weight * f,

@@ -1,9 +1,9 @@
 """Transects: curves through pixel × pupil that cross every straight edge at right angles to them just once.
 
-Light that leaves a point for pupil point a arrives at film position c + r a; r is the signed radius of its blur disc. So
-a straight edge with normal n parts pixel × pupil at one value of n·(p - r a), whatever its blur. A transect goes from
-the smallest to the largest value. What it leaves open, three places between 0 and 1, moves along the edge, and the mean
-along a transect depends on them but little: where edges are nearly straight, a few transects do.
+Light that leaves a point for pupil point a arrives at film position c + r a; r is the signed radius of its blur disc.
+So a straight edge with normal n parts pixel × pupil at one value of n·(p - r a), whatever its blur. A transect goes
+from the smallest to the largest value. What it leaves open, three places between 0 and 1, moves along the edge, and the
+mean along a transect depends on them but little: where edges are nearly straight, a few transects do.
 """
 
 from __future__ import annotations

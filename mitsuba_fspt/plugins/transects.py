@@ -28,69 +28,86 @@ SCATTER = (3.0, 2.0, 1.0, 1.0)
 SMOOTH_LEVELS, BUMPY = 3, 1e-2
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 16  # of the light, over the number of transects squared, is in a corner that none of them crosses
+FEWEST = 16  # lines of sight that a pixel has taken before
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
 SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
 
 
 def integrate_by_transects(draft: Draft, rough: Mask) -> None:
     """More transects each round on the pixels that the last round still moved, or moved a neighbour of."""
-    where, edges = rough, _edges(draft)
-    split, left = draft.grid.full(mi.Bool, False), draft.grid.full(mi.Float64, 0)
-    smooth, fewer = draft.grid.full(mi.Bool, True), 0
+    ladder = _Ladder(draft, rough)
     for level, many in enumerate(rules.TRANSECT_LEVELS):
-        rule, along = rules.transects(many), rules.along_transect(level, draft.quadrature.rtol)
-        if 16 + many * along.rays > draft.quadrature.max_nodes or not dr.any(where):
+        along = rules.along_transect(level, draft.quadrature.rtol)
+        if FEWEST + many * along.rays > draft.quadrature.max_nodes or not dr.any(ladder.where):
             break
-        means = _apply(draft, where, edges, rule, along)
-        fresh = where & means.jumps & ~split  # a jump that no transect met before
-        split |= fresh
-        smooth = smooth & where & ~split
+        ladder.climb(level, rules.transects(many), along)
+
+
+class _Ladder:
+    """Which pixels the next transects go to, and what is known of them.
+
+    where : pixels to look at
+    edges : which way transects go
+    split : True where a transect met a jump
+    smooth : True where node rules may do as well
+    left : what the value may be wrong by, of every pixel on its own
+    """
+
+    def __init__(self, draft: Draft, rough: Mask) -> None:
+        self.draft, self.where, self.edges = draft, rough, _edges(draft)
+        self.split, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
+        self.left = draft.grid.full(mi.Float64, 0)
+        self.count = 0
+
+    def climb(self, level: int, rule: rules.Transects, along: rules.AlongTransect) -> None:
+        """One round: values, what is left of the error, and whether a neighbour knows better."""
+        draft, where = self.draft, self.where
+        means = _apply(draft, where, self.edges, rule, along)
+        fresh = where & means.jumps & ~self.split
+        self.split |= fresh
+        self.smooth = self.smooth & where & ~self.split
         value, hits, scatter = means.value, means.hits, SCATTER[min(level, len(SCATTER) - 1)] * means.scatter
-        if 0 < level <= SMOOTH_LEVELS and dr.any(smooth):
-            nodes, _, _, _, seen, *_ = apply_nodes(draft, rules.product(level, draft.area), smooth)
-            value, hits = dr.select(smooth, nodes, value), dr.select(smooth, seen, hits)
-            scatter = dr.select(smooth, 0, scatter)
+        if 0 < level <= SMOOTH_LEVELS and dr.any(self.smooth):
+            nodes, _, _, _, seen, *_ = apply_nodes(draft, rules.product(level, draft.area), self.smooth)
+            value, hits = dr.select(self.smooth, nodes, value), dr.select(self.smooth, seen, hits)
         moved = dr.abs(value - draft.value)
         if level == 0:
-            # Where nothing jumps nodes are as good or better.
-            better = fresh
-            more = dr.select(fresh, dr.maximum(FIRST_GAIN * moved, scatter), NODES_GAIN * moved)
-            unseen = draft.unseen_by_transects(fresh)
+            better, left, unseen = self._first(fresh, moved, scatter)
         else:
-            better = where
-            more = dr.maximum(_left_after(moved, left, fewer / many), scatter)
-            if level <= SMOOTH_LEVELS:
-                # On what is smooth each step of the node rules gains more than it moves.
-                more = dr.select(smooth, STEP_GAIN * moved, more)
-                smooth = smooth & (moved < BUMPY * value)
-            # What was moved until now says nothing of a fresh jump.
-            more = dr.select(fresh, dr.maximum(more, 2 * draft.tolerance), more)
-            unseen = draft.near_edge(dr.select(fresh, moved, 0))
+            better, left, unseen = where, *self._later(level, fresh, moved, scatter, len(rule))
+            self.smooth = self.smooth & (moved < BUMPY * value)
         # Whose neighbour meets a jump at last may pass it by, settled or not, and be as wrong as that one was.
-        unseen = dr.select(split | ~draft.open, 0, unseen)
-        left = dr.select(where, more, left)
+        unseen = dr.select(self.split | ~draft.open, 0, unseen)
+        self.left = dr.select(where, left, self.left)
         draft.value = dr.select(better, value, draft.value)
         draft.hits = dr.select(better, hits, draft.hits)
-        draft.error = dr.maximum(dr.select(where, draft.grid.spread_max(left), draft.error), unseen)
-        edges.blur = dr.select(
-            means.jumps & ~draft.clipped & ~draft.stopped, draft.lens.blur_radius(means.depth), edges.blur
-        )
-        edges.sharp = (dr.abs(edges.blur) < SHARP) & draft.grid.dilate(
-            split | draft.grid.outline(draft.hits, 1), 1
-        )  # smooth pixels take Gauss's
-        where = (where | (unseen > 0)) & (draft.error > draft.tolerance)
-        fewer = many
-        dr.eval(draft.value, draft.hits, draft.error, split, left, edges.blur, edges.sharp, where)
+        draft.error = dr.maximum(dr.select(where, draft.grid.spread_max(self.left), draft.error), unseen)
+        self.edges.learn(draft, means, self.split)
+        self.where = (where | (unseen > 0)) & (draft.error > draft.tolerance)
+        self.count = len(rule)
+        edges = self.edges.blur, self.edges.sharp
+        dr.eval(draft.value, draft.hits, draft.error, self.split, self.smooth, self.left, edges, self.where)
 
+    def _first(self, fresh: Mask, moved: Image, scatter: Image) -> tuple[Mask, Image, Image]:
+        """Where the first transects are better than nodes (where they meet a jump), what is left, what they pass by."""
+        left = dr.select(fresh, dr.maximum(FIRST_GAIN * moved, scatter), NODES_GAIN * moved)
+        return fresh, left, self.draft.unseen_by_transects(fresh)
 
-def _left_after(moved: Image, left: Image, ratio: float) -> Image:
-    """What may be left after a level that `moved` the value, where so much was `left` before; `ratio` of their numbers.
+    def _later(self, level: int, fresh: Mask, moved: Image, scatter: Image, count: int) -> tuple[Image, Image]:
+        """What may be left, and what neighbours of a jump that is met at last may be wrong by.
 
-    The less it moved of what was expected the less is left, but lest two wrong values agree by chance no less than the
-    order of convergence grants.
-    """
-    change = dr.maximum(moved, left * dr.opaque(mi.Float64, ratio**rules.TRANSECT_ORDER))
-    return change * dr.clip(dr.select(left > 0, MOST_GAIN * change / left, MOST_GAIN), LEAST_GAIN, MOST_GAIN)
+        The less a level moved of what was left before the less is left, but lest two wrong values agree by chance no
+        less than the order of convergence grants. What was moved until now says nothing of a fresh jump.
+        """
+        before = self.left
+        change = dr.maximum(moved, before * dr.opaque(mi.Float64, (self.count / count) ** rules.TRANSECT_ORDER))
+        gain = dr.clip(dr.select(before > 0, MOST_GAIN * change / before, MOST_GAIN), LEAST_GAIN, MOST_GAIN)
+        left = dr.maximum(change * gain, scatter)
+        if level <= SMOOTH_LEVELS:
+            # On what is smooth each step of the node rules gains more than it moves.
+            left = dr.select(self.smooth, STEP_GAIN * moved, left)
+        left = dr.select(fresh, dr.maximum(left, 2 * self.draft.tolerance), left)
+        return left, self.draft.near_edge(dr.select(fresh, moved, 0))
 
 
 # ---------------------------------------------------------------------- which way transects go
@@ -103,6 +120,13 @@ class _Edges:
     angle: Image
     blur: Image
     sharp: Mask
+
+    def learn(self, draft: Draft, means: _Means, split: Mask) -> None:
+        """Blur from the depth of the edges that were met; pixels that see none are smooth, and none is sharp."""
+        met = means.jumps & ~draft.clipped & ~draft.stopped
+        self.blur = dr.select(met, draft.lens.blur_radius(means.depth), self.blur)
+        near = draft.grid.dilate(split | draft.grid.outline(draft.hits, 1), 1)
+        self.sharp = (dr.abs(self.blur) < SHARP) & near
 
 
 def _edges(draft: Draft) -> _Edges:
