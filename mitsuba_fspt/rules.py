@@ -162,17 +162,20 @@ class Transects:
 @cache
 def transects(count: int) -> Transects:
     """4 (exact to degree 2), 8 or 27 (to degree 3 and 5) transects by Gauss; of a larger power of two a net."""
-    if count <= 27:
-        blurred, weight = _gauss_cube(count)
-    else:
-        blurred, weight = _net(count), np.full(count, 1 / count)
     number = np.arange(count) + 0.5
-    sharp = np.column_stack([np.mod(np.outer(number, PLASTIC), 1.0), number / count])  # R₂ sequence and even lines
-    # Points opposite each other, so that what is odd about the middle cancels.
-    sharp[(count + 1) // 2 :] = 1 - sharp[: count // 2][::-1]
-    if count % 2:
-        sharp[count // 2] = 0.5
-    return Transects(sharp, blurred, weight)
+    if count > 27:
+        blurred, weight = _net(count), np.full(count, 1 / count)
+        return Transects(blurred, blurred, weight)
+    blurred, weight = _gauss_cube(count)
+    if count < 27:
+        # On the pupil the corners of Gauss's square, in an order that has little to do with the place along the pixel.
+        on_pupil = gauss(2)[0][np.array([[0, 0], [1, 1], [1, 0], [0, 1]] if count == 8 else [[0, 0], [1, 0]])]
+    else:
+        on_pupil = np.mod(np.outer(number, PLASTIC), 1.0)[: count // 2]  # R₂ sequence
+    # Opposite each other, so that what is odd about the middle cancels.
+    middle = np.full((count % 2, 2), 0.5)
+    on_pupil = np.concatenate([on_pupil, middle, 1 - on_pupil[::-1]])
+    return Transects(np.column_stack([on_pupil, number / count]), blurred, weight)
 
 
 def _gauss_cube(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -195,7 +198,7 @@ def _net(count: int) -> NDArray[np.float64]:
         mirrored ^= bit * (count >> (j + 1))
         sobol ^= bit * column
         column ^= column >> 1
-    return (np.stack([number, sobol, mirrored], axis=-1) + 0.5) / count
+    return (np.stack([mirrored, sobol, number], axis=-1) + 0.5) / count
 
 
 @cache

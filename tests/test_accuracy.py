@@ -50,7 +50,7 @@ def part_of(name, view, f_number, part):
 def test_every_pixel_is_as_accurate_as_asked(case):
     """Rationale: rtol bounds the error of every pixel relative to the brightest one.
 
-    Expected: against rtol/100, no pixel off by more than rtol. Seen to fail with the bisection of chords left out.
+    Expected: against rtol/100, no pixel off by more than rtol. Seen to fail with the bisection of jumps left out.
     """
     image, truth = pictures(*case)
     assert image.shape == case[3][:1:-1]

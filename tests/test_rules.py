@@ -182,10 +182,11 @@ def test_many_places_are_a_net(count):
 
 
 @pytest.mark.parametrize("count", rules.TRANSECT_LEVELS)
-def test_places_for_sharp_edges_are_even_lines_and_opposite_in_pairs(count):
+def test_places_for_sharp_edges_lie_on_even_lines_across_the_pixel(count):
     sharp = rules.transects(count).sharp
     np.testing.assert_allclose(np.sort(sharp[:, 2]), (np.arange(count) + 0.5) / count, atol=1e-12)
-    np.testing.assert_allclose(sharp + sharp[::-1], 1, atol=1e-12)
+    # What is odd about the middle of the pupil cancels.
+    np.testing.assert_allclose(sharp.mean(axis=0), 0.5, atol=1e-12)
 
 
 def test_transects_at_least_double_from_level_to_level():
