@@ -161,12 +161,13 @@ class Transects:
 
 @cache
 def transects(count: int) -> Transects:
-    """4 (exact to degree 2), 8 or 27 (to degree 3 and 5) transects by Gauss; of a larger power of two a net."""
+    """4 (exact to degree 2), 8, 27 or 64 (to degree 3, 5 and 7) transects by Gauss; of a larger power of two a net."""
     number = np.arange(count) + 0.5
-    if count > 27:
-        blurred, weight = _net(count), np.full(count, 1 / count)
-        return Transects(blurred, blurred, weight)
+    if count > 64:
+        return Transects(_net(count), _net(count), np.full(count, 1 / count))
     blurred, weight = _gauss_cube(count)
+    if count == 64:
+        return Transects(_net(count), blurred, weight)
     if count < 27:
         # On the pupil the corners of Gauss's square, in an order that has little to do with the place along the pixel.
         on_pupil = gauss(2)[0][np.array([[0, 0], [1, 1], [1, 0], [0, 1]] if count == 8 else [[0, 0], [1, 0]])]
@@ -180,7 +181,7 @@ def transects(count: int) -> Transects:
 
 def _gauss_cube(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Nodes (n, 3) and weights (n,) of Gauss in the cube; 4 are every other one of 8."""
-    x, w = gauss(3 if count == 27 else 2)
+    x, w = gauss(max(2, round(count ** (1 / 3))))
     place = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
     weight = np.multiply.outer(np.outer(w, w), w).ravel()
     if count == 4:

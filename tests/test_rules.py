@@ -156,7 +156,7 @@ def test_places_of_transects_lie_in_the_cube_and_are_as_many_as_asked(count):
         assert np.all((place > 0) & (place < 1))
 
 
-@pytest.mark.parametrize(("count", "degree"), [(4, 2), (8, 3), (27, 5)])
+@pytest.mark.parametrize(("count", "degree"), [(4, 2), (8, 3), (27, 5), (64, 7)])
 def test_few_places_are_exact_for_polynomials(count, degree):
     """Expected: means of x^i y^j z^k over the cube, 1/((i+1)(j+1)(k+1)), up to the degree in all and no further."""
     places = rules.transects(count)
@@ -173,7 +173,7 @@ def test_few_places_are_exact_for_polynomials(count, degree):
 @pytest.mark.parametrize("count", [64, 256])
 def test_many_places_are_a_net(count):
     """One place in every box of volume 1/n whose sides are powers of ½: 2^i × 2^j × 2^k boxes in all."""
-    place = rules.transects(count).blurred
+    place = rules.transects(count).sharp
     m = count.bit_length() - 1
     for i in range(m + 1):
         for j in range(m + 1 - i):

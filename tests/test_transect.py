@@ -94,7 +94,7 @@ def test_four_transects_know_the_share_of_a_straight_edge(shift, turn):
     """Half a plane that glows all alike, out of focus, at any angle to the pixels; small angles, cos⁴θ is 1.
 
     Expected: the segment of the blur disc averaged over the pixel, to 3e-4 of the whole wherever the edge passes.
-    Four chords across the pupil alone, straight ones with ends of their own, are wrong by 2e-2.
+    Fails if the blur's sign is dropped, and if what the pixel adds is left out.
     """
     width = 20.0
     corner = mi.ScalarTransform4f().translate([shift, 0, 0]).rotate([1, 0, 0], turn).rotate([0, 1, 0], 90)

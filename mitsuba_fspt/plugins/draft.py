@@ -22,6 +22,7 @@ LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 LEAST_CLAIM = (
     0.05  # rules that agree say little about what all miss: no error is said to be so much below the tolerance
 )
+FULL = 1e-6  # of all lines of sight hit but for so many, as far as a sum of float32 weights knows
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
 # A silhouette can pass between the outermost of a rule's nodes and the rim of the pupil, or beside the first transects:
 # that far in (blur radii). A straight one makes them wrong by at most this share of the light, sharp or blurred, where
@@ -77,7 +78,7 @@ class Draft:
         """The picture as it is, on the crop window."""
         floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
         error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, dr.opaque(mi.Float64, floor) * self.peak))
-        hits = dr.select(self.hits > 1 - FLOAT32_FLOOR, 1, dr.maximum(self.hits, 0))
+        hits = dr.select(self.hits > 1 - FULL, 1, dr.maximum(self.hits, 0))
         images = (self.value, dr.select(self.beyond, 0, error), hits)
         dr.eval(images)
         power, error, coverage = (self.window.expand(self.grid.array(image)) for image in images)
