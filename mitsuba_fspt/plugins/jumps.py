@@ -86,7 +86,8 @@ def integrate_transect(
     # Pieces 0 … last between -1, left, right, 1; an outer one on which every point looked past the phantom is dark.
     begin = dr.select(jumps & (lit.x > left), 1, 0)
     end = dr.select(lit.y >= dr.select(both, right, dr.select(jumps, left, -1)), last + 1, last)
-    to_left, to_right, to_end = (transect.moments(s) for s in (left, right, mi.Float(1)))
+    to_left, to_right = transect.moments(left), transect.moments(right)
+    to_end = mi.Vector2d(1, 0)  # the density is even
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
     def integrate(k: mi.UInt32, value: mi.Float, hits: mi.Float, sums: _Sums) -> tuple:
