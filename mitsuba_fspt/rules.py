@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 GOLDEN = 0.6180339887498949
+PLASTIC = (0.7548776662466927, 0.5698402909980532)  # steps of the R₂ sequence, even in the unit square
 
 Image = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
 
@@ -110,7 +111,6 @@ def product(level: int, area: bool) -> Rule:
 TRANSECT_LEVELS = (4, 8, 27, 64, 256, 1024)
 SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
 TRANSECT_ORDER = 1.5  # by which the error falls at least, whatever two levels agree on
-PLASTIC = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..rules import PLASTIC
 from .elements import Elements, at_one_wavelength, elements_of, scalar
 from .grid import Grid
 from .window import Window
@@ -23,7 +24,6 @@ OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any sq
 SLANTED, COVERED = 0.5, 0.5  # cosine to the lens, share of a pixel: at the limb of a wide body transects look closely
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
 WIDE, MOST_POINTS = 2.0, 1 << 12  # so thick [pixels, blur radii] no element is narrow; points of a thin one
-PLASTIC = (0.7548776662466927, 0.5698402909980532)  # steps of the R₂ sequence, even in the unit square
 LARGEST_GRID = 1 << 12  # pixels along each side that are told apart
 
 Column = NDArray[np.float64]

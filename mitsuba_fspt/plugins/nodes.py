@@ -16,6 +16,7 @@ from .lines import apply_rule
 if TYPE_CHECKING:
     from .grid import Image, Mask
 
+BOTH = 4 + 12  # lines of sight a pixel, without which four must do
 POINT = 0.1  # of rtol: what the curvature of cos⁴θ over the pupil may make
 IN_PIXEL = 0.5  # blur radius that stays in the pixel
 SETTLED = 0.25  # of the tolerance: where the picture bends less, more nodes would change it by less than a tenth

@@ -20,14 +20,12 @@ from ..quadrature import Quadrature, Solution
 from .draft import LANES, Draft, chunks
 from .grid import Grid
 from .lines import apply_rule
-from .nodes import first_nodes, twelve_nodes
+from .nodes import BOTH, first_nodes, twelve_nodes
 from .transects import integrate_by_transects
 from .window import Window, visible_window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-FEWEST = 16  # lines of sight a pixel, without which four must do
 
 
 def solve(
@@ -40,7 +38,7 @@ def solve(
     """
     draft = Draft(scene, lens, window, quadrature, known)
     rough = first_nodes(draft)
-    if quadrature.max_nodes >= FEWEST:
+    if quadrature.max_nodes >= BOTH:
         rough = twelve_nodes(draft, rough)
         if dr.any(rough):
             integrate_by_transects(draft, rough)

@@ -12,7 +12,7 @@ import mitsuba as mi
 from .. import rules
 from .draft import LANES, Draft, chunks
 from .jumps import integrate_transect
-from .nodes import apply_nodes
+from .nodes import BOTH, apply_nodes
 from .transect import transect
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ SCATTER = (3.0, 2.0, 1.0, 1.0)
 SMOOTH_LEVELS, BUMPY = 3, 1e-2
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 16  # of the light, over the number of transects squared, is in a corner that none of them crosses
-FEWEST = 16  # lines of sight that a pixel has taken before
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
 SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
 
@@ -38,7 +37,7 @@ def integrate_by_transects(draft: Draft, rough: Mask) -> None:
     ladder = _Ladder(draft, rough)
     for level, many in enumerate(rules.TRANSECT_LEVELS):
         along = rules.along_transect(level, draft.quadrature.rtol)
-        if FEWEST + many * along.rays > draft.quadrature.max_nodes or not dr.any(ladder.where):
+        if BOTH + many * along.rays > draft.quadrature.max_nodes or not dr.any(ladder.where):
             break
         ladder.climb(level, rules.transects(many), along)
 
