@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import gc
+import signal
 
 import pytest
+
+# A shell's background jobs inherit that Ctrl-C is ignored, and so would all that tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="module")

@@ -86,7 +86,7 @@ def test_grow_takes_every_pixel_as_far_as_it_reaches():
     grid = grid_of(mask.shape)
     import mitsuba as mi
 
-    grown = grid.array(grid.grow(grid.lanes(mask), mi.Int(reach.ravel())))
+    grown = grid.array(grid.grow(grid.lanes(mask), mi.Int(reach.ravel()), int(reach.max())))
     y, x = np.mgrid[:40, :50]
     distance = [np.maximum(abs(x - j), abs(y - i)) for i, j in np.argwhere(mask)]
     within = [d <= reach[i, j] for d, (i, j) in zip(distance, np.argwhere(mask), strict=True)]

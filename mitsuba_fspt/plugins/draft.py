@@ -38,7 +38,9 @@ class Draft:
     """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `hits`.
 
     nearest : depth of what is nearest [mm], inf where nothing is met
-    blur : largest blur radius of what a pixel or a neighbour sees [pixels]; sharp : True where the least one is small
+    blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
+    sharp : True where the least one is small
+    outline : True within a pixel of both a hit and a miss
     clipped : a second border of the lens cuts the pupil, whatever is sharp
     stopped, beyond : the border of the image-plane stop cuts the pixel, wherever its light comes from; or leaves it out
     open, known : False where the value is known from elsewhere, and that value
@@ -56,6 +58,7 @@ class Draft:
         self.clipped = grid.lanes(window.clipped(lens))
         inside, cut = window.stopped(lens)
         self.stopped, self.beyond = grid.lanes(cut & self.area), grid.lanes(~(inside | cut))
+        self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
         self.open, self.known = grid.full(mi.Bool, True), grid.full(mi.Float64, 0)
         if known is not None:
             self.open = grid.lanes(~window.cut(known.where))
@@ -97,44 +100,54 @@ class Draft:
         seen = dr.isfinite(self.nearest)
         front, back = (dr.abs(self.lens.blur_radius(depth)) for depth in (self.nearest, farthest))
         most = dr.opaque(mi.Float64, max(self.grid.shape))
-        self.blur = self.grid.spread_max(dr.select(seen, dr.minimum(dr.maximum(front, back), most), 0))
-        self.sharp = self.grid.dilate(seen & (dr.minimum(front, back) < SHARP), 1 + math.ceil(SHARP))
+        blur = dr.select(seen, dr.minimum(dr.maximum(front, back), most), 0)
+        sharp = seen & (dr.minimum(front, back) < SHARP)
+        dr.eval(blur, sharp)
+        self.most_blur = float(dr.max(blur)[0])
+        self.blur, self.sharp = self.grid.spread_max(blur), self.grid.dilate(sharp, 1 + math.ceil(SHARP))
+        dr.eval(self.blur, self.sharp)
 
-    def reach(self, rule: int | str) -> mi.Int:
-        """How far from where a rule sees an edge it may hide from it [pixels]."""
-        return 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, GAP[rule]) * self.blur))
+    def reach(self, rule: int | str) -> tuple[mi.Int, int]:
+        """How far from where a rule sees an edge it may hide from it, at each pixel and at most [pixels]."""
+        reach = 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, GAP[rule]) * self.blur))
+        return reach, 1 + math.ceil(GAP[rule] * self.most_blur)
+
+    def set_hits(self, hits: Image) -> None:
+        """Shares of lines of sight that hit, and with them the outline."""
+        self.hits, self.outline = hits, self.grid.outline(hits)
+        dr.eval(self.hits, self.outline)
 
     def grown(self, rough: Mask, nodes: int) -> Mask:
         """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `cut_off` knows."""
-        source = rough & (self.error > self.tolerance) & ~self.grid.outline(self.hits, 1)
-        return rough | self.grid.grow(source, self.reach(nodes))
+        source = rough & (self.error > self.tolerance) & ~self.outline
+        return rough | self.grid.grow(source, *self.reach(nodes))
 
     def cut_off(self, nodes: int) -> Image:
         """What a rule may be wrong by where an edge crosses or hides between its nodes and the pupil's rim.
 
         A silhouette, a second border of the lens, or the image-plane stop.
         """
-        reach = self.reach(nodes)
+        reach, most = self.reach(nodes)
         cut, unseen = (
             dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[nodes])) for share in (CUT, UNSEEN)
         )
-        share = dr.select(self.grid.grow(self.grid.outline(self.hits, 1), reach - 1), unseen, 0)
+        share = dr.select(self.grid.grow(self.outline, reach - 1, most - 1), unseen, 0)
         share = dr.select(parted(self.hits) | self.clipped | self.stopped, cut, share)
-        return share * self._whole(reach)
+        return share * self._whole(most)
 
     def unseen_by_transects(self, split: Mask) -> Image:
         """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump."""
-        reach = self.reach("transects")
-        return dr.select(self.grid.grow(split, reach), UNSEEN_BY_TRANSECTS * self._whole(reach), 0)
+        reach, most = self.reach("transects")
+        return dr.select(self.grid.grow(split, reach, most), UNSEEN_BY_TRANSECTS * self._whole(most), 0)
 
     def near_edge(self, image: Image) -> Image:
         """Largest value around, as far as transects may pass an edge by."""
-        return self.grid.spread_max(image, int(dr.max(self.reach("transects"))[0]))
+        return self.grid.spread_max(image, self.reach("transects")[1])
 
-    def _whole(self, reach: mi.Int) -> Image:
-        """Largest value within the largest `reach`, if no line of sight missed."""
+    def _whole(self, reach: int) -> Image:
+        """Largest value within `reach`, if no line of sight missed."""
         whole = dr.select(self.hits > ROUNDING, self.value / self.hits, 0)
-        return self.grid.spread_max(whole, int(dr.max(reach)[0]))
+        return self.grid.spread_max(whole, reach)
 
 
 def chunks(index: Index, size: int) -> list[Index]:

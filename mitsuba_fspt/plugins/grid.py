@@ -78,7 +78,7 @@ class Grid:
             # As far as it goes already once more, and no gap opens.
             step = min(reach + 1, most - reach)
             image = reduce(larger, self._neighbours(image, step).values(), image)
-            dr.eval(image)
+            dr.eval(image)  # all need this one kernel, which every larger one around it would compile anew
             reach += step
         return image
 
@@ -86,9 +86,10 @@ class Grid:
         """True within `radius` pixels (square) of a marked pixel."""
         return self.spread_max(mask, radius)
 
-    def grow(self, mask: Mask, reach: mi.Int) -> Mask:
-        """True within `reach` pixels (square) of a marked pixel, each with its own; at least 1, up to 1.5 times it."""
-        most = int(dr.max(dr.select(mask, reach, 0))[0])
+    def grow(self, mask: Mask, reach: mi.Int, most: int) -> Mask:
+        """True within `reach` ≤ `most` pixels (square) of a marked pixel, each with its own; at least 1, up to 1.5
+        times it.
+        """
         radii = [0, 1]
         while radii[-1] < most:
             radii.append(radii[-1] + max(1, radii[-1] // 2))
@@ -169,9 +170,13 @@ class Grid:
 
     # ------------------------------------------------------------------ silhouettes
 
-    def outline(self, hits: Image, reach: int) -> Mask:
-        """True within `reach` pixels of both a hit and a miss, where lines of sight may pass a silhouette."""
-        return self.dilate(hits > ROUNDING, reach) & self.dilate(hits < 1 - ROUNDING, reach)
+    def outline(self, hits: Image) -> Mask:
+        """True within a pixel of both a hit and a miss, where lines of sight may pass a silhouette."""
+        near = self._neighbours(hits).values()
+        most, least = reduce(dr.maximum, near, hits), reduce(dr.minimum, near, hits)
+        outline = (most > ROUNDING) & (least < 1 - ROUNDING)
+        dr.eval(outline)
+        return outline
 
 
 def parted(hits: Image) -> Mask:

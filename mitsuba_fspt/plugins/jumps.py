@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -33,84 +34,138 @@ def integrate_transect(
     of them at `phase` of one; a transect without a jump is one piece. In units of the integrand an `outline` counts so
     much as a jump of the radiance, and less than `least` does not.
     """
-    intervals = dr.opaque(mi.UInt32, along.scan)
-    step = 2 / mi.Float(intervals)
-    # Where edges run along pixels they would lie on points to bisect, and rounding choose the side.
-    shift = SHIFT * (phase - 0.5)
 
     def look(s: mi.Float) -> mi.Point3f:
         position, pupil, _ = transect.at(s)
         return mi.Point3f(*radiance_on_film(scene, lens, position, pupil)[1:])
 
-    def size(jump: _Jump) -> mi.Float:
-        # An outline outranks whatever steep but smooth change lies elsewhere on the transect.
-        return dr.abs(jump.after.x - jump.before.x) + dr.select(jump.before.y != jump.after.y, outline, 0)
-
-    def scan(k: mi.UInt32, first: _Jump, second: _Jump, total: mi.Float, lit: mi.Point2f, last: _Jump) -> tuple:
-        inside = (k > 0) & (k < intervals)
-        s = dr.select(inside, step * (mi.Float(k) + shift), dr.select(k > 0, 2, 0)) - 1
-        seen = look(s)
-        new = _Jump(mi.Point2f(last.at.y, s), last.after, seen)
-        new_size = dr.select(k > 0, size(new), 0)
-        largest, larger = new_size > size(first), new_size > size(second)
-        second = dr.select(largest, first, dr.select(larger, new, second))
-        first = dr.select(largest, new, first)
-        lit = dr.select(seen.y > 0, mi.Point2f(dr.minimum(lit.x, s), s), lit)
-        return first, second, total + new_size, lit, new
-
-    def bisect(k: mi.UInt32, jump: _Jump, other: _Jump) -> tuple:
-        # Half of the rounds for the first jump, then the two change places.
-        turn = k == bisections
-        jump, other = dr.select(turn, other, jump), dr.select(turn, jump, other)
-        s = 0.5 * (jump.at.x + jump.at.y)
-        seen = look(s)
-        left = _Jump(mi.Point2f(jump.at.x, s), jump.before, seen)
-        right = _Jump(mi.Point2f(s, jump.at.y), seen, jump.after)
-        return dr.select(size(left) >= size(right), left, right), other
-
-    bisections = dr.opaque(mi.UInt32, along.bisections)
-    first, second, total, lit, _ = repeat(
-        intervals + 1, scan, dr.zeros(_Jump), dr.zeros(_Jump), mi.Float(0), mi.Point2f(2, -2), dr.zeros(_Jump)
-    )
-    # A step that is not much larger than the others is a slope; on a parabola one is at most 3 times their mean.
-    one, two = size(first), size(second)
-    jumps = one > dr.maximum(STEEP * (total - one) / (mi.Float(intervals) - 1), least)
-    both = jumps & (two > dr.maximum(STEEP * (total - one - two) / (mi.Float(intervals) - 2), least))
-    last = dr.select(both, mi.Int(2), dr.select(jumps, mi.Int(1), 0))
-    found, other = repeat(mi.UInt32(last) * bisections, bisect, first, second)
-    first, second = dr.select(both, other, found), dr.select(both, found, other)
-    s_first, s_second = 0.5 * (first.at.x + first.at.y), 0.5 * (second.at.x + second.at.y)
-    left = dr.select(jumps, dr.select(both, dr.minimum(s_first, s_second), s_first), 1)
-    right = dr.select(both, dr.maximum(s_first, s_second), 1)
-
-    # Pieces 0 … last between -1, left, right, 1; an outer one on which every point looked past the phantom is dark.
-    begin = dr.select(jumps & (lit.x > left), 1, 0)
-    end = dr.select(lit.y >= dr.select(both, right, dr.select(jumps, left, -1)), last + 1, last)
-    to_left, to_right = transect.moments(left), transect.moments(right)
-    to_end = mi.Vector2d(1, 0)  # the density is even
+    found = _search(look, phase, along, outline, least)
+    jumps = found.jumps
+    first, second = found.first.middle(), found.second.middle()
+    left = dr.select(jumps > 0, dr.select(jumps > 1, dr.minimum(first, second), first), 1)
+    right = dr.select(jumps > 1, dr.maximum(first, second), 1)
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
-    def integrate(k: mi.UInt32, value: mi.Float, hits: mi.Float, sums: _Sums) -> tuple:
-        piece, number = mi.Int(k // nodes) + begin, k % nodes
-        at_start, at_end = piece > 0, piece < last
+    # Pieces 0 … jumps between -1, left, right, 1; an outer one on which every point looked past the phantom is dark.
+    def integrate(piece: mi.UInt32, since: mi.Vector2d, value: mi.Float, hits: mi.Float, looks: mi.UInt32) -> tuple:
+        at_start, at_end = piece > 0, piece < jumps
         low = dr.select(at_start, dr.select(piece == 1, left, right), -1)
         high = dr.select(at_end, dr.select(piece == 0, left, right), 1)
         middle, half = 0.5 * (low + high), dr.maximum(0.5 * (high - low), SHORTEST)
-        share, slope = _towards_jumps((mi.Float(number) + phase) / mi.Float(nodes), at_start, at_end)
-        s = low + (high - low) * share
-        position, pupil, density = transect.at(s)
-        f, _, body, _ = radiance_on_film(scene, lens, position, pupil)
-        sums = dr.select(number == 0, dr.zeros(_Sums), sums).plus(slope * density, (s - middle) / half, f, body)
-        until = dr.select(at_end, dr.select(piece == 0, to_left, to_right), to_end)
-        since = dr.select(at_start, dr.select(piece == 1, to_left, to_right), mi.Vector2d(0))
-        more_value, more_hits = sums.corrected(_about(until - since, middle, half))
-        done = number == nodes - 1
-        return value + dr.select(done, more_value, 0), hits + dr.select(done, more_hits, 0), sums
+        dark = dr.select(at_start, ~at_end & (found.lit.y < low), found.lit.x > high)
+        count = dr.select(dark, 0, nodes)
 
-    count = mi.UInt32(dr.maximum(end - begin, 0)) * nodes
-    value, hits, _ = repeat(count, integrate, mi.Float(0), mi.Float(0), dr.zeros(_Sums))
-    looks = intervals + 1 + mi.UInt32(last) * bisections + count
-    return value, hits, mi.Float(last), dr.select(jumps, first.depth(), 0), mi.Float(looks)
+        def add(number: mi.UInt32, sums: _Sums) -> tuple[_Sums]:
+            share, slope = _towards_jumps((mi.Float(number) + phase) / mi.Float(nodes), at_start, at_end)
+            s = low + (high - low) * share
+            position, pupil, density = transect.at(s)
+            f, _, body, _ = radiance_on_film(scene, lens, position, pupil)
+            return (sums.plus(slope * density, (s - middle) / half, f, body),)
+
+        (sums,) = repeat(count, add, dr.zeros(_Sums))
+        until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
+        more_value, more_hits = sums.corrected(_about(until - since, middle, half))
+        return until, value + more_value, hits + more_hits, looks + count
+
+    start = (mi.Vector2d(0), mi.Float(0), mi.Float(0), found.looks)
+    _, value, hits, looks = repeat(jumps + 1, integrate, *start)
+    depth = dr.select(jumps > 1, found.second.depth(), found.first.depth())
+    return value, hits, mi.Float(jumps), dr.select(jumps > 0, depth, 0), mi.Float(looks)
+
+
+# ---------------------------------------------------------------------- where it jumps
+
+
+@dataclass
+class _Jump:
+    """Two neighbouring points of a transect: their places `at`, and radiance, number of the body and depth at each."""
+
+    at: mi.Point2f
+    before: mi.Point3f
+    after: mi.Point3f
+
+    def middle(self) -> mi.Float:
+        """The place half-way between the two."""
+        return 0.5 * (self.at.x + self.at.y)
+
+    def depth(self) -> mi.Float:
+        """Of what is nearer, and hides the other [mm]."""
+        before, after = (dr.select(seen.y > 0, seen.z, dr.inf) for seen in (self.before, self.after))
+        return dr.minimum(before, after)
+
+    def size(self, outline: mi.Float) -> mi.Float:
+        """How much the radiance changes; an `outline` outranks whatever steep but smooth change lies elsewhere."""
+        return dr.abs(self.after.x - self.before.x) + dr.select(self.before.y != self.after.y, outline, 0)
+
+
+@dataclass
+class _Search:
+    """What is known of the jumps of a transect after so many `looks`.
+
+    first, second : the largest and the next; while bisected, the one whose turn it is and the other
+    step, total : the last step of the scan, and all of them together
+    lit : first and last place where anything was met
+    jumps : how many of the two are jumps, known when the scan is over
+    """
+
+    first: _Jump
+    second: _Jump
+    step: _Jump
+    total: mi.Float
+    lit: mi.Point2f
+    jumps: mi.UInt32
+    looks: mi.UInt32
+
+
+def _search(
+    look: Callable[[mi.Float], mi.Point3f], phase: mi.Float, along: AlongTransect, outline: mi.Float, least: mi.Float
+) -> _Search:
+    """Jumps of what lines of sight `look` at; scan and bisection are one loop, so that it is compiled once."""
+    intervals, bisections = dr.opaque(mi.UInt32, along.scan), dr.opaque(mi.UInt32, along.bisections)
+    number = mi.Float(intervals)
+    # Where edges run along pixels they would lie on points to bisect, and rounding choose the side.
+    shift = SHIFT * (phase - 0.5)
+
+    def scan(found: _Search, s: mi.Float, seen: mi.Point3f) -> _Search:
+        step = _Jump(mi.Point2f(found.step.at.y, s), found.step.after, seen)
+        size, one, two = (jump.size(outline) for jump in (step, found.first, found.second))
+        size = dr.select(found.looks > 0, size, 0)
+        second = dr.select(size > one, found.first, dr.select(size > two, step, found.second))
+        first, total = dr.select(size > one, step, found.first), found.total + size
+        one, two = dr.maximum(one, size), dr.maximum(dr.minimum(one, size), two)
+        # A step that is not much larger than the others is a slope; on a parabola one is at most 3 times their mean.
+        large = one > dr.maximum(STEEP * (total - one) / (number - 1), least)
+        both = large & (two > dr.maximum(STEEP * (total - one - two) / (number - 2), least))
+        jumps = dr.select(found.looks == intervals, dr.select(both, mi.UInt32(2), dr.select(large, mi.UInt32(1), 0)), 0)
+        lit = dr.select(seen.y > 0, mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
+        return _Search(first, second, step, total, lit, jumps, found.looks)
+
+    def bisect(found: _Search, s: mi.Float, seen: mi.Point3f) -> _Search:
+        jump = found.first
+        left = _Jump(mi.Point2f(jump.at.x, s), jump.before, seen)
+        right = _Jump(mi.Point2f(s, jump.at.y), seen, jump.after)
+        half = dr.select(left.size(outline) >= right.size(outline), left, right)
+        # Half of the rounds for the first of two, then they change places.
+        turn = (found.jumps > 1) & (found.looks == intervals + bisections)
+        first, second = dr.select(turn, found.second, half), dr.select(turn, half, found.second)
+        return _Search(first, second, found.step, found.total, found.lit, found.jumps, found.looks)
+
+    def once(found: _Search) -> tuple[_Search]:
+        k = found.looks
+        scans, inside = k <= intervals, (k > 0) & (k < intervals)
+        even = dr.select(inside, 2 * (mi.Float(k) + shift) / number, dr.select(k > 0, 2, 0)) - 1
+        s = dr.select(scans, even, found.first.middle())
+        seen = look(s)
+        found = dr.select(scans, scan(found, s, seen), bisect(found, s, seen))
+        found.looks = k + 1
+        return (found,)
+
+    start = dr.zeros(_Search)
+    start.lit = mi.Point2f(2, -2)
+    return dr.while_loop((start,), lambda found: found.looks <= intervals + found.jumps * bisections, once)[0]
+
+
+# ---------------------------------------------------------------------- the pieces between jumps
 
 
 def _towards_jumps(x: mi.Float, at_start: mi.Bool, at_end: mi.Bool) -> tuple[mi.Float, mi.Float]:
@@ -122,20 +177,6 @@ def _towards_jumps(x: mi.Float, at_start: mi.Bool, at_end: mi.Bool) -> tuple[mi.
     place = dr.select(at_start, dr.select(at_end, x * x * (3 - 2 * x), x * x), dr.select(at_end, 1 - y * y, x))
     slope = dr.select(at_start, dr.select(at_end, 6 * x * y, 2 * x), dr.select(at_end, 2 * y, 1))
     return place, slope
-
-
-@dataclass
-class _Jump:
-    """Two neighbouring points of a transect: their places `at`, and radiance, number of the body and depth at each."""
-
-    at: mi.Point2f
-    before: mi.Point3f
-    after: mi.Point3f
-
-    def depth(self) -> mi.Float:
-        """Of what is nearer, and hides the other [mm]."""
-        before, after = (dr.select(seen.y > 0, seen.z, dr.inf) for seen in (self.before, self.after))
-        return dr.minimum(before, after)
 
 
 def _about(moments: mi.Vector2d, middle: mi.Float, half: mi.Float) -> mi.Vector2f:

@@ -30,19 +30,10 @@ def radiance_on_film(
     return weight * radiance, radiance, body, si.t * cos_theta
 
 
-def repeat(
-    count: int | mi.UInt32,
-    body: Callable[..., tuple],
-    *state: Any,
-    while_true: Callable[..., mi.Bool] | None = None,
-) -> tuple:
+def repeat(count: int | mi.UInt32, body: Callable[..., tuple], *state: Any) -> tuple:
     """`state` after `count` rounds of state = body(k, *state), as one loop inside the kernel."""
-
-    def condition(k: mi.UInt32, *state: Any) -> mi.Bool:
-        more = k < count
-        return more & while_true(*state) if while_true else more
-
-    return dr.while_loop((mi.UInt32(0), *state), condition, lambda k, *state: (k + 1, *body(k, *state)))[1:]
+    start = (mi.UInt32(0), *state)
+    return dr.while_loop(start, lambda k, *_: k < count, lambda k, *state: (k + 1, *body(k, *state)))[1:]
 
 
 # ---------------------------------------------------------------------- rules on every pixel

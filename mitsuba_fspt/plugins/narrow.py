@@ -108,17 +108,14 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     """
     shape = emitter.get_shape()
     elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
-    whole = dr.arange(mi.UInt32, elements.count)
-    _, area, _, blur, _ = (column.numpy() for column in _look(emitter, elements, lens, whole, mi.Point2f(0.5)))
+    counts = np.ones(elements.count, np.int64)
+    _, area, _, blur, _ = (column.numpy() for column in _look(emitter, elements, lens, counts))
     unit = np.maximum(blur, 1)
     reach = _reach(elements, lens) / unit
     # A long and thin element is many points, a quarter of a unit apart; one that is wide may be wide at one.
     thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach)
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
-    index = mi.UInt32(np.repeat(np.arange(elements.count), counts).astype(np.uint32))
-    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    sample = np.mod(0.5 + np.outer(PLASTIC, number), 1.0)
-    *columns, centre = _look(emitter, elements, lens, index, mi.Point2f(sample.astype(np.float32)))
+    *columns, centre = _look(emitter, elements, lens, counts)
     seen = np.array([column.numpy() for column in (*columns, centre.x, centre.y)], np.float64)
     seen[1] /= np.repeat(counts, counts)
     seen[0, ~np.isfinite(seen).all(axis=0)] = 0
@@ -127,10 +124,15 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
 
 
 def _look(
-    emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, index: mi.UInt32, sample: mi.Point2f
+    emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f]:
-    """At a point of each element radiance to the lens, area of the element's image, slant, blur, place on film."""
-    si, area = elements.place(index, sample)
+    """At so many points of each element, the first its middle, radiance to the lens, area of the element's image,
+    slant, blur, place on film.
+    """
+    index = np.repeat(np.arange(elements.count), counts)
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
+    si, area = elements.place(mi.UInt32(index), sample)
     to_lens = dr.normalize(lens.world_transform() @ mi.Point3f(0) - si.p)
     si.initialize_sh_frame()
     si.wi = si.to_local(to_lens)

@@ -29,10 +29,11 @@ def first_nodes(draft: Draft) -> Mask:
     """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
-    value, contrast, mx, my, draft.hits, draft.nearest, farthest = apply_nodes(draft, rule)
-    if len(rule) == 1 and not dr.any(draft.hits > 0):  # what glows is thinner than a pixel
+    value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
+    if len(rule) == 1 and not dr.any(hits > 0):  # what glows is thinner than a pixel
         rule = rules.four(draft.area)
-        value, contrast, mx, my, draft.hits, draft.nearest, farthest = apply_nodes(draft, rule)
+        value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
+    draft.set_hits(hits)
     draft.set_blur(farthest)
     draft.value = value = dr.select(draft.open, value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
@@ -47,12 +48,13 @@ def first_nodes(draft: Draft) -> Mask:
             more = rules.one_spread(xx + yy, draft.blur, draft.area)
         else:
             turn = rules.four_turn(grid.gradient(mx)[1] - grid.gradient(my)[0], xx + yy)
-            more = -grid.mean_where(turn, ~grid.outline(draft.hits, 1), TURN_REACH)
+            more = -grid.mean_where(turn, ~draft.outline, TURN_REACH)
         draft.value = dr.maximum(value + dr.select(draft.hits > 1 - ROUNDING, more, 0), 0)
     bend = grid.spread_max(bend)
     draft.error = dr.maximum(bend, draft.cut_off(len(rule)))
     tolerance = draft.tolerance
     rough = (draft.error > tolerance) | (bend > SETTLED * tolerance)
+    dr.eval(draft.error, rough)
     unmet = not dr.any(draft.hits > 0)  # what glows is on the film, or may be
     if (neighbours and min(grid.shape) < 3) or unmet or not draft.quadrature.takes("smooth"):
         rough = grid.full(mi.Bool, True)
@@ -102,10 +104,11 @@ def _refine(draft: Draft, where: Mask) -> Image:
     # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
     gain = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
     draft.value = dr.select(where, value, draft.value)
-    draft.hits = dr.select(where, hits, draft.hits)
+    draft.set_hits(dr.select(where, hits, draft.hits))
     draft.nearest = dr.minimum(draft.nearest, nearest)
     error = dr.maximum(draft.grid.spread_max(difference * dr.clip(gain, LEAST_GAIN, 1)), draft.error / MOST_GAIN)
     draft.error = dr.select(where, dr.maximum(error, draft.cut_off(12)), draft.error)
+    dr.eval(draft.error, draft.nearest, difference)
     return difference
 
 

@@ -79,13 +79,13 @@ class _Ladder:
         unseen = dr.select(self.split | ~draft.open, 0, unseen)
         self.left = dr.select(where, left, self.left)
         draft.value = dr.select(better, value, draft.value)
-        draft.hits = dr.select(better, hits, draft.hits)
+        draft.set_hits(dr.select(better, hits, draft.hits))
         draft.error = dr.maximum(dr.select(where, draft.grid.spread_max(self.left), draft.error), unseen)
         self.edges.learn(draft, means, self.split)
         self.where = (where | (unseen > 0)) & (draft.error > draft.tolerance)
         self.count = len(rule)
         edges = self.edges.blur, self.edges.sharp
-        dr.eval(draft.value, draft.hits, draft.error, self.split, self.smooth, self.left, edges, self.where)
+        dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, edges, self.where)
 
     def _first(self, fresh: Mask, moved: Image, scatter: Image) -> tuple[Mask, Image, Image]:
         """Where the first transects are better than nodes (where they meet a jump), what is left, what they pass by."""
@@ -124,7 +124,7 @@ class _Edges:
         """Blur from the depth of the edges that were met; pixels that see none are smooth, and none is sharp."""
         met = means.jumps & ~draft.clipped & ~draft.stopped
         self.blur = dr.select(met, draft.lens.blur_radius(means.depth), self.blur)
-        near = draft.grid.dilate(split | draft.grid.outline(draft.hits, 1), 1)
+        near = draft.grid.dilate(split | draft.outline, 1)
         self.sharp = (dr.abs(self.blur) < SHARP) & near
 
 
@@ -134,11 +134,11 @@ def _edges(draft: Draft) -> _Edges:
     A second border of the lens is so blurred that only the pupil sees it, the image-plane stop is sharp.
     """
     grid = draft.grid
-    angle = grid.principal_angle(*grid.gradient(draft.value), 1 + math.ceil(dr.max(draft.blur)[0] / 2))
+    angle = grid.principal_angle(*grid.gradient(draft.value), 1 + math.ceil(draft.most_blur / 2))
     nearest = -grid.spread_max(-draft.nearest)
     # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
-    farther = -grid.spread_max(-draft.nearest, int(dr.max(draft.reach(12))[0]))
-    nearest = dr.select(grid.outline(draft.hits, 1) & dr.isfinite(nearest), nearest, farther)
+    farther = -grid.spread_max(-draft.nearest, draft.reach(12)[1])
+    nearest = dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
     blur = dr.select(draft.clipped, dr.inf, draft.lens.blur_radius(nearest))
     blur = dr.select(draft.stopped, 0, blur)
     return _Edges(angle, blur, dr.abs(blur) < SHARP)
