@@ -107,8 +107,10 @@ def product(level: int, area: bool) -> Rule:
     return Rule(pupil, pixel, weight, np.zeros(len(weight)))
 
 
+# On so many levels nodes may do yet where nothing jumps.
+SMOOTH_LEVELS = 3
 # Transects a level: the first ones for what is smooth but for one edge, then a net for what is not.
-TRANSECT_LEVELS = (4, 8, 27, 64, 256, 1024)
+TRANSECT_LEVELS = (2, 8, 27, 64, 256, 1024)
 SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
 TRANSECT_ORDER = 1.5  # by which the error falls at least, whatever two levels agree on
 
@@ -137,6 +139,20 @@ def along_transect(level: int, rtol: float) -> AlongTransect:
     return AlongTransect(scan=SCANS[level], bisections=bisections + level, nodes=nodes + level)
 
 
+def transect_levels(rtol: float, area: bool, most: int) -> list[tuple[int, AlongTransect]]:
+    """Number of transects and how far each is looked into, level by level, while a pixel takes at most so many lines
+    of sight in all of them.
+    """
+    levels = []
+    for level, count in enumerate(TRANSECT_LEVELS):
+        along = along_transect(level, rtol)
+        most -= count * along.rays + (len(product(level, area)) if 0 < level <= SMOOTH_LEVELS else 0)
+        if most < 0:
+            break
+        levels.append((count, along))
+    return levels
+
+
 @dataclass(frozen=True)
 class Transects:
     """Places in [0, 1]³ of n transects through pixel × pupil, (n, 3), for sharp edges and for blurred ones.
@@ -161,7 +177,9 @@ class Transects:
 
 @cache
 def transects(count: int) -> Transects:
-    """4 (exact to degree 2), 8, 27 or 64 (to degree 3, 5 and 7) transects by Gauss; of a larger power of two a net."""
+    """2 (exact to degree 1), 4, 8, 27 or 64 (to degree 2, 3, 5 and 7) transects by Gauss; of a larger power of two a
+    net.
+    """
     number = np.arange(count) + 0.5
     if count > 64:
         return Transects(_net(count), _net(count), np.full(count, 1 / count))
@@ -170,7 +188,7 @@ def transects(count: int) -> Transects:
         return Transects(_net(count), blurred, weight)
     if count < 27:
         # On the pupil the corners of Gauss's square, in an order that has little to do with the place along the pixel.
-        on_pupil = gauss(2)[0][np.array([[0, 0], [1, 1], [1, 0], [0, 1]] if count == 8 else [[0, 0], [1, 0]])]
+        on_pupil = gauss(2)[0][np.array([[0, 0], [1, 1], [1, 0], [0, 1]])][:: 8 // count]
     else:
         on_pupil = np.mod(np.outer(number, PLASTIC), 1.0)[: count // 2]  # R₂ sequence
     # Opposite each other, so that what is odd about the middle cancels.
@@ -180,13 +198,13 @@ def transects(count: int) -> Transects:
 
 
 def _gauss_cube(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes (n, 3) and weights (n,) of Gauss in the cube; 4 are every other one of 8."""
+    """Nodes (n, 3) and weights (n,) of Gauss in the cube; 4 are every other one of 8, 2 opposite ones of these."""
     x, w = gauss(max(2, round(count ** (1 / 3))))
     place = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
     weight = np.multiply.outer(np.outer(w, w), w).ravel()
-    if count == 4:
-        corners = [0, 3, 5, 6]
-        return place[corners], 2 * weight[corners]
+    if count < 8:
+        corners = [0, 3, 5, 6] if count == 4 else [2, 5]
+        return place[corners], 8 / count * weight[corners]
     return place, weight
 
 

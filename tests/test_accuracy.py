@@ -14,7 +14,7 @@ from mitsuba_fspt import stiff_cases_scenes as far_away
 pytestmark = pytest.mark.usefixtures("mono")
 
 RTOL = 1e-3
-FINER = {"rtol": RTOL / 100, "max_nodes": 1 << 17}
+FINER = {"rtol": RTOL / 100}
 # Parts of the film (x, y, width, height): a corner, the brightest spot, edges, a sphere's edge behind another sphere.
 CASES = [
     ("nylon_cylinder", 0, 2.8, (16, 12, 8, 7)),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mitsuba_fspt import rules
+from mitsuba_fspt.quadrature import Quadrature
 
 
 def disc_moment(a, b):
@@ -156,7 +157,7 @@ def test_places_of_transects_lie_in_the_cube_and_are_as_many_as_asked(count):
         assert np.all((place > 0) & (place < 1))
 
 
-@pytest.mark.parametrize(("count", "degree"), [(4, 2), (8, 3), (27, 5), (64, 7)])
+@pytest.mark.parametrize(("count", "degree"), [(2, 1), (4, 2), (8, 3), (27, 5), (64, 7)])
 def test_few_places_are_exact_for_polynomials(count, degree):
     """Expected: means of x^i y^j z^k over the cube, 1/((i+1)(j+1)(k+1)), up to the degree in all and no further."""
     places = rules.transects(count)
@@ -192,6 +193,16 @@ def test_places_for_sharp_edges_lie_on_even_lines_across_the_pixel(count):
 def test_transects_at_least_double_from_level_to_level():
     """So that the change from the last level says what is left."""
     assert np.all(np.divide(rules.TRANSECT_LEVELS[1:], rules.TRANSECT_LEVELS[:-1]) >= 2)
+
+
+@pytest.mark.parametrize("area", [False, True])
+def test_levels_take_no_more_lines_of_sight_than_a_pixel_may(area):
+    """Expected: as many levels as fit, and all of them in what an integrator allows when it is not told."""
+    first = rules.along_transect(0, 1e-3)
+    assert rules.transect_levels(1e-3, area, 2 * first.rays - 1) == []
+    assert rules.transect_levels(1e-3, area, 2 * first.rays) == [(2, first)]
+    counts = tuple(count for count, _ in rules.transect_levels(1e-6, area, Quadrature().max_nodes))
+    assert counts == rules.TRANSECT_LEVELS
 
 
 def test_every_level_looks_further_along_its_transects_and_so_does_a_smaller_rtol():

@@ -10,7 +10,7 @@ import mitsuba as mi
 from .. import rules
 from ..shortcuts import Finding
 from .draft import LANES, Draft, chunks
-from .grid import ROUNDING
+from .grid import ROUNDING, parted
 from .lines import apply_rule
 
 if TYPE_CHECKING:
@@ -65,14 +65,16 @@ def first_nodes(draft: Draft) -> Mask:
     return rough
 
 
-def twelve_nodes(draft: Draft, rough: Mask) -> Mask:
+def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
     """Twelve nodes over pupil and pixel on the rough pixels and their surroundings where four mislead.
 
     Returns the pixels that twelve do not settle either. Four nodes cannot see all that they miss, so a lattice of
     pixels is probed with twelve: what four were off by there counts for the pixels around.
     """
+    # What parts four nodes parts twelve, too: transects can begin at once.
+    begun = parted(draft.hits) & (draft.error > draft.tolerance) & dr.opaque(mi.Bool, transects_follow)
     probes = draft.grid.lattice() & (draft.hits > 0) & ~rough & draft.open
-    difference = _refine(draft, rough | probes)
+    difference = _refine(draft, (rough & ~begun) | probes)
     doubt = draft.grid.spread_over_lattice(dr.select(probes, difference, 0))
     draft.error = dr.select(rough, draft.error, dr.maximum(draft.error, doubt))
     misled = ~rough & (draft.hits > 0) & (draft.error > draft.tolerance) & draft.open

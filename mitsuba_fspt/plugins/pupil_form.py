@@ -39,9 +39,10 @@ def solve(
     draft = Draft(scene, lens, window, quadrature, known)
     rough = first_nodes(draft)
     if quadrature.max_nodes >= BOTH:
-        rough = twelve_nodes(draft, rough)
+        levels = rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
+        rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
         if dr.any(rough):
-            integrate_by_transects(draft, rough)
+            integrate_by_transects(draft, rough, levels)
     return draft.solution()
 
 

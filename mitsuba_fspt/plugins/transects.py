@@ -12,7 +12,8 @@ import mitsuba as mi
 from .. import rules
 from .draft import LANES, Draft, chunks
 from .jumps import integrate_transect
-from .nodes import BOTH, apply_nodes
+from .grid import parted
+from .nodes import apply_nodes
 from .transect import transect
 
 if TYPE_CHECKING:
@@ -23,23 +24,21 @@ if TYPE_CHECKING:
 FIRST_GAIN, NODES_GAIN = 0.2, 0.9
 LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be left
 # What a kink may hide from transects that differ, in units of their deviation over their number, level by level.
-SCATTER = (3.0, 2.0, 1.0, 1.0)
-# On so many levels nodes may do yet where nothing jumps, as long as they do not move the value by such a share.
-SMOOTH_LEVELS, BUMPY = 3, 1e-2
+SCATTER = (2.0, 2.0, 1.0, 1.0)
+BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 16  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
 SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
 
 
-def integrate_by_transects(draft: Draft, rough: Mask) -> None:
+def integrate_by_transects(draft: Draft, rough: Mask, levels: list[tuple[int, rules.AlongTransect]]) -> None:
     """More transects each round on the pixels that the last round still moved, or moved a neighbour of."""
     ladder = _Ladder(draft, rough)
-    for level, many in enumerate(rules.TRANSECT_LEVELS):
-        along = rules.along_transect(level, draft.quadrature.rtol)
-        if BOTH + many * along.rays > draft.quadrature.max_nodes or not dr.any(ladder.where):
+    for level, (count, along) in enumerate(levels):
+        if not dr.any(ladder.where):
             break
-        ladder.climb(level, rules.transects(many), along)
+        ladder.climb(level, rules.transects(count), along)
 
 
 class _Ladder:
@@ -66,12 +65,12 @@ class _Ladder:
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
         value, hits, scatter = means.value, means.hits, SCATTER[min(level, len(SCATTER) - 1)] * means.scatter
-        if 0 < level <= SMOOTH_LEVELS and dr.any(self.smooth):
+        if 0 < level <= rules.SMOOTH_LEVELS and dr.any(self.smooth):
             nodes, _, _, _, seen, *_ = apply_nodes(draft, rules.product(level, draft.area), self.smooth)
             value, hits = dr.select(self.smooth, nodes, value), dr.select(self.smooth, seen, hits)
         moved = dr.abs(value - draft.value)
         if level == 0:
-            better, left, unseen = self._first(fresh, moved, scatter)
+            better, left, unseen = self._first(fresh, moved, scatter, parted(hits))
         else:
             better, left, unseen = where, *self._later(level, fresh, moved, scatter, len(rule))
             self.smooth = self.smooth & (moved < BUMPY * value)
@@ -87,10 +86,16 @@ class _Ladder:
         edges = self.edges.blur, self.edges.sharp
         dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, edges, self.where)
 
-    def _first(self, fresh: Mask, moved: Image, scatter: Image) -> tuple[Mask, Image, Image]:
-        """Where the first transects are better than nodes (where they meet a jump), what is left, what they pass by."""
-        left = dr.select(fresh, dr.maximum(FIRST_GAIN * moved, scatter), NODES_GAIN * moved)
-        return fresh, left, self.draft.unseen_by_transects(fresh)
+    def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Mask, Image, Image]:
+        """Where the first transects are better than nodes (where they meet a jump), what is left, what they pass by.
+
+        That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
+        """
+        draft = self.draft
+        left = dr.maximum(FIRST_GAIN * moved, scatter)
+        left = dr.select(silhouette, left, dr.maximum(left, 2 * draft.tolerance))
+        missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, 0))
+        return fresh, dr.select(fresh, left, missed), draft.unseen_by_transects(fresh)
 
     def _later(self, level: int, fresh: Mask, moved: Image, scatter: Image, count: int) -> tuple[Image, Image]:
         """What may be left, and what neighbours of a jump that is met at last may be wrong by.
@@ -102,7 +107,7 @@ class _Ladder:
         change = dr.maximum(moved, before * dr.opaque(mi.Float64, (self.count / count) ** rules.TRANSECT_ORDER))
         gain = dr.clip(dr.select(before > 0, MOST_GAIN * change / before, MOST_GAIN), LEAST_GAIN, MOST_GAIN)
         left = dr.maximum(change * gain, scatter)
-        if level <= SMOOTH_LEVELS:
+        if level <= rules.SMOOTH_LEVELS:
             # On what is smooth each step of the node rules gains more than it moves.
             left = dr.select(self.smooth, STEP_GAIN * moved, left)
         left = dr.select(fresh, dr.maximum(left, 2 * self.draft.tolerance), left)
