@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 FLOOR = 3.0  # times the reference's stated error: errors below it say little about a method
+LEAST_CORRELATION = 0.9  # of the logarithms of work and error, for a power law to be one
 TARGETS = (1e-3, 1e-4, 1e-5)  # RMS errors over the brightest pixel
 
 
@@ -58,7 +59,7 @@ class Convergence:
     full : number of pixels whose whole cone sees the phantom
     raw_rate : rays per second of Embree or OptiX alone
     rows : method by method, from coarse to fine
-    left_out : methods that do not apply, and why
+    left_out : methods that do not apply and settings that take too long, and why
     """
 
     scene: str
@@ -125,11 +126,17 @@ class Convergence:
 
 
 def fitted_order(work: Sequence[float], errors: Sequence[float]) -> float | None:
-    """p of error ∝ work^-p by least squares in the logarithms; None without two settings of different work."""
+    """p of error ∝ work^-p by least squares in the logarithms.
+
+    None without two settings of different work, and where the errors do not fall like any power of it.
+    """
     points = [(w, e) for w, e in zip(work, errors, strict=True) if w > 0 and e > 0]
     if len({w for w, _ in points}) < 2:
         return None
     x, y = np.log(np.array(points, float)).T
+    spread = math.sqrt(np.var(x) * np.var(y))
+    if spread == 0 or np.mean((x - x.mean()) * (y - y.mean())) > -LEAST_CORRELATION * spread:
+        return None
     return float(-np.polyfit(x, y, 1)[0])
 
 

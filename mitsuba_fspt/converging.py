@@ -91,9 +91,11 @@ def converge(
     for k, method in enumerate(offered):
         tell(f"first runs: {method.name}", 0.1 + 0.4 * k / len(offered))
         try:
-            bench.try_ladder(method)
+            too_long = bench.try_ladder(method)
         except FsptError as refusal:
             left_out[method.name] = str(refusal)
+        else:
+            left_out |= too_long
     raw = raw_rate(scene, lens)
     rays, raw_seconds = raw(), []
     for k in range(rounds):
@@ -171,8 +173,11 @@ class Bench:
         self.judge, self.kernels, self.budget = judge, kernels, budget
         self.trials: list[Trial] = []
 
-    def try_ladder(self, method: Method) -> None:
-        """Run a method's settings from coarse to fine until one takes longer than the budget; the first one stays."""
+    def try_ladder(self, method: Method) -> dict[str, str]:
+        """Run a method's settings from coarse to fine until one takes longer than the budget; the first one stays.
+
+        Returns which ones are left out for that, and why.
+        """
         for k, value in enumerate(method.ladder):
             self._forget_kernels()
             run = method.prepare(value)
@@ -183,8 +188,10 @@ class Bench:
             if seconds > self.budget and (k > 0 or seconds > PATIENCE * self.budget):
                 if k == 0:
                     raise SceneError(f"its coarsest setting takes {seconds:.3g} s")
-                return
+                from_here = f"{method.name}, {method.knob} {value:g} and finer"
+                return {from_here: f"{seconds:.3g} s a picture, more than the budget of {self.budget:g} s"}
             self.trials.append(Trial(method, run, cold, memory, shot))
+        return {}
 
     def _forget_kernels(self) -> None:
         if self.kernels is None:

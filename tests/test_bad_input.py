@@ -227,6 +227,8 @@ COMMANDS = {
     "rtol negative": ((*RENDER, "--rtol", "-1"), "'rtol' must be in (0, 1), got -1"),
     "rtol nan": ((*RENDER, "--rtol", "nan"), "'rtol' must be in (0, 1), got nan"),
     "rtol in words": ((*RENDER, "--rtol", "fine"), "Invalid value for '--rtol'"),
+    "domain unknown": ((*RENDER, "--domain", "film"), "'domain' must be one of pupil, surface, got 'film'"),
+    "domain for path": ((*MONTE_CARLO, "--domain", "surface"), "'domain' = surface has no meaning for Monte Carlo"),
     "rtol for path": ((*MONTE_CARLO, "--rtol", "1e-3"), "'rtol' = 0.001 has no meaning for Monte Carlo"),
     "spp 0": ((*MONTE_CARLO, "--spp", "0"), "'spp' must be >= 2 for a standard error, got 0"),
     "spp negative": ((*MONTE_CARLO, "--spp", "-3"), "'spp' must be >= 2 for a standard error, got -3"),

@@ -99,6 +99,7 @@ LENS_NUMBERS = {
     ("options", "told"),
     [
         (["--rtol", "5e-3"], {"method": "integral", "rtol": 5e-3, "domain": "pupil", "pixel": "area"}),
+        (["--domain", "surface", "--rtol", "1e-2"], {"method": "integral", "rtol": 1e-2, "domain": "surface"}),
         (["--method", "path", "--spp", "70", "--seed", "9"], {"method": "path", "seed": 9, "spp": 96, "passes": 32}),
         (["--method", "ptracer", "--spp", "64"], {"method": "ptracer", "seed": 0, "spp": 64, "passes": 32}),
     ],
@@ -119,7 +120,7 @@ def test_the_header_tells_all_and_reproduces_the_file(run, tmp_path, options, to
     assert 0 < story["wall_time"] < 600
     if told["method"] == "integral":
         assert story["nodes"] > 0
-        again = ["--rtol", story["rtol"]]
+        again = ["--rtol", story["rtol"], "--domain", story["domain"]]
     else:
         again = ["--spp", story["spp"], "--seed", story["seed"]]
     scene, *parameters = story["scene"].split(" ")

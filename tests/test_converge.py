@@ -7,6 +7,7 @@ import json
 import math
 import os
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -46,6 +47,31 @@ def test_no_order_from_one_setting_or_from_none_that_differ():
     assert fitted_order([10.0], [0.1]) is None
     assert fitted_order([10.0, 10.0], [0.1, 0.2]) is None
     assert fitted_order([0.0, 10.0], [0.1, 0.2]) is None
+
+
+def test_no_order_where_errors_do_not_fall_with_the_work():
+    """A sum over points that stays sparse; one setting that is off by as much as two powers of ten do not."""
+    assert fitted_order([1e3, 1e4, 1e5], [0.8, 0.9, 1.2]) is None
+    assert fitted_order([1e3, 1e4, 1e5], [0.1, 0.1, 0.1]) is None
+    assert fitted_order([1e3, 1e4, 1e5, 1e6], [0.1, 1e-4, 0.1, 0.02]) is None
+
+
+@pytest.mark.usefixtures("mono")
+def test_what_takes_longer_than_the_budget_is_left_out_and_says_so():
+    def prepare(value):
+        def run():
+            time.sleep(0.05 * value)
+            return converge_methods.Shot(np.ones((1, 1)), 1, value)
+
+        return run
+
+    slow = converge_methods.Method("slow", "n", (1.0, 2.0, 6.0, 12.0), prepare)
+    bench = converging.Bench(None, None, budget=0.2)
+    (setting,) = (told := bench.try_ladder(slow))
+    assert setting == "slow, n 6 and finer"
+    assert "more than the budget of 0.2 s" in told[setting]
+    assert [trial.shot.knob for trial in bench.trials] == [1.0, 2.0]
+    assert converging.Bench(None, None, budget=10.0).try_ladder(slow) == {}
 
 
 def test_errors_near_the_references_own_have_no_say_in_the_order():

@@ -11,8 +11,8 @@ import mitsuba as mi
 
 from .. import rules
 from .draft import LANES, Draft, chunks
-from .jumps import integrate_transect
 from .grid import parted
+from .jumps import integrate_transect
 from .nodes import apply_nodes
 from .transect import transect
 
@@ -126,9 +126,14 @@ class _Edges:
     sharp: Mask
 
     def learn(self, draft: Draft, means: _Means, split: Mask) -> None:
-        """Blur from the depth of the edges that were met; pixels that see none are smooth, and none is sharp."""
-        met = means.jumps & ~draft.clipped & ~draft.stopped
-        self.blur = dr.select(met, draft.lens.blur_radius(means.depth), self.blur)
+        """Blur from the depth of the edges that were met; pixels that see none are smooth, and none is sharp.
+
+        Whoever met none may see the tip of a neighbour's.
+        """
+        depth = dr.select(means.jumps, means.depth, dr.inf)
+        depth = dr.select(means.jumps, depth, -draft.grid.spread_max(-depth))
+        met = dr.isfinite(depth) & ~draft.clipped & ~draft.stopped
+        self.blur = dr.select(met, draft.lens.blur_radius(depth), self.blur)
         near = draft.grid.dilate(split | draft.outline, 1)
         self.sharp = (dr.abs(self.blur) < SHARP) & near
 
