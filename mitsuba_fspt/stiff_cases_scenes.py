@@ -183,10 +183,10 @@ def cone(*bodies: Body, nodes: int = 4, film: tuple[int, int] | None = None, **l
     return off_anywhere(picture, filled(focus, side, focal / stop / 2, nodes, film))
 
 
-def balance(z: float, radius: float, domain: str = "pupil", **lens: float) -> float:
+def balance(z: float, radius: float, domain: str = "pupil", rtol: float = 10 * EXACT, **lens: float) -> float:
     """Error of all power of a disk whose whole picture is on the film, relative to that power."""
     expected = through_pupil(radius, z, FOCAL / lens.get("f_number", 8.0) / 2)
-    return abs(float(power(scene(disk(z, radius), **lens), domain=domain, rtol=10 * EXACT).sum()) / expected - 1)
+    return abs(float(power(scene(disk(z, radius), **lens), domain=domain, rtol=rtol).sum()) / expected - 1)
 
 
 def ball() -> Body:
