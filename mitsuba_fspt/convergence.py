@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 FLOOR = 3.0  # times the reference's stated error: errors below it say little about a method
-LEAST_CORRELATION = 0.9  # of the logarithms of work and error, for a power law to be one
+LEAST_CORRELATION = 0.7  # of the logarithms of work and error, for a power law to say something
 TARGETS = (1e-3, 1e-4, 1e-5)  # RMS errors over the brightest pixel
 
 
