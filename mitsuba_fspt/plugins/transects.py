@@ -26,6 +26,7 @@ LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be
 # What a kink may hide from transects that differ, in units of their deviation over their number, level by level.
 SCATTER = (2.0, 2.0, 1.0, 1.0)
 BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
+CURVED_LEVELS = 2  # of them have places like Gauss's two across the pupil, between which a second border may bend
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 16  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
@@ -74,6 +75,8 @@ class _Ladder:
         else:
             better, left, unseen = where, *self._later(level, fresh, moved, scatter, len(rule))
             self.smooth = self.smooth & (moved < BUMPY * value)
+        if level < CURVED_LEVELS:
+            left = dr.select(draft.clipped & self.split, self._unsettled(left), left)
         # Whose neighbour meets a jump at last may pass it by, settled or not, and be as wrong as that one was.
         unseen = dr.select(self.split | ~draft.open, 0, unseen)
         self.left = dr.select(where, left, self.left)
@@ -86,6 +89,10 @@ class _Ladder:
         edges = self.edges.blur, self.edges.sharp
         dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, edges, self.where)
 
+    def _unsettled(self, left: Image) -> Image:
+        """What is left, or so much that another level is needed."""
+        return dr.maximum(left, 2 * self.draft.tolerance)
+
     def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Mask, Image, Image]:
         """Where the first transects are better than nodes (where they meet a jump), what is left, what they pass by.
 
@@ -93,7 +100,7 @@ class _Ladder:
         """
         draft = self.draft
         left = dr.maximum(FIRST_GAIN * moved, scatter)
-        left = dr.select(silhouette, left, dr.maximum(left, 2 * draft.tolerance))
+        left = dr.select(silhouette, left, self._unsettled(left))
         missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, 0))
         return fresh, dr.select(fresh, left, missed), draft.unseen_by_transects(fresh)
 
@@ -110,7 +117,7 @@ class _Ladder:
         if level <= rules.SMOOTH_LEVELS:
             # On what is smooth each step of the node rules gains more than it moves.
             left = dr.select(self.smooth, STEP_GAIN * moved, left)
-        left = dr.select(fresh, dr.maximum(left, 2 * self.draft.tolerance), left)
+        left = dr.select(fresh, self._unsettled(left), left)
         return left, self.draft.near_edge(dr.select(fresh, moved, 0))
 
 
