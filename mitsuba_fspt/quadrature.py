@@ -28,7 +28,7 @@ class Quadrature:
     rtol: float = 1e-3
     domain: str = "pupil"
     pixel: str = "area"
-    max_nodes: int = 1 << 18
+    max_nodes: int = 200_000
     without: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -39,7 +39,7 @@ class Quadrature:
         if self.pixel not in PIXELS:
             raise SceneError(f"fspt_integral: 'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
         if self.max_nodes < 1:
-            raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 262144.")
+            raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 200000.")
         if unknown := set(self.without) - set(SHORTCUTS):
             raise SceneError(f"fspt_integral: 'without' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}.")
 

@@ -48,7 +48,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
        - area: integrate over the pixel (Default). centre: the value at its centre times its area, as in the paper.
      * - max_nodes
        - |int|
-       - Lines of sight a pixel may take at most (Default: 262144).
+       - Lines of sight a pixel may take at most (Default: 200000).
      * - shortcuts
        - |bool|
        - Leave out what the scene does not need (Default: true). Without, the same power comes out, later.
