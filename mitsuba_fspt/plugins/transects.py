@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .draft import Index
     from .grid import Image, Mask
 
-# Of the difference to twelve nodes may be left in the first transects, and in nodes that no transect parts.
+# Of the difference to nodes may be left in the first transects, and in nodes that no transect parts.
 FIRST_GAIN, NODES_GAIN = 0.2, 0.9
 LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be left
 # What a kink may hide from transects that differ, in units of their deviation over their number, level by level.
