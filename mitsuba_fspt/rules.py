@@ -177,9 +177,7 @@ class Transects:
 
 @cache
 def transects(count: int) -> Transects:
-    """2 (exact to degree 1), 4, 8, 27 or 64 (to degree 2, 3, 5 and 7) transects by Gauss; of a larger power of two a
-    net.
-    """
+    """2 (exact to degree 1), 8, 27 or 64 (to degree 3, 5 and 7) transects by Gauss; of a larger power of two a net."""
     number = np.arange(count) + 0.5
     if count > 64:
         return Transects(_net(count), _net(count), np.full(count, 1 / count))
@@ -198,13 +196,13 @@ def transects(count: int) -> Transects:
 
 
 def _gauss_cube(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes (n, 3) and weights (n,) of Gauss in the cube; 4 are every other one of 8, 2 opposite ones of these."""
+    """Nodes (n, 3) and weights (n,) of Gauss in the cube; 2 are opposite ones of 8."""
     x, w = gauss(max(2, round(count ** (1 / 3))))
     place = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
     weight = np.multiply.outer(np.outer(w, w), w).ravel()
-    if count < 8:
-        corners = [0, 3, 5, 6] if count == 4 else [2, 5]
-        return place[corners], 8 / count * weight[corners]
+    if count == 2:
+        corners = [2, 5]
+        return place[corners], 4 * weight[corners]
     return place, weight
 
 

@@ -157,7 +157,7 @@ def test_places_of_transects_lie_in_the_cube_and_are_as_many_as_asked(count):
         assert np.all((place > 0) & (place < 1))
 
 
-@pytest.mark.parametrize(("count", "degree"), [(2, 1), (4, 2), (8, 3), (27, 5), (64, 7)])
+@pytest.mark.parametrize(("count", "degree"), [(2, 1), (8, 3), (27, 5), (64, 7)])
 def test_few_places_are_exact_for_polynomials(count, degree):
     """Expected: means of x^i y^j z^k over the cube, 1/((i+1)(j+1)(k+1)), up to the degree in all and no further."""
     places = rules.transects(count)

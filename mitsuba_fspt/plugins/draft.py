@@ -115,7 +115,6 @@ class Draft:
     def set_hits(self, hits: Image) -> None:
         """Shares of lines of sight that hit, and with them the outline."""
         self.hits, self.outline = hits, self.grid.outline(hits)
-        dr.eval(self.hits, self.outline)
 
     def grown(self, rough: Mask, nodes: int) -> Mask:
         """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `cut_off` knows."""

@@ -62,7 +62,7 @@ def integrate_transect(
             f, _, body, _ = radiance_on_film(scene, lens, position, pupil)
             return (sums.plus(slope * density, (s - middle) / half, f, body),)
 
-        (sums,) = repeat(count, add, dr.zeros(_Sums))
+        (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))
         until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
         more_value, more_hits = sums.corrected(_about(until - since, middle, half))
         return until, value + more_value, hits + more_hits, looks + count
@@ -160,8 +160,9 @@ def _search(
         found.looks = k + 1
         return (found,)
 
-    start = dr.zeros(_Search)
-    start.lit = mi.Point2f(2, -2)
+    # Not `dr.zeros`: of a dataclass's fields it keeps the types of the variant that it meets first.
+    none = (_Jump(mi.Point2f(0), mi.Point3f(0), mi.Point3f(0)) for _ in range(3))
+    start = _Search(*none, mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
     return dr.while_loop((start,), lambda found: found.looks <= intervals + found.jumps * bisections, once)[0]
 
 

@@ -71,15 +71,16 @@ class _Ladder:
             value, hits = dr.select(self.smooth, nodes, value), dr.select(self.smooth, seen, hits)
         moved = dr.abs(value - draft.value)
         if level == 0:
-            better, left, unseen = self._first(fresh, moved, scatter, parted(hits))
+            left, unseen = self._first(fresh, moved, scatter, parted(hits))
         else:
-            better, left, unseen = where, *self._later(level, fresh, moved, scatter, len(rule))
+            left, unseen = self._later(level, fresh, moved, scatter, len(rule))
             self.smooth = self.smooth & (moved < BUMPY * value)
         if level < CURVED_LEVELS:
             left = dr.select(draft.clipped & self.split, self._unsettled(left), left)
         # Whose neighbour meets a jump at last may pass it by, settled or not, and be as wrong as that one was.
         unseen = dr.select(self.split | ~draft.open, 0, unseen)
         self.left = dr.select(where, left, self.left)
+        better = where if level else fresh  # where the first transects meet no jump nodes are
         draft.value = dr.select(better, value, draft.value)
         draft.set_hits(dr.select(better, hits, draft.hits))
         draft.error = dr.maximum(dr.select(where, draft.grid.spread_max(self.left), draft.error), unseen)
@@ -93,8 +94,8 @@ class _Ladder:
         """What is left, or so much that another level is needed."""
         return dr.maximum(left, 2 * self.draft.tolerance)
 
-    def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Mask, Image, Image]:
-        """Where the first transects are better than nodes (where they meet a jump), what is left, what they pass by.
+    def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Image, Image]:
+        """What may be left after the first transects, and what they pass by beside a jump.
 
         That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
         """
@@ -102,7 +103,7 @@ class _Ladder:
         left = dr.maximum(FIRST_GAIN * moved, scatter)
         left = dr.select(silhouette, left, self._unsettled(left))
         missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, 0))
-        return fresh, dr.select(fresh, left, missed), draft.unseen_by_transects(fresh)
+        return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh)
 
     def _later(self, level: int, fresh: Mask, moved: Image, scatter: Image, count: int) -> tuple[Image, Image]:
         """What may be left, and what neighbours of a jump that is met at last may be wrong by.
