@@ -30,6 +30,8 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     backend.ensure_variant()
     import mitsuba as mi
 
+    from .plugins.intersections import trace_surfaces_beside
+
     check_parameters(path, parameters)
     texts = {name: parameter_text(value) for name, value in parameters.items()}
     config = mi.parser.ParserConfig(mi.variant())
@@ -49,7 +51,9 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
         raise error if isinstance(error, SceneError) else SceneError(_one_line(str(error))) from error
     finally:
         mi.set_file_resolver(resolver)
-    return scene[0] if isinstance(scene, list) else scene
+    scene = scene[0] if isinstance(scene, list) else scene
+    trace_surfaces_beside(scene)
+    return scene
 
 
 def defaults(path: str | os.PathLike[str]) -> dict[str, str]:

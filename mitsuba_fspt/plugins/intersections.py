@@ -29,13 +29,27 @@ def robust_scene(scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
     return traced_robustly(scene.shapes())
 
 
-def traced_robustly(shapes: Sequence[mi.Shape]) -> mi.Scene:
-    """A scene of these shapes in Embree's robust mode; `mi.load_dict` would give the shapes other names."""
+def traced_robustly(shapes: Sequence[mi.Shape], beside: mi.Scene | None = None) -> mi.Scene:
+    """A scene of these shapes in Embree's robust mode; `mi.load_dict` would give the shapes other names.
+
+    On CUDA a kernel can trace rays in two scenes only where one of them was set up `beside` the other.
+    """
     props = mi.Properties("scene")
     props["embree_use_robust_intersections"] = True
+    if beside is not None:
+        props["beside"] = beside
     for number, shape in enumerate(shapes):
         props[f"shape_{number}"] = shape
     return mi.Scene(props)
+
+
+def trace_surfaces_beside(scene: mi.Scene) -> None:
+    """Let light leave meshes of a scene in the kernels that trace rays in it; needed on CUDA alone."""
+    if not mi.variant().startswith("cuda"):
+        return
+    for emitter in scene.emitters():
+        if type(emitter).__name__ == "FsptSurface":
+            emitter.trace_beside(scene)
 
 
 def twin(mesh: mi.Shape) -> mi.Mesh:

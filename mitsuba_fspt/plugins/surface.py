@@ -18,6 +18,11 @@ from .intersections import traced_robustly, twin
 from .last_flight import LastFlight
 from .recording import scene_is_checked
 
+APART = (
+    "fspt_surface: on CUDA a kernel that traces rays in the scene cannot look for faces of a mesh beside it, and loses "
+    "light. Load the scene with mitsuba_fspt.load, or render it with mitsuba_fspt.render."
+)
+
 
 class FsptSurface(mi.Emitter):
     r"""
@@ -236,6 +241,8 @@ class FsptSurface(mi.Emitter):
         if not shape.is_mesh():
             return self._distribution().elements.at(ps.uv)
         if self._probe is None:
+            if mi.variant().startswith("cuda"):
+                mi.Log(mi.LogLevel.Warn, APART)
             self._probe = aside(lambda shape: traced_robustly([twin(shape)]), shape)
         reach = 1e-4 * (dr.max(dr.abs(ps.p)) + 1e-3)
         ray = mi.Ray3f(ps.p + reach * ps.n, -ps.n)
@@ -246,6 +253,15 @@ class FsptSurface(mi.Emitter):
         si = shape.compute_surface_interaction(ray, pi, active=hit)
         si.t = dr.select(hit, si.t, dr.inf)
         return si
+
+    def trace_beside(self, scene: mi.Scene) -> None:
+        """Find faces in the kernels that trace rays in `scene`, see `traced_robustly`.
+
+        Each time anew: faces may have been looked for beside another scene since.
+        """
+        if self.get_shape().is_mesh():
+            with dr.suspend_grad():
+                self._probe = traced_robustly([twin(self.get_shape())], beside=scene)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         return self.get_shape().bbox()
@@ -273,7 +289,10 @@ def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
             return build(shape)
 
     with ThreadPoolExecutor(1) as pool:
-        return pool.submit(run).result()
+        built = pool.submit(run).result()
+    # What this thread records from now on comes after what that one left unevaluated: on CUDA the handle of a scene.
+    dr.detail.new_scope(dr.backend_v(mi.Float))
+    return built
 
 
 def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
