@@ -11,6 +11,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import Legendre
 from numpy.typing import NDArray
 
 GOLDEN = 0.6180339887498949
@@ -107,10 +108,12 @@ def product(level: int, area: bool) -> Rule:
     return Rule(pupil, pixel, weight, np.zeros(len(weight)))
 
 
-# On so many levels nodes may do yet where nothing jumps.
-SMOOTH_LEVELS = 3
-# Transects a level: the first ones for what is smooth but for one edge, then a net for what is not.
-TRANSECT_LEVELS = (2, 8, 27, 64, 256, 1024)
+SMOOTH_LEVELS = 3  # of transects on which nodes may do yet where nothing jumps
+TRANSECT_LEVELS = (2, 8, 24, 72, 256, 1024)
+# Places across the pupil at each level but the last. A second edge makes what transects find bend and kink there, while
+# along their other two places it is nearly linear.
+ACROSS = (2, 4, 6, 8, 16)
+TREND = 3  # degree across the pupil that says nothing yet of a kink
 SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
 TRANSECT_ORDER = 1.5  # by which the error falls at least, whatever two levels agree on
 
@@ -158,8 +161,9 @@ class Transects:
     """Places in [0, 1]³ of n transects through pixel × pupil, (n, 3), for sharp edges and for blurred ones.
 
     `sharp` lie evenly in the pixel, each on a line of its own, where the edge leaves it with a kink; all of weight 1/n.
-    `blurred` have the `weight` (n,) of sum 1. `phase` (n,) in [0, 1) is where between two of a transect's even nodes
-    they begin: were it the same on all, all would miss the same.
+    `blurred` have the `weight` (n,) of sum 1, and `trend` (k, n) are orthonormal polynomials on them, of mean 0, that
+    are part of any smooth function. `phase` (n,) in [0, 1) is where between two of a transect's even nodes they begin:
+    were it the same on all, all would miss the same.
     """
 
     sharp: NDArray[np.float64]
@@ -174,35 +178,49 @@ class Transects:
         """Even over any run of them (golden ratio)."""
         return np.mod(GOLDEN * (np.arange(len(self)) + 0.5), 1.0)
 
+    @property
+    def trend(self) -> NDArray[np.float64]:
+        """Legendre's, up to degree `TREND` across the pupil, linear along the other two places; none on two."""
+        if len(self) == 2:
+            return np.empty((0, 2))
+        along, across, pixel = 2 * self.blurred.T - 1
+        legendre = [math.sqrt(2 * k + 1) * Legendre.basis(k)(across) for k in range(1, TREND + 1)]
+        return np.stack([*legendre, math.sqrt(3) * along, math.sqrt(3) * pixel])
+
 
 @cache
 def transects(count: int) -> Transects:
-    """2 (exact to degree 1), 8, 27 or 64 (to degree 3, 5 and 7) transects by Gauss; of a larger power of two a net."""
+    """As many transects as a level of `TRANSECT_LEVELS` has: Gauss's places, at last a net for whatever is left."""
     number = np.arange(count) + 0.5
-    if count > 64:
+    level = TRANSECT_LEVELS.index(count)
+    if level == len(ACROSS):
         return Transects(_net(count), _net(count), np.full(count, 1 / count))
-    blurred, weight = _gauss_cube(count)
-    if count == 64:
+    blurred, weight = _across_the_pupil(count, ACROSS[level])
+    if count == 256:
         return Transects(_net(count), blurred, weight)
-    if count < 27:
+    if count <= 8:
         # On the pupil the corners of Gauss's square, in an order that has little to do with the place along the pixel.
         on_pupil = gauss(2)[0][np.array([[0, 0], [1, 1], [1, 0], [0, 1]])][:: 8 // count]
     else:
         on_pupil = np.mod(np.outer(number, PLASTIC), 1.0)[: count // 2]  # R₂ sequence
     # Opposite each other, so that what is odd about the middle cancels.
-    middle = np.full((count % 2, 2), 0.5)
-    on_pupil = np.concatenate([on_pupil, middle, 1 - on_pupil[::-1]])
+    on_pupil = np.concatenate([on_pupil, 1 - on_pupil[::-1]])
     return Transects(np.column_stack([on_pupil, number / count]), blurred, weight)
 
 
-def _gauss_cube(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes (n, 3) and weights (n,) of Gauss in the cube; 2 are opposite ones of 8."""
-    x, w = gauss(max(2, round(count ** (1 / 3))))
-    place = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
-    weight = np.multiply.outer(np.outer(w, w), w).ravel()
-    if count == 2:
-        corners = [2, 5]
-        return place[corners], 4 * weight[corners]
+def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places (n, 3) and weights (n,) of Gauss, so many of them across the pupil and equally many on the other axes.
+
+    8 are every other one of 16, as on a chessboard, exact to degree 2; 2 are opposite corners, exact to degree 1.
+    """
+    x, v = gauss(max(2, math.isqrt(count // across)))
+    y, w = gauss(across)
+    place = np.stack(np.meshgrid(x, y, x, indexing="ij"), axis=-1).reshape(-1, 3)
+    weight = np.multiply.outer(np.outer(v, w), v).ravel()
+    if count <= 8:
+        chessboard = np.indices((2, across, 2)).sum(axis=0).ravel() % 2 == 1
+        chosen = [2, 5] if count == 2 else chessboard
+        place, weight = place[chosen], weight[chosen] / weight[chosen].sum()
     return place, weight
 
 

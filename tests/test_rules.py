@@ -157,7 +157,7 @@ def test_places_of_transects_lie_in_the_cube_and_are_as_many_as_asked(count):
         assert np.all((place > 0) & (place < 1))
 
 
-@pytest.mark.parametrize(("count", "degree"), [(2, 1), (8, 3), (27, 5), (64, 7)])
+@pytest.mark.parametrize(("count", "degree"), [(2, 1), (8, 2), (24, 3), (72, 5), (256, 7)])
 def test_few_places_are_exact_for_polynomials(count, degree):
     """Expected: means of x^i y^j z^k over the cube, 1/((i+1)(j+1)(k+1)), up to the degree in all and no further."""
     places = rules.transects(count)
@@ -171,7 +171,18 @@ def test_few_places_are_exact_for_polynomials(count, degree):
     assert max(abs(off(*p)) for p in beyond) > 1e-5
 
 
-@pytest.mark.parametrize("count", [64, 256])
+@pytest.mark.parametrize("count", rules.TRANSECT_LEVELS)
+def test_trend_is_orthonormal_on_the_places(count):
+    """So that the sum of squared coefficients is what a trend adds to the variance; on a net but nearly."""
+    places = rules.transects(count)
+    trend = places.trend
+    assert len(trend) == (0 if count == 2 else rules.TREND + 2)
+    near = 1e-13 if count < 1024 else 2e-2
+    np.testing.assert_allclose(trend @ places.weight, 0, atol=near)
+    np.testing.assert_allclose((trend * places.weight) @ trend.T, np.eye(len(trend)), atol=near)
+
+
+@pytest.mark.parametrize("count", [256, 1024])
 def test_many_places_are_a_net(count):
     """One place in every box of volume 1/n whose sides are powers of ½: 2^i × 2^j × 2^k boxes in all."""
     place = rules.transects(count).sharp

@@ -51,7 +51,7 @@ def test_every_transect_meets_a_straight_edge_at_one_place(angle, blur):
 
     Fails if the pupil leans the other way for one sign of the blur.
     """
-    rule = rules.transects(27)
+    rule = rules.transects(24)
     pixel, pupil, _ = traced(rule.blurred, rule.weight, angle, blur)
     n = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
     other = 1 - np.argmax(np.abs(n))

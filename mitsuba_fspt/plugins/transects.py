@@ -23,10 +23,11 @@ if TYPE_CHECKING:
 # Of the difference to nodes may be left in the first transects, and in nodes that no transect parts.
 FIRST_GAIN, NODES_GAIN = 0.2, 0.9
 LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be left
-# What a kink may hide from transects that differ, in units of their deviation over their number, level by level.
-SCATTER = (2.0, 2.0, 1.0, 1.0)
+# What a kink may hide from transects, in units of their deviation (from a trend, if they are more than two) over their
+# number: of the first level and of later ones.
+SCATTER = (2.0, 6.0)
+DOUBT = 0.5  # of what a neighbour may be wrong by counts for a pixel that knows its own blurred edge
 BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
-CURVED_LEVELS = 2  # of them have places like Gauss's two across the pupil, between which a second border may bend
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 16  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
@@ -65,7 +66,7 @@ class _Ladder:
         fresh = where & means.jumps & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
-        value, hits, scatter = means.value, means.hits, SCATTER[min(level, len(SCATTER) - 1)] * means.scatter
+        value, hits, scatter = means.value, means.hits, SCATTER[min(level, 1)] * means.scatter
         if 0 < level <= rules.SMOOTH_LEVELS and dr.any(self.smooth):
             nodes, _, _, _, seen, *_ = apply_nodes(draft, rules.product(level, draft.area), self.smooth)
             value, hits = dr.select(self.smooth, nodes, value), dr.select(self.smooth, seen, hits)
@@ -75,15 +76,15 @@ class _Ladder:
         else:
             left, unseen = self._later(level, fresh, moved, scatter, len(rule))
             self.smooth = self.smooth & (moved < BUMPY * value)
-        if level < CURVED_LEVELS:
-            left = dr.select(draft.clipped & self.split, self._unsettled(left), left)
         # Whose neighbour meets a jump at last may pass it by, settled or not, and be as wrong as that one was.
         unseen = dr.select(self.split | ~draft.open, 0, unseen)
         self.left = dr.select(where, left, self.left)
         better = where if level else fresh  # where the first transects meet no jump nodes are
         draft.value = dr.select(better, value, draft.value)
         draft.set_hits(dr.select(better, hits, draft.hits))
-        draft.error = dr.maximum(dr.select(where, draft.grid.spread_max(self.left), draft.error), unseen)
+        known = self.split & ~fresh & ~self.edges.sharp
+        doubt = draft.grid.spread_max(self.left) * dr.select(known, dr.opaque(mi.Float64, DOUBT), 1)
+        draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, doubt), draft.error), unseen)
         self.edges.learn(draft, means, self.split)
         self.where = (where | (unseen > 0)) & (draft.error > draft.tolerance)
         self.count = len(rule)
@@ -97,11 +98,12 @@ class _Ladder:
     def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Image, Image]:
         """What may be left after the first transects, and what they pass by beside a jump.
 
-        That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
+        That two of them and the nodes agree says enough of a silhouette, and too little of another jump or of a second
+        border of the lens, which bends.
         """
         draft = self.draft
         left = dr.maximum(FIRST_GAIN * moved, scatter)
-        left = dr.select(silhouette, left, self._unsettled(left))
+        left = dr.select(silhouette & ~draft.clipped, left, self._unsettled(left))
         missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, 0))
         return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh)
 
@@ -169,7 +171,7 @@ def _edges(draft: Draft) -> _Edges:
 class _Means:
     """Of each marked pixel mean radiance on film, share of hits, whether a transect is split by a jump.
 
-    scatter : deviation of the transects over their number
+    scatter : deviation of the transects from a trend, over their number
     depth : of the edges, mean over transects that meet one [mm]
     """
 
@@ -183,7 +185,7 @@ class _Means:
 def _apply(draft: Draft, where: Mask, edges: _Edges, rule: rules.Transects, along: rules.AlongTransect) -> _Means:
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
     index = dr.compress(where)
-    images = [draft.grid.full(mi.Float64, 0) for _ in range(5)]
+    images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
     rays = 0
     for part in chunks(index, max(1, LANES // len(rule))):
         *sums, looks = _transect_sums(draft, part, edges, rule, along)
@@ -192,10 +194,11 @@ def _apply(draft: Draft, where: Mask, edges: _Edges, rule: rules.Transects, alon
         dr.eval(images)
         rays += int(dr.sum(looks)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
-    value, hits, squares, parted, depth = images
+    value, hits, squares, trend, parted, depth = images
     number = dr.opaque(mi.Float64, len(rule))
+    rest = squares - value * value - dr.select(edges.sharp, 0, trend)
     # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
-    scatter = dr.safe_sqrt(squares - value * value) / dr.select(edges.sharp, number * dr.sqrt(number), number)
+    scatter = dr.safe_sqrt(rest) / dr.select(edges.sharp, number * dr.sqrt(number), number)
     scatter = dr.maximum(scatter, dr.select(edges.sharp, CORNER * value / (number * number), 0))
     return _Means(value, hits, parted > 0, scatter, depth / parted)
 
@@ -203,8 +206,8 @@ def _apply(draft: Draft, where: Mask, edges: _Edges, rule: rules.Transects, alon
 def _transect_sums(
     draft: Draft, part: Index, edges: _Edges, rule: rules.Transects, along: rules.AlongTransect
 ) -> list[Image]:
-    """Of each listed pixel means over its transects of value, hits and value squared; how many jump, and sums over
-    them of the depth of the edge; lines of sight taken.
+    """Of each listed pixel means over its transects of value, hits, value squared, what of that is a trend; how many
+    jump, and sums over them of the depth of the edge; lines of sight taken.
     """
     count = dr.opaque(mi.UInt32, len(rule))
     lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
@@ -226,4 +229,8 @@ def _transect_sums(
     share = mi.Float64(weight) * value
     columns = [share, mi.Float64(weight) * hits, share * value, dr.minimum(jumps, 1), depth, looks]
     dr.eval(columns)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
-    return [dr.block_sum(column, len(rule)) for column in columns]
+    sums = [dr.block_sum(column, len(rule)) for column in columns]
+    trend = dr.zeros(mi.Float64, dr.width(part))
+    for polynomial in rule.trend:
+        trend += dr.square(dr.block_sum(share * dr.gather(mi.Float64, mi.Float64(polynomial), number), len(rule)))
+    return [*sums[:3], trend, *sums[3:]]
