@@ -26,7 +26,7 @@ LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be
 # What a kink may hide from transects, in units of their deviation (from a trend, if they are more than two) over their
 # number: of the first level and of later ones.
 SCATTER = (2.0, 6.0)
-DOUBT = 0.5  # of what a neighbour may be wrong by counts for a pixel that knows its own blurred edge
+DOUBT = 0.5  # of what a neighbour may be wrong by counts, unless it is by a sharp edge or one that it alone has met
 BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 16  # of the light, over the number of transects squared, is in a corner that none of them crosses
@@ -82,9 +82,8 @@ class _Ladder:
         better = where if level else fresh  # where the first transects meet no jump nodes are
         draft.value = dr.select(better, value, draft.value)
         draft.set_hits(dr.select(better, hits, draft.hits))
-        known = self.split & ~fresh & ~self.edges.sharp
-        doubt = draft.grid.spread_max(self.left) * dr.select(known, dr.opaque(mi.Float64, DOUBT), 1)
-        draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, doubt), draft.error), unseen)
+        known = self.split & ~fresh
+        draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, self._doubt(known)), draft.error), unseen)
         self.edges.learn(draft, means, self.split)
         self.where = (where | (unseen > 0)) & (draft.error > draft.tolerance)
         self.count = len(rule)
@@ -94,6 +93,13 @@ class _Ladder:
     def _unsettled(self, left: Image) -> Image:
         """What is left, or so much that another level is needed."""
         return dr.maximum(left, 2 * self.draft.tolerance)
+
+    def _doubt(self, known: Mask) -> Image:
+        """What pixels may be wrong by for all that neighbours know; `known`: which pixels know an edge themselves."""
+        spread = self.draft.grid.spread_max
+        near, edge = spread(self.left), spread(dr.select(self.split, self.left, 0))
+        doubt = dr.maximum(dr.opaque(mi.Float64, DOUBT) * near, dr.select(known, 0, edge))
+        return dr.select(self.edges.sharp, near, doubt)
 
     def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Image, Image]:
         """What may be left after the first transects, and what they pass by beside a jump.
