@@ -54,7 +54,7 @@ class _Ladder:
     """
 
     def __init__(self, draft: Draft, rough: Mask) -> None:
-        self.draft, self.where, self.edges = draft, rough, _edges(draft)
+        self.draft, self.where, self.edges = draft, rough, edges_of(draft)
         self.split, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
         self.left = draft.grid.full(mi.Float64, 0)
         self.count = 0
@@ -62,7 +62,7 @@ class _Ladder:
     def climb(self, level: int, rule: rules.Transects, along: rules.AlongTransect) -> None:
         """One round: values, what is left of the error, and whether a neighbour knows better."""
         draft, where = self.draft, self.where
-        means = _apply(draft, where, self.edges, rule, along)
+        means = apply_transects(draft, where, self.edges, rule, along)
         fresh = where & means.jumps & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
@@ -134,14 +134,14 @@ class _Ladder:
 
 
 @dataclass
-class _Edges:
+class Edges:
     """Of the edge that a pixel may see: its `angle`, signed `blur` radius [pixels] and whether it counts as `sharp`."""
 
     angle: Image
     blur: Image
     sharp: Mask
 
-    def learn(self, draft: Draft, means: _Means, split: Mask) -> None:
+    def learn(self, draft: Draft, means: Means, split: Mask) -> None:
         """Blur from the depth of the edges that were met; pixels that see none are smooth, and none is sharp.
 
         Whoever met none may see the tip of a neighbour's.
@@ -154,7 +154,7 @@ class _Edges:
         self.sharp = (dr.abs(self.blur) < SHARP) & near
 
 
-def _edges(draft: Draft) -> _Edges:
+def edges_of(draft: Draft) -> Edges:
     """Across the change of the picture around, with the blur of what is nearest to the lens.
 
     A second border of the lens is so blurred that only the pupil sees it, the image-plane stop is sharp.
@@ -167,14 +167,14 @@ def _edges(draft: Draft) -> _Edges:
     nearest = dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
     blur = dr.select(draft.clipped, dr.inf, draft.lens.blur_radius(nearest))
     blur = dr.select(draft.stopped, 0, blur)
-    return _Edges(angle, blur, dr.abs(blur) < SHARP)
+    return Edges(angle, blur, dr.abs(blur) < SHARP)
 
 
 # ---------------------------------------------------------------------- many transects in one launch
 
 
 @dataclass(frozen=True)
-class _Means:
+class Means:
     """Of each marked pixel mean radiance on film, share of hits, whether a transect is split by a jump.
 
     scatter : deviation of the transects from a trend, over their number
@@ -188,7 +188,9 @@ class _Means:
     depth: Image
 
 
-def _apply(draft: Draft, where: Mask, edges: _Edges, rule: rules.Transects, along: rules.AlongTransect) -> _Means:
+def apply_transects(
+    draft: Draft, where: Mask, edges: Edges, rule: rules.Transects, along: rules.AlongTransect
+) -> Means:
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
     index = dr.compress(where)
     images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
@@ -206,11 +208,11 @@ def _apply(draft: Draft, where: Mask, edges: _Edges, rule: rules.Transects, alon
     # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
     scatter = dr.safe_sqrt(rest) / dr.select(edges.sharp, number * dr.sqrt(number), number)
     scatter = dr.maximum(scatter, dr.select(edges.sharp, CORNER * value / (number * number), 0))
-    return _Means(value, hits, parted > 0, scatter, depth / parted)
+    return Means(value, hits, parted > 0, scatter, depth / parted)
 
 
 def _transect_sums(
-    draft: Draft, part: Index, edges: _Edges, rule: rules.Transects, along: rules.AlongTransect
+    draft: Draft, part: Index, edges: Edges, rule: rules.Transects, along: rules.AlongTransect
 ) -> list[Image]:
     """Of each listed pixel means over its transects of value, hits, value squared, what of that is a trend; how many
     jump, and sums over them of the depth of the edge; lines of sight taken.
