@@ -115,7 +115,7 @@ def _sample(
     import drjit as dr
 
     from .plugins.checks import check_scene
-    from .plugins.intersections import trace_surfaces_beside
+    from .plugins.probe import probe_beside
     from .plugins.pupil_form import coverage
     from .plugins.recording import recording
 
@@ -124,7 +124,7 @@ def _sample(
         raise SceneError(f"render: 'spp' must be >= 2 for a standard error, got {spp}. Give for example 256.")
     if not 0 <= seed < 1 << 32:
         raise SceneError(f"render: 'seed' must be in 0 … 2^32 - 1, got {seed}. Give for example 1.")
-    trace_surfaces_beside(scene)
+    probe_beside(scene)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
     passes = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
     total = squares = 0.0

@@ -30,7 +30,7 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     backend.ensure_variant()
     import mitsuba as mi
 
-    from .plugins.intersections import trace_surfaces_beside
+    from .plugins.probe import probe_beside
 
     check_parameters(path, parameters)
     texts = {name: parameter_text(value) for name, value in parameters.items()}
@@ -52,7 +52,7 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     finally:
         mi.set_file_resolver(resolver)
     scene = scene[0] if isinstance(scene, list) else scene
-    trace_surfaces_beside(scene)
+    probe_beside(scene)
     return scene
 
 

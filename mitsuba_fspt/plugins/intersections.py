@@ -43,25 +43,6 @@ def traced_robustly(shapes: Sequence[mi.Shape], beside: mi.Scene | None = None) 
     return mi.Scene(props)
 
 
-def trace_surfaces_beside(scene: mi.Scene) -> None:
-    """Let light leave meshes of a scene in the kernels that trace rays in it; needed on CUDA alone."""
-    if not mi.variant().startswith("cuda"):
-        return
-    for emitter in scene.emitters():
-        if type(emitter).__name__ == "FsptSurface":
-            emitter.trace_beside(scene)
-
-
-def twin(mesh: mi.Shape) -> mi.Mesh:
-    """The triangles of a mesh and nothing else of it."""
-    positions, faces = triangles(mesh)
-    copy = mi.Mesh("twin", dr.width(positions) // 3, dr.width(faces) // 3)
-    parameters = mi.traverse(copy)
-    parameters["vertex_positions"], parameters["faces"] = positions, faces
-    parameters.update()
-    return copy
-
-
 def loses_rays(scene: mi.Scene, lens: mi.Sensor) -> bool:
     """True if a ray from the lens to a mesh vertex meets nothing although four rays around it meet something."""
     if not mi.variant().startswith("llvm"):

@@ -6,9 +6,14 @@ Also of those in scenes nobody needs any more.
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
 
 _checked = ContextVar("scene_is_checked", default=False)
 
@@ -29,6 +34,24 @@ def recording() -> Iterator[None]:
         _checked.reset(token)
         if was_enabled:
             gc.enable()
+
+
+def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
+    """`build(shape)` evaluated now, even while this thread records a kernel; its gradients are not tracked.
+
+    Light tracers first meet the emitter in the middle of a recording, when nothing can be evaluated. Dr.Jit records
+    by thread, so a thread of its own is free to.
+    """
+
+    def run() -> Any:
+        with dr.suspend_grad():
+            return build(shape)
+
+    with ThreadPoolExecutor(1) as pool:
+        built = pool.submit(run).result()
+    # What this thread records from now on comes after what that one left unevaluated: on CUDA the handle of a scene.
+    dr.detail.new_scope(dr.backend_v(mi.Float))
+    return built
 
 
 def scene_is_checked() -> bool:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,14 +11,9 @@ from ..errors import ExitanceError
 from . import exitance
 from .elements import ElementDistribution, elements_of
 from .emission import Lambert, law_of
-from .intersections import traced_robustly, twin
 from .last_flight import LastFlight
-from .recording import scene_is_checked
-
-APART = (
-    "fspt_surface: on CUDA a kernel that traces rays in the scene cannot look for faces of a mesh beside it, and loses "
-    "light. Load the scene with mitsuba_fspt.load, or render it with mitsuba_fspt.render."
-)
+from .probe import Probe
+from .recording import aside, scene_is_checked
 
 
 class FsptSurface(mi.Emitter):
@@ -74,7 +66,7 @@ class FsptSurface(mi.Emitter):
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
         self._positions: ElementDistribution | None = None
-        self._probe: mi.Scene | None = None
+        self._probe: Probe | None = None
         self._checked = False
         self._attribute: mi.Float | None = None
         self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
@@ -241,27 +233,17 @@ class FsptSurface(mi.Emitter):
         if not shape.is_mesh():
             return self._distribution().elements.at(ps.uv)
         if self._probe is None:
-            if mi.variant().startswith("cuda"):
-                mi.Log(mi.LogLevel.Warn, APART)
-            self._probe = aside(lambda shape: traced_robustly([twin(shape)]), shape)
-        reach = 1e-4 * (dr.max(dr.abs(ps.p)) + 1e-3)
-        ray = mi.Ray3f(ps.p + reach * ps.n, -ps.n)
-        ray.maxt = 2 * reach
-        pi = self._probe.ray_intersect_preliminary(ray, active=active)
-        hit = pi.is_valid()
-        pi.prim_index = dr.select(hit, pi.prim_index, 0)
-        si = shape.compute_surface_interaction(ray, pi, active=hit)
-        si.t = dr.select(hit, si.t, dr.inf)
-        return si
+            self._probe = aside(Probe, shape)
+        return self._probe.at(shape, ps, active)
 
     def trace_beside(self, scene: mi.Scene) -> None:
-        """Find faces in the kernels that trace rays in `scene`, see `traced_robustly`.
+        """Find faces in the kernels that trace rays in `scene`, see `Probe`.
 
         Each time anew: faces may have been looked for beside another scene since.
         """
         if self.get_shape().is_mesh():
             with dr.suspend_grad():
-                self._probe = traced_robustly([twin(self.get_shape())], beside=scene)
+                self._probe = Probe(self.get_shape(), scene)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
         return self.get_shape().bbox()
@@ -275,24 +257,6 @@ def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedS
     if not mi.is_spectral:
         return mi.Color0f(), mi.UnpolarizedSpectrum(1)
     return mi.sample_rgb_spectrum(mi.math.sample_shifted(sample))
-
-
-def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
-    """`build(shape)` evaluated now, even while this thread records a kernel; its gradients are not tracked.
-
-    Light tracers first meet the emitter in the middle of a recording, when nothing can be evaluated. Dr.Jit records
-    by thread, so a thread of its own is free to.
-    """
-
-    def run() -> Any:
-        with dr.suspend_grad():
-            return build(shape)
-
-    with ThreadPoolExecutor(1) as pool:
-        built = pool.submit(run).result()
-    # What this thread records from now on comes after what that one left unevaluated: on CUDA the handle of a scene.
-    dr.detail.new_scope(dr.backend_v(mi.Float))
-    return built
 
 
 def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
