@@ -279,6 +279,8 @@ def test_position_density_and_weight(case):
     assert pdf.min() > 0
     np.testing.assert_allclose(weight.numpy() * pdf, 1, rtol=1e-5)
     assert_mostly_close(case.emitter.pdf_position(ps).numpy(), pdf, 1e-3)
+    case.emitter.trace_beside(case.scene)
+    assert_mostly_close(case.emitter.pdf_position(ps).numpy(), pdf, 1e-3)
     assert np.all(ps.time.numpy() == 0.25)
     share = case.exitance(local(ps.p)) / case.power.sum() + UNIFORM_SHARE / case.area.sum()
     assert_mostly_close(pdf, share / (1 + UNIFORM_SHARE), 2e-2, strays=2e-2)
