@@ -156,8 +156,10 @@ def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float
     import drjit as dr
     import mitsuba as mi
 
+    from .plugins.probe import probe_beside
     from .plugins.recording import recording
 
+    probe_beside(scene)
     # Depth 1 is the light that leaves the surface straight into the lens, all there is in free space: one ray a sample.
     integrator = mi.load_dict({"type": kind, "max_depth": 1})
     seed = itertools.count(1)

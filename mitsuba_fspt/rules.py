@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -161,9 +161,9 @@ class Transects:
     """Places in [0, 1]³ of n transects through pixel × pupil, (n, 3), for sharp edges and for blurred ones.
 
     `sharp` lie evenly in the pixel, each on a line of its own, where the edge leaves it with a kink; all of weight 1/n.
-    `blurred` have the `weight` (n,) of sum 1, and `trend` (k, n) are orthonormal polynomials on them, of mean 0, that
-    are part of any smooth function. `phase` (n,) in [0, 1) is where between two of a transect's even nodes they begin:
-    were it the same on all, all would miss the same.
+    `blurred` have the `weight` (n,) of sum 1, and `trend` (k, n) are orthonormal polynomials on them (on a net nearly),
+    of mean 0, that are part of any smooth function. `phase` (n,) in [0, 1) is where between two of a transect's even
+    nodes they begin: were it the same on all, all would miss the same.
     """
 
     sharp: NDArray[np.float64]
@@ -178,7 +178,7 @@ class Transects:
         """Even over any run of them (golden ratio)."""
         return np.mod(GOLDEN * (np.arange(len(self)) + 0.5), 1.0)
 
-    @property
+    @cached_property
     def trend(self) -> NDArray[np.float64]:
         """Legendre's, up to degree `TREND` across the pupil, linear along the other two places; none on two."""
         if len(self) == 2:
@@ -209,7 +209,7 @@ def transects(count: int) -> Transects:
 
 
 def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (n, 3) and weights (n,) of Gauss, so many of them across the pupil and equally many on the other axes.
+    """Places (n, 3) and weights (n,) of Gauss: `across` of them across the pupil, √(n/across) on both other axes.
 
     8 are every other one of 16, as on a chessboard, exact to degree 2; 2 are opposite corners, exact to degree 1.
     """

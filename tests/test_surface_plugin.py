@@ -272,6 +272,25 @@ def test_positions_lie_on_the_patches_in_proportion_to_their_power(case):
     assert scipy.stats.chisquare(counts, expected).pvalue > 1e-3
 
 
+def test_new_exitance_leaves_the_probe_in_its_place_and_a_new_shape_does_not(tmp_path):
+    """On CUDA one that was set up beside the scene would be lost, and light with it."""
+    path = write_ply(tmp_path / "one.ply", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    scene = plastic("ply", 1e-3, filename=str(path))
+    emitter = scene.emitters()[0]
+    emitter.trace_beside(scene)
+    probe = emitter._probe
+    parameters = mi.traverse(scene)
+    exitance = next(name for name in parameters.keys() if "exitance" in name)
+    positions = next(name for name in parameters.keys() if name.endswith("vertex_positions"))
+    parameters[exitance] = 2 * parameters[exitance]
+    parameters.update()
+    assert probe is not None
+    assert emitter._probe is probe
+    parameters[positions] = 2 * parameters[positions]
+    parameters.update()
+    assert emitter._probe is None
+
+
 def test_position_density_and_weight(case):
     u = uniform_numbers(6)
     ps, weight = case.emitter.sample_position(0.25, mi.Point2f(u[0], u[1]))

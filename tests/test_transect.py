@@ -7,7 +7,12 @@ import pytest
 from little_scenes import glow, lens, mi, scene_of
 
 from mitsuba_fspt import rules
+from mitsuba_fspt.plugins.draft import Draft
+from mitsuba_fspt.plugins.grid import parted
+from mitsuba_fspt.plugins.nodes import first_nodes
 from mitsuba_fspt.plugins.transect import transect
+from mitsuba_fspt.plugins.transects import apply_transects, edges_of
+from mitsuba_fspt.plugins.window import visible_window
 from mitsuba_fspt.quadrature import Quadrature
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -108,6 +113,35 @@ def test_transects_across_the_pupil_know_the_share_of_a_corner(blur, other):
     few, cube = (np.sqrt(np.mean(np.square(errors))) for errors in off.values())
     assert few < 6e-3
     assert cube > 2 * few
+
+
+def test_scatter_says_where_transects_kink_and_where_they_only_lean():
+    """One ball before another, both blurred: 24 transects against 1024, on the pixels that silhouettes part.
+
+    Expected: no less than the error wherever that is a thousandth of the peak, but for one pixel in twenty; and on most
+    pixels, which see one edge alone, little. Fails without KINK, and if the trend is not taken off (1.1e-2).
+    """
+    import drjit as dr
+
+    balls = [{"type": "sphere", "center": [x, y, 0], "radius": 4.0, "emitter": glow()} for x, y in ((12, -2), (-15, 2))]
+    scene = scene_of(*balls, sensor=lens(48, pitch=0.2, f_number=2.8))
+    sensor = scene.sensors()[0]
+    draft = Draft(scene, sensor, visible_window(scene, sensor), Quadrature(rtol=1e-4), None)
+    first_nodes(draft)
+    cut = parted(draft.hits)
+    edges = edges_of(draft)
+    edges.learn(draft, apply_transects(draft, cut, edges, rules.transects(2), rules.along_transect(0, 1e-4)), cut)
+    few, many = (
+        apply_transects(draft, cut, edges, rules.transects(count), rules.along_transect(level, 1e-4))
+        for level, count in ((2, 24), (5, 1024))
+    )
+    pixels, peak = np.array(dr.compress(cut)), float(draft.peak[0])
+    error = np.abs(np.array(few.value) - np.array(many.value))[pixels] / peak
+    scatter = np.array(few.scatter)[pixels] / peak
+    kinked = error > 1e-3
+    assert kinked.sum() > 10
+    assert np.mean(scatter[kinked] >= error[kinked]) > 0.95
+    assert np.median(scatter) < 5e-3
 
 
 def share_of_edge(offset, normal, blur):

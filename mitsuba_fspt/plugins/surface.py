@@ -81,7 +81,12 @@ class FsptSurface(mi.Emitter):
 
     def parameters_changed(self, keys: list[str]) -> None:
         super().parameters_changed(keys)
-        self._positions = self._probe = None
+        if not keys or "parent" in keys:  # the shape itself changed
+            self._probe = None
+        self._forget_exitance()
+
+    def _forget_exitance(self) -> None:
+        self._positions = None
         self._checked = False
         self.edition += 1
 
@@ -177,7 +182,7 @@ class FsptSurface(mi.Emitter):
         attribute = exitance.attribute_of(self.get_shape(), self.exitance)
         # Mitsuba does not tell an emitter of new values on its mesh.
         if attribute is not None and self._attribute is not None and attribute.index != self._attribute.index:
-            self.parameters_changed([])
+            self._forget_exitance()
         if self._checked:
             return
 

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 # Of the difference to nodes may be left in the first transects, and in nodes that no transect parts.
 FIRST_GAIN, NODES_GAIN = 0.2, 0.9
 LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be left
-# What a kink may hide from transects, in units of their deviation (from a trend, if they are more than two) over their
-# number: of the first level and of later ones.
-SCATTER = (2.0, 6.0)
+# What transects that differ may be wrong by, in units of their deviation over their number: two; more of them, what a
+# trend explains taken off, for a kink may hide between them; by a sharp edge, over the root of their number once more.
+SPREAD, KINK, SLANT = 2.0, 6.0, 2.0
 DOUBT = 0.5  # of what a neighbour may be wrong by counts, unless it is by a sharp edge or one that it alone has met
 BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
-CORNER = 1 / 16  # of the light, over the number of transects squared, is in a corner that none of them crosses
+CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
 SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
 
@@ -66,7 +66,7 @@ class _Ladder:
         fresh = where & means.jumps & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
-        value, hits, scatter = means.value, means.hits, SCATTER[min(level, 1)] * means.scatter
+        value, hits, scatter = means.value, means.hits, means.scatter
         if 0 < level <= rules.SMOOTH_LEVELS and dr.any(self.smooth):
             nodes, _, _, _, seen, *_ = apply_nodes(draft, rules.product(level, draft.area), self.smooth)
             value, hits = dr.select(self.smooth, nodes, value), dr.select(self.smooth, seen, hits)
@@ -177,7 +177,7 @@ def edges_of(draft: Draft) -> Edges:
 class Means:
     """Of each marked pixel mean radiance on film, share of hits, whether a transect is split by a jump.
 
-    scatter : deviation of the transects from a trend, over their number
+    scatter : what the value may be wrong by for all that the transects differ
     depth : of the edges, mean over transects that meet one [mm]
     """
 
@@ -204,11 +204,12 @@ def apply_transects(
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
     value, hits, squares, trend, parted, depth = images
     number = dr.opaque(mi.Float64, len(rule))
-    rest = squares - value * value - dr.select(edges.sharp, 0, trend)
+    variance = squares - value * value
+    blurred = dr.opaque(mi.Float64, KINK if len(rule) > 2 else SPREAD) * dr.safe_sqrt(variance - trend) / number
     # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
-    scatter = dr.safe_sqrt(rest) / dr.select(edges.sharp, number * dr.sqrt(number), number)
-    scatter = dr.maximum(scatter, dr.select(edges.sharp, CORNER * value / (number * number), 0))
-    return Means(value, hits, parted > 0, scatter, depth / parted)
+    slant = SLANT * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
+    sharp = dr.maximum(slant, CORNER * value / (number * number))
+    return Means(value, hits, parted > 0, dr.select(edges.sharp, sharp, blurred), depth / parted)
 
 
 def _transect_sums(
