@@ -27,6 +27,7 @@ LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be
 # trend explains taken off, for a kink may hide between them; by a sharp edge, over the root of their number once more.
 SPREAD, KINK, SLANT = 2.0, 6.0, 2.0
 DOUBT = 0.5  # of what a neighbour may be wrong by counts, unless it is by a sharp edge or one that it alone has met
+CURVED_LEVELS = 3  # of them may agree by chance on a second border of the lens, whose crescent has few places across
 BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
@@ -76,6 +77,8 @@ class _Ladder:
         else:
             left, unseen = self._later(level, fresh, moved, scatter, len(rule))
             self.smooth = self.smooth & (moved < BUMPY * value)
+        if level < CURVED_LEVELS:
+            left = dr.select(draft.clipped & self.split, self._unsettled(left), left)
         # Whose neighbour meets a jump at last may pass it by, settled or not, and be as wrong as that one was.
         unseen = dr.select(self.split | ~draft.open, 0, unseen)
         self.left = dr.select(where, left, self.left)
@@ -104,12 +107,11 @@ class _Ladder:
     def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Image, Image]:
         """What may be left after the first transects, and what they pass by beside a jump.
 
-        That two of them and the nodes agree says enough of a silhouette, and too little of another jump or of a second
-        border of the lens, which bends.
+        That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
         """
         draft = self.draft
         left = dr.maximum(FIRST_GAIN * moved, scatter)
-        left = dr.select(silhouette & ~draft.clipped, left, self._unsettled(left))
+        left = dr.select(silhouette, left, self._unsettled(left))
         missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, 0))
         return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh)
 
