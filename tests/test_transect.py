@@ -98,7 +98,7 @@ def share_of_corner(place, weight, blur, other, turn):
 def test_transects_across_the_pupil_know_the_share_of_a_corner(blur, other):
     """Where a second edge crosses the first one transects kink across the pupil, and little along their other places.
 
-    Expected: 24 of them right to 6e-3 of the whole; 27 with three places on each axis miss it by more than that.
+    Expected: 24 of them right to 6e-3 of the whole; 27, three on each axis, miss it by more than twice that.
     """
     three, weight = rules.gauss(3)
     cube = np.stack(np.meshgrid(three, three, three), axis=-1).reshape(-1, 3)
