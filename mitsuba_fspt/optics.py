@@ -178,13 +178,9 @@ class Lens:
         return math.inf if self.image_stop_diameter is None else self.image_stop_diameter / 2 / self.magnification
 
     @property
-    def clear_field(self) -> float:
-        """How far [mm] off the axis virtual points still see the whole pupil; inf where only one disc bounds it."""
-        if len(self.discs) == 1:
-            return math.inf
-        pupil, border = self.discs
-        gap, shift = border.radius - pupil.radius, abs(border.shift - pupil.shift)
-        return gap / shift if shift else math.copysign(math.inf, gap)
+    def pupil_radius(self) -> float:
+        """Radius [mm] over which lens points of lines of sight spread: the first disc's, of a pinhole 0."""
+        return 0.0 if self.model == "pinhole" else self.discs[0].radius
 
     @property
     def discs(self) -> tuple[Disc, ...]:

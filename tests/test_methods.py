@@ -188,10 +188,10 @@ def test_integral_agrees_with_the_reference_on_a_mesh_with_exitance_at_its_verti
     np.testing.assert_allclose(picture, truth, atol=1e-3 * truth.max() + 3 * error.max())
 
 
-def test_integral_agrees_with_path_where_the_lens_border_cuts_the_pupil_between_the_nodes():
-    """Rationale: nothing that the nodes meet tells of an arc of the lens border between them and the pupil's rim.
+def test_integral_agrees_with_path_where_the_lens_border_cuts_the_pupil():
+    """Rationale: path draws lens points everywhere and drops what the border stops, the integral never leaves it.
 
-    Expected: the accuracy asked for, beside the noise. Seen to fail, by 3.5e-2, with `clear_field` infinite.
+    Expected: the accuracy asked for, beside the noise. Seen to fail, by 3.5e-2, with nodes that pass the border by.
     """
     vignetted = scene(disk(FOCUS, 200.0), f_number=5.6, lens_diameter=22.0, diaphragm_distance=20.0, pixel_pitch=1.0)
     picture = power(vignetted, rtol=5e-3)

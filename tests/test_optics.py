@@ -143,15 +143,3 @@ def test_configuration_factor_far_and_near():
     """R²/u² without a digit lost for a tiny disc; all the light for an endless one."""
     assert configuration_factor(1e-6, 165.0, 0.0) == pytest.approx((1e-6 / 165) ** 2, rel=1e-12)
     assert configuration_factor(1e6, 1.0, 10.0) == pytest.approx(1, rel=1e-9)
-
-
-def test_clear_field_is_where_the_lens_border_begins_to_cut_the_pupil():
-    """Expected: from there on, and not before, some point of the pupil's rim lies outside the lens border."""
-    lens = Lens(55.0, 5.6, 165.0, lens_diameter=22.0, diaphragm_distance=20.0)
-    pupil, border = lens.discs
-    turn = np.linspace(0, 2 * math.pi, 721)
-    for field, clear in ((0.999 * lens.clear_field, True), (1.001 * lens.clear_field, False)):
-        on_lens = (pupil.shift - border.shift) * field + pupil.radius * np.cos(turn), pupil.radius * np.sin(turn)
-        assert (np.hypot(*on_lens) <= border.radius).all() == clear
-    assert Lens(55.0, 5.6, 165.0).clear_field == math.inf
-    assert Lens(55.0, 2.8, 165.0, lens_diameter=15.0, diaphragm_distance=20.0).clear_field < 0

@@ -41,7 +41,6 @@ class Draft:
     blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
     sharp : True where the least one is small
     outline : True within a pixel of both a hit and a miss
-    clipped : a second border of the lens cuts the pupil, whatever is sharp
     stopped, beyond : the border of the image-plane stop cuts the pixel, wherever its light comes from; or leaves it out
     open, known : False where the value is known from elsewhere, and that value
     """
@@ -55,7 +54,6 @@ class Draft:
         self.value, self.error, self.hits, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
-        self.clipped = grid.lanes(window.clipped(lens))
         inside, cut = window.stopped(lens)
         self.stopped, self.beyond = grid.lanes(cut & self.area), grid.lanes(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
@@ -82,7 +80,7 @@ class Draft:
         floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
         error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, dr.opaque(mi.Float64, floor) * self.peak))
         hits = dr.select(self.hits > 1 - FULL, 1, dr.maximum(self.hits, 0))
-        images = (self.value, dr.select(self.beyond, 0, error), hits)
+        images = (self.value, dr.select(self.beyond, 0, error), hits * open_share(self.lens, self.window, self.grid))
         dr.eval(images)
         power, error, coverage = (self.window.expand(self.grid.array(image)) for image in images)
         power, error = power * self.lens.etendue, error * self.lens.etendue
@@ -124,14 +122,14 @@ class Draft:
     def cut_off(self, nodes: int) -> Image:
         """What a rule may be wrong by where an edge crosses or hides between its nodes and the pupil's rim.
 
-        A silhouette, a second border of the lens, or the image-plane stop.
+        A silhouette or the image-plane stop.
         """
         reach, most = self.reach(nodes)
         cut, unseen = (
             dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[nodes])) for share in (CUT, UNSEEN)
         )
         share = dr.select(self.grid.grow(self.outline, reach - 1, most - 1), unseen, 0)
-        share = dr.select(parted(self.hits) | self.clipped | self.stopped, cut, share)
+        share = dr.select(parted(self.hits) | self.stopped, cut, share)
         return share * self._whole(most)
 
     def unseen_by_transects(self, split: Mask) -> Image:
@@ -147,6 +145,11 @@ class Draft:
         """Largest value within `reach`, if no line of sight missed."""
         whole = dr.select(self.hits > ROUNDING, self.value / self.hits, 0)
         return self.grid.spread_max(whole, reach)
+
+
+def open_share(lens: mi.Sensor, window: Window, grid: Grid) -> Image:
+    """Share of the pupil that a second border of the lens leaves open to the centre of each pixel."""
+    return mi.Float64(lens.open_pupil(window.centres(grid.number), mi.Point2f(0))[1])
 
 
 def chunks(index: Index, size: int) -> list[Index]:

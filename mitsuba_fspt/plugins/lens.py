@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OpticsError
-from ..optics import Disc, Lens
+from ..optics import Lens
 from .film import default_sampler, number, own_film
+from .pupil import Pupil
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
 OPTIONAL = (
@@ -117,8 +118,7 @@ class FsptLens(mi.Sensor):
             )
         self.pixel_pitch = pitch
         self.virtual_pitch = pitch / self.optics.magnification
-        self._discs = [_OpaqueDisc(disc) for disc in self.optics.discs]
-        self._spread = 0.0 if self._model == "pinhole" else 1.0
+        self._pupil = Pupil(self.optics)
         self._seen = dr.opaque(mi.Float, self.optics.seen_field)
         self._u = dr.opaque(mi.Float, self.optics.focus_distance)
         self._pitch = dr.opaque(mi.Float, self.virtual_pitch)
@@ -127,7 +127,7 @@ class FsptLens(mi.Sensor):
         # A_vd A_pupil/u² in double first: far away and stopped down, its factors leave the range of float32.
         self.etendue = self.virtual_pitch**2 * math.pi * (self.optics.discs[0].radius / self.optics.focus_distance) ** 2
         self._etendue = dr.opaque(mi.Float, self.etendue)
-        self._pupil = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
+        self._solid_angle = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
         dr.make_opaque(self.m_to_world)
         # How far float32 may move a line of sight on the virtual plane [virtual pixels].
         place = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
@@ -145,20 +145,27 @@ class FsptLens(mi.Sensor):
     def line_of_sight(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
         """Ray from the pupil point through the virtual point, its weight cos⁴θ and its cosθ to the optical axis.
 
-        `position` [film pixels], `pupil` [unit disc]. The weight is 0 where a second border clips the ray and
-        beside the image-plane stop. The mean of weight × radiance over a pixel and the pupil, times `etendue`, is the
-        power on the pixel [W] (Eq. 9).
+        `position` [film pixels], `pupil` [unit disc], on the part that `open_pupil` leaves. The weight is 0 beside the
+        image-plane stop. The mean of weight × radiance over a pixel and the pupil, times `etendue`, is the power on
+        the pixel [W] (Eq. 9).
         """
-        disc, x = self._discs[0], self.virtual_point(position)
-        a = disc.shift * x + (disc.radius * self._spread) * pupil
+        x = self.virtual_point(position)
+        a = self._pupil.on_lens(x, pupil)
         towards = mi.Vector3f(x.x - a.x, x.y - a.y, self._u)
         cos_theta = self._u * dr.rcp(dr.norm(towards))
-        weight = dr.select(self._open(x, a) & self._through_stop(x), dr.square(dr.square(cos_theta)), 0)
+        weight = dr.select(self._through_stop(x), dr.square(dr.square(cos_theta)), 0)
         # Far from the world's origin the lens point is rounded: from where it lies then, aim at the same virtual point.
         centre, offset = mi.Point3f(self.m_to_world.translation()), self.m_to_world @ mi.Vector3f(a.x, a.y, 0)
         origin = centre + offset
         lost = offset - (origin - centre)
         return mi.Ray3f(origin, dr.normalize(self.m_to_world @ towards + lost)), weight, cos_theta
+
+    def open_pupil(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
+        """Point of the part of the pupil that a second border (Eq. 5) leaves open at a film position; its share.
+
+        Even on it if `pupil` is on the unit disc, so that rules over the disc need not know of the border.
+        """
+        return self._pupil.opened(self.virtual_point(position), pupil)
 
     def blur_disc(self, point: mi.Point3f) -> tuple[mi.Point2f, mi.Float, mi.Float]:
         """Blur disc of a world point: centre and signed radius [film pixels]; side of a pixel at its depth [mm].
@@ -167,10 +174,10 @@ class FsptLens(mi.Sensor):
         a = shift·x + ρ, solved for the virtual point x of the line through r and ρ.
         """
         p = self._in_camera(point)
-        back, disc = (self._u - p.z) / self._u, self._discs[0]
-        scale = (1 - (1 - disc.shift) * back) * self._pitch
+        back = (self._u - p.z) / self._u
+        scale = (1 - (1 - self._pupil.shift) * back) * self._pitch
         centre = self._middle - mi.Vector2f(p.x, p.y) / scale
-        return mi.Point2f(centre), disc.radius * self._spread * back / scale, scale
+        return mi.Point2f(centre), self._pupil.radius * back / scale, scale
 
     def arrival(self, point: mi.Point3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
         """Where light of a world point that heads for `pupil` [unit disc] arrives: film position [pixels], lens point.
@@ -179,30 +186,23 @@ class FsptLens(mi.Sensor):
         passes the lens (an image-plane stop has no say); fourth cosθ of the line of sight to the optical axis.
         """
         centre, radius, _ = self.blur_disc(point)
-        position, disc = centre + radius * pupil, self._discs[0]
+        position, shift = centre + radius * pupil, self._pupil.shift
         x = self.virtual_point(position)
-        a = disc.shift * x + (disc.radius * self._spread) * pupil
+        a = self._pupil.on_lens(x, pupil)
         lens_point = self.m_to_world @ mi.Point3f(a.x, a.y, 0)
         depth = self._in_camera(point).z
         distance = dr.norm(lens_point - point)
         cos_theta = depth / distance
         # dA_a = (da/dρ)² dA_ρ: the pupil point moves along with x unless the disc is fixed in the lens plane.
         back = (self._u - depth) / self._u
-        growth = 1 - disc.shift * back / (1 - (1 - disc.shift) * back)
+        growth = 1 - shift * back / (1 - (1 - shift) * back)
         weight = dr.square(growth * self._u / distance) * cos_theta
-        passes = (depth > 0) & dr.isfinite(weight) & self._open(x, a)
+        passes = (depth > 0) & dr.isfinite(weight) & self._pupil.passes(x, a)
         return position, lens_point, dr.select(passes, weight, 0), cos_theta
 
     def _in_camera(self, point: mi.Point3f) -> mi.Vector3f:
         """A world point in the camera frame; the difference first, which is exact where the world is far off."""
         return self.m_to_world.inverse() @ mi.Vector3f(point - mi.Point3f(self.m_to_world.translation()))
-
-    def _open(self, x: mi.Point2f, a: mi.Point2f) -> mi.Bool:
-        """True where the line through virtual point x and lens point a passes every further border (Eq. 5)."""
-        passes = mi.Bool(True)
-        for disc in self._discs[1:]:
-            passes &= dr.squared_norm(a - disc.shift * x) <= dr.square(disc.radius)
-        return passes
 
     def _through_stop(self, x: mi.Point2f) -> mi.Bool:
         """True where the image of virtual point x lies inside the image-plane stop."""
@@ -213,7 +213,7 @@ class FsptLens(mi.Sensor):
     def blur_radius(self, depth: mi.Float64) -> mi.Float64:
         """Radius [pixels] of the blur disc of a point at `depth` z [mm], < 0 beyond the sharp plane; inf at z <= 0."""
         disc = self.optics.discs[0]
-        numbers = (self.optics.focus_distance, disc.shift, self._spread * disc.radius, self.virtual_pitch)
+        numbers = (self.optics.focus_distance, disc.shift, self.optics.pupil_radius, self.virtual_pitch)
         u, shift, radius, pitch = (dr.opaque(mi.Float64, n) for n in numbers)
         back = (u - depth) / u
         scale = 1 - (1 - shift) * back
@@ -247,7 +247,10 @@ class FsptLens(mi.Sensor):
         """Line of sight through a uniform point of the crop window and a uniform point of the pupil."""
         film = self.film()
         position = sample2 * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
-        ray, weight, _ = self.line_of_sight(position, mi.warp.square_to_uniform_disk_concentric(sample3))
+        pupil = mi.warp.square_to_uniform_disk_concentric(sample3)
+        ray, weight, _ = self.line_of_sight(position, pupil)
+        x = self.virtual_point(position)
+        weight = dr.select(self._pupil.passes(x, self._pupil.on_lens(x, pupil)), weight, 0)
         wavelengths, spectrum = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         ray.time, ray.wavelengths = time, wavelengths
         return ray, spectrum * (weight * self._etendue)
@@ -266,7 +269,7 @@ class FsptLens(mi.Sensor):
         position -= mi.Vector2f(film.crop_offset())
         size = mi.Vector2f(film.crop_size())
         inside = active & (weight > 0) & dr.all((position >= 0) & (position < size))
-        solid_angle = weight * self._pupil
+        solid_angle = weight * self._solid_angle
         ds = dr.zeros(mi.DirectionSample3f)
         ds.uv, ds.p, ds.n = mi.Point2f(position), lens_point, mi.Normal3f(self.m_to_world @ mi.Vector3f(0, 0, 1))
         ds.d = lens_point - it.p
@@ -286,13 +289,6 @@ class FsptLens(mi.Sensor):
     def to_string(self) -> str:
         rows = [f"  {name} = {float(value[0]):g}," for name, value in self._numbers.items()]
         return "\n".join(["FsptLens[", f"  model = {self._model},", *rows, f"  film = {self.film()}", "]"])
-
-
-class _OpaqueDisc:
-    """A disc of the lens plane as kernel parameters."""
-
-    def __init__(self, disc: Disc) -> None:
-        self.shift, self.radius = dr.opaque(mi.Float, disc.shift), dr.opaque(mi.Float, disc.radius)
 
 
 mi.register_sensor("fspt_lens", FsptLens)

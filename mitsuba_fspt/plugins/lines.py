@@ -20,14 +20,18 @@ from .elements import at_one_wavelength, scalar
 def radiance_on_film(
     scene: mi.Scene, lens: mi.Sensor, position: mi.Point2f, pupil: mi.Point2f
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
-    """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; L; number of the body met, 0 for none or no passage; its depth [mm]."""
+    """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; L; number of the body met, 0 for none or no passage; its depth [mm].
+
+    `pupil`, on the unit disc, stands for as large a share of what is open; the integrand for all of the pupil.
+    """
+    pupil, share = lens.open_pupil(position, pupil)
     ray, weight, cos_theta = lens.line_of_sight(position, pupil)
     at_one_wavelength(ray)
     # Embree traces packets of neighbouring lines of sight three times slower than single rays.
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=weight > 0)
     radiance = scalar(si.emitter(scene).eval(si))
     body = mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))
-    return weight * radiance, radiance, body, si.t * cos_theta
+    return share * weight * radiance, radiance, body, si.t * cos_theta
 
 
 def repeat(count: int | mi.UInt32, body: Callable[..., tuple], *state: Any) -> tuple:

@@ -89,7 +89,7 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
 def _one_will_do(draft: Draft) -> bool:
     """True where lines of sight differ over the pupil, if at all, like the picture over the pixel."""
     lens, blur = draft.lens.optics, draft.window.blur
-    curvature = 0.0 if lens.model == "pinhole" else 2 * (lens.discs[0].radius / lens.focus_distance) ** 2
+    curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
     will_do = curvature <= POINT * draft.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
     lambert = all(getattr(emitter, "is_lambertian", bool)() for emitter in draft.scene.emitters())
     taken = will_do and lambert and draft.quadrature.takes("one line")

@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import rules
 from ..quadrature import Quadrature, Solution
-from .draft import LANES, Draft, chunks
+from .draft import LANES, Draft, chunks, open_share
 from .grid import Grid
 from .lines import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
@@ -56,4 +56,4 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
     for part in chunks(grid.number, LANES):
         hits = apply_rule(scene, lens, window.centres(part), rules.twelve(True))[4]
         dr.scatter(image, mi.Float64(hits), part)
-    return window.expand(grid.array(image))
+    return window.expand(grid.array(image * open_share(lens, window, grid)))

@@ -8,20 +8,17 @@ mean along a transect depends on them but little: where edges are nearly straigh
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from numpy.polynomial import Chebyshev
-from numpy.typing import NDArray
+
+from .pupil import turned
+from .segments import segment, segment_double_integral, segment_height, segment_integral
 
 # Blur radii [pixels] that stand for smaller and larger ones; the edge moves by a share of a pixel then with the places.
 LEAST_BLUR, MOST_BLUR = 0.01, 32.0
 CENTRE_WIDTH = 0.1  # of the blur radius: the pixel that stands for its centre
-NEWTON_STEPS = 8
-DEGREE = 9  # reaches 2e-8
 
 
 @dataclass
@@ -44,12 +41,12 @@ class Transect:
     def at(self, s: mi.Float) -> tuple[mi.Point2f, mi.Point2f, mi.Float]:
         """Film position [pixels], pupil point [unit disc], and the density by which the mean over all is one over s."""
         half = 0.5 * self.width + self.blur
-        low, high = (_share((half * s + side * self.width) / self.blur) for side in (-0.5, 0.5))
-        y = _share_inverse(dr.lerp(low, high, self.place.x))
+        low, high = (segment((half * s + side * self.width) / self.blur) for side in (-0.5, 0.5))
+        y = segment_height(dr.lerp(low, high, self.place.x))
         x = dr.clip((half * s - self.blur * y) / self.width, -0.5, 0.5)
-        offset = x * self.axis + (self.place.z - 0.5) * _turned(self.axis)
+        offset = x * self.axis + (self.place.z - 0.5) * turned(self.axis)
         across = (2 * self.place.y - 1) * dr.safe_sqrt(1 - y * y)
-        pupil = mi.Point2f(y * self.lean + across * _turned(self.lean))
+        pupil = mi.Point2f(y * self.lean + across * turned(self.lean))
         return self.centre + self.area * offset, pupil, half * (high - low) / self.width
 
     def moments(self, s: mi.Float) -> mi.Vector2d:
@@ -57,8 +54,8 @@ class Transect:
         h, b, s = mi.Float64(self.width), mi.Float64(self.blur), mi.Float64(s)
         half = 0.5 * h + b
         low, high = (half * s - 0.5 * h) / b, (half * s + 0.5 * h) / b
-        measure = b / h * (_share_integral(high) - _share_integral(low))
-        second = b * b / (h * half) * (_share_double_integral(high) - _share_double_integral(low))
+        measure = b / h * (segment_integral(high) - segment_integral(low))
+        second = b * b / (h * half) * (segment_double_integral(high) - segment_double_integral(low))
         return mi.Vector2d(measure, s * measure - second)
 
 
@@ -80,56 +77,3 @@ def transect(centre: mi.Point2f, angle: mi.Float, blur: mi.Float, place: mi.Poin
         place=place,
         area=area,
     )
-
-
-def _turned(v: mi.Vector2f) -> mi.Vector2f:
-    return mi.Vector2f(-v.y, v.x)
-
-
-# ---------------------------------------------------------------------- segments of the unit disc
-
-
-def _share(y: mi.Float) -> mi.Float:
-    """F(y), the share of the disc on which a coordinate is less than y."""
-    y = dr.clip(y, -1, 1)
-    return 0.5 + (y * dr.sqrt(1 - y * y) + dr.asin(y)) / dr.pi
-
-
-def _share_inverse(share: mi.Float) -> mi.Float:
-    """y of F(y) = share. The angle δ = 2 acos y of the smaller segment has δ - sin δ = 2π times its share; with the
-    cube root of that for a variable y is smooth up to the disc's rim.
-    """
-    smaller = 2 * dr.pi * dr.minimum(share, 1 - share)
-    z = dr.square(dr.cbrt(smaller)) / (0.5 * LARGEST) - 1
-    y = mi.Float(_HEIGHT[-1])
-    for coefficient in reversed(_HEIGHT[:-1]):
-        y = dr.fma(y, z, coefficient)
-    return dr.mulsign(y, share - 0.5)
-
-
-def _height(square: NDArray[np.float64]) -> NDArray[np.float64]:
-    """cos(δ/2) of (δ - sin δ)^(2/3)."""
-    wanted = square**1.5
-    angle = np.cbrt(6 * wanted)  # the root, nearly
-    for _ in range(NEWTON_STEPS):
-        angle -= (angle - np.sin(angle) - wanted) / (1 - np.cos(angle))
-    return np.cos(angle / 2)
-
-
-LARGEST = math.pi ** (2 / 3)
-_HEIGHT = np.polynomial.chebyshev.cheb2poly(Chebyshev.interpolate(_height, DEGREE, domain=[0, LARGEST]).coef).tolist()
-
-
-def _share_integral(y: mi.Float64) -> mi.Float64:
-    """∫ F from -1 to y."""
-    z = dr.clip(y, -1, 1)
-    rest = dr.sqrt(1 - z * z)
-    return z * _share(z) + 2 / (3 * dr.pi) * rest**3 + dr.maximum(y - 1, 0)
-
-
-def _share_double_integral(y: mi.Float64) -> mi.Float64:
-    """∫∫ F from -1 to y."""
-    z = dr.clip(y, -1, 1)
-    rest = dr.sqrt(1 - z * z)
-    arc = dr.asin(z) * (4 * z * z + 1) / 8 + z * rest * (2 * z * z + 13) / 24
-    return (4 * z * z + 1) / 16 + arc / dr.pi + 0.5 * (dr.square(dr.maximum(y, 1)) - 1)

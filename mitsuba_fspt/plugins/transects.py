@@ -27,7 +27,6 @@ LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be
 # trend explains taken off, for a kink may hide between them; by a sharp edge, over the root of their number once more.
 SPREAD, KINK, SLANT = 2.0, 6.0, 2.0
 DOUBT = 0.5  # of what a neighbour may be wrong by counts, unless it is by a sharp edge or one that it alone has met
-CURVED_LEVELS = 3  # of them may agree by chance on a second border of the lens, whose crescent has few places across
 BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
@@ -77,8 +76,6 @@ class _Ladder:
         else:
             left, unseen = self._later(level, fresh, moved, scatter, len(rule))
             self.smooth = self.smooth & (moved < BUMPY * value)
-        if level < CURVED_LEVELS:
-            left = dr.select(draft.clipped & self.split, self._unsettled(left), left)
         # Whose neighbour meets a jump at last may pass it by, settled or not, and be as wrong as that one was.
         unseen = dr.select(self.split | ~draft.open, 0, unseen)
         self.left = dr.select(where, left, self.left)
@@ -150,7 +147,7 @@ class Edges:
         """
         depth = dr.select(means.jumps, means.depth, dr.inf)
         depth = dr.select(means.jumps, depth, -draft.grid.spread_max(-depth))
-        met = dr.isfinite(depth) & ~draft.clipped & ~draft.stopped
+        met = dr.isfinite(depth) & ~draft.stopped
         self.blur = dr.select(met, draft.lens.blur_radius(depth), self.blur)
         near = draft.grid.dilate(split | draft.outline, 1)
         self.sharp = (dr.abs(self.blur) < SHARP) & near
@@ -159,7 +156,7 @@ class Edges:
 def edges_of(draft: Draft) -> Edges:
     """Across the change of the picture around, with the blur of what is nearest to the lens.
 
-    A second border of the lens is so blurred that only the pupil sees it, the image-plane stop is sharp.
+    The image-plane stop is sharp.
     """
     grid = draft.grid
     angle = grid.principal_angle(*grid.gradient(draft.value), 1 + math.ceil(draft.most_blur / 2))
@@ -167,8 +164,7 @@ def edges_of(draft: Draft) -> Edges:
     # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
     farther = -grid.spread_max(-draft.nearest, draft.reach(12)[1])
     nearest = dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
-    blur = dr.select(draft.clipped, dr.inf, draft.lens.blur_radius(nearest))
-    blur = dr.select(draft.stopped, 0, blur)
+    blur = dr.select(draft.stopped, 0, draft.lens.blur_radius(nearest))
     return Edges(angle, blur, dr.abs(blur) < SHARP)
 
 

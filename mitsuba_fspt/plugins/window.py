@@ -41,15 +41,6 @@ class Window:
         top = dr.opaque(mi.Float, self.top + self.crop_offset[1] + 0.5)
         return mi.Point2f(left + mi.Float(number % width), top + mi.Float(number // width))
 
-    def clipped(self, lens: mi.Sensor) -> NDArray[np.bool_]:
-        """Pixels (h, w) for a point of which a second border of the lens cuts the pupil."""
-        if math.isinf(lens.optics.clear_field):
-            return np.full(self.shape, lens.optics.clear_field < 0)
-        width, height = (int(n) for n in lens.film().size())
-        x = self.left + self.crop_offset[0] + np.arange(self.shape[1]) + 0.5 - width / 2
-        y = self.top + self.crop_offset[1] + np.arange(self.shape[0]) + 0.5 - height / 2
-        return (np.hypot(x, y[:, None]) + np.sqrt(0.5)) * lens.virtual_pitch > lens.optics.clear_field
-
     def stopped(self, lens: mi.Sensor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Pixels (h, w) that lie inside the image-plane stop, and those that its border cuts."""
         if math.isinf(lens.optics.seen_field):
