@@ -37,6 +37,7 @@ SHARP = 0.3  # blur radius [pixels]
 class Draft:
     """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `hits`.
 
+    roughness : how far four nodes and twelve differ near by, silhouettes left out
     nearest : depth of what is nearest [mm], inf where nothing is met
     blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
     sharp : True where the least one is small
@@ -54,6 +55,7 @@ class Draft:
         self.value, self.error, self.hits, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
+        self.roughness = grid.full(mi.Float64, 0)
         inside, cut = window.stopped(lens)
         self.stopped, self.beyond = grid.lanes(cut & self.area), grid.lanes(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0

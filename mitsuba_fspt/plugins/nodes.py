@@ -22,7 +22,9 @@ IN_PIXEL = 0.5  # blur radius that stays in the pixel
 SETTLED = 0.25  # of the tolerance: where the picture bends less, more nodes would change it by less than a tenth
 TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
 MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
-LEAST_GAIN = 0.5  # no difference between four and twelve nodes promises more than to shrink to this
+# No difference between four and twelve nodes promises more than to shrink to the first; where it is as large as that for
+# four was thought to be, both are but samples of something rough, and may agree by chance.
+LEAST_GAIN, ROUGH_GAIN = 0.5, 2.0
 
 
 def first_nodes(draft: Draft) -> Mask:
@@ -108,7 +110,9 @@ def _refine(draft: Draft, where: Mask) -> Image:
     draft.value = dr.select(where, value, draft.value)
     draft.set_hits(dr.select(where, hits, draft.hits))
     draft.nearest = dr.minimum(draft.nearest, nearest)
-    error = dr.maximum(draft.grid.spread_max(difference * dr.clip(gain, LEAST_GAIN, 1)), draft.error / MOST_GAIN)
+    left = difference * dr.clip(gain, LEAST_GAIN, ROUGH_GAIN)
+    draft.roughness = draft.grid.spread_max(dr.select(parted(hits), 0, dr.maximum(left, difference)))
+    error = dr.maximum(draft.grid.spread_max(left), draft.error / MOST_GAIN)
     draft.error = dr.select(where, dr.maximum(error, draft.cut_off(12)), draft.error)
     dr.eval(draft.error, draft.nearest, difference)
     return difference

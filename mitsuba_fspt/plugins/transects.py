@@ -109,7 +109,7 @@ class _Ladder:
         draft = self.draft
         left = dr.maximum(FIRST_GAIN * moved, scatter)
         left = dr.select(silhouette, left, self._unsettled(left))
-        missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, 0))
+        missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, draft.roughness))
         return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh)
 
     def _later(self, level: int, fresh: Mask, moved: Image, scatter: Image, count: int) -> tuple[Image, Image]:
