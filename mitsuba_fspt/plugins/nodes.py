@@ -22,8 +22,8 @@ IN_PIXEL = 0.5  # blur radius that stays in the pixel
 SETTLED = 0.25  # of the tolerance: where the picture bends less, more nodes would change it by less than a tenth
 TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
 MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
-# No difference between four and twelve nodes promises more than to shrink to the first; where it is as large as that for
-# four was thought to be, both are but samples of something rough, and may agree by chance.
+# No difference between four and twelve nodes promises more than to shrink to the first; where it is as large as what
+# four were thought to be wrong by, both are but samples of something rough, and may agree by chance.
 LEAST_GAIN, ROUGH_GAIN = 0.5, 2.0
 
 
