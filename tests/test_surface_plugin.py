@@ -438,6 +438,22 @@ def test_a_rendered_scene_can_be_freed_and_keeps_its_names(integrator, tmp_path)
     assert sum(type(thing).__name__ == "FsptSurface" for thing in gc.get_objects()) == kept
 
 
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk", "rectangle", "cube"])
+def test_corners_of_all_elements_are_found(kind):
+    """Seen to fail for a third of a disk's rim, which a ray to where it should be missed by rounding."""
+    import drjit as dr
+
+    from mitsuba_fspt.plugins.elements import elements_of
+
+    place = mi.ScalarTransform4f().translate([7, -3, 165]).rotate([0, 1, 0], 210).scale(6)
+    shape = mi.load_dict({"type": kind, "to_world": place})
+    elements = elements_of(shape)
+    for corner in elements.corners:
+        si, area = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*corner))
+        assert dr.all(si.is_valid() & dr.isfinite(area))
+        assert float(dr.max(dr.norm(si.p - mi.Point3f(7, -3, 165)))[0]) < 6 * np.sqrt(3) + 1e-4
+
+
 @pytest.mark.parametrize("angle", [0, 90, 180])
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
 def test_elements_of_turned_shapes_lie_where_their_parameters_say(kind, angle):

@@ -156,7 +156,7 @@ class ParameterElements(Elements):
         cell = mi.Point2f(mi.Point2u(index % self.side, index // self.side))
         number, cut = mi.UInt32(part), mi.UInt32(cut)
         within = (mi.Point2f(mi.Point2u(number % cut, number // cut)) + sample) / mi.Float(cut)
-        # A hair inside: at their very ends the parameters of a disk miss it.
+        # A hair inside: what still looks for its points misses some at the very ends of its parameters.
         uv = dr.clip((cell + within) / self.side, 2.0**-21, 1 - 2.0**-21)
         si = self.at(uv)
         return si, self._area(si) / dr.square(mi.Float(cut))
@@ -174,15 +174,15 @@ class ParameterElements(Elements):
     def at(self, uv: mi.Point2f) -> mi.SurfaceInteraction3f:
         """The surface record at (u, v) of [0, 1]².
 
-        Mitsuba's spheres and cylinders look for their own points along the normal they would have unturned, and past
-        some of them when turned by 90°.
+        Mitsuba's spheres, cylinders and disks look for their own points along a ray. Turned by 90° the first two look
+        past some of them, along the normal that they would have unturned; a tilted disk misses a third of its rim.
         """
         if not self._round:
             return self.shape.eval_parameterization(uv)
         local, normal = self._round(uv)
         p, n = self._to_world @ local, dr.normalize(self._to_world @ normal)
         pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(uv))
-        pi.valid, pi.t = True, 1.0
+        pi.valid, pi.t, pi.prim_uv = True, 1.0, mi.Point2f(local.x, local.y)
         return self.shape.compute_surface_interaction(mi.Ray3f(p + n, -n), pi, mi.RayFlags.All)
 
     def _cell(self, si: mi.SurfaceInteraction3f) -> mi.Point2u:
@@ -206,7 +206,13 @@ def _on_cylinder(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
     return mi.Point3f(cos_phi, sin_phi, uv.y), mi.Normal3f(cos_phi, sin_phi, 0)
 
 
-_ROUND = {"Sphere": _on_sphere, "Cylinder": _on_cylinder}
+def _on_disk(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
+    """Point and normal of the unit disk at its parameters: radius, longitude/2π from +x."""
+    sin_phi, cos_phi = dr.sincos(dr.two_pi * uv.y)
+    return mi.Point3f(uv.x * cos_phi, uv.x * sin_phi, 0), mi.Normal3f(0, 0, 1)
+
+
+_ROUND = {"Sphere": _on_sphere, "Cylinder": _on_cylinder, "Disk": _on_disk}
 
 
 def _of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:
