@@ -149,6 +149,24 @@ def test_a_bar_thinner_than_a_pixel_or_than_its_blur_is_seen_all_along(bar):
     assert np.mean(off <= picture.error / expected.max() + 5e-3) >= 0.99
 
 
+def test_light_that_only_grazes_the_pupil_is_seen():
+    """Rationale: of a tube along the axis the pupil's rim sees the outside, as strips far thinner than a pixel.
+
+    Expected: all power, ∫∫ J_n cosθ_s cosθ / (π d²) dA dS, to 1e-3. Seen to fail (only 0.4 of it) where surfaces were
+    judged by what the middle of the pupil sees of them.
+    """
+    depth, radius, off_axis = 180.0, 3.0, 1.0
+    ends = {"p0": [off_axis, off_axis, depth], "p1": [off_axis, off_axis, depth + 1]}
+    picture = fspt.render(scene({"type": "cylinder", **ends, "radius": radius}), rtol=0.05)
+    number, turn = np.arange(20000) + 0.5, np.linspace(0, 2 * np.pi, 720, endpoint=False)[:, None]
+    angle = number * np.pi * (3 - np.sqrt(5))
+    ax, ay = RADIUS * np.sqrt(number / 20000) * np.array([np.cos(angle), np.sin(angle)])
+    dx, dy = ax - off_axis - radius * np.cos(turn), ay - off_axis - radius * np.sin(turn)
+    z = depth + 0.5
+    seen = np.maximum(dx * np.cos(turn) + dy * np.sin(turn), 0) * z / (dx**2 + dy**2 + z**2) ** 2
+    assert picture.power.sum() == pytest.approx(2 * np.pi * radius * RADIUS**2 * seen.mean(), rel=1e-3)
+
+
 def test_a_blur_disc_is_even_from_its_middle_to_its_rim():
     """Expected: cos⁴θ of the spot's angle to the pupil and nothing else, to 2e-3, already by the coarsest cells.
 

@@ -103,7 +103,7 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     """Of points all over a surface radiance to the lens, area of the sharp image they stand for [pixels²], slant,
     how far they are apart, blur, x, y [pixels]; (7, n).
 
-    Radiance 0 where a point has no image. `slant`: cosine of the normal to the lens. How far apart: in pixels, or in
+    Radiance 0 where a point has no image. `slant`: the largest cosine of the normal to a point of the pupil. How far apart: in pixels, or in
     blur radii where they are larger.
     """
     shape = emitter.get_shape()
@@ -126,14 +126,14 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
 def _look(
     emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f]:
-    """At so many points of each element, the first its middle, radiance to the lens, area of the element's image,
-    slant, blur, place on film.
+    """At so many points of each element, the first its middle, radiance to where the lens sees most of it, area of the
+    element's image from there, slant, blur, place on film.
     """
     index = np.repeat(np.arange(elements.count), counts)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
     si, area = elements.place(mi.UInt32(index), sample)
-    to_lens = dr.normalize(lens.world_transform() @ mi.Point3f(0) - si.p)
+    to_lens = dr.normalize(_rim_above(si, lens) - si.p)
     si.initialize_sh_frame()
     si.wi = si.to_local(to_lens)
     at_one_wavelength(si)
@@ -144,6 +144,13 @@ def _look(
     columns = (scalar(emitter.eval(si)), image, slant, dr.abs(blur), centre)
     dr.eval(columns)
     return columns
+
+
+def _rim_above(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Point3f:
+    """The point of the pupil farthest above the tangent plane: all that a surface which grazes the lens may shine on."""
+    normal = lens.world_transform().inverse() @ mi.Vector3f(si.n)
+    across = dr.norm(mi.Vector2f(normal.x, normal.y))
+    return lens.arrival(si.p, dr.select(across > 0, mi.Point2f(normal.x, normal.y) / across, 0))[1]
 
 
 def _reach(elements: Elements, lens: mi.Sensor) -> Column:
