@@ -16,6 +16,7 @@ from .elements import elements_of, triangles
 COARSEST = 0.1  # virtual pixels by which float32 may move a line of sight
 # W/mm² and W that leave room in float32 for the shares and the faint parts of a picture.
 EXITANCES, FAINTEST = (1e-32, 1e32), 1e-36
+STRETCH = 1e-4  # by which float32 may make lengths and right angles differ
 PROBES = 1 << 10  # surface points of a shape at which another one is looked for
 LIFT = 1e-6  # of the largest coordinate: what lies no further before a surface cannot be told from it
 
@@ -30,6 +31,7 @@ def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
         if type(emitter).__name__ == "FsptSurface":
             emitter.check()
             check_range(emitter, sensor)
+            check_round(emitter.get_shape())
             with dr.suspend_grad():
                 check_alone(scene, emitter)
     check_outside(scene, sensor)
@@ -74,6 +76,22 @@ def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
         raise ExitanceError(
             f"{name} reaches {brightest:.3g} W/mm², of which a pixel gets {power:.1g} W; single precision needs "
             f"{FAINTEST:g}. Give larger pixels, a smaller f_number, or J_n on another scale."
+        )
+
+
+def check_round(shape: mi.Shape) -> None:
+    """Raise SceneError where a sphere or cylinder is stretched: Mitsuba traces it round, its parameters are not."""
+    kind = shape.class_name().lower()
+    if kind not in ("sphere", "cylinder"):
+        return
+    axes = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
+    lengths = np.linalg.norm(axes, axis=0)
+    alike = lengths[: 3 if kind == "sphere" else 2]  # a cylinder is as long as it likes
+    cosines = axes.T @ axes / np.outer(lengths, lengths) - np.eye(3)
+    if np.ptp(alike) > STRETCH * alike.max() or np.abs(cosines).max() > STRETCH:
+        raise SceneError(
+            f"scene: 'to_world' of {kind} '{shape.id()}' stretches or shears it, which it cannot follow. Give a "
+            "rotation (about an axis of length 1), a translation and one scale, or a mesh."
         )
 
 

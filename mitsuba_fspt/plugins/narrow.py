@@ -103,8 +103,8 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     """Of points all over a surface radiance to the lens, area of the sharp image they stand for [pixels²], slant,
     how far they are apart, blur, x, y [pixels]; (7, n).
 
-    Radiance 0 where a point has no image. `slant`: the largest cosine of the normal to a point of the pupil. How far apart: in pixels, or in
-    blur radii where they are larger.
+    Radiance 0 where a point has no image. `slant`: the largest cosine of the normal to a point of the pupil. How far
+    apart: in pixels, or in blur radii where they are larger.
     """
     shape = emitter.get_shape()
     elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
@@ -147,7 +147,7 @@ def _look(
 
 
 def _rim_above(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Point3f:
-    """The point of the pupil farthest above the tangent plane: all that a surface which grazes the lens may shine on."""
+    """The point of the pupil farthest above the tangent plane, the only side that a grazing surface shines on."""
     normal = lens.world_transform().inverse() @ mi.Vector3f(si.n)
     across = dr.norm(mi.Vector2f(normal.x, normal.y))
     return lens.arrival(si.p, dr.select(across > 0, mi.Point2f(normal.x, normal.y) / across, 0))[1]
