@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .errors import OpticsError
-from .reference_shapes import Array, Shape, unit_disc
+from .reference_shapes import Array, Shape, dot, unit_disc
 
 Pixel = Literal["area", "centre"]
 Exitance = Callable[[Array, int], Array]  # (points (n, 3) of shape number i, i) -> (n,) [W/mm²]
@@ -211,8 +211,8 @@ def collected_power(camera: Camera, shape: Shape, exitance: Exitance, n: int) ->
     r = camera.from_world(points)
     line = pupil - r
     normal = shape.outward(points) @ camera.to_world[:3, :3]
-    distance2 = np.sum(line**2, axis=1)
-    cosines = np.maximum(np.sum(normal * line, axis=1), 0) * r[:, 2] / distance2
+    distance2 = dot(line, line)
+    cosines = np.maximum(dot(normal, line), 0) * r[:, 2] / distance2
     total = np.sum(exitance(points, 0) * cosines / (np.pi * distance2)) / n
     return float(total * area * np.pi * camera.pupil_radius**2)
 
@@ -227,7 +227,7 @@ def _average(camera: Camera, shapes: Sequence[Shape], exitance: Exitance, rule: 
         virtual = _on_plane(virtual.reshape(-1, 2), camera.focus_distance)
         start = _on_plane(np.tile(camera.pupil_radius * pupil, (len(centres[pixels]), 1)), 0.0)
         line = virtual - start
-        cos = camera.focus_distance / np.linalg.norm(line, axis=1)
+        cos = camera.focus_distance / np.sqrt(dot(line, line))
         seen = _seen(shapes, exitance, camera.in_world(start), line @ camera.to_world[:3, :3].T)
         power[pixels] += (seen * cos**4).reshape(-1, len(pupil)) @ rule.weight[nodes]
     return camera.scale * power.reshape(camera.height, camera.width)
@@ -242,7 +242,7 @@ def _seen(shapes: Sequence[Shape], exitance: Exitance, origin: Array, direction:
     for i, shape in enumerate(shapes):
         (mine,) = np.nonzero(first == i)
         points = origin[mine] + nearest[i, mine, None] * direction[mine]
-        lit = np.sum(shape.outward(points) * direction[mine], axis=1) < 0
+        lit = dot(shape.outward(points), direction[mine]) < 0
         seen[mine[lit]] = exitance(points[lit], i)
     return seen
 
@@ -260,13 +260,13 @@ def _surface_sum(camera: Camera, shape: Shape, exitance: Exitance, nodes: Array,
     for pixels, part in _blocks(len(centres), len(nodes)):
         virtual = _on_plane(centres[pixels, None] + offset[part], u)
         line = r[part] - virtual
-        distance2 = np.sum(line**2, axis=-1)
+        distance2 = dot(line, line)
         # The line through r and r_vd pierces the lens plane here.
         pierced = virtual - line * (u / line[..., 2])[..., None]
-        beta = np.sum(pierced[..., :2] ** 2, axis=-1) <= camera.pupil_radius**2
+        beta = dot(pierced[..., :2], pierced[..., :2]) <= camera.pupil_radius**2
         # One convex body: whatever faces the pupil is seen from there.
-        alpha = np.sum(normal[part] * (pierced - r[part]), axis=-1) > 0
-        cos_s = np.abs(np.sum(normal[part] * line, axis=-1))
+        alpha = dot(normal[part], pierced - r[part]) > 0
+        cos_s = np.abs(dot(normal[part], line))
         cos_d = np.abs(line[..., 2])
         power[pixels] += np.where(alpha & beta, cos_s * cos_d / distance2**2, 0.0) @ shine[part]
     return (camera.pixel_side**2 / np.pi * power).reshape(camera.height, camera.width)

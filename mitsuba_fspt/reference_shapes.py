@@ -62,7 +62,7 @@ class Disc:
         s = _plane(origin - centre, direction, normal)
         miss = ~np.isfinite(s)
         hit = origin + np.where(miss, 0.0, s)[:, None] * direction - centre
-        return np.where(miss | (np.sum(hit**2, axis=1) > self.radius**2), np.inf, s)
+        return np.where(miss | (dot(hit, hit) > self.radius**2), np.inf, s)
 
     def outward(self, points: Array) -> Array:
         return np.broadcast_to(_unit(self.normal), points.shape)
@@ -85,7 +85,7 @@ class Rectangle:
         s = _plane(origin - np.asarray(self.centre), direction, self._normal())
         miss = ~np.isfinite(s)
         hit = origin + np.where(miss, 0.0, s)[:, None] * direction - np.asarray(self.centre)
-        inside = np.all(np.abs(hit @ across.T) <= np.sum(across**2, axis=1), axis=1)
+        inside = np.all(np.abs(hit @ across.T) <= dot(across, across), axis=1)
         return np.where(miss | ~inside, np.inf, s)
 
     def outward(self, points: Array) -> Array:
@@ -144,6 +144,11 @@ class Cylinder:
         return centre + along[:, None] * axis + distance[:, None] * ring, 2 * cap + side
 
 
+def dot(a: Array, b: Array) -> Array:
+    """Scalar products along the last axis; NumPy sums over so short an axis five times more slowly."""
+    return np.einsum("...k,...k->...", a, b)
+
+
 def unit_disc(square: Array) -> Array:
     """Points of the unit disc, shape (n, 2), from points of the unit square, areas kept [Shirley & Chiu,
     "A low distortion map between disk and square", J. Graphics Tools 2(3), 1997].
@@ -177,12 +182,12 @@ def _plane(start: Array, direction: Array, normal: Array) -> Array:
 
 def _ball(start: Array, direction: Array, radius: float) -> tuple[Array, Array]:
     """Parameters between which lines are within `radius` of 0: (inf, -inf) for never."""
-    a = np.sum(direction**2, axis=1)
-    half = np.sum(start * direction, axis=1)
-    c = np.sum(start**2, axis=1) - radius**2
+    a = dot(direction, direction)
+    half = dot(start, direction)
+    c = dot(start, start) - radius**2
     # a·c cancels against half² for a far lens; the distance of the line from 0 does not.
     nearest = start - np.divide(half, a, out=np.zeros_like(a), where=a > 0)[:, None] * direction
-    discriminant = a * (radius**2 - np.sum(nearest**2, axis=1))
+    discriminant = a * (radius**2 - dot(nearest, nearest))
     root = np.sqrt(np.maximum(discriminant, 0))
     # The root that adds like signs is free of cancellation, the other follows from their product c/a.
     q = -(half + np.copysign(root, half))

@@ -125,8 +125,8 @@ def test_monte_carlo_agrees_where_silhouettes_cross_the_border(method, borders):
 
 @pytest.mark.slow
 def test_both_domains_agree():
-    body = sphere(150.0, 6.0, 7.0, -3.0)
-    pictures = [power(scene(body, image_stop_diameter=STOP), domain=d, rtol=3e-3) for d in ("pupil", "surface")]
+    body = sphere(158.0, 3.0, 8.5, -3.0)
+    pictures = [power(scene(body, image_stop_diameter=STOP), domain=d, rtol=5e-3) for d in ("pupil", "surface")]
     np.testing.assert_allclose(pictures[0], pictures[1], atol=2e-3 * pictures[0].max())
     assert np.any(pictures[0] != pictures[1])
 

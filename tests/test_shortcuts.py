@@ -144,7 +144,7 @@ def test_what_is_thinner_than_a_pixel_and_between_two_rows_is_seen():
     by_light = fspt.render(scene, method="ptracer", spp=1024, seed=1)
     noise = np.sqrt((by_light.error**2).sum())
     assert noise < 0.05 * by_light.power.sum()
-    assert solved(scene, rtol=1e-2).power.sum() == pytest.approx(by_light.power.sum(), abs=4 * noise)
+    assert solved(scene, rtol=3e-2).power.sum() == pytest.approx(by_light.power.sum(), abs=4 * noise)
 
 
 def test_a_pinhole_takes_one_line_of_sight_a_pixel():
