@@ -48,13 +48,14 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     parts = [_seen(emitter, lens) for emitter in emitters if type(emitter).__name__ == "FsptSurface"]
     if not parts or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, slant, apart, blur, x, y = np.concatenate(parts, axis=1)
+    radiance, area, slant, front, apart, blur, x, y = np.concatenate(parts, axis=1)
     x, y = x - window.left - window.crop_offset[0], y - window.top - window.crop_offset[1]
     height, width = window.shape
     near = (x > -blur) & (x < width + blur) & (y > -blur) & (y < height + blur) & (area > 0) & (slant > 0)
     if not (near & (radiance > 0)).any():
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, slant, apart, blur, x, y = (column[near] for column in (radiance, area, slant, apart, blur, x, y))
+    columns = radiance, area, slant, front, apart, blur, x, y
+    radiance, area, slant, front, apart, blur, x, y = (column[near] for column in columns)
     # A blur disc spreads a point's light over so many pixels; discs that overlap add up.
     light = radiance * area / (math.pi * blur**2 + 1)
     level = np.round(np.log2(np.maximum(blur, 1)))
@@ -64,20 +65,28 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
         brightest = max(brightest, _grid(light[here], x[here] / 2**k, y[here] / 2**k)[0].max())
         far = reach + 2 * 2**k  # beyond that the points of this level have no neighbours
         there = (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
-        here[there] &= _hidden(radiance[there], area[there], slant[there], x[there], y[there], 2**k)
+        here[there] &= _hidden(*(column[there] for column in (radiance, area, slant, front, x, y)), 2**k)
         here &= there & (apart < 1)
         if here.any():
             on_pixels += _spread(light[here], x[here], y[here], reach, window.shape)
     return NarrowLight(on_pixels, float(brightest))
 
 
-def _hidden(radiance: Column, area: Column, slant: Column, x: Column, y: Column, side: float) -> NDArray[np.bool_]:
-    """True of points that outshine the squares of a `side` [pixels] around, and are not the limb of a wide body."""
-    power, row, column = _grid(radiance * area / side**2, x / side, y / side)
-    cover, _, _ = _grid(area / side**2, x / side, y / side)
+def _hidden(
+    radiance: Column, area: Column, slant: Column, front: Column, x: Column, y: Column, side: float
+) -> NDArray[np.bool_]:
+    """True of points that outshine the squares of a `side` [pixels] around, and are not the limb of a wide body.
+
+    Beyond the limb lies what only a part of the pupil sees, beside what its middle does.
+    """
+    weights = radiance * area / side**2, area / side**2, (front > 0).astype(np.float64)
+    (power, row, column), (cover, _, _), (faces, _, _) = (_grid(weight, x / side, y / side) for weight in weights)
     grid = Grid(power.shape)
-    around, most = (grid.array(grid.spread_max(grid.lanes(image)))[row, column] for image in (power, cover))
-    return (radiance > OUTSHINES * around) & ~((slant < SLANTED) & (most > COVERED))
+    around, most, facing = (
+        grid.array(grid.spread_max(grid.lanes(image)))[row, column] for image in (power, cover, faces)
+    )
+    limb = (slant < SLANTED) & (most > COVERED) | (front <= 0) & (facing > 0)
+    return (radiance > OUTSHINES * around) & ~limb
 
 
 def _grid(weight: Column, x: Column, y: Column) -> tuple[Image, Index, Index]:
@@ -101,33 +110,35 @@ def _spread(light: Column, x: Column, y: Column, reach: int, shape: tuple[int, i
 
 def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     """Of points all over a surface radiance to the lens, area of the sharp image they stand for [pixels²], slant,
-    how far they are apart, blur, x, y [pixels]; (7, n).
+    front, how far they are apart, blur, x, y [pixels]; (8, n).
 
-    Radiance 0 where a point has no image. `slant`: the largest cosine of the normal to a point of the pupil. How far
-    apart: in pixels, or in blur radii where they are larger.
+    Radiance 0 where a point has no image. `slant`: the largest cosine of the normal to a point of the pupil,
+    `front` > 0 if its middle sees the point. How far apart: in pixels, or in blur radii where they are larger.
     """
     shape = emitter.get_shape()
     elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
     counts = np.ones(elements.count, np.int64)
-    _, area, _, blur, _ = (column.numpy() for column in _look(emitter, elements, lens, counts))
+    _, area, _, _, blur, _ = (column.numpy() for column in _look(emitter, elements, lens, counts))
     unit = np.maximum(blur, 1)
     reach = _reach(elements, lens) / unit
-    # A long and thin element is many points, a quarter of a unit apart; one that is wide may be wide at one.
-    thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach)
-    counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
+    # A long and thin element is many points, a quarter of a unit apart or eight a square, lest a square around be empty
+    # by chance; one that is wide may be wide at one.
+    long = np.isfinite(reach) & (reach > MOST_POINTS)  # points all along would be too far apart to tell
+    thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
+    counts = np.ceil(np.where(thin, np.maximum(4 * reach, 8 * area / unit**2), 1)).clip(1, MOST_POINTS).astype(np.int64)
     *columns, centre = _look(emitter, elements, lens, counts)
     seen = np.array([column.numpy() for column in (*columns, centre.x, centre.y)], np.float64)
     seen[1] /= np.repeat(counts, counts)
-    seen[0, ~np.isfinite(seen).all(axis=0)] = 0
+    seen[0, ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)] = 0
     seen = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
-    return np.insert(seen, 3, np.repeat(reach / counts, counts), axis=0)
+    return np.insert(seen, 4, np.repeat(reach / counts, counts), axis=0)
 
 
 def _look(
     emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index
-) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f]:
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f]:
     """At so many points of each element, the first its middle, radiance to where the lens sees most of it, area of the
-    element's image from there, slant, blur, place on film.
+    element's image from there, slant, front, blur, place on film.
     """
     index = np.repeat(np.arange(elements.count), counts)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -141,7 +152,8 @@ def _look(
     axis = lens.world_transform() @ mi.Vector3f(0, 0, 1)
     slant = dr.dot(si.n, to_lens)
     image = area * dr.abs(slant / (dr.dot(axis, to_lens) * dr.square(scale)))
-    columns = (scalar(emitter.eval(si)), image, slant, dr.abs(blur), centre)
+    front = dr.dot(si.n, lens.world_transform() @ mi.Point3f(0) - si.p)
+    columns = (scalar(emitter.eval(si)), image, slant, front, dr.abs(blur), centre)
     dr.eval(columns)
     return columns
 
