@@ -113,7 +113,7 @@ def test_monte_carlo_agrees_where_silhouettes_cross_the_border(method, borders):
     inside, beside = pixels(STOP)
     cut = ~inside & ~beside
     image = fspt.render(view)
-    truth = fspt.render(view, method=method, spp=4000, seed=4)
+    truth = fspt.render(view, method=method, spp=2000, seed=4)
     assert (image.power[cut] > 0.05 * image.power.max()).sum() > 10
     lit = truth.power > 0.02 * truth.power.max()
     z = (truth.power - image.power)[lit] / np.hypot(truth.error, image.error)[lit]

@@ -93,7 +93,7 @@ def test_integral_agrees_with_monte_carlo(name, method):
     1/π of the radiance dropped (against ptracer, whose positions know J_n alone) and with the near sphere left out.
     """
     image = fspt.render(phantom(name), method="integral", rtol=1e-3)
-    assert_agrees(passes(name, method), image.power, 1e-3)
+    assert_agrees(passes(name, method, spp=128), image.power, 1e-3)
 
 
 @pytest.mark.parametrize("name", MODELS)

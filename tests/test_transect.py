@@ -17,7 +17,7 @@ from mitsuba_fspt.quadrature import Quadrature
 
 pytestmark = pytest.mark.usefixtures("mono")
 
-S = np.linspace(-1, 1, 2001)
+S = np.linspace(-1, 1, 1001)
 BLURS = [0.05, 0.3, 1.0, -4.0, 25.0]
 ANGLES = [0.0, 25.0, 130.0, -75.0]
 
