@@ -62,7 +62,7 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     brightest = 0.0
     for k in np.unique(level):
         here, reach = level == k, math.ceil(2 ** (k + 0.5))
-        brightest = max(brightest, _grid(light[here], x[here] / 2**k, y[here] / 2**k)[0].max())
+        brightest = max(brightest, _cells(x[here] / 2**k, y[here] / 2**k).sums(light[here]).max())
         far = reach + 2 * 2**k  # beyond that the points of this level have no neighbours
         there = (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
         here[there] &= _hidden(*(column[there] for column in (radiance, area, slant, front, x, y)), 2**k)
@@ -79,21 +79,33 @@ def _hidden(
 
     Beyond the limb lies what only a part of the pupil sees, beside what its middle does.
     """
+    cells = _cells(x / side, y / side)
+    grid = Grid(cells.shape)
     weights = radiance * area / side**2, area / side**2, (front > 0).astype(np.float64)
-    (power, row, column), (cover, _, _), (faces, _, _) = (_grid(weight, x / side, y / side) for weight in weights)
-    grid = Grid(power.shape)
     around, most, facing = (
-        grid.array(grid.spread_max(grid.lanes(image)))[row, column] for image in (power, cover, faces)
+        grid.array(grid.spread_max(grid.lanes(cells.sums(weight)))).ravel()[cells.number] for weight in weights
     )
     limb = (slant < SLANTED) & (most > COVERED) | (front <= 0) & (facing > 0)
     return (radiance > OUTSHINES * around) & ~limb
 
 
-def _grid(weight: Column, x: Column, y: Column) -> tuple[Image, Index, Index]:
-    """Sums of `weight` on unit cells, and each one's row and column there; what is too far off falls into the last."""
+@dataclass(frozen=True)
+class _Cells:
+    """Unit cells with points in them: `shape` (h, w) of their grid and, row by row, the `number` of each point's."""
+
+    shape: tuple[int, int]
+    number: Index
+
+    def sums(self, weight: Column) -> Image:
+        """Sum of the points' weights on each cell."""
+        return np.bincount(self.number, weight, minlength=math.prod(self.shape)).reshape(self.shape)
+
+
+def _cells(x: Column, y: Column) -> _Cells:
+    """Cells of points; what is too far off falls into the last."""
     column, row = (np.clip(np.floor(c - c.min()), 0, LARGEST_GRID - 1).astype(np.int64) for c in (x, y))
-    height, width = row.max() + 1, column.max() + 1
-    return np.bincount(row * width + column, weight, minlength=height * width).reshape(height, width), row, column
+    width = int(column.max()) + 1
+    return _Cells((int(row.max()) + 1, width), row * width + column)
 
 
 def _spread(light: Column, x: Column, y: Column, reach: int, shape: tuple[int, int]) -> Image:
@@ -121,17 +133,18 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     _, area, _, _, blur, _ = (column.numpy() for column in _look(emitter, elements, lens, counts))
     unit = np.maximum(blur, 1)
     reach = _reach(elements, lens) / unit
-    # A long and thin element is many points, a quarter of a unit apart or eight a square, lest a square around be empty
-    # by chance; one that is wide may be wide at one.
+    # A long and thin element is many points, a quarter of a unit apart; one that is wide may be wide at one.
     long = np.isfinite(reach) & (reach > MOST_POINTS)  # points all along would be too far apart to tell
     thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
-    counts = np.ceil(np.where(thin, np.maximum(4 * reach, 8 * area / unit**2), 1)).clip(1, MOST_POINTS).astype(np.int64)
+    counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     *columns, centre = _look(emitter, elements, lens, counts)
     seen = np.array([column.numpy() for column in (*columns, centre.x, centre.y)], np.float64)
     seen[1] /= np.repeat(counts, counts)
     seen[0, ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)] = 0
     seen = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
-    return np.insert(seen, 4, np.repeat(reach / counts, counts), axis=0)
+    # What is half as thick as a unit covers half of some square by itself.
+    apart = np.where(area < unit**2 * reach, reach / counts, np.inf)
+    return np.insert(seen, 4, np.repeat(apart, counts), axis=0)
 
 
 def _look(
