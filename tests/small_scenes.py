@@ -48,6 +48,13 @@ def scene(*shapes, exitance=1.0, crop=None, lamp=None, **lens):
     return mi.load_dict(whole, optimize=False)
 
 
+def even_disc(count):
+    """Points (2, count) of the unit disc, evenly (sunflower)."""
+    number = np.arange(count) + 0.5
+    angle = number * np.pi * (3 - np.sqrt(5))
+    return np.sqrt(number / count) * np.stack([np.cos(angle), np.sin(angle)])
+
+
 def disk(z, radius=100.0, x=0.0, y=0.0, tilt=0.0):
     """Disk that faces the lens, turned about the vertical by `tilt` degrees."""
     import mitsuba as mi

@@ -6,7 +6,19 @@ from functools import cache
 
 import numpy as np
 import pytest
-from small_scenes import FOCAL, FOCUS, HEIGHT, MAGNIFICATION, WIDTH, disk, load, scene, sphere, virtual_pixels
+from small_scenes import (
+    FOCAL,
+    FOCUS,
+    HEIGHT,
+    MAGNIFICATION,
+    WIDTH,
+    disk,
+    even_disc,
+    load,
+    scene,
+    sphere,
+    virtual_pixels,
+)
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt import stiff_cases_scenes as far_away
@@ -198,8 +210,7 @@ def test_kinks_finer_than_the_nodes_are_not_believed_smooth():
     )
     # By points even on pupil and pixel.
     side, number = 0.8 / MAGNIFICATION, np.arange(4096) + 0.5
-    angle = number * np.pi * (3 - np.sqrt(5))
-    ax, ay = radius * np.sqrt(number / 4096) * np.array([np.cos(angle), np.sin(angle)])
+    ax, ay = radius * even_disc(4096)
     inside = (np.arange(32) + 0.5) / 32 - 0.5
     expected = np.empty(WIDTH)
     y = np.mod(number * (np.sqrt(5) - 1) / 2, 1) * side

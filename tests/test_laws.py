@@ -20,6 +20,7 @@ from small_scenes import (
     WIDTH,
     configuration_factor,
     disk,
+    even_disc,
     load,
     over_pixels,
     power,
@@ -300,10 +301,8 @@ def behind_two_circles(stop, lens, distance, x, y):
     behind = distance * FOCAL / (FOCAL - distance) if distance > 0 else distance
     pupil = stop / 2 * (behind / distance if distance > 0 else 1)
     growth, u = abs(1 + behind / FOCUS), FOCUS + behind
-    number = np.arange(4096) + 0.5
-    angle = number * np.pi * (3 - np.sqrt(5))
     count, falloff = 0, 0
-    for a, b in pupil * np.sqrt(number / 4096)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1):
+    for a, b in pupil * even_disc(4096).T:
         inside = np.hypot(a + x * behind / FOCUS, b + y * behind / FOCUS) <= lens / 2 * growth
         count, falloff = count + inside, falloff + inside * (1 + ((a - x) ** 2 + (b - y) ** 2) / u**2) ** -2.0
     area = overlap(lens / 2 * growth, pupil, np.hypot(x, y) * abs(behind) / FOCUS)

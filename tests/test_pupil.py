@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from little_scenes import mi
+from small_scenes import even_disc
 
 from mitsuba_fspt.plugins.pupil import onto_overlap
 
@@ -17,13 +18,6 @@ pytestmark = pytest.mark.usefixtures("mono")
 MEETING = [(0.02, 1.01), (0.3, 1.2), (0.5, 0.7), (1.2, 0.4), (3.0, 2.5), (60.0, 60.3)]
 NESTED = [(0.0, 0.5), (0.0, 1.0), (0.0, 2.0), (0.3, 0.7), (0.3, 1.5)]
 AXIS = np.array([0.6, -0.8])
-
-
-def even_points(count):
-    """Points (count, 2) of the unit disc, evenly (sunflower)."""
-    number = np.arange(count) + 0.5
-    angle = number * math.pi * (3 - math.sqrt(5))
-    return np.sqrt(number / count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def mapped(points, distance, radius):
@@ -43,13 +37,13 @@ def share_of(distance, radius):
 @pytest.mark.parametrize(("distance", "radius"), MEETING)
 def test_share_of_the_pupil_that_is_open(distance, radius):
     """Fails, by 3e-4, where the segment of a large border is computed in single precision."""
-    _, share = mapped(even_points(1), distance, radius)
+    _, share = mapped(even_disc(1).T, distance, radius)
     assert share == pytest.approx(share_of(distance, radius), abs=1e-5 if radius > 10 else 5e-7)
 
 
 @pytest.mark.parametrize(("distance", "radius"), NESTED)
 def test_share_of_one_disc_in_the_other(distance, radius):
-    points = even_points(100)
+    points = even_disc(100).T
     overlap, share = mapped(points, distance, radius)
     assert share == pytest.approx(min(radius, 1) ** 2, abs=5e-7)
     expected = points if radius >= 1 else distance * AXIS + radius * points
@@ -57,7 +51,7 @@ def test_share_of_one_disc_in_the_other(distance, radius):
 
 
 def test_nothing_is_open_between_discs_apart():
-    assert mapped(even_points(1), 2.0, 0.9)[1] == 0
+    assert mapped(even_disc(1).T, 2.0, 0.9)[1] == 0
 
 
 @pytest.mark.parametrize(("distance", "radius"), MEETING + NESTED)
@@ -67,7 +61,7 @@ def test_even_points_stay_even_on_what_is_open(distance, radius):
     Seen to fail with a chord's points left where they are along it, and with the heights of both discs not shared out
     by area.
     """
-    points = even_points(1 << 18)
+    points = even_disc(1 << 18).T
     overlap, _ = mapped(points, distance, radius)
     inside = points[np.linalg.norm(points - distance * AXIS, axis=1) <= radius]
     assert np.linalg.norm(overlap, axis=1).max() <= 1 + 1e-6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_scenes import FOCUS, HEIGHT, MAGNIFICATION, PITCH, RADIUS, SIDE, WIDTH, disk, load, scene, sphere
+from small_scenes import FOCUS, HEIGHT, MAGNIFICATION, PITCH, RADIUS, SIDE, WIDTH, disk, even_disc, load, scene, sphere
 from test_laws import collected, filled
 
 import mitsuba_fspt as fspt
@@ -158,9 +158,8 @@ def test_light_that_only_grazes_the_pupil_is_seen():
     depth, radius, off_axis = 180.0, 3.0, 1.0
     ends = {"p0": [off_axis, off_axis, depth], "p1": [off_axis, off_axis, depth + 1]}
     picture = fspt.render(scene({"type": "cylinder", **ends, "radius": radius}), rtol=0.05)
-    number, turn = np.arange(20000) + 0.5, np.linspace(0, 2 * np.pi, 720, endpoint=False)[:, None]
-    angle = number * np.pi * (3 - np.sqrt(5))
-    ax, ay = RADIUS * np.sqrt(number / 20000) * np.array([np.cos(angle), np.sin(angle)])
+    turn = np.linspace(0, 2 * np.pi, 720, endpoint=False)[:, None]
+    ax, ay = RADIUS * even_disc(20000)
     dx, dy = ax - off_axis - radius * np.cos(turn), ay - off_axis - radius * np.sin(turn)
     z = depth + 0.5
     seen = np.maximum(dx * np.cos(turn) + dy * np.sin(turn), 0) * z / (dx**2 + dy**2 + z**2) ** 2
