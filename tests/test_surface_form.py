@@ -167,7 +167,7 @@ def test_light_that_only_grazes_the_pupil_is_seen():
 
 
 def test_a_blur_disc_is_even_from_its_middle_to_its_rim():
-    """Expected: cos⁴θ of the spot's angle to the pupil and nothing else, to 2e-3, already by the coarsest cells.
+    """Expected: cos⁴θ of the spot's angle to the pupil and nothing else, to 4e-3, already by 8 × 8 cells.
 
     Seen to fail with cells of equal weight.
     """
@@ -180,7 +180,7 @@ def test_a_blur_disc_is_even_from_its_middle_to_its_rim():
     inside = off_middle < blur - 1.5
     cos4 = (1 + (off_middle / blur * RADIUS / depth) ** 2) ** -2
     even = picture[inside] / cos4[inside]
-    assert np.ptp(even) < 2e-3 * even.max()
+    assert np.ptp(even) < 4e-3 * even.max()
 
 
 def rectangle(depth, width, height, angle):
@@ -226,3 +226,48 @@ def test_a_light_without_a_surface_is_refused():
     lit = scene(sphere(180.0, 8.0), lamp=lamp)
     with pytest.raises(SceneError, match="needs surfaces"):
         fspt.render(lit, domain="surface")
+
+
+def test_a_small_ball_far_out_of_focus():
+    """Rationale: the radiance on film is J_n/π times the mean of cos⁴θ over the lines of sight that meet the ball.
+
+    Expected: rtol on every pixel, and no more claimed. Fails (2.5e-3) with as many elements as do for 1e-2.
+    """
+    depth, radius, x, y = 120.0, 0.4, 1.0, -2.0
+    picture = fspt.render(scene(sphere(depth, radius, x, y)), domain="surface", rtol=1e-3)
+    rows, columns = np.nonzero(picture.power > 0)
+    pick = slice(None, None, 6)
+    expected = [
+        power_of_ball(row, column, depth, radius, x, y) for row, column in zip(rows[pick], columns[pick], strict=True)
+    ]
+    np.testing.assert_allclose(picture.power[rows, columns][pick], expected, atol=1e-3 * picture.power.max())
+    assert picture.error.max() <= 1e-3 * picture.power.max()
+
+
+def power_of_ball(row, column, depth, radius, x, y, sub=12, points=3000):
+    """Power on a pixel from a ball, by sub² points of the pixel, each through points of its image on the pupil [W]."""
+    place = (np.arange(sub) + 0.5) / sub
+    across, down = (np.ravel(n) for n in np.meshgrid(place, place))
+    virtual = (((WIDTH / 2 - column - across) + 1j * (HEIGHT / 2 - row - down)) * SIDE)[:, None]
+    centre = x + 1j * y
+    stretch = FOCUS / (FOCUS - depth)  # from the ball to the lens, seen from the virtual plane
+    seen = 1.1 * radius * stretch
+    a = virtual + stretch * (centre - virtual) + seen * (even_disc(points).T @ [1, 1j])
+    c, d = centre - a, virtual - a
+    length = np.sqrt(np.abs(d) ** 2 + FOCUS**2)
+    along = ((c * d.conj()).real + depth * FOCUS) / length
+    meets = (np.abs(c) ** 2 + depth**2 - along**2 <= radius**2) & (np.abs(a) <= RADIUS)
+    return np.mean(meets * (FOCUS / length) ** 4) * seen**2 * (SIDE / FOCUS) ** 2
+
+
+def test_a_thin_tube_far_away():
+    """Rationale: Mitsuba knows the limb of a cylinder by a share of its distance squared over its radius, so lines of
+    sight begin just before what there is. Expected: one picture by both forms. Fails (1.3e-2) from the lens on.
+    """
+    import mitsuba as mi
+
+    place = mi.ScalarTransform4f().translate([-4, 0, FOCUS])
+    tube = {"type": "cylinder", "p0": [0, -3, 0], "p1": [0, 3, 0], "radius": 0.2, "to_world": place}
+    of = scene(tube, f_number=8.0, pixel_pitch=0.2)
+    surface, pupil = (fspt.render(of, domain=domain, rtol=1e-3).power for domain in ("surface", "pupil"))
+    np.testing.assert_allclose(surface, pupil, atol=1e-3 * surface.max())

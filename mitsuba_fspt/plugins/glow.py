@@ -16,9 +16,10 @@ from .elements import Elements, elements_of
 from .exitance import function_on
 from .window import Window
 
-CELLS = 2.0  # balances the cells of the pupil with the size of the pieces, see `cells_of`
+CELLS = 2.5  # balances the cells of the pupil with the size of the pieces, whatever the blur
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
+CURVED = 8.0  # over rtol: elements of a round body, whose normals differ within each by too much else
 BULGE = 0.1  # how far a curved element may reach beyond its corners, in units of their distance
 UNBOUNDED = 4.0  # side [pixels] counted for an element that reaches through the lens plane and has no image
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))  # of an element, once around
@@ -34,21 +35,20 @@ class Batch:
     glow: Glow
     index: Index
     cuts: Index
-    cells: Index
+    cells: int
 
     @property
     def lines(self) -> Index:
         return (self.cuts * self.cells) ** 2
 
-    def lanes(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Of every line of sight the element, its cuts, its cells and the line's number within the element."""
+    def lanes(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """Of every line of sight the element, its cuts and the line's number within the element."""
         ends = np.cumsum(self.lines)
         number = np.arange(ends[-1]) - np.repeat(ends - self.lines, self.lines)
         row = mi.UInt32(np.repeat(np.arange(len(self.index)), self.lines).astype(np.uint32))
-        columns = [mi.UInt32(column.astype(np.uint32)) for column in (self.index, self.cuts, self.cells)]
-        index, cuts, cells = (dr.gather(mi.UInt32, column, row) for column in columns)
+        index, cuts = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in (self.index, self.cuts))
         # Lanes beyond the last one gather 0, and whole numbers divided by 0 end the process.
-        return index, dr.maximum(cuts, 1), dr.maximum(cells, 1), mi.UInt32(number.astype(np.uint32))
+        return index, dr.maximum(cuts, 1), mi.UInt32(number.astype(np.uint32))
 
 
 @dataclass(frozen=True)
@@ -76,15 +76,15 @@ class Glow:
     def batches(self, lines: int, mark: NDArray[np.bool_]) -> Iterator[Batch]:
         """The lines of sight of all elements with light on a marked pixel, some `LANES` at a time."""
         index = self._touching(mark)
-        cells = cells_of(lines, self.blur[index], self.small)
-        cuts = np.ceil(self.sides[index] * math.sqrt(lines) / cells).astype(np.int64)
-        cuts = cuts.clip(1, np.maximum(math.isqrt(LANES) // cells, 1))
+        cells = cells_of(lines)
+        cuts = np.round(self.sides[index] * math.sqrt(lines) / cells).astype(np.int64)
+        cuts = cuts.clip(1, max(math.isqrt(LANES) // cells, 1))
         ends = np.cumsum((cuts * cells) ** 2)
         first = 0
         while first < len(index):
             done = ends[first - 1] if first else 0
             last = max(first + 1, int(np.searchsorted(ends, done + LANES, side="right")))
-            yield Batch(self, index[first:last], cuts[first:last], cells[first:last])
+            yield Batch(self, index[first:last], cuts[first:last], cells)
             first = last
 
     def _touching(self, mark: NDArray[np.bool_]) -> Index:
@@ -105,7 +105,7 @@ class Glow:
                 f"fspt_integral: domain 'surface' needs surfaces, but emitter {emitter.class_name()} has none. Set "
                 "domain to 'pupil'."
             )
-        elements = _elements(emitter.get_shape(), lens)
+        elements = _elements(emitter.get_shape(), lens, rtol)
         count = elements.count
         low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
         least, most = np.full(count, np.inf), np.full(count, -np.inf)
@@ -159,16 +159,14 @@ def _extent(points: Image) -> float:
     return float((points.max(axis=0) - points.min(axis=0)).max()) if len(points) else 0.0
 
 
-def cells_of(lines: int, blur: Image, small: bool) -> Index:
-    """Cells M along the pupil, a power of two, for blur discs of these radii [pixels] at so many lines a pixel.
+def cells_of(lines: int) -> int:
+    """Cells M along the pupil, 2ᵏ or 3·2ᵏ, where a pixel of the image gets so many lines of sight: M ∝ ⁴√lines.
 
-    Balanced: through neighbouring cells a piece's images lie about half its own size apart; the middles of a `small`
-    body's pieces are as coarse as the cells' chords along the disc's rim. At least 4, and no more than leave pieces of
-    a pixel.
+    At least 4, and no more than leave pieces of a pixel.
     """
-    power = np.where((blur < 1) | (not small), 0.5, 0.25)
-    ideal = np.ceil(np.log2(np.maximum(CELLS * lines**0.25 * blur**power, 4)))
-    return (2 ** np.minimum(ideal, math.log2(lines) // 2)).astype(np.int64)
+    ideal = min(max(CELLS * lines**0.25, 4), math.sqrt(lines))
+    octave = 2 ** int(math.log2(ideal))
+    return octave if ideal < 1.5 * octave else 3 * octave // 2
 
 
 def film_corner(window: Window) -> tuple[int, int]:
@@ -176,11 +174,12 @@ def film_corner(window: Window) -> tuple[int, int]:
     return window.left + window.crop_offset[0], window.top + window.crop_offset[1]
 
 
-def _elements(shape: mi.Shape, lens: mi.Sensor) -> Elements:
+def _elements(shape: mi.Shape, lens: mi.Sensor, rtol: float) -> Elements:
     """Elements of a few pixels each, so that what one pixel needs concerns few others."""
     pixel = float(lens.blur_disc(mi.Point3f(shape.bbox().center()))[2][0])
     ideal = float(shape.surface_area()[0]) / (PIXELS_PER_ELEMENT * pixel**2)
-    return elements_of(shape, int(min(max(ideal, FEWEST_ELEMENTS), MOST_ELEMENTS)))
+    fewest = FEWEST_ELEMENTS if shape.is_mesh() else max(FEWEST_ELEMENTS, CURVED / rtol)
+    return elements_of(shape, int(min(max(ideal, fewest), MOST_ELEMENTS)))
 
 
 def _dark(emitter: mi.Emitter, elements: Elements) -> NDArray[np.bool_]:

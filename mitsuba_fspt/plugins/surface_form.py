@@ -28,7 +28,8 @@ from .window import Window
 # are refined by turns; by the second level both are, or what one of them does wrong would pass for converged.
 FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
 BLURRED = 0.5  # of the blur radius: a piece of a small body that is smaller is sent as one point
-SAFETY = 4.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
+SAFETY = 3.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
+MEMORY = 0.4  # of what the level before was thought to leave may be left: two levels may agree by chance
 LEAST_CLAIM = 0.05  # two levels say little about what both miss: no error is said to be so much smaller than asked
 FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 lines of sight cannot resolve
 # No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
@@ -86,9 +87,7 @@ class _Refinement:
             value, hits = self._level(lines, mark)
             change = np.where(mark, np.abs(value - self.value), 0)
             recent, last = SAFETY * grid.array(grid.spread_max(grid.lanes(change))), recent
-            # Two levels may agree by chance. Later ones refine pieces and cells by turns: half of what the level before
-            # changed may yet be to come.
-            estimate = 2 * recent if last is None else np.maximum(recent, 0.5 * last)
+            estimate = recent if last is None else np.maximum(recent, MEMORY * last)
             # All elements with light on a marked pixel were refined: only there is the new picture whole.
             self.error[mark], self.value[mark], self.hits[mark] = estimate[mark], value[mark], hits[mark]
             mark = self.error > self.quadrature.rtol * max(self.value.max(), least_peak)
@@ -131,7 +130,7 @@ class _Refinement:
     def _lay(self, canvas: Canvas, batch: Batch) -> float:
         """Lay the light of a batch on the canvas, one line of sight a lane; the largest radiance it met."""
         elements, lens = batch.glow.elements, self.lens
-        index, cut, m, number = batch.lanes()
+        (index, cut, number), m = batch.lanes(), dr.opaque(mi.UInt32, batch.cells)
         part, i, j = number // (m * m), number % m, number // m % m
         spot, aim = _strata(i, j, m, index * STRIDE + part)
 
@@ -178,7 +177,7 @@ def _strata(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, number: mi.UInt32) -> tupl
     modulo M, as complex numbers, a lattice without short vectors in four dimensions. They lie off the middles,
     differently in every piece `number`, and in turns opposite ways, so that what is linear is integrated exactly.
     """
-    turn = 2 * mi.UInt32(dr.round(0.5 * dr.sqrt(mi.Float(m))))  # even: 1 + turn² shares no divisor with M = 2ⁿ
+    turn = 2 * mi.UInt32(dr.round(0.5 * dr.sqrt(mi.Float(m))))  # even: 1 + turn² has neither 2 nor 3 in common with M
     strata = ((turn * i + (m - 1) * j) % m, (i + turn * j) % m, i, j)
     way = dr.select((i + j) % 2 == 0, 1.0, -1.0)
     off = [way * (mi.Float(number * step) * 2.0**-32 - 0.5) for step in STEPS]
