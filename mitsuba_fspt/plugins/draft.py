@@ -11,6 +11,7 @@ import mitsuba as mi
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import Finding
 from .grid import ROUNDING, Grid, parted
+from .lines import View
 from .window import Window
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ class Draft:
         self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, known: Solution | None
     ) -> None:
         self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
+        self.view = View.of(scene, lens)
         self.area = quadrature.pixel == "area"
         self.grid = grid = Grid(window.shape)
         self.value, self.error, self.hits, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))

@@ -9,9 +9,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..rules import AlongTransect
-from .lines import radiance_on_film, repeat
+from .lines import View, repeat
 from .transect import Transect
 
+MOST_JUMPS = 3  # of a transect: one body before another has three
 STEEP = 4.0  # a jump is so many times larger than the mean of the transect's other steps
 SHIFT = 0.1  # of an interval: by which scanned points are moved, as the phase wants
 SHORTEST = 1e-6  # half of a piece, lest its moments are divided by nothing
@@ -19,8 +20,7 @@ FLAT = 1e-4  # variance of z over nodes that lie in one place
 
 
 def integrate_transect(
-    scene: mi.Scene,
-    lens: mi.Sensor,
+    view: View,
     transect: Transect,
     phase: mi.Float,
     along: AlongTransect,
@@ -29,28 +29,28 @@ def integrate_transect(
 ) -> tuple[mi.Float, ...]:
     """Of a transect means of integrand and hits, number of jumps, depth of the edge at the largest, lines of sight.
 
-    It is split at its two largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points, then
-    bisected towards the larger difference; every piece that is not dark gets `along.nodes` at even distances, the first
-    of them at `phase` of one; a transect without a jump is one piece. In units of the integrand an `outline` counts so
-    much as a jump of the radiance, and less than `least` does not.
+    It is split at its `MOST_JUMPS` largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points,
+    then bisected towards the larger difference; every piece that is not dark gets `along.nodes` at even distances, the
+    first of them at `phase` of one; a transect without a jump is one piece. In units of the integrand an `outline`
+    counts so much as a jump of the radiance, and less than `least` does not.
     """
 
     def look(s: mi.Float) -> mi.Point3f:
         position, pupil, _ = transect.at(s)
-        return mi.Point3f(*radiance_on_film(scene, lens, position, pupil)[1:])
+        return mi.Point3f(*view.radiance_on_film(position, pupil)[1:])
 
     found = _search(look, phase, along, outline, least)
-    jumps = found.jumps
-    first, second = found.first.middle(), found.second.middle()
-    left = dr.select(jumps > 0, dr.select(jumps > 1, dr.minimum(first, second), first), 1)
-    right = dr.select(jumps > 1, dr.maximum(first, second), 1)
+    jumps, places = found.jumps, found.places()
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
-    # Pieces 0 … jumps between -1, left, right, 1; an outer one on which every point looked past the phantom is dark.
-    def integrate(piece: mi.UInt32, since: mi.Vector2d, value: mi.Float, hits: mi.Float, looks: mi.UInt32) -> tuple:
+    # Pieces 0 … jumps between -1, the places and 1; an outer one on which every point looked past the phantom is dark.
+    def integrate(
+        piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, value: mi.Float, hits: mi.Float, looks: mi.UInt32
+    ) -> tuple:
         at_start, at_end = piece > 0, piece < jumps
-        low = dr.select(at_start, dr.select(piece == 1, left, right), -1)
-        high = dr.select(at_end, dr.select(piece == 0, left, right), 1)
+        high = mi.Float(1)
+        for k, place in enumerate(places):
+            high = dr.select(at_end & (piece == k), place, high)
         middle, half = 0.5 * (low + high), dr.maximum(0.5 * (high - low), SHORTEST)
         dark = dr.select(at_start, ~at_end & (found.lit.y < low), found.lit.x > high)
         count = dr.select(dark, 0, nodes)
@@ -59,18 +59,18 @@ def integrate_transect(
             share, slope = _towards_jumps((mi.Float(number) + phase) / mi.Float(nodes), at_start, at_end)
             s = low + (high - low) * share
             position, pupil, density = transect.at(s)
-            f, _, body, _ = radiance_on_film(scene, lens, position, pupil)
+            f, _, body, _ = view.radiance_on_film(position, pupil)
             return (sums.plus(slope * density, (s - middle) / half, f, body),)
 
         (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))
         until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
         more_value, more_hits = sums.corrected(_about(until - since, middle, half))
-        return until, value + more_value, hits + more_hits, looks + count
+        return high, until, value + more_value, hits + more_hits, looks + count
 
-    start = (mi.Vector2d(0), mi.Float(0), mi.Float(0), found.looks)
-    _, value, hits, looks = repeat(jumps + 1, integrate, *start)
-    depth = dr.select(jumps > 1, found.second.depth(), found.first.depth())
-    return value, hits, mi.Float(jumps), dr.select(jumps > 0, depth, 0), mi.Float(looks)
+    start = (mi.Float(-1), mi.Vector2d(0), mi.Float(0), mi.Float(0), found.looks)
+    _, _, value, hits, looks = repeat(jumps + 1, integrate, *start)
+    depth = dr.select(jumps > 0, found.largest[0].depth(), 0)
+    return value, hits, mi.Float(jumps), depth, mi.Float(looks)
 
 
 # ---------------------------------------------------------------------- where it jumps
@@ -102,19 +102,28 @@ class _Jump:
 class _Search:
     """What is known of the jumps of a transect after so many `looks`.
 
-    first, second : the largest and the next; while bisected, the one whose turn it is and the other
+    largest : the `MOST_JUMPS` largest steps of the scan, the largest first, then bisected one by one
     step, total : the last step of the scan, and all of them together
     lit : first and last place where anything was met
-    jumps : how many of the two are jumps, known when the scan is over
+    jumps : how many of the largest are jumps, known when the scan is over
     """
 
-    first: _Jump
-    second: _Jump
+    largest: list[_Jump]
     step: _Jump
     total: mi.Float
     lit: mi.Point2f
     jumps: mi.UInt32
     looks: mi.UInt32
+
+    def places(self) -> list[mi.Float]:
+        """Where the jumps are, in order along the transect, and 1 for each that is none."""
+        ordered: list[mi.Float] = []
+        for k, jump in enumerate(self.largest):
+            place = dr.select(self.jumps > k, jump.middle(), 1)
+            for i, other in enumerate(ordered):
+                ordered[i], place = dr.minimum(other, place), dr.maximum(other, place)
+            ordered.append(place)
+        return ordered
 
 
 def _search(
@@ -127,42 +136,46 @@ def _search(
     shift = SHIFT * (phase - 0.5)
 
     def scan(found: _Search, s: mi.Float, seen: mi.Point3f) -> _Search:
-        step = _Jump(mi.Point2f(found.step.at.y, s), found.step.after, seen)
-        size, one, two = (jump.size(outline) for jump in (step, found.first, found.second))
-        size = dr.select(found.looks > 0, size, 0)
-        second = dr.select(size > one, found.first, dr.select(size > two, step, found.second))
-        first, total = dr.select(size > one, step, found.first), found.total + size
-        one, two = dr.maximum(one, size), dr.maximum(dr.minimum(one, size), two)
+        step = new = _Jump(mi.Point2f(found.step.at.y, s), found.step.after, seen)
+        size = dr.select(found.looks > 0, step.size(outline), 0)
+        total = rest = found.total + size
         # A step that is not much larger than the others is a slope; on a parabola one is at most 3 times their mean.
-        large = one > dr.maximum(STEEP * (total - one) / (number - 1), least)
-        both = large & (two > dr.maximum(STEEP * (total - one - two) / (number - 2), least))
-        jumps = dr.select(found.looks == intervals, dr.select(both, mi.UInt32(2), dr.select(large, mi.UInt32(1), 0)), 0)
+        largest, jumps, large = [], mi.UInt32(0), found.looks == intervals
+        for k, old in enumerate(found.largest):
+            old_size = old.size(outline)
+            larger, most = size > old_size, dr.maximum(size, old_size)
+            largest.append(dr.select(larger, new, old))
+            new, size = dr.select(larger, old, new), dr.minimum(size, old_size)
+            rest -= most
+            large &= most > dr.maximum(STEEP * rest / (number - (k + 1)), least)
+            jumps += dr.select(large, mi.UInt32(1), 0)
         lit = dr.select(seen.y > 0, mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
-        return _Search(first, second, step, total, lit, jumps, found.looks)
+        return _Search(largest, step, total, lit, jumps, found.looks)
 
-    def bisect(found: _Search, s: mi.Float, seen: mi.Point3f) -> _Search:
-        jump = found.first
+    def bisect(found: _Search, turn: mi.UInt32, jump: _Jump, s: mi.Float, seen: mi.Point3f) -> _Search:
         left = _Jump(mi.Point2f(jump.at.x, s), jump.before, seen)
         right = _Jump(mi.Point2f(s, jump.at.y), seen, jump.after)
         half = dr.select(left.size(outline) >= right.size(outline), left, right)
-        # Half of the rounds for the first of two, then they change places.
-        turn = (found.jumps > 1) & (found.looks == intervals + bisections)
-        first, second = dr.select(turn, found.second, half), dr.select(turn, half, found.second)
-        return _Search(first, second, found.step, found.total, found.lit, found.jumps, found.looks)
+        largest = [dr.select(turn == k, half, old) for k, old in enumerate(found.largest)]
+        return _Search(largest, found.step, found.total, found.lit, found.jumps, found.looks)
 
     def once(found: _Search) -> tuple[_Search]:
         k = found.looks
         scans, inside = k <= intervals, (k > 0) & (k < intervals)
         even = dr.select(inside, 2 * (mi.Float(k) + shift) / number, dr.select(k > 0, 2, 0)) - 1
-        s = dr.select(scans, even, found.first.middle())
+        turn = (k - intervals - 1) // bisections
+        jump = found.largest[0]
+        for i, other in enumerate(found.largest[1:], 1):
+            jump = dr.select(turn == i, other, jump)
+        s = dr.select(scans, even, jump.middle())
         seen = look(s)
-        found = dr.select(scans, scan(found, s, seen), bisect(found, s, seen))
+        found = dr.select(scans, scan(found, s, seen), bisect(found, turn, jump, s, seen))
         found.looks = k + 1
         return (found,)
 
     # Not `dr.zeros`: of a dataclass's fields it keeps the types of the variant that it meets first.
-    none = (_Jump(mi.Point2f(0), mi.Point3f(0), mi.Point3f(0)) for _ in range(3))
-    start = _Search(*none, mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
+    none = [_Jump(mi.Point2f(0), mi.Point3f(0), mi.Point3f(0)) for _ in range(MOST_JUMPS + 1)]
+    start = _Search(none[1:], none[0], mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
     return dr.while_loop((start,), lambda found: found.looks <= intervals + found.jumps * bisections, once)[0]
 
 

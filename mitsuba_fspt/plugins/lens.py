@@ -25,6 +25,7 @@ OPTIONAL = (
     "image_stop_diameter",
 )
 STRETCH = 1e-5  # by which float32 may make a rotation's matrix differ from one
+CLEAR, MOST_CLEAR = 0.999, 0.9  # of the depth of what is nearest, and of u, that lines of sight leave out
 EPSILON = 2.0**-23  # float32's rounding of a length, relative to the largest one it comes from
 
 
@@ -101,16 +102,12 @@ class FsptLens(mi.Sensor):
         numbers = {name: float(value[0]) for name, value in self._numbers.items()}
         pitch = numbers.pop("pixel_pitch")
         if not 0 < pitch < float("inf"):
-            raise OpticsError(
-                f"fspt_lens: 'pixel_pitch' must be > 0 and finite, got {pitch:g}. Give mm, for example 0.0135."
-            )
+            raise OpticsError(f"fspt_lens: 'pixel_pitch' must be > 0 and finite, got {pitch:g}. Give mm, say 0.0135.")
         matrix = np.array(self.m_to_world.matrix, np.float64).reshape(4, 4)
-        self.placement = tuple(matrix.ravel())
+        self.placement, self._to_camera = tuple(matrix.ravel()), np.linalg.inv(matrix)
         axes = matrix[:3, :3]
         if not np.allclose(axes @ axes.T, np.eye(3), atol=STRETCH) or np.linalg.det(axes) < 0:
-            raise OpticsError(
-                "fspt_lens: 'to_world' scales lengths or mirrors. Give a rotation and a translation only."
-            )
+            raise OpticsError("fspt_lens: 'to_world' scales lengths or mirrors. Give a rotation and a translation.")
         self.optics = Lens.focused(model=self._model, **numbers)
         if (stop := numbers.get("image_stop_diameter", pitch)) < pitch:
             raise OpticsError(
@@ -142,23 +139,27 @@ class FsptLens(mi.Sensor):
         """
         return mi.Point2f(self._middle - position) * self._pitch
 
-    def line_of_sight(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
+    def line_of_sight(
+        self, position: mi.Point2f, pupil: mi.Point2f, start: mi.Float | float = 0.0
+    ) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
         """Ray from the pupil point through the virtual point, its weight cos⁴θ and its cosθ to the optical axis.
 
-        `position` [film pixels], `pupil` [unit disc], on the part that `open_pupil` leaves. The weight is 0 beside the
-        image-plane stop. The mean of weight × radiance over a pixel and the pupil, times `etendue`, is the power on
-        the pixel [W] (Eq. 9).
+        `position` [film pixels], `pupil` [unit disc], on the part that `open_pupil` leaves; the ray begins at depth
+        `start` < u [mm]. The weight is 0 beside the image-plane stop. The mean of weight × radiance over a pixel and
+        the pupil, times `etendue`, is the power on the pixel [W] (Eq. 9).
         """
         x = self.virtual_point(position)
         a = self._pupil.on_lens(x, pupil)
         towards = mi.Vector3f(x.x - a.x, x.y - a.y, self._u)
         cos_theta = self._u * dr.rcp(dr.norm(towards))
         weight = dr.select(self._through_stop(x), dr.square(dr.square(cos_theta)), 0)
-        # Far from the world's origin the lens point is rounded: from where it lies then, aim at the same virtual point.
-        centre, offset = mi.Point3f(self.m_to_world.translation()), self.m_to_world @ mi.Vector3f(a.x, a.y, 0)
+        share = start / self._u
+        offset = self.m_to_world @ (mi.Vector3f(a.x, a.y, 0) + share * towards)
+        # Far from the world's origin that point is rounded: from where it lies then, aim at the same virtual point.
+        centre = mi.Point3f(self.m_to_world.translation())
         origin = centre + offset
         lost = offset - (origin - centre)
-        return mi.Ray3f(origin, dr.normalize(self.m_to_world @ towards + lost)), weight, cos_theta
+        return mi.Ray3f(origin, dr.normalize(self.m_to_world @ towards * (1 - share) + lost)), weight, cos_theta
 
     def open_pupil(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
         """Point of the part of the pupil that a second border (Eq. 5) leaves open at a film position; its share.
@@ -220,12 +221,17 @@ class FsptLens(mi.Sensor):
         blur = radius * back / (scale * pitch)
         return dr.select((scale > 0) & ~dr.isnan(blur), blur, dr.inf)
 
+    def clear_depth(self, box: mi.ScalarBoundingBox3f) -> float:
+        """Depth [mm] from 0 to most of u before which nothing of a box lies; 0 where the lens stands in it."""
+        corners = np.array([np.ravel(box.corner(k)) for k in range(8)], np.float64)
+        nearest = float((corners @ self._to_camera[2, :3] + self._to_camera[2, 3]).min())
+        return min(max(CLEAR * nearest, 0.0), MOST_CLEAR * self.optics.focus_distance)
+
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; inf: nothing bounds it."""
-        to_camera = np.linalg.inv(np.array(self.m_to_world.matrix, np.float64).reshape(4, 4))
         # A turned sphere does not find a few of its own points: they may be anywhere, z = -inf.
         lost = ~np.isfinite(points).all(axis=-1, keepdims=True)
-        p = np.where(lost, 0, points) @ to_camera[:3, :3].T + to_camera[:3, 3]
+        p = np.where(lost, 0, points) @ self._to_camera[:3, :3].T + self._to_camera[:3, 3]
         p[..., 2:][lost] = -np.inf
         disc, u = self.optics.discs[0], self.optics.focus_distance
         scale = 1 - (1 - disc.shift) * (u - p[..., 2:]) / u

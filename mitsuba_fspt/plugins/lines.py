@@ -6,6 +6,7 @@ Every function here is one loop of one kernel, over as many lines of sight as th
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -17,21 +18,38 @@ from .elements import at_one_wavelength, scalar
 # ---------------------------------------------------------------------- one line of sight
 
 
-def radiance_on_film(
-    scene: mi.Scene, lens: mi.Sensor, position: mi.Point2f, pupil: mi.Point2f
-) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
-    """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; L; number of the body met, 0 for none or no passage; its depth [mm].
+@dataclass(frozen=True)
+class View:
+    """What a lens sees of a scene along lines of sight that begin at the depth `start` [mm], before all there is.
 
-    `pupil`, on the unit disc, stands for as large a share of what is open; the integrand for all of the pupil.
+    To Mitsuba a small round body far from where a ray begins has a fuzzy limb: rounding moves it by a share of the
+    distance squared over its radius.
     """
-    pupil, share = lens.open_pupil(position, pupil)
-    ray, weight, cos_theta = lens.line_of_sight(position, pupil)
-    at_one_wavelength(ray)
-    # Embree traces packets of neighbouring lines of sight three times slower than single rays.
-    si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=weight > 0)
-    radiance = scalar(si.emitter(scene).eval(si))
-    body = mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))
-    return share * weight * radiance, radiance, body, si.t * cos_theta
+
+    scene: mi.Scene
+    lens: mi.Sensor
+    start: mi.Float
+
+    @classmethod
+    def of(cls, scene: mi.Scene, lens: mi.Sensor) -> View:
+        return cls(scene, lens, dr.opaque(mi.Float, lens.clear_depth(scene.bbox())))
+
+    def radiance_on_film(
+        self, position: mi.Point2f, pupil: mi.Point2f
+    ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+        """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; L; number of the body met, 0 for none or no passage; its depth
+        [mm].
+
+        `pupil`, on the unit disc, stands for as large a share of what is open; the integrand for all of the pupil.
+        """
+        pupil, share = self.lens.open_pupil(position, pupil)
+        ray, weight, cos_theta = self.lens.line_of_sight(position, pupil, self.start)
+        at_one_wavelength(ray)
+        # Embree traces packets of neighbouring lines of sight three times slower than single rays.
+        si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=weight > 0)
+        radiance = scalar(si.emitter(self.scene).eval(si))
+        body = mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))
+        return share * weight * radiance, radiance, body, self.start + si.t * cos_theta
 
 
 def repeat(count: int | mi.UInt32, body: Callable[..., tuple], *state: Any) -> tuple:
@@ -43,7 +61,7 @@ def repeat(count: int | mi.UInt32, body: Callable[..., tuple], *state: Any) -> t
 # ---------------------------------------------------------------------- rules on every pixel
 
 
-def apply_rule(scene: mi.Scene, lens: mi.Sensor, centre: mi.Point2f, rule: rules.Rule) -> tuple[mi.Float, ...]:
+def apply_rule(view: View, centre: mi.Point2f, rule: rules.Rule) -> tuple[mi.Float, ...]:
     """Weighted sums of one rule at every pixel: value, contrast, first moments over the pupil, hits, depth range."""
     table = [mi.Float(column) for column in (*rule.pupil.T, *rule.pixel.T, rule.weight, rule.contrast)]
 
@@ -57,7 +75,7 @@ def apply_rule(scene: mi.Scene, lens: mi.Sensor, centre: mi.Point2f, rule: rules
         farthest: mi.Float,
     ) -> tuple:
         ax, ay, dx, dy, weight, null = (dr.gather(mi.Float, column, k) for column in table)
-        f, _, body, depth = radiance_on_film(scene, lens, centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
+        f, _, body, depth = view.radiance_on_film(centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
         hit = body > 0
         return (
             value + weight * f,

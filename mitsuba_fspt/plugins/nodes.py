@@ -128,7 +128,7 @@ def apply_nodes(draft: Draft, rule: rules.Rule, where: Mask | None = None) -> li
         index = dr.compress(where)
         images = [draft.grid.full(mi.Float64, fill) for fill in (0, 0, 0, 0, 0, dr.inf, 0)]
     for part in chunks(index, LANES):
-        sums = apply_rule(draft.scene, draft.lens, draft.window.centres(part), rule)
+        sums = apply_rule(draft.view, draft.window.centres(part), rule)
         for image, column in zip(images, sums, strict=True):
             dr.scatter(image, mi.Float64(column), part)
         dr.eval(images)

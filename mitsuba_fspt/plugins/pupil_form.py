@@ -19,7 +19,7 @@ from .. import rules
 from ..quadrature import Quadrature, Solution
 from .draft import LANES, Draft, chunks, open_share
 from .grid import Grid
-from .lines import apply_rule
+from .lines import View, apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
 from .transects import integrate_by_transects
 from .window import Window, visible_window
@@ -51,9 +51,9 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
     window = visible_window(scene, lens)
     if 0 in window.shape:
         return np.zeros(window.full)
-    grid = Grid(window.shape)
+    grid, view = Grid(window.shape), View.of(scene, lens)
     image = grid.full(mi.Float64, 0)
     for part in chunks(grid.number, LANES):
-        hits = apply_rule(scene, lens, window.centres(part), rules.twelve(True))[4]
+        hits = apply_rule(view, window.centres(part), rules.twelve(True))[4]
         dr.scatter(image, mi.Float64(hits), part)
     return window.expand(grid.array(image * open_share(lens, window, grid)))

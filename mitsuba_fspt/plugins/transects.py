@@ -231,7 +231,7 @@ def _transect_sums(
     place = dr.select(sharp, even, gauss)
     curve = transect(draft.window.centres(pixel), angle, blur, place, area)
     outline, least = mi.Float(2 * draft.peak), mi.Float(LEAST_JUMP * draft.tolerance)
-    found = integrate_transect(draft.scene, draft.lens, curve, phase, along, outline, least)
+    found = integrate_transect(draft.view, curve, phase, along, outline, least)
     value, hits, jumps, depth, looks = (mi.Float64(column) for column in found)
     share = mi.Float64(weight) * value
     columns = [share, mi.Float64(weight) * hits, share * value, dr.minimum(jumps, 1), depth, looks]
