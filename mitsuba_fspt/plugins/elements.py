@@ -42,6 +42,7 @@ class Elements:
 
     count: int
     corners: tuple[tuple[int, int], ...]  # the samples at which `place` puts an element's corners
+    middle: tuple[float, float]  # and its middle
 
     def __init__(self, shape: mi.Shape) -> None:
         # A pointer array does not keep what it points at. Emitters keep elements and shapes their emitter: elements
@@ -85,6 +86,7 @@ class MeshElements(Elements):
     """Faces of a triangle mesh, each cut into k² congruent triangles."""
 
     corners = ((0, 0), (1, 0), (0, 1))
+    middle = (5 / 9, 1 / 2)
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         super().__init__(shape)
@@ -141,6 +143,7 @@ class ParameterElements(Elements):
     """Grid of equal cells in the surface parameters (u, v) of an analytic shape."""
 
     corners = ((0, 0), (1, 0), (0, 1), (1, 1))
+    middle = (1 / 2, 1 / 2)
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         super().__init__(shape)

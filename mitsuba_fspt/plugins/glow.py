@@ -19,7 +19,7 @@ from .window import Window
 CELLS = 2.5  # balances the cells of the pupil with the size of the pieces, whatever the blur
 LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
-CURVED = 8.0  # over rtol: elements of a round body, whose normals differ within each by too much else
+CURVED = 8.0  # over rtol: elements of a round body; below a pixel none is cut, and their middles have to do
 BULGE = 0.1  # how far a curved element may reach beyond its corners, in units of their distance
 UNBOUNDED = 4.0  # side [pixels] counted for an element that reaches through the lens plane and has no image
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))  # of an element, once around

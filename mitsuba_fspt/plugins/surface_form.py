@@ -132,18 +132,21 @@ class _Refinement:
         elements, lens = batch.glow.elements, self.lens
         (index, cut, number), m = batch.lanes(), dr.opaque(mi.UInt32, batch.cells)
         part, i, j = number // (m * m), number % m, number // m % m
-        spot, aim = _strata(i, j, m, index * STRIDE + part)
+        within, aim = _strata(i, j, m, index * STRIDE + part)
 
-        si, area = elements.place(index, spot, cut, part)
-        _, lens_point, weight, cos_theta = lens.arrival(si.p, mi.warp.square_to_uniform_disk_concentric(aim))
-        to_lens = dr.normalize(lens_point - si.p)
-        cos_s = dr.dot(si.n, to_lens)
+        # What is smooth comes from a piece's middle, by the midpoint rule: normals that differed from line to line
+        # would make a round body noisy. What may jump within a piece, J_n and what hides it, comes from spots all over.
+        middle, area = elements.place(index, mi.Point2f(*elements.middle), cut, part)
+        spot, _ = elements.place(index, within, cut, part)
+        _, lens_point, weight, cos_theta = lens.arrival(middle.p, mi.warp.square_to_uniform_disk_concentric(aim))
+        to_lens = dr.normalize(lens_point - middle.p)
+        cos_s = dr.dot(middle.n, to_lens)
         active = (cos_s > 0) & (weight > 0)
         if self.hidden:
-            active &= ~self.scene.ray_test(si.spawn_ray_to(lens_point), active)
-        si.initialize_sh_frame()
-        si.wi = si.to_local(to_lens)
-        radiance = dr.select(active, scalar(batch.glow.emitter.eval(si, active)), 0)
+            active &= ~self.scene.ray_test(spot.spawn_ray_to(lens_point), active)
+        spot.initialize_sh_frame()
+        spot.wi = mi.Frame3f(middle.n).to_local(to_lens)
+        radiance = dr.select(active, scalar(batch.glow.emitter.eval(spot, active)), 0)
         # dΩ dS |cosθ_s| over A_vd A_pupil/u², that the film's value is a mean radiance whatever the lengths.
         virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
         cell = [_corner(i + x, j + y, m) for x, y in CORNERS]
