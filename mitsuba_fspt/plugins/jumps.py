@@ -139,15 +139,17 @@ def _search(
         step = new = _Jump(mi.Point2f(found.step.at.y, s), found.step.after, seen)
         size = dr.select(found.looks > 0, step.size(outline), 0)
         total = rest = found.total + size
-        # A step that is not much larger than the others is a slope; on a parabola one is at most 3 times their mean.
+        # An outline is a jump. A step of one body's radiance that is not much larger than the rest is a slope; on a
+        # parabola one is at most 3 times their mean.
         largest, jumps, large = [], mi.UInt32(0), found.looks == intervals
         for k, old in enumerate(found.largest):
             old_size = old.size(outline)
             larger, most = size > old_size, dr.maximum(size, old_size)
             largest.append(dr.select(larger, new, old))
             new, size = dr.select(larger, old, new), dr.minimum(size, old_size)
-            rest -= most
-            large &= most > dr.maximum(STEEP * rest / (number - (k + 1)), least)
+            rest = rest - most  # not `-=`, which would change the total with it
+            steep = most > dr.maximum(STEEP * rest / (number - (k + 1)), least)
+            large &= steep | (most >= outline)
             jumps += dr.select(large, mi.UInt32(1), 0)
         lit = dr.select(seen.y > 0, mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
         return _Search(largest, step, total, lit, jumps, found.looks)
