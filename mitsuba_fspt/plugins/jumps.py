@@ -12,7 +12,9 @@ from ..rules import AlongTransect
 from .lines import View, repeat
 from .transect import Transect
 
-MOST_JUMPS = 3  # of a transect: one body before another has three
+# Jumps of a transect: one body before another has three outlines, and what the scan has left beside two steps is too
+# little to tell a third from a slope.
+MOST_JUMPS, MOST_STEPS = 3, 2
 STEEP = 4.0  # a jump is so many times larger than the mean of the transect's other steps
 SHIFT = 0.1  # of an interval: by which scanned points are moved, as the phase wants
 SHORTEST = 1e-6  # half of a piece, lest its moments are divided by nothing
@@ -148,8 +150,10 @@ def _search(
             largest.append(dr.select(larger, new, old))
             new, size = dr.select(larger, old, new), dr.minimum(size, old_size)
             rest = rest - most  # not `-=`, which would change the total with it
-            steep = most > dr.maximum(STEEP * rest / (number - (k + 1)), least)
-            large &= steep | (most >= outline)
+            jump = most >= outline
+            if k < MOST_STEPS:
+                jump = jump | (most > dr.maximum(STEEP * rest / (number - (k + 1)), least))
+            large &= jump
             jumps += dr.select(large, mi.UInt32(1), 0)
         lit = dr.select(seen.y > 0, mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
         return _Search(largest, step, total, lit, jumps, found.looks)
