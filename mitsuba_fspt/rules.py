@@ -113,8 +113,12 @@ TRANSECT_LEVELS = (2, 8, 24, 72, 256, 1024)
 # Places across the pupil at each level but the last. A second edge makes what transects find bend and kink there, while
 # along their other two places it is nearly linear.
 ACROSS = (2, 4, 6, 8, 16)
+# Where at each place across the pupil the others lie around the middle [degrees]. Were 8 at the two heights of 2 and of
+# 24, Gauss's, all three would agree on what all three miss, as of a plate seen edge-on through the sharp plane.
+TURNS = {2: [[45], [225]], 8: [[15, 195], [60, 240], [150, 330], [105, 285]]}
 TREND = 3  # degree across the pupil that says nothing yet of a kink
 SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
+MOST_JUMPS = 3  # that split a transect: one body before another has three outlines
 TRANSECT_ORDER = 1.5  # by which the error falls at least, whatever two levels agree on
 
 
@@ -128,8 +132,8 @@ class AlongTransect:
 
     @property
     def rays(self) -> int:
-        """Lines of sight at most: both jumps bisected, three pieces lit."""
-        return self.scan + 1 + 2 * self.bisections + 3 * self.nodes
+        """Lines of sight at most: all jumps bisected, all pieces lit."""
+        return self.scan + 1 + MOST_JUMPS * self.bisections + (MOST_JUMPS + 1) * self.nodes
 
 
 def along_transect(level: int, rtol: float) -> AlongTransect:
@@ -211,17 +215,16 @@ def transects(count: int) -> Transects:
 def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (n, 3) and weights (n,) of Gauss: `across` of them across the pupil, √(n/across) on both other axes.
 
-    8 are every other one of 16, as on a chessboard, exact to degree 2; 2 are opposite corners, exact to degree 1.
+    8 are four pairs of opposite places, exact to degree 2, and 2 a single one, exact to degree 1.
     """
-    x, v = gauss(max(2, math.isqrt(count // across)))
     y, w = gauss(across)
+    each = count // across
+    if each <= 2:
+        others = 0.5 + _polar(math.sqrt(1 / 6), np.radians(TURNS[count]))
+        return np.insert(others.reshape(-1, 2), 1, np.repeat(y, each), axis=1), np.repeat(w / each, each)
+    x, v = gauss(math.isqrt(each))
     place = np.stack(np.meshgrid(x, y, x, indexing="ij"), axis=-1).reshape(-1, 3)
-    weight = np.multiply.outer(np.outer(v, w), v).ravel()
-    if count <= 8:
-        chessboard = np.indices((2, across, 2)).sum(axis=0).ravel() % 2 == 1
-        chosen = [2, 5] if count == 2 else chessboard
-        place, weight = place[chosen], weight[chosen] / weight[chosen].sum()
-    return place, weight
+    return place, np.multiply.outer(np.outer(v, w), v).ravel()
 
 
 def _net(count: int) -> NDArray[np.float64]:

@@ -120,7 +120,7 @@ def test_transects_across_the_pupil_know_the_share_of_a_corner(blur, other):
 def test_scatter_says_where_transects_kink_and_where_they_only_lean():
     """One ball before another, both blurred: 24 transects against 1024, on the pixels that silhouettes part.
 
-    Expected: no less than the error wherever that is a thousandth of the peak, but for one pixel in ten; and on most
+    Expected: no less than the error wherever that is a thousandth of the peak, but for one pixel in twenty; and on most
     pixels, which see one edge alone, little. Fails without KINK, and if the trend is not taken off (1.1e-2).
     """
     import drjit as dr
@@ -142,7 +142,7 @@ def test_scatter_says_where_transects_kink_and_where_they_only_lean():
     scatter = np.array(few.scatter)[pixels] / peak
     kinked = error > 1e-3
     assert kinked.sum() > 10
-    assert np.mean(scatter[kinked] >= error[kinked]) > 0.9
+    assert np.mean(scatter[kinked] >= error[kinked]) > 0.95
     assert np.median(scatter) < 5e-3
 
 

@@ -50,7 +50,7 @@ class Draft:
     def __init__(
         self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, known: Solution | None
     ) -> None:
-        self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
+        self.lens, self.window, self.quadrature = lens, window, quadrature
         self.view = View.of(scene, lens)
         self.area = quadrature.pixel == "area"
         self.grid = grid = Grid(window.shape)

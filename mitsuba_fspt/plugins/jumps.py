@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..rules import AlongTransect
+from ..rules import MOST_JUMPS, AlongTransect
 from .lines import View, repeat
 from .transect import Transect
 
-# Jumps of a transect: one body before another has three outlines, and what the scan has left beside two steps is too
-# little to tell a third from a slope.
-MOST_JUMPS, MOST_STEPS = 3, 2
+MOST_STEPS = 2  # of jumps within a body: beside two the scan has too little left to tell a third from a slope
 STEEP = 4.0  # a jump is so many times larger than the mean of the transect's other steps
 SHIFT = 0.1  # of an interval: by which scanned points are moved, as the phase wants
 SHORTEST = 1e-6  # half of a piece, lest its moments are divided by nothing

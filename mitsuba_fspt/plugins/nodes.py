@@ -93,7 +93,7 @@ def _one_will_do(draft: Draft) -> bool:
     lens, blur = draft.lens.optics, draft.window.blur
     curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
     will_do = curvature <= POINT * draft.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
-    lambert = all(getattr(emitter, "is_lambertian", bool)() for emitter in draft.scene.emitters())
+    lambert = all(getattr(emitter, "is_lambertian", bool)() for emitter in draft.view.scene.emitters())
     taken = will_do and lambert and draft.quadrature.takes("one line")
     why = f"cos⁴θ differs by {curvature:.1e} over the pupil, blur discs reach {blur:.2g} pixels"
     why += "" if lambert else ", the radiance depends on direction"

@@ -24,8 +24,8 @@ from .glow import CORNERS, Batch, Glow, film_corner
 from .grid import Grid
 from .window import Window
 
-# Lines of sight a pixel of the image at the first level, and how many times more at each further one. Pieces and cells
-# are refined by turns; by the second level both are, or what one of them does wrong would pass for converged.
+# Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second
+# level both pieces and cells are refined, or what one of them does wrong would pass for converged.
 FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
 BLURRED = 0.5  # of the blur radius: a piece of a small body that is smaller is sent as one point
 SAFETY = 3.0  # the last change of a pixel and of its neighbours, times this, bounds what is left

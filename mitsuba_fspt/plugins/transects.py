@@ -26,6 +26,7 @@ LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be
 # What transects that differ may be wrong by, in units of their deviation over their number: two; more of them, what a
 # trend explains taken off, for a kink may hide between them; by a sharp edge, over the root of their number once more.
 SPREAD, KINK, SLANT = 2.0, 6.0, 2.0
+UNSETTLED = 1.5  # times the tolerance: another level is needed, but not of the neighbours that doubt half of it
 DOUBT = 0.5  # of what a neighbour may be wrong by counts, unless it is by a sharp edge or one that it alone has met
 BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
@@ -92,7 +93,7 @@ class _Ladder:
 
     def _unsettled(self, left: Image) -> Image:
         """What is left, or so much that another level is needed."""
-        return dr.maximum(left, 2 * self.draft.tolerance)
+        return dr.maximum(left, UNSETTLED * self.draft.tolerance)
 
     def _doubt(self, known: Mask) -> Image:
         """What pixels may be wrong by for all that neighbours know; `known`: which pixels know an edge themselves."""
@@ -141,16 +142,20 @@ class Edges:
     sharp: Mask
 
     def learn(self, draft: Draft, means: Means, split: Mask) -> None:
-        """Blur from the depth of the edges that were met; pixels that see none are smooth, and none is sharp.
+        """Blur of the edges that were met; pixels that see none are smooth, and none is sharp.
 
         Whoever met none may see the tip of a neighbour's.
         """
-        depth = dr.select(means.jumps, means.depth, dr.inf)
-        depth = dr.select(means.jumps, depth, -draft.grid.spread_max(-depth))
-        met = dr.isfinite(depth) & ~draft.stopped
-        self.blur = dr.select(met, draft.lens.blur_radius(depth), self.blur)
-        near = draft.grid.dilate(split | draft.outline, 1)
+        grid, jumps = draft.grid, means.jumps
+        blur = dr.select(jumps, means.blur, _most_blurred(grid.spread_max(means.blur), -grid.spread_max(-means.blur)))
+        self.blur = dr.select(grid.dilate(jumps, 1) & ~draft.stopped, blur, self.blur)
+        near = grid.dilate(split | draft.outline, 1)
         self.sharp = (dr.abs(self.blur) < SHARP) & near
+
+
+def _most_blurred(ahead: Image, behind: Image) -> Image:
+    """Of two signed blur radii the larger: between them, where neither edge is sharp, the mean may be."""
+    return dr.select(ahead > -behind, ahead, behind)
 
 
 def edges_of(draft: Draft) -> Edges:
@@ -176,14 +181,14 @@ class Means:
     """Of each marked pixel mean radiance on film, share of hits, whether a transect is split by a jump.
 
     scatter : what the value may be wrong by for all that the transects differ
-    depth : of the edges, mean over transects that meet one [mm]
+    blur : signed radius of the most blurred edge that a transect met, 0 where none did [pixels]
     """
 
     value: Image
     hits: Image
     jumps: Mask
     scatter: Image
-    depth: Image
+    blur: Image
 
 
 def apply_transects(
@@ -200,21 +205,21 @@ def apply_transects(
         dr.eval(images)
         rays += int(dr.sum(looks)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
-    value, hits, squares, trend, parted, depth = images
+    value, hits, squares, trend, parted, blur = images
     number = dr.opaque(mi.Float64, len(rule))
     variance = squares - value * value
     blurred = dr.opaque(mi.Float64, KINK if len(rule) > 2 else SPREAD) * dr.safe_sqrt(variance - trend) / number
     # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
     slant = SLANT * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, CORNER * value / (number * number))
-    return Means(value, hits, parted > 0, dr.select(edges.sharp, sharp, blurred), depth / parted)
+    return Means(value, hits, parted > 0, dr.select(edges.sharp, sharp, blurred), blur)
 
 
 def _transect_sums(
     draft: Draft, part: Index, edges: Edges, rule: rules.Transects, along: rules.AlongTransect
 ) -> list[Image]:
     """Of each listed pixel means over its transects of value, hits, value squared, what of that is a trend; how many
-    jump, and sums over them of the depth of the edge; lines of sight taken.
+    jump, and the blur of the most blurred edge; lines of sight taken.
     """
     count = dr.opaque(mi.UInt32, len(rule))
     lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
@@ -234,10 +239,13 @@ def _transect_sums(
     found = integrate_transect(draft.view, curve, phase, along, outline, least)
     value, hits, jumps, depth, looks = (mi.Float64(column) for column in found)
     share = mi.Float64(weight) * value
-    columns = [share, mi.Float64(weight) * hits, share * value, dr.minimum(jumps, 1), depth, looks]
-    dr.eval(columns)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
+    blur = dr.select(jumps > 0, draft.lens.blur_radius(depth), 0)
+    columns = [share, mi.Float64(weight) * hits, share * value, dr.minimum(jumps, 1), looks]
+    dr.eval(columns, blur)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
     sums = [dr.block_sum(column, len(rule)) for column in columns]
     trend = dr.zeros(mi.Float64, dr.width(part))
     for polynomial in rule.trend:
         trend += dr.square(dr.block_sum(share * dr.gather(mi.Float64, mi.Float64(polynomial), number), len(rule)))
-    return [*sums[:3], trend, *sums[3:]]
+    ahead, behind = (dr.block_reduce(end, blur, len(rule)) for end in (dr.ReduceOp.Max, dr.ReduceOp.Min))
+    *sums, parted, looks = sums
+    return [*sums, trend, parted, _most_blurred(ahead, behind), looks]
