@@ -36,11 +36,13 @@ class Rule:
         return len(self.weight)
 
 
+@cache
 def one() -> Rule:
     """The one line of sight through the middle of pupil and pixel, exact to degree 1."""
     return Rule(np.zeros((1, 2)), np.zeros((1, 2)), np.ones(1), np.zeros(1))
 
 
+@cache
 def four(area: bool) -> Rule:
     """Four nodes, exact to degree 3 on the pupil; with `area` also over the pixel, for what blurs like a picture.
 
@@ -71,6 +73,7 @@ def four_turn(curl: Image, laplacian: Image) -> Image:
     return 4 * c * (curl - c * laplacian)
 
 
+@cache
 def twelve(area: bool) -> Rule:
     """Twelve nodes, exact to degree 7 on the pupil (Hammer and Stroud 1958); with `area` to degree 3 jointly.
 
@@ -93,6 +96,7 @@ def twelve(area: bool) -> Rule:
     return Rule(pupil, pixel, weights, contrast)
 
 
+@cache
 def product(level: int, area: bool) -> Rule:
     """Rings × spokes over the pupil, with `area` times Gauss nodes over the pixel: finer with the level, for what is
     smooth.
@@ -115,7 +119,7 @@ TRANSECT_LEVELS = (2, 8, 24, 72, 256, 1024)
 ACROSS = (2, 4, 6, 8, 16)
 # Where at each place across the pupil the others lie around the middle [degrees]. Were 8 at the two heights of 2 and of
 # 24, Gauss's, all three would agree on what all three miss, as of a plate seen edge-on through the sharp plane.
-TURNS = {2: [[45], [225]], 8: [[15, 195], [60, 240], [150, 330], [105, 285]]}
+TURNS = {2: [[45], [225]], 8: [[30, 210], [120, 300]] * 2}
 TREND = 3  # degree across the pupil that says nothing yet of a kink
 SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
 MOST_JUMPS = 3  # that split a transect: one body before another has three outlines

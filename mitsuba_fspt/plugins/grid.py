@@ -75,8 +75,7 @@ class Grid:
         larger = operator.or_ if dr.is_mask_v(image) else dr.maximum
         reach, most = 0, min(radius, max(self.shape) - 1)
         while reach < most:
-            # As far as it goes already once more, and no gap opens.
-            step = min(reach + 1, most - reach)
+            step = min(2 * reach + 1, most - reach)  # no gap opens
             image = reduce(larger, self._neighbours(image, step).values(), image)
             dr.eval(image)  # all need this one kernel, which every larger one around it would compile anew
             reach += step
@@ -87,19 +86,28 @@ class Grid:
         return self.spread_max(mask, radius)
 
     def grow(self, mask: Mask, reach: mi.Int, most: int) -> Mask:
-        """True within `reach` ≤ `most` pixels (square) of a marked pixel, each with its own; at least 1, up to 1.5
-        times it.
-        """
-        radii = [0, 1]
-        while radii[-1] < most:
-            radii.append(radii[-1] + max(1, radii[-1] // 2))
-        # The farthest begin, and go on together with those that reach less far.
-        grown = self.full(mi.Bool, False)
-        for low, high in reversed(list(itertools.pairwise(radii))):
-            more = reach > dr.opaque(mi.Int, low if low else -1)
-            grown |= mask & more & (reach <= dr.opaque(mi.Int, high))
-            grown = self.dilate(grown, high - low)
-        return grown
+        """True within `reach` ≤ `most` pixels (square) of a marked pixel, each with its own; at least 1."""
+        left = dr.select(mask, dr.maximum(reach, 1), -1)
+        covered, step = 0, 1
+        while covered < most:
+            left = self._reached(left, step)
+            covered += 2 * step
+            step *= 2
+        return left >= 0
+
+    def _reached(self, left: mi.Int, step: int) -> mi.Int:
+        """The most that is `left` of reaches from two steps around; of steps 1, 2, 4 … every way is the shortest."""
+        k = dr.opaque(mi.Int, step)
+        dr.eval(left)
+
+        def row(j: mi.Int, most: mi.Int) -> tuple:
+            for i in range(-2, 3):
+                there = self.at(left, self.x + i * k, self.y + j * k)
+                most = dr.maximum(most, there - k * dr.maximum(dr.abs(j), abs(i)))
+            return j + 1, most
+
+        _, most = dr.while_loop((mi.Int(-2), left), lambda j, most: j <= 2, row)
+        return most
 
     def box_sum(self, image: Image, radius: int) -> Image:
         """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
