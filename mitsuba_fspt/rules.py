@@ -117,9 +117,9 @@ TRANSECT_LEVELS = (2, 8, 24, 72, 256, 1024)
 # Places across the pupil at each level but the last. A second edge makes what transects find bend and kink there, while
 # along their other two places it is nearly linear.
 ACROSS = (2, 4, 6, 8, 16)
-# Where at each place across the pupil the others lie around the middle [degrees]. Were 8 at the two heights of 2 and of
-# 24, Gauss's, all three would agree on what all three miss, as of a plate seen edge-on through the sharp plane.
-TURNS = {2: [[45], [225]], 8: [[30, 210], [120, 300]] * 2}
+# Where at each place across the pupil the others lie around the middle [degrees]. Levels of the same heights agree on
+# what they all miss, as of a plate seen edge-on through the sharp plane.
+TURNS = {2: [[45], [225]], 8: [[30, 210], [120, 300]] * 2, 24: [[0, 90, 180, 270]] * 6}
 TREND = 3  # degree across the pupil that says nothing yet of a kink
 SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
 MOST_JUMPS = 3  # that split a transect: one body before another has three outlines
@@ -217,18 +217,20 @@ def transects(count: int) -> Transects:
 
 
 def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (n, 3) and weights (n,) of Gauss: `across` of them across the pupil, √(n/across) on both other axes.
+    """Places (n, 3) and weights (n,): Gauss's `across` the pupil, at each of them n/across on both other axes.
 
-    8 are four pairs of opposite places, exact to degree 2, and 2 a single one, exact to degree 1.
+    These are Gauss's, too, or few on a circle: corners of a square, exact to degree 3 however it is turned; opposite
+    ones, exact to degree 2 over all places; one, exact to degree 1.
     """
     y, w = gauss(across)
     each = count // across
-    if each <= 2:
-        others = 0.5 + _polar(math.sqrt(1 / 6), np.radians(TURNS[count]))
-        return np.insert(others.reshape(-1, 2), 1, np.repeat(y, each), axis=1), np.repeat(w / each, each)
-    x, v = gauss(math.isqrt(each))
-    place = np.stack(np.meshgrid(x, y, x, indexing="ij"), axis=-1).reshape(-1, 3)
-    return place, np.multiply.outer(np.outer(v, w), v).ravel()
+    if count in TURNS:
+        others, share = 0.5 + _polar(math.sqrt(1 / 6), np.radians(TURNS[count])), np.full(each, 1 / each)
+    else:
+        x, v = gauss(math.isqrt(each))
+        square = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+        others, share = np.broadcast_to(square, (across, each, 2)), np.outer(v, v).ravel()
+    return np.insert(others.reshape(-1, 2), 1, np.repeat(y, each), axis=1), np.outer(w, share).ravel()
 
 
 def _net(count: int) -> NDArray[np.float64]:
