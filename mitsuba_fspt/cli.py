@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from typer.exceptions import TyperException
 from .arguments import Parameters, SceneFile, definitions, require_writable
 from .backend import quiet_mitsuba
 from .errors import FsptError
+from .interrupt import ctrl_c_noted
 from .sweep_cli import Interrupted
 from .terminal import progress_bar
 
@@ -55,7 +57,7 @@ def render(
     output = output or Path(scene.stem + ".exr")
     require_writable(output, ".exr")
     if png:
-        from .picture import require_matplotlib
+        from .picture import png_file, require_matplotlib
 
         require_matplotlib()
     with progress_bar() as progress:
@@ -73,14 +75,13 @@ def render(
             seed=seed,
             progress=progress,
         )
-    image.write(output)
+    picture = output.with_suffix(".png")
+    with png_file(image, picture) if png else nullcontext():  # both files or none
+        image.write(output)
     power, peak = image.power.sum(), image.power.max()
     typer.echo(f"{output}: total {power:.6g} W, brightest pixel {peak:.6g} W, {image.metadata['wall_time']:.3g} s")
     if png:
-        from .picture import write_png
-
-        write_png(image, output.with_suffix(".png"))
-        typer.echo(f"{output.with_suffix('.png')}: the same to look at")
+        typer.echo(f"{picture}: the same to look at")
 
 
 @app.command()
@@ -221,13 +222,19 @@ _add_converge()
 
 def main() -> None:
     """Entry point: run the command line and exit with 0, 2 for bad input or 130 for Ctrl-C."""
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    if code == INTERRUPTED:  # at once: the renderer, stopped while it recorded, may not survive being taken down
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def run(arguments: list[str]) -> int:
     """Exit code of `fspt` with these arguments; errors are one line on stderr and leave nothing behind."""
     try:
-        code = app(args=arguments, prog_name="fspt", standalone_mode=False)
+        with ctrl_c_noted():
+            code = app(args=arguments, prog_name="fspt", standalone_mode=False)
         if code == INTERRUPTED:  # typer's own answer to Ctrl-C
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0

@@ -52,8 +52,8 @@ def converge(
         quiet_mitsuba()
         loaded = load(scene, **definitions(define))
         found = converge(loaded, rounds=rounds, budget=budget, reference=reference, kernels=kernels, progress=progress)
+    write_png(found, figure)  # it takes a second, in which Ctrl-C would leave the table alone
     write_csv(found, figure.with_suffix(".csv"))
-    write_png(found, figure)
     if as_json:
         typer.echo(json.dumps(found.to_dict(), allow_nan=False))
         return

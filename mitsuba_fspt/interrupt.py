@@ -1,4 +1,6 @@
-"""Ctrl-C while the renderer calls back: what is raised in a plugin's method can be lost on its way through C++."""
+"""Ctrl-C while the renderer calls back: what is raised in a plugin's method or a recorded loop can be lost or turned
+into another exception on its way through C++.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +10,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from .errors import FsptError
+
 
 @contextmanager
 def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     """A function that raises KeyboardInterrupt if Ctrl-C was pressed before; the usual exception comes, too.
 
-    Elsewhere than in the main thread, which alone hears of signals, it does nothing.
+    What else but our own errors comes after Ctrl-C becomes KeyboardInterrupt. Elsewhere than in the main thread, which
+    alone hears of signals, nothing is done.
     """
     pressed = False
 
@@ -34,5 +39,11 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     signal.signal(signal.SIGINT, note)
     try:
         yield check
+    except FsptError:
+        raise
+    except Exception as error:
+        if pressed:
+            raise KeyboardInterrupt from error
+        raise
     finally:
         signal.signal(signal.SIGINT, before)

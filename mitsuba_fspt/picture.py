@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,13 +36,19 @@ def write_png(image: Image, path: str | os.PathLike[str]) -> None:
     ImageError : the suffix is not .png or the file cannot be written.
     BackendError : matplotlib is not installed.
     """
+    with png_file(image, path):
+        pass
+
+
+def png_file(image: Image, path: str | os.PathLike[str]) -> AbstractContextManager[None]:
+    """The file of `write_png`, drawn before a block and in its place when the block ends well. Raises as that."""
     path = require_png(path)
     figure = empty_figure(width=6.0, height=0.7 + 4.4 * _aspect(image))
     axes = figure.add_subplot()
     scale, unit = scale_and_unit(image.power)
     draw_picture(axes, image.power / scale, image, f"power [{unit}]", (0.0, float(image.power.max() / scale)))
     axes.set_title(caption(image))
-    save_figure(figure, path)
+    return figure_file(figure, path)
 
 
 def write_comparison_png(calculated: Image, standard: Image, path: str | os.PathLike[str]) -> None:
@@ -168,6 +176,14 @@ def empty_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+@contextmanager
+def figure_file(figure: Figure, path: Path) -> Iterator[None]:
+    """The PNG file of a figure, drawn before a block and in its place when the block ends well."""
     with atomic_path(path, ImageError) as temporary:
         figure.savefig(temporary, dpi=150)
+        yield
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    with figure_file(figure, path):
+        pass

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from . import backend
 from .errors import SceneError
+from .interrupt import ctrl_c_noted
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -39,14 +40,15 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     mi.set_file_resolver(mi.FileResolver(resolver))
     mi.file_resolver().prepend(str(path.resolve().parent))
     try:
-        state = mi.parser.parse_file(config, str(path), **texts)
-        if state.root.props.plugin_name() != "scene":
-            raise SceneError(f"{path}: the root is <{state.root.props.plugin_name()}>, a scene file has <scene>.")
-        state.root.props["embree_use_robust_intersections"] = True
-        state.root.props.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in texts.items())]))
-        _name_children(state)
-        mi.parser.transform_all(config, state)
-        scene = mi.parser.instantiate(config, state)
+        with ctrl_c_noted():
+            state = mi.parser.parse_file(config, str(path), **texts)
+            if state.root.props.plugin_name() != "scene":
+                raise SceneError(f"{path}: the root is <{state.root.props.plugin_name()}>, a scene file has <scene>.")
+            state.root.props["embree_use_robust_intersections"] = True
+            state.root.props.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in texts.items())]))
+            _name_children(state)
+            mi.parser.transform_all(config, state)
+            scene = mi.parser.instantiate(config, state)
     except (RuntimeError, ValueError) as error:
         raise error if isinstance(error, SceneError) else SceneError(_one_line(str(error))) from error
     finally:

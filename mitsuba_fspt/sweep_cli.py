@@ -10,6 +10,7 @@ import typer
 from .arguments import SceneFile
 from .backend import quiet_mitsuba
 from .errors import BackendError, FsptError, SceneError
+from .interrupt import ctrl_c_noted
 from .terminal import progress_bar
 
 
@@ -45,27 +46,28 @@ def sweep(
     folder = output or Path(f"{scene.stem}_sweep")
     values = _values(define)
     try:
-        with progress_bar() as progress:
-            quiet_mitsuba()
-            rows = sweep(
-                scene,
-                values,
-                folder,
-                method=method,
-                rtol=rtol,
-                spp=spp,
-                seed=seed,
-                jobs=jobs,
-                scheduler=scheduler,
-                progress=progress,
-            )
+        with ctrl_c_noted():
+            with progress_bar() as progress:
+                quiet_mitsuba()
+                rows = sweep(
+                    scene,
+                    values,
+                    folder,
+                    method=method,
+                    rtol=rtol,
+                    spp=spp,
+                    seed=seed,
+                    jobs=jobs,
+                    scheduler=scheduler,
+                    progress=progress,
+                )
+            total = sum(row.wall_time for row in rows)
+            typer.echo(f"{folder / INDEX}: {len(rows)} points, {total:.3g} s of rendering")
+            _write_sheet(rows, folder / "contact_sheet.png")
     except KeyboardInterrupt as cause:
         raise Interrupted(
             f"interrupted; finished images stay in {folder}, the same command goes on from there."
         ) from cause
-    total = sum(row.wall_time for row in rows)
-    typer.echo(f"{folder / INDEX}: {len(rows)} points, {total:.3g} s of rendering")
-    _write_sheet(rows, folder / "contact_sheet.png")
 
 
 def _write_sheet(rows: list, path: Path) -> None:

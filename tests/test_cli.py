@@ -238,6 +238,20 @@ def test_a_closed_pipe_is_no_error():
     assert done.stderr == ""
 
 
+def test_ctrl_c_while_the_picture_is_drawn_leaves_no_image(run, tmp_path, monkeypatch):
+    """Seen to fail with the image written first."""
+    from matplotlib.figure import Figure
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Figure, "savefig", interrupted)
+    write_scene(tmp_path / "s.xml")
+    code, out, err = run("render", tmp_path / "s.xml", "-o", tmp_path / "a.exr", "--png")
+    assert (code, out, err) == (130, "", "fspt: interrupted; nothing was written.\n")
+    assert os.listdir(tmp_path) == ["s.xml"]
+
+
 def test_ctrl_c_leaves_one_line_and_no_file(tmp_path):
     """On a terminal, which shows progress: the signal comes once the sampling has begun."""
     write_scene(tmp_path / "s.xml")

@@ -8,6 +8,7 @@ import threading
 
 import pytest
 
+from mitsuba_fspt.errors import SceneError
 from mitsuba_fspt.interrupt import ctrl_c_noted
 
 
@@ -23,6 +24,33 @@ def test_an_interrupt_that_was_swallowed_comes_again():
             press()
         with pytest.raises(KeyboardInterrupt):
             check()
+
+
+def test_an_interrupt_that_became_another_exception_is_one_again(mono):
+    """As in a loop that Dr.Jit records. Seen to fail (RuntimeError) with the exception let through."""
+    import drjit as dr
+
+    def body(k):
+        press()
+        return (k + 1,)
+
+    with pytest.raises(KeyboardInterrupt), ctrl_c_noted():
+        dr.while_loop((mono.UInt32(0),), lambda k: k < 3, body)
+
+
+def test_what_was_wrong_without_ctrl_c_stays_what_it_was():
+    with pytest.raises(RuntimeError, match="of its own"), ctrl_c_noted():
+        raise RuntimeError("of its own")
+
+
+def test_our_own_errors_say_what_is_wrong_after_ctrl_c_too():
+    def say():
+        with pytest.raises(KeyboardInterrupt):
+            press()
+        raise SceneError("wrong")
+
+    with pytest.raises(SceneError, match="wrong"), ctrl_c_noted():
+        say()
 
 
 def test_the_handler_before_comes_back():
