@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from . import libllvm
 from .errors import BackendError
+from .interrupt import ctrl_c_held
 
 if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec
@@ -113,6 +114,7 @@ def choose_variant(kind: str = "mono") -> str:
     raise BackendError(f"no backend to compute on: {no_cuda}; {no_llvm}")
 
 
+@ctrl_c_held()
 def ensure_variant() -> str:
     """The active variant; where there is none, `choose_variant()` is set first.
 

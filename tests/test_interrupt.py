@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from mitsuba_fspt.errors import SceneError
-from mitsuba_fspt.interrupt import ctrl_c_noted
+from mitsuba_fspt.interrupt import ctrl_c_held, ctrl_c_noted
 
 
 def press():
@@ -51,6 +51,21 @@ def test_our_own_errors_say_what_is_wrong_after_ctrl_c_too():
 
     with pytest.raises(SceneError, match="wrong"), ctrl_c_noted():
         say()
+
+
+def test_ctrl_c_waits_for_what_must_not_be_interrupted():
+    """Seen to fail with the signal let through."""
+    steps = []
+
+    def work():
+        with ctrl_c_held():
+            press()
+            steps.append("done")
+        steps.append("never")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert steps == ["done"]
 
 
 def test_the_handler_before_comes_back():
