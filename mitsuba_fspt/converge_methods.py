@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import SceneError
+
 if TYPE_CHECKING:
     import mitsuba as mi
 
@@ -185,28 +187,29 @@ def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float
 def raw_rate(scene: mi.Scene, lens: mi.Sensor, least: int = 1 << 20) -> Callable[[], int]:
     """A run of nothing but Embree or OptiX: rays in memory to hits in memory; it returns their number.
 
-    Lines of sight like the integral's: four nodes over every pixel of the crop window, turned about the pupil's middle
-    until there are `least` rays.
+    Lines of sight like the integral's: four nodes on every pixel that can see what glows, turned about the pupil's
+    middle until there are `least` rays. Rays beside it, which cost far less, are none of them.
     """
     import drjit as dr
     import mitsuba as mi
 
     from . import rules
+    from .plugins.window import visible_window
 
-    film = lens.film()
-    width, height = (int(n) for n in film.crop_size())
+    window = visible_window(scene, lens)
+    pixels = math.prod(window.shape)
+    if not pixels:
+        raise SceneError("converge: nothing that glows is on the film. Point the lens at it.")
     rule = rules.four(True)
-    turns = max(1, math.ceil(least / (len(rule) * width * height)))
+    turns = max(1, math.ceil(least / (len(rule) * pixels)))
     angle = np.arange(turns)[:, None] * (math.pi * (3 - math.sqrt(5)))
     x, y = rule.pupil.T
     pupil = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
     columns = np.concatenate([pupil.reshape(2, -1), np.tile(rule.pixel.T, turns)])
-    node = dr.arange(mi.UInt32, width * height * columns.shape[1])
+    node = dr.arange(mi.UInt32, pixels * columns.shape[1])
     pixel, node = node // columns.shape[1], node % columns.shape[1]
     ax, ay, dx, dy = (dr.gather(mi.Float, mi.Float(column), node) for column in columns)
-    left, top = (float(int(n)) + 0.5 for n in film.crop_offset())
-    position = mi.Point2f(left + mi.Float(pixel % width) + dx, top + mi.Float(pixel // width) + dy)
-    ray, _, _ = lens.line_of_sight(position, mi.Point2f(ax, ay))
+    ray, _, _ = lens.line_of_sight(window.centres(pixel) + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
     dr.eval(ray)
 
     def run() -> int:

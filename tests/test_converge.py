@@ -204,9 +204,18 @@ def test_lens_with_another_sampler_is_the_same_lens():
 
 @pytest.mark.usefixtures("mono")
 def test_raw_rays_are_as_many_as_asked_for():
-    scene = small_scenes.scene(small_scenes.sphere(200.0, 10.0))
-    lines = converge_methods.raw_rate(scene, scene.sensors()[0], least=30000)()
-    assert lines == 4 * WIDTH * HEIGHT * math.ceil(30000 / (4 * WIDTH * HEIGHT))
+    """On the pixels that can see what glows alone: rays beside it cost next to nothing."""
+    scene = small_scenes.scene(small_scenes.sphere(200.0, 4.0))
+    once, often = (converge_methods.raw_rate(scene, scene.sensors()[0], least)() for least in (1, 30000))
+    assert 0 < once < 2 * WIDTH * HEIGHT
+    assert often == once * math.ceil(30000 / once)
+
+
+@pytest.mark.usefixtures("mono")
+def test_where_nothing_glows_on_the_film_there_is_nothing_to_trace():
+    scene = small_scenes.scene(small_scenes.sphere(200.0, 4.0, 500.0))
+    with pytest.raises(SceneError, match="nothing that glows is on the film"):
+        converge_methods.raw_rate(scene, scene.sensors()[0])
 
 
 # --- what it is counted from ---
