@@ -17,7 +17,7 @@ def render_text(found: Convergence) -> str:
     h, w = found.shape
     lines = [
         f"{found.scene}: {w} x {h} pixels, {found.full} of them see the phantom with their whole cone ('full')",
-        f"{found.machine}; tracing alone makes {found.raw_rate / 1e6:.3g} million rays a second that can meet it ('raw')",
+        f"{found.machine}; tracing alone: {found.raw_rate / 1e6:.3g} million rays a second that can meet it ('raw')",
         f"reference: {found.reference}, stated error {found.stated:.1e} RMS, {found.stated_largest:.1e} at the most",
     ]
     lines += [f"checked by: {found.check}"] if found.check else []
