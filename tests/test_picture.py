@@ -31,8 +31,9 @@ def spot(height: int = 8, width: int = 12, power: float = 2.5e-10, **metadata) -
 
 
 @pytest.fixture
-def drawn(monkeypatch):
-    """The figures that would have been saved."""
+def drawn(monkeypatch, tmp_path):
+    """The figures that would have been saved, here."""
+    monkeypatch.chdir(tmp_path)
     figures = []
     monkeypatch.setattr(picture, "figure_file", lambda figure, path: nullcontext(figures.append(figure)))
     return figures
