@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from .atomic import require_place
 from .errors import ImageError, SceneError
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")]
@@ -35,3 +36,4 @@ def require_writable(path: Path, suffix: str) -> None:
         raise ImageError(f"{path}: the folder '{folder}' does not exist. Make it, or write elsewhere with -o.")
     if not os.access(folder, os.W_OK):
         raise ImageError(f"{path}: the folder '{folder}' is not writable. Write elsewhere with -o.")
+    require_place(path, ImageError)

@@ -27,12 +27,7 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
     error : `path` is a folder or write-protected, or its folder does not exist, is full or write-protected.
     """
     path = Path(path)
-    if os.path.isdir(path):
-        raise error(f"output file '{path}' is a folder. Give the name of a file in it.")
-    if not os.path.isdir(path.parent):
-        raise error(f"output file '{path}': the folder '{path.parent}' does not exist. Create it first.")
-    if os.path.exists(path) and not os.access(path, os.W_OK):
-        raise error(f"output file '{path}' is write-protected. Give another name or remove it first.")
+    require_place(path, error)
     # A long stem is cut, so that the temporary name is not refused where the final one is allowed.
     temporary = path.with_name(f".{path.stem[:40]}-{secrets.token_hex(4)}{path.suffix}")
     try:
@@ -45,3 +40,13 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def require_place(path: Path, error: type[FsptError] = FsptError) -> None:
+    """Raise `error` where no file can stand at `path`: a folder does, or something write-protected, or no folder is."""
+    if os.path.isdir(path):
+        raise error(f"output file '{path}' is a folder. Give the name of a file in it.")
+    if not os.path.isdir(path.parent):
+        raise error(f"output file '{path}': the folder '{path.parent}' does not exist. Create it first.")
+    if os.path.exists(path) and not os.access(path, os.W_OK):
+        raise error(f"output file '{path}' is write-protected. Give another name or remove it first.")

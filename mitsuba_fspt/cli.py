@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -55,10 +55,12 @@ def render(
 ) -> None:
     """Render a scene to an EXR with the power [W], its error and the coverage of every pixel."""
     output = output or Path(scene.stem + ".exr")
+    picture = output.with_suffix(".png")
     require_writable(output, ".exr")
     if png:
         from .picture import png_file, require_matplotlib
 
+        require_writable(picture, ".png")
         require_matplotlib()
     with progress_bar() as progress:
         from .rendering import render
@@ -75,7 +77,6 @@ def render(
             seed=seed,
             progress=progress,
         )
-    picture = output.with_suffix(".png")
     with png_file(image, picture) if png else nullcontext():  # both files or none
         image.write(output)
     power, peak = image.power.sum(), image.power.max()
@@ -257,5 +258,6 @@ def run(arguments: list[str]) -> int:
 
 
 def _fail(message: str, code: int = 2) -> int:
-    typer.echo(f"fspt: {' '.join(message.split())}", err=True)
+    with suppress(OSError):  # nobody listens
+        typer.echo(f"fspt: {' '.join(message.split())}", err=True)
     return code

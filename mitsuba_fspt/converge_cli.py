@@ -38,12 +38,13 @@ def converge(
     Writes SCENE_converge.csv and SCENE_converge.png, prints the fitted orders
     and the times to an error. Takes about rounds x 20 x budget and two minutes.
     """
-    from .converge_sheet import write_csv, write_png
+    from .converge_sheet import png_file, write_csv
     from .converge_table import render_text
     from .picture import require_matplotlib
 
-    figure = output / f"{scene.stem}_converge.png"
+    figure, sheet = (output / f"{scene.stem}_converge{suffix}" for suffix in (".png", ".csv"))
     require_writable(figure, ".png")
+    require_writable(sheet, ".csv")
     require_matplotlib()
     with progress_bar() as progress, _empty_kernel_cache() as kernels:
         from .converging import converge
@@ -52,13 +53,13 @@ def converge(
         quiet_mitsuba()
         loaded = load(scene, **definitions(define))
         found = converge(loaded, rounds=rounds, budget=budget, reference=reference, kernels=kernels, progress=progress)
-    write_png(found, figure)  # it takes a second, in which Ctrl-C would leave the table alone
-    write_csv(found, figure.with_suffix(".csv"))
+    with png_file(found, figure):  # both files or none
+        write_csv(found, sheet)
     if as_json:
         typer.echo(json.dumps(found.to_dict(), allow_nan=False))
         return
     typer.echo(render_text(found))
-    typer.echo(f"\n{figure.with_suffix('.csv')}: every setting; {figure}: the same to look at")
+    typer.echo(f"\n{sheet}: every setting; {figure}: the same to look at")
 
 
 @contextmanager

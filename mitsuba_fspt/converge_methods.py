@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import SceneError
-
 if TYPE_CHECKING:
     import mitsuba as mi
 
@@ -188,7 +186,8 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, least: int = 1 << 20) -> Callable
     """A run of nothing but Embree or OptiX: rays in memory to hits in memory; it returns their number.
 
     Lines of sight like the integral's: four nodes on every pixel that can see what glows, turned about the pupil's
-    middle until there are `least` rays. Rays beside it, which cost far less, are none of them.
+    middle until there are `least` rays. Rays beside it, which cost far less, are none of them: a method whose rays are
+    many such may get more than this out of Embree.
     """
     import drjit as dr
     import mitsuba as mi
@@ -198,8 +197,6 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, least: int = 1 << 20) -> Callable
 
     window = visible_window(scene, lens)
     pixels = math.prod(window.shape)
-    if not pixels:
-        raise SceneError("converge: nothing that glows is on the film. Point the lens at it.")
     rule = rules.four(True)
     turns = max(1, math.ceil(least / (len(rule) * pixels)))
     angle = np.arange(turns)[:, None] * (math.pi * (3 - math.sqrt(5)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 from . import picture
@@ -73,9 +74,10 @@ def _line(row: Row, raw_rate: float) -> dict[str, str | int]:
     return dict(zip(COLUMNS, values, strict=True))
 
 
-def write_png(found: Convergence, path: str | os.PathLike[str]) -> None:
-    """Write error over warm time: RMS of all pixels, RMS of those whose whole cone sees the phantom, largest.
+def png_file(found: Convergence, path: str | os.PathLike[str]) -> AbstractContextManager[None]:
+    """A picture of error over warm time, drawn before a block and in its place when the block ends well.
 
+    RMS of all pixels, RMS of those whose whole cone sees the phantom, largest.
     Dotted: the error the reference states of itself; what lies below it is drawn hollow, on the lower edge at the
     least.
 
@@ -104,7 +106,7 @@ def write_png(found: Convergence, path: str | os.PathLike[str]) -> None:
     handles, labels = every[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize="small")
     figure.suptitle(found.scene, fontsize="large")
-    picture.save_figure(figure, file)
+    return picture.figure_file(figure, file)
 
 
 def _draw(axes: Axes, found: Convergence, errors: list[float], stated: float, bottom: float) -> None:

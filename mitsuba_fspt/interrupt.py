@@ -18,24 +18,23 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     """A function that raises KeyboardInterrupt if Ctrl-C was pressed before; the usual exception comes, too.
 
     What else but our own errors comes after Ctrl-C becomes KeyboardInterrupt. Elsewhere than in the main thread, which
-    alone hears of signals, nothing is done.
+    alone hears of signals, and where Ctrl-C raises nothing, nothing is done.
     """
     pressed = False
 
     def note(number: int, frame: FrameType | None) -> None:
         nonlocal pressed
         pressed = True
-        if callable(before):
-            before(number, frame)
+        before(number, frame)
 
     def check() -> None:
         if pressed:
             raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield check
         return
-    before = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGINT, note)
     try:
         yield check

@@ -79,7 +79,7 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
         since = draft.rays
         means = apply_transects(draft, cut, edges, rules.transects(count), rules.along_transect(level, RTOL))
         note(f"{count} transects", means.value, since)
-        if level == 0:  # the depth of the edges that were met says how blurred they are
+        if level == 0:  # the edges that were met say how blurred they are
             edges.learn(draft, means, cut)
     finest = values.pop(f"{rules.TRANSECT_LEVELS[-1]} transects")
     return [(rule, rays[rule], shares(np.abs(value - finest))) for rule, value in values.items()]

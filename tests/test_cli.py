@@ -281,3 +281,14 @@ def test_ctrl_c_leaves_one_line_and_no_file(tmp_path):
     assert lines == ["fspt: interrupted; nothing was written."]
     assert out == b""
     assert os.listdir(tmp_path) == ["s.xml"]
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.png"])
+def test_a_folder_in_the_place_of_a_file_is_refused_before_the_work(run, tmp_path, monkeypatch, name):
+    """Seen to fail with the picture's place looked at last: all was rendered, and nothing written."""
+    write_scene(tmp_path / "s.xml")
+    (tmp_path / name).mkdir()
+    monkeypatch.setattr("mitsuba_fspt.rendering.render", None)
+    code, out, err = run("render", tmp_path / "s.xml", "-o", tmp_path / "a.exr", "--png")
+    assert (code, out) == (2, "")
+    assert err == f"fspt: output file '{tmp_path / name}' is a folder. Give the name of a file in it.\n"

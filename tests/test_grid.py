@@ -79,15 +79,18 @@ def test_mean_where_something_is_marked(shape):
     np.testing.assert_allclose(on_grid("mean_where", values, values > 0.5, 1), expected, atol=1e-12)
 
 
-def test_grow_takes_every_pixel_as_far_as_it_reaches():
+@pytest.mark.parametrize("shape", [(40, 50), (1, 60), (7, 1), (1, 1)])
+@pytest.mark.parametrize("most", [0, 1, 15])
+def test_grow_takes_every_pixel_as_far_as_it_reaches(shape, most):
     """Expected: all within the reach of a marked pixel, at least 1, and none beyond."""
-    reach = np.random.default_rng(1).integers(0, 16, (40, 50))
-    mask = np.random.default_rng(2).random((40, 50)) < 0.01
+    reach = np.random.default_rng(1).integers(0, most + 1, shape)
+    mask = np.random.default_rng(2).random(shape) < 0.01
+    mask[0, 0] = True
     grid = grid_of(mask.shape)
     import mitsuba as mi
 
-    grown = grid.array(grid.grow(grid.lanes(mask), mi.Int(reach.ravel()), int(reach.max())))
-    y, x = np.mgrid[:40, :50]
+    grown = grid.array(grid.grow(grid.lanes(mask), mi.Int(reach.ravel()), most))
+    y, x = np.mgrid[: shape[0], : shape[1]]
     distance = [np.maximum(abs(x - j), abs(y - i)) for i, j in np.argwhere(mask)]
     within = [d <= max(1, reach[i, j]) for d, (i, j) in zip(distance, np.argwhere(mask), strict=True)]
     np.testing.assert_array_equal(grown, np.any(within, axis=0))

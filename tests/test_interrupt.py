@@ -68,6 +68,23 @@ def test_ctrl_c_waits_for_what_must_not_be_interrupted():
     assert steps == ["done"]
 
 
+def test_where_ctrl_c_is_ignored_it_stays_ignored():
+    """As in a job that a shell runs in the background. Seen to fail: the RuntimeError became KeyboardInterrupt."""
+
+    def work():
+        with ctrl_c_held(), ctrl_c_noted() as check:
+            press()
+            check()
+            raise RuntimeError("of its own")
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(RuntimeError, match="of its own"):
+            work()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_the_handler_before_comes_back():
     before = signal.getsignal(signal.SIGINT)
     with ctrl_c_noted():
@@ -79,7 +96,7 @@ def test_other_threads_hear_of_no_signal():
     seen = []
 
     def run():
-        with ctrl_c_noted() as check:
+        with ctrl_c_held(), ctrl_c_noted() as check:
             check()
             seen.append(True)
 

@@ -89,7 +89,7 @@ class Grid:
         """True within `reach` ≤ `most` pixels (square) of a marked pixel, each with its own; at least 1."""
         left = dr.select(mask, dr.maximum(reach, 1), -1)
         covered, step = 0, 1
-        while covered < most:
+        while covered < max(most, 1):
             left = self._reached(left, step)
             covered += 2 * step
             step *= 2

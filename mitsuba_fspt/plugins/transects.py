@@ -32,6 +32,7 @@ BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the val
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
+FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
 SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
 
 
@@ -239,7 +240,7 @@ def _transect_sums(
     found = integrate_transect(draft.view, curve, phase, along, outline, least)
     value, hits, jumps, depth, looks = (mi.Float64(column) for column in found)
     share = mi.Float64(weight) * value
-    blur = dr.select(jumps > 0, draft.lens.blur_radius(depth), 0)
+    blur = dr.select(jumps > 0, draft.lens.blur_radius(dr.minimum(depth, FAR)), 0)
     columns = [share, mi.Float64(weight) * hits, share * value, dr.minimum(jumps, 1), looks]
     dr.eval(columns, blur)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
     sums = [dr.block_sum(column, len(rule)) for column in columns]
