@@ -103,8 +103,8 @@ def compare(
         neither is given, those through the standard's brightest pixel
 
     The z-test counts `error` as a standard deviation and the two as independent; a deterministic method's is
-    a bound and makes the test milder. A Monte Carlo pixel that rare samples could have lit, but none did,
-    has error 0 and makes it too strict: give such images samples enough.
+    a bound and makes the test milder. A Monte Carlo pixel that few samples have lit knows its error badly and
+    makes it too strict: give such images samples enough.
 
     Raises
     ------

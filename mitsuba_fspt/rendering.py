@@ -11,6 +11,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import backend
 from .errors import SceneError
@@ -27,6 +28,7 @@ METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 LANES = 1 << 23  # Monte Carlo samples in flight
 Progress = Callable[[str, float], None]
+Picture = NDArray[np.float64]
 
 
 def render(
@@ -52,7 +54,8 @@ def render(
     sensor : number of the sensor, an `fspt_lens`
     rtol, domain, pixel, max_nodes : accuracy of the integral, see `Quadrature`; None takes the scene's own
     shortcuts : False to leave out nothing of the integral, see `SHORTCUTS`; True takes the scene's own
-    spp : Monte Carlo samples a pixel, >= 2 (default 256); their error is the standard error of independent passes
+    spp : Monte Carlo samples a pixel, >= 2 (default 256); their error is the standard error of independent passes,
+        and where no sample met light, but one could have, about what a single one brings
     seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
     progress : called with what is being done and the share done
 
@@ -138,7 +141,6 @@ def _sample(
         total, squares = total + power, squares + power * power
         samples += lens.sampler().sample_count()
     mean = total / passes
-    variance = np.maximum(squares / passes - mean * mean, 0) * passes / (passes - 1)
     name = {"PathIntegrator": "path", "ParticleTracerIntegrator": "ptracer", "VolumetricPathIntegrator": "volpath"}
     how = {
         "method": name.get(integrator.class_name(), integrator.class_name()),
@@ -147,7 +149,32 @@ def _sample(
         "passes": passes,
         "seed": seed,
     }
-    return mean, np.sqrt(variance / passes), coverage(scene, lens), how
+    error = _standard_error(mean, squares / passes, passes, samples)
+    return mean, np.where((mean > 0) | _can_see(scene, lens), error, 0), coverage(scene, lens), how
+
+
+def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
+    """True on pixels with lines of sight to where something glows (Eq. 4) that no image-plane stop holds back."""
+    from .plugins.window import visible_window
+
+    window = visible_window(scene, lens)
+    inside, cut = window.stopped(lens)
+    return window.expand((inside | cut).astype(np.float64)) > 0
+
+
+def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -> Picture:
+    """Of the mean of passes, from that of their squares; where no sample met light, what a single one would bring.
+
+    The scatter of none says nothing, but the neighbours know: what events bring that are counted, and few, is variance
+    over mean, and where all samples meet light a share of it.
+    """
+    from .plugins.grid import Grid
+
+    variance = np.maximum(square - mean * mean, 0) / (passes - 1)
+    met = mean > 0
+    event = np.maximum(np.divide(variance, mean, out=np.zeros_like(mean), where=met), mean / samples)
+    grid = Grid(mean.shape)
+    return np.where(met, np.sqrt(variance), grid.array(grid.spread_max(grid.lanes(event))))
 
 
 def _is_scene(scene: object) -> bool:
