@@ -31,9 +31,6 @@ def require_writable(path: Path, suffix: str) -> None:
     """Refuse an output that cannot be written before the work, not after it."""
     if path.suffix != suffix:
         raise ImageError(f"{path}: images are written as {suffix}. Give a name that ends in {suffix}.")
-    folder = path.parent
-    if not folder.is_dir():
-        raise ImageError(f"{path}: the folder '{folder}' does not exist. Make it, or write elsewhere with -o.")
-    if not os.access(folder, os.W_OK):
-        raise ImageError(f"{path}: the folder '{folder}' is not writable. Write elsewhere with -o.")
     require_place(path, ImageError)
+    if not os.access(path.parent, os.W_OK):
+        raise ImageError(f"{path}: the folder '{path.parent}' is not writable. Write elsewhere with -o.")

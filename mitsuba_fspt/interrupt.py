@@ -17,8 +17,8 @@ from .errors import FsptError
 def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     """A function that raises KeyboardInterrupt if Ctrl-C was pressed before; the usual exception comes, too.
 
-    What else but our own errors comes after Ctrl-C becomes KeyboardInterrupt. Elsewhere than in the main thread, which
-    alone hears of signals, and where Ctrl-C raises nothing, nothing is done.
+    What else but our own errors comes after Ctrl-C becomes KeyboardInterrupt. Nothing is done where there is no
+    `_handler`.
     """
     pressed = False
 
@@ -31,8 +31,8 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
         if pressed:
             raise KeyboardInterrupt
 
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
+    before = _handler()
+    if before is None:
         yield check
         return
     signal.signal(signal.SIGINT, note)
@@ -52,10 +52,10 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
 def ctrl_c_held() -> Iterator[None]:
     """Ctrl-C waits for the end of the block: what is written in C++ and not made to be interrupted may end the process.
 
-    Elsewhere than in the main thread, and where Ctrl-C raises nothing, nothing is done.
+    Nothing is done where there is no `_handler`.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
+    before = _handler()
+    if before is None:
         yield
         return
     pressed: list[FrameType | None] = []
@@ -66,3 +66,10 @@ def ctrl_c_held() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
         if pressed:
             before(signal.SIGINT, pressed[0])
+
+
+def _handler() -> Callable[[int, FrameType | None], object] | None:
+    """What Ctrl-C calls; None where it is ignored, and in other threads than the main one, which alone hears of it."""
+    handler = signal.getsignal(signal.SIGINT)
+    in_main = threading.current_thread() is threading.main_thread()
+    return handler if in_main and callable(handler) else None

@@ -10,7 +10,6 @@ import typer
 from .arguments import SceneFile
 from .backend import quiet_mitsuba
 from .errors import BackendError, FsptError, SceneError
-from .interrupt import ctrl_c_noted
 from .terminal import progress_bar
 
 
@@ -46,24 +45,23 @@ def sweep(
     folder = output or Path(f"{scene.stem}_sweep")
     values = _values(define)
     try:
-        with ctrl_c_noted():
-            with progress_bar() as progress:
-                quiet_mitsuba()
-                rows = sweep(
-                    scene,
-                    values,
-                    folder,
-                    method=method,
-                    rtol=rtol,
-                    spp=spp,
-                    seed=seed,
-                    jobs=jobs,
-                    scheduler=scheduler,
-                    progress=progress,
-                )
-            total = sum(row.wall_time for row in rows)
-            typer.echo(f"{folder / INDEX}: {len(rows)} points, {total:.3g} s of rendering")
-            _write_sheet(rows, folder / "contact_sheet.png")
+        with progress_bar() as progress:
+            quiet_mitsuba()
+            rows = sweep(
+                scene,
+                values,
+                folder,
+                method=method,
+                rtol=rtol,
+                spp=spp,
+                seed=seed,
+                jobs=jobs,
+                scheduler=scheduler,
+                progress=progress,
+            )
+        total = sum(row.wall_time for row in rows)
+        typer.echo(f"{folder / INDEX}: {len(rows)} points, {total:.3g} s of rendering")
+        _write_sheet(rows, folder / "contact_sheet.png")
     except KeyboardInterrupt as cause:
         raise Interrupted(
             f"interrupted; finished images stay in {folder}, the same command goes on from there."

@@ -45,7 +45,7 @@ class View:
         pupil, share = self.lens.open_pupil(position, pupil)
         ray, weight, cos_theta = self.lens.line_of_sight(position, pupil, self.start)
         at_one_wavelength(ray)
-        # Embree traces packets of neighbouring lines of sight three times slower than single rays.
+        # Embree traces packets of neighbouring lines of sight more slowly than single rays.
         si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=weight > 0)
         radiance = scalar(si.emitter(self.scene).eval(si))
         body = mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))
