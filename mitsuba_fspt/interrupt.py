@@ -5,6 +5,7 @@ into another exception on its way through C++.
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,8 +18,8 @@ from .errors import FsptError
 def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     """A function that raises KeyboardInterrupt if Ctrl-C was pressed before; the usual exception comes, too.
 
-    What else but our own errors comes after Ctrl-C becomes KeyboardInterrupt. Nothing is done where there is no
-    `_handler`.
+    What else but our own errors comes after Ctrl-C becomes KeyboardInterrupt; what Python could only tell of, as it
+    came in a destructor, is not told. Nothing is done where there is no `_handler`.
     """
     pressed = False
 
@@ -26,6 +27,10 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
         nonlocal pressed
         pressed = True
         before(number, frame)
+
+    def tell(lost: sys.UnraisableHookArgs) -> None:
+        if not pressed:
+            told_before(lost)
 
     def check() -> None:
         if pressed:
@@ -35,7 +40,9 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     if before is None:
         yield check
         return
+    told_before = sys.unraisablehook
     signal.signal(signal.SIGINT, note)
+    sys.unraisablehook = tell
     try:
         yield check
     except FsptError:
@@ -46,6 +53,7 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
         raise
     finally:
         signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = told_before
 
 
 @contextmanager

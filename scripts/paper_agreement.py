@@ -90,7 +90,8 @@ def noise_of(truth: fspt.Image, exact: fspt.Image) -> tuple[float, float]:
     """ME and CF that the standard errors of a Monte Carlo picture would give by themselves, about an exact one."""
     rng = np.random.default_rng(6)
     scale = exact.power.sum() / truth.power.sum()
-    draws = (exact.power + scale * truth.error * rng.standard_normal(exact.shape) for _ in range(20))
+    scatter = np.where(truth.power > 0, truth.error, 0)  # where no photon came the error is a bound, not a scatter
+    draws = (exact.power + scale * scatter * rng.standard_normal(exact.shape) for _ in range(20))
     return _mean_distance(exact, draws)
 
 

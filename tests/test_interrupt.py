@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 
 import pytest
@@ -36,6 +37,22 @@ def test_an_interrupt_that_became_another_exception_is_one_again(mono):
 
     with pytest.raises(KeyboardInterrupt), ctrl_c_noted():
         dr.while_loop((mono.UInt32(0),), lambda k: k < 3, body)
+
+
+def test_an_interrupt_of_a_destructor_is_not_told_but_comes_again(monkeypatch):
+    """Python can but print it, and the command line promises one line. Seen to fail with its hook left alone."""
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+
+    class Guest:
+        def __del__(self):
+            press()
+
+    with ctrl_c_noted() as check:
+        Guest()
+        with pytest.raises(KeyboardInterrupt):
+            check()
+    assert told == []
 
 
 def test_what_was_wrong_without_ctrl_c_stays_what_it_was():
