@@ -38,6 +38,7 @@ SHARP = 0.3  # blur radius [pixels]
 class Draft:
     """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `hits`.
 
+    nodes : of the rule that saw the last edges
     roughness : how far four nodes and twelve differ near by, silhouettes left out
     nearest : depth of what is nearest [mm], inf where nothing is met
     blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
@@ -65,7 +66,7 @@ class Draft:
         if known is not None:
             self.open = grid.lanes(~window.cut(known.where))
             self.known = grid.lanes(window.cut(known.power) / lens.etendue)
-        self.rays = 0
+        self.nodes = self.rays = 0
         self.levels: list[str] = []
         self.findings: list[Finding] = []
 
@@ -106,8 +107,8 @@ class Draft:
         sharp = seen & (dr.minimum(front, back) < SHARP)
         dr.eval(blur, sharp)
         self.most_blur = float(dr.max(blur)[0])
-        self.blur, self.sharp = self.grid.spread_max(blur), self.grid.dilate(sharp, 1 + math.ceil(SHARP))
-        dr.eval(self.blur, self.sharp)
+        self.blur, near = self.grid.spread_all((blur, sharp))
+        self.sharp = self.grid.dilate(near, math.ceil(SHARP))
 
     def reach(self, rule: int | str) -> tuple[mi.Int, int]:
         """How far from where a rule sees an edge it may hide from it, at each pixel and at most [pixels]."""
@@ -118,19 +119,19 @@ class Draft:
         """Shares of lines of sight that hit, and with them the outline."""
         self.hits, self.outline = hits, self.grid.outline(hits)
 
-    def grown(self, rough: Mask, nodes: int) -> Mask:
+    def grown(self, rough: Mask) -> Mask:
         """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `cut_off` knows."""
         source = rough & (self.error > self.tolerance) & ~self.outline
-        return rough | self.grid.grow(source, *self.reach(nodes))
+        return rough | self.grid.grow(source, *self.reach(self.nodes))
 
-    def cut_off(self, nodes: int) -> Image:
-        """What a rule may be wrong by where an edge crosses or hides between its nodes and the pupil's rim.
+    def cut_off(self) -> Image:
+        """What the nodes may be wrong by where an edge crosses or hides between them and the pupil's rim.
 
         A silhouette or the image-plane stop.
         """
-        reach, most = self.reach(nodes)
+        reach, most = self.reach(self.nodes)
         cut, unseen = (
-            dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[nodes])) for share in (CUT, UNSEEN)
+            dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[self.nodes])) for share in (CUT, UNSEEN)
         )
         share = dr.select(self.grid.grow(self.outline, reach - 1, most - 1), unseen, 0)
         share = dr.select(parted(self.hits) | self.stopped, cut, share)

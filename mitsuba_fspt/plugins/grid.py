@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import operator
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
@@ -72,14 +71,18 @@ class Grid:
 
     def spread_max(self, image: Any, radius: int = 1) -> Any:
         """Largest value within `radius` pixels (square) of each."""
-        larger = operator.or_ if dr.is_mask_v(image) else dr.maximum
+        return self.spread_all((image,), radius)[0]
+
+    def spread_all(self, images: tuple, radius: int = 1) -> tuple:
+        """`spread_max` of several images in one."""
         reach, most = 0, min(radius, max(self.shape) - 1)
         while reach < most:
             step = min(2 * reach + 1, most - reach)  # no gap opens
-            image = reduce(larger, self._neighbours(image, step).values(), image)
-            dr.eval(image)  # all need this one kernel, which every larger one around it would compile anew
+            dr.eval(images)  # together: gathers would evaluate each one alone
+            images = tuple(reduce(_larger, self._neighbours(image, step).values(), image) for image in images)
+            dr.eval(images)  # all need this one kernel, which every larger one around it would compile anew
             reach += step
-        return image
+        return images
 
     def dilate(self, mask: Mask, radius: int) -> Mask:
         """True within `radius` pixels (square) of a marked pixel."""
@@ -185,6 +188,10 @@ class Grid:
         outline = (most > ROUNDING) & (least < 1 - ROUNDING)
         dr.eval(outline)
         return outline
+
+
+def _larger(a: Any, b: Any) -> Any:
+    return a | b if dr.is_mask_v(a) else dr.maximum(a, b)
 
 
 def parted(hits: Image) -> Mask:

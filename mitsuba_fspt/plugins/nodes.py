@@ -28,13 +28,14 @@ LEAST_GAIN, ROUGH_GAIN = 0.5, 2.0
 
 
 def first_nodes(draft: Draft) -> Mask:
-    """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle."""
+    """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle on their own."""
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
     value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
     if len(rule) == 1 and not dr.any(hits > 0):  # what glows is thinner than a pixel
         rule = rules.four(draft.area)
         value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
+    draft.nodes = len(rule)
     draft.set_hits(hits)
     draft.set_blur(farthest)
     draft.value = value = dr.select(draft.open, value, draft.known)
@@ -44,6 +45,7 @@ def first_nodes(draft: Draft) -> Mask:
     neighbours = draft.area or len(rule) == 1  # tell how the picture bends
     if neighbours:
         xx, yy = grid.second_differences(value)
+        dr.eval(xx, yy)
         xxxx, yyyy = grid.second_differences(xx)[0], grid.second_differences(yy)[1]
         bend += (dr.abs(xxxx) + dr.abs(yyyy)) / 12
         if len(rule) == 1:
@@ -53,29 +55,30 @@ def first_nodes(draft: Draft) -> Mask:
             more = -grid.mean_where(turn, ~draft.outline, TURN_REACH)
         draft.value = dr.maximum(value + dr.select(draft.hits > 1 - ROUNDING, more, 0), 0)
     bend = grid.spread_max(bend)
-    draft.error = dr.maximum(bend, draft.cut_off(len(rule)))
+    draft.error = dr.maximum(bend, draft.cut_off())
     tolerance = draft.tolerance
     rough = (draft.error > tolerance) | (bend > SETTLED * tolerance)
     dr.eval(draft.error, rough)
     unmet = not dr.any(draft.hits > 0)  # what glows is on the film, or may be
     if (neighbours and min(grid.shape) < 3) or unmet or not draft.quadrature.takes("smooth"):
         rough = grid.full(mi.Bool, True)
-    rough = draft.grown(rough & draft.open, len(rule)) & draft.open
-    smooth = int(dr.count(~rough & (draft.hits > 0))[0])
-    why = f"{smooth} of {len(grid)} pixels see the surface, smooth and no edge of it"
-    draft.findings.append(Finding("smooth", smooth > 0, why))
-    return rough
+    return rough & draft.open
 
 
 def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
-    """Twelve nodes over pupil and pixel on the rough pixels and their surroundings where four mislead.
+    """Twelve nodes over pupil and pixel on the rough pixels and their surroundings, and where four mislead.
 
     Returns the pixels that twelve do not settle either. Four nodes cannot see all that they miss, so a lattice of
     pixels is probed with twelve: what four were off by there counts for the pixels around.
     """
+    rough = draft.grown(rough) & draft.open
+    smooth = int(dr.count(~rough & (draft.hits > 0))[0])
+    why = f"{smooth} of {len(draft.grid)} pixels see the surface, smooth and no edge of it"
+    draft.findings.append(Finding("smooth", smooth > 0, why))
     # What parts four nodes parts twelve, too: transects can begin at once.
     begun = parted(draft.hits) & (draft.error > draft.tolerance) & dr.opaque(mi.Bool, transects_follow)
     probes = draft.grid.lattice() & (draft.hits > 0) & ~rough & draft.open
+    draft.nodes = 12
     difference = _refine(draft, (rough & ~begun) | probes)
     doubt = draft.grid.spread_over_lattice(dr.select(probes, difference, 0))
     draft.error = dr.select(rough, draft.error, dr.maximum(draft.error, doubt))
@@ -85,7 +88,7 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
     rough = rough | misled
     if not dr.any(draft.hits > 0):
         return rough
-    return rough & draft.grown(rough & (draft.error > draft.tolerance), 12)
+    return rough & draft.grown(rough & (draft.error > draft.tolerance))
 
 
 def _one_will_do(draft: Draft) -> bool:
@@ -112,9 +115,10 @@ def _refine(draft: Draft, where: Mask) -> Image:
     draft.nearest = dr.minimum(draft.nearest, nearest)
     left = difference * dr.clip(gain, LEAST_GAIN, ROUGH_GAIN)
     rough = dr.select(parted(hits), 0, dr.maximum(left, difference))
-    draft.roughness = dr.maximum(draft.roughness, draft.grid.spread_max(rough))
-    error = dr.maximum(draft.grid.spread_max(left), draft.error / MOST_GAIN)
-    draft.error = dr.select(where, dr.maximum(error, draft.cut_off(12)), draft.error)
+    rough, left = draft.grid.spread_all((rough, left))
+    draft.roughness = dr.maximum(draft.roughness, rough)
+    error = dr.maximum(left, draft.error / MOST_GAIN)
+    draft.error = dr.select(where, dr.maximum(error, draft.cut_off()), draft.error)
     dr.eval(draft.error, draft.nearest, difference)
     return difference
 

@@ -53,6 +53,7 @@ class _Ladder:
     split : True where a transect met a jump
     smooth : True where node rules may do as well
     left : what the value may be wrong by, of every pixel on its own
+    count, means : of the last round, how many transects and what they found
     """
 
     def __init__(self, draft: Draft, rough: Mask) -> None:
@@ -60,11 +61,14 @@ class _Ladder:
         self.split, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
         self.left = draft.grid.full(mi.Float64, 0)
         self.count = 0
+        self.means: Means | None = None
 
     def climb(self, level: int, rule: rules.Transects, along: rules.AlongTransect) -> None:
         """One round: values, what is left of the error, and whether a neighbour knows better."""
         draft, where = self.draft, self.where
-        means = apply_transects(draft, where, self.edges, rule, along)
+        if self.means:
+            self.edges.learn(draft, self.means, self.split)
+        self.means = means = apply_transects(draft, where, self.edges, rule, along)
         fresh = where & means.jumps & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
@@ -86,11 +90,9 @@ class _Ladder:
         draft.set_hits(dr.select(better, hits, draft.hits))
         known = self.split & ~fresh
         draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, self._doubt(known)), draft.error), unseen)
-        self.edges.learn(draft, means, self.split)
         self.where = (where | (unseen > 0)) & (draft.error > draft.tolerance)
         self.count = len(rule)
-        edges = self.edges.blur, self.edges.sharp
-        dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, edges, self.where)
+        dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, self.where)
 
     def _unsettled(self, left: Image) -> Image:
         """What is left, or so much that another level is needed."""
@@ -98,8 +100,7 @@ class _Ladder:
 
     def _doubt(self, known: Mask) -> Image:
         """What pixels may be wrong by for all that neighbours know; `known`: which pixels know an edge themselves."""
-        spread = self.draft.grid.spread_max
-        near, edge = spread(self.left), spread(dr.select(self.split, self.left, 0))
+        near, edge = self.draft.grid.spread_all((self.left, dr.select(self.split, self.left, 0)))
         doubt = dr.maximum(dr.opaque(mi.Float64, DOUBT) * near, dr.select(known, 0, edge))
         return dr.select(self.edges.sharp, near, doubt)
 
@@ -148,10 +149,12 @@ class Edges:
         Whoever met none may see the tip of a neighbour's.
         """
         grid, jumps = draft.grid, means.jumps
-        blur = dr.select(jumps, means.blur, _most_blurred(grid.spread_max(means.blur), -grid.spread_max(-means.blur)))
-        self.blur = dr.select(grid.dilate(jumps, 1) & ~draft.stopped, blur, self.blur)
-        near = grid.dilate(split | draft.outline, 1)
+        around = (means.blur, -means.blur, jumps, split | draft.outline)
+        ahead, behind, known, near = grid.spread_all(around)
+        blur = dr.select(jumps, means.blur, _most_blurred(ahead, -behind))
+        self.blur = dr.select(known & ~draft.stopped, blur, self.blur)
         self.sharp = (dr.abs(self.blur) < SHARP) & near
+        dr.eval(self.blur, self.sharp)
 
 
 def _most_blurred(ahead: Image, behind: Image) -> Image:
@@ -166,10 +169,10 @@ def edges_of(draft: Draft) -> Edges:
     """
     grid = draft.grid
     angle = grid.principal_angle(*grid.gradient(draft.value), 1 + math.ceil(draft.most_blur / 2))
-    nearest = -grid.spread_max(-draft.nearest)
+    nearest = grid.spread_max(-draft.nearest)
     # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
-    farther = -grid.spread_max(-draft.nearest, draft.reach(12)[1])
-    nearest = dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
+    farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
+    nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
     blur = dr.select(draft.stopped, 0, draft.lens.blur_radius(nearest))
     return Edges(angle, blur, dr.abs(blur) < SHARP)
 
