@@ -128,7 +128,7 @@ def test_scatter_says_where_transects_kink_and_where_they_only_lean():
     balls = [{"type": "sphere", "center": [x, y, 0], "radius": 4.0, "emitter": glow()} for x, y in ((12, -2), (-15, 2))]
     scene = scene_of(*balls, sensor=lens(48, pitch=0.2, f_number=2.8))
     sensor = scene.sensors()[0]
-    draft = Draft(scene, sensor, visible_window(scene, sensor), Quadrature(rtol=1e-4), None)
+    draft = Draft(View.of(scene, sensor), visible_window(scene, sensor), Quadrature(rtol=1e-4), None)
     first_nodes(draft)
     cut = parted(draft.hits)
     edges = edges_of(draft)

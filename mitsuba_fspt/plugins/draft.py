@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..quadrature import Quadrature, Solution
-from ..shortcuts import Finding
 from .grid import ROUNDING, Grid, parted
 from .lines import View
 from .window import Window
@@ -48,27 +47,24 @@ class Draft:
     open, known : False where the value is known from elsewhere, and that value
     """
 
-    def __init__(
-        self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, known: Solution | None
-    ) -> None:
-        self.lens, self.window, self.quadrature = lens, window, quadrature
-        self.view = View.of(scene, lens)
+    def __init__(self, view: View, window: Window, quadrature: Quadrature, known: Solution | None) -> None:
+        self.view, self.lens, self.window, self.quadrature = view, view.lens, window, quadrature
         self.area = quadrature.pixel == "area"
         self.grid = grid = Grid(window.shape)
         self.value, self.error, self.hits, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
         self.roughness = grid.full(mi.Float64, 0)
-        inside, cut = window.stopped(lens)
+        inside, cut = window.stopped(view.lens)
         self.stopped, self.beyond = grid.lanes(cut & self.area), grid.lanes(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
         self.open, self.known = grid.full(mi.Bool, True), grid.full(mi.Float64, 0)
         if known is not None:
             self.open = grid.lanes(~window.cut(known.where))
-            self.known = grid.lanes(window.cut(known.power) / lens.etendue)
+            self.known = grid.lanes(window.cut(known.power) / view.lens.etendue)
         self.nodes = self.rays = 0
         self.levels: list[str] = []
-        self.findings: list[Finding] = []
+        self.findings = [view.finding()]
 
     @property
     def peak(self) -> Image:

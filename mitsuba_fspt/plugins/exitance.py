@@ -56,6 +56,28 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
     return lambda si: shape.eval_attribute_1(name, si) * scale
 
 
+def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float, mi.Float] | None:
+    """J_n [W/mm²] at the three corners of every face, between which it is linear; None where it is something else."""
+    faces = triangles(mesh)[1]
+    count = dr.width(faces) // 3
+    if is_uniform(texture):
+        everywhere = function_on(mesh, texture)(dr.zeros(mi.SurfaceInteraction3f)) + dr.zeros(mi.Float, count)
+        return everywhere, everywhere, everywhere
+    values = attribute_of(mesh, texture)
+    if values is None:
+        return None
+    values *= float(mi.traverse(texture)["scale"])
+    if str(_attribute_name(texture)).startswith("face"):
+        return values, values, values
+    corner = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, count))
+    return tuple(dr.gather(mi.Float, values, index) for index in corner)
+
+
+def is_uniform(texture: mi.Texture) -> bool:
+    """True where J_n is one number."""
+    return texture.class_name() == "UniformSpectrum"
+
+
 def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> float:
     """Largest J_n [W/mm²] of all corners and centres; ExitanceError if one is negative or not finite, or all are 0."""
     if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):

@@ -16,8 +16,10 @@ from ..quadrature import Quadrature, Solution
 from ..shortcuts import SHORTCUTS, Finding
 from . import pupil_form, surface_form
 from .checks import check_scene
+from .faces import Faces, edition_of
 from .grid import Grid
 from .intersections import robust_scene
+from .lines import View
 from .narrow import NarrowLight, narrow_light
 from .recording import recording
 from .window import Window, glowing_boxes, window_of
@@ -68,7 +70,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         )
         # What was found out about the last scene; the scene itself, whose child this is, must not be kept.
         self._sound: list[mi.Emitter] = []
-        self._window, self._narrow = Memory(), Memory()
+        self._window, self._narrow, self._faces = Memory(), Memory(), Memory()
 
     def solve(self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None) -> Solution:
         """Power, error and coverage of the sensor's crop window, with another `quadrature` than the integrator's own.
@@ -88,19 +90,20 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         """The form of Eq. 9 asked for; pixels with light of narrow spots take the surface form in any case."""
         if 0 in window.shape:
             return Solution(*np.zeros((3, *window.full)), rays=0)
+        view = View.of(scene, lens, self._faces_of(scene) if quadrature.takes("record") else None)
         # Light from the surface knows no border on the film: pixels that the image-plane stop cuts take lines of sight.
         inside, cut = window.stopped(lens)
         if quadrature.domain == "surface":
             if not cut.any():
                 return surface_form.solve(scene, lens, window, quadrature)
             known = surface_form.solve(scene, lens, window, quadrature, inside)
-            return known.completed_by(pupil_form.solve(scene, lens, window, quadrature, known))
+            return known.completed_by(pupil_form.solve(view, window, quadrature, known))
         narrow = self._narrow_light(scene, lens, window)
         where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest)
         if not where.any():
-            return pupil_form.solve(scene, lens, window, quadrature)
+            return pupil_form.solve(view, window, quadrature)
         known = surface_form.solve(scene, lens, window, quadrature, where, narrow.brightest / 2)
-        return known.completed_by(pupil_form.solve(scene, lens, window, quadrature, known))
+        return known.completed_by(pupil_form.solve(view, window, quadrature, known))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""
@@ -114,6 +117,11 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     def _visible_window(self, scene: mi.Scene, lens: mi.Sensor, everywhere: bool) -> Window:
         boxes = glowing_boxes(scene)
         return self._window.recall((boxes, _view(lens), everywhere), lambda: window_of(boxes, lens, everywhere))
+
+    def _faces_of(self, scene: mi.Scene) -> Faces | None:
+        shapes = scene.shapes()
+        edition = edition_of(shapes)
+        return None if edition is None else self._faces.recall(edition, lambda: Faces.of(shapes))
 
     def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
         emitters = scene.emitters()

@@ -13,7 +13,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import rules
+from ..shortcuts import Finding
 from .elements import at_one_wavelength, scalar
+from .faces import Faces
 
 # ---------------------------------------------------------------------- one line of sight
 
@@ -29,10 +31,12 @@ class View:
     scene: mi.Scene
     lens: mi.Sensor
     start: mi.Float
+    faces: Faces | None
 
     @classmethod
-    def of(cls, scene: mi.Scene, lens: mi.Sensor) -> View:
-        return cls(scene, lens, dr.opaque(mi.Float, lens.clear_depth(scene.bbox())))
+    def of(cls, scene: mi.Scene, lens: mi.Sensor, faces: Faces | None = None) -> View:
+        """As seen through Mitsuba's surface records or, where the scene has them, its `faces`."""
+        return cls(scene, lens, dr.opaque(mi.Float, lens.clear_depth(scene.bbox())), faces)
 
     def radiance_on_film(
         self, position: mi.Point2f, pupil: mi.Point2f
@@ -46,10 +50,20 @@ class View:
         ray, weight, cos_theta = self.lens.line_of_sight(position, pupil, self.start)
         at_one_wavelength(ray)
         # Embree traces packets of neighbouring lines of sight more slowly than single rays.
-        si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=weight > 0)
-        radiance = scalar(si.emitter(self.scene).eval(si))
-        body = mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))
-        return share * weight * radiance, radiance, body, self.start + si.t * cos_theta
+        pi = self.scene.ray_intersect_preliminary(ray, coherent=False, active=weight > 0)
+        radiance = self.faces.radiance(pi, ray.d) if self.faces else self._by_record(pi, ray)
+        body = mi.Float(dr.reinterpret_array(mi.UInt32, pi.shape))
+        return share * weight * radiance, radiance, body, self.start + pi.t * cos_theta
+
+    def finding(self) -> Finding:
+        """Whether lines of sight do without Mitsuba's surface records."""
+        why = "meshes alone, J_n linear on every face, the same radiance in all directions"
+        return Finding("record", self.faces is not None, why if self.faces else f"wanted: {why}")
+
+    def _by_record(self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Float:
+        """Radiance [W/mm²/sr] where a ray ends, whatever the shape and however it glows."""
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        return scalar(si.emitter(self.scene).eval(si))
 
 
 def repeat(count: int | mi.UInt32, body: Callable[..., tuple], *state: Any) -> tuple:

@@ -28,15 +28,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def solve(
-    scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, known: Solution | None = None
-) -> Solution:
+def solve(view: View, window: Window, quadrature: Quadrature, known: Solution | None = None) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
     Only pixels of the `window` are looked at, the others are dark. Where a partial solution is `known` no work is done,
     and what comes back is rough.
     """
-    draft = Draft(scene, lens, window, quadrature, known)
+    draft = Draft(view, window, quadrature, known)
     rough = first_nodes(draft)
     if quadrature.max_nodes >= BOTH:
         levels = rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)

@@ -212,11 +212,16 @@ class FsptSurface(mi.Emitter):
 
     def is_uniform(self) -> bool:
         """True where J_n is one number."""
-        return self.exitance.class_name() == "UniformSpectrum"
+        return exitance.is_uniform(self.exitance)
 
     def is_linear(self) -> bool:
         """True where J_n is linear on every face of a mesh: an attribute of it."""
         return self._attribute is not None and self.get_shape().is_mesh()
+
+    def radiance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
+        """Radiance [W/mm²/sr] at the corners of every face of a mesh; None where it is not linear or not Lambert's."""
+        corners = exitance.at_corners(self.get_shape(), self.exitance) if self.is_lambertian() else None
+        return corners and tuple(dr.inv_pi * value for value in corners)
 
     def texels(self) -> int:
         """Number of pixels of the bitmap that J_n is, 1 where it is none."""

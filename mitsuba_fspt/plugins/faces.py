@@ -1,0 +1,102 @@
+"""Scenes of meshes as one table of their faces, read where a line of sight ends.
+
+Mitsuba's surface record gathers the corners of the face, looks for the place between them anew and asks shape, emitter
+and texture through pointers. Where J_n is linear on every face and the radiance alike in all outward directions, its
+values at three corners and the normal are all there is to know, and they lie in half a cache line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .elements import elements_of
+
+
+@dataclass(frozen=True)
+class Faces:
+    """All faces of a scene's meshes.
+
+    first : of each shape, by its number, at which face of all its own begin
+    table : eight numbers a face: the least radiance at its corners, how much more it is at each of them [W/mm²/sr],
+        its normal, 0
+    """
+
+    first: mi.UInt32
+    table: mi.Float
+
+    @classmethod
+    def of(cls, shapes: Sequence[mi.Shape]) -> Faces | None:
+        """The faces of all shapes; None unless all are meshes, and those that glow Lambert's with a linear J_n."""
+        first: dict[int, int] = {}
+        tables, begin = [], 0
+        for shape in shapes:
+            radiance = _radiance_at_corners(shape)
+            if radiance is None:
+                return None
+            tables.append(_table(shape, radiance))
+            first[_number_of(shape)] = begin
+            begin += shape.face_count()
+        starts = mi.UInt32([first.get(number, 0) for number in range(max(first, default=0) + 1)])
+        table = dr.concat(tables)
+        dr.eval(starts, table)
+        return cls(starts, table)
+
+    def radiance(self, pi: mi.PreliminaryIntersection3f, direction: mi.Vector3f) -> mi.Float:
+        """Radiance [W/mm²/sr] where a ray with `direction` meets a face, towards its origin; 0 on the inward side."""
+        met = pi.is_valid()
+        face = dr.gather(mi.UInt32, self.first, _number(pi.shape), met) + pi.prim_index
+        least, normal = (dr.gather(mi.Vector4f, self.table, 2 * face + half, met) for half in (0, 1))
+        u, v = pi.prim_uv.x, pi.prim_uv.y
+        radiance = least.x + dr.maximum(1 - u - v, 0) * least.y + u * least.z + v * least.w
+        towards = normal.x * direction.x + normal.y * direction.y + normal.z * direction.z
+        return dr.select(met & (towards < 0), radiance, 0)
+
+
+def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
+    """What `Faces.of` follows from once a scene is checked; None where it is None at once."""
+    if not all(shape.is_mesh() for shape in shapes):
+        return None
+    emitters = [shape.emitter() for shape in shapes]
+    return [
+        (_number_of(shape), shape.face_count(), emitter, getattr(emitter, "edition", 0))
+        for shape, emitter in zip(shapes, emitters, strict=True)
+    ]
+
+
+def _number(shape: mi.ShapePtr) -> mi.UInt32:
+    return dr.reinterpret_array(mi.UInt32, shape)
+
+
+def _number_of(shape: mi.Shape) -> int:
+    return int(_number(mi.ShapePtr(shape))[0])
+
+
+def _radiance_at_corners(mesh: mi.Shape) -> tuple[mi.Float, ...] | None:
+    """Radiance [W/mm²/sr] at the three corners of every face, 0 where nothing glows; None as in `Faces.of`."""
+    if not mesh.is_mesh():
+        return None
+    emitter = mesh.emitter()
+    if emitter is None:
+        return (dr.zeros(mi.Float, mesh.face_count()),) * 3
+    return emitter.radiance_at_corners() if type(emitter).__name__ == "FsptSurface" else None
+
+
+def _table(mesh: mi.Shape, radiance: tuple[mi.Float, ...]) -> mi.Float:
+    """Eight numbers for each face of a mesh, see `Faces`."""
+    elements = elements_of(mesh, minimum=1)
+    si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
+    # On a sliver a normal or J_n may be no number: it is dark.
+    sound = dr.all(dr.isfinite(si.n)) & dr.all(dr.isfinite(mi.Vector3f(*radiance)))
+    # From the least one on: where all are alike so is all between, and a dim one beside a bright one is not lost.
+    least = dr.minimum(dr.minimum(radiance[0], radiance[1]), radiance[2])
+    columns = [least, *(corner - least for corner in radiance), si.n.x, si.n.y, si.n.z, mi.Float(0)]
+    table = dr.empty(mi.Float, 8 * elements.count)
+    index = 8 * dr.arange(mi.UInt32, elements.count)
+    for k, column in enumerate(columns):
+        dr.scatter(table, dr.select(sound, column, 0), index + k)
+    return table
