@@ -111,7 +111,10 @@ def test_lattice_takes_one_pixel_of_sixteen_and_is_near_to_all():
     assert mask.sum() == 32 * 48 // 16
     assert mask.sum(axis=0).tolist() == [2] * 48
     assert mask.sum(axis=1).tolist() == [3] * 32
-    assert on_grid("spread_over_lattice", mask.astype(float)).min() == 1
+    values = np.where(mask, image(mask.shape), -np.inf)
+    blocks = values.reshape(8, 4, 12, 4).max(axis=(1, 3))
+    expected = [[block.max() for block in row] for row in around(blocks, 1)]
+    np.testing.assert_array_equal(on_grid("spread_over_lattice", values), np.kron(expected, np.ones((4, 4))))
 
 
 @pytest.mark.parametrize("angle", [-1.2, -0.4, 0.0, 0.3, 1.0, 1.5])

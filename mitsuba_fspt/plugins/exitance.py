@@ -66,7 +66,7 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
     values = attribute_of(mesh, texture)
     if values is None:
         return None
-    values *= float(mi.traverse(texture)["scale"])
+    values = values * float(mi.traverse(texture)["scale"])
     if str(_attribute_name(texture)).startswith("face"):
         return values, values, values
     corner = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, count))

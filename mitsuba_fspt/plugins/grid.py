@@ -147,16 +147,15 @@ class Grid:
         return ((self.x - 5 * self.y) & (BLOCK * BLOCK - 1)) == 0
 
     def spread_over_lattice(self, image: Image) -> Image:
-        """Largest value among the 3 × 3 blocks of 4 × 4 pixels around each pixel's block: some lie on the lattice."""
-        blocks = Grid((-(-self.shape[0] // BLOCK), -(-self.shape[1] // BLOCK)))
-
-        def largest(k: mi.Int, value: Image) -> tuple:
-            x, y = BLOCK * blocks.x + k % BLOCK, BLOCK * blocks.y + k // BLOCK
-            return k + 1, dr.maximum(value, self.at(image, x, y))
-
-        start = (mi.Int(0), blocks.full(mi.Float64, -dr.inf))
-        _, most = dr.while_loop(start, lambda k, value: k < BLOCK * BLOCK, largest)
-        return blocks.at(blocks.spread_max(most), self.x // BLOCK, self.y // BLOCK)
+        """Largest value on the lattice in the 3 × 3 blocks of 4 × 4 pixels around each pixel's block."""
+        dr.eval(image)
+        near = []
+        for dx, dy in [(0, 0), *AROUND]:
+            x = dr.clip(self.x // BLOCK + dx, 0, (self._width - 1) // BLOCK)
+            y = dr.clip(self.y // BLOCK + dy, 0, (self._height - 1) // BLOCK)
+            k = (x - y) & (BLOCK - 1)  # where on its diagonal the lattice meets the block
+            near.append(self.at(image, BLOCK * x + k, BLOCK * y + k))
+        return reduce(dr.maximum, near)
 
     # ------------------------------------------------------------------ how an image changes
 
@@ -176,7 +175,9 @@ class Grid:
 
     def principal_angle(self, x: Image, y: Image, radius: int) -> Image:
         """Angle of the axis along which the vectors (x, y) of a neighbourhood mostly point (structure tensor)."""
-        cross, along = self.box_sum(x * y, radius), self.box_sum(x * x - y * y, radius)
+        products = x * y, x * x - y * y
+        dr.eval(products)
+        cross, along = (self.box_sum(product, radius) for product in products)
         return 0.5 * dr.atan2(2 * cross, along)
 
     # ------------------------------------------------------------------ silhouettes

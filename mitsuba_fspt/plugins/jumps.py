@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -103,13 +103,15 @@ class _Search:
     """What is known of the jumps of a transect after so many `looks`.
 
     largest : the `MOST_JUMPS` largest steps of the scan, the largest first, then bisected one by one
-    step, total : the last step of the scan, and all of them together
+    place, seen : the last point of the scan
+    total : all its steps together
     lit : first and last place where anything was met
     jumps : how many of the largest are jumps, known when the scan is over
     """
 
     largest: list[_Jump]
-    step: _Jump
+    place: mi.Float
+    seen: mi.Point3f
     total: mi.Float
     lit: mi.Point2f
     jumps: mi.UInt32
@@ -136,8 +138,8 @@ def _search(
     shift = SHIFT * (phase - 0.5)
 
     def scan(found: _Search, s: mi.Float, seen: mi.Point3f) -> _Search:
-        step = new = _Jump(mi.Point2f(found.step.at.y, s), found.step.after, seen)
-        size = dr.select(found.looks > 0, step.size(outline), 0)
+        new = _Jump(mi.Point2f(found.place, s), found.seen, seen)
+        size = dr.select(found.looks > 0, new.size(outline), 0)
         total = rest = found.total + size
         # An outline is a jump. A step of one body's radiance that is not much larger than the rest is a slope; on a
         # parabola one is at most 3 times their mean.
@@ -154,14 +156,14 @@ def _search(
             large &= jump
             jumps += dr.select(large, mi.UInt32(1), 0)
         lit = dr.select(seen.y > 0, mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
-        return _Search(largest, step, total, lit, jumps, found.looks)
+        return _Search(largest, s, seen, total, lit, jumps, found.looks)
 
     def bisect(found: _Search, turn: mi.UInt32, jump: _Jump, s: mi.Float, seen: mi.Point3f) -> _Search:
         left = _Jump(mi.Point2f(jump.at.x, s), jump.before, seen)
         right = _Jump(mi.Point2f(s, jump.at.y), seen, jump.after)
         half = dr.select(left.size(outline) >= right.size(outline), left, right)
         largest = [dr.select(turn == k, half, old) for k, old in enumerate(found.largest)]
-        return _Search(largest, found.step, found.total, found.lit, found.jumps, found.looks)
+        return replace(found, largest=largest)
 
     def once(found: _Search) -> tuple[_Search]:
         k = found.looks
@@ -178,8 +180,8 @@ def _search(
         return (found,)
 
     # Not `dr.zeros`: of a dataclass's fields it keeps the types of the variant that it meets first.
-    none = [_Jump(mi.Point2f(0), mi.Point3f(0), mi.Point3f(0)) for _ in range(MOST_JUMPS + 1)]
-    start = _Search(none[1:], none[0], mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
+    none = [_Jump(mi.Point2f(0), mi.Point3f(0), mi.Point3f(0)) for _ in range(MOST_JUMPS)]
+    start = _Search(none, mi.Float(0), mi.Point3f(0), mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
     return dr.while_loop((start,), lambda found: found.looks <= intervals + found.jumps * bisections, once)[0]
 
 

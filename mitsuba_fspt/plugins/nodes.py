@@ -59,10 +59,9 @@ def first_nodes(draft: Draft) -> Mask:
     tolerance = draft.tolerance
     rough = (draft.error > tolerance) | (bend > SETTLED * tolerance)
     dr.eval(draft.error, rough)
-    unmet = not dr.any(draft.hits > 0)  # what glows is on the film, or may be
-    if (neighbours and min(grid.shape) < 3) or unmet or not draft.quadrature.takes("smooth"):
+    if (neighbours and min(grid.shape) < 3) or not draft.quadrature.takes("smooth"):
         rough = grid.full(mi.Bool, True)
-    return rough & draft.open
+    return (rough | _nothing_met(draft)) & draft.open
 
 
 def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
@@ -86,9 +85,12 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
     if dr.any(misled):
         _refine(draft, misled & ~probes)
     rough = rough | misled
-    if not dr.any(draft.hits > 0):
-        return rough
-    return rough & draft.grown(rough & (draft.error > draft.tolerance))
+    return rough & (draft.grown(rough & (draft.error > draft.tolerance)) | _nothing_met(draft))
+
+
+def _nothing_met(draft: Draft) -> Mask:
+    """True where no line of sight of any pixel met a surface yet, one lane: what glows is on the film, or may be."""
+    return ~dr.any(draft.hits > 0)
 
 
 def _one_will_do(draft: Draft) -> bool:
