@@ -81,11 +81,12 @@ class Draft:
         floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
         error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, dr.opaque(mi.Float64, floor) * self.peak))
         hits = dr.select(self.hits > 1 - FULL, 1, dr.maximum(self.hits, 0))
-        images = (self.value, dr.select(self.beyond, 0, error), hits * open_share(self.lens, self.window, self.grid))
+        etendue = dr.opaque(mi.Float64, self.lens.etendue)
+        power, error = etendue * self.value, etendue * dr.select(self.beyond, 0, error)
+        images = (power, error, hits * open_share(self.lens, self.window, self.grid))
         dr.eval(images)
-        power, error, coverage = (self.window.expand(self.grid.array(image)) for image in images)
-        power, error = power * self.lens.etendue, error * self.lens.etendue
-        return Solution(power, error, coverage, self.rays, tuple(self.levels), findings=tuple(self.findings))
+        arrays = (self.window.expand(self.grid.array(image)) for image in images)
+        return Solution(*arrays, self.rays, tuple(self.levels), findings=tuple(self.findings))
 
     def count(self, what: str, pixels_touched: int, rays: int) -> None:
         """Note a rung of the ladder."""

@@ -83,8 +83,11 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             traced = self._traced(scene, sensor)
             window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
             solution = self._solve_in(window, traced, sensor, quadrature)
-        error = solution.error + _moved(solution.power, sensor.rounding)
-        return replace(solution, error=error, findings=(_outside(window), *solution.findings))
+        findings = (_outside(window), *solution.findings)
+        if sensor.rounding < ROUNDING or 0 in window.shape:  # by so little lines of sight move at random
+            return replace(solution, findings=findings)
+        moved = window.expand(_moved(window.cut(solution.power), sensor.rounding))
+        return replace(solution, error=solution.error + moved, findings=findings)
 
     def _solve_in(self, window: Window, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
         """The form of Eq. 9 asked for; pixels with light of narrow spots take the surface form in any case."""
@@ -171,9 +174,7 @@ def _view(lens: mi.Sensor) -> tuple[object, ...]:
 
 
 def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
-    """What lines of sight that float32 moves by `rounding` [pixels] may change; by less they move at random."""
-    if rounding < ROUNDING or min(power.shape) == 0:
-        return np.zeros_like(power)
+    """What lines of sight that float32 moves by `rounding` [pixels] may change."""
     grid = Grid(power.shape)
     x, y = grid.gradient(grid.lanes(power))
     return rounding * grid.array(grid.spread_max(dr.sqrt(x * x + y * y)))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .elements import Elements, elements_of, scalar
+from .occlusion import hidden
 from .recording import recording
 
 LANES = 1 << 22  # pairs of a point and a pixel in flight: bounds the memory, not the picture
@@ -96,7 +97,7 @@ def _add(
     to_lens /= distance
     cos_s = dr.dot(si.n, to_lens)
     lit = (dr.squared_norm(pupil) <= 1) & (passes > 0) & (cos_s > 0)
-    lit &= ~scene.ray_test(si.spawn_ray_to(lens_point), lit)
+    lit &= ~hidden(scene, si.p, lens_point, lit)
     si.initialize_sh_frame()
     si.wi = si.to_local(to_lens)
     radiance = dr.select(lit, scalar(emitter.eval(si, lit)), 0)

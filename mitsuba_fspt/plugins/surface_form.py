@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import Finding
-from .convexity import hides_nothing
 from .elements import scalar
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow, film_corner
 from .grid import Grid
+from .occlusion import hidden, hides_nothing
 from .window import Window
 
 # Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second
@@ -143,7 +143,7 @@ class _Refinement:
         cos_s = dr.dot(middle.n, to_lens)
         active = (cos_s > 0) & (weight > 0)
         if self.hidden:
-            active &= ~self.scene.ray_test(spot.spawn_ray_to(lens_point), active)
+            active &= ~hidden(self.scene, spot.p, lens_point, active)
         spot.initialize_sh_frame()
         spot.wi = mi.Frame3f(middle.n).to_local(to_lens)
         radiance = dr.select(active, scalar(batch.glow.emitter.eval(spot, active)), 0)

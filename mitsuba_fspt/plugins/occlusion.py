@@ -1,4 +1,4 @@
-"""Bodies that hide nothing of themselves: what leaves a convex one outwards never meets it again."""
+"""What hides light on its way from the surface to the lens, and bodies that hide nothing of themselves."""
 
 from __future__ import annotations
 
@@ -13,6 +13,24 @@ GRAZING = 0.01  # rad above the surface; light that leaves it flatter is next to
 LIFT = 1e-6  # of the body's size: what float32 needs to stand clear of the surface
 DIRECTIONS = 4  # looked along from each element
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+# Where a ray begins on its way from the surface: so much of the largest coordinate and of the distance [mm/mm], some
+# hundred times what float32 can be wrong by.
+CLEAR, CLEAR_OF_DISTANCE = 2.0**-16, 2.0**-20
+
+
+def hidden(scene: mi.Scene, point: mi.Point3f, lens_point: mi.Point3f, active: mi.Bool) -> mi.Bool:
+    """True where a surface lies between a surface point and a point of the lens.
+
+    The ray begins a little further on its way. Mitsuba's own would be lifted off along the normal, by 9e-5 of the
+    point's distance from the origin, and with them the borders of all shadows: by a hundredth of a pixel.
+    """
+    way = mi.Vector3f(lens_point - point)
+    distance = dr.norm(way)
+    direction = way / distance
+    clear = CLEAR * dr.max(dr.abs(point), axis=0) + CLEAR_OF_DISTANCE * distance
+    ray = mi.Ray3f(point + clear * direction, direction)
+    ray.maxt = distance - clear
+    return scene.ray_test(ray, active=active)
 
 
 def hides_nothing(scene: mi.Scene) -> bool:
