@@ -30,7 +30,7 @@ def definitions(define: list[str] | None) -> dict[str, str]:
 def require_writable(path: Path, suffix: str) -> None:
     """Refuse an output that cannot be written before the work, not after it."""
     if path.suffix != suffix:
-        raise ImageError(f"{path}: images are written as {suffix}. Give a name that ends in {suffix}.")
+        raise ImageError(f"{path}: images are written as {suffix}. Give a name such as image{suffix}.")
     require_place(path, ImageError)
     if not os.access(path.parent, os.W_OK):
         raise ImageError(f"{path}: the folder '{path.parent}' is not writable. Write elsewhere with -o.")

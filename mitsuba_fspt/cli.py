@@ -54,9 +54,9 @@ def render(
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
 ) -> None:
     """Render a scene to an EXR with the power [W], its error and the coverage of every pixel."""
-    output = output or Path(scene.stem + ".exr")
-    picture = output.with_suffix(".png")
+    output = output or Path((scene.stem or "image") + ".exr")
     require_writable(output, ".exr")
+    picture = output.with_suffix(".png")
     if png:
         from .picture import png_file, require_matplotlib
 
@@ -134,9 +134,8 @@ def expose(
     exposure = Detector.typical_ccd().expose(
         read(image), exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, seed=seed
     )
-    exposure.write(output)
-    if counts:
-        exposure.write_counts(counts)
+    with exposure.counts_file(counts) if counts else nullcontext():  # both files or none
+        exposure.write(output)
     saturated = exposure.metadata["saturated_pixels"]
     typer.echo(f"{output}: brightest pixel {exposure.electrons.max():.6g} electrons, {saturated} pixels saturated")
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,6 +62,12 @@ class Exposure:
         ImageError : the suffix is neither .png nor .tif(f), or the file cannot be written.
         BackendError : Pillow is not installed.
         """
+        with self.counts_file(path):
+            pass
+
+    @contextmanager
+    def counts_file(self, path: str | os.PathLike[str]) -> Iterator[None]:
+        """The file of `write_counts`, written before a block, in its place when the block ends well. Raises as that."""
         path = Path(path)
         if path.suffix.lower() not in (".png", ".tif", ".tiff"):
             raise ImageError(f"counts file '{path}': counts are written as PNG or TIFF. Give a .png or .tif.")
@@ -79,6 +87,7 @@ class Exposure:
                 picture.save(temporary, pnginfo=text)
             else:
                 picture.save(temporary, description=description)
+            yield
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,7 +66,8 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], Metadata
     """
     path = Path(path)
     if not os.path.isfile(path):
-        raise ImageError(f"image file '{path}' does not exist. Give the path of an EXR file.")
+        wrong = "is a folder" if os.path.isdir(path) else "does not exist"
+        raise ImageError(f"image file '{path}' {wrong}. Give the path of an EXR file.")
     if not OpenEXR.isOpenExrFile(str(path)):
         raise ImageError(f"image file '{path}' is no readable OpenEXR file. Give an EXR file.")
     try:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 LANES = 1 << 23  # Monte Carlo samples in flight
+ALIKE = 3.0  # by less do the errors of neighbours differ that see the same
 Progress = Callable[[str, float], None]
 Picture = NDArray[np.float64]
 
@@ -130,13 +131,15 @@ def _sample(
     probe_beside(scene)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
     passes = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
+    lens.sampler().set_sample_count(math.ceil(spp / passes))
+    each = lens.sampler().sample_count()  # some samplers take more: told once, not in every pass
     total = squares = 0.0
     samples = 0
     for k in range(passes):
         progress("sampling", k / passes)
         with dr.suspend_grad(), recording():
             (of_pass,) = np.random.SeedSequence((seed, k)).generate_state(1)
-            image = integrator.render(scene, lens, seed=int(of_pass), spp=math.ceil(spp / passes))
+            image = integrator.render(scene, lens, seed=int(of_pass), spp=each)
         power = np.array(image, np.float64)[..., 0]
         total, squares = total + power, squares + power * power
         samples += lens.sampler().sample_count()
@@ -163,18 +166,21 @@ def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
 
 
 def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -> Picture:
-    """Of the mean of passes, from that of their squares; where no sample met light, what a single one would bring.
+    """Of the mean of passes, from that of their squares; what a single sample brings where none met light, or none
+    missed it though some did next to it.
 
-    The scatter of none says nothing, but the neighbours know: what events bring that are counted, and few, is variance
-    over mean, and where all samples meet light a share of it.
+    Their scatter says nothing, but the neighbours know: what events bring that are counted, and few, is variance over
+    mean, and where all samples meet light a share of it.
     """
     from .plugins.grid import Grid
 
     variance = np.maximum(square - mean * mean, 0) / (passes - 1)
     met = mean > 0
     event = np.maximum(np.divide(variance, mean, out=np.zeros_like(mean), where=met), mean / samples)
-    grid = Grid(mean.shape)
-    return np.where(met, np.sqrt(variance), grid.array(grid.spread_max(grid.lanes(event))))
+    scatter, grid = np.sqrt(variance), Grid(mean.shape)
+    near, single = (grid.array(grid.spread_max(grid.lanes(image))) for image in (scatter, event))
+    missed = np.where(near > ALIKE * scatter, np.minimum(near, mean / samples), 0)
+    return np.where(met, np.maximum(scatter, missed), single)
 
 
 def _is_scene(scene: object) -> bool:

@@ -175,6 +175,24 @@ def test_expose_writes_electrons_and_counts(run, two_images, tmp_path):
     assert header("e.exr")["fspt:quantity"] == "electrons"
 
 
+@pytest.mark.parametrize("counts", ["n.jpg", "nowhere/n.png", ""])
+def test_expose_leaves_both_files_or_none(run, two_images, tmp_path, counts):
+    """Fails with the electrons written before the counts' place is looked at."""
+    before = set(os.listdir(tmp_path))
+    options = ["--exposure-time", "1", "--wavelength-nm", "600", "--counts", counts]
+    code, _, err = run("expose", "a.exr", "-o", "e.exr", *options)
+    assert code == 2
+    assert err.count("\n") == 1
+    assert set(os.listdir(tmp_path)) == before
+
+
+@pytest.mark.parametrize("output", ["", ".exr", "picture"])
+def test_render_wants_a_name_for_its_image(run, tmp_path, output):
+    code, _, err = run("render", write_scene(tmp_path / "s.xml"), "-o", output)
+    assert code == 2
+    assert err.endswith("images are written as .exr. Give a name such as image.exr.\n")
+
+
 def test_flux_import_makes_a_phantom_that_renders(run, tmp_path):
     vertices = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
     write_ply(tmp_path / "sheet.ply", vertices, [(0, 1, 2), (0, 2, 3)])

@@ -126,6 +126,16 @@ def test_a_corner_nine_decades_dimmer_than_its_neighbour_keeps_its_light(tmp_pat
     np.testing.assert_allclose(found.numpy(), exitance / np.pi, rtol=1e-6)
 
 
+def test_a_zero_far_from_the_origin_is_not_taken_for_negative(tmp_path):
+    """Half a metre off, interpolation finds -2e-6 of the neighbours at a corner without light; it was refused."""
+    body = trimesh.creation.icosphere(2, radius=5)
+    exitance = np.where(np.arange(len(body.vertices)) < 40, 1e-3, 0)
+    write_ply(tmp_path / "far.ply", body.vertices + np.array([500, 0, 0]), body.faces, vertex=exitance)
+    shape = {"type": "ply", "filename": str(tmp_path / "far.ply"), "emitter": glow(attribute())}
+    far = lens(distance=665.0, magnification=None, focus_distance=165.0)
+    assert solved(scene_of(shape, sensor=far)).power.max() > 0
+
+
 def test_one_integrator_for_many_scenes(tmp_path):
     """No mesh passes for an earlier one, whatever numbers the renderer gives them once that is gone."""
     import mitsuba as mi

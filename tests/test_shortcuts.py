@@ -194,6 +194,13 @@ def test_explain_measures_what_each_shortcut_saves():
     assert SHORTCUTS["occlusion"] in {row.what for row in other}
 
 
+def test_no_more_pixels_are_told_of_than_the_picture_has():
+    """Where the phantom reaches beyond the picture so does what is looked at: pixels around know of silhouettes."""
+    solution = solved(scene_of(ball(radius=60.0), sensor=lens(8, f_number=2.8)))
+    (outside,) = [finding for finding in solution.findings if finding.name == "outside"]
+    assert (outside.taken, outside.why) == (False, "64 of 64 pixels can see what glows")
+
+
 def test_explain_and_render_without_shortcuts_from_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     small = ["-D", "width=12", "-D", "height=10", "-D", "pixel_pitch=2.304", "--rtol", "1e-2"]

@@ -8,12 +8,14 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import ExitanceError
 from .elements import at_one_wavelength, elements_of, scalar, triangles
 
 SLIVER = 1e-6  # of the mean area: on a smaller face single precision may find no place to interpolate at
 ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
+CORNERS_AND_CENTRE = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
 
 
 def texture_of(props: mi.Properties) -> mi.Texture:
@@ -78,16 +80,11 @@ def is_uniform(texture: mi.Texture) -> bool:
     return texture.class_name() == "UniformSpectrum"
 
 
-def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> float:
+def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
     """Largest J_n [W/mm²] of all corners and centres; ExitanceError if one is negative or not finite, or all are 0."""
     if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):
         raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has vertices that are not finite. Mend its mesh.")
-    elements = elements_of(shape, minimum=1 << 14)
-    index = dr.arange(mi.UInt32, elements.count)
-    corners_and_centre = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
-    points = [elements.place(index, mi.Point2f(*point)) for point in corners_and_centre]
-    everywhere = [np.broadcast_arrays(exitance(si).numpy(), area.numpy()) for si, area in points]
-    values, areas = (np.concatenate(columns) for columns in zip(*everywhere, strict=True))
+    values, areas = _values_and_areas(shape, texture)
     values, areas = values[areas > 0], areas[areas > 0]  # a face without area emits nothing
     name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
     if not values.size:
@@ -104,6 +101,23 @@ def check_values(shape: mi.Shape, exitance: Callable[[mi.SurfaceInteraction3f], 
     if values.max() == 0:
         raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
     return float(values.max())
+
+
+def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """J_n [W/mm²] all over a shape and the areas that it counts for; at corners as it was given where it is linear."""
+    corners = at_corners(shape, texture) if shape.is_mesh() else None
+    elements = elements_of(shape, minimum=1 if corners else 1 << 14)
+    index = dr.arange(mi.UInt32, elements.count)
+    if corners:
+        # Interpolation far from the world's origin would make a zero negative.
+        everywhere = [(value, elements.areas()) for value in corners]
+    else:
+        value_at = function_on(shape, texture)
+        points = [elements.place(index, mi.Point2f(*point)) for point in CORNERS_AND_CENTRE]
+        everywhere = [(value_at(si), area) for si, area in points]
+    arrays = [np.broadcast_arrays(value.numpy(), area.numpy()) for value, area in everywhere]
+    values, areas = (np.concatenate(columns) for columns in zip(*arrays, strict=True))
+    return values, areas
 
 
 def _attribute_name(texture: mi.Texture) -> str | None:

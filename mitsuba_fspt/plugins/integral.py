@@ -181,7 +181,7 @@ def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
 
 
 def _outside(window: Window) -> Finding:
-    inside, pixels = math.prod(window.shape), math.prod(window.full)
+    inside, pixels = window.count, math.prod(window.full)
     return Finding("outside", inside < pixels, f"{inside} of {pixels} pixels can see what glows")
 
 

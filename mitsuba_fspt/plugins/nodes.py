@@ -72,7 +72,7 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
     """
     rough = draft.grown(rough) & draft.open
     smooth = int(dr.count(~rough & (draft.hits > 0))[0])
-    why = f"{smooth} of {len(draft.grid)} pixels see the surface, smooth and no edge of it"
+    why = f"{smooth} of {len(draft.grid)} pixels looked at see the surface, smooth and no edge of it"
     draft.findings.append(Finding("smooth", smooth > 0, why))
     # What parts four nodes parts twelve, too: transects can begin at once.
     begun = parted(draft.hits) & (draft.error > draft.tolerance) & dr.opaque(mi.Bool, transects_follow)

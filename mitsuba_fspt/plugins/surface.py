@@ -187,7 +187,7 @@ class FsptSurface(mi.Emitter):
             return
 
         def look(shape: mi.Shape) -> float:
-            brightest = exitance.check_values(shape, exitance.function_on(shape, self.exitance))
+            brightest = exitance.check_values(shape, self.exitance)
             self.law.prepare(shape)
             return brightest
 

@@ -34,6 +34,12 @@ class Window:
     crop_offset: tuple[int, int]
     blur: float
 
+    @property
+    def count(self) -> int:
+        """Pixels of the crop window in this one."""
+        here, _ = self._common()
+        return math.prod(side.stop - side.start for side in here)
+
     def centres(self, number: mi.UInt32) -> mi.Point2f:
         """Film positions [pixels] of the centres of the window's pixels of so much `number`, row by row."""
         width = dr.opaque(mi.UInt32, self.shape[1])
