@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 BUDGET, ROUNDS = 2.0, 5
 REFERENCE_TIME = 15.0  # times the budget
 PATIENCE = 4.0  # times the budget: what a coarsest setting may take
+BURST = 0.1  # s
 WHOLE_CONE = 1 - 1e-4  # of the lines of sight: a sum of float32 weights
 MIB = 1 << 20
 
@@ -51,9 +52,9 @@ def converge(
         found = fspt.converge("scenes/two_spheres.xml", budget=0.5)
         found.order("integral"), found.time_to("path, multijitter", 1e-3)
 
-    Every setting runs once cold, once more for its memory, then once a round, the rounds forwards and backwards
-    through all settings by turns: a slow moment of the machine meets them all, and medians count. `converge_sheet`
-    writes the CSV file, the figure and the table.
+    Every setting runs once cold, once more for its memory, then for a tenth of a second, at least once, in each round,
+    the rounds forwards and backwards through all settings by turns: a slow moment of the machine meets them all, and
+    medians count. `converge_sheet` writes the CSV file, the figure and the table.
 
     Cold is the first run of a setting: tracing, compiling, and what an integrator finds out once about a scene. Kernels
     that Dr.Jit has, in memory or on disk, are not compiled again, unless `kernels` lets it forget them.
@@ -144,9 +145,12 @@ class Trial:
     errors: list[tuple[float, float, float]] = field(default_factory=list)
 
     def run_timed(self, judge: Judge) -> None:
-        """One run of a round."""
-        seconds, self.shot = _seconds(self.run)
-        self.seconds.append(seconds)
+        """One round: again and again for `BURST`, lest what ran before decides how warm a short one is; its median."""
+        times: list[float] = []
+        while sum(times) < BURST:
+            seconds, self.shot = _seconds(self.run)
+            times.append(seconds)
+        self.seconds.append(float(np.median(times)))
         self.errors.append(judge(self.shot.power))
 
     def row(self) -> Row:

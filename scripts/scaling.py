@@ -3,14 +3,16 @@
     python scripts/scaling.py [--out docs] [--rounds 5] [--rtol 1e-2]
 
 A ball with a smooth J_n, its front in focus, f/2.8. First the same field on ever more pixels, 128 x 128 to 2048 x 2048;
-then on 256 x 256 pixels the same ball in ever more triangles, 10 thousand to 3 million. Warm, in one process, in rounds
-that go through all settings in turn; medians. Writes scaling.csv and scaling.png and prints the table.
+then the same ball in ever more triangles, 10 thousand to 3 million, on 256 x 256 pixels, where at last every line of
+sight meets a triangle of its own, and on 2048 x 2048. Warm, in one process; medians. Writes scaling.csv and scaling.png
+and prints the tables.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import math
 import tempfile
 import time
@@ -25,6 +27,7 @@ from mitsuba_fspt.atomic import atomic_path
 
 SIDES = (128, 256, 512, 1024, 2048)
 TRIANGLES = (10_000, 100_000, 1_000_000, 3_000_000)
+FEW_AND_MANY = (256, 2048)  # pixels a side on which triangles are counted
 FIELD, RADIUS = 27.648, 15.0  # mm: the detector's width, the ball's radius
 
 
@@ -51,12 +54,12 @@ def main() -> None:
     parser.add_argument("--rtol", type=float, default=1e-2)
     arguments = parser.parse_args()
     by_pixels = [Setting(side, TRIANGLES[1]) for side in SIDES]
-    by_triangles = [Setting(256, triangles) for triangles in TRIANGLES]
+    by_triangles = [[Setting(side, triangles) for triangles in TRIANGLES] for side in FEW_AND_MANY]
     with tempfile.TemporaryDirectory() as folder:
-        for settings in (by_pixels, by_triangles):
+        for settings in (by_pixels, *by_triangles):
             measure(settings, Path(folder), arguments.rounds, arguments.rtol)
     arguments.out.mkdir(exist_ok=True)
-    write_csv(by_pixels + by_triangles, arguments.out / "scaling.csv")
+    write_csv([*by_pixels, *itertools.chain(*by_triangles)], arguments.out / "scaling.csv")
     draw(by_pixels, by_triangles, arguments.out / "scaling.png")
     report(by_pixels, by_triangles)
 
@@ -129,7 +132,7 @@ def write_csv(settings: list[Setting], path: Path) -> None:
             rows.writerow([s.side, s.triangles, *times, s.rays])
 
 
-def draw(by_pixels: list[Setting], by_triangles: list[Setting], path: Path) -> None:
+def draw(by_pixels: list[Setting], by_triangles: list[list[Setting]], path: Path) -> None:
     """Time a pixel against both."""
     from matplotlib.figure import Figure
 
@@ -137,20 +140,28 @@ def draw(by_pixels: list[Setting], by_triangles: list[Setting], path: Path) -> N
     left, right = figure.subplots(1, 2)
     left.semilogx([s.side for s in by_pixels], [s.nanoseconds for s in by_pixels], "o-", base=2)
     left.set(xlabel="pixels a side", ylabel="time a pixel [ns]", ylim=(0, None))
-    right.semilogx([s.triangles for s in by_triangles], [s.nanoseconds for s in by_triangles], "o-")
+    for settings in by_triangles:
+        label = f"{settings[0].side}² pixels"
+        right.semilogx([s.triangles for s in settings], [s.nanoseconds for s in settings], "o-", label=label)
     right.set(xlabel="triangles", ylim=(0, None))
+    right.legend()
     for axes in (left, right):
         axes.grid(alpha=0.3)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=130)
 
 
-def report(by_pixels: list[Setting], by_triangles: list[Setting]) -> None:
-    """Both tables, as Markdown."""
+def report(by_pixels: list[Setting], by_triangles: list[list[Setting]]) -> None:
+    """All settings as a Markdown table, then growth over the triangles beside that of their logarithm."""
     print("| pixels | triangles | time | a pixel | lines of sight a pixel |\n|---|---|---|---|---|")
-    for s in by_pixels + by_triangles:
+    for s in [*by_pixels, *itertools.chain(*by_triangles)]:
         seconds = float(np.median(s.seconds))
         print(f"| {s.side}² | {s.triangles} | {seconds:.3g} s | {s.nanoseconds:.0f} ns | {s.rays / s.side**2:.2f} |")
+    logarithm = math.log(TRIANGLES[-1]) / math.log(TRIANGLES[0])
+    for settings in by_triangles:
+        growth = settings[-1].nanoseconds / settings[0].nanoseconds
+        print(f"{settings[0].side}² pixels, {TRIANGLES[0]} to {TRIANGLES[-1]} triangles: x{growth:.2f}", end="")
+        print(f" (the logarithm: x{logarithm:.2f})")
 
 
 if __name__ == "__main__":

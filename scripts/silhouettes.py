@@ -53,6 +53,7 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
 
     from mitsuba_fspt.plugins.draft import Draft
     from mitsuba_fspt.plugins.grid import parted
+    from mitsuba_fspt.plugins.lines import View
     from mitsuba_fspt.plugins.nodes import apply_nodes, first_nodes
     from mitsuba_fspt.plugins.transects import apply_transects, edges_of
     from mitsuba_fspt.plugins.window import visible_window
@@ -60,7 +61,7 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
 
     scene = fspt.load(name, f_number=f_number)
     lens = scene.sensors()[0]
-    draft = Draft(scene, lens, visible_window(scene, lens), Quadrature(rtol=RTOL), None)
+    draft = Draft(View.of(scene, lens), visible_window(scene, lens), Quadrature(rtol=RTOL), None)
     first_nodes(draft)
     cut = parted(draft.hits)
     pixels = np.array(dr.compress(cut))

@@ -1,0 +1,42 @@
+"""scripts/silhouettes.py and scripts/scaling.py on scenes so small that they take seconds."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import pytest
+from little_scenes import write_scene
+
+pytestmark = pytest.mark.usefixtures("mono")
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
+
+import scaling  # noqa: E402
+import silhouettes  # noqa: E402
+
+
+def test_silhouettes_finds_errors_that_fall(tmp_path):
+    """A ball of six pixels, where edges bend much. Expected: the order of 1.5 from two transects to 24."""
+    measured = silhouettes.measure(str(write_scene(tmp_path / "ball.xml")), 2.8)
+    rays, rms = ({row[0]: row[k] for row in measured} for k in (1, 2))
+    assert rms["12 nodes"][0] > 2 * rms["2 transects"][0]
+    more = rays["24 transects"] / rays["2 transects"]
+    assert 0 < rms["24 transects"][0] < rms["2 transects"][0] / more**1.5
+
+
+def test_scaling_measures_every_setting(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(scaling, "SIDES", (8, 16))
+    monkeypatch.setattr(scaling, "TRIANGLES", (200, 800))
+    monkeypatch.setattr(scaling, "FEW_AND_MANY", (8, 16))
+    monkeypatch.setattr(sys, "argv", ["scaling.py", "--out", str(tmp_path), "--rounds", "1"])
+    scaling.main()
+    with open(tmp_path / "scaling.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["side"], row["triangles"]) for row in rows] == [
+        *(("8", "800"), ("16", "800")),
+        *(("8", "200"), ("8", "800"), ("16", "200"), ("16", "800")),
+    ]
+    assert all(float(row["seconds_median"]) > 0 for row in rows)
+    assert (tmp_path / "scaling.png").stat().st_size > 0
+    assert capsys.readouterr().out.count("the logarithm") == 2
