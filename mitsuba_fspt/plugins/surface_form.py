@@ -144,6 +144,7 @@ class _Refinement:
         active = (cos_s > 0) & (weight > 0)
         if self.hidden:
             active &= ~hidden(self.scene, spot.p, lens_point, active)
+        spot.sh_frame.n = spot.n  # not the normal that a mesh is shaded with
         spot.initialize_sh_frame()
         spot.wi = mi.Frame3f(middle.n).to_local(to_lens)
         radiance = dr.select(active, scalar(batch.glow.emitter.eval(spot, active)), 0)
