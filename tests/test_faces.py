@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from little_scenes import attribute, ball, glow, lens, scene_of, write_ply
 
+from mitsuba_fspt.errors import ExitanceError
 from mitsuba_fspt.quadrature import Quadrature
 
 FLOAT32 = 1e-6  # of the brightest pixel
@@ -124,6 +125,38 @@ def test_a_corner_nine_decades_dimmer_than_its_neighbour_keeps_its_light(tmp_pat
     pi.valid, pi.t, pi.prim_uv, pi.shape = True, 1.0, mi.Point2f([0, 1, 0], [0, 0, 1]), mi.ShapePtr(face)
     found = Faces.of([face]).radiance(pi, mi.Vector3f(-1, 0, 0))
     np.testing.assert_allclose(found.numpy(), exitance / np.pi, rtol=1e-6)
+
+
+def test_the_table_follows_what_nobody_tells_of(tmp_path):
+    """A texture updated by itself; faces turned round. Seen to fail with a table made anew only when Mitsuba tells."""
+    import mitsuba as mi
+
+    texture = mi.load_dict(attribute())
+    body = trimesh.creation.icosphere(2, radius=5)
+    write_ply(tmp_path / "body.ply", body.vertices, body.faces, vertex=np.full(len(body.vertices), 1e-3))
+    shape = {"type": "ply", "filename": str(tmp_path / "body.ply"), "emitter": glow(texture)}
+    scene = scene_of(shape, sensor=lens())
+    before = solved(scene).power
+    alone = mi.traverse(texture)
+    alone["scale"] = 4.0
+    alone.update()
+    np.testing.assert_allclose(solved(scene).power, 4 * before, rtol=1e-6)
+    parameters = mi.traverse(scene)
+    parameters["shape_0.faces"] = np.array(parameters["shape_0.faces"]).reshape(-1, 3)[:, ::-1].ravel().copy()
+    parameters.update()
+    assert solved(scene).power.max() == 0
+
+
+@pytest.mark.parametrize("kind", ["vertex", "face"])
+def test_an_attribute_of_several_channels_is_refused(tmp_path, kind):
+    """Fails where the first of its numbers are taken for one each."""
+    scene = scene_of(ply(tmp_path / "body.ply", per=kind), sensor=lens())
+    (mesh,) = scene.shapes()
+    count = mesh.vertex_count() if kind == "vertex" else mesh.face_count()
+    mesh.remove_attribute(f"{kind}_exitance")
+    mesh.add_attribute(f"{kind}_exitance", 3, [1e-3] * (3 * count))
+    with pytest.raises(ExitanceError, match=f"has several numbers for each {kind}, J_n is one"):
+        solved(scene)
 
 
 def test_a_zero_far_from_the_origin_is_not_taken_for_negative(tmp_path):

@@ -54,6 +54,12 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
             f"fspt_surface: shape '{shape.id()}' has no mesh attribute '{name}'. In a PLY name the {kind} property "
             f"'{plain}_x', or bring the values in with 'fspt flux import'."
         )
+    values = attribute_of(shape, texture)
+    if values is not None and dr.width(values) != _places(shape, name):
+        raise ExitanceError(
+            f"fspt_surface: mesh attribute '{name}' of shape '{shape.id()}' has several numbers for each "
+            f"{name.partition('_')[0]}, J_n is one. Give an attribute of one channel."
+        )
     scale = float(mi.traverse(texture)["scale"])
     return lambda si: shape.eval_attribute_1(name, si) * scale
 
@@ -61,18 +67,24 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
 def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float, mi.Float] | None:
     """J_n [W/mm²] at the three corners of every face, between which it is linear; None where it is something else."""
     faces = triangles(mesh)[1]
-    count = dr.width(faces) // 3
+    count = _places(mesh, "face")
     if is_uniform(texture):
         everywhere = function_on(mesh, texture)(dr.zeros(mi.SurfaceInteraction3f)) + dr.zeros(mi.Float, count)
         return everywhere, everywhere, everywhere
-    values = attribute_of(mesh, texture)
-    if values is None:
+    name, values = _attribute_name(texture), attribute_of(mesh, texture)
+    if name is None or values is None or dr.width(values) != _places(mesh, name):
         return None
     values = values * float(mi.traverse(texture)["scale"])
-    if str(_attribute_name(texture)).startswith("face"):
+    if name.startswith("face"):
         return values, values, values
     corner = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, count))
     return tuple(dr.gather(mi.Float, values, index) for index in corner)
+
+
+def numbers_of(texture: mi.Texture) -> tuple[float, ...]:
+    """The numbers that J_n depends on beside the mesh where it is uniform or a mesh attribute: value or scale."""
+    parameters = mi.traverse(texture)
+    return tuple(float(n) for name in ("value", "scale") if name in parameters for n in np.ravel(parameters[name]))
 
 
 def is_uniform(texture: mi.Texture) -> bool:
@@ -118,6 +130,12 @@ def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.
     arrays = [np.broadcast_arrays(value.numpy(), area.numpy()) for value, area in everywhere]
     values, areas = (np.concatenate(columns) for columns in zip(*arrays, strict=True))
     return values, areas
+
+
+def _places(mesh: mi.Shape, attribute: str) -> int:
+    """How many vertices or faces of a mesh an attribute of this name is for."""
+    positions, faces = triangles(mesh)
+    return dr.width(faces if attribute.startswith("face") else positions) // 3
 
 
 def _attribute_name(texture: mi.Texture) -> str | None:

@@ -24,10 +24,12 @@ class Faces:
     first : of each shape, by its number, at which face of all its own begin
     table : eight numbers a face: the least radiance at its corners, how much more it is at each of them [W/mm²/sr],
         its normal, 0
+    sources : the meshes' buffers, kept lest others take their numbers in `edition_of`
     """
 
     first: mi.UInt32
     table: mi.Float
+    sources: tuple[Any, ...]
 
     @classmethod
     def of(cls, shapes: Sequence[mi.Shape]) -> Faces | None:
@@ -44,7 +46,7 @@ class Faces:
         starts = mi.UInt32([first.get(number, 0) for number in range(max(first, default=0) + 1)])
         table = dr.concat(tables)
         dr.eval(starts, table)
-        return cls(starts, table)
+        return cls(starts, table, tuple(_buffers(shape) for shape in shapes))
 
     def radiance(self, pi: mi.PreliminaryIntersection3f, direction: mi.Vector3f) -> mi.Float:
         """Radiance [W/mm²/sr] where a ray with `direction` meets a face, towards its origin; 0 on the inward side."""
@@ -61,11 +63,18 @@ def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
     """What `Faces.of` follows from once a scene is checked; None where it is None at once."""
     if not all(shape.is_mesh() for shape in shapes):
         return None
-    emitters = [shape.emitter() for shape in shapes]
-    return [
-        (_number_of(shape), shape.face_count(), emitter, getattr(emitter, "edition", 0))
-        for shape, emitter in zip(shapes, emitters, strict=True)
-    ]
+    return [_edition(shape) for shape in shapes]
+
+
+def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
+    emitter = mesh.emitter()
+    places = (buffer.index for buffer in _buffers(mesh))
+    return _number_of(mesh), *places, emitter, getattr(emitter, "edition", 0)
+
+
+def _buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
+    # Copies, which share the data: what a mesh hands out keeps it alive.
+    return mi.Float(mesh.vertex_positions_buffer()), mi.UInt32(mesh.faces_buffer())
 
 
 def _number(shape: mi.ShapePtr) -> mi.UInt32:

@@ -69,6 +69,7 @@ class FsptSurface(mi.Emitter):
         self._probe: Probe | None = None
         self._checked = False
         self._attribute: mi.Float | None = None
+        self._numbers: tuple[float, ...] = ()  # of the texture
         self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
         self.brightest = 0.0  # largest J_n [W/mm²], known after `check`
         self.edition = 0  # counts the changes of J_n, for those who remember something about it
@@ -180,8 +181,10 @@ class FsptSurface(mi.Emitter):
     def check(self) -> None:
         """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
         attribute = exitance.attribute_of(self.get_shape(), self.exitance)
-        # Mitsuba does not tell an emitter of new values on its mesh.
-        if attribute is not None and self._attribute is not None and attribute.index != self._attribute.index:
+        numbers = exitance.numbers_of(self.exitance)
+        # Mitsuba does not tell an emitter of new values on its mesh, nor of those of a texture updated by itself.
+        renewed = attribute is not None and self._attribute is not None and attribute.index != self._attribute.index
+        if self._checked and (renewed or numbers != self._numbers):
             self._forget_exitance()
         if self._checked:
             return
@@ -192,7 +195,7 @@ class FsptSurface(mi.Emitter):
             return brightest
 
         self.brightest = aside(look, self.get_shape())
-        self._checked, self._attribute = True, attribute
+        self._checked, self._attribute, self._numbers = True, attribute, numbers
 
     def _sound(self) -> bool:
         """True after `check`; False where it fails in a recording for another scene, which must not care."""
