@@ -67,7 +67,7 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
 def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float, mi.Float] | None:
     """J_n [W/mm²] at the three corners of every face, between which it is linear; None where it is something else."""
     faces = triangles(mesh)[1]
-    count = _places(mesh, "face")
+    count = dr.width(faces) // 3
     if is_uniform(texture):
         everywhere = function_on(mesh, texture)(dr.zeros(mi.SurfaceInteraction3f)) + dr.zeros(mi.Float, count)
         return everywhere, everywhere, everywhere
@@ -119,12 +119,12 @@ def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.
     """J_n [W/mm²] all over a shape and the areas that it counts for; at corners as it was given where it is linear."""
     corners = at_corners(shape, texture) if shape.is_mesh() else None
     elements = elements_of(shape, minimum=1 if corners else 1 << 14)
-    index = dr.arange(mi.UInt32, elements.count)
     if corners:
         # Interpolation far from the world's origin would make a zero negative.
-        everywhere = [(value, elements.areas()) for value in corners]
+        area = elements.areas()
+        everywhere = [(value, area) for value in corners]
     else:
-        value_at = function_on(shape, texture)
+        value_at, index = function_on(shape, texture), dr.arange(mi.UInt32, elements.count)
         points = [elements.place(index, mi.Point2f(*point)) for point in CORNERS_AND_CENTRE]
         everywhere = [(value_at(si), area) for si, area in points]
     arrays = [np.broadcast_arrays(value.numpy(), area.numpy()) for value, area in everywhere]

@@ -32,21 +32,21 @@ class Faces:
     sources: tuple[Any, ...]
 
     @classmethod
-    def of(cls, shapes: Sequence[mi.Shape]) -> Faces | None:
-        """The faces of all shapes; None unless all are meshes, and those that glow Lambert's with a linear J_n."""
+    def of(cls, meshes: Sequence[mi.Shape]) -> Faces | None:
+        """The faces of these meshes; None unless all that glow do so by Lambert's law with a linear J_n."""
         first: dict[int, int] = {}
         tables, begin = [], 0
-        for shape in shapes:
-            radiance = _radiance_at_corners(shape)
+        for mesh in meshes:
+            radiance = _radiance_at_corners(mesh)
             if radiance is None:
                 return None
-            tables.append(_table(shape, radiance))
-            first[_number_of(shape)] = begin
-            begin += shape.face_count()
+            tables.append(_table(mesh, radiance))
+            first[_number_of(mesh)] = begin
+            begin += mesh.face_count()
         starts = mi.UInt32([first.get(number, 0) for number in range(max(first, default=0) + 1)])
         table = dr.concat(tables)
         dr.eval(starts, table)
-        return cls(starts, table, tuple(_buffers(shape) for shape in shapes))
+        return cls(starts, table, tuple(_buffers(mesh) for mesh in meshes))
 
     def radiance(self, pi: mi.PreliminaryIntersection3f, direction: mi.Vector3f) -> mi.Float:
         """Radiance [W/mm²/sr] where a ray with `direction` meets a face, towards its origin; 0 on the inward side."""
@@ -60,7 +60,7 @@ class Faces:
 
 
 def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
-    """What `Faces.of` follows from once a scene is checked; None where it is None at once."""
+    """What `Faces.of` follows from once a scene is checked; None where not all shapes are meshes."""
     if not all(shape.is_mesh() for shape in shapes):
         return None
     return [_edition(shape) for shape in shapes]
@@ -87,8 +87,6 @@ def _number_of(shape: mi.Shape) -> int:
 
 def _radiance_at_corners(mesh: mi.Shape) -> tuple[mi.Float, ...] | None:
     """Radiance [W/mm²/sr] at the three corners of every face, 0 where nothing glows; None as in `Faces.of`."""
-    if not mesh.is_mesh():
-        return None
     emitter = mesh.emitter()
     if emitter is None:
         return (dr.zeros(mi.Float, mesh.face_count()),) * 3

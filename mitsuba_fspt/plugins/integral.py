@@ -83,11 +83,10 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             traced = self._traced(scene, sensor)
             window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
             solution = self._solve_in(window, traced, sensor, quadrature)
-        findings = (_outside(window), *solution.findings)
-        if sensor.rounding < ROUNDING or 0 in window.shape:  # by so little lines of sight move at random
-            return replace(solution, findings=findings)
-        moved = window.expand(_moved(window.cut(solution.power), sensor.rounding))
-        return replace(solution, error=solution.error + moved, findings=findings)
+        error = solution.error
+        if sensor.rounding >= ROUNDING and 0 not in window.shape:  # by less lines of sight move at random
+            error = error + window.expand(_moved(window.cut(solution.power), sensor.rounding))
+        return replace(solution, error=error, findings=(_outside(window), *solution.findings))
 
     def _solve_in(self, window: Window, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
         """The form of Eq. 9 asked for; pixels with light of narrow spots take the surface form in any case."""

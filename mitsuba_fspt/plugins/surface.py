@@ -224,7 +224,10 @@ class FsptSurface(mi.Emitter):
     def radiance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
         """Radiance [W/mm²/sr] at the corners of every face of a mesh; None where it is not linear or not Lambert's."""
         corners = exitance.at_corners(self.get_shape(), self.exitance) if self.is_lambertian() else None
-        return corners and tuple(dr.inv_pi * value for value in corners)
+        if corners is None:
+            return None
+        profile = self.law.profile(dr.zeros(mi.SurfaceInteraction3f), mi.Vector3f(0, 0, 1), mi.Bool(True))
+        return tuple(profile * value for value in corners)
 
     def texels(self) -> int:
         """Number of pixels of the bitmap that J_n is, 1 where it is none."""
