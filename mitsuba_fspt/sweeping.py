@@ -15,6 +15,7 @@ import numpy as np
 from .atomic import atomic_path
 from .errors import ImageError, SceneError
 from .image import Image, read
+from .interrupt import ctrl_c_held
 from .sweep_point import Point, points
 
 if TYPE_CHECKING:
@@ -102,12 +103,14 @@ def sweep(
         with closing(_images(missing, jobs, scheduler)) as images:
             for point, image in images:
                 folder.mkdir(exist_ok=True)
-                image.write(folder / point.file)
-                rows[point.file] = _row(point, folder, image)
+                with ctrl_c_held():  # no image without its row in the index
+                    image.write(folder / point.file)
+                    rows[point.file] = _row(point, folder, image)
                 tell()
     finally:
         if rows:
-            _write_index([rows[point.file] for point in wanted if point.file in rows], folder / INDEX)
+            with ctrl_c_held():
+                _write_index([rows[point.file] for point in wanted if point.file in rows], folder / INDEX)
     return [rows[point.file] for point in wanted]
 
 

@@ -400,6 +400,26 @@ def test_ctrl_c_leaves_one_line_and_what_is_done(tmp_path, calls, jobs):
     assert all(fspt.read(tmp_path / "o" / name).power.max() > 0 for name in done)
 
 
+@pytest.mark.parametrize("hit", ["write", "_write_index"])
+def test_ctrl_c_while_a_file_is_written_leaves_no_image_without_its_row(scene, monkeypatch, hit):
+    holder = fspt.Image if hit == "write" else sweeping
+    write = getattr(holder, hit)
+
+    def interrupted(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        write(*arguments)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(holder, hit, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fspt.sweep(scene, {"f_number": [8, 16]}, "o")
+    done = [name for name in os.listdir("o") if name.endswith(".exr")]
+    assert len(done) == (1 if hit == "write" else 2)
+    assert set(os.listdir("o")) == {*done, "index.csv"}
+    with open("o/index.csv", encoding="utf-8") as index:
+        assert {row["file"] for row in csv.DictReader(index)} == set(done)
+
+
 def test_a_run_after_ctrl_c_renders_the_rest(scene, calls):
     rendered, _ = calls
 
