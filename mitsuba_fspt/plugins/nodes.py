@@ -71,6 +71,7 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
     pixels is probed with twelve: what four were off by there counts for the pixels around.
     """
     rough = draft.grown(rough) & draft.open
+    dr.eval(rough)
     smooth = int(dr.count(~rough & (draft.hits > 0))[0])
     why = f"{smooth} of {len(draft.grid)} pixels looked at see the surface, smooth and no edge of it"
     draft.findings.append(Finding("smooth", smooth > 0, why))
@@ -82,6 +83,7 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
     doubt = draft.grid.spread_over_lattice(dr.select(probes, difference, 0))
     draft.error = dr.select(rough, draft.error, dr.maximum(draft.error, doubt))
     misled = ~rough & (draft.hits > 0) & (draft.error > draft.tolerance) & draft.open
+    dr.eval(draft.error, misled)
     if dr.any(misled):
         _refine(draft, misled & ~probes)
     rough = rough | misled
@@ -121,7 +123,7 @@ def _refine(draft: Draft, where: Mask) -> Image:
     draft.roughness = dr.maximum(draft.roughness, rough)
     error = dr.maximum(left, draft.error / MOST_GAIN)
     draft.error = dr.select(where, dr.maximum(error, draft.cut_off()), draft.error)
-    dr.eval(draft.error, draft.nearest, difference)
+    dr.eval(draft.value, draft.error, draft.roughness, draft.nearest, difference)
     return difference
 
 
