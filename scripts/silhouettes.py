@@ -61,7 +61,8 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
 
     scene = fspt.load(name, f_number=f_number)
     lens = scene.sensors()[0]
-    draft = Draft(View.of(scene, lens), visible_window(scene, lens), Quadrature(rtol=RTOL), None)
+    window = visible_window(scene, lens)
+    draft = Draft(View.of(scene, lens, window), window, Quadrature(rtol=RTOL), None)
     first_nodes(draft)
     cut = parted(draft.hits)
     pixels = np.array(dr.compress(cut))

@@ -128,7 +128,8 @@ def test_scatter_says_where_transects_kink_and_where_they_only_lean():
     balls = [{"type": "sphere", "center": [x, y, 0], "radius": 4.0, "emitter": glow()} for x, y in ((12, -2), (-15, 2))]
     scene = scene_of(*balls, sensor=lens(48, pitch=0.2, f_number=2.8))
     sensor = scene.sensors()[0]
-    draft = Draft(View.of(scene, sensor), visible_window(scene, sensor), Quadrature(rtol=1e-4), None)
+    window = visible_window(scene, sensor)
+    draft = Draft(View.of(scene, sensor, window), window, Quadrature(rtol=1e-4), None)
     first_nodes(draft)
     cut = parted(draft.hits)
     edges = edges_of(draft)
@@ -197,7 +198,7 @@ def test_a_transect_is_split_where_it_enters_one_body_leaves_it_for_another_and_
     ]
     scene = scene_of(*balls, sensor=lens(8, pitch=4.0, f_number=2.8))
     sensor, points, number = scene.sensors()[0], 4000, 16
-    view = View.of(scene, sensor)
+    view = View.of(scene, sensor, visible_window(scene, sensor))
     place = np.stack([np.linspace(0.3, 0.7, number), np.full(number, 0.5), np.linspace(0.4, 0.6, number)])
 
     def curves(copies):

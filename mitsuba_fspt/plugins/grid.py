@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 ROUNDING = 1e-4  # of a share of hits: a sum of float32 weights
 AROUND = [(dx, dy) for dx, dy in itertools.product((-1, 0, 1), repeat=2) if (dx, dy) != (0, 0)]
-BLOCK = 4  # side of the blocks of pixels, each of which holds one of the lattice
+BLOCK = 4  # side of the squares of pixels that are looked at together, each of which holds one of the lattice
 
 
 class Grid:
@@ -35,10 +35,25 @@ class Grid:
         self.x = mi.Int(self.number) - self.y * self._width
         # Numbers of the neighbours, which are asked for again and again.
         self._around = {(dx, dy): self._index(self.x + dx, self.y + dy) for dx, dy in AROUND}
-        dr.eval(self.number, self.x, self.y, self._around)
+        self._by_squares = self._in_bands()
+        dr.eval(self.number, self.x, self.y, self._around, self._by_squares)
 
     def __len__(self) -> int:
         return math.prod(self.shape)
+
+    def pixels(self, mask: Mask | None = None) -> mi.UInt32:
+        """Numbers of all pixels or of the marked ones, squares of sixteen together."""
+        if mask is None:
+            return self._by_squares
+        return dr.gather(mi.UInt32, self._by_squares, dr.compress(dr.gather(mi.Bool, mask, self._by_squares)))
+
+    def _in_bands(self) -> mi.UInt32:
+        """Numbers of the pixels band by band, `BLOCK` rows each, and in a band column by column."""
+        number, full = mi.Int(self.number), BLOCK * self._width
+        band = number // full
+        place, rows = number - band * full, dr.minimum(BLOCK, self._height - BLOCK * band)
+        column = place // rows
+        return mi.UInt32((BLOCK * band + place - column * rows) * self._width + column)
 
     def full(self, kind: type, value: Any) -> Any:
         """An image that has the same value everywhere."""

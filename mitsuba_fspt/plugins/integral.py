@@ -92,7 +92,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         """The form of Eq. 9 asked for; pixels with light of narrow spots take the surface form in any case."""
         if 0 in window.shape:
             return Solution(*np.zeros((3, *window.full)), rays=0)
-        view = View.of(scene, lens, self._faces_of(scene) if quadrature.takes("record") else None)
+        view = View.of(scene, lens, window, self._faces_of(scene) if quadrature.takes("record") else None)
         # Light from the surface knows no border on the film: pixels that the image-plane stop cuts take lines of sight.
         inside, cut = window.stopped(lens)
         if quadrature.domain == "surface":

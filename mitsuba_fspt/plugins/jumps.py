@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..rules import MOST_JUMPS, AlongTransect
-from .lines import View, repeat
+from .lines import TRANSECTS_TOGETHER, View, repeat
 from .transect import Transect
 
 MOST_STEPS = 2  # of jumps within a body: beside two the scan has too little left to tell a third from a slope
@@ -34,10 +34,11 @@ def integrate_transect(
     first of them at `phase` of one; a transect without a jump is one piece. In units of the integrand an `outline`
     counts so much as a jump of the radiance, and less than `least` does not.
     """
+    together = view.detail <= TRANSECTS_TOGETHER
 
     def look(s: mi.Float) -> mi.Point3f:
         position, pupil, _ = transect.at(s)
-        return mi.Point3f(*view.radiance_on_film(position, pupil)[1:])
+        return mi.Point3f(*view.radiance_on_film(position, pupil, together)[1:])
 
     found = _search(look, phase, along, outline, least)
     jumps, places = found.jumps, found.places()
@@ -59,7 +60,7 @@ def integrate_transect(
             share, slope = _towards_jumps((mi.Float(number) + phase) / mi.Float(nodes), at_start, at_end)
             s = low + (high - low) * share
             position, pupil, density = transect.at(s)
-            f, _, body, _ = view.radiance_on_film(position, pupil)
+            f, _, body, _ = view.radiance_on_film(position, pupil, together)
             return (sums.plus(slope * density, (s - middle) / half, f, body),)
 
         (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))

@@ -5,9 +5,10 @@ Every function here is one loop of one kernel, over as many lines of sight as th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +18,13 @@ from ..shortcuts import Finding
 from .elements import at_one_wavelength, scalar
 from .faces import Faces
 
+if TYPE_CHECKING:
+    from .window import Window
+
+# Triangles a pixel up to which neighbouring lines of sight meet the same ones, and are traced the faster together: nodes
+# of pixels in a square, transects of one pixel.
+NODES_TOGETHER, TRANSECTS_TOGETHER = 4.0, 0.5
+
 # ---------------------------------------------------------------------- one line of sight
 
 
@@ -25,32 +33,35 @@ class View:
     """What a lens sees of a scene along lines of sight that begin at the depth `start` [mm], before all there is.
 
     To Mitsuba a small round body far from where a ray begins has a fuzzy limb: rounding moves it by a share of the
-    distance squared over its radius.
+    distance squared over its radius. Of its triangles there are `detail` a pixel.
     """
 
     scene: mi.Scene
     lens: mi.Sensor
     start: mi.Float
     faces: Faces | None
+    detail: float
 
     @classmethod
-    def of(cls, scene: mi.Scene, lens: mi.Sensor, faces: Faces | None = None) -> View:
-        """As seen through Mitsuba's surface records or, where the scene has them, its `faces`."""
-        return cls(scene, lens, dr.opaque(mi.Float, lens.clear_depth(scene.bbox())), faces)
+    def of(cls, scene: mi.Scene, lens: mi.Sensor, window: Window, faces: Faces | None = None) -> View:
+        """As seen in a window through Mitsuba's surface records or, where the scene has them, its `faces`."""
+        triangles = sum(shape.face_count() if shape.is_mesh() else 1 for shape in scene.shapes())
+        start = dr.opaque(mi.Float, lens.clear_depth(scene.bbox()))
+        return cls(scene, lens, start, faces, triangles / math.prod(window.shape))
 
     def radiance_on_film(
-        self, position: mi.Point2f, pupil: mi.Point2f
+        self, position: mi.Point2f, pupil: mi.Point2f, together: bool = False
     ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
         """Integrand of Eq. 9, cos⁴θ · L [W/mm²/sr]; L; number of the body met, 0 for none or no passage; its depth
         [mm].
 
         `pupil`, on the unit disc, stands for as large a share of what is open; the integrand for all of the pupil.
+        Lines of neighbouring lanes are traced `together`, as one packet, or each on its own.
         """
         pupil, share = self.lens.open_pupil(position, pupil)
         ray, weight, cos_theta = self.lens.line_of_sight(position, pupil, self.start)
         at_one_wavelength(ray)
-        # Embree traces packets of neighbouring lines of sight more slowly than single rays.
-        pi = self.scene.ray_intersect_preliminary(ray, coherent=False, active=weight > 0)
+        pi = self.scene.ray_intersect_preliminary(ray, coherent=together, active=weight > 0)
         radiance = self.faces.radiance(pi, ray.d) if self.faces else self._by_record(pi, ray)
         body = mi.Float(dr.reinterpret_array(mi.UInt32, pi.shape))
         return share * weight * radiance, radiance, body, self.start + pi.t * cos_theta
@@ -78,6 +89,7 @@ def repeat(count: int | mi.UInt32, body: Callable[..., tuple], *state: Any) -> t
 def apply_rule(view: View, centre: mi.Point2f, rule: rules.Rule) -> tuple[mi.Float, ...]:
     """Weighted sums of one rule at every pixel: value, contrast, first moments over the pupil, hits, depth range."""
     table = [mi.Float(column) for column in (*rule.pupil.T, *rule.pixel.T, rule.weight, rule.contrast)]
+    together = view.detail <= NODES_TOGETHER
 
     def node(
         k: mi.UInt32,
@@ -89,7 +101,7 @@ def apply_rule(view: View, centre: mi.Point2f, rule: rules.Rule) -> tuple[mi.Flo
         farthest: mi.Float,
     ) -> tuple:
         ax, ay, dx, dy, weight, null = (dr.gather(mi.Float, column, k) for column in table)
-        f, _, body, depth = view.radiance_on_film(centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
+        f, _, body, depth = view.radiance_on_film(centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay), together)
         hit = body > 0
         return (
             value + weight * f,

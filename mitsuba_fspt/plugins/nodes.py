@@ -130,10 +130,10 @@ def _refine(draft: Draft, where: Mask) -> Image:
 def apply_nodes(draft: Draft, rule: rules.Rule, where: Mask | None = None) -> list[Image]:
     """Images of `apply_rule`'s sums at all or at the marked pixels, 0 (depths: inf, 0) elsewhere."""
     if where is None:
-        index = draft.grid.number
+        index = draft.grid.pixels()
         images = [dr.empty(mi.Float64, len(draft.grid)) for _ in range(7)]
     else:
-        index = dr.compress(where)
+        index = draft.grid.pixels(where)
         images = [draft.grid.full(mi.Float64, fill) for fill in (0, 0, 0, 0, 0, dr.inf, 0)]
     for part in chunks(index, LANES):
         sums = apply_rule(draft.view, draft.window.centres(part), rule)

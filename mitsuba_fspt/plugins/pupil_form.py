@@ -49,7 +49,7 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
     window = visible_window(scene, lens)
     if 0 in window.shape:
         return np.zeros(window.full)
-    grid, view = Grid(window.shape), View.of(scene, lens)
+    grid, view = Grid(window.shape), View.of(scene, lens, window)
     image = grid.full(mi.Float64, 0)
     for part in chunks(grid.number, LANES):
         hits = apply_rule(view, window.centres(part), rules.twelve(True))[4]

@@ -199,7 +199,7 @@ def apply_transects(
     draft: Draft, where: Mask, edges: Edges, rule: rules.Transects, along: rules.AlongTransect
 ) -> Means:
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
-    index = dr.compress(where)
+    index = draft.grid.pixels(where)
     images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
     rays = 0
     for part in chunks(index, max(1, LANES // len(rule))):
