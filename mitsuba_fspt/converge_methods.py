@@ -182,17 +182,19 @@ def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float
     return prepare
 
 
-def raw_rate(scene: mi.Scene, lens: mi.Sensor, least: int = 1 << 20) -> Callable[[], int]:
+def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 << 20) -> Callable[[], int]:
     """A run of nothing but Embree or OptiX: rays in memory to hits in memory; it returns their number.
 
     Lines of sight like the integral's: four nodes on every pixel that can see what glows, turned about the pupil's
-    middle until there are `least` rays. Rays beside it, which cost far less, are none of them: a method whose rays are
-    many such may get more than this out of Embree.
+    middle until there are `least` rays; those of neighbouring pixels lie side by side, and are traced `together`, in
+    packets, or each on its own. Rays beside it, which cost far less, are none of them: a method whose rays are many
+    such may get more than this out of Embree.
     """
     import drjit as dr
     import mitsuba as mi
 
     from . import rules
+    from .plugins.grid import Grid
     from .plugins.window import visible_window
 
     window = visible_window(scene, lens)
@@ -204,13 +206,13 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, least: int = 1 << 20) -> Callable
     pupil = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
     columns = np.concatenate([pupil.reshape(2, -1), np.tile(rule.pixel.T, turns)])
     node = dr.arange(mi.UInt32, pixels * columns.shape[1])
-    pixel, node = node // columns.shape[1], node % columns.shape[1]
+    pixel, node = dr.gather(mi.UInt32, Grid(window.shape).pixels(), node % pixels), node // pixels
     ax, ay, dx, dy = (dr.gather(mi.Float, mi.Float(column), node) for column in columns)
     ray, _, _ = lens.line_of_sight(window.centres(pixel) + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
     dr.eval(ray)
 
     def run() -> int:
-        hits = scene.ray_intersect_preliminary(ray, coherent=False)
+        hits = scene.ray_intersect_preliminary(ray, coherent=together)
         dr.eval(hits)
         dr.sync_thread()
         return len(node)

@@ -57,7 +57,8 @@ class Convergence:
     reference, check : what errors are counted from, and what an independent picture said of it
     stated, stated_largest : its own RMS and largest error over its brightest pixel
     full : number of pixels whose whole cone sees the phantom
-    raw_rate : rays per second of Embree or OptiX alone, on pixels that can see what glows
+    raw_rate : rays per second of Embree or OptiX alone, on pixels that can see what glows; in packets or one by one,
+        whichever is faster
     rows : method by method, from coarse to fine
     left_out : methods that do not apply and settings that take too long, and why
     """

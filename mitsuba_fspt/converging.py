@@ -97,10 +97,11 @@ def converge(
             left_out[method.name] = str(refusal)
         else:
             left_out |= too_long
-    raw = raw_rate(scene, lens)
-    rays, raw_seconds = raw(), []
+    raws = {raw: raw() for raw in (raw_rate(scene, lens, together) for together in (False, True))}
+    raw_seconds: dict[object, list[float]] = {raw: [] for raw in raws}
     for k in range(rounds):
-        raw_seconds.append(_seconds(raw)[0])
+        for raw in raws:
+            raw_seconds[raw].append(_seconds(raw)[0])
         for trial in bench.trials[:: -1 if k % 2 else 1]:
             tell(f"round {k + 1}: {trial.method.name}", 0.5 + 0.5 * k / rounds)
             trial.run_timed(judge)
@@ -113,7 +114,7 @@ def converge(
         stated=known.rms,
         stated_largest=known.largest,
         full=int(judge.full.sum()),
-        raw_rate=rays / float(np.median(raw_seconds)),
+        raw_rate=max(rays / float(np.median(raw_seconds[raw])) for raw, rays in raws.items()),
         rows=tuple(trial.row() for trial in bench.trials),
         left_out=left_out,
     )

@@ -212,8 +212,9 @@ def test_raw_rays_are_as_many_as_asked_for():
     lens = scene.sensors()[0]
     once = 4 * math.prod(visible_window(scene, lens).shape)
     assert 0 < once < 2 * WIDTH * HEIGHT
-    lines = [converge_methods.raw_rate(scene, lens, least)() for least in (1, 30000)]
-    assert lines == [once, once * math.ceil(30000 / once)]
+    for together in (False, True):
+        lines = [converge_methods.raw_rate(scene, lens, together, least)() for least in (1, 30000)]
+        assert lines == [once, once * math.ceil(30000 / once)]
 
 
 # --- what it is counted from ---
