@@ -51,7 +51,8 @@ class Grid:
         """Numbers of the pixels band by band, `BLOCK` rows each, and in a band column by column."""
         number, full = mi.Int(self.number), BLOCK * self._width
         band = number // full
-        place, rows = number - band * full, dr.minimum(BLOCK, self._height - BLOCK * band)
+        # At least 1: kernels run on a little beyond the last pixel, and nothing may be divided by zero there.
+        place, rows = number - band * full, dr.clip(self._height - BLOCK * band, 1, BLOCK)
         column = place // rows
         return mi.UInt32((BLOCK * band + place - column * rows) * self._width + column)
 
