@@ -21,8 +21,8 @@ from .faces import Faces
 if TYPE_CHECKING:
     from .window import Window
 
-# Triangles a pixel up to which neighbouring lines of sight meet the same ones, and are traced the faster together: nodes
-# of pixels in a square, transects of one pixel.
+# Triangles a pixel up to which neighbouring lines of sight meet the same ones and are the faster traced together:
+# nodes of pixels in a square, transects of one pixel.
 NODES_TOGETHER, TRANSECTS_TOGETHER = 4.0, 0.5
 
 # ---------------------------------------------------------------------- one line of sight
