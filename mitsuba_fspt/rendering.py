@@ -28,6 +28,7 @@ METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 LANES = 1 << 23  # Monte Carlo samples in flight
 ALIKE = 3.0  # by less do the errors of neighbours differ that see the same
+FEW = 20  # events on a pixel; fewer say too little of how many to expect
 Progress = Callable[[str, float], None]
 Picture = NDArray[np.float64]
 
@@ -166,11 +167,12 @@ def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
 
 
 def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -> Picture:
-    """Of the mean of passes, from that of their squares; what a single sample brings where none met light, or none
-    missed it though some did next to it.
+    """Of the mean of passes, from that of their squares; at least what a single sample brings where none met light, or
+    none missed it though some did next to it.
 
     Their scatter says nothing, but the neighbours know: what events bring that are counted, and few, is variance over
-    mean, and where all samples meet light a share of it.
+    mean, and where all samples meet light a share of it. Of how many to expect a few say little on one pixel, more on
+    nine: variance is what an event brings times the mean.
     """
     from .plugins.grid import Grid
 
@@ -179,8 +181,11 @@ def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -
     event = np.maximum(np.divide(variance, mean, out=np.zeros_like(mean), where=met), mean / samples)
     scatter, grid = np.sqrt(variance), Grid(mean.shape)
     near, single = (grid.array(grid.spread_max(grid.lanes(image))) for image in (scatter, event))
+    few = mean * mean <= FEW * variance
+    expected = grid.array(grid.mean_where(grid.lanes(mean), grid.lanes(few), 1))
+    counted = np.maximum(np.where(met, scatter, single), np.sqrt(single * expected))
     missed = np.where(near > ALIKE * scatter, np.minimum(near, mean / samples), 0)
-    return np.where(met, np.maximum(scatter, missed), single)
+    return np.where(few, counted, np.maximum(scatter, missed))
 
 
 def _is_scene(scene: object) -> bool:
