@@ -1,4 +1,4 @@
-"""scripts/silhouettes.py and scripts/scaling.py on scenes so small that they take seconds."""
+"""scripts/silhouettes.py, scaling.py and start_time.py on scenes so small that they take seconds."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
 
 import scaling  # noqa: E402
 import silhouettes  # noqa: E402
+import start_time  # noqa: E402
 
 
 def test_silhouettes_finds_errors_that_fall(tmp_path):
@@ -40,3 +41,14 @@ def test_scaling_measures_every_setting(tmp_path, monkeypatch, capsys):
     assert all(float(row["seconds_median"]) > 0 for row in rows)
     assert (tmp_path / "scaling.png").stat().st_size > 0
     assert capsys.readouterr().out.count("the logarithm") == 2
+
+
+def test_start_time_tells_what_the_kernels_cost(tmp_path, monkeypatch, capsys):
+    scene = write_scene(tmp_path / "ball.xml")
+    monkeypatch.setattr(sys, "argv", ["start_time.py", "--scene", str(scene), "--rounds", "1"])
+    start_time.main()
+    table, steps = capsys.readouterr().out.split("\n\n")
+    told = {row.split("|")[1].strip(): float(row.split("|")[2].split()[0]) for row in table.splitlines()[2:]}
+    assert 0 < told["import mitsuba_fspt"] < told["fspt render again"] < told["fspt render, no kernels"]
+    assert int(steps.split("of which ")[1].split()[0]) > 10
+    assert steps.count(" s\n") == len(start_time.STEP_NAMES)
