@@ -119,8 +119,12 @@ def check_alone(scene: mi.Scene, emitter: mi.Emitter) -> None:
     lift = LIFT * dr.max(dr.abs(si.p))
     ray = mi.Ray3f(si.p + lift * si.n, -si.n)
     ray.maxt = 2 * lift
-    other = scene.ray_intersect(ray, active=area > 0)
-    shared = other.is_valid() & (other.shape != mi.ShapePtr(shape)) & (dr.dot(other.n, si.n) > 0)
+    met = scene.ray_intersect_preliminary(ray, active=area > 0)
+    near = met.is_valid() & (met.shape != mi.ShapePtr(shape))
+    if not dr.any(near):  # else only: what it is asks every shape of the scene
+        return
+    other = met.compute_surface_interaction(ray, active=near)
+    shared = near & (dr.dot(other.n, si.n) > 0)
     if dr.any(shared):
         second = other.shape[int(np.argmax(shared.numpy()))]
         raise SceneError(
