@@ -28,7 +28,7 @@ METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 LANES = 1 << 23  # Monte Carlo samples in flight
 ALIKE = 3.0  # by less do the errors of neighbours differ that see the same
-FEW = 20  # events on a pixel; fewer say too little of how many to expect
+FEW = 20  # events on a pixel; fewer say too little of their variance
 Progress = Callable[[str, float], None]
 Picture = NDArray[np.float64]
 
@@ -171,8 +171,8 @@ def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -
     none missed it though some did next to it.
 
     Their scatter says nothing, but the neighbours know: what events bring that are counted, and few, is variance over
-    mean, and where all samples meet light a share of it. Of how many to expect a few say little on one pixel, more on
-    nine: variance is what an event brings times the mean.
+    mean, and where all samples meet light a share of it. Of their own variance a few say little on one pixel, more on
+    nine.
     """
     from .plugins.grid import Grid
 
@@ -182,8 +182,8 @@ def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -
     scatter, grid = np.sqrt(variance), Grid(mean.shape)
     near, single = (grid.array(grid.spread_max(grid.lanes(image))) for image in (scatter, event))
     few = mean * mean <= FEW * variance
-    expected = grid.array(grid.mean_where(grid.lanes(mean), grid.lanes(few), 1))
-    counted = np.maximum(np.where(met, scatter, single), np.sqrt(single * expected))
+    pooled = np.sqrt(grid.array(grid.mean_where(grid.lanes(variance), grid.lanes(few), 1)))
+    counted = np.where(met, pooled, np.maximum(pooled, single))
     missed = np.where(near > ALIKE * scatter, np.minimum(near, mean / samples), 0)
     return np.where(few, counted, np.maximum(scatter, missed))
 
