@@ -172,7 +172,7 @@ def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -
 
     Their scatter says nothing, but the neighbours know: what events bring that are counted, and few, is variance over
     mean, and where all samples meet light a share of it. Of their own variance a few say little on one pixel, more on
-    nine.
+    all around that were met.
     """
     from .plugins.grid import Grid
 
@@ -182,7 +182,7 @@ def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -
     scatter, grid = np.sqrt(variance), Grid(mean.shape)
     near, single = (grid.array(grid.spread_max(grid.lanes(image))) for image in (scatter, event))
     few = mean * mean <= FEW * variance
-    pooled = np.sqrt(grid.array(grid.mean_where(grid.lanes(variance), grid.lanes(few), 1)))
+    pooled = np.sqrt(grid.array(grid.mean_where(grid.lanes(variance), grid.lanes(few & met), 1)))
     counted = np.where(met, pooled, np.maximum(pooled, single))
     missed = np.where(near > ALIKE * scatter, np.minimum(near, mean / samples), 0)
     return np.where(few, counted, np.maximum(scatter, missed))

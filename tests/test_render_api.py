@@ -148,9 +148,10 @@ def test_a_few_events_on_a_pixel_are_off_by_the_root_of_how_many_to_expect(expec
     mean = counts.mean(axis=0)
     error = rendering._standard_error(mean, np.square(counts).mean(axis=0), passes, samples=1 << 10)
     off = mean - expected / passes
-    assert np.mean(off**2) == pytest.approx(np.mean(error**2), rel=0.05)
-    assert np.mean((off / error) ** 2) == pytest.approx(1, abs=0.05)
-    assert np.abs(off / error).max() < 5.4
+    # What no event met has the error of one at least: of two to expect a little too large.
+    assert 0.83 < np.mean(off**2) / np.mean(error**2) < 1.05
+    assert 0.8 < np.mean((off / error) ** 2) < 1.05
+    assert np.abs(off / error).max() < 5
 
 
 def test_samples_may_be_few(scene):
