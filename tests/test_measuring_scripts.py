@@ -1,11 +1,13 @@
-"""scripts/silhouettes.py, scaling.py and start_time.py on scenes so small that they take seconds."""
+"""scripts/silhouettes.py, scaling.py, start_time.py and work_precision.py, made so small that they take seconds."""
 
 from __future__ import annotations
 
 import csv
+import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from little_scenes import write_scene
 
@@ -15,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
 import scaling  # noqa: E402
 import silhouettes  # noqa: E402
 import start_time  # noqa: E402
+import work_precision  # noqa: E402
 
 
 def test_silhouettes_finds_errors_that_fall(tmp_path):
@@ -52,3 +55,29 @@ def test_start_time_tells_what_the_kernels_cost(tmp_path, monkeypatch, capsys):
     assert 0 < told["import mitsuba_fspt"] < told["fspt render again"] < told["fspt render, no kernels"]
     assert int(steps.split("of which ")[1].split()[0]) > 10
     assert steps.count(" s\n") == len(start_time.STEP_NAMES)
+
+
+def test_work_precision_makes_the_truth_once_and_counts_from_it(tmp_path, monkeypatch, capsys):
+    power, truths = np.full((256, 256), 1e-9), []
+
+    def truth(camera, mesh):
+        truths.append((camera, mesh))
+        return power, 1e-6 * power
+
+    def measured(arguments):
+        with np.load(tmp_path / "new" / "truth.npz") as arrays:
+            np.testing.assert_array_equal(arrays["power"], power)
+        assert arguments[0] == "converge"
+        assert {"f_number=2.8", os.path.join("new", "truth.npz"), str(tmp_path)} < set(arguments)
+        return 0
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(work_precision, "mesh_truth", truth)
+    monkeypatch.setattr(work_precision, "run", measured)
+    options = ["-o", str(tmp_path), "--truth", str(tmp_path / "new" / "truth.npz")]
+    monkeypatch.setattr(sys, "argv", ["work_precision.py", *options])
+    for _ in range(2):
+        with pytest.raises(SystemExit, match="0"):
+            work_precision.main()
+    assert len(truths) == 1
+    assert "1.0e-06 at the most" in capsys.readouterr().out
