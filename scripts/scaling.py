@@ -4,8 +4,8 @@
 
 A ball with a smooth J_n, its front in focus, f/2.8. First the same field on ever more pixels, 128 x 128 to 2048 x 2048;
 then the same ball in ever more triangles, 10 thousand to 3 million, on 256 x 256 pixels, where at last every line of
-sight meets a triangle of its own, and on 2048 x 2048. Warm, in one process; medians. Writes scaling.csv and scaling.png
-and prints the tables.
+sight meets a triangle of its own, and on 2048 x 2048. Beside each what Embree alone takes for four lines of sight a
+pixel. Warm, in one process; medians. Writes scaling.csv and scaling.png and prints the tables.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import itertools
 import math
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +25,7 @@ import numpy as np
 import mitsuba_fspt as fspt
 from mitsuba_fspt import backend
 from mitsuba_fspt.atomic import atomic_path
+from mitsuba_fspt.converge_methods import raw_rate
 
 SIDES = (128, 256, 512, 1024, 2048)
 TRIANGLES = (10_000, 100_000, 1_000_000, 3_000_000)
@@ -38,12 +40,18 @@ class Setting:
     side: int
     triangles: int
     seconds: list[float] = field(default_factory=list)
+    bare_seconds: list[float] = field(default_factory=list)  # of tracing alone, four lines of sight a pixel
     rays: int = 0
 
     @property
     def nanoseconds(self) -> float:
         """Median time a pixel [ns]."""
         return 1e9 * float(np.median(self.seconds)) / self.side**2
+
+    @property
+    def bare_nanoseconds(self) -> float:
+        """Median time a pixel of tracing alone [ns]."""
+        return 1e9 * float(np.median(self.bare_seconds)) / self.side**2
 
 
 def main() -> None:
@@ -114,22 +122,35 @@ def measure(settings: list[Setting], folder: Path, rounds: int, rtol: float) -> 
     integrator = mi.load_dict({"type": "fspt_integral", "rtol": rtol})
     for setting in settings:  # one scene alive at a time: every living one costs all kernels
         of = scene(setting, folder)
+        lens = of.sensors()[0]
+        bare = [raw_rate(of, lens, together, least=1) for together in (False, True)]
         for k in range(rounds + 1):
             start = time.perf_counter()
-            setting.rays = integrator.solve(of, of.sensors()[0]).rays
+            setting.rays = integrator.solve(of, lens).rays
+            seconds = time.perf_counter() - start
+            bare_seconds = min(seconds_of(run) for run in bare)  # packets where they are the faster
             if k:
-                setting.seconds.append(time.perf_counter() - start)
-        del of
+                setting.seconds.append(seconds)
+                setting.bare_seconds.append(bare_seconds)
+        del of, lens, bare
+
+
+def seconds_of(run: Callable[[], object]) -> float:
+    """Time of one run [s]."""
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
 
 
 def write_csv(settings: list[Setting], path: Path) -> None:
-    """One row a setting: pixels a side, triangles, median, least and largest time [s], lines of sight."""
+    """One row a setting: its film and mesh, median, least and largest time [s], lines of sight, tracing alone [s]."""
     with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(["side", "triangles", "seconds_median", "seconds_min", "seconds_max", "lines_of_sight"])
+        times = ("seconds_median", "seconds_min", "seconds_max")
+        rows.writerow(["side", "triangles", *times, "lines_of_sight", "bare_seconds"])
         for s in settings:
             times = [f"{f(s.seconds):.5f}" for f in (np.median, min, max)]
-            rows.writerow([s.side, s.triangles, *times, s.rays])
+            rows.writerow([s.side, s.triangles, *times, s.rays, f"{np.median(s.bare_seconds):.5f}"])
 
 
 def draw(by_pixels: list[Setting], by_triangles: list[list[Setting]], path: Path) -> None:
@@ -141,8 +162,10 @@ def draw(by_pixels: list[Setting], by_triangles: list[list[Setting]], path: Path
     left.semilogx([s.side for s in by_pixels], [s.nanoseconds for s in by_pixels], "o-", base=2)
     left.set(xlabel="pixels a side", ylabel="time a pixel [ns]", ylim=(0, None))
     for settings in by_triangles:
-        label = f"{settings[0].side}² pixels"
-        right.semilogx([s.triangles for s in settings], [s.nanoseconds for s in settings], "o-", label=label)
+        label, triangles = f"{settings[0].side}² pixels", [s.triangles for s in settings]
+        (line,) = right.semilogx(triangles, [s.nanoseconds for s in settings], "o-", label=label)
+        bare = [s.bare_nanoseconds for s in settings]
+        right.semilogx(triangles, bare, "o--", color=line.get_color(), label=f"{label}, tracing alone")
     right.set(xlabel="triangles", ylim=(0, None))
     right.legend()
     for axes in (left, right):
@@ -153,15 +176,18 @@ def draw(by_pixels: list[Setting], by_triangles: list[list[Setting]], path: Path
 
 def report(by_pixels: list[Setting], by_triangles: list[list[Setting]]) -> None:
     """All settings as a Markdown table, then growth over the triangles beside that of their logarithm."""
-    print("| pixels | triangles | time | a pixel | lines of sight a pixel |\n|---|---|---|---|---|")
+    print("| pixels | triangles | time | a pixel | lines of sight a pixel | 4 a pixel, tracing alone |")
+    print("|---|---|---|---|---|---|")
     for s in [*by_pixels, *itertools.chain(*by_triangles)]:
         seconds = float(np.median(s.seconds))
-        print(f"| {s.side}² | {s.triangles} | {seconds:.3g} s | {s.nanoseconds:.0f} ns | {s.rays / s.side**2:.2f} |")
+        row = (f"{s.side}²", s.triangles, f"{seconds:.3g} s", f"{s.nanoseconds:.0f} ns", f"{s.rays / s.side**2:.2f}")
+        print(f"| {' | '.join(map(str, row))} | {s.bare_nanoseconds:.0f} ns |")
     logarithm = math.log(TRIANGLES[-1]) / math.log(TRIANGLES[0])
     for settings in by_triangles:
-        growth = settings[-1].nanoseconds / settings[0].nanoseconds
-        print(f"{settings[0].side}² pixels, {TRIANGLES[0]} to {TRIANGLES[-1]} triangles: x{growth:.2f}", end="")
-        print(f" (the logarithm: x{logarithm:.2f})")
+        few, many = settings[0], settings[-1]
+        growth, bare = many.nanoseconds / few.nanoseconds, many.bare_nanoseconds / few.bare_nanoseconds
+        print(f"{few.side}² pixels, {few.triangles} to {many.triangles} triangles: x{growth:.2f}", end="")
+        print(f" (tracing alone: x{bare:.2f}, the logarithm: x{logarithm:.2f})")
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ def test_scaling_measures_every_setting(tmp_path, monkeypatch, capsys):
         *(("8", "200"), ("8", "800"), ("16", "200"), ("16", "800")),
     ]
     assert all(float(row["seconds_median"]) > 0 for row in rows)
+    assert all(float(row["bare_seconds"]) > 0 for row in rows)
     assert (tmp_path / "scaling.png").stat().st_size > 0
     assert capsys.readouterr().out.count("the logarithm") == 2
 
