@@ -9,28 +9,33 @@ from typing import Annotated
 import typer
 
 from .atomic import require_place
-from .errors import ImageError, SceneError
+from .errors import FsptError, ImageError, SceneError
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE.xml", help="Mitsuba scene with an fspt_lens.")]
 Parameters = Annotated[
     list[str] | None,
     typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
 ]
+NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom"}
 
 
 def definitions(define: list[str] | None) -> dict[str, str]:
-    """Values by name of the options -D NAME=VALUE; SceneError for one that is none."""
-    pairs = dict(text.partition("=")[::2] for text in define or ())
+    """Values by name of the options -D NAME=VALUE; SceneError for one that is none, or for a name given twice."""
+    pairs: dict[str, str] = {}
     for text in define or ():
         if "=" not in text.strip("="):
             raise SceneError(f"-D {text}: must be NAME=VALUE, for example -D f_number=8.")
+        name, _, value = text.partition("=")
+        if name in pairs:
+            raise SceneError(f"-D {text}: {name} is {pairs[name]} already. Give each name once.")
+        pairs[name] = value
     return pairs
 
 
-def require_writable(path: Path, suffix: str) -> None:
-    """Refuse an output that cannot be written before the work, not after it."""
-    if path.suffix != suffix:
-        raise ImageError(f"{path}: images are written as {suffix}. Give a name such as image{suffix}.")
-    require_place(path, ImageError)
+def require_writable(path: Path, suffix: str | None = None, error: type[FsptError] = ImageError) -> None:
+    """Refuse, as an `error`, an output that cannot be written before the work, not after it; None: any suffix."""
+    if suffix and path.suffix.lower() != suffix:
+        raise error(f"output file '{path}' must end in {suffix}. Give a name such as {NAMES[suffix]}{suffix}.")
+    require_place(path, error)
     if not os.access(path.parent, os.W_OK):
-        raise ImageError(f"{path}: the folder '{path.parent}' is not writable. Write elsewhere with -o.")
+        raise error(f"output file '{path}': the folder '{path.parent}' is not writable. Write elsewhere with -o.")

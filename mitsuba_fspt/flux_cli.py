@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import nullcontext
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from .arguments import require_writable
+from .atomic import atomic_path
 from .errors import FluxError
 
 app = typer.Typer(no_args_is_help=True)
@@ -65,6 +68,7 @@ def import_(
     """
     from .flux_import import import_flux
 
+    require_writable(output, ".ply", FluxError)
     phantom = import_flux(
         mesh,
         values,
@@ -99,9 +103,9 @@ def solve(
     from .phantom_file import PhantomFile
 
     start = time.perf_counter()
-    for path in filter(None, (output, volume)):
-        if not path.parent.is_dir():
-            raise FluxError(f"output file '{path}': the folder '{path.parent}' does not exist. Create it first.")
+    require_writable(output, ".ply", FluxError)
+    if volume:
+        require_writable(volume, error=FluxError)
     told = PhantomFile.read(description)
     with Console(stderr=True).status("mesh") as status:
         solution = told.solve(status.update)
@@ -112,9 +116,10 @@ def solve(
             status.update("volume")
             grid = solution.volume(told.voxel)
             report |= {"volume": str(volume)} | grid.report()
-    phantom.write(output)
-    if volume is not None:
-        grid.write(volume)
+    with atomic_path(volume, FluxError) if volume else nullcontext() as beside:  # both files or none
+        if beside:
+            grid.write(beside)
+        phantom.write(output)
     report |= {"seconds": time.perf_counter() - start, "output": str(output)}
     typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
 

@@ -218,10 +218,11 @@ COMMANDS = {
     "parameter without =": ((*RENDER, "-D", "f_number"), "-D f_number: must be NAME=VALUE"),
     "parameter without name": ((*RENDER, "-D", "=8"), "-D =8: must be NAME=VALUE"),
     "parameter without value": ((*RENDER, "-D", "f_number="), "-D f_number=: must be NAME=VALUE"),
+    "parameter twice": ((*RENDER, "-D", "f_number=4", "-D", "f_number=8"), "f_number is 4 already. Give each name once"),
     "parameter in words": ((*RENDER, "-D", "f_number=wide"), 'could not parse floating point value "wide"'),
     "parameter that cannot be": ((*RENDER, "-D", "f_number=0"), "'f_number' must be > 0 and finite, got 0"),
     "no such folder": ((*RENDER, "-o", "gone/o.exr"), "the folder 'gone' does not exist"),
-    "another format": ((*RENDER, "-o", "o.png"), "images are written as .exr"),
+    "another format": ((*RENDER, "-o", "o.png"), "must end in .exr"),
     "a folder for a file": ((*RENDER, "-o", "folder.exr"), "'folder.exr' is a folder"),
     "rtol 0": ((*RENDER, "--rtol", "0"), "'rtol' must be in (0, 1), got 0"),
     "rtol negative": ((*RENDER, "--rtol", "-1"), "'rtol' must be in (0, 1), got -1"),
@@ -250,13 +251,21 @@ COMMANDS = {
     "compare: no image": (("compare", "broken.xml", "broken.xml"), "no readable OpenEXR file"),
     "expose: no file": (EXPOSE, "image file 'gone.exr' does not exist"),
     "flux: no mesh": (("flux", "import", "gone.ply", "-o", "p.ply"), "mesh 'gone.ply' does not exist"),
+    # Before any work, which for a tissue takes minutes: the description is not even read.
+    "flux solve: another format": (("flux", "solve", "gone.toml", "-o", "p.vtk"), "must end in .ply"),
+    "flux solve: a folder for a file": (("flux", "solve", "gone.toml", "-o", "folder.ply"), "'folder.ply' is a folder"),
+    "flux solve: volume nowhere": (
+        ("flux", "solve", "gone.toml", "-o", "p.ply", "--volume", "gone/f.vol"),
+        "the folder 'gone' does not exist",
+    ),
 }
 
 
 @pytest.fixture(scope="module")
 def files(folder):
     """The files that are no scenes; a good one, `s.xml`, is written by each test."""
-    (folder / "folder.exr").mkdir()
+    for name in ("folder.exr", "folder.ply"):
+        (folder / name).mkdir()
     (folder / "broken.xml").write_text('<scene version="3.0.0"><')
     (folder / "bsdf.xml").write_text('<bsdf version="3.0.0" type="diffuse"/>')
     (folder / "old.xml").write_text("<scene></scene>")

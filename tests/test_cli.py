@@ -190,7 +190,7 @@ def test_expose_leaves_both_files_or_none(run, two_images, tmp_path, counts):
 def test_render_wants_a_name_for_its_image(run, tmp_path, output):
     code, _, err = run("render", write_scene(tmp_path / "s.xml"), "-o", output)
     assert code == 2
-    assert err.endswith("images are written as .exr. Give a name such as image.exr.\n")
+    assert err.endswith("must end in .exr. Give a name such as image.exr.\n")
 
 
 def test_flux_import_makes_a_phantom_that_renders(run, tmp_path):

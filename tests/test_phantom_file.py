@@ -231,3 +231,15 @@ def test_flux_solve_leaves_nothing_behind(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["solve", str(tmp_path / "small.toml"), "-o", str(tmp_path / "small.ply")])
     assert isinstance(result.exception, FluxError)
     assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
+
+
+def test_flux_solve_writes_both_files_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: Phantom, path: Path) -> None:
+        raise FluxError("the disk is full")
+
+    monkeypatch.setattr(Phantom, "write", fail)
+    (tmp_path / "small.toml").write_text(SMALL, encoding="utf-8")
+    description, ply, vol = (str(tmp_path / name) for name in ("small.toml", "small.ply", "small.vol"))
+    result = CliRunner().invoke(app, ["solve", description, "-o", ply, "--volume", vol])
+    assert isinstance(result.exception, FluxError)
+    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
