@@ -53,15 +53,15 @@ class Method:
 def methods(scene: mi.Scene, lens: mi.Sensor, least_rtol: float = 0.0) -> tuple[list[Method], dict[str, str]]:
     """All methods that apply to a scene, and why others do not; `least_rtol`: of the integral's pupil form."""
     found = [integral(scene, lens, "pupil", tuple(rtol for rtol in RTOL if rtol >= least_rtol))]
-    left_out = {}
+    skipped = {}
     surfaces, reason = _surfaces_and_pupil(scene, lens)
     if surfaces:
         found += [integral(scene, lens, "surface", RTOL_SURFACE), _point_sum(scene, lens)]
     else:
-        left_out = dict.fromkeys((SURFACE_FORM, POINT_SUM, PTRACER), reason)
+        skipped = dict.fromkeys((SURFACE_FORM, POINT_SUM, PTRACER), reason)
     found += [_path(scene, lens, sampler) for sampler in SAMPLERS]
     found += [_ptracer(scene, lens)] if surfaces else []
-    return found, left_out
+    return found, skipped
 
 
 def integral(scene: mi.Scene, lens: mi.Sensor, domain: str, ladder: tuple[float, ...]) -> Method:

@@ -21,7 +21,7 @@ def render_text(found: Convergence) -> str:
         f"reference: {found.reference}, stated error {found.stated:.1e} RMS, {found.stated_largest:.1e} at the most",
     ]
     lines += [f"checked by: {found.check}"] if found.check else []
-    lines += [f"left out: {method}: {reason}" for method, reason in found.left_out.items()]
+    lines += [f"skipped: {method}: {reason}" for method, reason in found.skipped.items()]
     return "\n".join([*lines, "", table(_methods(found)), "", table(_beside_path(found))])
 
 

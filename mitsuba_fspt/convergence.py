@@ -60,7 +60,7 @@ class Convergence:
     raw_rate : rays per second of Embree or OptiX alone, on pixels that can see what glows; in packets or one by one,
         whichever is faster
     rows : method by method, from coarse to fine
-    left_out : methods that do not apply and settings that take too long, and why
+    skipped : methods that do not apply and settings that take too long, and why
     """
 
     scene: str
@@ -73,7 +73,7 @@ class Convergence:
     full: int
     raw_rate: float
     rows: tuple[Row, ...]
-    left_out: dict[str, str]
+    skipped: dict[str, str]
 
     @property
     def methods(self) -> list[str]:

@@ -87,16 +87,16 @@ def converge(
     known = known or own_reference(scene, lens, REFERENCE_TIME * budget)
     judge = Judge(known, rendering.render(scene, method="integral", sensor=sensor, rtol=1e-3).coverage > WHOLE_CONE)
 
-    offered, left_out = methods(scene, lens, known.least_rtol)
+    offered, skipped = methods(scene, lens, known.least_rtol)
     bench = Bench(judge, Path(kernels) if kernels is not None else None, budget)
     for k, method in enumerate(offered):
         tell(f"first runs: {method.name}", 0.1 + 0.4 * k / len(offered))
         try:
             too_long = bench.try_ladder(method)
         except FsptError as refusal:
-            left_out[method.name] = str(refusal)
+            skipped[method.name] = str(refusal)
         else:
-            left_out |= too_long
+            skipped |= too_long
     raws = {raw: raw() for raw in (raw_rate(scene, lens, together) for together in (False, True))}
     raw_seconds: dict[object, list[float]] = {raw: [] for raw in raws}
     for k in range(rounds):
@@ -116,7 +116,7 @@ def converge(
         full=int(judge.full.sum()),
         raw_rate=max(rays / float(np.median(raw_seconds[raw])) for raw, rays in raws.items()),
         rows=tuple(trial.row() for trial in bench.trials),
-        left_out=left_out,
+        skipped=skipped,
     )
 
 

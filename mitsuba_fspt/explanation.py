@@ -83,7 +83,7 @@ def explain(
     solution, _ = solve(quadrature)
     rows = []
     for finding in solution.findings:
-        without = replace(quadrature, without=quadrature.without | {finding.name})
+        without = replace(quadrature, shortcuts_off=quadrature.shortcuts_off | {finding.name})
         saved = _saved(solve, quadrature, without) if finding.taken else (None, None)
         rows.append(_row(finding, *saved))
     return rows + _never_done(scene, variant)

@@ -21,15 +21,16 @@ class Quadrature:
     rtol : absolute error of every pixel, relative to the brightest pixel; 0 < rtol < 1 (default 1e-3)
     domain : 'pupil' (lines of sight from the pixel) or 'surface' (power spread from surface elements)
     pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
-    max_nodes : lines of sight a pixel may take at most; bounds the time, and where it is reached the error says so
-    without : names of `SHORTCUTS` that are not taken; they change no more than the error asked for
+    max_nodes : lines of sight a pixel may take at most, four in any case (domain 'surface': on average, 256 in any
+        case); bounds the time, and where it is reached the error says so
+    shortcuts_off : names of `SHORTCUTS` that are not taken; they change no more than the error asked for
     """
 
     rtol: float = 1e-3
     domain: str = "pupil"
     pixel: str = "area"
     max_nodes: int = 200_000
-    without: frozenset[str] = frozenset()
+    shortcuts_off: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
@@ -40,19 +41,22 @@ class Quadrature:
             raise SceneError(f"fspt_integral: 'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
         if self.max_nodes < 1:
             raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 200000.")
-        if unknown := set(self.without) - set(SHORTCUTS):
-            raise SceneError(f"fspt_integral: 'without' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}.")
+        if unknown := set(self.shortcuts_off) - set(SHORTCUTS):
+            raise SceneError(
+                f"fspt_integral: 'shortcuts_off' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}."
+            )
 
     def takes(self, shortcut: str) -> bool:
         """True unless this one of `SHORTCUTS` is switched off."""
-        return shortcut not in self.without
+        return shortcut not in self.shortcuts_off
 
 
 @dataclass(frozen=True)
 class Solution:
     """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
 
-    `rays` counts all lines of sight, `levels` what each rung of the refinement did (for humans and the EXR header).
+    `rays` counts the lines of sight of all pixels together, in the EXR header `nodes`; `levels` tells humans what each
+    rung of the refinement did.
     A partial solution is the whole picture only on the pixels `where`. `findings`: what was left out, and why.
     """
 

@@ -75,7 +75,7 @@ def render(
     deterministic = type(integrator).__name__ == "FsptIntegral"
     refused = sampling if deterministic else accuracy | {"shortcuts": None if shortcuts else False}
     _refuse(refused, "integral" if deterministic else "Monte Carlo")
-    accuracy["without"] = None if shortcuts else frozenset(SHORTCUTS)
+    accuracy["shortcuts_off"] = None if shortcuts else frozenset(SHORTCUTS)
     start = time.perf_counter()
     with ctrl_c_noted() as check_interrupt:
 
@@ -103,7 +103,7 @@ def _integrate(
     progress("integrating", 0.0)
     solution = integrator.solve(scene, lens, Quadrature(**wanted))
     how = {"method": "integral", **wanted, "nodes": solution.rays, "levels": "; ".join(solution.levels)}
-    how["without"] = ", ".join(sorted(wanted["without"])) or "nothing"
+    how["shortcuts_off"] = ", ".join(sorted(wanted["shortcuts_off"])) or "nothing"
     how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
     return solution.power, solution.error, solution.coverage, how
 

@@ -218,7 +218,10 @@ COMMANDS = {
     "parameter without =": ((*RENDER, "-D", "f_number"), "-D f_number: must be NAME=VALUE"),
     "parameter without name": ((*RENDER, "-D", "=8"), "-D =8: must be NAME=VALUE"),
     "parameter without value": ((*RENDER, "-D", "f_number="), "-D f_number=: must be NAME=VALUE"),
-    "parameter twice": ((*RENDER, "-D", "f_number=4", "-D", "f_number=8"), "f_number is 4 already. Give each name once"),
+    "parameter twice": (
+        (*RENDER, "-D", "f_number=4", "-D", "f_number=8"),
+        "f_number is 4 already",
+    ),
     "parameter in words": ((*RENDER, "-D", "f_number=wide"), 'could not parse floating point value "wide"'),
     "parameter that cannot be": ((*RENDER, "-D", "f_number=0"), "'f_number' must be > 0 and finite, got 0"),
     "no such folder": ((*RENDER, "-o", "gone/o.exr"), "the folder 'gone' does not exist"),

@@ -111,7 +111,7 @@ def test_ratio_is_paired_so_that_a_slow_round_does_not_decide():
 def test_text_and_json_hold_what_was_found():
     told = found(row(rays=100, rms=1e-2), row(rays=10000, rms=1e-4, seconds=(0.05, 0.05)), stated=3e-5)
     text = render_text(told)
-    assert "left out: b: no surface" in text
+    assert "skipped: b: no surface" in text
     assert [cell.strip() for cell in text.splitlines()[8].split("|")[1:6]] == ["a", "1.00", "50 ms", "50 ms", "–"]
     plain = json.loads(json.dumps(told.to_dict(), allow_nan=False))
     assert plain["methods"]["a"]["time_to_0.0001"] == 0.05
@@ -142,7 +142,7 @@ def test_every_method_comes_nearer_with_its_knob(tmp_path):
     scene = small_scenes.scene(small_scenes.sphere(220.0, 6.0), exitance=1e-3)
     told = fspt.converge(scene, rounds=1, budget=100.0)
     assert told.methods == ALL
-    assert told.left_out == {}
+    assert told.skipped == {}
     assert 0 < told.full < WIDTH * HEIGHT
     assert told.stated < 1e-3
     assert told.raw_rate > 0
@@ -179,10 +179,10 @@ def test_methods_that_do_not_apply_are_left_out_with_the_reason():
     import mitsuba as mi
 
     pinhole = small_scenes.scene(small_scenes.sphere(200.0, 10.0), model="pinhole")
-    offered, left_out = converge_methods.methods(pinhole, pinhole.sensors()[0])
-    assert {method.name for method in offered} | set(left_out) == set(ALL)
-    assert set(left_out) == {"integral, surface form", "sum over points", "ptracer"}
-    assert all("pinhole" in reason for reason in left_out.values())
+    offered, skipped = converge_methods.methods(pinhole, pinhole.sensors()[0])
+    assert {method.name for method in offered} | set(skipped) == set(ALL)
+    assert set(skipped) == {"integral, surface form", "sum over points", "ptracer"}
+    assert all("pinhole" in reason for reason in skipped.values())
     lamp = mi.load_dict({"type": "constant"})
     sky = small_scenes.scene(small_scenes.sphere(200.0, 10.0), lamp=lamp)
     assert "no surface" in converge_methods.methods(sky, sky.sensors()[0])[1]["ptracer"]

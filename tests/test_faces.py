@@ -49,7 +49,7 @@ MESHES = {
 
 def solved(scene, *without, domain="pupil"):
     return scene.integrator().solve(
-        scene, scene.sensors()[0], Quadrature(rtol=1e-3, domain=domain, without=frozenset(without))
+        scene, scene.sensors()[0], Quadrature(rtol=1e-3, domain=domain, shortcuts_off=frozenset(without))
     )
 
 

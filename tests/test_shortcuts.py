@@ -52,7 +52,7 @@ CASES = {
 
 
 def solved(scene, domain="pupil", without=(), rtol=RTOL):
-    quadrature = Quadrature(rtol=rtol, domain=domain, without=frozenset(without))
+    quadrature = Quadrature(rtol=rtol, domain=domain, shortcuts_off=frozenset(without))
     return scene.integrator().solve(scene, scene.sensors()[0], quadrature)
 
 
@@ -164,20 +164,20 @@ def test_the_image_tells_what_was_left_out_and_what_was_not_allowed_to_be():
     scene = scene_of(ball(), sensor=lens(40))
     image, without = fspt.render(scene, rtol=RTOL), fspt.render(scene, rtol=RTOL, shortcuts=False)
     assert SHORTCUTS["outside"] in image.metadata["left_out"]
-    assert image.metadata["without"] == "nothing"
+    assert image.metadata["shortcuts_off"] == "nothing"
     assert without.metadata["left_out"] == "nothing"
-    assert without.metadata["without"] == ", ".join(sorted(SHORTCUTS))
+    assert without.metadata["shortcuts_off"] == ", ".join(sorted(SHORTCUTS))
     assert np.abs(image.power - without.power).max() <= RTOL / 10 * image.power.max()
 
 
 def test_a_scene_file_can_switch_them_off():
     scene = scene_of(ball(), integrator={"type": "fspt_integral", "shortcuts": False})
-    assert scene.integrator().quadrature.without == frozenset(SHORTCUTS)
+    assert scene.integrator().quadrature.shortcuts_off == frozenset(SHORTCUTS)
 
 
 def test_an_unknown_shortcut_is_refused():
-    with pytest.raises(SceneError, match=r"'without' must be some of .* got 'haste'"):
-        Quadrature(without=frozenset(["haste"]))
+    with pytest.raises(SceneError, match=r"'shortcuts_off' must be some of .* got 'haste'"):
+        Quadrature(shortcuts_off=frozenset(["haste"]))
 
 
 def test_explain_measures_what_each_shortcut_saves():
@@ -212,7 +212,7 @@ def test_explain_and_render_without_shortcuts_from_the_command_line(tmp_path, mo
     rows = json.loads(capsys.readouterr().out)
     assert {"what", "left_out", "why", "lines_saved", "time_saved"} == set(rows[0])
     assert cli.run(["render", scene, *small, "--no-shortcuts"]) == 0
-    assert fspt.read("two_spheres.exr").metadata["without"] == ", ".join(sorted(SHORTCUTS))
+    assert fspt.read("two_spheres.exr").metadata["shortcuts_off"] == ", ".join(sorted(SHORTCUTS))
 
 
 @pytest.mark.parametrize("arguments", [["none.xml"], [str(SCENES / "two_spheres.xml"), "--domain", "lens"]])

@@ -98,7 +98,7 @@ class Glow:
         return np.flatnonzero((marked > 0) & (right > left) & (bottom > top))
 
     @classmethod
-    def seen(cls, emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol: float, without_dark: bool) -> Glow:
+    def seen(cls, emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol: float, skip_dark: bool) -> Glow:
         """What `lens` sees of an emitter's shape in `window`; SceneError where the emitter has no surface."""
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
             raise SceneError(
@@ -126,7 +126,7 @@ class Glow:
         low, high = low - margin - film_corner(window), high + margin - film_corner(window)
         # Away for certain: between its corners a curved element may turn to the lens as far again as they differ.
         away = 2 * most - least <= 0
-        dark = _dark(emitter, elements) if without_dark else np.zeros(count, bool)
+        dark = _dark(emitter, elements) if skip_dark else np.zeros(count, bool)
         low[away | dark], high[away | dark] = np.inf, -np.inf
         lit = ~(away | dark)
         area, extent = _area(*centres)[lit].sum(), _extent(np.concatenate([corner[lit] for corner in centres]))

@@ -50,7 +50,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
        - area: integrate over the pixel (Default). centre: the value at its centre times its area, as in the paper.
      * - max_nodes
        - |int|
-       - Lines of sight a pixel may take at most (Default: 200000).
+       - Lines of sight a pixel may take at most (Default: 200000), four in any case; domain surface: on average, and
+         256 in any case.
      * - shortcuts
        - |bool|
        - Leave out what the scene does not need (Default: true). Without, the same power comes out, later.
@@ -66,7 +67,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             domain=str(props.get("domain", defaults.domain)),
             pixel=str(props.get("pixel", defaults.pixel)),
             max_nodes=int(props.get("max_nodes", defaults.max_nodes)),
-            without=frozenset() if props.get("shortcuts", True) else frozenset(SHORTCUTS),
+            shortcuts_off=frozenset() if props.get("shortcuts", True) else frozenset(SHORTCUTS),
         )
         # What was found out about the last scene; the scene itself, whose child this is, must not be kept.
         self._sound: list[mi.Emitter] = []
