@@ -75,7 +75,9 @@ def read_reference(path: str | os.PathLike[str], shape: tuple[int, int]) -> Refe
             sizes = " and ".join(f"{w} x {h}" for h, w in (plane.shape[:2], shape))
             raise ImageError(f"reference '{path}' and the scene's film differ: {sizes} pixels. Give one of its size.")
     if not (np.isfinite(power).all() and np.isfinite(error).all() and error.min() >= 0 and power.max() > 0):
-        raise ImageError(f"reference '{path}': power and error must be finite, error >= 0, one pixel bright.")
+        raise ImageError(
+            f"reference '{path}': power and error must be finite, error >= 0, one pixel bright. Make it anew."
+        )
     return Reference(power.astype(np.float64), error.astype(np.float64), str(path))
 
 
@@ -86,7 +88,7 @@ def _arrays(path: Path) -> tuple[Picture, Picture]:
     except OSError as cause:
         raise ImageError(f"reference '{path}' cannot be read: {cause.strerror or cause}. Check the name.") from cause
     except Exception as cause:  # whatever a damaged archive makes NumPy and zipfile raise
-        raise ImageError(f"reference '{path}' is no NPZ file with arrays 'power' and 'error' [W].") from cause
+        raise ImageError(f"reference '{path}' is no NPZ file. Give arrays 'power', 'error' [W].") from cause
     if power.ndim != 2 or {power.dtype.kind, error.dtype.kind} - set("fiu"):
         raise ImageError(f"reference '{path}': 'power' and 'error' must be numbers of shape (h, w), in W.")
     return power, error

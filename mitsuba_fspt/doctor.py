@@ -22,17 +22,9 @@ from pathlib import Path
 
 from . import backend, libllvm
 from .errors import BackendError
+from .extras import EXTRAS
 
 CORE = ("mitsuba-fspt", "mitsuba", "drjit", "numpy", "trimesh", "OpenEXR", "typer", "rich")
-
-# Optional packages, each with the extra that brings it.
-OPTIONAL = {
-    "matplotlib": "plot",
-    "meshio": "mesh",
-    "h5py": "mesh",
-    "scikit-fem": "tissue",
-    "scipy": "tissue",
-}
 
 VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
 
@@ -202,8 +194,9 @@ def _backends(trials: dict[str, dict[str, float] | str]) -> Iterator[Row]:
 
 
 def _optional() -> Iterator[Row]:
-    for name, extra in OPTIONAL.items():
-        yield Row("extras", name, _version(name) or f"not installed: pip install 'mitsuba-fspt[{extra}]'")
+    for one in EXTRAS:
+        missing = f"not installed: pip install 'mitsuba-fspt[{one.extra}]'"
+        yield Row("extras", one.distribution, _version(one.distribution) or missing)
 
 
 def _cache() -> Iterator[Row]:

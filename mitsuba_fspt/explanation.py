@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from . import backend
+from .extras import EXTRAS
 from .rendering import integrator_of, sensor_of
 from .scene import load
 from .shortcuts import SHORTCUTS, Finding
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 ROUNDS = 3  # a median of; once where a round takes longer than LONG [s]
 LONG = 5.0
-OPTIONAL = ("matplotlib", "skfem", "scipy", "meshio", "dask", "gmsh", "PIL")
 WHAT_WIDTH = 1 + max(len(what) for what in SHORTCUTS.values())
 
 
@@ -106,7 +106,7 @@ def _row(finding: Finding, lines: float | None, seconds: float | None) -> Row:
 
 def _never_done(scene: mi.Scene, variant: str) -> list[Row]:
     """What costs nothing because it is never begun."""
-    loaded = [name for name in OPTIONAL if name in sys.modules]
+    loaded = [one.module for one in EXTRAS if one.module in sys.modules]
     uniform = [type(emitter).__name__ == "FsptSurface" and emitter.is_uniform() for emitter in scene.emitters()]
     return [
         Row("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),

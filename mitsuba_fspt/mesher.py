@@ -56,7 +56,7 @@ def read_tetrahedra(
         )
     values = found[0].values
     if not (values == np.round(values)).all():
-        raise FluxError(f"geometry: the labels '{labels}' of '{path}' must be whole numbers.")
+        raise FluxError(f"geometry: the labels '{labels}' of '{path}' must be whole numbers. Name another field.")
     return Tetrahedra(points, raw.cells, values.astype(np.int64))
 
 
@@ -83,7 +83,9 @@ def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
         ) from cause
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not 0 < edge <= diagonal:
-        raise FluxError(f"geometry: the mesh edge must be > 0 and at most the size {diagonal:.3g} mm, got {edge:g} mm.")
+        raise FluxError(
+            f"geometry: the mesh edge must be > 0 and at most the size {diagonal:.3g} mm, got {edge:g}. Give mm."
+        )
     with _in_temporary_folder():  # the mesher leaves a file where it runs
         points, cells = pytetwild.tetrahedralize(
             np.ascontiguousarray(vertices, dtype=np.float64),

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from .errors import OpticsError
 
 MODELS = ("diaphragm", "hrrt", "pinhole", "ripoll")
+FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
+BORDERS = ("lens_diameter", "diaphragm_distance", "numerical_aperture", "image_stop_diameter")
+NUMBERS = ("focal_length", "f_number", *FOCUS, *BORDERS)  # of `Lens.focused`
 
 
 @dataclass(frozen=True)
@@ -71,19 +74,12 @@ class Lens:
         Lens law: 1/F = 1/u + 1/v, t = v/u. Raises OpticsError where none or several are given.
         """
         _require_positive("focal_length", focal_length, "mm, for example 55")
-        given = {
-            name: value
-            for name, value in (
-                ("focus_distance", focus_distance),
-                ("magnification", magnification),
-                ("image_distance", image_distance),
-            )
-            if value is not None
-        }
+        focus = zip(FOCUS, (focus_distance, magnification, image_distance), strict=True)
+        given = {name: value for name, value in focus if value is not None}
         if len(given) != 1:
             raise OpticsError(
-                f"fspt_lens: exactly one of 'focus_distance', 'magnification', 'image_distance' sets the focus, got "
-                f"{' and '.join(repr(n) for n in given) or 'none'}. Give one, for example magnification = 0.5."
+                f"fspt_lens: exactly one of {', '.join(map(repr, FOCUS))} sets the focus, got "
+                f"{' and '.join(map(repr, given)) or 'none'}. Give one, for example magnification = 0.5."
             )
         ((name, value),) = given.items()
         _require_positive(name, value, "for example magnification = 0.5")
@@ -93,7 +89,7 @@ class Lens:
             if value <= focal_length:
                 raise OpticsError(
                     f"fspt_lens: 'image_distance' must be > focal_length = {focal_length:g} mm for a real image, "
-                    f"got {value:g}."
+                    f"got {value:g}. Give a larger one, or 'magnification'."
                 )
             focus_distance = focal_length * value / (value - focal_length)
         else:
@@ -110,16 +106,22 @@ class Lens:
                 f"got {self.focus_distance:g}. Move the camera back or use a shorter lens."
             )
         if self.model not in MODELS:
-            raise OpticsError(f"fspt_lens: 'model' must be one of {', '.join(MODELS)}, got '{self.model}'.")
+            raise OpticsError(
+                f"fspt_lens: 'model' must be one of {', '.join(MODELS)}, got '{self.model}'. Give one of these."
+            )
         if not math.isfinite(self.diaphragm_distance):
-            raise OpticsError(f"fspt_lens: 'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm.")
+            raise OpticsError(
+                f"fspt_lens: 'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm. Give mm, for "
+                "example 5."
+            )
         self._check_borders()
 
     def _check_borders(self) -> None:
         if self.model == "ripoll":
             if self.numerical_aperture is None or not 0 < self.numerical_aperture < 1:
                 raise OpticsError(
-                    f"fspt_lens: model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}."
+                    f"fspt_lens: model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}. "
+                    "Give for example 0.5."
                 )
         elif self.numerical_aperture is not None:
             raise OpticsError(
@@ -127,7 +129,9 @@ class Lens:
                 f"'{self.model}'. Leave it out or set model to 'ripoll'."
             )
         if self.model == "hrrt" and self.lens_diameter is None:
-            raise OpticsError("fspt_lens: model 'hrrt' needs 'lens_diameter', the border that stops its light.")
+            raise OpticsError(
+                "fspt_lens: model 'hrrt' needs 'lens_diameter', the border that stops its light. Give mm, say 20."
+            )
         if self.image_stop_diameter is not None:
             _require_positive("image_stop_diameter", self.image_stop_diameter, "mm on the detector, for example 20")
         if self.lens_diameter is not None:
@@ -144,17 +148,18 @@ class Lens:
             if self.lens_diameter is None:
                 raise OpticsError(
                     f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm needs 'lens_diameter', the "
-                    "second border a line of sight has to pass."
+                    "second border a line of sight has to pass. Give mm, for example 20."
                 )
             if self.diaphragm_distance >= self.image_distance:
                 raise OpticsError(
                     f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be smaller than the image "
-                    f"distance {self.image_distance:g} mm: the diaphragm stands between lens and detector."
+                    f"distance {self.image_distance:g} mm: the diaphragm stands between lens and detector. Give less."
                 )
             if -self.diaphragm_distance >= self.focus_distance:
                 raise OpticsError(
                     f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be above -focus_distance = "
-                    f"{-self.focus_distance:g} mm: the diaphragm stands between lens and virtual detector plane."
+                    f"{-self.focus_distance:g} mm: the diaphragm stands between lens and virtual detector plane. Give "
+                    "more."
                 )
 
     @property

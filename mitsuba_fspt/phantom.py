@@ -62,18 +62,18 @@ class Phantom:
         if self.vertices.shape[1:] != (3,) or self.faces.shape[1:] != (3,) or self.exitance.shape != (count,):
             raise FluxError(
                 f"phantom: vertices (V, 3), faces (F, 3) and exitance per {self.per} must fit, got shapes "
-                f"{self.vertices.shape}, {self.faces.shape} and {self.exitance.shape}."
+                f"{self.vertices.shape}, {self.faces.shape} and {self.exitance.shape}. Give one value each."
             )
         if len(self.faces) == 0 or self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
-            raise FluxError(f"phantom: faces must be numbers of the {len(self.vertices)} vertices, from 0.")
+            raise FluxError(f"phantom: faces must be numbers of the {len(self.vertices)} vertices. Count from 0.")
         for key in self.provenance:
             if key in RESERVED or key.split() != [key]:
                 raise FluxError(f"phantom: '{key}' is taken or no single word. Name the provenance otherwise.")
         require_finite(self.exitance, self.per)
         if self.exitance.min() < 0:
-            raise ExitanceError(f"exitance: must be >= 0, the least is {self.exitance.min():.6g} {UNIT}.")
+            raise ExitanceError(f"exitance: must be >= 0, the least is {self.exitance.min():.6g} {UNIT}. Clip it.")
         if not self.area > 0:
-            raise FluxError(f"phantom: the surface has no area ({self.area:g} mm^2), it can give off no light.")
+            raise FluxError(f"phantom: the surface has no area ({self.area:g} mm^2). Mend its vertices.")
         if not self.power > 0:
             raise ExitanceError("exitance: zero everywhere, the phantom would be black. Check the field's name.")
 
@@ -162,7 +162,9 @@ class Phantom:
             negatives = int(comments.pop("negatives", "0"))
             removed = float(comments.pop("removed_power", "0 W").removesuffix(" W"))
         except ValueError as cause:
-            raise FluxError(f"'{path}': its comments negatives and removed_power must be numbers.") from cause
+            raise FluxError(
+                f"'{path}': its comments negatives and removed_power must be numbers. Import it anew."
+            ) from cause
         comments = {key: text for key, text in comments.items() if key not in RESERVED}
         ((on, values),) = exitance.items()
         per = "vertex" if on == "vertex" else "face"

@@ -17,6 +17,7 @@ from . import backend
 from .errors import SceneError
 from .image import Image
 from .interrupt import ctrl_c_noted
+from .optics import NUMBERS
 from .quadrature import Quadrature
 from .scene import load
 from .shortcuts import SHORTCUTS
@@ -91,7 +92,9 @@ def render(
             power, error, coverage, how = _sample(scene, lens, integrator, spp, seed, tell)
         check_interrupt()
     how["wall_time"] = time.perf_counter() - start
-    return Image(power, error, coverage, {"scene": scene.id(), **how, **_lens_numbers(lens), **_versions()})
+    return Image(
+        power, error, coverage, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()}
+    )
 
 
 def _integrate(
@@ -196,7 +199,8 @@ def sensor_of(scene: mi.Scene, number: int) -> mi.Sensor:
     """Sensor `number` of a scene; SceneError where there is none."""
     sensors = scene.sensors()
     if not 0 <= number < len(sensors):
-        raise SceneError(f"scene: sensor {number} does not exist, the scene has {len(sensors)}. Give an 'fspt_lens'.")
+        rule = f"Give 0 to {len(sensors) - 1}." if sensors else "Give it an 'fspt_lens'."
+        raise SceneError(f"scene: sensor {number} does not exist, the scene has {len(sensors)}. {rule}")
     return sensors[number]
 
 
@@ -223,20 +227,8 @@ def _refuse(settings: dict[str, object], method: str) -> None:
 
 def _lens_numbers(lens: mi.Sensor) -> dict[str, float | int | str]:
     optics = lens.optics
-    numbers = {
-        "model": optics.model,
-        "focal_length": optics.focal_length,
-        "f_number": optics.f_number,
-        "diaphragm_diameter": optics.diaphragm_diameter,
-        "focus_distance": optics.focus_distance,
-        "image_distance": optics.image_distance,
-        "magnification": optics.magnification,
-        "lens_diameter": optics.lens_diameter,
-        "diaphragm_distance": optics.diaphragm_distance,
-        "numerical_aperture": optics.numerical_aperture,
-        "image_stop_diameter": optics.image_stop_diameter,
-        "pixel_pitch": lens.pixel_pitch,
-    }
+    numbers = {name: getattr(optics, name) for name in ("model", *NUMBERS, "diaphragm_diameter")}
+    numbers["pixel_pitch"] = lens.pixel_pitch
     return {name: value for name, value in numbers.items() if value is not None}
 
 

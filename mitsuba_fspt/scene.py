@@ -43,7 +43,9 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
         with ctrl_c_noted():
             state = mi.parser.parse_file(config, str(path), **texts)
             if state.root.props.plugin_name() != "scene":
-                raise SceneError(f"{path}: the root is <{state.root.props.plugin_name()}>, a scene file has <scene>.")
+                raise SceneError(
+                    f"{path}: the root is <{state.root.props.plugin_name()}>, a scene file has <scene>. Give one."
+                )
             state.root.props["embree_use_robust_intersections"] = True
             state.root.props.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in texts.items())]))
             _name_children(state)

@@ -11,13 +11,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from .errors import SceneError
-from .optics import Lens
+from .optics import NUMBERS, Lens
 from .scene import defaults
 
-LENS_NUMBERS = {
-    *("focal_length", "f_number", "focus_distance", "magnification", "image_distance"),
-    *("lens_diameter", "diaphragm_distance", "numerical_aperture"),
-}
 REFERENCE = re.compile(r"\$(\w+)")
 
 
@@ -45,7 +41,7 @@ class Source:
         ours = []
         for node in self._lens:
             reference = REFERENCE.fullmatch(node.get("value", ""))
-            if reference and node.tag == "float" and node.get("name") in LENS_NUMBERS | {"pixel_pitch"}:
+            if reference and node.tag == "float" and node.get("name") in (*NUMBERS, "pixel_pitch"):
                 found[reference[1]] = (*found.get(reference[1], ()), node.get("name", ""))
                 ours.append(node)
         elsewhere = " ".join(text for node in self._nodes if node not in ours for text in node.attrib.values())
@@ -63,7 +59,7 @@ class Source:
     def _check_lens(self, parameters: Mapping[str, str]) -> None:
         """Before the work, not after half of it; what the scene file does not say in so many words is left to it."""
         given = {node.get("name", ""): self._fill_in(node.get("value", ""), parameters) for node in self._lens}
-        numbers = {name: text for name, text in given.items() if name in LENS_NUMBERS}
+        numbers = {name: text for name, text in given.items() if name in NUMBERS}
         plain = all(map(_is_number, numbers.values())) and "include" not in {node.tag for node in self._lens}
         if plain and {"focal_length", "f_number"} <= set(numbers):
             model = given.get("model", "diaphragm")

@@ -41,9 +41,13 @@ class Tetrahedra:
     def __post_init__(self) -> None:
         vertices, cells = np.asarray(self.vertices, dtype=np.float64), np.asarray(self.cells, dtype=np.int64)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
-            raise FluxError(f"tetrahedra: vertices must be finite, shape (V, 3), got shape {vertices.shape}.")
+            raise FluxError(
+                f"tetrahedra: vertices must be finite, shape (V, 3), got shape {vertices.shape}. Mend them."
+            )
         if cells.ndim != 2 or cells.shape[1] != 4 or len(cells) == 0:
-            raise FluxError(f"tetrahedra: cells must have shape (T, 4), T > 0, got {cells.shape}.")
+            raise FluxError(
+                f"tetrahedra: cells must have shape (T, 4), T > 0, got {cells.shape}. Give four corners each."
+            )
         if cells.min() < 0 or cells.max() >= len(vertices):
             raise FluxError(
                 f"tetrahedra: cells refer to vertices {cells.min()} to {cells.max()}, there are "
@@ -51,7 +55,9 @@ class Tetrahedra:
             )
         region = np.asarray(self.region, dtype=np.int64) if len(self.region) else np.zeros(len(cells), np.int64)
         if region.shape != (len(cells),):
-            raise FluxError(f"tetrahedra: {len(cells)} cells need as many region labels, got {region.shape}.")
+            raise FluxError(
+                f"tetrahedra: {len(cells)} cells need as many region labels, got {region.shape}. Give one each."
+            )
         for name, value in (("vertices", vertices), ("cells", cells), ("region", region)):
             object.__setattr__(self, name, value)
         flat = self.volumes <= 1e-12 * np.ptp(vertices, axis=0).max() ** 3 / len(cells)

@@ -59,7 +59,7 @@ def test_mmc_options(tmp_path):
         import_flux(mesh, values, per="vertex")
     with pytest.raises(FluxError, match=r"no field"):
         import_flux(mesh, values, field="2")
-    with pytest.raises(FluxError, match=r"must be called node_ID\.dat"):
+    with pytest.raises(FluxError, match=r"is no node_ID\.dat\. Name the mesh so"):
         import_flux(mesh.rename(tmp_path / "mesh.dat"), values, format="mmc")
 
 

@@ -69,6 +69,7 @@ def test_any_sensor_of_the_scene(scene):
     images = [fspt.render(scene, sensor=number, rtol=1e-2) for number in (0, 1)]
     assert images[1].shape == (4, 5)
     assert images[1].metadata["f_number"] == 16
+    assert [image.metadata["sensor"] for image in images] == [0, 1]
     # A quarter of the light through half the aperture.
     assert images[1].power.sum() == pytest.approx(images[0].power.sum() / 4, rel=1e-2)
     for number in (2, -1):

@@ -86,15 +86,15 @@ def _from_arrays(mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field
     """Points and cells in memory; those of MMC and NIRFAST count from 1, all others from 0."""
     points, cells = np.asarray(mesh[0], np.float64), np.asarray(mesh[1])
     if values is None:
-        raise FluxError("flux import: a mesh in memory needs 'values', one for each vertex or face.")
+        raise FluxError("flux import: a mesh in memory needs 'values'. Give one for each vertex or face.")
     if format == "mmc":
         if field is not None or not isinstance(values, np.ndarray):
-            raise FluxError("MMC: a mesh in memory goes with dref in memory (faces, gates), and no field.")
+            raise FluxError("MMC: a mesh in memory has no fields. Give dref in memory, (faces, gates).")
         return mmc_mesh(points, cells, values, "MMC dref")
     if format == "nirfast":
         return _with_values(nirfast_mesh(points, cells, "NIRFAST mesh"), values, field)
     if format != "auto":
-        raise FluxError(f"flux import: format '{format}' reads files; a mesh in memory is auto, mmc or nirfast.")
+        raise FluxError(f"flux import: format '{format}' reads files. Give auto, mmc or nirfast to a mesh in memory.")
     return _with_values(RawMesh(points, cells, "arrays"), values, field)
 
 

@@ -30,7 +30,7 @@ def read_mmc(mesh: Path, values: Path | None) -> RawMesh:
     """
     kind, _, session = mesh.stem.partition("_")
     if kind not in ("node", "elem") or not session:
-        raise FluxError(f"MMC: the mesh must be called node_ID.dat beside elem_ID.dat, got '{mesh}'.")
+        raise FluxError(f"MMC: '{mesh}' is no node_ID.dat. Name the mesh so, beside its elem_ID.dat.")
     if values is None:
         raise FluxError(f"MMC: '{mesh}' needs the exitance of its faces. Give --values SESSION_dref.dat.")
     nodes, _ = read_table(mesh.with_name(f"node_{session}.dat"), skip_lines=1)
@@ -95,5 +95,8 @@ def _read_dref(path: Path) -> NDArray[np.float64]:
     starts = np.flatnonzero(number == 1)
     period = starts[1] if len(starts) > 1 else len(number)
     if len(number) % period or not np.array_equal(number, np.arange(len(number)) % period + 1):
-        raise FluxError(f"MMC: the first column of '{path}' must count faces from 1, once for each time gate.")
+        raise FluxError(
+            f"MMC: the first column of '{path}' must count faces from 1, once for each time gate. Give the file as mmc "
+            "wrote it."
+        )
     return table[:, 1]

@@ -71,7 +71,7 @@ def write_ply(
     FluxError : the suffix is not .ply, or the file cannot be written; nothing is left behind then.
     """
     if path.suffix.lower() != ".ply":
-        raise FluxError(f"output file '{path}' must end in .ply, the format of a phantom.")
+        raise FluxError(f"output file '{path}' must end in .ply. Give a name such as phantom.ply.")
     scalars = [(name, "<f8") for name in attributes]
     points = np.empty(len(vertices), [(axis, "<f8") for axis in "xyz"] + scalars * (per == "vertex"))
     triangles = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", (3,))] + scalars * (per == "face"))

@@ -55,13 +55,14 @@ class RawMesh:
     def __post_init__(self) -> None:
         points, cells = self.points, self.cells
         if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-            raise FluxError(f"{self.source}: vertices must have shape (V, 3), got {points.shape}.")
+            raise FluxError(f"{self.source}: vertices must have shape (V, 3), got {points.shape}. Give x, y and z.")
         if cells.ndim != 2 or cells.shape[1] not in (3, 4) or len(cells) == 0:
             raise FluxError(
-                f"{self.source}: cells must be triangles (F, 3) or tetrahedra (T, 4), got shape {cells.shape}."
+                f"{self.source}: cells must be triangles (F, 3) or tetrahedra (T, 4), got shape {cells.shape}. "
+                "Split other cells."
             )
         if cells.dtype.kind not in "iu":
-            raise FluxError(f"{self.source}: cells must be integers, the numbers of vertices, got {cells.dtype}.")
+            raise FluxError(f"{self.source}: cells must be integers, got {cells.dtype}. Give numbers of vertices.")
         object.__setattr__(self, "points", points.astype(np.float64))
         object.__setattr__(self, "cells", cells.astype(np.int64))
         if cells.min() < 0 or cells.max() >= len(points):
@@ -70,7 +71,7 @@ class RawMesh:
                 f"are {len(points)}. Is the mesh complete, does it count from 0 or from 1?"
             )
         if not np.isfinite(points).all() and not np.isfinite(points[cells]).all():
-            raise FluxError(f"{self.source}: vertices of cells must be finite, some are NaN or inf.")
+            raise FluxError(f"{self.source}: vertices of cells must be finite, some are NaN or inf. Mend the mesh.")
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def read_obj(path: Path) -> RawMesh:
     vertices = re.findall(rb"^[ \t]*v[ \t]+([^\r\n]*)", text, re.MULTILINE)
     faces = re.sub(rb"/\S*", b"", b"\n".join(re.findall(rb"^[ \t]*f[ \t]+([^\r\n]*)", text, re.MULTILINE)))
     if not vertices or not faces:
-        raise FluxError(f"'{path}' has no vertices or no faces, it is not an OBJ mesh.")
+        raise FluxError(f"'{path}' has no vertices or no faces. Give an OBJ with lines v and f.")
     try:
         points = np.loadtxt([line.decode("ascii") for line in vertices], ndmin=2, usecols=(0, 1, 2))
         cells = np.loadtxt(faces.decode("ascii").split("\n"), ndmin=2, dtype=np.int64)

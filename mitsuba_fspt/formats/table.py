@@ -28,7 +28,7 @@ def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
     if suffix == ".npy":
         array = _load_numpy(path)
         if not isinstance(array, np.ndarray):
-            raise FluxError(f"'{path}' holds several arrays; such a file ends in .npz.")
+            raise FluxError(f"'{path}' holds several arrays. Name such a file .npz.")
         return column(array, [], field, str(path))
     if suffix in (".npz", ".mat"):
         arrays = read_npz(path) if suffix == ".npz" else _read_mat(path)
@@ -76,7 +76,7 @@ def column(array: NDArray, names: list[str], field: str | None, where: str) -> N
     if array.ndim == 1:
         array = array[:, None]
     if array.ndim != 2:
-        raise FluxError(f"{where}: values must have shape (N,) or (N, columns), got {array.shape}.")
+        raise FluxError(f"{where}: values must have shape (N,) or (N, columns), got {array.shape}. Reshape them.")
     count = array.shape[1]
     if field is None and count == 1:
         return array[:, 0].astype(np.float64)
@@ -124,7 +124,7 @@ def _layout(path: Path, skip_lines: int) -> tuple[list[str], str | None, int]:
                 names = [name.strip(' "') for name in header.lstrip("# ").split(delimiter)] if header else []
                 return names, delimiter, number
             else:
-                raise FluxError(f"'{path}' holds no values.")
+                raise FluxError(f"'{path}' holds no values. Give one number a line.")
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
     except UnicodeDecodeError:
@@ -150,7 +150,7 @@ def read_npz(path: Path) -> dict[str, NDArray]:
     """
     loaded = _load_numpy(path)
     if isinstance(loaded, np.ndarray):
-        raise FluxError(f"'{path}' holds one array without a name; such a file ends in .npy.")
+        raise FluxError(f"'{path}' holds one array without a name. Name such a file .npy.")
     return loaded
 
 

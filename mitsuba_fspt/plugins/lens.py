@@ -10,20 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OpticsError
-from ..optics import Lens
+from ..optics import NUMBERS, Lens
 from .film import default_sampler, number, own_film
 from .pupil import Pupil
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
-OPTIONAL = (
-    "focus_distance",
-    "magnification",
-    "image_distance",
-    "lens_diameter",
-    "diaphragm_distance",
-    "numerical_aperture",
-    "image_stop_diameter",
-)
 STRETCH = 1e-5  # by which float32 may make a rotation's matrix differ from one
 CLEAR, MOST_CLEAR = 0.999, 0.9  # of the depth of what is nearest, and of u, that lines of sight leave out
 EPSILON = 2.0**-23  # float32's rounding of a length, relative to the largest one it comes from
@@ -81,7 +72,7 @@ class FsptLens(mi.Sensor):
         own_film(props)
         default_sampler(props)
         super().__init__(props)
-        self._numbers = {n: number(props, n) for n in REQUIRED + OPTIONAL if n in props}
+        self._numbers = {n: number(props, n) for n in (*NUMBERS, "pixel_pitch") if n in props}
         missing = [name for name in REQUIRED if name not in self._numbers]
         if missing:
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
