@@ -205,7 +205,7 @@ class Lens:
         return (lens,) if pupil is None else (pupil, lens)
 
     def _entrance_pupil_disc(self, radius: float) -> Disc | None:
-        """The diaphragm's image through the lens, projected from the virtual plane onto the lens plane.
+        """The diaphragm's image through the lens, projected from the virtual detector plane onto the lens plane.
 
         A diaphragm at s behind the lens has its image at s F/(s - F), magnified F/(F - s), seen from the object
         side; one in front is its own image. A virtual point at (x, u) sees a circle of radius R_p at depth z_p as

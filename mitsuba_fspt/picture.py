@@ -1,4 +1,4 @@
-"""Images to look at: PNG files with a calibrated colour bar and a scale in mm on the object plane."""
+"""Images to look at: PNG files with a calibrated colour bar and a scale in mm on the sharp plane."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DIFFERENCES = "RdBu_r"  # white where the images agree
 def write_png(image: Image, path: str | os.PathLike[str]) -> None:
     """Write a picture of `image` [W/pixel] to a PNG file, method and lens above it.
 
-    Axes are in mm from the middle, on the object plane where the metadata hold `pixel_pitch` and
+    Axes are in mm from the middle, on the sharp plane where the metadata hold `pixel_pitch` and
     `magnification`, on the detector where they hold the pitch alone; else they count rows and columns.
 
     Raises
@@ -138,7 +138,7 @@ def _extent(image: Image) -> tuple[tuple[float, float, float, float], str]:
         return (-0.5, width - 0.5, height - 0.5, -0.5), "pixel"
     side = float(pitch) / float(magnification or 1.0)
     x, y = side * width / 2, side * height / 2
-    return (-x, x, -y, y), "mm on the object plane" if magnification else "mm on the detector"
+    return (-x, x, -y, y), "mm on the sharp plane" if magnification else "mm on the detector"
 
 
 def _aspect(image: Image) -> float:

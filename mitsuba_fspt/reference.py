@@ -201,7 +201,7 @@ def surface_form(
 
 
 def collected_power(camera: Camera, shape: Shape, exitance: Exitance, n: int) -> float:
-    """∫_S J_n f dS [W], the power of one convex body that passes the diaphragm; no virtual plane enters.
+    """∫_S J_n f dS [W], the power of one convex body that passes the diaphragm; no virtual detector plane enters.
 
     f is the configuration factor of a surface element to the pupil; n lattice points over surface × pupil.
     """

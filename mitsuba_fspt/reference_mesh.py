@@ -1,7 +1,7 @@
 """Eq. 9 over triangle meshes in float64 NumPy, without tracing a ray.
 
 Seen from one point a of the pupil the lines of sight are a central projection: the vertices are projected
-through a onto the virtual plane and the triangles are scan-converted onto the sample points of the film, with
+through a onto the virtual detector plane and the triangles are scan-converted onto the sample points of the film, with
 a depth buffer. The samples are a grid of k × k points a pixel that moves from node to node, so that nodes and
 samples together fill pixel × pupil. Independently shifted lattices of nodes give the mean and its error.
 """

@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 GOLDEN = 0.6180339887498949
 PLASTIC = (0.7548776662466927, 0.5698402909980532)  # steps of the R₂ sequence, even in the unit square
 
+# So far in (blur radii) a silhouette can pass unseen between the outermost of a rule's nodes and the rim of the pupil,
+# or beside the first transects.
+GAP = {1: 1.0, 4: 0.6, 12: 0.25, "transects": 0.1}
+
 Image = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
 
 

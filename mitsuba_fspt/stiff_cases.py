@@ -56,18 +56,18 @@ def cases() -> list[Case]:
 
 
 def focus_cases() -> list[Case]:
-    """In, through and around the focal plane, from the focal point to far away."""
+    """In, through and around the sharp plane, from the focal point to far away."""
     rows = []
     for name, share in (("in", 0.0), ("1e-7 before", -1e-7), ("1e-7 behind", 1e-7)):
         z = FOCUS * (1 + share)
         rows += [
-            Case(f"surface {name} the focal plane", CONE, partial(lambda z: cone(disk(z, 60)), z), EXACT),
-            Case(f"edge {name} the focal plane", BALANCE, partial(balance, z, 4.0), EXACT),
+            Case(f"surface {name} the sharp plane", CONE, partial(lambda z: cone(disk(z, 60)), z), EXACT),
+            Case(f"edge {name} the sharp plane", BALANCE, partial(balance, z, 4.0), EXACT),
         ]
     rows += [
-        Case("surface through the focal plane, 80° tilted", CONE, lambda: cone(disk(FOCUS, 600, tilt=80)), EXACT),
-        Case("edge in the focal plane, surface form", BALANCE, partial(balance, FOCUS, 4.0, "surface", 1e-3), SHARP),
-        Case("ball through the focal plane", OTHER, lambda: domains(ball()), AGREED),
+        Case("surface through the sharp plane, 80° tilted", CONE, lambda: cone(disk(FOCUS, 600, tilt=80)), EXACT),
+        Case("edge in the sharp plane, surface form", BALANCE, partial(balance, FOCUS, 4.0, "surface", 1e-3), SHARP),
+        Case("ball through the sharp plane", OTHER, lambda: domains(ball()), AGREED),
     ]
     for share, tolerance in ((1e-6, None), (1e-5, EXACT), (1e-4, EXACT), (1e-2, EXACT)):
         run = partial(lambda u: cone(disk(u, 60), focus_distance=u, pixel_pitch=10), FOCAL * (1 + share))

@@ -75,7 +75,7 @@ def _nine_decades() -> float:
 
 
 def _half_dark(border: float) -> float:
-    """A sharp plane that is dark up to x = border [mm], against the lit share of every pixel."""
+    """A plane in focus that is dark up to x = border [mm], against the lit share of every pixel."""
     vertices, faces = grid(np.unique([*np.linspace(-40, 40, 81), border]), np.linspace(-40, 40, 81), FOCUS)
     lit = vertices[faces].mean(axis=1)[:, 0] > border
     x = (WIDTH / 2 - np.arange(WIDTH)) * SIDE

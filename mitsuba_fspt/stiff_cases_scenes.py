@@ -190,12 +190,12 @@ def balance(z: float, radius: float, domain: str = "pupil", rtol: float = 10 * E
 
 
 def ball() -> Body:
-    """A ball through the focal plane, off the axis."""
+    """A ball through the sharp plane, off the axis."""
     return sphere(168.0, 6.0, 1.5, -1.0)
 
 
 def square() -> Body:
-    """A sharp square of 8 × 8 mm in the focal plane, its edges in the middle of pixels; float32 holds its vertices."""
+    """A sharp square of 8 × 8 mm in the sharp plane, its edges in the middle of pixels; float32 holds its vertices."""
     lines = np.linspace(-4, 4, 9)
     return mesh(*grid(lines, lines, FOCUS))
 

@@ -157,7 +157,7 @@ def binned(image: fspt.Image, side: int) -> fspt.Image:
 
 
 def places(image: fspt.Image) -> Array:
-    """Middle of each column [mm on the object plane], from the middle of the picture."""
+    """Middle of each column [mm on the sharp plane], from the middle of the picture."""
     side = float(image.metadata["pixel_pitch"]) / float(image.metadata["magnification"])
     return (np.arange(image.shape[1]) + 0.5 - image.shape[1] / 2) * side
 
@@ -170,7 +170,7 @@ def figure(width: float, height: float) -> Figure:
 
 
 def panel(axes: Axes, image: fspt.Image, title: str, reach: float, high: float | None = None) -> None:
-    """A picture with its colour bar, ± `reach` [mm on the object plane] of it; `high` [W/pixel]: end of the bar."""
+    """A picture with its colour bar, ± `reach` [mm on the sharp plane] of it; `high` [W/pixel]: end of the bar."""
     from mitsuba_fspt.picture import draw_picture, scale_and_unit
 
     high = float(image.power.max()) if high is None else high

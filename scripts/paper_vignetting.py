@@ -59,7 +59,7 @@ def overlap(r: float, s: float, apart: Array) -> tuple[Array, Array]:
 
 
 def illumination(off: Array, diameter: float) -> Array:
-    """Power over that on the axis at points `off` the axis [mm on the object plane], closed form.
+    """Power over that on the axis at points `off` the axis [mm on the sharp plane], closed form.
 
     The diaphragm of a diameter [mm], s behind the lens, appears sF/(F − s) behind it, magnified F/(F − s). Seen from
     a point of the sharp plane the lens border and this entrance pupil cover each other in part. The light is the

@@ -369,7 +369,7 @@ def test_sharp_picture_is_the_object_times_the_magnification():
 
 @pytest.mark.parametrize("depth", [110.0, 230.0])
 def test_blur_disc_has_the_radius_of_similar_triangles(depth):
-    """Rationale: a point at z spreads over D/2 · |u − z|/z on the virtual plane, nearer or farther alike.
+    """Rationale: a point at z spreads over D/2 · |u − z|/z on the virtual detector plane, nearer or farther alike.
 
     Expected: mean squared radius (B² + r²)/2 + 1/6 pixels² with r the disk's own image; f/4, to the cos⁴θ of its rim,
     2 (4/110)² = 2.6e-3.

@@ -53,7 +53,7 @@ def test_colour_bar_and_scale(drawn):
     assert shown.get_clim() == pytest.approx((0, 250))
     assert bar.get_ylabel() == "power [$10^{-12}$ W/pixel]"
     assert shown.get_extent() == pytest.approx((-1.296, 1.296, -0.864, 0.864))
-    assert axes.get_xlabel() == axes.get_ylabel() == "mm on the object plane"
+    assert axes.get_xlabel() == axes.get_ylabel() == "mm on the sharp plane"
     assert axes.get_title() == "integral,  F = 55 mm,  f/2.8,  magnification 0.5"
 
 

@@ -103,7 +103,7 @@ def test_pupil_form_and_surface_form_are_one_integral(body, pixel):
 
 
 def test_a_dark_back_hides_what_lies_behind():
-    """Rationale: a disc in the virtual plane is in focus: its shadow has no penumbra."""
+    """Rationale: a disc in the virtual detector plane is in focus: its shadow has no penumbra."""
     shade = Disc([3.0, 2.0, 165.0], [0, 0, 1], 1.6)  # the pixel in row 1, column 1 and a part of its neighbours
     power, _ = pupil_form(camera(), [sheet(400.0), shade], uniform, 6)
     free, _ = pupil_form(camera(), [sheet(400.0)], uniform, 6)

@@ -281,7 +281,7 @@ def power_of_ball(row, column, depth, radius, x, y, sub=12, points=3000):
     across, down = (np.ravel(n) for n in np.meshgrid(place, place))
     virtual = (((WIDTH / 2 - column - across) + 1j * (HEIGHT / 2 - row - down)) * SIDE)[:, None]
     centre = x + 1j * y
-    stretch = FOCUS / (FOCUS - depth)  # from the ball to the lens, seen from the virtual plane
+    stretch = FOCUS / (FOCUS - depth)  # from the ball to the lens, seen from the virtual detector plane
     seen = 1.1 * radius * stretch
     a = virtual + stretch * (centre - virtual) + seen * (even_disc(points).T @ [1, 1j])
     c, d = centre - a, virtual - a

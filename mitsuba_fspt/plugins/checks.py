@@ -57,8 +57,8 @@ def check_rounding(lens: mi.Sensor) -> None:
     side = lens.virtual_pitch
     raise SceneError(
         f"fspt_lens: single precision places lines of sight to {lens.rounding * side:.2g} mm, a pixel is {side:.2g} mm "
-        f"wide on the virtual plane and must be at least {1 / COARSEST:g} times that. Give a larger 'pixel_pitch' or, "
-        "where the scene lies far from the world's origin, move it there."
+        f"wide on the virtual detector plane and must be at least {1 / COARSEST:g} times that. Give a larger "
+        "'pixel_pitch' or, where the scene lies far from the world's origin, move it there."
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from .. import rules
 from ..quadrature import Quadrature, Solution
 from .grid import ROUNDING, Grid, parted
 from .lines import View
@@ -16,22 +17,13 @@ from .window import Window
 if TYPE_CHECKING:
     from .grid import Image, Mask
 
-    Index = mi.UInt32  # numbers of pixels, row by row
-
-LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
-LEAST_CLAIM = (
-    0.05  # rules that agree say little about what all miss: no error is said to be so much below the tolerance
-)
 FULL = 1e-6  # of all lines of sight hit but for so many, as far as a sum of float32 weights knows
-FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 rays cannot resolve
-# A silhouette can pass between the outermost of a rule's nodes and the rim of the pupil, or beside the first transects:
-# that far in (blur radii). A straight one makes them wrong by at most this share of the light, sharp or blurred, where
-# it parts the nodes and where it does not.
-GAP = {1: 1.0, 4: 0.6, 12: 0.25, "transects": 0.1}
+# A straight silhouette makes a rule wrong by at most this share of the light, sharp or blurred, where it parts the
+# nodes and where it passes through the rule's gap at the rim of the pupil.
 CUT = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
 UNSEEN = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
 UNSEEN_BY_TRANSECTS = 0.0125
-SHARP = 0.3  # blur radius [pixels]
+IN_FOCUS = 0.3  # blur radius [pixels] below which an edge counts as sharp in these tables
 
 
 class Draft:
@@ -78,8 +70,8 @@ class Draft:
 
     def solution(self) -> Solution:
         """The picture as it is, on the crop window."""
-        floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
-        error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, dr.opaque(mi.Float64, floor) * self.peak))
+        least = dr.opaque(mi.Float64, self.quadrature.least_error) * self.peak
+        error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, least))
         hits = dr.select(self.hits > 1 - FULL, 1, dr.maximum(self.hits, 0))
         etendue = dr.opaque(mi.Float64, self.lens.etendue)
         power, error = etendue * self.value, etendue * dr.select(self.beyond, 0, error)
@@ -101,16 +93,16 @@ class Draft:
         front, back = (dr.abs(self.lens.blur_radius(depth)) for depth in (self.nearest, farthest))
         most = dr.opaque(mi.Float64, max(self.grid.shape))
         blur = dr.select(seen, dr.minimum(dr.maximum(front, back), most), 0)
-        sharp = seen & (dr.minimum(front, back) < SHARP)
+        sharp = seen & (dr.minimum(front, back) < IN_FOCUS)
         dr.eval(blur, sharp)
         self.most_blur = float(dr.max(blur)[0])
         self.blur, near = self.grid.spread_all((blur, sharp))
-        self.sharp = self.grid.dilate(near, math.ceil(SHARP))
+        self.sharp = self.grid.dilate(near, math.ceil(IN_FOCUS))
 
     def reach(self, rule: int | str) -> tuple[mi.Int, int]:
         """How far from where a rule sees an edge it may hide from it, at each pixel and at most [pixels]."""
-        reach = 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, GAP[rule]) * self.blur))
-        return reach, 1 + math.ceil(GAP[rule] * self.most_blur)
+        reach = 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, rules.GAP[rule]) * self.blur))
+        return reach, 1 + math.ceil(rules.GAP[rule] * self.most_blur)
 
     def set_hits(self, hits: Image) -> None:
         """Shares of lines of sight that hit, and with them the outline."""
@@ -152,15 +144,3 @@ class Draft:
 def open_share(lens: mi.Sensor, window: Window, grid: Grid) -> Image:
     """Share of the pupil that a second border of the lens leaves open to the centre of each pixel."""
     return mi.Float64(lens.open_pupil(window.centres(grid.number), mi.Point2f(0))[1])
-
-
-def chunks(index: Index, size: int) -> list[Index]:
-    """Runs of at most `size` of the listed pixels."""
-    count = dr.width(index)
-    if count <= size:
-        return [index] if count else []
-    starts = range(0, count, size)
-    return [
-        dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, min(size, count - k)) + dr.opaque(mi.UInt32, k))
-        for k in starts
-    ]

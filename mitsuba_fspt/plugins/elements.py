@@ -86,7 +86,7 @@ class MeshElements(Elements):
     """Faces of a triangle mesh, each cut into k² congruent triangles."""
 
     corners = ((0, 0), (1, 0), (0, 1))
-    middle = (5 / 9, 1 / 2)
+    middle = (5 / 9, 1 / 2)  # which `place` puts at the centroid
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         super().__init__(shape)

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ..errors import SceneError
 from .elements import Elements, elements_of
 from .exitance import function_on
+from .lanes import LANES, runs
 from .window import Window
 
 CELLS = 2.5  # balances the cells of the pupil with the size of the pieces, whatever the blur
-LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
 PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
 CURVED = 8.0  # over rtol: elements of a round body; below a pixel none is cut, and their middles have to do
 BULGE = 0.1  # how far a curved element may reach beyond its corners, in units of their distance
@@ -79,13 +79,8 @@ class Glow:
         cells = cells_of(lines)
         cuts = np.round(self.sides[index] * math.sqrt(lines) / cells).astype(np.int64)
         cuts = cuts.clip(1, max(math.isqrt(LANES) // cells, 1))
-        ends = np.cumsum((cuts * cells) ** 2)
-        first = 0
-        while first < len(index):
-            done = ends[first - 1] if first else 0
-            last = max(first + 1, int(np.searchsorted(ends, done + LANES, side="right")))
-            yield Batch(self, index[first:last], cuts[first:last], cells)
-            first = last
+        for run in runs((cuts * cells) ** 2):
+            yield Batch(self, index[run], cuts[run], cells)
 
     def _touching(self, mark: NDArray[np.bool_]) -> Index:
         """Elements with a marked pixel in their bounds, by the sums over all rectangles that begin at pixel (0, 0)."""

@@ -117,7 +117,7 @@ class FsptLens(mi.Sensor):
         self._etendue = dr.opaque(mi.Float, self.etendue)
         self._solid_angle = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
         dr.make_opaque(self.m_to_world)
-        # How far float32 may move a line of sight on the virtual plane [virtual pixels].
+        # How far float32 may move a line of sight on the virtual detector plane [virtual pixels].
         place = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
         self.rounding = EPSILON * (place + self.optics.focus_distance) / self.virtual_pitch
 

@@ -9,8 +9,9 @@ import mitsuba as mi
 
 from .. import rules
 from ..shortcuts import Finding
-from .draft import LANES, Draft, chunks
+from .draft import Draft
 from .grid import ROUNDING, parted
+from .lanes import chunks
 from .lines import apply_rule
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ def apply_nodes(draft: Draft, rule: rules.Rule, where: Mask | None = None) -> li
     else:
         index = draft.grid.pixels(where)
         images = [draft.grid.full(mi.Float64, fill) for fill in (0, 0, 0, 0, 0, dr.inf, 0)]
-    for part in chunks(index, LANES):
+    for part in chunks(index):
         sums = apply_rule(draft.view, draft.window.centres(part), rule)
         for image, column in zip(images, sums, strict=True):
             dr.scatter(image, mi.Float64(column), part)

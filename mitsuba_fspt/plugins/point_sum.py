@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .elements import Elements, elements_of, scalar
+from .lanes import runs
 from .occlusion import hidden
 from .recording import recording
-
-LANES = 1 << 22  # pairs of a point and a pixel in flight: bounds the memory, not the picture
-MIDDLE_OF_FACE = (5 / 9, 1 / 2)  # where `place` of a mesh puts the centre of a triangle
 
 Image = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -49,7 +47,7 @@ def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Image, in
 
 def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]:
     """Elements and the flat numbers of the pixels around their blur discs, some `LANES` pairs at a time."""
-    si, _ = elements.place(dr.arange(mi.UInt32, elements.count), _middle(elements))
+    si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
     centre, radius = lens.film_discs(si.p.numpy().T.astype(np.float64))
     size, offset = (
         np.array([int(n) for n in corner]) for corner in (lens.film().crop_size(), lens.film().crop_offset())
@@ -60,17 +58,12 @@ def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]
     last = np.clip(np.floor(centre + reach - 0.5 - offset), -1, size - 1).astype(np.int64)
     columns, rows = np.maximum(last - first + 1, 0).T
     count = columns * rows
-    ends = np.cumsum(count)
-    begin = 0
-    while begin < len(count):
-        done = ends[begin - 1] if begin else 0
-        end = max(begin + 1, int(np.searchsorted(ends, done + LANES, side="right")))
-        index = np.repeat(np.arange(begin, end), count[begin:end])
-        number = np.arange(len(index)) - np.repeat(ends[begin:end] - count[begin:end] - done, count[begin:end])
+    for run in runs(count):
+        index = np.repeat(np.arange(run.start, run.stop), count[run])
+        number = np.arange(len(index)) - np.repeat(np.cumsum(count[run]) - count[run], count[run])
         row, column = number // columns[index] + first[index, 1], number % columns[index] + first[index, 0]
         if len(index):
             yield index, row * size[0] + column
-        begin = end
 
 
 def _add(
@@ -88,7 +81,7 @@ def _add(
     corner = mi.Point2f(*(dr.opaque(mi.Float, int(n) + 0.5) for n in lens.film().crop_offset()))
     position = corner + mi.Vector2f(mi.Float(number % width), mi.Float(number // width))
 
-    si, area = elements.place(mi.UInt32(index.astype(np.uint32)), _middle(elements))
+    si, area = elements.place(mi.UInt32(index.astype(np.uint32)), mi.Point2f(*elements.middle))
     centre, radius, _ = lens.blur_disc(si.p)
     pupil = mi.Point2f((position - centre) / radius)
     _, lens_point, passes, cos_d = lens.arrival(si.p, pupil)
@@ -106,7 +99,3 @@ def _add(
     solid_angle = cos_d * dr.square(cos_d * dr.opaque(mi.Float, lens.virtual_pitch) / defocus)
     added = mi.Float64(radiance * cos_s) * mi.Float64(area) * mi.Float64(solid_angle)
     dr.scatter_add(power, dr.select(lit, added, 0), number, lit)
-
-
-def _middle(elements: Elements) -> mi.Point2f:
-    return mi.Point2f(*(MIDDLE_OF_FACE if len(elements.corners) == 3 else (0.5, 0.5)))

@@ -17,8 +17,9 @@ import numpy as np
 
 from .. import rules
 from ..quadrature import Quadrature, Solution
-from .draft import LANES, Draft, chunks, open_share
+from .draft import Draft, open_share
 from .grid import Grid
+from .lanes import chunks
 from .lines import View, apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
 from .transects import integrate_by_transects
@@ -51,7 +52,7 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
         return np.zeros(window.full)
     grid, view = Grid(window.shape), View.of(scene, lens, window)
     image = grid.full(mi.Float64, 0)
-    for part in chunks(grid.number, LANES):
+    for part in chunks(grid.number):
         hits = apply_rule(view, window.centres(part), rules.twelve(True))[4]
         dr.scatter(image, mi.Float64(hits), part)
     return window.expand(grid.array(image * open_share(lens, window, grid)))

@@ -30,8 +30,6 @@ FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
 BLURRED = 0.5  # of the blur radius: a piece of a small body that is smaller is sent as one point
 SAFETY = 3.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
 MEMORY = 0.4  # of what the level before was thought to leave may be left: two levels may agree by chance
-LEAST_CLAIM = 0.05  # two levels say little about what both miss: no error is said to be so much smaller than asked
-FLOAT32_FLOOR = 2e-7  # share of the brightest pixel that float32 lines of sight cannot resolve
 # No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
 # bits, and thousands of roundings on a pixel stay below 1e-9 of any but the faintest.
 HEADROOM, RESOLUTION, COVERAGE_QUANTUM = 2.0**4, 2.0**-56, 2.0**-50
@@ -91,8 +89,7 @@ class _Refinement:
             # All elements with light on a marked pixel were refined: only there is the new picture whole.
             self.error[mark], self.value[mark], self.hits[mark] = estimate[mark], value[mark], hits[mark]
             mark = self.error > self.quadrature.rtol * max(self.value.max(), least_peak)
-        floor = max(FLOAT32_FLOOR, LEAST_CLAIM * self.quadrature.rtol)
-        error = np.maximum(self.error, floor * self.value.max(initial=0.0))
+        error = np.maximum(self.error, self.quadrature.least_error * self.value.max(initial=0.0))
         error[self.hits == 0] = self.error[self.hits == 0]
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.hits, 0, 1))

@@ -10,14 +10,14 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import rules
-from .draft import LANES, Draft, chunks
+from .draft import Draft
 from .grid import parted
 from .jumps import integrate_transect
+from .lanes import chunks
 from .nodes import apply_nodes
 from .transect import transect
 
 if TYPE_CHECKING:
-    from .draft import Index
     from .grid import Image, Mask
 
 # Of the difference to nodes may be left in the first transects, and in nodes that no transect parts.
@@ -202,7 +202,7 @@ def apply_transects(
     index = draft.grid.pixels(where)
     images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
     rays = 0
-    for part in chunks(index, max(1, LANES // len(rule))):
+    for part in chunks(index, len(rule)):
         *sums, looks = _transect_sums(draft, part, edges, rule, along)
         for image, column in zip(images, sums, strict=True):
             dr.scatter(image, column, part)
@@ -220,7 +220,7 @@ def apply_transects(
 
 
 def _transect_sums(
-    draft: Draft, part: Index, edges: Edges, rule: rules.Transects, along: rules.AlongTransect
+    draft: Draft, part: mi.UInt32, edges: Edges, rule: rules.Transects, along: rules.AlongTransect
 ) -> list[Image]:
     """Of each listed pixel means over its transects of value, hits, value squared, what of that is a trend; how many
     jump, and the blur of the most blurred edge; lines of sight taken.

@@ -12,11 +12,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..rules import GAP
+
 Boxes = tuple[tuple[float, ...], ...]
 
-# So far in (blur radii) a silhouette can pass unseen between the nodes of a pixel and the rim of its pupil, and no
-# further than so many pixels is looked beyond the crop window for one.
-GAP, MOST_RIM = 0.5, 16
+MOST_RIM = 16  # pixels: no further is looked beyond the crop window for a silhouette that four nodes may miss
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False) -> Window
         low, high = np.full(2, -np.inf), np.full(2, np.inf)
     middle, radius = 0.5 * np.array(film.size(), np.float64), lens.optics.seen_field / lens.virtual_pitch
     low, high = np.maximum(low, middle - radius), np.minimum(high, middle + radius)
-    rim = 1 + math.ceil(min(GAP * blur, MOST_RIM - 1))
+    rim = 1 + math.ceil(min(GAP[4] * blur, MOST_RIM - 1))
     # One pixel more than needed on each side keeps second differences and rounding inside.
     (left, right), (top, bottom) = (
         (
