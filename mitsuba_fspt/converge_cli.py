@@ -26,7 +26,7 @@ def converge(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for SCENE_converge.csv and .png, which must exist.")
     ] = Path("."),
-    rounds: Annotated[int, typer.Option(min=1, help="Timed runs of every setting.")] = 5,
+    rounds: Annotated[int, typer.Option(min=1, help="Timed rounds through all settings.")] = 5,
     budget: Annotated[float, typer.Option(help="Longest time of one picture [s]; finer settings are left out.")] = 2.0,
     reference: Annotated[
         Path | None, typer.Option(metavar="FILE.npz|.exr", help="Power and its error [W]; made where not given.")

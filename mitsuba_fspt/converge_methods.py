@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .monte_carlo import passes, tracer
+
 if TYPE_CHECKING:
     import mitsuba as mi
 
@@ -153,29 +155,20 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
 
 def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], Shot]]:
     """Settings over the samples a pixel, in as few passes as memory allows; every run has another seed."""
-    import drjit as dr
-    import mitsuba as mi
-
     from .plugins.probe import probe_beside
-    from .plugins.recording import recording
 
     probe_beside(scene)
-    # Depth 1 is the light that leaves the surface straight into the lens, all there is in free space: one ray a sample.
-    integrator = mi.load_dict({"type": kind, "max_depth": 1})
-    seed = itertools.count(1)
+    integrator, seed = tracer(kind), itertools.count(1)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
 
     def prepare(spp: float) -> Callable[[], Shot]:
-        passes = math.ceil(spp * pixels / LANES)
+        count = math.ceil(spp * pixels / LANES)
 
         def run() -> Shot:
             total, samples = np.zeros(()), 0
-            for _ in range(passes):
-                with dr.suspend_grad(), recording():
-                    image = integrator.render(scene, lens, seed=next(seed), spp=math.ceil(spp / passes))
-                total = total + np.array(image, np.float64)[..., 0]
-                samples += lens.sampler().sample_count()
-            return Shot(total / passes, samples * pixels, samples)
+            for power, taken in passes(scene, lens, integrator, itertools.islice(seed, count), math.ceil(spp / count)):
+                total, samples = total + power, samples + taken
+            return Shot(total / count, samples * pixels, samples)
 
         return run
 

@@ -20,7 +20,7 @@ class Row:
     """One method at one setting of its `knob`. Errors are relative to the reference's brightest pixel.
 
     cold : first run [s], with the compiling and what is found out once about a scene
-    seconds : of every further run but one, a run a round [s]
+    seconds : median of the runs of each round [s]
     rays : lines of sight; for the sum over points, pairs of a point and a pixel
     rms, rms_full : RMS error over all pixels and over those whose whole cone sees the phantom (NaN: there are none)
     largest : largest error of a pixel; of Monte Carlo the median over the runs, whose squares `rms` averages

@@ -52,9 +52,10 @@ def converge(
         found = fspt.converge("scenes/two_spheres.xml", budget=0.5)
         found.order("integral"), found.time_to("path, multijitter", 1e-3)
 
-    Every setting runs once cold, once more for its memory, then for a tenth of a second, at least once, in each round,
-    the rounds forwards and backwards through all settings by turns: a slow moment of the machine meets them all, and
-    medians count. `converge_sheet` writes the CSV file, the figure and the table.
+    Every setting runs once cold, once more for its memory, once untimed before the first round, and in each round for a
+    tenth of a second, at least once, the rounds forwards and backwards through all settings by turns: a slow moment of
+    the machine meets them all, and medians count. `converge_sheet` writes the CSV file and the figure,
+    `converge_table` the table.
 
     Cold is the first run of a setting: tracing, compiling, and what an integrator finds out once about a scene. Kernels
     that Dr.Jit has, in memory or on disk, are not compiled again, unless `kernels` lets it forget them.
@@ -63,7 +64,7 @@ def converge(
     ----------
     scene : Mitsuba scene (see `load`) or the name of a scene file
     sensor : number of the sensor, an `fspt_lens`
-    rounds : timed runs of every setting, >= 1
+    rounds : timed rounds, >= 1; in each the median of a setting's runs counts
     budget : longest time of one picture [s], > 0; finer settings are left out. About rounds × 20 × budget in all,
         and some seconds a setting for its first runs.
     reference : EXR file with error.Y, or NPZ file with arrays power and error [W]; None makes one, see `own_reference`

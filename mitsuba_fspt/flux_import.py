@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from .boundary import boundary_a
 from .errors import ExitanceError, FluxError
 from .formats import MeshLike, RawMesh, SurfaceValues, ValuesLike, read_mesh, surface_values
+from .formats.length_unit import millimetres
 from .phantom import UNIT, Phantom, require_finite, shares
 from .surface import closure, face_areas
 
-MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 TISSUE_INDEX = 1.37
 
 
@@ -56,13 +56,11 @@ def import_flux(
     ExitanceError : values that are NaN or infinite, negative without `clip`, or zero everywhere.
     BackendError : the format needs an optional package.
     """
-    if length_unit not in MILLIMETRES:
-        raise FluxError(f"flux import: 'length_unit' must be one of {', '.join(MILLIMETRES)}, got '{length_unit}'.")
+    scale = millimetres(length_unit, "flux import")
     if per not in (None, "vertex", "face"):
         raise FluxError(f"flux import: 'per' must be vertex or face, got '{per}'.")
     raw = read_mesh(mesh, values, field, format)
     found = surface_values(raw, field if values is None else None, per)
-    scale = MILLIMETRES[length_unit]
     found = replace(found, vertices=found.vertices * scale, faces=found.faces[:, ::-1] if flip else found.faces)
     require_finite(found.values, found.per)
     source = raw.source if values is not None else f"{raw.source} '{found.name}'"

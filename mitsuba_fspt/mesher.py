@@ -13,14 +13,13 @@ from trimesh.remesh import subdivide_to_size
 
 from .errors import BackendError, FluxError
 from .formats import read_mesh
+from .formats.length_unit import millimetres
 from .lattice import nearest_points
 from .surface import boundary, closure
 from .tetrahedra import Tetrahedra
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 
 
 def read_tetrahedra(
@@ -36,10 +35,9 @@ def read_tetrahedra(
     FluxError : the file cannot be read, its surface is open, or it lacks the field of labels.
     BackendError : a package to read or to mesh it is missing.
     """
-    if length_unit not in MILLIMETRES:
-        raise FluxError(f"geometry: 'length_unit' must be {', '.join(MILLIMETRES)}, got '{length_unit}'.")
+    scale = millimetres(length_unit, "geometry")
     raw = read_mesh(path, None, None, "auto")
-    points = raw.points * MILLIMETRES[length_unit]
+    points = raw.points * scale
     if raw.cells.shape[1] == 3:
         if labels is not None:
             raise FluxError(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from . import backend
+from . import backend, monte_carlo
 from .errors import SceneError
 from .image import Image
 from .interrupt import ctrl_c_noted
@@ -28,10 +28,7 @@ if TYPE_CHECKING:
 METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 LANES = 1 << 23  # Monte Carlo samples in flight
-ALIKE = 3.0  # by less do the errors of neighbours differ that see the same
-FEW = 20  # events on a pixel; fewer say too little of their variance
 Progress = Callable[[str, float], None]
-Picture = NDArray[np.float64]
 
 
 def render(
@@ -120,12 +117,9 @@ def _sample(
     progress: Progress,
 ) -> tuple:
     """Mean and standard error of independent Monte Carlo passes, summed in double precision."""
-    import drjit as dr
-
     from .plugins.checks import check_scene
     from .plugins.probe import probe_beside
     from .plugins.pupil_form import coverage
-    from .plugins.recording import recording
 
     check_scene(scene, lens)
     if spp < 2:
@@ -134,29 +128,26 @@ def _sample(
         raise SceneError(f"render: 'seed' must be in 0 … 2^32 - 1, got {seed}. Give for example 1.")
     probe_beside(scene)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
-    passes = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
-    lens.sampler().set_sample_count(math.ceil(spp / passes))
+    count = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
+    lens.sampler().set_sample_count(math.ceil(spp / count))
     each = lens.sampler().sample_count()  # some samplers take more: told once, not in every pass
+    seeds = [int(np.random.SeedSequence((seed, k)).generate_state(1)[0]) for k in range(count)]
     total = squares = 0.0
     samples = 0
-    for k in range(passes):
-        progress("sampling", k / passes)
-        with dr.suspend_grad(), recording():
-            (of_pass,) = np.random.SeedSequence((seed, k)).generate_state(1)
-            image = integrator.render(scene, lens, seed=int(of_pass), spp=each)
-        power = np.array(image, np.float64)[..., 0]
-        total, squares = total + power, squares + power * power
-        samples += lens.sampler().sample_count()
-    mean = total / passes
+    progress("sampling", 0.0)
+    for k, (power, taken) in enumerate(monte_carlo.passes(scene, lens, integrator, seeds, each), 1):
+        total, squares, samples = total + power, squares + power * power, samples + taken
+        progress("sampling", k / count)
+    mean = total / count
     name = {"PathIntegrator": "path", "ParticleTracerIntegrator": "ptracer", "VolumetricPathIntegrator": "volpath"}
     how = {
         "method": name.get(integrator.class_name(), integrator.class_name()),
         "sampler": lens.sampler().class_name(),
         "spp": samples,
-        "passes": passes,
+        "passes": count,
         "seed": seed,
     }
-    error = _standard_error(mean, squares / passes, passes, samples)
+    error = monte_carlo.standard_error(mean, squares / count, count, samples)
     return mean, np.where((mean > 0) | _can_see(scene, lens), error, 0), coverage(scene, lens), how
 
 
@@ -167,28 +158,6 @@ def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
     window = visible_window(scene, lens)
     inside, cut = window.stopped(lens)
     return window.expand((inside | cut).astype(np.float64)) > 0
-
-
-def _standard_error(mean: Picture, square: Picture, passes: int, samples: int) -> Picture:
-    """Of the mean of passes, from that of their squares; at least what a single sample brings where none met light, or
-    none missed it though some did next to it.
-
-    Their scatter says nothing, but the neighbours know: what events bring that are counted, and few, is variance over
-    mean, and where all samples meet light a share of it. Of their own variance a few say little on one pixel, more on
-    all around that were met.
-    """
-    from .plugins.grid import Grid
-
-    variance = np.maximum(square - mean * mean, 0) / (passes - 1)
-    met = mean > 0
-    event = np.maximum(np.divide(variance, mean, out=np.zeros_like(mean), where=met), mean / samples)
-    scatter, grid = np.sqrt(variance), Grid(mean.shape)
-    near, single = (grid.array(grid.spread_max(grid.lanes(image))) for image in (scatter, event))
-    few = mean * mean <= FEW * variance
-    pooled = np.sqrt(grid.array(grid.mean_where(grid.lanes(variance), grid.lanes(few & met), 1)))
-    counted = np.where(met, pooled, np.maximum(pooled, single))
-    missed = np.where(near > ALIKE * scatter, np.minimum(near, mean / samples), 0)
-    return np.where(few, counted, np.maximum(scatter, missed))
 
 
 def _is_scene(scene: object) -> bool:
@@ -215,8 +184,7 @@ def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
         return own if type(own).__name__ == "FsptIntegral" else mi.load_dict({"type": "fspt_integral"})
     if method not in METHODS:
         raise SceneError(f"render: 'method' must be one of {', '.join(METHODS)}, got '{method}'.")
-    # Depth 1 is the light that leaves the surface straight into the lens, all there is in free space.
-    return mi.load_dict({"type": method, "max_depth": 1})
+    return monte_carlo.tracer(method)
 
 
 def _refuse(settings: dict[str, object], method: str) -> None:

@@ -7,7 +7,6 @@ floor of float32 is 4e-7 there. Where a silhouette is in the picture, errors are
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 from .stability import Case
 from .stiff_cases_bodies import body_cases, light_cases, mesh_cases
@@ -36,9 +35,6 @@ from .stiff_cases_scenes import (
     power,
     scene,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 def cases() -> list[Case]:

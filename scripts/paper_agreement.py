@@ -1,4 +1,4 @@
-"""Part A of scripts/paper.py: the integral against Monte Carlo at f/8 (the paper's Table 1 and Fig. 5)."""
+"""Of scripts/paper.py, the integral against Monte Carlo at f/8 (the paper's Table 1 and Fig. 5)."""
 
 from __future__ import annotations
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 FOCAL, MAGNIFICATION, DISTANCE = 55.0, 0.5, 180.0  # mm, 1, mm from the lens to the phantom's axis
 FOCUS = FOCAL * (1 + 1 / MAGNIFICATION)  # mm, from the lens to the sharp plane: the phantom's front
+WHOLE_CONE = 0.999  # coverage from which on all of a pixel's lines of sight are said to meet the phantom
 SIZE, PITCH = 256, 0.108  # pixels a side, mm: the 2048² CCD of 13.5 µm, binned 8 × 8
 INDEX, MUA, MUSP = 1.37, 0.0138, 0.91  # of nylon_cylinder.toml: 1, 1/mm, 1/mm
 

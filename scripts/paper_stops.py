@@ -1,4 +1,4 @@
-"""Part B of scripts/paper.py: the diaphragm from f/2.8 to f/22, the 6 mm source from the left (Figs. 6-8)."""
+"""Of scripts/paper.py, the diaphragm from f/2.8 to f/22, the 6 mm source from the left (Figs. 6-8)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from paper_common import MAGNIFICATION, Array, Table, figure, panel, save, solve, stage
+from paper_common import MAGNIFICATION, PITCH, WHOLE_CONE, Array, Table, figure, panel, save, solve, stage
 
 import mitsuba_fspt as fspt
 
@@ -89,7 +89,7 @@ def _intensity(rows: list[tuple[float, ...]]) -> Table:
 
 
 def _distance(rows: list[tuple[float, ...]]) -> Table:
-    side = 0.108 / MAGNIFICATION
+    side = PITCH / MAGNIFICATION
     columns = {"f-number": "g", "distance at 5 % [pixels]": ".2f", "[mm on the sharp plane]": ".3f"}
     columns |= {"distance at 50 % [pixels]": ".2f", "column of the peak": ".2f"}
     return Table("distance", columns, [(f, far, far * side, half, peak) for f, _, _, peak, far, half in rows])
@@ -99,7 +99,7 @@ def _sparse(images: dict[float, fspt.Image], naive: dict[float, fspt.Image]) -> 
     """Eq. 9 as a sum over points against the integral."""
     rows = []
     for f, image in images.items():
-        inside = image.coverage > 0.999
+        inside = image.coverage > WHOLE_CONE
         found = fspt.compare(naive[f], image)
         empty = [100 * float(np.mean(each.power[inside] == 0)) for each in (naive[f], image)]
         rows.append((f, *empty, found.me, found.cf, naive[f].power.max() / image.power.max()))
@@ -124,7 +124,7 @@ def _draw_pictures(images: dict[float, fspt.Image], naive: dict[float, fspt.Imag
 
 def _draw_curves(rows: Array, path: Path) -> None:
     f, peak, mean, _, far, half = rows.T
-    side = 0.108 / MAGNIFICATION
+    side = PITCH / MAGNIFICATION
     drawn = figure(11.0, 3.4)
     left, middle, right = drawn.subplots(1, 3)
     for axes, values, name in ((left, peak, "peak"), (middle, mean, "mean")):

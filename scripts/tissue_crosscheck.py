@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from paper_common import MAGNIFICATION, SCENES, Array, Table, figure, fill, photograph, save, write_csv
+from paper_common import MAGNIFICATION, SCENES, WHOLE_CONE, Array, Table, figure, fill, photograph, save, write_csv
 from tissue_batches import LEFT_RIGHT, TOP_BOTTOM, Batches, mirrored, summed
 
 import mitsuba_fspt as fspt
@@ -131,7 +131,7 @@ def ratio(image: fspt.Image, truth: fspt.Image, where: NDArray[np.bool_]) -> tup
 
 def limb(image: fspt.Image) -> NDArray[np.bool_]:
     """The outermost pixel of each row that the phantom fills, on both sides."""
-    full = image.coverage > 0.999
+    full = image.coverage > WHOLE_CONE
     inside = np.zeros_like(full)
     inside[:, 1:-1] = full[:, :-2] & full[:, 2:]
     return full & ~inside
@@ -204,7 +204,7 @@ def draw(path: Path, pictures: Pictures) -> None:
     for (view, images), (top, bottom) in zip(pictures.items(), axes.T, strict=True):
         truth = mirrored(bands(images["volpath"]), SYMMETRY[view])
         mean, error = profile(truth, 0)
-        seen = truth.coverage[len(HEIGHTS) - 1] > 0.999
+        seen = truth.coverage[len(HEIGHTS) - 1] > WHOLE_CONE
         top.errorbar(x, mean, error, fmt="k.", capsize=2, label="Monte Carlo, source to CCD")
         noise = error[seen] / mean[seen]
         bottom.fill_between(x[seen], 1 - noise, 1 + noise, color="0.85")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsuba_fspt import backend, rendering
+from mitsuba_fspt import backend
 
 backend.ensure_variant()
 
@@ -14,6 +14,7 @@ from little_scenes import ball, lens, scene_of, write_scene  # noqa: E402
 
 import mitsuba_fspt as fspt  # noqa: E402
 from mitsuba_fspt.errors import SceneError  # noqa: E402
+from mitsuba_fspt.monte_carlo import standard_error  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +148,7 @@ def test_a_few_events_on_a_pixel_are_off_by_the_root_of_how_many_to_expect(expec
     passes, draw = 32, np.random.default_rng(1)
     counts = draw.poisson(expected / passes, (passes, 128, 128)).astype(float)
     mean = counts.mean(axis=0)
-    error = rendering._standard_error(mean, np.square(counts).mean(axis=0), passes, samples=1 << 10)
+    error = standard_error(mean, np.square(counts).mean(axis=0), passes, samples=1 << 10)
     off = mean - expected / passes
     # What no event met has the error of one at least: of two to expect a little too large.
     assert 0.83 < np.mean(off**2) / np.mean(error**2) < 1.05

@@ -8,7 +8,7 @@ the light does.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -48,50 +48,91 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     parts = [_seen(emitter, lens) for emitter in emitters if type(emitter).__name__ == "FsptSurface"]
     if not parts or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0)
-    radiance, area, slant, front, apart, blur, x, y = np.concatenate(parts, axis=1)
-    x, y = x - window.left - window.crop_offset[0], y - window.top - window.crop_offset[1]
-    height, width = window.shape
-    near = (x > -blur) & (x < width + blur) & (y > -blur) & (y < height + blur) & (area > 0) & (slant > 0)
-    if not (near & (radiance > 0)).any():
+    points = _Points.joined(parts).on(window)
+    points = points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
+    if not (points.radiance > 0).any():
         return NarrowLight(on_pixels, 0.0)
-    columns = radiance, area, slant, front, apart, blur, x, y
-    radiance, area, slant, front, apart, blur, x, y = (column[near] for column in columns)
     # A blur disc spreads a point's light over so many pixels; discs that overlap add up.
-    light = radiance * area / (math.pi * blur**2 + 1)
-    level = np.round(np.log2(np.maximum(blur, 1)))
+    light = points.radiance * points.area / (math.pi * points.blur**2 + 1)
+    level = np.round(np.log2(np.maximum(points.blur, 1)))
     brightest = 0.0
     for k in np.unique(level):
         here, reach = level == k, math.ceil(2 ** (k + 0.5))
-        brightest = max(brightest, _cells(x[here] / 2**k, y[here] / 2**k).sums(light[here]).max())
-        far = reach + 2 * 2**k  # beyond that the points of this level have no neighbours
-        there = (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
-        here[there] &= _hidden(*(column[there] for column in (radiance, area, slant, front, x, y)), 2**k)
-        here &= there & (apart < 1)
+        brightest = max(brightest, points[here].cells(2**k).sums(light[here]).max())
+        there = points.near(reach + 2 * 2**k, window.shape)  # beyond, those of this level have no neighbours
+        here[there] &= _hidden(points[there], 2**k)
+        here &= there & (points.apart < 1)
         if here.any():
-            on_pixels += _spread(light[here], x[here], y[here], reach, window.shape)
+            on_pixels += _spread(light[here], points[here], reach, window.shape)
     return NarrowLight(on_pixels, float(brightest))
 
 
-def _hidden(
-    radiance: Column, area: Column, slant: Column, front: Column, x: Column, y: Column, side: float
-) -> NDArray[np.bool_]:
+@dataclass(frozen=True)
+class _Points:
+    """Points all over surfaces, columns (n,).
+
+    radiance : to the lens; 0 where a point has no image
+    area : of the sharp image that it stands for [pixels²]
+    cosine, front : the largest cosine of the normal to a point of the pupil; > 0 if the pupil's middle sees the point
+    apart : how far it is from the next; in pixels, or in blur radii where they are larger
+    blur, x, y : on film [pixels]
+    """
+
+    radiance: Column
+    area: Column
+    cosine: Column
+    front: Column
+    apart: Column
+    blur: Column
+    x: Column
+    y: Column
+
+    @classmethod
+    def joined(cls, parts: list[_Points]) -> _Points:
+        """All of them."""
+        return cls(*(np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)))
+
+    def __getitem__(self, which: NDArray[np.bool_]) -> _Points:
+        return _Points(*(column[which] for column in vars(self).values()))
+
+    def on(self, window: Window) -> _Points:
+        """Places counted from the corner of a window."""
+        left, top = window.left + window.crop_offset[0], window.top + window.crop_offset[1]
+        return replace(self, x=self.x - left, y=self.y - top)
+
+    def near(self, far: float | Column, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """True less than `far` from a picture of this shape."""
+        (height, width), (x, y) = shape, (self.x, self.y)
+        return (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
+
+    def cells(self, side: float) -> _Cells:
+        """Square cells of a `side` [pixels]; what is too far off falls into the last."""
+        column, row = (
+            np.clip(np.floor((c - c.min()) / side), 0, LARGEST_GRID - 1).astype(np.int64) for c in (self.x, self.y)
+        )
+        width = int(column.max()) + 1
+        return _Cells((int(row.max()) + 1, width), row * width + column)
+
+
+def _hidden(points: _Points, side: float) -> NDArray[np.bool_]:
     """True of points that outshine the squares of a `side` [pixels] around, and are not the limb of a wide body.
 
     Beyond the limb lies what only a part of the pupil sees, beside what its middle does.
     """
-    cells = _cells(x / side, y / side)
+    cells = points.cells(side)
     grid = Grid(cells.shape)
-    weights = radiance * area / side**2, area / side**2, (front > 0).astype(np.float64)
+    share = points.area / side**2
     around, most, facing = (
-        grid.array(grid.spread_max(grid.lanes(cells.sums(weight)))).ravel()[cells.number] for weight in weights
+        grid.array(grid.spread_max(grid.lanes(cells.sums(weight)))).ravel()[cells.number]
+        for weight in (points.radiance * share, share, (points.front > 0).astype(np.float64))
     )
-    limb = (slant < SLANTED) & (most > COVERED) | (front <= 0) & (facing > 0)
-    return (radiance > OUTSHINES * around) & ~limb
+    limb = (points.cosine < SLANTED) & (most > COVERED) | (points.front <= 0) & (facing > 0)
+    return (points.radiance > OUTSHINES * around) & ~limb
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """Unit cells with points in them: `shape` (h, w) of their grid and, row by row, the `number` of each point's."""
+    """Cells with points in them: `shape` (h, w) of their grid and, row by row, the `number` of each point's."""
 
     shape: tuple[int, int]
     number: Index
@@ -101,18 +142,11 @@ class _Cells:
         return np.bincount(self.number, weight, minlength=math.prod(self.shape)).reshape(self.shape)
 
 
-def _cells(x: Column, y: Column) -> _Cells:
-    """Cells of points; what is too far off falls into the last."""
-    column, row = (np.clip(np.floor(c - c.min()), 0, LARGEST_GRID - 1).astype(np.int64) for c in (x, y))
-    width = int(column.max()) + 1
-    return _Cells((int(row.max()) + 1, width), row * width + column)
-
-
-def _spread(light: Column, x: Column, y: Column, reach: int, shape: tuple[int, int]) -> Image:
+def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) -> Image:
     """Sums of `light` within `reach` pixels of each pixel of the window, (h, w)."""
     height, width = shape
     reach = min(reach, height + width)
-    row, column = (np.floor(c).astype(np.int64) + reach for c in (y, x))
+    row, column = (np.floor(c).astype(np.int64) + reach for c in (points.y, points.x))
     on = (row >= 0) & (row < height + 2 * reach) & (column >= 0) & (column < width + 2 * reach)
     sums = np.zeros((height + 2 * reach, width + 2 * reach))
     np.add.at(sums, (row[on], column[on]), light[on])
@@ -120,13 +154,8 @@ def _spread(light: Column, x: Column, y: Column, reach: int, shape: tuple[int, i
     return grid.array(grid.box_sum(grid.lanes(sums), reach))[reach : reach + height, reach : reach + width]
 
 
-def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
-    """Of points all over a surface radiance to the lens, area of the sharp image they stand for [pixels²], slant,
-    front, how far they are apart, blur, x, y [pixels]; (8, n).
-
-    Radiance 0 where a point has no image. `slant`: the largest cosine of the normal to a point of the pupil,
-    `front` > 0 if its middle sees the point. How far apart: in pixels, or in blur radii where they are larger.
-    """
+def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
+    """Points all over a surface as the lens sees them."""
     shape = emitter.get_shape()
     elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
     counts = np.ones(elements.count, np.int64)
@@ -139,19 +168,18 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> NDArray[np.float64]:
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     *columns, centre = _look(emitter, elements, lens, counts)
     seen = np.array([column.numpy() for column in (*columns, centre.x, centre.y)], np.float64)
-    seen[1] /= np.repeat(counts, counts)
-    seen[0, ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)] = 0
-    seen = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
+    radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
     # What is half as thick as a unit covers half of some square by itself.
-    apart = np.where(area < unit**2 * reach, reach / counts, np.inf)
-    return np.insert(seen, 4, np.repeat(apart, counts), axis=0)
+    apart = np.repeat(np.where(area < unit**2 * reach, reach / counts, np.inf), counts)
+    return _Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
 
 
 def _look(
     emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f]:
     """At so many points of each element, the first its middle, radiance to where the lens sees most of it, area of the
-    element's image from there, slant, front, blur, place on film.
+    element's image from there, cosine, front, blur, place on film; see `_Points`.
     """
     index = np.repeat(np.arange(elements.count), counts)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -163,10 +191,10 @@ def _look(
     at_one_wavelength(si)
     centre, blur, scale = lens.blur_disc(si.p)
     axis = lens.world_transform() @ mi.Vector3f(0, 0, 1)
-    slant = dr.dot(si.n, to_lens)
-    image = area * dr.abs(slant / (dr.dot(axis, to_lens) * dr.square(scale)))
+    cosine = dr.dot(si.n, to_lens)
+    image = area * dr.abs(cosine / (dr.dot(axis, to_lens) * dr.square(scale)))
     front = dr.dot(si.n, lens.world_transform() @ mi.Point3f(0) - si.p)
-    columns = (scalar(emitter.eval(si)), image, slant, front, dr.abs(blur), centre)
+    columns = (scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre)
     dr.eval(columns)
     return columns
 
