@@ -162,7 +162,7 @@ def test_tetrahedra_with_labels_from_a_file(tmp_path: Path) -> None:
     assert exited[0] == pytest.approx(straight.solved.exited, rel=0.02)
     with pytest.raises(FluxError, match=r"no field 'organ' .* Fields it has: 'tissue'"):
         read_tetrahedra(tmp_path / "tissue.vtu", 2, labels="organ")
-    with pytest.raises(FluxError, match="'length_unit' must be mm, cm, m, got 'inch'"):
+    with pytest.raises(FluxError, match="'length_unit' must be one of mm, cm, m, got 'inch'"):
         read_tetrahedra(tmp_path / "tissue.vtu", 2, "inch")
 
 
