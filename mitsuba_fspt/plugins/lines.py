@@ -45,7 +45,10 @@ class View:
     @classmethod
     def of(cls, scene: mi.Scene, lens: mi.Sensor, window: Window, faces: Faces | None = None) -> View:
         """As seen in a window through Mitsuba's surface records or, where the scene has them, its `faces`."""
-        triangles = sum(shape.face_count() if shape.is_mesh() else 1 for shape in scene.shapes())
+        shapes = scene.shapes()
+        # In packets Embree passes by some points of a disk.
+        meshes = all(shape.is_mesh() for shape in shapes)
+        triangles = sum(shape.face_count() for shape in shapes) if meshes else math.inf
         start = dr.opaque(mi.Float, lens.clear_depth(scene.bbox()))
         return cls(scene, lens, start, faces, triangles / math.prod(window.shape))
 

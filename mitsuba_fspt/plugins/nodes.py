@@ -33,7 +33,7 @@ def first_nodes(draft: Draft) -> Mask:
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
     value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
-    if len(rule) == 1 and not dr.any(hits > 0):  # what glows is thinner than a pixel
+    if len(rule) == 1 and not dr.any(value > 0):  # what glows is thinner than a pixel
         rule = rules.four(draft.area)
         value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
     draft.nodes = len(rule)
@@ -62,7 +62,7 @@ def first_nodes(draft: Draft) -> Mask:
     dr.eval(draft.error, rough)
     if (neighbours and min(grid.shape) < 3) or not draft.quadrature.takes("smooth"):
         rough = grid.full(mi.Bool, True)
-    return (rough | _nothing_met(draft)) & draft.open
+    return (rough | _dark(draft)) & draft.open
 
 
 def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
@@ -88,12 +88,12 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
     if dr.any(misled):
         _refine(draft, misled & ~probes)
     rough = rough | misled
-    return rough & (draft.grown(rough & (draft.error > draft.tolerance)) | _nothing_met(draft))
+    return rough & (draft.grown(rough & (draft.error > draft.tolerance)) | _dark(draft))
 
 
-def _nothing_met(draft: Draft) -> Mask:
-    """True where no line of sight of any pixel met a surface yet, one lane: what glows is on the film, or may be."""
-    return ~dr.any(draft.hits > 0)
+def _dark(draft: Draft) -> Mask:
+    """True while no line of sight of any pixel has met light, one lane: what glows is on the film, or may be."""
+    return ~dr.any(draft.value > 0)
 
 
 def _one_will_do(draft: Draft) -> bool:

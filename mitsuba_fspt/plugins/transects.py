@@ -69,7 +69,8 @@ class _Ladder:
         if self.means:
             self.edges.learn(draft, self.means, self.split)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
-        fresh = where & means.jumps & ~self.split
+        # What hides the light may be cut by outlines all over the pupil but where the light comes past it.
+        fresh = where & means.jumps & (means.value > 0) & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
         value, hits, scatter = means.value, means.hits, means.scatter

@@ -1,0 +1,69 @@
+"""Light that comes past a dark body out of focus, against counting: lines of sight that meet the one disk and not the
+other, by plane geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from little_scenes import glow, lens, scene_of
+
+import mitsuba as mi  # noqa: I001  (after the variant is set)
+
+import mitsuba_fspt as fspt
+
+FOCUS, WIDTH, HEIGHT = 180.0, 14, 12
+ACROSS, ALONG = 120, 6  # lines of sight across the pupil and along each side of a pixel
+COUNTED = 3e-3  # of the brightest pixel: what so many of them may be off by
+
+
+def seen_past(glowing, dark, f_number):
+    """A scene with a glowing and a dark disk (x, y, depth, radius) [mm], both square to the axis of a lens on +z."""
+    disks = [
+        {"type": "disk", "to_world": mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 1, 0], 180).scale(radius)}
+        for x, y, z, radius in (glowing, dark)
+    ]
+    sensor = lens(
+        size=(WIDTH, HEIGHT), pitch=0.55, f_number=f_number, magnification=None, focus_distance=FOCUS, to_world=None
+    )
+    return scene_of(disks[0] | {"emitter": glow(1.0)}, disks[1], sensor=sensor)
+
+
+def counted(camera, glowing, dark):
+    """Power [W] on every pixel, (h, w)."""
+    ax, ay = np.meshgrid(*2 * [(np.arange(ACROSS) + 0.5) / ACROSS * 2 - 1])
+    open_ = ax**2 + ay**2 <= 1
+    ax, ay = (camera.optics.diaphragm_diameter / 2 * a[open_] for a in (ax, ay))
+    step = np.arange(ALONG * WIDTH) + 0.5, np.arange(ALONG * HEIGHT) + 0.5
+    x, y = (camera.virtual_pitch * (side / 2 - s / ALONG) for s, side in zip(step, (WIDTH, HEIGHT), strict=True))
+    light = np.zeros((len(y), len(x)))
+    for i, j in np.ndindex(light.shape):
+        meets = [
+            np.hypot(ax + (x[j] - ax) * z / FOCUS - cx, ay + (y[i] - ay) * z / FOCUS - cy) < radius
+            for cx, cy, z, radius in (glowing, dark)
+        ]
+        cos2 = FOCUS**2 / ((x[j] - ax) ** 2 + (y[i] - ay) ** 2 + FOCUS**2)
+        light[i, j] = (cos2**2 * (meets[0] & ~meets[1])).mean()
+    return camera.etendue / np.pi * light.reshape(HEIGHT, ALONG, WIDTH, ALONG).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize(
+    ("glowing", "dark", "f_number"),
+    [
+        ((0.0, 0.0, 149.6, 2.5), (0.0, 3.0, 95.1, 5.0), 1.4),
+        ((2.0, 2.0, 149.6, 2.0), (1.0, 5.0, 95.1, 6.0), 2.8),
+        ((3.5, -0.5, 149.6, 3.0), (2.0, 3.9, 95.1, 5.5), 1.4),
+        ((-0.3, 2.7, 149.2, 4.8), (1.3, 0.7, 95.9, 6.1), 5.6),
+    ],
+)
+def test_light_past_a_dark_disk_arrives(glowing, dark, f_number):
+    """Seen to fail where outlines of what is dark settle a pixel: off by 0.05 to 0.23 of the brightest pixel, zeros
+    without an error. In the last case four nodes meet but the dark disk, and the picture was black; in packets of rays,
+    which pass by the dark disk here and there, 0.35 of the peak shines through it.
+    """
+    scene = seen_past(glowing, dark, f_number)
+    truth = counted(scene.sensors()[0], glowing, dark)
+    image = fspt.render(scene, rtol=1e-2)
+    off = np.abs(image.power - truth)
+    assert (off <= image.error + COUNTED * truth.max()).mean() > 0.99
+    assert off.max() <= 3 * image.error.max() + COUNTED * truth.max()
+    assert not ((image.power == 0) & (truth > COUNTED * truth.max())).any()
