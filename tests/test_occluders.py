@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from little_scenes import glow, lens, scene_of
-
-import mitsuba as mi  # noqa: I001  (after the variant is set)
+from little_scenes import glow, lens, mi, scene_of
 
 import mitsuba_fspt as fspt
 

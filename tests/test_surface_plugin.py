@@ -450,6 +450,24 @@ def test_round_shapes_that_are_stretched_are_refused(kind, scale):
         fspt.render(scene)
 
 
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk"])
+def test_a_rotation_about_an_axis_not_of_length_1_is_refused(kind):
+    """Rationale: its inverse in Mitsuba is none; a disk was traced a fifth smaller than its parameters say."""
+    import mitsuba_fspt as fspt
+
+    place = mi.ScalarTransform4f().rotate([1, 0.5, 0], 40).scale(3)
+    scene = scene_of({"type": kind, "to_world": place, "emitter": glow()})
+    with pytest.raises(SceneError, match=r"Give (every rotation an axis|a rotation \(about an axis) of length 1"):
+        fspt.render(scene)
+
+
+def test_a_disk_may_be_an_ellipse():
+    import mitsuba_fspt as fspt
+
+    place = mi.ScalarTransform4f().rotate([0.48, 0.64, 0.6], 30).rotate([0, 1, 0], 90).scale([1e-2, 10, 1])
+    assert fspt.render(scene_of({"type": "disk", "to_world": place, "emitter": glow()})).power.max() > 0
+
+
 def test_a_cylinder_may_be_as_long_as_it_likes():
     import mitsuba_fspt as fspt
 

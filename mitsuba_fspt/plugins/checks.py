@@ -17,6 +17,7 @@ COARSEST = 0.1  # virtual pixels by which float32 may move a line of sight
 # W/mm² and W that leave room in float32 for the shares and the faint parts of a picture.
 EXITANCES, FAINTEST = (1e-32, 1e32), 1e-36
 STRETCH = 1e-4  # by which float32 may make lengths and right angles differ
+ROUNDING = 1e-6  # of float32, in sums of products
 PROBES = 1 << 10  # surface points of a shape at which another one is looked for
 LIFT = 1e-6  # of the largest coordinate: what lies no further before a surface cannot be told from it
 
@@ -31,7 +32,7 @@ def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
         if type(emitter).__name__ == "FsptSurface":
             emitter.check()
             check_range(emitter, sensor)
-            check_round(emitter.get_shape())
+            check_placement(emitter.get_shape())
             with dr.suspend_grad():
                 check_alone(scene, emitter)
     check_outside(scene, sensor)
@@ -79,16 +80,26 @@ def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
         )
 
 
-def check_round(shape: mi.Shape) -> None:
-    """Raise SceneError where a sphere or cylinder is stretched: Mitsuba traces it round, its parameters are not."""
+def check_placement(shape: mi.Shape) -> None:
+    """Raise SceneError where a sphere, cylinder or disk is not traced where its parameters say."""
     kind = shape.class_name().lower()
-    if kind not in ("sphere", "cylinder"):
+    if kind not in ("sphere", "cylinder", "disk"):
         return
-    axes = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
+    placement = mi.traverse(shape)["to_world"]
+    axes, back = (np.array(t.matrix, np.float64).reshape(4, 4)[:3, :3] for t in (placement, placement.inverse()))
+    # Mitsuba inverts each step of a transform by rule, a rotation by its transpose, whatever its axis.
+    if (np.abs(axes @ back - np.eye(3)) > STRETCH + ROUNDING * (np.abs(axes) @ np.abs(back))).any():
+        raise SceneError(
+            f"scene: 'to_world' of {kind} '{shape.id()}' is not undone by the inverse that Mitsuba traces with. Give "
+            "every rotation an axis of length 1, or a mesh."
+        )
+    if kind == "disk":
+        return
     lengths = np.linalg.norm(axes, axis=0)
     alike = lengths[: 3 if kind == "sphere" else 2]  # a cylinder is as long as it likes
     cosines = axes.T @ axes / np.outer(lengths, lengths) - np.eye(3)
     if np.ptp(alike) > STRETCH * alike.max() or np.abs(cosines).max() > STRETCH:
+        # Mitsuba traces it round, its parameters are not.
         raise SceneError(
             f"scene: 'to_world' of {kind} '{shape.id()}' stretches or shears it, which it cannot follow. Give a "
             "rotation (about an axis of length 1), a translation and one scale, or a mesh."

@@ -104,7 +104,8 @@ class FsptSurface(mi.Emitter):
         outward = active & (dr.dot(si.n, direction) > 0)
         radiance = self.exitance.eval(si, outward) * self.law.profile(si, direction, outward)
         # On a sliver, where single precision finds no place to interpolate at, J_n is not a number.
-        return dr.select(outward & dr.isfinite(radiance), radiance, 0)
+        # `select` makes a plain array of it, of which Mitsuba's depolarizer would take the first wavelength alone.
+        return mi.UnpolarizedSpectrum(dr.select(outward & dr.isfinite(radiance), radiance, 0))
 
     # ------------------------------------------------------------------ sampling
 
@@ -272,7 +273,7 @@ def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedS
     """Wavelengths [nm] and the inverse of their density, in spectral variants; nothing and 1 elsewhere."""
     if not mi.is_spectral:
         return mi.Color0f(), mi.UnpolarizedSpectrum(1)
-    return mi.sample_rgb_spectrum(mi.math.sample_shifted(sample))
+    return mi.sample_rgb_spectrum(mi.sample_shifted(sample))
 
 
 def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
