@@ -25,6 +25,24 @@ def mmc(folder, nodes=NODES, elements=ELEMENTS, dref=DREF, name="s_dref.dat"):
     return folder / "node_s.dat", folder / name
 
 
+def test_a_ply_that_ends_early(tmp_path):
+    """Rationale: it was imported with the faces that were left."""
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 4",
+        *(f"property float {name}" for name in ("x", "y", "z", "jn")),
+    ]
+    header += ["element face 4", "property list uchar int vertex_indices", "end_header"]
+    rows = ["0 0 0 1", "1 0 0 1", "0 1 0 1", "0 0 1 1", "3 0 2 1", "3 0 1 3", "3 0 3 2", "3 1 2 3"]
+    path = tmp_path / "whole.ply"
+    path.write_text("\n".join([*header, *rows, ""]))
+    assert len(import_flux(path, field="jn").faces) == 4
+    path.write_text("\n".join([*header, *rows[:-1], ""]))
+    with pytest.raises(FluxError, match="ends early: its header tells of 4 face lines, there are 3"):
+        import_flux(path, field="jn")
+
+
 @pytest.mark.parametrize(
     ("files", "message"),
     [

@@ -258,6 +258,14 @@ def test_a_light_without_a_surface_is_refused():
         fspt.render(lit, domain="surface")
 
 
+@pytest.mark.parametrize("domain", ["surface", "pupil"])
+def test_light_from_beyond_all_surfaces_is_refused(domain):
+    """Rationale: pixels beside the bodies would not see it."""
+    sky = scene(sphere(180.0, 8.0), lamp={"type": "constant"})
+    with pytest.raises(SceneError, match=r"shines from beyond all surfaces.* Leave it out, or render with method path"):
+        fspt.render(sky, domain=domain)
+
+
 def test_a_small_ball_far_out_of_focus():
     """Rationale: the radiance on film is J_n/π times the mean of cos⁴θ over the lines of sight that meet the ball.
 

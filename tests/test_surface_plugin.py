@@ -21,7 +21,7 @@ backend.ensure_variant()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-from little_scenes import attribute, glow, scene_of, write_ply  # noqa: E402
+from little_scenes import attribute, ball, glow, scene_of, write_ply  # noqa: E402
 
 from mitsuba_fspt.errors import SceneError  # noqa: E402
 from mitsuba_fspt.plugins.elements import UNIFORM_SHARE  # noqa: E402
@@ -437,6 +437,21 @@ def test_a_rendered_scene_can_be_freed_and_keeps_its_names(integrator, tmp_path)
     del scene, image
     gc.collect()
     assert sum(type(thing).__name__ == "FsptSurface" for thing in gc.get_objects()) == kept
+
+
+def test_an_integrator_of_its_own_keeps_no_emitter(tmp_path):
+    """Rationale: an emitter that outlives its shape is recorded with the next scene's, and the process ended."""
+    vertices = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
+    path = write_ply(tmp_path / "sheet.ply", vertices, [(0, 1, 2), (0, 2, 3)], vertex=[1, 2, 3, 4])
+    integrator = mi.load_dict({"type": "fspt_integral", "rtol": 1e-2})
+    gc.collect()
+    kept = sum(type(thing).__name__ == "FsptSurface" for thing in gc.get_objects())
+    for shape in ({"type": "ply", "filename": str(path), "emitter": glow(attribute())}, ball()):
+        scene = scene_of(shape)
+        assert integrator.solve(scene, scene.sensors()[0]).power.max() > 0
+        del scene
+        gc.collect()
+        assert sum(type(thing).__name__ == "FsptSurface" for thing in gc.get_objects()) == kept
 
 
 @pytest.mark.parametrize(("kind", "scale"), [("sphere", (3, 3, 6)), ("cylinder", (3, 3.01, 3))])

@@ -23,11 +23,17 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
 
     Raises
     ------
-    FluxError : the file cannot be read, or holds no triangles.
+    FluxError : the file cannot be read, ends early, or holds no triangles.
     """
     # Texture coordinates would make trimesh split the vertices.
     mesh = load_triangles(path, "ply", fix_texture=False, skip_materials=True)
     elements = mesh.metadata.get("_ply_raw", {})
+    for element, count in (("vertex", len(mesh.vertices)), ("face", len(mesh.faces))):
+        told = elements.get(element, {}).get("length", 0)
+        if count < told:  # polygons may be more triangles
+            raise FluxError(
+                f"'{path}' ends early: its header tells of {told} {element} lines, there are {count}. Mend it."
+            )
     fields = []
     for on, element in (("vertex", "vertex"), ("cell", "face")):
         data = elements.get(element, {}).get("data", {})

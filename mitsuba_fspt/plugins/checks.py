@@ -63,6 +63,16 @@ def check_rounding(lens: mi.Sensor) -> None:
     )
 
 
+def check_surfaces_alone(scene: mi.Scene) -> None:
+    """Raise SceneError where light comes from beyond all surfaces: the integral counts that of surfaces."""
+    for emitter in scene.emitters():
+        if emitter.is_environment():
+            raise SceneError(
+                f"fspt_integral: emitter {emitter.class_name()} shines from beyond all surfaces, whose light alone is "
+                "counted. Leave it out, or render with method path."
+            )
+
+
 def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
     """Raise ExitanceError where J_n or the power that comes of it leaves the range of float32."""
     brightest = emitter.brightest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 
@@ -15,14 +16,25 @@ from .elements import at_one_wavelength, elements_of, scalar, triangles
 
 SLIVER = 1e-6  # of the mean area: on a smaller face single precision may find no place to interpolate at
 ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
+FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # of a shape's elements that are looked at, of the texels that tell how many
+COLOURS = ("SRGB", "D65")  # how the names of Mitsuba's classes begin that hold a colour
 CORNERS_AND_CENTRE = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
 
 
 def texture_of(props: mi.Properties) -> mi.Texture:
-    """J_n as a texture; a number is the same at all wavelengths, where Mitsuba would make it white light."""
+    """J_n as a texture; a number is the same at all wavelengths, where Mitsuba would make it white light.
+
+    ExitanceError for a colour, whose watts would depend on the variant.
+    """
     value = props["exitance"]
     if not isinstance(value, int | float):
-        return props.get_emissive_texture("exitance")
+        texture = props.get_emissive_texture("exitance")
+        if texture.class_name().startswith(COLOURS):
+            raise ExitanceError(
+                f"fspt_surface: 'exitance' is a colour ({texture.class_name()}), J_n is one number. Give W/mm² as a "
+                "float or a texture of one channel."
+            )
+        return texture
     uniform = mi.Properties("uniform")
     uniform["value"] = float(value)
     return mi.PluginManager.instance().create_object(uniform)
@@ -92,6 +104,15 @@ def is_uniform(texture: mi.Texture) -> bool:
     return texture.class_name() == "UniformSpectrum"
 
 
+def texels_of(texture: mi.Texture) -> int:
+    """How many pixels of the bitmap that is J_n lie on the unit square of (u, v), up to `MOST_TEXELS`; 1 if none is."""
+    values = mi.traverse(texture)
+    if "data" not in values:
+        return 1
+    tiles = abs(np.linalg.det(np.array(values["to_uv"].matrix, np.float64).reshape(3, 3)[:2, :2]))
+    return round(min(math.prod(values["data"].shape[:2]) * tiles, MOST_TEXELS))
+
+
 def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
     """Largest J_n [W/mm²] of all corners and centres; ExitanceError if one is negative or not finite, or all are 0."""
     if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):
@@ -110,15 +131,21 @@ def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
             f"{name} must be >= 0 W/mm², its lowest value is {values.min():.4g}. Clip it on import: "
             "'fspt flux import --clip'."
         )
-    if values.max() == 0:
+    if values.max() == 0 and not _has_light(texture):
         raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
     return float(values.max())
+
+
+def _has_light(texture: mi.Texture) -> bool:
+    """True where a bitmap has a texel above 0, which points all over a shape may miss."""
+    values = mi.traverse(texture)
+    return "data" in values and bool(dr.any(values["data"].array > 0))
 
 
 def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """J_n [W/mm²] all over a shape and the areas that it counts for; at corners as it was given where it is linear."""
     corners = at_corners(shape, texture) if shape.is_mesh() else None
-    elements = elements_of(shape, minimum=1 if corners else 1 << 14)
+    elements = elements_of(shape, minimum=1 if corners else max(FEWEST, texels_of(texture)))
     if corners:
         # Interpolation far from the world's origin would make a zero negative.
         area = elements.areas()

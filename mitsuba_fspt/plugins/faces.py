@@ -69,7 +69,12 @@ def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
 def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
     emitter = mesh.emitter()
     places = (buffer.index for buffer in _buffers(mesh))
-    return _number_of(mesh), *places, emitter, getattr(emitter, "edition", 0)
+    return _number_of(mesh), *places, mark_of(emitter), getattr(emitter, "edition", 0)
+
+
+def mark_of(emitter: mi.Emitter | None) -> object:
+    """What tells an emitter from others, to be kept in its stead."""
+    return getattr(emitter, "mark", None) or dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]
 
 
 def _buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import SHORTCUTS, Finding
 from . import pupil_form, surface_form
-from .checks import check_scene
-from .faces import Faces, edition_of
+from .checks import check_scene, check_surfaces_alone
+from .faces import Faces, edition_of, mark_of
 from .grid import Grid
 from .intersections import robust_scene
 from .lines import View
@@ -70,16 +70,17 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             shortcuts_off=frozenset() if props.get("shortcuts", True) else frozenset(SHORTCUTS),
         )
         # What was found out about the last scene; the scene itself, whose child this is, must not be kept.
-        self._sound: list[mi.Emitter] = []
+        self._sound: list[object] = []
         self._window, self._narrow, self._faces = Memory(), Memory(), Memory()
 
     def solve(self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None) -> Solution:
         """Power, error and coverage of the sensor's crop window, with another `quadrature` than the integrator's own.
 
-        Raises SceneError or ExitanceError as in `check_scene`.
+        Raises SceneError or ExitanceError as in `check_scene`, or where something else than surfaces shines.
         """
         quadrature = quadrature or self.quadrature
         check_scene(scene, sensor)
+        check_surfaces_alone(scene)
         with recording(), dr.suspend_grad():
             traced = self._traced(scene, sensor)
             window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
@@ -110,11 +111,12 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""
-        if scene.emitters() != self._sound:
+        marks = [mark_of(emitter) for emitter in scene.emitters()]
+        if marks != self._sound:
             robust = robust_scene(scene, lens)
             if robust is not scene:
                 return robust
-            self._sound = scene.emitters()
+            self._sound = marks
         return scene
 
     def _visible_window(self, scene: mi.Scene, lens: mi.Sensor, everywhere: bool) -> Window:
@@ -128,8 +130,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
     def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
         emitters = scene.emitters()
-        editions = [getattr(emitter, "edition", 0) for emitter in emitters]
-        state = (emitters, editions, glowing_boxes(scene), _view(lens), window)
+        editions = [(mark_of(emitter), getattr(emitter, "edition", 0)) for emitter in emitters]
+        state = (editions, glowing_boxes(scene), _view(lens), window)
         return self._narrow.recall(state, lambda: narrow_light(emitters, lens, window))
 
     def render(

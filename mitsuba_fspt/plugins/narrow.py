@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 
 from ..rules import PLASTIC
 from .elements import Elements, at_one_wavelength, elements_of, scalar
+from .exitance import texels_of
 from .grid import Grid
 from .window import Window
 
 OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
-SLANTED, COVERED = 0.5, 0.5  # cosine to the lens, share of a pixel: at the limb of a wide body transects look closely
+# Transects look closely at the limb of a wide body: where it is slanted (cosine to the lens), its squares are covered
+# (a share) and it is not so many times brighter than the body around.
+SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
 WIDE, MOST_POINTS = 2.0, 1 << 12  # so thick [pixels, blur radii] no element is narrow; points of a thin one
 LARGEST_GRID = 1 << 12  # pixels along each side that are told apart
@@ -122,11 +125,15 @@ def _hidden(points: _Points, side: float) -> NDArray[np.bool_]:
     cells = points.cells(side)
     grid = Grid(cells.shape)
     share = points.area / side**2
-    around, most, facing = (
-        grid.array(grid.spread_max(grid.lanes(cells.sums(weight)))).ravel()[cells.number]
-        for weight in (points.radiance * share, share, (points.front > 0).astype(np.float64))
+    light, covered, front = (
+        cells.sums(weight) for weight in (points.radiance * share, share, (points.front > 0).astype(np.float64))
     )
-    limb = (points.cosine < SLANTED) & (most > COVERED) | (points.front <= 0) & (facing > 0)
+    mean = np.divide(light, covered, out=np.zeros_like(light), where=covered > 0)
+    around, mean_around, most, facing = (
+        grid.array(grid.spread_max(grid.lanes(image))).ravel()[cells.number] for image in (light, mean, covered, front)
+    )
+    limb = (points.cosine < SLANTED) & (most > COVERED) & (points.radiance <= GLARES * mean_around)
+    limb |= (points.front <= 0) & (facing > 0)
     return (points.radiance > OUTSHINES * around) & ~limb
 
 
@@ -157,7 +164,11 @@ def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) 
 def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
     """Points all over a surface as the lens sees them."""
     shape = emitter.get_shape()
-    elements: Elements = elements_of(shape, 1 if shape.is_mesh() else max(emitter.texels(), FEWEST_ELEMENTS))
+    texels = texels_of(emitter.exitance)
+    if shape.is_mesh():  # whose elements lie across the texels
+        elements: Elements = elements_of(shape, 4 * texels if texels > 1 else 1)
+    else:
+        elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
     counts = np.ones(elements.count, np.int64)
     _, area, _, _, blur, _ = (column.numpy() for column in _look(emitter, elements, lens, counts))
     unit = np.maximum(blur, 1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import mitsuba as mi
 
@@ -72,7 +70,10 @@ class FsptSurface(mi.Emitter):
         self._numbers: tuple[float, ...] = ()  # of the texture
         self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
         self.brightest = 0.0  # largest J_n [W/mm²], known after `check`
-        self.edition = 0  # counts the changes of J_n, for those who remember something about it
+        # For those who remember something about it: what tells it from all others, and counts the changes of J_n. Who
+        # kept it instead, and not its shape, would leave Dr.Jit an emitter to record whose shape is gone.
+        self.mark, self.edition = object(), 0
+        self._shape: mi.ShapePtr | None = None
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
@@ -179,9 +180,17 @@ class FsptSurface(mi.Emitter):
 
     # ------------------------------------------------------------------ the surface itself
 
+    def _home(self) -> mi.Shape:
+        """The shape; ExitanceError where it is gone with its scene, for Dr.Jit records every emitter that is left."""
+        if self._shape is None:
+            self._shape = mi.ShapePtr(self.get_shape())
+        if self._shape[0] is None:
+            raise ExitanceError("fspt_surface: its scene is gone. Keep the scene, not its emitter.")
+        return self._shape[0]
+
     def check(self) -> None:
         """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
-        attribute = exitance.attribute_of(self.get_shape(), self.exitance)
+        attribute = exitance.attribute_of(self._home(), self.exitance)
         numbers = exitance.numbers_of(self.exitance)
         # Mitsuba does not tell an emitter of new values on its mesh, nor of those of a texture updated by itself.
         renewed = attribute is not None and self._attribute is not None and attribute.index != self._attribute.index
@@ -195,7 +204,7 @@ class FsptSurface(mi.Emitter):
             self.law.prepare(shape)
             return brightest
 
-        self.brightest = aside(look, self.get_shape())
+        self.brightest = aside(look, self._home())
         self._checked, self._attribute, self._numbers = True, attribute, numbers
 
     def _sound(self) -> bool:
@@ -220,33 +229,28 @@ class FsptSurface(mi.Emitter):
 
     def is_linear(self) -> bool:
         """True where J_n is linear on every face of a mesh: an attribute of it."""
-        return self._attribute is not None and self.get_shape().is_mesh()
+        return self._attribute is not None and self._home().is_mesh()
 
     def radiance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
         """Radiance [W/mm²/sr] at the corners of every face of a mesh; None where it is not linear or not Lambert's."""
-        corners = exitance.at_corners(self.get_shape(), self.exitance) if self.is_lambertian() else None
+        corners = exitance.at_corners(self._home(), self.exitance) if self.is_lambertian() else None
         if corners is None:
             return None
         profile = self.law.profile(dr.zeros(mi.SurfaceInteraction3f), mi.Vector3f(0, 0, 1), mi.Bool(True))
         return tuple(profile * value for value in corners)
-
-    def texels(self) -> int:
-        """Number of pixels of the bitmap that J_n is, 1 where it is none."""
-        values = mi.traverse(self.exitance)
-        return math.prod(values["data"].shape[:2]) if "data" in values else 1
 
     def _distribution(self) -> ElementDistribution:
         self.check()
         if self._positions is None:
             self._positions = aside(
                 lambda shape: ElementDistribution(elements_of(shape), exitance.function_on(shape, self.exitance)),
-                self.get_shape(),
+                self._home(),
             )
         return self._positions
 
     def _surface_at(self, ps: mi.PositionSample3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """The full surface record at a position sample, which lacks the face it lies on."""
-        shape = self.get_shape()
+        shape = self._home()
         if not shape.is_mesh():
             return self._distribution().elements.at(ps.uv)
         if self._probe is None:
@@ -258,12 +262,12 @@ class FsptSurface(mi.Emitter):
 
         Each time anew: faces may have been looked for beside another scene since.
         """
-        if self.get_shape().is_mesh():
+        if self._home().is_mesh():
             with dr.suspend_grad():
-                self._probe = Probe(self.get_shape(), scene)
+                self._probe = Probe(self._home(), scene)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
-        return self.get_shape().bbox()
+        return self._home().bbox()
 
     def to_string(self) -> str:
         return f"FsptSurface[\n  exitance = {self.exitance},\n  emission = {self.law}\n]"
