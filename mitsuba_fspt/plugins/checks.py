@@ -39,13 +39,14 @@ def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
 
 def check_lens(sensor: mi.Sensor) -> None:
-    """Raise SceneError unless the sensor is an `fspt_lens` with a film."""
+    """Raise SceneError unless the sensor is an `fspt_lens` with a film, OpticsError where it cannot exist."""
     if type(sensor).__name__ != "FsptLens":
         raise SceneError(
             f"scene: the sensor is a {sensor.class_name()}, power on a pixel needs a lens. Use a sensor of type "
             "'fspt_lens'."
         )
-
+    if sensor.fault:  # the last update was refused
+        raise sensor.fault
     width, height = (int(n) for n in sensor.film().crop_size())
     if not (width and height):
         raise SceneError(f"scene: the film has {width} x {height} pixels. Give it at least one.")

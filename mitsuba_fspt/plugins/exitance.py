@@ -104,6 +104,12 @@ def is_uniform(texture: mi.Texture) -> bool:
     return texture.class_name() == "UniformSpectrum"
 
 
+def bitmap_of(texture: mi.Texture) -> mi.Float | None:
+    """The values of the bitmap that J_n is; None where it is none."""
+    values = mi.traverse(texture)
+    return mi.Float(values["data"].array) if "data" in values else None
+
+
 def texels_of(texture: mi.Texture) -> int:
     """How many pixels of the bitmap that is J_n lie on the unit square of (u, v), up to `MOST_TEXELS`; 1 if none is."""
     values = mi.traverse(texture)
@@ -131,15 +137,13 @@ def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
             f"{name} must be >= 0 W/mm², its lowest value is {values.min():.4g}. Clip it on import: "
             "'fspt flux import --clip'."
         )
-    if values.max() == 0 and not _has_light(texture):
+    brightest = float(values.max())
+    texels = bitmap_of(texture)
+    if brightest == 0 and texels is not None:  # points all over the shape may miss the only bright one
+        brightest = float(dr.max(texels)[0])
+    if brightest <= 0:
         raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
-    return float(values.max())
-
-
-def _has_light(texture: mi.Texture) -> bool:
-    """True where a bitmap has a texel above 0, which points all over a shape may miss."""
-    values = mi.traverse(texture)
-    return "data" in values and bool(dr.any(values["data"].array > 0))
+    return brightest
 
 
 def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

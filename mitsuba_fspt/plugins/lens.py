@@ -78,6 +78,7 @@ class FsptLens(mi.Sensor):
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
         self._model = str(props.get("model", "diaphragm"))
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
+        self.fault: OpticsError | None = None
         self._update()
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
@@ -86,7 +87,12 @@ class FsptLens(mi.Sensor):
         cb.put("to_world", self.m_to_world, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        self._update()
+        self.fault = None
+        try:
+            self._update()
+        except OpticsError as error:
+            self.fault = error  # lines of sight follow the numbers before
+            raise
 
     def _update(self) -> None:
         """Check the numbers and derive what the kernels read; opaque, so that a new value compiles nothing."""

@@ -67,6 +67,7 @@ class FsptSurface(mi.Emitter):
         self._probe: Probe | None = None
         self._checked = False
         self._attribute: mi.Float | None = None
+        self._bitmap: mi.Float | None = None
         self._numbers: tuple[float, ...] = ()  # of the texture
         self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
         self.brightest = 0.0  # largest J_n [W/mm²], known after `check`
@@ -191,10 +192,10 @@ class FsptSurface(mi.Emitter):
     def check(self) -> None:
         """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
         attribute = exitance.attribute_of(self._home(), self.exitance)
-        numbers = exitance.numbers_of(self.exitance)
+        bitmap, numbers = exitance.bitmap_of(self.exitance), exitance.numbers_of(self.exitance)
         # Mitsuba does not tell an emitter of new values on its mesh, nor of those of a texture updated by itself.
-        renewed = attribute is not None and self._attribute is not None and attribute.index != self._attribute.index
-        if self._checked and (renewed or numbers != self._numbers):
+        renewed = _another(attribute, self._attribute) or _another(bitmap, self._bitmap) or numbers != self._numbers
+        if self._checked and renewed:
             self._forget_exitance()
         if self._checked:
             return
@@ -205,7 +206,7 @@ class FsptSurface(mi.Emitter):
             return brightest
 
         self.brightest = aside(look, self._home())
-        self._checked, self._attribute, self._numbers = True, attribute, numbers
+        self._checked, self._attribute, self._bitmap, self._numbers = True, attribute, bitmap, numbers
 
     def _sound(self) -> bool:
         """True after `check`; False where it fails in a recording for another scene, which must not care."""
@@ -284,6 +285,10 @@ def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
     """Density per solid angle [1/sr] from density per area [1/mm²]; 0 from behind."""
     cos_theta = -dr.dot(ds.d, ds.n)
     return dr.select(cos_theta > 0, pdf * dr.square(ds.dist) / cos_theta, 0)
+
+
+def _another(values: mi.Float | None, before: mi.Float | None) -> bool:
+    return values is not None and before is not None and values.index != before.index
 
 
 def _rcp(pdf: mi.Float) -> mi.Float:
