@@ -14,7 +14,7 @@ from typer.exceptions import TyperException
 
 from .arguments import Parameters, SceneFile, definitions, require_writable
 from .backend import quiet_mitsuba
-from .errors import FsptError
+from .errors import FsptError, ImageError
 from .interrupt import ctrl_c_noted
 from .sweep_cli import Interrupted
 from .terminal import progress_bar
@@ -131,6 +131,8 @@ def expose(
     from .detector import Detector
     from .image import read
 
+    if output.exists() and image.exists() and output.samefile(image):
+        raise ImageError(f"output file '{output}' is the image itself, whose power would be lost. Give another name.")
     exposure = Detector.typical_ccd().expose(
         read(image), exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, seed=seed
     )
@@ -250,6 +252,8 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except MemoryError as error:
+        return _fail(f"out of memory: {error}. Give fewer pixels, or a smaller mesh.")
     except Exception as error:
         if os.environ.get("FSPT_DEBUG"):
             raise

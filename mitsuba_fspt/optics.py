@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from .errors import OpticsError
 
+LARGEST = 1e30  # of a lens's numbers and of their inverses: squares stay finite
 MODELS = ("diaphragm", "hrrt", "pinhole", "ripoll")
 FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
 BORDERS = ("lens_diameter", "diaphragm_distance", "numerical_aperture", "image_stop_diameter")
@@ -238,3 +239,5 @@ def configuration_factor(radius: float, distance: float, offset: float) -> float
 def _require_positive(name: str, value: float, example: str) -> None:
     if not (math.isfinite(value) and value > 0):
         raise OpticsError(f"fspt_lens: '{name}' must be > 0 and finite, got {value:g}. Give {example}.")
+    if not 1 / LARGEST <= value <= LARGEST:
+        raise OpticsError(f"fspt_lens: '{name}' must be in 1/{LARGEST:g} … {LARGEST:g}, got {value:g}. Give {example}.")

@@ -222,6 +222,7 @@ COMMANDS = {
         (*RENDER, "-D", "f_number=4", "-D", "f_number=8"),
         "f_number is 4 already",
     ),
+    "parameter out of range": ((*RENDER, "-D", "f_number=1e-300"), "'f_number' must be in 1/1e+30"),
     "parameter in words": ((*RENDER, "-D", "f_number=wide"), 'could not parse floating point value "wide"'),
     "parameter that cannot be": ((*RENDER, "-D", "f_number=0"), "'f_number' must be > 0 and finite, got 0"),
     "no such folder": ((*RENDER, "-o", "gone/o.exr"), "the folder 'gone' does not exist"),

@@ -15,7 +15,7 @@ import time
 import numpy as np
 import OpenEXR
 import pytest
-from little_scenes import SCENES, write_ply, write_scene
+from little_scenes import LENS_XML, SCENES, write_ply, write_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt import doctor
@@ -184,6 +184,22 @@ def test_expose_leaves_both_files_or_none(run, two_images, tmp_path, counts):
     assert code == 2
     assert err.count("\n") == 1
     assert set(os.listdir(tmp_path)) == before
+
+
+def test_more_pixels_than_memory_holds(run, tmp_path):
+    sensor = LENS_XML.replace('"width" value="8"', '"width" value="1000000"').replace('value="6"', 'value="1000000"')
+    code, _, err = run("render", write_scene(tmp_path / "s.xml", sensor=sensor), "-o", tmp_path / "o.exr")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "out of memory" in err
+    assert not (tmp_path / "o.exr").exists()
+
+
+def test_expose_does_not_overwrite_the_power(run, two_images):
+    before = fspt.read("a.exr").metadata
+    code, _, err = run("expose", "a.exr", "-o", "a.exr", "--exposure-time", "1", "--wavelength-nm", "600")
+    assert code == 2
+    assert "is the image itself" in err
+    assert fspt.read("a.exr").metadata == before
 
 
 @pytest.mark.parametrize("output", ["", ".exr", "picture"])
