@@ -163,10 +163,10 @@ def draw(by_pixels: list[Setting], by_triangles: list[list[Setting]], path: Path
     left.set(xlabel="pixels a side", ylabel="time a pixel [ns]", ylim=(0, None))
     for settings in by_triangles:
         label, triangles = f"{settings[0].side}² pixels", [s.triangles for s in settings]
-        (line,) = right.semilogx(triangles, [s.nanoseconds for s in settings], "o-", label=label)
+        (line,) = right.loglog(triangles, [s.nanoseconds for s in settings], "o-", label=label)
         bare = [s.bare_nanoseconds for s in settings]
-        right.semilogx(triangles, bare, "o--", color=line.get_color(), label=f"{label}, tracing alone")
-    right.set(xlabel="triangles", ylim=(0, None))
+        right.loglog(triangles, bare, "o--", color=line.get_color(), label=f"{label}, tracing alone")
+    right.set(xlabel="triangles", ylim=(1, None))
     right.legend()
     for axes in (left, right):
         axes.grid(alpha=0.3)
