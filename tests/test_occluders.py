@@ -14,8 +14,8 @@ ACROSS, ALONG = 120, 6  # lines of sight across the pupil and along each side of
 COUNTED = 3e-3  # of the brightest pixel: what so many of them may be off by
 
 
-def seen_past(glowing, dark, f_number):
-    """A scene with a glowing and a dark disk (x, y, depth, radius) [mm], both square to the axis of a lens on +z."""
+def seen_past(glowing, dark, f_number, dim):
+    """A glowing and a dark or `dim` disk (x, y, depth, radius) [mm], both square to the axis of a lens on +z."""
     disks = [
         {"type": "disk", "to_world": mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 1, 0], 180).scale(radius)}
         for x, y, z, radius in (glowing, dark)
@@ -23,7 +23,9 @@ def seen_past(glowing, dark, f_number):
     sensor = lens(
         size=(WIDTH, HEIGHT), pitch=0.55, f_number=f_number, magnification=None, focus_distance=FOCUS, to_world=None
     )
-    return scene_of(disks[0] | {"emitter": glow(1.0)}, disks[1], sensor=sensor)
+    return scene_of(
+        disks[0] | {"emitter": glow(1.0)}, disks[1] | ({"emitter": glow(dim)} if dim else {}), sensor=sensor
+    )
 
 
 def counted(camera, glowing, dark):
@@ -44,6 +46,7 @@ def counted(camera, glowing, dark):
     return camera.etendue / np.pi * light.reshape(HEIGHT, ALONG, WIDTH, ALONG).mean(axis=(1, 3))
 
 
+@pytest.mark.parametrize("dim", [0, 1e-7])
 @pytest.mark.parametrize(
     ("glowing", "dark", "f_number"),
     [
@@ -53,15 +56,16 @@ def counted(camera, glowing, dark):
         ((-0.3, 2.7, 149.2, 4.8), (1.3, 0.7, 95.9, 6.1), 5.6),
     ],
 )
-def test_light_past_a_dark_disk_arrives(glowing, dark, f_number):
+def test_light_past_a_dark_disk_arrives(glowing, dark, f_number, dim):
     """Seen to fail where outlines of what is dark settle a pixel: off by 0.05 to 0.23 of the brightest pixel, zeros
     without an error. In the last case four nodes meet but the dark disk, and the picture was black; in packets of rays,
-    which pass by the dark disk here and there, 0.35 of the peak shines through it.
+    which pass by the dark disk here and there, 0.35 of the peak shines through it. A disk that glows ever so little
+    changes nothing: it settles no pixel either.
     """
-    scene = seen_past(glowing, dark, f_number)
+    scene = seen_past(glowing, dark, f_number, dim)
     truth = counted(scene.sensors()[0], glowing, dark)
     image = fspt.render(scene, rtol=1e-2)
     off = np.abs(image.power - truth)
     assert (off <= image.error + COUNTED * truth.max()).mean() > 0.99
     assert off.max() <= 3 * image.error.max() + COUNTED * truth.max()
-    assert not ((image.power == 0) & (truth > COUNTED * truth.max())).any()
+    assert not ((image.power <= 2 * dim * truth.max()) & (truth > COUNTED * truth.max())).any()

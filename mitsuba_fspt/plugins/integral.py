@@ -104,10 +104,14 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             return known.completed_by(pupil_form.solve(view, window, quadrature, known))
         narrow = self._narrow_light(scene, lens, window)
         where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest)
-        if not where.any():
-            return pupil_form.solve(view, window, quadrature)
-        known = surface_form.solve(scene, lens, window, quadrature, where, narrow.brightest / 2)
-        return known.completed_by(pupil_form.solve(view, window, quadrature, known))
+        if where.any():
+            known = surface_form.solve(scene, lens, window, quadrature, where, narrow.brightest / 2)
+            solution = known.completed_by(pupil_form.solve(view, window, quadrature, known))
+        else:
+            solution = pupil_form.solve(view, window, quadrature)
+        # On pixels that the stop cuts, lines of sight may miss what is narrow.
+        missed = window.expand(np.where(cut, narrow.on_pixels, 0)) * lens.etendue - solution.power
+        return replace(solution, error=np.maximum(solution.error, missed))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""

@@ -32,6 +32,8 @@ BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the val
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
+DIM = 0.03  # of the tolerance: less light says nothing of the edges of brighter bodies
+DARK_LEVELS = 3  # while no light is found anywhere
 FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
 SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
 
@@ -69,8 +71,9 @@ class _Ladder:
         if self.means:
             self.edges.learn(draft, self.means, self.split)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
-        # What hides the light may be cut by outlines all over the pupil but where the light comes past it.
-        fresh = where & means.jumps & (means.value > 0) & ~self.split
+        # What hides light may be cut by outlines all over the pupil but where the light comes past it.
+        lit = means.value > dr.opaque(mi.Float64, DIM) * draft.tolerance
+        fresh = where & means.jumps & lit & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
         value, hits, scatter = means.value, means.hits, means.scatter
@@ -91,7 +94,8 @@ class _Ladder:
         draft.set_hits(dr.select(better, hits, draft.hits))
         known = self.split & ~fresh
         draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, self._doubt(known)), draft.error), unseen)
-        self.where = (where | (unseen > 0)) & (draft.error > draft.tolerance)
+        dark = (draft.peak <= 0) & dr.opaque(mi.Bool, level + 1 < DARK_LEVELS)
+        self.where = (where | (unseen > 0)) & ((draft.error > draft.tolerance) | dark)
         self.count = len(rule)
         dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, self.where)
 
