@@ -32,7 +32,7 @@ BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the val
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
-DIM = 0.03  # of the tolerance: less light says nothing of the edges of brighter bodies
+DIM = 1e-5  # of the brightest pixel: less light says nothing of the edges of brighter bodies
 DARK_LEVELS = 3  # while no light is found anywhere
 FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
 SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
@@ -72,7 +72,7 @@ class _Ladder:
             self.edges.learn(draft, self.means, self.split)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
         # What hides light may be cut by outlines all over the pupil but where the light comes past it.
-        lit = means.value > dr.opaque(mi.Float64, DIM) * draft.tolerance
+        lit = means.value > dr.opaque(mi.Float64, DIM) * draft.peak
         fresh = where & means.jumps & lit & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
