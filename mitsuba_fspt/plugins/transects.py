@@ -94,8 +94,9 @@ class _Ladder:
         draft.set_hits(dr.select(better, hits, draft.hits))
         known = self.split & ~fresh
         draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, self._doubt(known)), draft.error), unseen)
-        dark = (draft.peak <= 0) & dr.opaque(mi.Bool, level + 1 < DARK_LEVELS)
-        self.where = (where | (unseen > 0)) & ((draft.error > draft.tolerance) | dark)
+        tolerance = draft.tolerance
+        dark = (tolerance <= 0) & dr.opaque(mi.Bool, level + 1 < DARK_LEVELS)
+        self.where = (where | (unseen > 0)) & ((draft.error > tolerance) | dark)
         self.count = len(rule)
         dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, self.where)
 
