@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -40,11 +41,31 @@ def texture_of(props: mi.Properties) -> mi.Texture:
     return mi.PluginManager.instance().create_object(uniform)
 
 
-def attribute_of(shape: mi.Shape, texture: mi.Texture) -> mi.Float | None:
-    """The values of the mesh attribute that `texture` reads; None where it reads none, or the mesh has none such."""
-    name = _attribute_name(texture)
-    values = mi.traverse(shape)
-    return mi.Float(values[name]) if name in values else None
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Where J_n comes from: the values of the mesh attribute or of the bitmap that `texture` reads, None where it reads
+    none, and its plain numbers, `value` or `scale`.
+    """
+
+    attribute: mi.Float | None
+    bitmap: mi.Float | None
+    numbers: tuple[float, ...]
+
+    @classmethod
+    def of(cls, shape: mi.Shape, texture: mi.Texture) -> Source:
+        """As it is now; a mesh that lacks the attribute has none."""
+        name, parameters = _attribute_name(texture), mi.traverse(texture)
+        on_mesh = {} if name is None else mi.traverse(shape)
+        numbers = (n for key in ("value", "scale") if key in parameters for n in np.ravel(parameters[key]))
+        return cls(
+            mi.Float(on_mesh[name]) if name in on_mesh else None,
+            mi.Float(parameters["data"].array) if "data" in parameters else None,
+            tuple(map(float, numbers)),
+        )
+
+    def state(self) -> tuple[object, ...]:
+        """What tells it from any other for as long as it is kept."""
+        return *(values if values is None else values.index for values in (self.attribute, self.bitmap)), *self.numbers
 
 
 def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
@@ -66,7 +87,7 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
             f"fspt_surface: shape '{shape.id()}' has no mesh attribute '{name}'. In a PLY name the {kind} property "
             f"'{plain}_x', or bring the values in with 'fspt flux import'."
         )
-    values = attribute_of(shape, texture)
+    values = Source.of(shape, texture).attribute
     if values is not None and dr.width(values) != _places(shape, name):
         raise ExitanceError(
             f"fspt_surface: mesh attribute '{name}' of shape '{shape.id()}' has several numbers for each "
@@ -83,7 +104,7 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
     if is_uniform(texture):
         everywhere = function_on(mesh, texture)(dr.zeros(mi.SurfaceInteraction3f)) + dr.zeros(mi.Float, count)
         return everywhere, everywhere, everywhere
-    name, values = _attribute_name(texture), attribute_of(mesh, texture)
+    name, values = _attribute_name(texture), Source.of(mesh, texture).attribute
     if name is None or values is None or dr.width(values) != _places(mesh, name):
         return None
     values = values * float(mi.traverse(texture)["scale"])
@@ -93,21 +114,9 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
     return tuple(dr.gather(mi.Float, values, index) for index in corner)
 
 
-def numbers_of(texture: mi.Texture) -> tuple[float, ...]:
-    """The numbers that J_n depends on beside the mesh where it is uniform or a mesh attribute: value or scale."""
-    parameters = mi.traverse(texture)
-    return tuple(float(n) for name in ("value", "scale") if name in parameters for n in np.ravel(parameters[name]))
-
-
 def is_uniform(texture: mi.Texture) -> bool:
     """True where J_n is one number."""
     return texture.class_name() == "UniformSpectrum"
-
-
-def bitmap_of(texture: mi.Texture) -> mi.Float | None:
-    """The values of the bitmap that J_n is; None where it is none."""
-    values = mi.traverse(texture)
-    return mi.Float(values["data"].array) if "data" in values else None
 
 
 def texels_of(texture: mi.Texture) -> int:
@@ -138,7 +147,7 @@ def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
             "'fspt flux import --clip'."
         )
     brightest = float(values.max())
-    texels = bitmap_of(texture)
+    texels = Source.of(shape, texture).bitmap
     if brightest == 0 and texels is not None:  # points all over the shape may miss the only bright one
         brightest = float(dr.max(texels)[0])
     if brightest <= 0:

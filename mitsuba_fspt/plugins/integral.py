@@ -109,7 +109,9 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             solution = known.completed_by(pupil_form.solve(view, window, quadrature, known))
         else:
             solution = pupil_form.solve(view, window, quadrature)
-        # On pixels that the stop cuts, lines of sight may miss what is narrow.
+        if not cut.any():
+            return solution
+        # There lines of sight may miss what is narrow.
         missed = window.expand(np.where(cut, narrow.on_pixels, 0)) * lens.etendue - solution.power
         return replace(solution, error=np.maximum(solution.error, missed))
 

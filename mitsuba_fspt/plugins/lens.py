@@ -220,8 +220,9 @@ class FsptLens(mi.Sensor):
 
     def clear_depth(self, box: mi.ScalarBoundingBox3f) -> float:
         """Depth [mm] from 0 to most of u before which nothing of a box lies; 0 where the lens stands in it."""
-        corners = np.array([np.ravel(box.corner(k)) for k in range(8)], np.float64)
-        nearest = float((corners @ self._to_camera[2, :3] + self._to_camera[2, 3]).min())
+        ends = np.array([box.min, box.max], np.float64)
+        axis, offset = self._to_camera[2, :3], self._to_camera[2, 3]
+        nearest = float((ends * axis).min(axis=0).sum() + offset)
         return min(max(CLEAR * nearest, 0.0), MOST_CLEAR * self.optics.focus_distance)
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

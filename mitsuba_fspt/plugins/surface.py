@@ -65,10 +65,7 @@ class FsptSurface(mi.Emitter):
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
         self._positions: ElementDistribution | None = None
         self._probe: Probe | None = None
-        self._checked = False
-        self._attribute: mi.Float | None = None
-        self._bitmap: mi.Float | None = None
-        self._numbers: tuple[float, ...] = ()  # of the texture
+        self._source: exitance.Source | None = None  # known after `check`
         self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
         self.brightest = 0.0  # largest J_n [W/mm²], known after `check`
         # For those who remember something about it: what tells it from all others, and counts the changes of J_n. Who
@@ -89,8 +86,7 @@ class FsptSurface(mi.Emitter):
         self._forget_exitance()
 
     def _forget_exitance(self) -> None:
-        self._positions = None
-        self._checked = False
+        self._positions = self._source = None
         self.edition += 1
 
     # ------------------------------------------------------------------ radiance
@@ -191,13 +187,11 @@ class FsptSurface(mi.Emitter):
 
     def check(self) -> None:
         """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
-        attribute = exitance.attribute_of(self._home(), self.exitance)
-        bitmap, numbers = exitance.bitmap_of(self.exitance), exitance.numbers_of(self.exitance)
+        source = exitance.Source.of(self._home(), self.exitance)
         # Mitsuba does not tell an emitter of new values on its mesh, nor of those of a texture updated by itself.
-        renewed = _another(attribute, self._attribute) or _another(bitmap, self._bitmap) or numbers != self._numbers
-        if self._checked and renewed:
+        if self._source and self._source.state() != source.state():
             self._forget_exitance()
-        if self._checked:
+        if self._source:
             return
 
         def look(shape: mi.Shape) -> float:
@@ -206,11 +200,11 @@ class FsptSurface(mi.Emitter):
             return brightest
 
         self.brightest = aside(look, self._home())
-        self._checked, self._attribute, self._bitmap, self._numbers = True, attribute, bitmap, numbers
+        self._source = source
 
     def _sound(self) -> bool:
         """True after `check`; False where it fails in a recording for another scene, which must not care."""
-        if self._checked and scene_is_checked():
+        if self._source and scene_is_checked():
             return True
         try:
             self.check()
@@ -230,7 +224,7 @@ class FsptSurface(mi.Emitter):
 
     def is_linear(self) -> bool:
         """True where J_n is linear on every face of a mesh: an attribute of it."""
-        return self._attribute is not None and self._home().is_mesh()
+        return bool(self._source) and self._source.attribute is not None and self._home().is_mesh()
 
     def radiance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
         """Radiance [W/mm²/sr] at the corners of every face of a mesh; None where it is not linear or not Lambert's."""
@@ -285,10 +279,6 @@ def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
     """Density per solid angle [1/sr] from density per area [1/mm²]; 0 from behind."""
     cos_theta = -dr.dot(ds.d, ds.n)
     return dr.select(cos_theta > 0, pdf * dr.square(ds.dist) / cos_theta, 0)
-
-
-def _another(values: mi.Float | None, before: mi.Float | None) -> bool:
-    return values is not None and before is not None and values.index != before.index
 
 
 def _rcp(pdf: mi.Float) -> mi.Float:
