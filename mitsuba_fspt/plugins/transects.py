@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from .. import rules
 from .draft import Draft
-from .grid import parted
+from .grid import ROUNDING, parted
 from .jumps import integrate_transect
 from .lanes import chunks
 from .nodes import apply_nodes
@@ -119,7 +119,8 @@ class _Ladder:
         left = dr.maximum(FIRST_GAIN * moved, scatter)
         left = dr.select(silhouette, left, self._unsettled(left))
         missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, draft.roughness))
-        return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh)
+        # Who is known from elsewhere takes no transects, and knows of the silhouette all the same.
+        return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh | (draft.outline & ~draft.open))
 
     def _later(self, level: int, fresh: Mask, moved: Image, scatter: Image, count: int) -> tuple[Image, Image]:
         """What may be left, and what neighbours of a jump that is met at last may be wrong by.
@@ -143,7 +144,7 @@ class _Ladder:
 
 @dataclass
 class Edges:
-    """Of the edge that a pixel may see: its `angle`, signed `blur` radius [pixels] and whether it counts as `sharp`."""
+    """Of the edge a pixel may see: `angle` across it, signed `blur` radius [pixels], whether it counts as `sharp`."""
 
     angle: Image
     blur: Image
@@ -152,7 +153,7 @@ class Edges:
     def learn(self, draft: Draft, means: Means, split: Mask) -> None:
         """Blur of the edges that were met; pixels that see none are smooth, and none is sharp.
 
-        Whoever met none may see the tip of a neighbour's.
+        Whoever met none may see the tip of a neighbour's, and looks next towards where more or fewer lines hit.
         """
         grid, jumps = draft.grid, means.jumps
         around = (means.blur, -means.blur, jumps, split | draft.outline)
@@ -160,7 +161,15 @@ class Edges:
         blur = dr.select(jumps, means.blur, _most_blurred(ahead, -behind))
         self.blur = dr.select(known & ~draft.stopped, blur, self.blur)
         self.sharp = (dr.abs(self.blur) < SHARP) & near
-        dr.eval(self.blur, self.sharp)
+        x, y = grid.gradient(grid.box_sum(draft.hits, _around(draft)))
+        alike = dr.abs(x) + dr.abs(y) < ROUNDING
+        self.angle = dr.select(split | alike, self.angle, dr.atan2(y, x))
+        dr.eval(self.angle, self.blur, self.sharp)
+
+
+def _around(draft: Draft) -> int:
+    """From how far around a pixel learns which way its edge runs [pixels]."""
+    return 1 + math.ceil(draft.most_blur / 2)
 
 
 def _most_blurred(ahead: Image, behind: Image) -> Image:
@@ -174,7 +183,7 @@ def edges_of(draft: Draft) -> Edges:
     The image-plane stop is sharp.
     """
     grid = draft.grid
-    angle = grid.principal_angle(*grid.gradient(draft.value), 1 + math.ceil(draft.most_blur / 2))
+    angle = grid.principal_angle(*grid.gradient(draft.value), _around(draft))
     nearest = grid.spread_max(-draft.nearest)
     # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
     farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
