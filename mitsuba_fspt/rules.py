@@ -124,6 +124,9 @@ ACROSS = (2, 4, 6, 8, 16)
 # Where at each place across the pupil the others lie around the middle [degrees]. Levels of the same heights agree on
 # what they all miss, as of a plate seen edge-on through the sharp plane.
 TURNS = {2: [[45], [225]], 8: [[30, 210], [120, 300]] * 2, 24: [[0, 90, 180, 270]] * 6}
+# Steps along the first two places from one transect across a sharp edge to the next, in numbers of transects: of all
+# without a common divisor those that fill the cube most evenly (least centred discrepancy).
+STEPS = {2: (1, 1), 8: (3, 5), 24: (5, 11), 72: (19, 61)}
 TREND = 3  # degree across the pupil that says nothing yet of a kink
 SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
 MOST_JUMPS = 3  # that split a transect: one body before another has three outlines
@@ -203,21 +206,13 @@ class Transects:
 @cache
 def transects(count: int) -> Transects:
     """As many transects as a level of `TRANSECT_LEVELS` has: Gauss's places, at last a net for whatever is left."""
-    number = np.arange(count) + 0.5
     level = TRANSECT_LEVELS.index(count)
     if level == len(ACROSS):
         return Transects(_net(count), _net(count), np.full(count, 1 / count))
     blurred, weight = _across_the_pupil(count, ACROSS[level])
     if count == 256:
         return Transects(_net(count), blurred, weight)
-    if count <= 8:
-        # On the pupil the corners of Gauss's square, in an order that has little to do with the place along the pixel.
-        on_pupil = gauss(2)[0][np.array([[0, 0], [1, 1], [1, 0], [0, 1]])][:: 8 // count]
-    else:
-        on_pupil = np.mod(np.outer(number, PLASTIC), 1.0)[: count // 2]  # R₂ sequence
-    # Opposite each other, so that what is odd about the middle cancels.
-    on_pupil = np.concatenate([on_pupil, 1 - on_pupil[::-1]])
-    return Transects(np.column_stack([on_pupil, number / count]), blurred, weight)
+    return Transects(_lattice(count, *STEPS[count]), blurred, weight)
 
 
 def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -235,6 +230,13 @@ def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDA
         square = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
         others, share = np.broadcast_to(square, (across, each, 2)), np.outer(v, v).ravel()
     return np.insert(others.reshape(-1, 2), 1, np.repeat(y, each), axis=1), np.outer(w, share).ravel()
+
+
+def _lattice(count: int, *steps: int) -> NDArray[np.float64]:
+    """Rank-1 lattice of points in [0, 1]³, the last coordinate in order; each has its opposite, so that what is odd
+    about the middle cancels.
+    """
+    return np.mod(np.outer(np.arange(count) + 0.5, (*steps, 1)) / count, 1.0)
 
 
 def _net(count: int) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
 
 from mitsuba_fspt import rules
 from mitsuba_fspt.quadrature import Quadrature
@@ -199,6 +200,18 @@ def test_places_for_sharp_edges_lie_on_even_lines_across_the_pixel(count):
     np.testing.assert_allclose(np.sort(sharp[:, 2]), (np.arange(count) + 0.5) / count, atol=1e-12)
     # What is odd about the middle of the pupil cancels.
     np.testing.assert_allclose(sharp.mean(axis=0), 0.5, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", rules.STEPS)
+def test_places_for_sharp_edges_fill_the_cube_most_evenly(count):
+    """Where a silhouette is curved within the pixel, and a little out of focus, nothing else makes them converge."""
+
+    def unevenness(steps):
+        return qmc.discrepancy(np.mod(np.outer(np.arange(count) + 0.5, (*steps, 1)) / count, 1.0))
+
+    steps = [k for k in range(1, count) if math.gcd(k, count) == 1]
+    least = min(unevenness(pair) for pair in itertools.combinations_with_replacement(steps, 2))
+    assert qmc.discrepancy(rules.transects(count).sharp) == pytest.approx(least, rel=1e-6)
 
 
 def test_transects_at_least_double_from_level_to_level():
