@@ -24,6 +24,9 @@ class Law(Protocol):
     def prepare(self, shape: mi.Shape) -> None:
         """Look at the surface once before the first `profile`; ExitanceError where the law does not fit it."""
 
+    def renewed(self) -> bool:
+        """True where what the law follows has changed since, so that it is to be prepared again."""
+
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """L/J_n [1/sr] at the surface point `si` towards the outward unit vector `direction` of the world."""
 
@@ -33,6 +36,9 @@ class Lambert:
 
     def prepare(self, shape: mi.Shape) -> None:
         pass
+
+    def renewed(self) -> bool:
+        return False
 
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         return mi.Float(dr.inv_pi)
@@ -66,6 +72,9 @@ class Fresnel:
 
     def prepare(self, shape: mi.Shape) -> None:
         pass
+
+    def renewed(self) -> bool:
+        return False
 
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         # Transmittance is the same both ways: the border is looked through from outside.

@@ -37,6 +37,7 @@ class LastFlight:
         self._weight = mi.Float(weight)
         self._hemisphere = _hemisphere()
         self._total: _Table | None = None
+        self._values: mi.Float | None = None  # of the volume that is tabulated
 
     def prepare(self, shape: mi.Shape) -> None:
         """Tabulate what the hemisphere over each point of the surface carries; ExitanceError where Φ gives nothing."""
@@ -46,12 +47,15 @@ class LastFlight:
                 f"fspt_surface: the volume 'fluence', {_extent(outside)}, does not hold shape '{shape.id()}', "
                 f"{_extent(inside)}. Set its 'use_grid_bbox' or 'to_world'."
             )
-        self._total = _Table(shape, self._carried)
+        self._total, self._values = _Table(shape, self._carried), _values_of(self.fluence)
         if not self._total.positive():
             raise ExitanceError(
                 f"fspt_surface: the volume 'fluence' has values <= 0 or not finite under shape '{shape.id()}'. Write "
                 "it with 'fspt flux solve --volume'."
             )
+
+    def renewed(self) -> bool:
+        return self._values is not None and self._values.index != _values_of(self.fluence).index
 
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
         return self._seen(si, direction, active) / self._total(si)
@@ -101,6 +105,12 @@ class _Table:
     def __call__(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         index, weights = self._elements.weigh(si)
         return sum(w * dr.gather(mi.Float, value, index) for w, value in zip(weights, self._values, strict=True))
+
+
+def _values_of(volume: mi.Volume) -> mi.Float:
+    """The numbers that a volume updated by itself changes; none where it holds no grid."""
+    parameters = mi.traverse(volume)
+    return mi.Float(parameters["data"].array) if "data" in parameters else mi.Float()
 
 
 def _hemisphere() -> tuple[mi.Float, ...]:

@@ -188,8 +188,8 @@ class FsptSurface(mi.Emitter):
     def check(self) -> None:
         """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
         source = exitance.Source.of(self._home(), self.exitance)
-        # Mitsuba does not tell an emitter of new values on its mesh, nor of those of a texture updated by itself.
-        if self._source and self._source.state() != source.state():
+        # Mitsuba does not tell an emitter of new values on its mesh, nor of what is updated by itself.
+        if self._source and (self._source.state() != source.state() or self.law.renewed()):
             self._forget_exitance()
         if self._source:
             return

@@ -143,7 +143,7 @@ class _Refinement:
             active &= ~hidden(self.scene, spot.p, lens_point, active)
         spot.sh_frame.n = spot.n  # not the normal that a mesh is shaded with
         spot.initialize_sh_frame()
-        spot.wi = mi.Frame3f(middle.n).to_local(to_lens)
+        spot.wi = spot.to_local(_turned_along(to_lens, middle.n, spot.n))
         radiance = dr.select(active, scalar(batch.glow.emitter.eval(spot, active)), 0)
         # dΩ dS |cosθ_s| over A_vd A_pupil/u², that the film's value is a mean radiance whatever the lengths.
         virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
@@ -169,6 +169,12 @@ class _Refinement:
         canvas.lay(lights, polygon, active)
         dr.eval(radiance, canvas.layers)
         return float(dr.max(radiance)[0])
+
+
+def _turned_along(direction: mi.Vector3f, normal: mi.Normal3f, other: mi.Normal3f) -> mi.Vector3f:
+    """A direction turned the shortest way that takes one normal to the `other`: as slanted to that as it was."""
+    a, b = mi.Vector3f(normal), mi.Vector3f(other)
+    return direction - dr.dot(a + b, direction) / (1 + dr.dot(a, b)) * (a + b) + 2 * dr.dot(a, direction) * b
 
 
 def _strata(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, number: mi.UInt32) -> tuple[mi.Point2f, mi.Point2f]:
