@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from little_scenes import write_ply
+from little_scenes import glow, lens, scene_of, write_ply
 from small_scenes import FOCUS, HEIGHT, MAGNIFICATION, PITCH, RADIUS, SIDE, WIDTH, disk, even_disc, load, scene, sphere
 from test_laws import collected, filled
 
@@ -310,3 +310,30 @@ def test_a_thin_tube_far_away():
     of = scene(tube, f_number=8.0, pixel_pitch=0.2)
     surface, pupil = (fspt.render(of, domain=domain, rtol=1e-3).power for domain in ("surface", "pupil"))
     np.testing.assert_allclose(surface, pupil, atol=1e-3 * surface.max())
+
+
+def test_no_pixel_is_dark_because_the_first_lines_of_sight_pass_it_by(tmp_path):
+    """Pixels' centres behind a lens whose border passes a hundredth of the cone of its telecentric diaphragm.
+
+    Stripes a pixel high, near the sharp plane. Expected at a pixel that sees but a stripe: A_vd times the configuration
+    factor of the border's disc seen from the pixel's virtual point. Seen to fail (0 W, error 0) where a pixel is
+    settled that the first two levels light alike, with nothing.
+    """
+    heights = [(-1.95, -0.601), (0.2465, 1.5955), (4.639, 5.988), (6.835, 8.184), (9.03, 10.379)]
+    corners = [
+        (x, y, 181.212) for low, high in heights for x, y in ((-7.55, low), (5.63, low), (5.63, high), (-7.55, high))
+    ]
+    faces = [tuple(4 * k + i for i in face) for k in range(len(heights)) for face in ((0, 2, 1), (0, 3, 2))]
+    mesh = {"type": "ply", "filename": str(write_ply(tmp_path / "stripes.ply", corners, faces)), "face_normals": True}
+    border, pitch, u = 3.028, 0.70377, 180.0
+    optics = {"f_number": 6.1255, "magnification": None, "focus_distance": u, "to_world": None}
+    telecentric = {"diaphragm_distance": 55.0, "lens_diameter": border}
+    of = scene_of(mesh | {"emitter": glow(1.0)}, sensor=lens(size=(12, 10), pitch=pitch, **optics, **telecentric))
+    side, radius = pitch * 125 / 55, border / 2
+    squared = (1.5**2 + 0.5**2) * side**2
+    z = u**2 + radius**2 + squared
+    expected = side**2 * 0.5 * (1 - (z - 2 * radius**2) / np.sqrt(z**2 - 4 * radius**2 * squared))
+    for domain in ("surface", "pupil"):
+        image = fspt.render(of, domain=domain, pixel="centre", rtol=1e-3, max_nodes=20000)
+        assert image.power[5, 7] > 0
+        assert abs(image.power[5, 7] - expected) <= image.error[5, 7] + 1e-3 * image.power.max()

@@ -97,15 +97,16 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         view = View.of(scene, lens, window, self._faces_of(scene) if quadrature.takes("record") else None)
         # Light from the surface knows no border on the film: pixels that the image-plane stop cuts take lines of sight.
         inside, cut = window.stopped(lens)
-        if quadrature.domain == "surface":
-            if not cut.any():
-                return surface_form.solve(scene, lens, window, quadrature)
-            known = surface_form.solve(scene, lens, window, quadrature, inside)
-            return known.completed_by(pupil_form.solve(view, window, quadrature, known))
+        everywhere = quadrature.domain == "surface"
+        if everywhere and not cut.any():
+            return surface_form.solve(scene, lens, window, quadrature)
         narrow = self._narrow_light(scene, lens, window)
-        where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest)
+        where, least_peak = inside, 0.0
+        if not everywhere:
+            where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest)
+            least_peak = narrow.brightest / 2
         if where.any():
-            known = surface_form.solve(scene, lens, window, quadrature, where, narrow.brightest / 2)
+            known = surface_form.solve(scene, lens, window, quadrature, where, least_peak)
             solution = known.completed_by(pupil_form.solve(view, window, quadrature, known))
         else:
             solution = pupil_form.solve(view, window, quadrature)

@@ -28,6 +28,7 @@ from .window import Window
 # level both pieces and cells are refined, or what one of them does wrong would pass for converged.
 FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
 BLURRED = 0.5  # of the blur radius: a piece of a small body that is smaller is sent as one point
+DARK_LINES = 4096  # lines of sight a pixel before one is dark that no light has reached: two levels may pass it by
 SAFETY = 3.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
 MEMORY = 0.4  # of what the level before was thought to leave may be left: two levels may agree by chance
 # No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
@@ -89,6 +90,7 @@ class _Refinement:
             # All elements with light on a marked pixel were refined: only there is the new picture whole.
             self.error[mark], self.value[mark], self.hits[mark] = estimate[mark], value[mark], hits[mark]
             mark = self.error > self.quadrature.rtol * max(self.value.max(), least_peak)
+            mark |= where & (self.hits == 0) & (lines < DARK_LINES)
         error = np.maximum(self.error, self.quadrature.least_error * self.value.max(initial=0.0))
         error[self.hits == 0] = self.error[self.hits == 0]
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
