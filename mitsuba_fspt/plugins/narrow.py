@@ -21,7 +21,7 @@ from .exitance import texels_of
 from .grid import Grid
 from .window import Window
 
-OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
+OUTSHINES = 1.1  # a point is narrow if it is so many times brighter than any square around, seen sharp
 # Transects look closely at the limb of a wide body: where it is slanted (cosine to the lens), its squares are covered
 # (a share) and it is not so many times brighter than the body around.
 SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
@@ -55,8 +55,9 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
     points = points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
     if not (points.radiance > 0).any():
         return NarrowLight(on_pixels, 0.0)
-    # A blur disc spreads a point's light over so many pixels; discs that overlap add up.
-    light = points.radiance * points.area / (math.pi * points.blur**2 + 1)
+    # A blur disc spreads a point's light over so many pixels; discs that overlap add up. More than all of a disc does
+    # not come from an element, however wide.
+    light = points.radiance * np.minimum(points.area / (math.pi * points.blur**2 + 1), 1)
     level = np.round(np.log2(np.maximum(points.blur, 1)))
     brightest = 0.0
     for k in np.unique(level):
@@ -124,7 +125,7 @@ def _hidden(points: _Points, side: float) -> NDArray[np.bool_]:
     """
     cells = points.cells(side)
     grid = Grid(cells.shape)
-    share = points.area / side**2
+    share = np.minimum(points.area / side**2, 1)
     light, covered, front = (
         cells.sums(weight) for weight in (points.radiance * share, share, (points.front > 0).astype(np.float64))
     )
