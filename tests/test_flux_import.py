@@ -195,6 +195,42 @@ def test_meshio_formats(tmp_path, suffix, cell, per):
     assert phantom.report()["outward"] is True
 
 
+def turned(text, section, header):
+    """The lines of a section of a text file in reverse order, but the `header` lines it begins with."""
+    before, name, rest = text.partition(f"${section}\n")
+    inside, end, after = rest.partition(f"$End{section}\n")
+    lines = inside.splitlines(keepends=True)
+    return "".join([before, name, *lines[:header], *lines[: header - 1 : -1], end, after])
+
+
+def write_gmsh(path, version, binary, nodes):
+    """SPHERE with jn and jf by the law, the nodes on lines (or rows) in the order `nodes`; tags are 1, 2, 3, ..."""
+    data = {"jn": law(VERTICES)}, {"jf": [law(centroids(VERTICES, FACES))]}
+    points = VERTICES[nodes] if binary and version == "4.1" else VERTICES
+    mesh = meshio.Mesh(points, [("triangle", FACES)], *data)
+    meshio.gmsh.write(path, mesh, version, binary=binary)
+    if binary and version == "4.1":
+        tags = np.arange(1, len(VERTICES) + 1, dtype=np.uint64)
+        content = path.read_bytes()
+        assert content.count(tags.tobytes()) == 1
+        path.write_bytes(content.replace(tags.tobytes(), tags[nodes].tobytes()))
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("version", ["2.2", "4.1"])
+def test_gmsh_values_go_to_the_tags_they_have(tmp_path, version, binary):
+    """Not to the nodes and elements in the order of their lines, which is any order."""
+    path = tmp_path / "mesh.msh"
+    write_gmsh(path, version, binary, np.random.default_rng(2).permutation(len(VERTICES)))
+    if not binary:
+        text = path.read_text().replace("np.float64(", "").replace(")", "")  # as meshio writes with NumPy 2
+        for section in ("Nodes", "Elements") if version == "2.2" else ("NodeData", "ElementData"):
+            text = turned(text, section, 1 if version == "2.2" else 8)
+        path.write_text(text)
+    for field in ("jn", "jf"):
+        assert_law(import_flux(path, field=field), SPHERE.area)
+
+
 def test_boundary_of_tetrahedra_is_outward_whatever_their_orientation():
     """The opposite node decides; without it half of the mixed block's faces would show inward."""
     nodes, elements = block("mixed")

@@ -145,6 +145,36 @@ def test_meshio_choices(tmp_path, cells, point_data, cell_data, options, message
         import_flux(tmp_path / "m.vtu", **options)
 
 
+def test_a_vtu_of_several_pieces(tmp_path):
+    """Rationale: of two pieces the cells of the last one alone came, with half the power."""
+    meshio.Mesh(POINTS, [("triangle", TRIANGLES)], {"jn": np.ones(4)}).write(tmp_path / "m.vtu", binary=False)
+    text = (tmp_path / "m.vtu").read_text()
+    piece = text[text.index("<Piece") : text.index("</Piece>") + len("</Piece>")]
+    (tmp_path / "m.vtu").write_text(text.replace(piece, piece + piece))
+    with pytest.raises(FluxError, match=r"m\.vtu' has 2 pieces, only one can be read\. Save them as one"):
+        import_flux(tmp_path / "m.vtu")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("$EndNodeData\n", "$EndNodeData\n{section}", r"'jn' more than once.*Save one step alone"),
+        ("\n4 4.0\n", "\n5 4.0\n", r"'jn' have other tags than the mesh\. Save both anew"),
+        ("\n4 4.0\n", "\n3 4.0\n", r"'jn' have other tags than the mesh"),
+    ],
+    ids=["steps", "strange", "twice"],
+)
+def test_gmsh_values_of_no_node(tmp_path, old, new, message):
+    path = tmp_path / "m.msh"
+    meshio.gmsh.write(path, meshio.Mesh(POINTS, [("triangle", TRIANGLES)], {"jn": np.arange(1.0, 5)}), "2.2", False)
+    text = path.read_text().replace("np.float64(", "").replace(")", "")
+    section = text[text.index("$NodeData") :]
+    assert old in text
+    path.write_text(text.replace(old, new.format(section=section)))
+    with pytest.raises(FluxError, match=message):
+        import_flux(path)
+
+
 def test_one_real_field_is_found_among_labels_and_vectors(tmp_path):
     mesh = meshio.Mesh(
         POINTS,

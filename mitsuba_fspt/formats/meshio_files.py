@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import BackendError, FluxError
+from .gmsh import put_in_order
 from .raw import Field, RawMesh, scalars
 from .table import one_line
 
@@ -25,6 +28,7 @@ FORMATS = {
 TRIANGLES = {"triangle": 3, "triangle6": 3, "triangle7": 3}
 TETRAHEDRA = {"tetra": 4, "tetra10": 4}
 IGNORED = ("vertex", "line", "line3")
+LABELS = "gmsh:"
 
 
 def read_meshio(path: Path) -> RawMesh:
@@ -38,12 +42,16 @@ def read_meshio(path: Path) -> RawMesh:
     BackendError : meshio is not installed, or h5py for an XDMF or MEDIT file with HDF5 data.
     """
     mesh = _load(path)
+    if path.suffix.lower() == ".vtu":
+        _require_one_piece(path)
     kinds = {block.type for block in mesh.cells}
     wanted = TETRAHEDRA if kinds & set(TETRAHEDRA) else TRIANGLES
     other = kinds - set(TRIANGLES) - set(TETRAHEDRA) - set(IGNORED)
     if other or not kinds & set(wanted):
         listed = ", ".join(sorted(other or kinds)) or "no cells"
         raise FluxError(f"'{path}' holds {listed}; triangles or tetrahedra are read. Split its cells first.")
+    if FORMATS.get(path.suffix.lower()) == "gmsh" and _has_values(mesh):
+        put_in_order(mesh, path)
     blocks = [k for k, block in enumerate(mesh.cells) if block.type in wanted]
     cells = np.concatenate([mesh.cells[k].data[:, : wanted[mesh.cells[k].type]] for k in blocks]).astype(np.int64)
     fields = [Field(name, values, "vertex") for name, values in mesh.point_data.items()]
@@ -53,9 +61,23 @@ def read_meshio(path: Path) -> RawMesh:
         source += " (its cell data passed over: both on triangles and on tetrahedra)"
     else:
         for name, data in mesh.cell_data.items():
-            if not name.startswith("gmsh:"):  # labels
+            if not name.startswith(LABELS):
                 fields.append(Field(name, np.concatenate([data[k] for k in blocks]), "cell"))
     return RawMesh(np.asarray(mesh.points, np.float64), cells, source, scalars(fields))
+
+
+def _has_values(mesh: Any) -> bool:
+    """Whether there is more than labels."""
+    return not all(name.startswith(LABELS) for name in (*mesh.point_data, *mesh.cell_data))
+
+
+def _require_one_piece(path: Path) -> None:
+    """Refuse a VTU of several pieces: meshio takes the cells of the last one alone."""
+    pieces = len(re.findall(rb"<Piece[\s>/]", path.read_bytes()))
+    if pieces > 1:
+        raise FluxError(
+            f"'{path}' has {pieces} pieces, only one can be read. Save them as one, for example by ParaView."
+        )
 
 
 def _load(path: Path):
