@@ -90,14 +90,18 @@ def _exitance(
     values = found.values / scale**2
     if a is None:
         return values, {}
-    factor, told = _boundary_factor(a, n, found)
+    factor, told = _boundary_factor(a, n, found, raw.source)
     return values / (2 * factor), {"boundary_factor": told}
 
 
-def _boundary_factor(a: str | float, n: float | None, found: SurfaceValues) -> tuple[float | NDArray[np.float64], str]:
+def _boundary_factor(
+    a: str | float, n: float | None, found: SurfaceValues, source: str
+) -> tuple[float | NDArray[np.float64], str]:
     """A, one for all or one for each value, and what to record of it."""
     if n is None and found.index is not None and a in ("robin", "haskell"):
         index = found.index if found.per == "vertex" else found.index[found.faces].mean(axis=1)
+        if np.isnan(index).any():
+            raise FluxError(f"{source}: its file of parameters tells no refractive index for A. Give --n.")
     else:
         index = np.array([TISSUE_INDEX if n is None else n])
     indices, where = np.unique(index, return_inverse=True)

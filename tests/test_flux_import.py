@@ -317,15 +317,31 @@ def test_nirfast(tmp_path, suffix):
     np.testing.assert_allclose(in_memory.exitance, phantom.exitance, rtol=1e-6)
 
 
-def test_nirfast_refractive_index_of_param(tmp_path):
+@pytest.mark.parametrize("kind", ["stnd", "fluor", "blt"])
+def test_nirfast_refractive_index_of_param(tmp_path, kind):
     """The .param file tells n: A(1.53) where it says so, node by node, unless n is given."""
     nodes, elements = block()
     write(tmp_path / "cube.node", rows(np.column_stack([np.ones(27), nodes])))
     write(tmp_path / "cube.elem", rows(elements + 1))
     index = np.where(nodes[:, 0] > 3, 1.53, 1.37)
-    write(tmp_path / "cube.param", "stnd\n" + rows(np.column_stack([np.full((27, 2), 0.1), index])))
+    columns = [np.full((27, 2), 0.1), index, np.full((27, 5 if kind == "fluor" else 0), 0.2)]
+    write(tmp_path / "cube.param", f"{kind}\n" + rows(np.column_stack(columns)))
     phantom = import_flux(tmp_path / "cube.node", np.ones(27))
     ratio = phantom.exitance[phantom.vertices[:, 0] <= 3][0] / phantom.exitance[phantom.vertices[:, 0] > 3][0]
     assert ratio == pytest.approx(3.571 / 2.570, abs=1e-3)
     assert phantom.provenance["boundary_factor"] == "2.57006 to 3.57064 (robin, n = 1.37 to 1.53)"
     assert np.ptp(import_flux(tmp_path / "cube.node", np.ones(27), n=1.4).exitance) == 0
+
+
+def test_nirfast_kinds_of_param_without_an_index_need_it(tmp_path):
+    """Rationale: 1.37 was taken in silence. The concentrations of kind spec are no n."""
+    nodes, elements = block()
+    write(tmp_path / "cube.node", rows(np.column_stack([np.ones(27), nodes])))
+    write(tmp_path / "cube.elem", rows(elements + 1))
+    names = "HbO\ndeoxyHb\nWater\nS-Amplitude\nS-Power\n"
+    write(tmp_path / "cube.param", f"spec\n{names}" + rows(np.full((27, 5), 0.5)))
+    with pytest.raises(FluxError, match=r"tells no refractive index for A\. Give --n"):
+        import_flux(tmp_path / "cube.node", np.ones(27))
+    phantom = import_flux(tmp_path / "cube.node", np.ones(27), n=1.53)
+    assert phantom.provenance["boundary_factor"] == "3.57064 (robin, n = 1.53)"
+    assert import_flux(tmp_path / "cube.node", np.ones(27), a=2.5).power == pytest.approx(6 * 36 / 5)

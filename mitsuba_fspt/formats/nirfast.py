@@ -1,11 +1,13 @@
 """NIRFAST: text files of one stem, without headers; fluence at the nodes of a tetrahedral mesh.
 
 `.node`: `boundary x y z` (boundary 1 or 0; no number of the node, unlike TetGen's `.node`), `.elem`: four
-node numbers from 1, `.param` (if there): a line with its kind, then `mua kappa n` a node. Lengths in mm.
+node numbers from 1, `.param` (if there): a line with its kind, then a line a node, `mua kappa n` of kinds stnd
+and blt, `mua kappa n mua kappa mua eta tau` of kind fluor; kind spec has no n. Lengths in mm.
 """
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +18,12 @@ from ..surface import Indices, Points
 from .raw import RawMesh
 from .table import read_table
 
+# Columns of a .param by its kind; the third one is n.
+COLUMNS = {"stnd": 3, "blt": 3, "fluor": 8}
+
 
 def read_nirfast(mesh: Path) -> RawMesh:
-    """Mesh of `STEM.node` and `STEM.elem`, and the refractive index at the nodes of `STEM.param`.
+    """Mesh of `STEM.node` and `STEM.elem`, and the refractive index at the nodes from `STEM.param`.
 
     Raises
     ------
@@ -47,16 +52,17 @@ def nirfast_mesh(nodes: Points, elements: Indices, source: str, index: NDArray[n
 
 
 def _index(path: Path, nodes: int) -> NDArray[np.float64] | None:
-    """The refractive index at the nodes from a `.param` of kind 'stnd'; None where there is no such file."""
-    if not path.exists():
+    """The refractive index at the nodes from a `.param`, NaN where its kind tells none; None without a file."""
+    if not os.path.exists(path):
         return None
     with path.open(errors="replace") as file:
-        if file.readline().strip().lower() != "stnd":
-            return None
+        kind = file.readline().strip().lower()
+    if kind not in COLUMNS:
+        return np.full(nodes, np.nan)
     parameters, _ = read_table(path, skip_lines=1)
-    if parameters.shape != (nodes, 3):
+    if parameters.shape != (nodes, COLUMNS[kind]):
         raise FluxError(
-            f"NIRFAST: '{path}' must have 3 columns (mua kappa n) and {nodes} lines after its first, it has "
-            f"{parameters.shape[1]} and {parameters.shape[0]}."
+            f"NIRFAST: '{path}' of kind {kind} must have {COLUMNS[kind]} columns and {nodes} lines after its first, "
+            f"it has {parameters.shape[1]} and {parameters.shape[0]}. Save it with its mesh anew."
         )
     return parameters[:, 2]

@@ -41,7 +41,7 @@ class RawMesh:
     quantity : what the values are: 'exitance' and 'fluence' [W per square of the file's length unit], or
         'power', W of each face
     point_order : False where the file has no vertices of its own, so that values cannot be in their order
-    index : the refractive index at the points (V,), where the file knows it
+    index : the refractive index at the points (V,), where the file knows it; NaN where it should and does not
     """
 
     points: Points
