@@ -101,7 +101,7 @@ def _boundary_factor(
     if n is None and found.index is not None and a in ("robin", "haskell"):
         index = found.index if found.per == "vertex" else found.index[found.faces].mean(axis=1)
         if np.isnan(index).any():
-            raise FluxError(f"{source}: its file of parameters tells no refractive index for A. Give --n.")
+            raise FluxError(f"{source}: its .param tells no refractive index n for A. Give --n.")
     else:
         index = np.array([TISSUE_INDEX if n is None else n])
     indices, where = np.unique(index, return_inverse=True)

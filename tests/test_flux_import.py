@@ -340,7 +340,7 @@ def test_nirfast_kinds_of_param_without_an_index_need_it(tmp_path):
     write(tmp_path / "cube.elem", rows(elements + 1))
     names = "HbO\ndeoxyHb\nWater\nS-Amplitude\nS-Power\n"
     write(tmp_path / "cube.param", f"spec\n{names}" + rows(np.full((27, 5), 0.5)))
-    with pytest.raises(FluxError, match=r"tells no refractive index for A\. Give --n"):
+    with pytest.raises(FluxError, match=r"its \.param tells no refractive index n for A\. Give --n"):
         import_flux(tmp_path / "cube.node", np.ones(27))
     phantom = import_flux(tmp_path / "cube.node", np.ones(27), n=1.53)
     assert phantom.provenance["boundary_factor"] == "3.57064 (robin, n = 1.53)"

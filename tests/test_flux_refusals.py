@@ -25,22 +25,43 @@ def mmc(folder, nodes=NODES, elements=ELEMENTS, dref=DREF, name="s_dref.dat"):
     return folder / "node_s.dat", folder / name
 
 
+def write_ply(path, properties, vertices, faces):
+    """A PLY in text with these further properties on vertices and on faces, and the lines of both."""
+    header = ["ply", "format ascii 1.0", f"element vertex {len(POINTS)}"]
+    header += [f"property float {name}" for name in ("x", "y", "z", *properties[0])]
+    header += ["element face 4", "property list uchar int vertex_indices"]
+    header += [f"property float {name}" for name in properties[1]]
+    path.write_text("\n".join([*header, "end_header", *vertices, *faces, ""]))
+    return path
+
+
+CORNERS = [f"{x:g} {y:g} {z:g}" for x, y, z in POINTS]
+SIDES = ["3 0 2 1", "3 0 1 3", "3 0 3 2", "3 1 2 3"]
+
+
 def test_a_ply_that_ends_early(tmp_path):
     """Rationale: it was imported with the faces that were left."""
-    header = [
-        "ply",
-        "format ascii 1.0",
-        "element vertex 4",
-        *(f"property float {name}" for name in ("x", "y", "z", "jn")),
-    ]
-    header += ["element face 4", "property list uchar int vertex_indices", "end_header"]
-    rows = ["0 0 0 1", "1 0 0 1", "0 1 0 1", "0 0 1 1", "3 0 2 1", "3 0 1 3", "3 0 3 2", "3 1 2 3"]
-    path = tmp_path / "whole.ply"
-    path.write_text("\n".join([*header, *rows, ""]))
-    assert len(import_flux(path, field="jn").faces) == 4
-    path.write_text("\n".join([*header, *rows[:-1], ""]))
+    path, vertices = tmp_path / "whole.ply", [f"{line} 1" for line in CORNERS]
+    assert len(import_flux(write_ply(path, (["jn"], []), vertices, SIDES), field="jn").faces) == 4
+    write_ply(path, (["jn"], []), vertices, SIDES[:-1])
     with pytest.raises(FluxError, match="ends early: its header tells of 4 face lines, there are 3"):
         import_flux(path, field="jn")
+
+
+def test_a_ply_with_a_polygon_of_two_corners(tmp_path):
+    """Rationale: beside a quadrangle, two triangles to the loader, the values of faces kept their number and moved."""
+    faces = ["4 0 2 3 1 10", "2 0 1 20", "3 0 3 2 30", "3 1 2 3 40"]
+    with pytest.raises(FluxError, match=r"has faces of 2 corners, a face has 3 or more\. Remove them"):
+        import_flux(write_ply(tmp_path / "m.ply", ([], ["jn"]), CORNERS, faces))
+
+
+def test_texture_coordinates_of_a_ply_are_values_by_name_only(tmp_path):
+    vertices = [f"{line} {k + 1} 7" for k, line in enumerate(CORNERS)]
+    path = write_ply(tmp_path / "m.ply", (["u", "v"], []), vertices, SIDES)
+    with pytest.raises(FluxError, match=r"which field holds the values\?.*texture coordinates: 'u', 'v'\. Choose"):
+        import_flux(path)
+    assert import_flux(path, field="u").exitance.tolist() == [1, 2, 3, 4]
+    assert import_flux(write_ply(path, (["jn", "v"], []), vertices, SIDES)).exitance.tolist() == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(
@@ -186,6 +207,24 @@ def test_one_real_field_is_found_among_labels_and_vectors(tmp_path):
         "m.vtu (its cell data passed over: both on triangles and on tetrahedra) 'phi'"
     )
     assert import_flux(tmp_path / "m.vtu", field="region").exitance.tolist() == [0, 1, 2, 3]
+
+
+def test_whole_numbers_are_never_values_but_by_name(tmp_path):
+    """Rationale: a file with nothing but the numbers of its regions was imported as J_n."""
+    data = {"jn": [np.arange(1, 5)]}
+    meshio.Mesh(POINTS, [("triangle", TRIANGLES)], {}, data).write(tmp_path / "m.vtu")
+    with pytest.raises(FluxError, match=r"All it has are whole numbers.*: 'jn'\. Choose one by --field"):
+        import_flux(tmp_path / "m.vtu")
+    assert import_flux(tmp_path / "m.vtu", field="jn").exitance.tolist() == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("options", [{}, {"per": "face"}, {"per": "vertex"}, {"field": "medit:ref"}])
+def test_labels_of_medit_are_no_field(tmp_path, options):
+    """They stand on vertices and on cells, and were offered as values; for the media of a tissue they remain."""
+    data = {"medit:ref": np.ones(4, int)}, {"medit:ref": [np.ones(4, int)]}
+    meshio.Mesh(POINTS, [("triangle", TRIANGLES)], *data).write(tmp_path / "m.mesh")
+    with pytest.raises(FluxError, match=r"Fields it has: none"):
+        import_flux(tmp_path / "m.mesh", **options)
 
 
 def test_second_order_tetrahedra_keep_their_corners(tmp_path):

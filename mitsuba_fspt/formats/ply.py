@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,8 @@ from .raw import Field, RawMesh, scalars
 from .surface_files import load_triangles
 
 # Properties that are geometry or colour.
-NOT_VALUES = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v"}
+NOT_VALUES = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
+TEXTURE = {"s", "t", "u", "v"}
 
 
 def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
@@ -34,6 +36,9 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
             raise FluxError(
                 f"'{path}' ends early: its header tells of {told} {element} lines, there are {count}. Mend it."
             )
+    corners = _corners(elements.get("face", {}).get("data", {}))
+    if min(corners, default=3) < 3:
+        raise FluxError(f"'{path}' has faces of {min(corners)} corners, a face has 3 or more. Remove them.")
     fields = []
     for on, element in (("vertex", "vertex"), ("cell", "face")):
         data = elements.get(element, {}).get("data", {})
@@ -41,9 +46,18 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
         values = {name: np.asarray(data[name]) for name in names if name not in NOT_VALUES}
         # trimesh splits polygons of more than three corners: then values on faces no longer fit.
         fitting = len(mesh.vertices if on == "vertex" else mesh.faces)
-        fields += [Field(name, v, on) for name, v in values.items() if len(v) == fitting]
+        fields += [Field(name, v, on, name in TEXTURE) for name, v in values.items() if len(v) == fitting]
     points, cells = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     return RawMesh(points, cells, path.name, scalars(fields)), _comments(path)
+
+
+def _corners(faces: Any) -> list[int]:
+    """The number of corners of each face, from what trimesh keeps of their lines: a structured array or columns."""
+    names = (faces.dtype.names or ()) if isinstance(faces, np.ndarray) else faces
+    name = next((name for name in ("vertex_indices", "vertex_index") if name in names), None)
+    if name is None:
+        return []
+    return faces[name]["f0"].tolist() if isinstance(faces, np.ndarray) else [np.size(line) for line in faces[name]]
 
 
 def _comments(path: Path) -> dict[str, str]:

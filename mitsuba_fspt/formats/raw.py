@@ -10,19 +10,23 @@ from numpy.typing import NDArray
 
 from ..errors import FluxError
 from ..surface import Indices, Points, boundary, compact
-from .table import pick
+from .table import pick, quoted
+
+# Numbers of the parts of a mesh.
+LABELS = "medit:"
 
 
 @dataclass(frozen=True)
 class Field:
     """Named values of shape (N,), one on each 'vertex', 'cell' (triangle or tetrahedron) or boundary 'face'.
 
-    `on` None leaves it to the number of values.
+    `on` None leaves it to the number of values. `by_name`: never chosen but by its name.
     """
 
     name: str
     values: NDArray
     on: str | None
+    by_name: bool = False
 
 
 def scalars(fields: Iterable[Field]) -> tuple[Field, ...]:
@@ -120,16 +124,22 @@ def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceV
 
 
 def _choose(mesh: RawMesh, name: str | None, per: str | None) -> Field:
-    """The one field of that name; without a name the only one that is no label (integers)."""
-    fitting = [f for f in mesh.fields if per is None or f.on is None or (f.on == "vertex") == (per == "vertex")]
-    if mesh.fields and not fitting:
+    """The one field of that name; without a name the only one of real numbers: whole ones label something."""
+    fields = [f for f in mesh.fields if not f.name.startswith(LABELS)]
+    fitting = [f for f in fields if per is None or f.on is None or (f.on == "vertex") == (per == "vertex")]
+    if fields and not fitting:
         stand = "vertices" if per == "face" else "faces"
         raise FluxError(f"{mesh.source}: its values stand on {stand}, not per {per}. Leave out --per.")
+    names = {f.name: f.values for f in fitting}
     if name is None:
-        real = {f.name: f.values for f in fitting if f.values.dtype.kind == "f"}
-        name = pick(real or {f.name: f.values for f in fitting}, None, mesh.source)
+        real = {f.name: f.values for f in fitting if f.values.dtype.kind == "f" and not f.by_name}
+        if names and not real:
+            raise FluxError(
+                f"{mesh.source}: which field holds the values? All it has are whole numbers or texture coordinates: "
+                f"{quoted(names)}. Choose one by --field NAME, or give --values FILE."
+            )
+        name = pick(real, None, mesh.source)
     else:  # a PLY property jn_x is Mitsuba's attribute jn
-        names = {f.name: f.values for f in fitting}
         name = pick(names, f"{name}_x" if name not in names and f"{name}_x" in names else name, mesh.source)
     same = [f for f in fitting if f.name == name]
     if len(same) > 1:

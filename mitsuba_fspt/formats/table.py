@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -47,18 +48,22 @@ def pick(candidates: dict[str, NDArray], field: str | None, where: str) -> str:
     ------
     FluxError : no such name, none at all, or several; the message lists them.
     """
-    listed = ", ".join(f"'{name}'" for name in candidates) or "none"
     if field is not None:
         if field not in candidates:
-            raise FluxError(f"{where}: there is no field '{field}'. Fields it has: {listed}.")
+            raise FluxError(f"{where}: there is no field '{field}'. Fields it has: {quoted(candidates)}.")
         return field
     for name in ("exitance", "exitance_x"):
         if name in candidates:
             return name
     if len(candidates) != 1:
         mend = "Choose one by --field NAME." if candidates else "Give the values by --values FILE."
-        raise FluxError(f"{where}: which field holds the values? Fields it has: {listed}. {mend}")
+        raise FluxError(f"{where}: which field holds the values? Fields it has: {quoted(candidates)}. {mend}")
     return next(iter(candidates))
+
+
+def quoted(names: Iterable[str]) -> str:
+    """The names in quotes."""
+    return ", ".join(f"'{name}'" for name in names) or "none"
 
 
 def column(array: NDArray, names: list[str], field: str | None, where: str) -> NDArray[np.float64]:
@@ -86,8 +91,9 @@ def column(array: NDArray, names: list[str], field: str | None, where: str) -> N
     if field is not None and re.fullmatch(r"\d+", field) and 1 <= int(field) <= count:
         return array[:, int(field) - 1].astype(np.float64)
     asked = "which of" if field is None else f"there is no column '{field}' among"
-    listed = ", ".join(f"'{label}'" for label in labels[:20])
-    raise FluxError(f"{where}: {asked} its {count} columns? Choose one by --field, by name or number: {listed}.")
+    raise FluxError(
+        f"{where}: {asked} its {count} columns? Choose one by --field, by name or number: {quoted(labels[:20])}."
+    )
 
 
 def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], list[str]]:
