@@ -16,7 +16,7 @@ Parameters = Annotated[
     list[str] | None,
     typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
 ]
-NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom"}
+NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
 
 
 def definitions(define: list[str] | None) -> dict[str, str]:

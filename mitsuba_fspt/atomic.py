@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -50,3 +50,13 @@ def require_place(path: Path, error: type[FsptError] = FsptError) -> None:
         raise error(f"output file '{path}': the folder '{path.parent}' does not exist. Create it first.")
     if os.path.exists(path) and not os.access(path, os.W_OK):
         raise error(f"output file '{path}' is write-protected. Give another name or remove it first.")
+
+
+def require_apart(output: Path, inputs: Iterable[Path], option: str = "-o", error: type[FsptError] = FsptError) -> None:
+    """Raise `error` where the output that `option` names would take the place of one of the `inputs`."""
+    for other in inputs:
+        same = os.path.realpath(output) == os.path.realpath(other)
+        if same or (os.path.exists(output) and os.path.exists(other) and os.path.samefile(output, other)):
+            raise error(
+                f"output file '{output}': {option} would overwrite '{other}', which is needed too. Give another name."
+            )

@@ -13,6 +13,7 @@ import typer
 from typer.exceptions import TyperException
 
 from .arguments import Parameters, SceneFile, definitions, require_writable
+from .atomic import require_apart
 from .backend import quiet_mitsuba
 from .errors import FsptError, ImageError
 from .interrupt import ctrl_c_noted
@@ -131,8 +132,7 @@ def expose(
     from .detector import Detector
     from .image import read
 
-    if output.exists() and image.exists() and output.samefile(image):
-        raise ImageError(f"output file '{output}' is the image itself, whose power would be lost. Give another name.")
+    require_apart(output, [image], error=ImageError)
     exposure = Detector.typical_ccd().expose(
         read(image), exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, seed=seed
     )

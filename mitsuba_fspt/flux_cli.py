@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from .arguments import require_writable
-from .atomic import atomic_path
+from .atomic import atomic_path, require_apart
 from .errors import FluxError
 
 app = typer.Typer(no_args_is_help=True)
@@ -69,6 +69,8 @@ def import_(
     from .flux_import import import_flux
 
     require_writable(output, ".ply", FluxError)
+    # What lies beside a mesh (node, elem, param, ...) never ends in .ply.
+    require_apart(output, [mesh, values] if values else [mesh], error=FluxError)
     phantom = import_flux(
         mesh,
         values,
@@ -105,8 +107,11 @@ def solve(
     start = time.perf_counter()
     require_writable(output, ".ply", FluxError)
     if volume:
-        require_writable(volume, error=FluxError)
+        require_writable(volume, ".vol", FluxError)
     told = PhantomFile.read(description)
+    require_apart(output, [description, *told.files], error=FluxError)
+    if volume:
+        require_apart(volume, [description, *told.files, output], "--volume", FluxError)
     with Console(stderr=True).status("mesh") as status:
         solution = told.solve(status.update)
         status.update("surface")

@@ -141,6 +141,11 @@ class PhantomFile:
             table.done()
         return result
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that it reads besides itself."""
+        return (self.geometry.path,) if isinstance(self.geometry, File) else ()
+
     def mesh(self) -> Tetrahedra:
         """The tetrahedra with the number of their region, 1, 2, …, 0 for the rest; of several the last.
 

@@ -198,7 +198,7 @@ def test_expose_does_not_overwrite_the_power(run, two_images):
     before = fspt.read("a.exr").metadata
     code, _, err = run("expose", "a.exr", "-o", "a.exr", "--exposure-time", "1", "--wavelength-nm", "600")
     assert code == 2
-    assert "is the image itself" in err
+    assert "output file 'a.exr': -o would overwrite 'a.exr', which is needed too. Give another name." in err
     assert fspt.read("a.exr").metadata == before
 
 

@@ -5,8 +5,10 @@ import sys
 import meshio
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from mitsuba_fspt.errors import BackendError, FluxError
+from mitsuba_fspt.flux_cli import app
 from mitsuba_fspt.flux_import import import_flux
 
 POINTS = np.vstack([np.zeros(3), np.eye(3)])
@@ -259,3 +261,45 @@ def test_npz_fields(tmp_path):
     np.savez(tmp_path / "m.npz", points=POINTS, faces=TRIANGLES)
     with pytest.raises(FluxError, match=r"one array named vertices or nodes.*'points' \(4, 3\)"):
         import_flux(tmp_path / "m.npz")
+
+
+DESCRIPTION = """
+[geometry]
+{geometry}
+[optical]
+mua = 0.05
+musp = 1
+[[sources]]
+shape = "point"
+centre = [0, 0, 0]
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "overwritten"),
+    [
+        ("import m.ply -o m.ply", "-o would overwrite 'm.ply'"),
+        ("import link.ply -o m.ply", "-o would overwrite 'link.ply'"),
+        ("import m.ply --values v.ply -o ./v.ply", "-o would overwrite 'v.ply'"),
+        ("solve file.toml -o m.ply", "-o would overwrite 'm.ply'"),
+        ("solve file.toml -o new.ply --volume file.toml", "must end in .vol. Give a name such as fluence.vol"),
+        ("solve told.vol -o new.ply --volume told.vol", "--volume would overwrite 'told.vol'"),
+        ("solve file.toml -o new.ply --volume link.vol", "--volume would overwrite 'm.ply'"),
+        ("solve told.ply -o told.ply", "-o would overwrite 'told.ply'"),
+    ],
+)
+def test_no_output_takes_the_place_of_an_input(tmp_path, monkeypatch, arguments, overwritten):
+    """Refused before any work, whatever the name it is given by; every file stays as it was."""
+    monkeypatch.chdir(tmp_path)
+    write_ply(tmp_path / "m.ply", (["jn"], []), [f"{line} 1" for line in CORNERS], SIDES)
+    for name in ("link.ply", "link.vol"):
+        (tmp_path / name).symlink_to("m.ply")
+    (tmp_path / "v.ply").write_text("1\n2\n3\n4\n")
+    (tmp_path / "file.toml").write_text(DESCRIPTION.format(geometry='file = "m.ply"'))
+    for name in ("told.vol", "told.ply"):
+        (tmp_path / name).write_text(DESCRIPTION.format(geometry='shape = "cylinder"\nradius = 3\nheight = 6'))
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    result = CliRunner().invoke(app, arguments.split())
+    assert isinstance(result.exception, FluxError)
+    assert overwritten in str(result.exception)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
