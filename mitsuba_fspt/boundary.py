@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from .errors import FluxError
 
+LARGEST_INDEX = 100  # farther off A is all rounding
+
 
 def robin_a(n: float) -> float:
     """A = (2/(1 − R0) − 1 + |cos θc|³)/(1 − |cos θc|²), no unit, >= 1; R0: reflectance face-on, sin θc = 1/n.
@@ -23,7 +25,7 @@ def robin_a(n: float) -> float:
 
     Raises
     ------
-    FluxError : n is below 1 or not finite.
+    FluxError : n is below 1 or above 100.
     """
     n = _index(n)
     face_on = ((n - 1) / (n + 1)) ** 2
@@ -40,7 +42,7 @@ def haskell_a(n: float) -> float:
 
     Raises
     ------
-    FluxError : n is below 1 or not finite.
+    FluxError : n is below 1 or above 100.
     """
     n = _index(n)
     # In the outer cosine (µ dµ = µ_o dµ_o / n²) the transmittance has no kink at the critical angle;
@@ -58,7 +60,7 @@ def boundary_a(a: str | float, n: float) -> float:
 
     Raises
     ------
-    FluxError : neither of the names nor a positive finite number, or n below 1.
+    FluxError : neither of the names nor a positive finite number, or n below 1 or above 100.
     """
     if a == "robin":
         return robin_a(n)
@@ -85,9 +87,9 @@ def fresnel_transmittance(cos_inner: NDArray[np.float64], n: float) -> NDArray[n
 
 def _index(n: float) -> float:
     """The refractive index, checked."""
-    if not (math.isfinite(n) and n >= 1):
+    if not 1 <= n <= LARGEST_INDEX:
         raise FluxError(
-            f"boundary factor: the refractive index n must be >= 1 and finite, got {n:g}. Give the tissue's "
-            "index relative to the medium around it, for example 1.37."
+            f"boundary factor: the refractive index n must be >= 1 and at most {LARGEST_INDEX}, got {n:g}. Give the "
+            "tissue's index relative to the medium around it, for example 1.37."
         )
     return float(n)

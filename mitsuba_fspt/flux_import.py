@@ -11,7 +11,7 @@ from .boundary import boundary_a
 from .errors import ExitanceError, FluxError
 from .formats import MeshLike, RawMesh, SurfaceValues, ValuesLike, read_mesh, surface_values
 from .formats.length_unit import millimetres
-from .phantom import UNIT, Phantom, require_finite, shares
+from .phantom import UNIT, Phantom, require_finite, require_single, shares
 from .surface import closure, face_areas
 
 TISSUE_INDEX = 1.37
@@ -53,7 +53,8 @@ def import_flux(
     ------
     FluxError : unreadable or contradictory input; a closed surface that shows inward; faces that contradict
         each other.
-    ExitanceError : values that are NaN or infinite, negative without `clip`, or zero everywhere.
+    ExitanceError : values that are NaN or infinite, negative without `clip`, or zero everywhere; J_n beyond
+        single precision.
     BackendError : the format needs an optional package.
     """
     scale = millimetres(length_unit, "flux import")
@@ -64,7 +65,9 @@ def import_flux(
     found = replace(found, vertices=found.vertices * scale, faces=found.faces[:, ::-1] if flip else found.faces)
     require_finite(found.values, found.per)
     source = raw.source if values is not None else f"{raw.source} '{found.name}'"
-    exitance, provenance = _exitance(raw, found, scale, a, n)
+    with np.errstate(over="ignore"):  # inf is refused next
+        exitance, provenance = _exitance(raw, found, scale, a, n)
+    require_single(exitance)
     provenance = {"source": source, **provenance}
     exitance, negatives, removed = _without_negatives(found, exitance, clip)
     phantom = Phantom(found.vertices, found.faces, exitance, found.per, provenance, negatives, removed)

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from .errors import FluxError
 from .shapes import Shape
 
+LARGEST = 1e6  # 1/mm: a mean free path of 1 nm, far below a wavelength
+LARGEST_POWER = 1e30  # W
+
 
 @dataclass(frozen=True)
 class Medium:
-    """Absorption `mua` >= 0, reduced scattering `musp` > 0 [1/mm], relative refractive index `n` >= 1.
+    """Absorption `mua` >= 0, reduced scattering `musp` > 0 [1/mm], both <= 1e6; relative refractive index `n` >= 1.
 
     Raises
     ------
@@ -23,11 +26,12 @@ class Medium:
     n: float = 1.37
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.mua) and self.mua >= 0):
-            raise FluxError(f"medium: 'mua' must be >= 0 and finite, got {self.mua:g}. Give 1/mm.")
-        if not (math.isfinite(self.musp) and self.musp > 0):
+        if not 0 <= self.mua <= LARGEST:
+            raise FluxError(f"medium: 'mua' must be >= 0 and at most {LARGEST:g}, got {self.mua:g}. Give 1/mm.")
+        if not 0 < self.musp <= LARGEST:
             raise FluxError(
-                f"medium: 'musp' must be > 0 and finite, got {self.musp:g}. Give 1/mm; diffusion needs scattering."
+                f"medium: 'musp' must be > 0 and at most {LARGEST:g}, got {self.musp:g}. Give 1/mm; diffusion needs "
+                "scattering."
             )
         if not (math.isfinite(self.n) and self.n >= 1):
             raise FluxError(f"medium: 'n' must be >= 1 and finite, got {self.n:g}. Give for example 1.37.")
@@ -40,16 +44,16 @@ class Medium:
 
 @dataclass(frozen=True)
 class Source:
-    """Isotropic light of `power` [W] > 0, uniform over the `shape`.
+    """Isotropic light of `power` [W] > 0 and <= 1e30, uniform over the `shape`.
 
     Raises
     ------
-    FluxError : the power is not positive and finite.
+    FluxError : the power is not positive, or above 1e30.
     """
 
     shape: Shape
     power: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.power) and self.power > 0):
-            raise FluxError(f"source: 'power' must be > 0 and finite, got {self.power:g}. Give W.")
+        if not 0 < self.power <= LARGEST_POWER:
+            raise FluxError(f"source: 'power' must be > 0 and at most {LARGEST_POWER:g}, got {self.power:g}. Give W.")

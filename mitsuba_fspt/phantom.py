@@ -21,6 +21,8 @@ from .formats.ply import read_ply, write_ply
 from .surface import Closure, Indices, Points, closure, face_areas
 
 UNIT = "W/mm^2"
+# What the renderer's 32-bit numbers hold.
+LEAST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 # Words of the report and the PLY's comments that no provenance may overwrite.
 RESERVED = {
     *("area", "power", "min", "max", "zeros", "negatives", "removed_power", "removed_percent", "quantity"),
@@ -70,8 +72,11 @@ class Phantom:
             if key in RESERVED or key.split() != [key]:
                 raise FluxError(f"phantom: '{key}' is taken or no single word. Name the provenance otherwise.")
         require_finite(self.exitance, self.per)
+        require_single(self.exitance)
         if self.exitance.min() < 0:
             raise ExitanceError(f"exitance: must be >= 0, the least is {self.exitance.min():.6g} {UNIT}. Clip it.")
+        if (far := np.abs(self.vertices[self.faces]).max()) > LARGEST:
+            raise FluxError(f"phantom: a vertex lies at {far:.3g} mm, the renderer holds {LARGEST:.2g}. Scale it.")
         if not self.area > 0:
             raise FluxError(f"phantom: the surface has no area ({self.area:g} mm^2). Mend its vertices.")
         if not self.power > 0:
@@ -189,4 +194,14 @@ def require_finite(exitance: NDArray[np.float64], per: str) -> None:
         raise ExitanceError(
             f"exitance: {np.count_nonzero(~finite)} of {len(exitance)} values are NaN or inf, the first on "
             f"{per} {np.argmin(finite)} (counted from 0). Every value must be finite; repair the data."
+        )
+
+
+def require_single(exitance: NDArray[np.float64]) -> None:
+    """Raise ExitanceError where the renderer's single precision would make inf of a value, or 0 of all of them."""
+    largest = float(np.abs(exitance).max(initial=0.0))
+    if largest > LARGEST or 0 < largest < LEAST:
+        raise ExitanceError(
+            f"exitance: the largest value is {largest:.3g} {UNIT}, the renderer holds {LEAST:.2g} to "
+            f"{LARGEST:.2g}. Check its unit, or scale it."
         )

@@ -89,10 +89,16 @@ class Solution:
 
         Raises
         ------
-        FluxError : the edge is not positive, or the values below 0 matter: the mesh is too coarse.
+        FluxError : the edge is not positive, no light leaves, or the values below 0 matter: the mesh is too
+            coarse.
         """
         if not (math.isfinite(edge) and edge > 0):
             raise FluxError(f"surface: 'edge' must be > 0 and finite, got {edge:g}. Give mm.")
+        if not self.solved.exited > 0:
+            raise FluxError(
+                f"solve: the exit power is {self.solved.exited:g} W of {self.source_power:g} W, the phantom would be "
+                "black. Give smaller mua and musp, or a source closer to the border."
+            )
         vertices, faces = self._border(edge)
         exitance = self.exitance_at(vertices)
         areas = face_areas(vertices, faces)

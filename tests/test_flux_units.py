@@ -113,6 +113,28 @@ def test_vertices_that_no_face_uses_do_not_count():
     assert len(phantom.vertices) == 8
 
 
+@pytest.mark.parametrize(
+    ("values", "options", "largest"),
+    [
+        (np.full(8, 1e308), {}, r"1e\+308"),
+        (np.linspace(-1e308, 1, 8), {"clip": True}, r"1e\+308"),
+        (np.full(8, 1e-40), {}, "1e-40"),
+        (np.ones(8), {"a": 1e-320}, "inf"),
+        (np.full(8, 1e-40), {"length_unit": "m"}, "1e-46"),
+    ],
+)
+def test_what_single_precision_cannot_hold_is_refused(values, options, largest):
+    """Rationale: J_n = 1e308 was written, and its power told as inf; Mitsuba counts in 32 bits."""
+    with pytest.raises(ExitanceError, match=rf"largest value is {largest} W/mm\^2, the renderer holds 1.2e-38 to 3.4e"):
+        import_flux(MESH, values, **options)
+    assert import_flux(MESH, np.full(8, 1e38)).power == pytest.approx(52e38)
+
+
+def test_vertices_that_single_precision_cannot_hold_are_refused():
+    with pytest.raises(FluxError, match=r"a vertex lies at 2e\+39 mm, the renderer holds 3.4"):
+        import_flux((VERTICES * 1e39, FACES), np.ones(8))
+
+
 TETRAHEDRON = (np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
 
 
@@ -132,6 +154,7 @@ TETRAHEDRON = (np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 
         (MESH, np.ones(8), {"format": "obj"}, r"reads files"),
         (MESH, np.ones(8), {"a": "exact"}, r"'a' must be robin, haskell or a number > 0, got 'exact'"),
         (MESH, np.ones(8), {"a": "robin", "n": 0.9}, r"n must be >= 1"),
+        (MESH, np.ones(8), {"a": "robin", "n": 1e9}, r"n must be >= 1 and at most 100, got 1e\+09"),
         (MESH, np.ones(8), {"n": 1.4}, r"'n' = 1.4 goes with 'a'"),
         (MESH, np.ones(8), {"a": 2.5, "n": 1.4}, r"'n' = 1.4 goes with 'a'"),
         ((VERTICES, FACES + 1), np.ones(8), {}, r"vertices 1 to 8 \(counted from 0\), there are 8"),

@@ -335,6 +335,13 @@ def test_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
         solve(cylinder_tetrahedra(15, 30, 5), [NYLON], [POINT])
 
 
+def test_a_phantom_that_lets_no_light_out_is_refused() -> None:
+    """Rationale: an exit power that is 0 in 64 bits was divided by."""
+    solution = solve(cylinder_tetrahedra(5, 10, 2.5), [Medium(1e3, 1)], [Source(Ball((0, 0, 0)))], order=1)
+    with pytest.raises(FluxError, match=r"the exit power is 0 W of 1 W, the phantom would be black\. Give smaller mua"):
+        solution.phantom(2.5)
+
+
 def test_arguments_refused() -> None:
     mesh = cylinder_tetrahedra(15, 30, 5)
     with pytest.raises(FluxError, match="'order' must be 1 or 2, got 3"):
@@ -354,6 +361,9 @@ def test_arguments_refused() -> None:
     for kind, numbers, message in (
         (Medium, (-0.1, 1), "'mua' must be >= 0"),
         (Medium, (0.1, 0), "'musp' must be > 0"),
+        (Medium, (0.1, 1e9), r"'musp' must be > 0 and at most 1e\+06, got 1e\+09"),
+        (Medium, (1e300, 1), r"'mua' must be >= 0 and at most 1e\+06"),
+        (Source, (Ball((0.0, 0.0, 0.0)), 1e308), r"'power' must be > 0 and at most 1e\+30"),
         (Medium, (0.1, 1, 0.9), "'n' must be >= 1"),
         (Source, (Ball((0.0, 0.0, 0.0)), 0), "'power' must be > 0"),
         (Ball, ((0.0, 0.0, float("nan")),), "three finite numbers"),
