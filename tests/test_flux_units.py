@@ -1,6 +1,7 @@
 """Importing J_n: what a value means, in which unit, and what is refused."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -181,13 +182,14 @@ def test_bad_arrays(mesh, values, options, message):
     [
         ("v.csv", "a,b\n1,2\n3,4\n", r"which of its 2 columns.*'a', 'b'"),
         ("v.csv", "1,2\n3,x\n", r"not a table of numbers.*'x'"),
+        ("v.csv", "1,2\n3,x\n", r"not a table of numbers.*\. Mend that line\."),
         ("v.csv", "1\n\n", r"1 values fit nothing"),
         ("v.csv", "# nothing\n", r"holds no values"),
         ("v.csv", "", r"holds no values"),
         ("v.txt", b"\x00\x01\xff\xfe" * 9, r"is binary"),
-        ("v.npy", b"no numpy", r"cannot be read as a NumPy file"),
-        ("v.npz", b"PK\x03\x04 broken", r"cannot be read as a NumPy file"),
-        ("v.mat", b"broken", r"cannot be read as a MATLAB file"),
+        ("v.npy", b"no numpy", r"cannot be read as a NumPy file: .*\. Save it anew"),
+        ("v.npz", b"PK\x03\x04 broken", r"cannot be read as a NumPy file: .*\. Save it anew"),
+        ("v.mat", b"broken", r"cannot be read as a MATLAB file: .*\. Save it anew"),
         ("missing.csv", None, r"missing.csv' cannot be read: No such file"),
     ],
 )
@@ -212,6 +214,43 @@ def test_bad_value_files(tmp_path, name, content, message):
 def test_columns_by_name_or_number(tmp_path, content, field):
     (tmp_path / "v.csv").write_text(content, encoding="utf-8")
     assert import_flux(MESH, tmp_path / "v.csv", field=field).exitance.tolist() == [1.0] + [2.0] * 7
+
+
+@pytest.mark.parametrize("field", ["jn", "2"])
+def test_a_table_of_one_row(tmp_path, field):
+    """Rationale: the row was taken for a column of two values, and then asked for its second column."""
+    path = tmp_path / "v.csv"
+    path.write_text("id,jn\n7,0.5\n")
+    one = (VERTICES[FACES[0]], np.array([[0, 1, 2]]))
+    assert import_flux(one, path, field=field, per="face").exitance.tolist() == [0.5]
+    with pytest.raises(FluxError, match=r"which of its 2 columns.*'id', 'jn'"):
+        import_flux(one, path, per="face")
+
+
+def test_columns_of_one_name(tmp_path):
+    path = tmp_path / "v.csv"
+    path.write_text("jn,jn\n" + "1,2\n" * 8)
+    with pytest.raises(FluxError, match=r"2 columns are named 'jn'\. Choose one by its number"):
+        import_flux(MESH, path, field="jn")
+    assert import_flux(MESH, path, field="2").exitance.tolist() == [2.0] * 8
+
+
+@pytest.mark.skipif(not os.path.isdir("/dev/fd"), reason="no names for open files")
+def test_values_from_a_pipe():
+    """Rationale: the second look into it found nothing."""
+    source, sink = os.pipe()
+    os.write(sink, b"jn\n" + b"1\n" * 7 + b"2\n")
+    os.close(sink)
+    assert import_flux(MESH, f"/dev/fd/{source}").exitance.tolist() == [1.0] * 7 + [2.0]
+    os.close(source)
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["variable", "member"])
+def test_a_sparse_vector_of_matlab(tmp_path, inside):
+    scipy = pytest.importorskip("scipy")
+    values = scipy.sparse.csc_matrix(np.arange(8.0)[:, None])
+    scipy.io.savemat(tmp_path / "v.mat", {"data": {"phi": values}} if inside else {"phi": values})
+    assert import_flux(MESH, tmp_path / "v.mat").exitance.tolist() == list(range(8))
 
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "off", "glb", "vtu", "vtk", "msh", "xdmf", "npz", "step"])

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from io import StringIO
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -76,7 +78,7 @@ def column(array: NDArray, names: list[str], field: str | None, where: str) -> N
     if array.dtype.kind not in "fiu":
         kind = "complex numbers" if array.dtype.kind == "c" else f"of type {array.dtype}"
         raise FluxError(f"{where}: values must be real numbers, these are {kind}. Save their amplitude.")
-    if array.ndim == 2 and array.shape[0] == 1:
+    if array.ndim == 2 and array.shape[0] == 1 and field is None and not names:
         array = array.T
     if array.ndim == 1:
         array = array[:, None]
@@ -86,6 +88,8 @@ def column(array: NDArray, names: list[str], field: str | None, where: str) -> N
     if field is None and count == 1:
         return array[:, 0].astype(np.float64)
     labels = names or [str(k + 1) for k in range(count)]
+    if labels.count(field or "") > 1:
+        raise FluxError(f"{where}: {labels.count(field or '')} columns are named '{field}'. Choose one by its number.")
     if field in labels:
         return array[:, labels.index(field)].astype(np.float64)
     if field is not None and re.fullmatch(r"\d+", field) and 1 <= int(field) <= count:
@@ -103,39 +107,44 @@ def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], li
     ------
     FluxError : the file is missing, empty, binary, or a line does not fit; the message names the line.
     """
-    names, delimiter, skip = _layout(path, skip_lines)
+    text = _text(path)
+    names, delimiter, skip = _layout(text, skip_lines)
+    if skip is None:
+        raise FluxError(f"'{path}' holds no values. Give one number a line.")
     try:
-        table = np.loadtxt(path, delimiter=delimiter, skiprows=skip, ndmin=2, encoding="utf-8-sig")
-    except (OSError, ValueError) as cause:
-        raise FluxError(f"'{path}' is not a table of numbers: {one_line(cause)}.") from cause
+        table = np.loadtxt(StringIO(text), delimiter=delimiter, skiprows=skip, ndmin=2)
+    except ValueError as cause:
+        raise FluxError(f"'{path}' is not a table of numbers: {one_line(cause)}. Mend that line.") from cause
     return table, names if len(names) == table.shape[1] else []
 
 
-def _layout(path: Path, skip_lines: int) -> tuple[list[str], str | None, int]:
-    """Column names ([]: no header), delimiter (None: blanks), number of lines above the first numbers."""
-    header = ""
+def _text(path: Path) -> str:
+    """What stands in a text file, read once: a pipe holds it only once."""
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            for number, line in enumerate(file):
-                text = line.strip()
-                if number < skip_lines or not text:
-                    continue
-                if "\0" in text:
-                    break
-                headed = bool(header) and not header.startswith("#")
-                if text.startswith("#") or not (headed or _is_numeric(text)):
-                    header = text
-                    continue
-                delimiter = next((mark for mark in ",;\t" if mark in text), None)
-                names = [name.strip(' "') for name in header.lstrip("# ").split(delimiter)] if header else []
-                return names, delimiter, number
-            else:
-                raise FluxError(f"'{path}' holds no values. Give one number a line.")
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
     except UnicodeDecodeError:
-        pass
-    raise FluxError(f"'{path}' is binary, a text table was expected. Save it as text.")
+        text = "\0"
+    if "\0" in text:
+        raise FluxError(f"'{path}' is binary, a text table was expected. Save it as text.")
+    return text
+
+
+def _layout(text: str, skip_lines: int) -> tuple[list[str], str | None, int | None]:
+    """Column names ([]: no header), delimiter (None: blanks), number of lines above the first numbers (None: none)."""
+    header = ""
+    for number, line in enumerate(map(str.strip, StringIO(text))):
+        if number < skip_lines or not line:
+            continue
+        headed = bool(header) and not header.startswith("#")
+        if line.startswith("#") or not (headed or _is_numeric(line)):
+            header = line
+            continue
+        delimiter = next((mark for mark in ",;\t" if mark in line), None)
+        names = [name.strip(' "') for name in header.lstrip("# ").split(delimiter)] if header else []
+        return names, delimiter, number
+    return [], None, None
 
 
 def _is_numeric(line: str) -> bool:
@@ -169,7 +178,9 @@ def _load_numpy(path: Path) -> NDArray | dict[str, NDArray]:
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
     except (ValueError, EOFError, BadZipFile) as cause:
-        raise FluxError(f"'{path}' cannot be read as a NumPy file: {one_line(cause)}.") from cause
+        raise FluxError(
+            f"'{path}' cannot be read as a NumPy file: {one_line(cause)}. Save it anew by numpy.save."
+        ) from cause
 
 
 def _read_mat(path: Path) -> dict[str, NDArray]:
@@ -177,6 +188,7 @@ def _read_mat(path: Path) -> dict[str, NDArray]:
     try:
         from scipy.io import loadmat
         from scipy.io.matlab import MatReadError
+        from scipy.sparse import issparse
     except ImportError as cause:
         raise BackendError(
             "flux import: SciPy, which reads .mat files, is not installed. pip install 'mitsuba-fspt[tissue]'."
@@ -186,16 +198,16 @@ def _read_mat(path: Path) -> dict[str, NDArray]:
     except NotImplementedError as cause:  # MATLAB 7.3 is HDF5
         raise FluxError(f"'{path}' is a MATLAB 7.3 file. Save it with save(..., '-v7').") from cause
     except (OSError, ValueError, MatReadError) as cause:
-        raise FluxError(f"'{path}' cannot be read as a MATLAB file: {one_line(cause)}.") from cause
-    arrays: dict[str, NDArray] = {}
+        raise FluxError(f"'{path}' cannot be read as a MATLAB file: {one_line(cause)}. Save it anew.") from cause
+    arrays: dict[str, Any] = {}
     for name, value in variables.items():
         if name.startswith("__"):
             continue
-        if value.dtype.names and value.size == 1:
-            arrays |= {f"{name}.{member}": np.asarray(value[member].item()) for member in value.dtype.names}
+        if not issparse(value) and value.dtype.names and value.size == 1:
+            arrays |= {f"{name}.{member}": value[member].item() for member in value.dtype.names}
         else:
             arrays[name] = value
-    return arrays
+    return {name: value.toarray() if issparse(value) else np.asarray(value) for name, value in arrays.items()}
 
 
 def one_line(cause: BaseException) -> str:
