@@ -145,7 +145,7 @@ class Phantom:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Phantom:
-        """The phantom that `write` wrote, every bit.
+        """The phantom that `write` wrote, its numbers bit by bit.
 
         Raises
         ------

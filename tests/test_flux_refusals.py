@@ -248,6 +248,48 @@ def test_a_missing_package_names_its_extra(tmp_path, monkeypatch, module, name, 
         import_flux(mesh, tmp_path / name)
 
 
+def test_a_package_that_a_loader_misses(tmp_path, monkeypatch):
+    """Rationale: it was asked whether the file is damaged."""
+
+    def load(*_, **__):
+        raise ImportError("No module named 'networkx'")
+
+    monkeypatch.setattr("trimesh.load_scene", load)
+    (tmp_path / "m.3mf").touch()
+    with pytest.raises(
+        BackendError, match=r"m\.3mf' as \.3mf needs a package .*'networkx'\. Install it by pip, or save"
+    ):
+        import_flux(tmp_path / "m.3mf", np.ones(4))
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "off", "npz", "vtu", "msh", "glb"])
+def test_a_folder_for_a_mesh(tmp_path, suffix):
+    (tmp_path / f"m.{suffix}").mkdir()
+    with pytest.raises(FluxError, match=r"(it is a folder|Is a directory)\. Check the name\."):
+        import_flux(tmp_path / f"m.{suffix}", np.ones(4))
+
+
+LONG = "x" * 300
+
+
+@pytest.mark.parametrize(
+    "arguments", [f"{LONG}.ply -o o.ply", f"m.ply --values {LONG}.csv -o o.ply", f"m.ply -o {LONG}.ply"]
+)
+def test_names_that_are_too_long(tmp_path, monkeypatch, arguments):
+    """Rationale: to ask for such a file raises."""
+    monkeypatch.chdir(tmp_path)
+    write_ply(tmp_path / "m.ply", (["jn"], []), [f"{line} 1" for line in CORNERS], SIDES)
+    result = CliRunner().invoke(app, ["import", *arguments.split()])
+    assert isinstance(result.exception, FluxError)
+    assert [path.name for path in tmp_path.iterdir()] == ["m.ply"]
+
+
+def test_what_meshio_cannot_read_has_a_mend(tmp_path):
+    (tmp_path / "m.vtu").write_text("<VTK")
+    with pytest.raises(FluxError, match=r"cannot be read by meshio: .*\. Save it anew\."):
+        import_flux(tmp_path / "m.vtu")
+
+
 def test_npz_fields(tmp_path):
     arrays = {"vertices_mm": POINTS, "faces": TRIANGLES, "source_mm": np.zeros(3), "jn_mc": np.ones(4)}
     np.savez(tmp_path / "m.npz", **arrays)

@@ -30,17 +30,18 @@ def test_ply_comes_back_bit_by_bit(tmp_path, per):
         assert np.array_equal(getattr(read, name), getattr(written, name))
     assert read.per == per
     assert read.provenance["boundary_factor"] == "2.57 (robin, n = 1.37)"
+    assert read.provenance["source"] == "Mäuse, 2 of them"
     assert read.report() | {"source": ""} == written.report() | {"source": ""}
-    header = (tmp_path / "p.ply").read_bytes().split(b"end_header")[0].decode("ascii")
+    header = (tmp_path / "p.ply").read_bytes().split(b"end_header")[0].decode("utf-8")
     for line in ("quantity exitance", "unit W/mm^2", "length_unit mm", f"power {written.power!r} W"):
         assert f"comment {line}\n" in header
-    assert "comment source M\\xe4use, 2 of them\n" in header
+    assert "comment source Mäuse, 2 of them\n" in header
 
 
 @pytest.mark.parametrize("per", ["vertex", "face"])
 def test_mitsuba_finds_the_exitance(tmp_path, per):
     """The attribute is there under its name and holds each value, rounded to single precision once."""
-    written = phantom(per)
+    written = phantom(per, provenance={"source": "Mäuse"})
     written.write(tmp_path / "p.ply")
     mi.set_variant("llvm_ad_mono")
     mesh = mi.load_dict({"type": "ply", "filename": str(tmp_path / "p.ply")})
@@ -96,3 +97,10 @@ def test_a_ply_of_another_kind_is_refused(tmp_path):
     (tmp_path / "p.ply").write_bytes(other)
     with pytest.raises(FluxError, match=r"the unit of a phantom must be W/mm\^2"):
         Phantom.read(tmp_path / "p.ply")
+
+
+@pytest.mark.parametrize(("name", "what"), [("gone.ply", "there is no such file"), ("", "it is a folder")])
+def test_no_file_to_read(tmp_path, name, what):
+    """Rationale: the loader's words were that the file is damaged."""
+    with pytest.raises(FluxError, match=rf"cannot be read: {what}\. Check the name\."):
+        Phantom.read(tmp_path / name)

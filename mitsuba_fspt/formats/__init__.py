@@ -58,7 +58,7 @@ def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, form
     if isinstance(mesh, tuple):
         return _from_arrays(mesh, values, field, format)
     path = Path(mesh)
-    if not path.exists() and format != "nirfast":  # its name may come without a suffix
+    if not os.path.exists(path) and format != "nirfast":  # its name may come without a suffix
         raise FluxError(f"mesh '{path}' does not exist. Check the name.")
     if format == "auto":
         format = _detect(path)

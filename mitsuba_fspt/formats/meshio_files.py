@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import BackendError, FluxError
 from .gmsh import put_in_order
 from .raw import Field, RawMesh, scalars
-from .table import one_line
+from .table import one_line, require_file
 
 FORMATS = {
     ".vtu": "vtu",
@@ -88,8 +88,7 @@ def _load(path: Path):
         raise BackendError(
             f"flux import: meshio, which reads '{path.name}', is not installed. pip install 'mitsuba-fspt[mesh]'."
         ) from cause
-    if not path.is_file():
-        raise FluxError(f"'{path}' cannot be read: there is no such file. Check the name.")
+    require_file(path)
     said = StringIO()
     try:
         with redirect_stdout(said), redirect_stderr(said):
@@ -101,4 +100,4 @@ def _load(path: Path):
         ) from cause
     except (Exception, SystemExit) as cause:  # a damaged file makes meshio's readers raise anything, or exit
         reason = " ".join(said.getvalue().split()) or one_line(cause)
-        raise FluxError(f"'{path}' cannot be read by meshio: {reason[:200].rstrip('.')}.") from cause
+        raise FluxError(f"'{path}' cannot be read by meshio: {reason[:200].rstrip('.')}. Save it anew.") from cause

@@ -64,7 +64,7 @@ def _comments(path: Path) -> dict[str, str]:
     comments = {}
     with path.open("rb") as file:
         for line in file:
-            word, _, text = line.decode("ascii", "replace").strip().partition(" ")
+            word, _, text = line.decode("utf-8", "replace").strip().partition(" ")
             if word == "end_header":
                 break
             if word == "comment":
@@ -108,6 +108,6 @@ def write_ply(
     header += [f"property double {name}" for name in (triangles.dtype.names or ())[2:]]
     header += ["end_header", ""]
     with atomic_path(path, FluxError) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode("ascii", "backslashreplace"))
+        file.write("\n".join(header).encode("utf-8", "backslashreplace"))
         file.write(points.tobytes())
         file.write(triangles.tobytes())

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FluxError
+from ..errors import BackendError, FluxError
 from ..surface import merge
 from .raw import Field, RawMesh, scalars
-from .table import one_line, read_npz
+from .table import one_line, read_npz, require_file
 
 if TYPE_CHECKING:
     import trimesh
@@ -108,6 +108,7 @@ def read_trimesh(path: Path) -> RawMesh:
     Raises
     ------
     FluxError : trimesh does not know the format or cannot read the file, or finds no triangles in it.
+    BackendError : the format needs a package that is not installed.
     """
     kind = path.suffix.lower().lstrip(".")
     if kind not in KINDS:
@@ -124,14 +125,26 @@ def read_trimesh(path: Path) -> RawMesh:
 
 
 def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
-    """trimesh's mesh of a file, its vertices and faces as they are; refused where there are no faces."""
+    """trimesh's mesh of a file, its vertices and faces as they are.
+
+    Raises
+    ------
+    FluxError : the file cannot be read, or has no faces.
+    BackendError : its format needs a package that is not installed.
+    """
     import trimesh  # takes longer to load than most meshes
 
+    require_file(path)
     try:
         mesh = trimesh.load_scene(path, process=False, **options).to_mesh()
         count = len(mesh.faces)
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
+    except ImportError as cause:
+        raise BackendError(
+            f"'{path}' as .{kind} needs a package that is not installed: {one_line(cause)}. Install it by pip, or save "
+            "the mesh as .ply."
+        ) from cause
     except Exception as cause:  # a damaged file makes trimesh's loaders raise anything
         raise FluxError(f"'{path}' cannot be read as .{kind}: {one_line(cause)}. Is the file damaged?") from cause
     if count == 0:

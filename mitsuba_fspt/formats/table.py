@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
 from io import StringIO
@@ -208,6 +209,13 @@ def _read_mat(path: Path) -> dict[str, NDArray]:
         else:
             arrays[name] = value
     return {name: value.toarray() if issparse(value) else np.asarray(value) for name, value in arrays.items()}
+
+
+def require_file(path: Path) -> None:
+    """Raise FluxError where there is no file, but nothing or a folder."""
+    if not os.path.isfile(path):
+        what = "it is a folder" if os.path.isdir(path) else "there is no such file"
+        raise FluxError(f"'{path}' cannot be read: {what}. Check the name.")
 
 
 def one_line(cause: BaseException) -> str:
