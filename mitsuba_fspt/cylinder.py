@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import FluxError
-from .tetrahedra import Tetrahedra
+from .tetrahedra import Tetrahedra, require_few
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -21,7 +21,8 @@ def cylinder_tetrahedra(radius: float, height: float, edge: float) -> Tetrahedra
 
     Raises
     ------
-    FluxError : a length is not positive and finite, or the edge is longer than the radius or the height.
+    FluxError : a length is not positive and finite, or the edge is longer than the radius or the height, or so
+        short that there would be more than 5 million tetrahedra.
     """
     for name, value in (("radius", radius), ("height", height), ("edge", edge)):
         if not (math.isfinite(value) and value > 0):
@@ -31,6 +32,7 @@ def cylinder_tetrahedra(radius: float, height: float, edge: float) -> Tetrahedra
             f"cylinder: the mesh edge {edge:g} mm must not exceed radius {radius:g} mm or height {height:g} "
             f"mm. Give {min(radius, height) / 10:.3g} or less."
         )
+    require_few(18 * radius * radius * height, edge)
     rings, layers = round(radius / edge), round(height / edge)
     disc, triangles = unit_disc(rings)
     z = np.linspace(-height / 2, height / 2, layers + 1)

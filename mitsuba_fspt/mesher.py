@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ from .formats import read_mesh
 from .formats.length_unit import millimetres
 from .lattice import nearest_points
 from .surface import boundary, closure
-from .tetrahedra import Tetrahedra
+from .tetrahedra import Tetrahedra, require_few
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -65,7 +66,7 @@ def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
 
     Raises
     ------
-    FluxError : the surface is open, or nothing comes out.
+    FluxError : the surface is open, nothing comes out, or there would be more than 5 million tetrahedra.
     BackendError : pytetwild is not installed.
     """
     if not closure(vertices, faces).watertight:
@@ -84,6 +85,8 @@ def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
         raise FluxError(
             f"geometry: the mesh edge must be > 0 and at most the size {diagonal:.3g} mm, got {edge:g}. Give mm."
         )
+    volume = abs(float(np.linalg.det(vertices[faces]).sum())) / 6
+    require_few(6 * math.sqrt(2) * volume, edge)  # regular ones
     with _in_temporary_folder():  # the mesher leaves a file where it runs
         points, cells = pytetwild.tetrahedralize(
             np.ascontiguousarray(vertices, dtype=np.float64),

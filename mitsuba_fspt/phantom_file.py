@@ -171,8 +171,10 @@ class PhantomFile:
         import_skfem()  # before the mesher's minutes
         if progress:
             progress("mesh")
+        mesh = self.mesh()
+        mesh.cuts(self.surface_edge)  # refuses what cannot be, before the solver's minutes
         media = (self.medium, *(part.medium for part in self.regions))
-        return solve(self.mesh(), media, self.sources, a=self.a, order=self.order, progress=progress)
+        return solve(mesh, media, self.sources, a=self.a, order=self.order, progress=progress)
 
 
 def _geometry(table: Table, folder: Path) -> Cylinder | File:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,11 +88,9 @@ class Solution:
 
         Raises
         ------
-        FluxError : the edge is not positive, no light leaves, or the values below 0 matter: the mesh is too
-            coarse.
+        FluxError : the edge is not positive or far too short, no light leaves, or the values below 0 matter: the
+            mesh is too coarse.
         """
-        if not (math.isfinite(edge) and edge > 0):
-            raise FluxError(f"surface: 'edge' must be > 0 and finite, got {edge:g}. Give mm.")
         if not self.solved.exited > 0:
             raise FluxError(
                 f"solve: the exit power is {self.solved.exited:g} W of {self.source_power:g} W, the phantom would be "
@@ -130,6 +127,8 @@ class Solution:
         ------
         FluxError : the voxel's edge is not positive, or there would be too many of them.
         """
+        # Too many voxels are refused before the border is cut as fine.
+        voxel_box(self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0), voxel)
         border, faces = self._border(voxel)
         low, high, axes = voxel_box(border.min(axis=0), border.max(axis=0), voxel)
         z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
@@ -153,7 +152,7 @@ class Solution:
 
     def _border(self, edge: float) -> tuple[Array, Index]:
         """The border as vertices and faces with edges of about `edge` [mm] or less, on the true surface."""
-        vertices, faces = border_lattice(self.basis.mesh, max(1, math.ceil(self.mesh.edge / edge)))
+        vertices, faces = border_lattice(self.basis.mesh, self.mesh.cuts(edge))
         return self._snap(vertices), faces
 
     def _snap(self, points: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +19,9 @@ Index = NDArray[np.int64]
 STARTS = 4  # of the search for a point's cell
 MOST_STEPS = 200
 ROUND_OFF = 1e-9  # of a barycentric coordinate
+# More take tens of gigabytes: tetrahedra in the solver, triangles of the surface.
+MOST_CELLS = 5_000_000
+MOST_FACES = 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +70,24 @@ class Tetrahedra:
                 f"tetrahedra: {np.count_nonzero(flat)} of {len(cells)} cells have no volume, the first is "
                 f"cell {np.argmax(flat)}. Mesh again or remove the slivers."
             )
+
+    def cuts(self, edge: float) -> int:
+        """Into how many parts the border's edges are to be cut for triangles with edges of about `edge` [mm].
+
+        Raises
+        ------
+        FluxError : the edge is not positive, or there would be more than 10 million triangles.
+        """
+        if not (math.isfinite(edge) and edge > 0):
+            raise FluxError(f"surface: 'edge' must be > 0 and finite, got {edge:g}. Give mm.")
+        facets = np.count_nonzero(self.neighbours < 0)
+        parts = max(1.0, self.edge / edge)
+        if parts * parts * facets > MOST_FACES:
+            raise FluxError(
+                f"surface: edges of {edge:g} mm make {parts * parts * facets:.3g} triangles, at most {MOST_FACES:.0e} "
+                f"can be. Give an edge above {self.edge * math.sqrt(facets / MOST_FACES):.2g} mm."
+            )
+        return math.ceil(parts)
 
     @property
     def edges(self) -> Array:
@@ -148,6 +170,19 @@ class Tetrahedra:
         neighbours = np.full(len(facets), -1)
         neighbours[order[pair]], neighbours[order[pair + 1]] = order[pair + 1] // 4, order[pair] // 4
         return neighbours.reshape(-1, 4)
+
+
+def require_few(at_one: float, edge: float) -> None:
+    """Raise FluxError where a mesh with edges of `edge` [mm] would have more than 5 million tetrahedra.
+
+    `at_one` : how many it would have with edges of 1 mm
+    """
+    cells = at_one / edge / edge / edge
+    if cells > MOST_CELLS:
+        raise FluxError(
+            f"geometry: mesh edges of {edge:g} mm make about {cells:.3g} tetrahedra, at most {MOST_CELLS:.0e} can be. "
+            f"Give an edge above {(at_one / MOST_CELLS) ** (1 / 3):.2g} mm."
+        )
 
 
 def depth(local: Array) -> Array:

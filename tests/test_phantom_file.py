@@ -226,6 +226,39 @@ def test_flux_solve(tmp_path: Path) -> None:
     assert "exit fraction" in table.stdout
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("edge = 1\n", "edge = 1e-3\n", r"surface: edges of 0.001 mm make .*e\+09 triangles, at most 1e\+07 can be"),
+        (
+            "edge = 1\n",
+            "edge = 1e-300\n",
+            r"surface: edges of 1e-300 mm make inf triangles.* Give an edge above 0\.\d+ mm",
+        ),
+        ("edge = 2\n", "edge = 1e-3\n", r"geometry: mesh edges of 0.001 mm make about 5.18e\+12 tetrahedra"),
+        ("edge = 2\n", "edge = 1e-300\n", r"geometry: .* about inf tetrahedra.* Give an edge above 0\.1 mm"),
+    ],
+)
+def test_what_no_memory_holds_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, message: str
+) -> None:
+    """Rationale: the process was killed for its memory after a minute, without a word."""
+    monkeypatch.setattr(phantom_file, "solve", None)
+    assert old in SMALL
+    with pytest.raises(FluxError, match=message):
+        described(tmp_path, SMALL.replace(old, new)).solve()
+
+
+def test_a_filling_that_no_memory_holds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cube of 1 mm³ has 8.5 regular tetrahedra of 1 mm. The mesher is not asked."""
+    monkeypatch.setitem(sys.modules, "pytetwild", object())
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    with pytest.raises(
+        FluxError, match=r"edges of 0.005 mm make about 6.79e\+07 tetrahedra.* Give an edge above 0.012 mm"
+    ):
+        tetrahedralize(np.array(cube.vertices), np.array(cube.faces), 0.005)
+
+
 def test_flux_solve_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL.replace("[1, 0, -1]", "[9, 0, -1]"), encoding="utf-8")
     result = CliRunner().invoke(app, ["solve", str(tmp_path / "small.toml"), "-o", str(tmp_path / "small.ply")])

@@ -111,3 +111,12 @@ def test_box() -> None:
         voxel_box(np.zeros(3), np.ones(3), -1)
     with pytest.raises(FluxError, match="Give larger ones"):
         voxel_box(np.zeros(3), np.ones(3), 1e-3)
+
+
+@pytest.mark.parametrize(("voxel", "message"), [(0.0, "'voxel' must be > 0"), (1e-3, "Give larger ones")])
+def test_too_many_voxels_are_refused_before_the_border_is_cut(
+    nylon: Solution, monkeypatch: pytest.MonkeyPatch, voxel: float, message: str
+) -> None:
+    monkeypatch.setattr("mitsuba_fspt.solution.border_lattice", None)
+    with pytest.raises(FluxError, match=message):
+        nylon.volume(voxel)
