@@ -1,5 +1,6 @@
 """Importing J_n: files of solvers and of meshio that must not be taken, or not without a choice."""
 
+import struct
 import sys
 
 import meshio
@@ -55,6 +56,17 @@ def test_a_ply_with_a_polygon_of_two_corners(tmp_path):
     faces = ["4 0 2 3 1 10", "2 0 1 20", "3 0 3 2 30", "3 1 2 3 40"]
     with pytest.raises(FluxError, match=r"has faces of 2 corners, a face has 3 or more\. Remove them"):
         import_flux(write_ply(tmp_path / "m.ply", ([], ["jn"]), CORNERS, faces))
+
+
+def test_a_binary_ply_of_polygons_of_several_sizes(tmp_path):
+    """Rationale: the loader takes the first size for all, and where the lengths agree misreads them in silence."""
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 4\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "element face 3\nproperty list uchar int vertex_indices\nend_header\n"
+    faces = b"".join(struct.pack(f"<B{n}i", n, *[k % 4 for k in range(n)]) for n in (4, 3, 5))
+    (tmp_path / "m.ply").write_bytes(header.encode() + POINTS.astype("<f4").tobytes() + faces)
+    with pytest.raises(FluxError, match=r"faces of different numbers of corners, in binary form\. Triangulate it"):
+        import_flux(tmp_path / "m.ply", np.ones(4))
 
 
 def test_texture_coordinates_of_a_ply_are_values_by_name_only(tmp_path):

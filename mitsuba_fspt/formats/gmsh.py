@@ -93,11 +93,12 @@ class _Reader:
         count = int(self.file.readline())
         if not self.binary:
             return np.array([int(self.file.readline().split()[0]) for _ in range(count)])
-        tags: list[Tags] = []
-        while sum(map(len, tags)) < count:
+        blocks = []
+        while count > 0:
             kind, number, labels = (int(x) for x in self._numbers("i4", 3))
-            tags.append(self._table("i4", 1 + labels + NODES[kind], number))
-        return np.concatenate(tags)
+            blocks.append(self._table("i4", 1 + labels + NODES[kind], number))
+            count -= number
+        return np.concatenate(blocks)
 
     def data(self) -> tuple[str, Tags]:
         """Name and tags of the values of a section."""

@@ -28,7 +28,7 @@ FORMATS = {
 TRIANGLES = {"triangle": 3, "triangle6": 3, "triangle7": 3}
 TETRAHEDRA = {"tetra": 4, "tetra10": 4}
 IGNORED = ("vertex", "line", "line3")
-LABELS = "gmsh:"
+LABELS = "gmsh:"  # meshio's names for what Gmsh numbers parts by
 
 
 def read_meshio(path: Path) -> RawMesh:

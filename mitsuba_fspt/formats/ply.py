@@ -36,9 +36,7 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
             raise FluxError(
                 f"'{path}' ends early: its header tells of {told} {element} lines, there are {count}. Mend it."
             )
-    corners = _corners(elements.get("face", {}).get("data", {}))
-    if min(corners, default=3) < 3:
-        raise FluxError(f"'{path}' has faces of {min(corners)} corners, a face has 3 or more. Remove them.")
+    _require_corners(elements.get("face", {}).get("data", {}), path)
     fields = []
     for on, element in (("vertex", "vertex"), ("cell", "face")):
         data = elements.get(element, {}).get("data", {})
@@ -51,13 +49,18 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
     return RawMesh(points, cells, path.name, scalars(fields)), _comments(path)
 
 
-def _corners(faces: Any) -> list[int]:
-    """The number of corners of each face, from what trimesh keeps of their lines: a structured array or columns."""
-    names = (faces.dtype.names or ()) if isinstance(faces, np.ndarray) else faces
-    name = next((name for name in ("vertex_indices", "vertex_index") if name in names), None)
-    if name is None:
-        return []
-    return faces[name]["f0"].tolist() if isinstance(faces, np.ndarray) else [np.size(line) for line in faces[name]]
+def _require_corners(faces: Any, path: Path) -> None:
+    """Refuse faces that trimesh drops or misreads; of their lines it keeps an array (binary) or columns (text)."""
+    binary = isinstance(faces, np.ndarray)
+    names = (faces.dtype.names or ()) if binary else faces
+    for name in {"vertex_indices", "vertex_index"} & set(names):
+        corners = faces[name]["f0"] if binary else np.array([np.size(line) for line in faces[name]])
+        if binary and np.ptp(corners):
+            raise FluxError(
+                f"'{path}' has faces of different numbers of corners, in binary form. Triangulate it first."
+            )
+        if corners.min() < 3:
+            raise FluxError(f"'{path}' has faces of {corners.min()} corners, a face has 3 or more. Remove them.")
 
 
 def _comments(path: Path) -> dict[str, str]:

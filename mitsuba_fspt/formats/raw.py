@@ -12,8 +12,7 @@ from ..errors import FluxError
 from ..surface import Indices, Points, boundary, compact
 from .table import pick, quoted
 
-# Numbers of the parts of a mesh.
-LABELS = "medit:"
+LABELS = "medit:"  # numbers of the parts of a mesh: good for media, never values
 
 
 @dataclass(frozen=True)

@@ -89,8 +89,8 @@ def column(array: NDArray, names: list[str], field: str | None, where: str) -> N
     if field is None and count == 1:
         return array[:, 0].astype(np.float64)
     labels = names or [str(k + 1) for k in range(count)]
-    if labels.count(field or "") > 1:
-        raise FluxError(f"{where}: {labels.count(field or '')} columns are named '{field}'. Choose one by its number.")
+    if field is not None and (same := labels.count(field)) > 1:
+        raise FluxError(f"{where}: {same} columns are named '{field}'. Choose one by its number.")
     if field in labels:
         return array[:, labels.index(field)].astype(np.float64)
     if field is not None and re.fullmatch(r"\d+", field) and 1 <= int(field) <= count:
