@@ -143,7 +143,7 @@ def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
     except ImportError as cause:
         raise BackendError(
             f"'{path}' as .{kind} needs a package that is not installed: {one_line(cause)}. Install it by pip, or save "
-            "the mesh as .ply."
+            "the mesh anew, as .ply."
         ) from cause
     except Exception as cause:  # a damaged file makes trimesh's loaders raise anything
         raise FluxError(f"'{path}' cannot be read as .{kind}: {one_line(cause)}. Is the file damaged?") from cause
