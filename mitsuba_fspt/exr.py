@@ -8,6 +8,7 @@ from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from numbers import Integral, Real
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import OpenEXR
@@ -19,9 +20,8 @@ from .errors import ImageError
 Metadata = dict[str, str | int | float]
 
 PREFIX = "fspt:"
-
-
 STREAM_BUFFER = 1 << 16  # bytes, more than any C++ library holds back
+_mute = Lock()  # the process has one standard output and one standard error: who mutes them is alone
 
 
 def write_exr(
@@ -126,9 +126,9 @@ def _muted() -> Iterator[None]:
     """Nothing of what OpenEXR prints about a damaged file, which it reports by raising as well.
 
     Its Python part prints to `sys.stdout`; its C part writes past `sys.stderr`, so that for a moment the
-    whole process has no standard error.
+    whole process has no standard error. One thread at a time: two would keep each other's muted streams.
     """
-    with redirect_stdout(StringIO()):
+    with _mute, redirect_stdout(StringIO()):
         try:
             stderr = os.dup(2)
         except OSError:  # standard error is closed already

@@ -1,6 +1,8 @@
 """Images: what goes into the file comes out of it, and a file is whole or not there."""
 
 import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import OpenEXR
@@ -227,6 +229,18 @@ def test_damaged_files(tmp_path, capfd, change, message):
         read(tmp_path / "a.exr")
     assert "\n" not in str(caught.value)
     assert capfd.readouterr() == ("", "")
+
+
+def test_reading_in_several_threads_leaves_the_streams_as_they_were(tmp_path, capfd):
+    """Seen to fail without the lock: standard output was a buffer and standard error /dev/null for good."""
+    Image(np.ones((8, 8))).write(tmp_path / "a.exr")
+    streams = sys.stdout, os.fstat(2).st_ino
+    with ThreadPoolExecutor(8) as threads:
+        images = list(threads.map(read, [tmp_path / "a.exr"] * 400))
+    assert (sys.stdout, os.fstat(2).st_ino) == streams
+    assert all((image.power == 1).all() for image in images)
+    os.write(2, b"heard")
+    assert capfd.readouterr() == ("", "heard")
 
 
 def test_files_without_power(tmp_path):
