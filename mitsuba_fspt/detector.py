@@ -24,9 +24,11 @@ from .atomic import atomic_path
 from .errors import BackendError, DetectorError, ImageError
 from .exr import Metadata, write_exr
 from .image import Image
+from .plain import number, whole
 
-# What an exposure's metadata says about its detector.
-RECORDED = ("quantum_efficiency", "dark_current", "read_noise", "full_well", "gain", "bias", "bits")
+# Of a detector, and what an exposure's metadata call them: its `pixel_pitch` there is that of the pixels read out.
+NUMBERS = ("quantum_efficiency", "dark_current", "read_noise", "full_well", "gain", "bias", "bits", "pixel_pitch")
+RECORDED = {name: name for name in NUMBERS} | {"pixel_pitch": "detector_pixel_pitch"}
 
 PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
 
@@ -146,6 +148,10 @@ class Detector:
         )
 
     def __post_init__(self) -> None:
+        for name in NUMBERS:
+            value = getattr(self, name)
+            if name != "pixel_pitch" or value is not None:
+                object.__setattr__(self, name, number(f"detector: '{name}'", value, DetectorError, "16"))
         eta, full_well, bits = self.quantum_efficiency, self.full_well, self.bits
         _require("quantum_efficiency", eta, 0 < eta <= 1, "in (0, 1], for example 0.85")
         _require("full_well", full_well, 0 < full_well <= 1e15, "in (0, 1e15] e-, for example 1e5")
@@ -154,6 +160,7 @@ class Detector:
         _require("read_noise", self.read_noise, self.read_noise >= 0, ">= 0 e-, for example 3.5")
         _require("bias", self.bias, self.bias >= 0, ">= 0 DN, for example 500")
         _require("bits", bits, bits in range(1, 17), "a whole number in 1 … 16, for example 16")
+        object.__setattr__(self, "bits", int(bits))
         if self.pixel_pitch is not None:
             _require("pixel_pitch", self.pixel_pitch, self.pixel_pitch > 0, "> 0 mm, for example 0.0135")
 
@@ -162,8 +169,7 @@ class Detector:
 
         Parameters and errors as for `expose`.
         """
-        _require("exposure_time", exposure_time, exposure_time >= 0, ">= 0 s, for example 60")
-        _require("wavelength_nm", wavelength_nm, wavelength_nm > 0, "> 0 nm, for example 650")
+        exposure_time, wavelength_nm = _light(exposure_time, wavelength_nm)
         if (darkest := image.power.min()) < 0:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
         energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
@@ -171,7 +177,7 @@ class Detector:
         pitch = image.metadata.get("pixel_pitch")
         area = 1.0 if self.pixel_pitch is None or pitch is None else (float(pitch) / self.pixel_pitch) ** 2
         charge = self.quantum_efficiency * photons + self.dark_current * exposure_time * area
-        mean = _binned(charge, binning)
+        mean = _binned(charge, _whole("binning", binning))
         return Expectation(mean, mean + self.read_noise**2)
 
     def expose(
@@ -182,8 +188,8 @@ class Detector:
         Parameters
         ----------
         image : power [W], shape (h, w), monochromatic
-        exposure_time : [s], >= 0 (0 gives a bias frame)
-        wavelength_nm : of the light in vacuum [nm], > 0
+        exposure_time : [s], 0 … 1e12 (0 gives a bias frame)
+        wavelength_nm : of the light in vacuum [nm], 1e-3 … 1e9
         binning : side of the square of pixels whose charge is summed before read-out, a divisor of h and w
         seed : of the shot and read noise, >= 0
 
@@ -191,6 +197,8 @@ class Detector:
         ------
         DetectorError : a number outside its range, or a binning that does not divide the image.
         """
+        exposure_time, wavelength_nm = _light(exposure_time, wavelength_nm)
+        seed, binning = _whole("seed", seed), _whole("binning", binning)
         _require("seed", seed, seed >= 0, ">= 0, for example 1")
         rng = np.random.default_rng(seed)
         mean = self.expected(image, exposure_time, wavelength_nm, binning=binning).mean
@@ -211,7 +219,7 @@ class Detector:
             "detector_seed": seed,
             "saturated_pixels": int(np.sum(full | (counts >= top))),
         }
-        metadata |= {name: getattr(self, name) for name in RECORDED}
+        metadata |= {told: getattr(self, name) for name, told in RECORDED.items() if getattr(self, name) is not None}
         if "pixel_pitch" in image.metadata:
             metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
         return Exposure(electrons, counts.astype(np.uint16), metadata)
@@ -227,6 +235,19 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
         )
     blocks = charge.reshape(height // binning, binning, width // binning, binning)
     return blocks.sum(axis=(1, 3))
+
+
+def _light(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
+    """Both as plain numbers, within bounds that keep dark pixels dark: 0 W times infinitely many photons is no number."""
+    time = number("detector: 'exposure_time'", exposure_time, DetectorError, "60")
+    wavelength = number("detector: 'wavelength_nm'", wavelength_nm, DetectorError, "650")
+    _require("exposure_time", time, 0 <= time <= 1e12, "in 0 … 1e12 s, for example 60")
+    _require("wavelength_nm", wavelength, 1e-3 <= wavelength <= 1e9, "in 1e-3 … 1e9 nm, for example 650")
+    return time, wavelength
+
+
+def _whole(name: str, value: int) -> int:
+    return whole(f"detector: '{name}'", value, DetectorError, "1")
 
 
 def _require(name: str, value: float, holds: bool, rule: str) -> None:

@@ -18,6 +18,7 @@ CCD = Detector.typical_ccd()
 WAVELENGTH_NM = 650.0
 # One photon of 650 nm, from the electron volt: E = 1239.841984 eV nm / λ.
 PHOTON = 1239.841984 / WAVELENGTH_NM * 1.602176634e-19  # [J]
+DARK = Image(np.zeros((4, 4)))
 
 
 def flat(photons_per_second: float, size: int = 512, **metadata: float) -> Image:
@@ -137,6 +138,20 @@ def test_converter_ends_at_its_last_count(bits):
     assert exposure.metadata["saturated_pixels"] == 64
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.int8, np.int16, np.array])
+def test_small_numbers_of_numpy_are_plain_numbers(kind):
+    """2^bits of an 8-bit 12 is no number of 8 bits. Seen to fail: every count was 255."""
+    numbers = {"gain": 2, "bits": 12, "bias": 50, "read_noise": 3, "dark_current": 1}
+    arguments = {"exposure_time": 60, "wavelength_nm": 127, "binning": 2, "seed": 9}
+    image = flat(100.0, 200)
+    plain = replace(CCD, **numbers).expose(image, **arguments)
+    small = replace(CCD, **{name: kind(value) for name, value in numbers.items()})
+    exposure = small.expose(image, **{name: kind(value) for name, value in arguments.items()})
+    np.testing.assert_array_equal(exposure.counts, plain.counts)
+    assert exposure.counts.max() > 255
+    assert json.dumps(exposure.metadata) == json.dumps(plain.metadata)
+
+
 def test_counts_end_at_zero():
     """Without a bias the read-outs below zero are lost, half of them in the dark."""
     counts = replace(CCD, bias=0, gain=0.1).expose(flat(0.0), 0.0, WAVELENGTH_NM).counts
@@ -162,6 +177,7 @@ def test_exr(tmp_path):
     expected |= {"exposure_time": 30.0, "wavelength_nm": 650.0, "binning": 4, "pixel_pitch": 0.054}
     expected |= {"quantum_efficiency": 0.85, "dark_current": 1e-3, "read_noise": 3.5, "full_well": 1e5}
     expected |= {"gain": 1.6, "bias": 500, "bits": 16, "detector": "typical, not a data sheet"}
+    expected |= {"detector_pixel_pitch": 0.0135}  # of the dark current
     assert expected.items() <= metadata.items()
 
 
@@ -214,8 +230,12 @@ def test_detectors_that_cannot_exist(name, value, rule):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"exposure_time": -1.0}, "'exposure_time' must be finite and >= 0 s, for example 60, got -1.0"),
-        ({"wavelength_nm": 0.0}, "'wavelength_nm' must be finite and > 0 nm"),
+        ({"exposure_time": -1.0}, "'exposure_time' must be finite and in 0 … 1e12 s, for example 60, got -1.0"),
+        ({"wavelength_nm": 0.0}, "'wavelength_nm' must be finite and in 1e-3 … 1e9 nm"),
+        ({"wavelength_nm": 1e308, "image": DARK}, "must be finite and in 1e-3 … 1e9 nm, for example 650, got 1e\\+308"),
+        ({"exposure_time": 1e300, "image": DARK}, "must be finite and in 0 … 1e12 s, for example 60, got 1e\\+300"),
+        ({"exposure_time": "60"}, "'exposure_time' must be a number, got '60'. Give for example 60"),
+        ({"seed": 1.5}, "'seed' must be a whole number, got 1.5. Give for example 1"),
         ({"seed": -1}, "'seed' must be finite and >= 0"),
         ({"binning": 3}, r"'binning' = 3 does not divide the image of 4 × 4 pixels. Give a divisor of 4"),
         ({"binning": 0}, "'binning' = 0 does not divide"),
