@@ -110,7 +110,8 @@ def compare(
     typer.echo(f"CF     {result.cf:.7f}   correlation factor")
     typer.echo(f"max    {result.max_error:.3e}   largest error over the standard's peak")
     typer.echo(f"RMS    {result.rms:.3e}   over the standard's peak")
-    typer.echo(f"ratio  {result.ratio:.6f}   of the total powers")
+    undefined = "none       the standard's powers add up to 0"
+    typer.echo("ratio  " + (undefined if result.ratio is None else f"{result.ratio:.6f}   of the total powers"))
     if result.z_test:
         z = result.z_test
         typer.echo(

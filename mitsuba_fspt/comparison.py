@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import ImageError
 from .image import Image
+from .plain import whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Comparison:
     cf : correlation factor, Pearson's, with sums over N − 1 (paper, section 3), in [−1, 1]
     max_error : max|P_cal − P_std| / max P_std, absolute powers: only the standard's peak scales both
     rms : √(Σ(P_cal − P_std)² / N) / max P_std, likewise absolute
-    ratio : Σ P_cal / Σ P_std of the absolute powers
+    ratio : Σ P_cal / Σ P_std of the absolute powers; None where the standard's add up to 0
     profiles : power along rows and columns
     z_test : differences against their errors; None where no image has an error above 0
     """
@@ -68,7 +68,7 @@ class Comparison:
     cf: float
     max_error: float
     rms: float
-    ratio: float
+    ratio: float | None
     profiles: tuple[Profile, ...] = field(repr=False)
     z_test: ZTest | None
 
@@ -91,16 +91,16 @@ def compare(
     calculated: Image,
     standard: Image,
     *,
-    rows: Sequence[int] | None = None,
-    columns: Sequence[int] | None = None,
+    rows: ArrayLike | None = None,
+    columns: ArrayLike | None = None,
 ) -> Comparison:
     """Distance of a calculated image from a standard of the same shape (h, w).
 
     Parameters
     ----------
     calculated, standard : power [W], for example the integral and a Monte Carlo image
-    rows, columns : numbers of the rows and columns to take profiles of, in 0 … h − 1 and 0 … w − 1; where
-        neither is given, those through the standard's brightest pixel
+    rows, columns : numbers of the rows and columns to take profiles of, in 0 … h − 1 and 0 … w − 1, one alone or
+        several; where neither is given, those through the standard's brightest pixel
 
     The z-test counts `error` as a standard deviation and the two as independent; a deterministic method's is
     a bound and makes the test milder. A Monte Carlo pixel that few samples have lit knows its error badly and
@@ -124,8 +124,8 @@ def compare(
         cf=float(np.corrcoef(normalised_cal.ravel(), normalised_std.ravel())[0, 1]),
         max_error=float(difference.max() / peak),
         rms=float(np.sqrt(np.square(difference / peak).mean())),
-        ratio=float(p_cal.sum() / p_std.sum()),
-        profiles=_profiles(p_cal, p_std, rows or (), columns or ()),
+        ratio=_ratio(float(p_cal.sum()), float(p_std.sum())),
+        profiles=_profiles(p_cal, p_std, () if rows is None else rows, () if columns is None else columns),
         z_test=_z_test(difference, calculated.error, standard.error),
     )
 
@@ -150,15 +150,21 @@ def _check(calculated: Image, standard: Image) -> None:
             )
 
 
+def _ratio(calculated: float, standard: float) -> float | None:
+    ratio = calculated / standard if standard else math.inf
+    return ratio if math.isfinite(ratio) else None
+
+
 def _profiles(
-    p_cal: NDArray[np.float64], p_std: NDArray[np.float64], rows: Sequence[int], columns: Sequence[int]
+    p_cal: NDArray[np.float64], p_std: NDArray[np.float64], rows: ArrayLike, columns: ArrayLike
 ) -> tuple[Profile, ...]:
     profiles = []
     for line, indices, cal, std in (("row", rows, p_cal, p_std), ("column", columns, p_cal.T, p_std.T)):
-        for index in indices:
+        for given in np.atleast_1d(indices):
+            index = whole(f"compare: the number of a {line}", given, ImageError, "0")
             if not 0 <= index < len(std):
                 raise ImageError(f"compare: {line} {index} does not exist. Give one in 0 … {len(std) - 1}.")
-            profiles.append(Profile(line, int(index), cal[index], std[index]))
+            profiles.append(Profile(line, index, cal[index], std[index]))
     return tuple(profiles)
 
 

@@ -19,6 +19,7 @@ from .converge_methods import Method, Shot, methods, raw_rate
 from .converge_reference import Reference, own_reference, read_reference
 from .convergence import Convergence, Row
 from .errors import FsptError, SceneError
+from .plain import number, whole
 from .scene import load
 
 if TYPE_CHECKING:
@@ -75,6 +76,9 @@ def converge(
     ------
     SceneError, OpticsError, ExitanceError, ImageError, BackendError : what is wrong and how to mend it.
     """
+    sensor = whole("converge: 'sensor'", sensor, SceneError, "0")
+    rounds = whole("converge: 'rounds'", rounds, SceneError, str(ROUNDS))
+    budget = number("converge: 'budget'", budget, SceneError, str(BUDGET))
     if not (rounds >= 1 and 0 < budget < math.inf):
         raise SceneError(f"converge: 'rounds' must be >= 1 and 'budget' > 0 s and finite, got {rounds} and {budget:g}.")
     if isinstance(scene, (str, os.PathLike)):

@@ -238,7 +238,7 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
 
 
 def _light(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
-    """Both as plain numbers, within bounds that keep dark pixels dark: 0 W times infinitely many photons is no number."""
+    """Both as plain numbers, in bounds that keep dark pixels dark: 0 W times infinitely many photons is no number."""
     time = number("detector: 'exposure_time'", exposure_time, DetectorError, "60")
     wavelength = number("detector: 'wavelength_nm'", wavelength_nm, DetectorError, "650")
     _require("exposure_time", time, 0 <= time <= 1e12, "in 0 … 1e12 s, for example 60")

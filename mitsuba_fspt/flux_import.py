@@ -21,7 +21,7 @@ def import_flux(
     mesh: MeshLike,
     values: ValuesLike | None = None,
     *,
-    field: str | None = None,
+    field: str | int | None = None,
     per: str | None = None,
     format: str = "auto",
     length_unit: str = "mm",
@@ -38,7 +38,7 @@ def import_flux(
         boundary becomes the surface; from 0, or from 1 with format 'mmc' or 'nirfast'.
     values : one value for each vertex, triangle, tetrahedron or boundary face: a file or an array. None:
         `mesh` has them.
-    field : which array, property or column holds them
+    field : which array, property or column holds them; of a table its name or its number from 1
     per : 'vertex' or 'face', what the values stand on; needed where their number or name leaves that open
     format : 'auto' (by the file's name) or one of `formats.FORMATS`
     length_unit : 'mm', 'cm' or 'm', of the mesh **and** of its values: W per square of it. MMC's values are
@@ -60,6 +60,7 @@ def import_flux(
     scale = millimetres(length_unit, "flux import")
     if per not in (None, "vertex", "face"):
         raise FluxError(f"flux import: 'per' must be vertex or face, got '{per}'.")
+    field = None if field is None else str(field)
     raw = read_mesh(mesh, values, field, format)
     found = surface_values(raw, field if values is None else None, per)
     found = replace(found, vertices=found.vertices * scale, faces=found.faces[:, ::-1] if flip else found.faces)

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 from .errors import OpticsError
+from .plain import number
 
 LARGEST = 1e30  # of a lens's numbers and of their inverses: squares stay finite
 MODELS = ("diaphragm", "hrrt", "pinhole", "ripoll")
@@ -74,7 +75,7 @@ class Lens:
 
         Lens law: 1/F = 1/u + 1/v, t = v/u. Raises OpticsError where none or several are given.
         """
-        _require_positive("focal_length", focal_length, "mm, for example 55")
+        focal_length = _require_positive("focal_length", focal_length, "mm, for example 55")
         focus = zip(FOCUS, (focus_distance, magnification, image_distance), strict=True)
         given = {name: value for name, value in focus if value is not None}
         if len(given) != 1:
@@ -83,7 +84,7 @@ class Lens:
                 f"{' and '.join(map(repr, given)) or 'none'}. Give one, for example magnification = 0.5."
             )
         ((name, value),) = given.items()
-        _require_positive(name, value, "for example magnification = 0.5")
+        value = _require_positive(name, value, "for example magnification = 0.5")
         if name == "magnification":
             focus_distance = focal_length * (1 + 1 / value)
         elif name == "image_distance":
@@ -98,6 +99,9 @@ class Lens:
         return cls(focal_length, f_number, focus_distance, **borders)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
+        for name in ("focal_length", "f_number", "focus_distance", *BORDERS):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, number(f"fspt_lens: '{name}'", value, OpticsError, "20"))
         _require_positive("focal_length", self.focal_length, "mm, for example 55")
         _require_positive("f_number", self.f_number, "f_number = F/D, for example 8")
         _require_positive("focus_distance", self.focus_distance, "mm, for example 165")
@@ -236,8 +240,11 @@ def configuration_factor(radius: float, distance: float, offset: float) -> float
     return 2 * radius**2 * distance**2 / (s * (s + z - 2 * radius**2))
 
 
-def _require_positive(name: str, value: float, example: str) -> None:
+def _require_positive(name: str, value: float, example: str) -> float:
+    """`value` as a plain number."""
+    value = number(f"fspt_lens: '{name}'", value, OpticsError, "20")
     if not (math.isfinite(value) and value > 0):
         raise OpticsError(f"fspt_lens: '{name}' must be > 0 and finite, got {value:g}. Give {example}.")
     if not 1 / LARGEST <= value <= LARGEST:
         raise OpticsError(f"fspt_lens: '{name}' must be in 1/{LARGEST:g} … {LARGEST:g}, got {value:g}. Give {example}.")
+    return value

@@ -75,8 +75,9 @@ def write_comparison_png(calculated: Image, standard: Image, path: str | os.Path
     bottom_right.set_title(f"row {row}", fontsize="medium")
     bottom_right.set_box_aspect(_aspect(standard))
     bottom_right.legend(frameon=False)
+    ratio = "none" if comparison.ratio is None else f"{comparison.ratio:.5g}"
     figure.suptitle(
-        f"ME {comparison.me:.3g},  CF {comparison.cf:.5g},  ratio of powers {comparison.ratio:.5g},  "
+        f"ME {comparison.me:.3g},  CF {comparison.cf:.5g},  ratio of powers {ratio},  "
         f"of the peak: rms {comparison.rms:.2g}, largest error {comparison.max_error:.2g}"
     )
     save_figure(figure, path)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import SceneError
+from .plain import number, whole
 from .shortcuts import SHORTCUTS, Finding
 
 DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
@@ -36,6 +37,9 @@ class Quadrature:
     shortcuts_off: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "rtol", number("fspt_integral: 'rtol'", self.rtol, SceneError, "1e-3"))
+        nodes = whole("fspt_integral: 'max_nodes'", self.max_nodes, SceneError, "200000")
+        object.__setattr__(self, "max_nodes", nodes)
         if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
             raise SceneError(f"fspt_integral: 'rtol' must be in (0, 1), got {self.rtol:g}. Give for example 1e-3.")
         if self.domain not in DOMAINS:

@@ -18,6 +18,7 @@ from .errors import SceneError
 from .image import Image
 from .interrupt import ctrl_c_noted
 from .optics import NUMBERS
+from .plain import whole
 from .quadrature import Quadrature
 from .scene import load
 from .shortcuts import SHORTCUTS
@@ -66,6 +67,7 @@ def render(
     if not _is_scene(scene):
         scene = load(scene)
     backend.ensure_variant()
+    sensor = whole("render: 'sensor'", sensor, SceneError, "0")
     lens = sensor_of(scene, sensor)
     integrator = integrator_of(scene, method)
     accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
@@ -85,7 +87,7 @@ def render(
         if deterministic:
             power, error, coverage, how = _integrate(scene, lens, integrator, accuracy, tell)
         else:
-            spp, seed = 256 if spp is None else spp, seed or 0
+            spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
             power, error, coverage, how = _sample(scene, lens, integrator, spp, seed, tell)
         check_interrupt()
     how["wall_time"] = time.perf_counter() - start
@@ -101,9 +103,10 @@ def _integrate(
     own = asdict(integrator.quadrature)
     wanted = own | {name: value for name, value in accuracy.items() if value is not None}
     progress("integrating", 0.0)
-    solution = integrator.solve(scene, lens, Quadrature(**wanted))
-    how = {"method": "integral", **wanted, "nodes": solution.rays, "levels": "; ".join(solution.levels)}
-    how["shortcuts_off"] = ", ".join(sorted(wanted["shortcuts_off"])) or "nothing"
+    quadrature = Quadrature(**wanted)
+    solution = integrator.solve(scene, lens, quadrature)
+    how = {"method": "integral", **asdict(quadrature), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
+    how["shortcuts_off"] = ", ".join(sorted(quadrature.shortcuts_off)) or "nothing"
     how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
     return solution.power, solution.error, solution.coverage, how
 
@@ -122,6 +125,8 @@ def _sample(
     from .plugins.pupil_form import coverage
 
     check_scene(scene, lens)
+    spp = whole("render: 'spp'", spp, SceneError, "256")
+    seed = whole("render: 'seed'", seed, SceneError, "1")
     if spp < 2:
         raise SceneError(f"render: 'spp' must be >= 2 for a standard error, got {spp}. Give for example 256.")
     if not 0 <= seed < 1 << 32:
@@ -165,12 +170,29 @@ def _is_scene(scene: object) -> bool:
 
 
 def sensor_of(scene: mi.Scene, number: int) -> mi.Sensor:
-    """Sensor `number` of a scene; SceneError where there is none."""
+    """Sensor `number` of a scene; SceneError where there is none, or what is given is no scene of this variant."""
+    _check_kind(scene)
     sensors = scene.sensors()
     if not 0 <= number < len(sensors):
         rule = f"Give 0 to {len(sensors) - 1}." if sensors else "Give it an 'fspt_lens'."
         raise SceneError(f"scene: sensor {number} does not exist, the scene has {len(sensors)}. {rule}")
     return sensors[number]
+
+
+def _check_kind(scene: object) -> None:
+    import mitsuba as mi
+
+    if isinstance(scene, mi.Scene):
+        return
+    home = getattr(scene, "variant_name", None)
+    if type(scene).__name__ == "Scene" and home is not None:
+        raise SceneError(
+            f"scene: loaded in the variant {home()}, which none but that can render; the active one is {mi.variant()}. "
+            "Load it again, or set its variant."
+        )
+    raise SceneError(
+        f"scene: must be a Mitsuba scene or the name of a file, got {type(scene).__name__}. Give what `load` returns."
+    )
 
 
 def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:

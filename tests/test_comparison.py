@@ -76,6 +76,30 @@ def test_profiles():
     assert compare(CALCULATED, STANDARD, rows=[]).profiles == ()
 
 
+def test_profiles_of_an_array_of_rows_or_of_one_alone():
+    """Seen to fail with a ValueError and a TypeError."""
+    profiles = compare(CALCULATED, STANDARD, rows=np.arange(2), columns=1).profiles
+    assert [(profile.line, profile.index) for profile in profiles] == [("row", 0), ("row", 1), ("column", 1)]
+    json.dumps(compare(CALCULATED, STANDARD, rows=np.arange(2)).to_dict())
+    for wrong in ([0.5], ["0"], [None]):
+        with pytest.raises(ImageError, match=r"number of a row must be a whole number, got .*Give for example 0"):
+            compare(CALCULATED, STANDARD, rows=wrong)
+
+
+def test_powers_that_add_up_to_0_have_no_ratio(run, tmp_path):
+    """Seen to fail: a warning of NumPy, 'nan' and a NaN that is no JSON."""
+    image = Image(np.array([[1.0, -1.0], [2.0, -2.0]]))
+    image.write(tmp_path / "z.exr")
+    assert compare(STANDARD, image).ratio is None
+    assert compare(image, STANDARD).ratio == 0
+    code, out, err = run("compare", tmp_path / "z.exr", tmp_path / "z.exr")
+    assert (code, err) == (0, "")
+    assert "ratio  none       the standard's powers add up to 0\n" in out
+    code, out, err = run("compare", tmp_path / "z.exr", tmp_path / "z.exr", "--json", "--png", tmp_path / "z.png")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["ratio"] is None
+
+
 def test_z_by_hand():
     """Differences 1, 0, 2, 3 over deviations 5 = √(3² + 4²), 0, 2, 0: z = .2 and 1; the 3 is not judged."""
     calculated = replace(CALCULATED, error=np.array([[3, 0], [2, 0]]) * 1e-9)

@@ -317,6 +317,19 @@ def test_nirfast(tmp_path, suffix):
     np.testing.assert_allclose(in_memory.exitance, phantom.exitance, rtol=1e-6)
 
 
+@pytest.mark.parametrize("number", [2, np.int64(2), "2"])
+def test_a_column_by_its_number(tmp_path, number):
+    """Seen to fail: no number that is no text was taken."""
+    nodes, elements = block()
+    table = np.column_stack([np.ones(27), np.arange(27.0)])
+    write(tmp_path / "values.txt", rows(table))
+    by_file = import_flux((nodes, elements), tmp_path / "values.txt", field=number, per="vertex")
+    by_array = import_flux((nodes, elements), table, field=number, per="vertex")
+    alone = import_flux((nodes, elements), table[:, 1], per="vertex")
+    np.testing.assert_array_equal(by_file.exitance, alone.exitance)
+    np.testing.assert_array_equal(by_array.exitance, alone.exitance)
+
+
 @pytest.mark.parametrize("kind", ["stnd", "fluor", "blt"])
 def test_nirfast_refractive_index_of_param(tmp_path, kind):
     """The .param file tells n: A(1.53) where it says so, node by node, unless n is given."""

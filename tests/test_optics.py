@@ -143,3 +143,16 @@ def test_configuration_factor_far_and_near():
     """R²/u² without a digit lost for a tiny disc; all the light for an endless one."""
     assert configuration_factor(1e-6, 165.0, 0.0) == pytest.approx((1e-6 / 165) ** 2, rel=1e-12)
     assert configuration_factor(1e6, 1.0, 10.0) == pytest.approx(1, rel=1e-9)
+
+
+def test_small_numbers_of_numpy_are_plain_numbers():
+    """Seen to fail: F u of two 8-bit numbers overflows."""
+    numbers = {"focal_length": 100, "f_number": 5, "lens_diameter": 60, "diaphragm_distance": 10}
+    plain = Lens.focused(**numbers, magnification=1)
+    for kind in (np.uint8, np.array):
+        lens = Lens.focused(**{name: kind(value) for name, value in numbers.items()}, magnification=kind(1))
+        assert lens == plain
+        assert {type(value) for value in (lens.focal_length, lens.image_distance, lens.discs[0].radius)} == {float}
+    assert Lens(np.int8(50), 8, np.int8(100)).image_distance == 100
+    with pytest.raises(OpticsError, match=r"'f_number' must be a number, got '8'\. Give for example"):
+        Lens(55.0, "8", 165.0)

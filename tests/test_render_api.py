@@ -206,6 +206,14 @@ WRONG = {
     "rtol nan": ({"rtol": float("nan")}, "'rtol' must be in (0, 1), got nan"),
     "domain": ({"domain": "sphere"}, "'domain' must be one of pupil, surface, got 'sphere'"),
     "pixel": ({"pixel": "corner"}, "'pixel' must be one of area, centre, got 'corner'"),
+    "rtol as text": ({"rtol": "1e-3"}, "'rtol' must be a number, got '1e-3'. Give for example 1e-3"),
+    "rtol beyond floats": ({"rtol": 10**400}, "'rtol' must be in (0, 1), got inf"),
+    "rtol in a list": ({"rtol": np.array([1e-3])}, "'rtol' must be a number, got array([0.001]). Give"),
+    "half a node": ({"max_nodes": 100.5}, "'max_nodes' must be a whole number, got 100.5. Give for example 200000"),
+    "nodes without end": ({"max_nodes": float("inf")}, "'max_nodes' must be a whole number, got inf"),
+    "sensor as text": ({"sensor": "0"}, "'sensor' must be a whole number, got '0'. Give for example 0"),
+    "half a sample": ({"method": "path", "spp": 16.5}, "'spp' must be a whole number, got 16.5. Give for example 256"),
+    "seed as text": ({"method": "path", "seed": "1"}, "'seed' must be a whole number, got '1'. Give for example 1"),
     "max_nodes": ({"max_nodes": 0}, "'max_nodes' must be >= 1, got 0"),
 }
 
@@ -217,6 +225,33 @@ def test_settings_that_mean_nothing_are_refused(scene, name):
         fspt.render(scene, **options)
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_numbers_of_numpy_and_arrays_without_axes_are_numbers(scene, tmp_path):
+    """Seen to fail when written: an array is no metadata."""
+    plain = fspt.render(scene, sensor=1, rtol=0.5, max_nodes=100)
+    image = fspt.render(scene, sensor=np.int8(1), rtol=np.array(0.5), max_nodes=np.uint8(100))
+    np.testing.assert_array_equal(image.power, plain.power)
+    image.write(tmp_path / "a.exr")
+    plain.metadata["wall_time"] = image.metadata["wall_time"]
+    assert image.metadata == plain.metadata
+    plain, image = (fspt.render(scene, method="path", spp=kind(16), seed=kind(3)) for kind in (int, np.array))
+    np.testing.assert_array_equal(image.power, plain.power)
+    image.write(tmp_path / "a.exr")
+
+
+def test_a_scene_of_another_variant_is_told_from_what_is_no_scene(scene):
+    """Seen to fail: 'Broadcast from type mitsuba.Shape to type mitsuba.Shape failed'."""
+    before = mi.variant()
+    mi.set_variant("llvm_ad_rgb")
+    try:
+        with pytest.raises(SceneError, match=rf"in the variant {before}, .* the active one is llvm_ad_rgb\. Load"):
+            fspt.render(scene)
+    finally:
+        mi.set_variant(before)
+    for wrong in (None, 5, {"type": "scene"}, scene.sensors()[0]):
+        with pytest.raises(SceneError, match=r"must be a Mitsuba scene or the name of a file, got \w+\. Give"):
+            fspt.render(wrong)
 
 
 def test_only_a_lens_makes_watts():
