@@ -95,13 +95,13 @@ def png_file(found: Convergence, path: str | os.PathLike[str]) -> AbstractContex
     panels = [panel for panel in panels if not all(map(math.isnan, panel[2]))]
     figure = picture.empty_figure(width=1.0 + 3.9 * len(panels), height=5.6)
     every = figure.subplots(1, len(panels), sharey=True)
-    bottom = found.stated / 4
+    bottom = found.stated / 4 or min((e for *_, errors in panels for e in errors if e > 0), default=1.0)
     for axes, (title, stated, errors) in zip(every, panels, strict=True):
         _draw(axes, found, errors, stated, bottom)
         axes.set_title(title, fontsize="medium")
         axes.set_xlabel("run time, warm [s]")
     every[0].set_ylabel("error / brightest pixel")
-    top = max(row.largest for row in found.rows)
+    top = max(bottom, *(row.largest for row in found.rows))
     every[0].set_ylim(bottom / 1.5, 2 * top)
     handles, labels = every[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize="small")
@@ -121,6 +121,14 @@ def _draw(axes: Axes, found: Convergence, errors: list[float], stated: float, bo
         below = [(t, h) for t, h, (_, e) in zip(times, heights, points, strict=True) if e < stated]
         hollow = style | {"linestyle": "none", "markerfacecolor": "white", "zorder": style["zorder"] + 0.5}
         axes.plot([t for t, _ in below], [h for _, h in below], **hollow)
+    if stated > 0:
+        _draw_stated(axes, stated)
+    axes.grid(which="major", color="0.9", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_stated(axes: Axes, stated: float) -> None:
     axes.axhline(stated, color="0.3", linestyle=":", linewidth=1.2)
     axes.annotate(
         "the reference's own error",
@@ -132,6 +140,3 @@ def _draw(axes: Axes, found: Convergence, errors: list[float], stated: float, bo
         color="0.3",
         fontsize="small",
     )
-    axes.grid(which="major", color="0.9", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)

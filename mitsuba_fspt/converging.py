@@ -102,6 +102,9 @@ def converge(
             skipped[method.name] = str(refusal)
         else:
             skipped |= too_long
+    if not bench.trials:
+        name, why = next(iter(skipped.items()))
+        raise SceneError(f"converge: nothing to time; {name}: {why}, 'budget' is {budget:g} s. Give a longer one.")
     raws = {raw: raw() for raw in (raw_rate(scene, lens, together) for together in (False, True))}
     raw_seconds: dict[object, list[float]] = {raw: [] for raw in raws}
     for k in range(rounds):

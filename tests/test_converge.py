@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import os
+import re
 import sys
 import time
 
@@ -119,6 +120,15 @@ def test_text_and_json_hold_what_was_found():
 
 
 # --- what is measured ---
+
+
+@pytest.mark.parametrize("errors", [[0.1], [0.1, 0.01], [0.0]])
+@pytest.mark.parametrize("stated", [0.0, 1e-7])
+def test_a_picture_of_few_settings_or_without_an_error_of_the_reference(tmp_path, errors, stated):
+    """Seen to fail: warnings of an axis that starts at 0."""
+    few = found(*(row("ptracer", error, (0.001,)) for error in errors), stated=stated)
+    with png_file(few, tmp_path / "a.png"):
+        pass
 
 
 @pytest.fixture
@@ -330,6 +340,16 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capfd, arguments, to
     assert out == ""
     assert len(err.splitlines()) == 1
     assert told in err
+    assert os.listdir(tmp_path) == ["s.xml"]
+
+
+@pytest.mark.usefixtures("mono", "short", "in_a_folder_of_its_own")
+def test_a_budget_too_short_for_any_setting_is_refused(tmp_path, capfd):
+    """Seen to fail with a ValueError of the picture."""
+    assert cli.run(["converge", "s.xml", "--budget", "1e-9", "--rounds", "1"]) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert re.fullmatch(r"fspt: converge: nothing to time; integral: its .*, 'budget' is 1e-09 s\. Give a .*\n", err)
     assert os.listdir(tmp_path) == ["s.xml"]
 
 
