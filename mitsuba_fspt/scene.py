@@ -5,13 +5,16 @@ from __future__ import annotations
 import itertools
 import os
 import re
-import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from . import backend
 from .errors import SceneError
 from .interrupt import ctrl_c_noted
+from .scene_xml import read_xml
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -60,24 +63,9 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     return scene
 
 
-def defaults(path: str | os.PathLike[str]) -> dict[str, str]:
-    """Names and values of the `<default>` parameters of a scene file and the files it includes."""
-    path = Path(path)
-    try:
-        root = ElementTree.parse(path).getroot()
-    except OSError as error:
-        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}. Check the name.") from error
-    except ElementTree.ParseError as error:
-        raise SceneError(f"{path}: not valid XML: {error}. Mend that line.") from error
-    found: dict[str, str] = {}
-    for include in root.iter("include"):
-        inner = path.parent / include.get("filename", "")
-        found |= defaults(inner) if inner.is_file() else {}
-    return found | {node.get("name", ""): node.get("value", "") for node in root.iter("default")}
-
-
-def check_parameters(path: Path, parameters: dict[str, object]) -> None:
-    known = defaults(path)
+def check_parameters(path: Path, parameters: Mapping[str, object]) -> None:
+    """Raise SceneError for a name that is no `<default>` of the file or of what it includes with these values."""
+    known = read_xml(path, {name: parameter_text(value) for name, value in parameters.items()}).defaults
     for name in parameters:
         if name not in known:
             names = ", ".join(known) or "none"
@@ -87,7 +75,7 @@ def check_parameters(path: Path, parameters: dict[str, object]) -> None:
 
 
 def parameter_text(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    return str(value).lower() if isinstance(value, (bool, np.bool_)) else str(value)
 
 
 def _name_children(state: mi.parser.ParserState) -> None:

@@ -64,23 +64,20 @@ def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Set
     texts = {name: _texts(name, given) for name, given in values.items()}
     if not texts:
         raise SceneError(f"sweep: no parameter to vary over {scene}. Give one, for example -D f_number=2.8,5.6.")
-    check_parameters(scene, dict(texts))
-    source = Source(scene)
+    every = [dict(zip(texts, one, strict=True)) for one in itertools.product(*texts.values())]
+    digests: dict[Path, str] = {}
+    return [_point(scene, parameters, digests, dict(settings)) for parameters in every]
+
+
+def _point(scene: Path, parameters: dict[str, str], digests: dict[Path, str], settings: dict[str, Setting]) -> Point:
+    check_parameters(scene, parameters)
+    source = Source(scene, parameters, digests)
+    source.check()
     lens = source.lens_parameters()
-    return [
-        _point(source, dict(zip(texts, one, strict=True)), lens, dict(settings))
-        for one in itertools.product(*texts.values())
-    ]
-
-
-def _point(
-    source: Source, parameters: dict[str, str], lens: dict[str, tuple[str, ...]], settings: dict[str, Setting]
-) -> Point:
-    source.check(parameters)
     moving = {name: lens[name] for name in parameters if name in lens}
     standing = {name: value for name, value in parameters.items() if name not in moving}
     versions = [version(name) for name in ("mitsuba-fspt", "mitsuba")]
-    geometry = _hash(versions, source.digests(parameters), standing)
+    geometry = _hash(versions, source.digests(), standing)
     fingerprint = _hash(geometry, {name: parameters[name] for name in moving}, settings)
     path = source.path
     return Point(str(path), path.absolute(), parameters, moving, settings, geometry, fingerprint)
@@ -88,7 +85,7 @@ def _point(
 
 def _texts(name: str, given: object) -> list[str]:
     """Values of a parameter as the scene file would spell them; one alone need not be in a list."""
-    several = isinstance(given, Iterable) and not isinstance(given, (str, bytes))
+    several = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and getattr(given, "ndim", 1) > 0
     values = list(given) if several else [given]  # type: ignore[call-overload]
     texts = [parameter_text(value).strip() for value in values]
     if not texts or "" in texts:

@@ -7,33 +7,37 @@ import math
 import os
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from .errors import SceneError
 from .optics import NUMBERS, Lens
-from .scene import defaults
+from .scene_xml import read_xml
 
 REFERENCE = re.compile(r"\$(\w+)")
 
 
 class Source:
-    """A scene file and the files it includes, as they were when read.
+    """A scene file and the files it includes with some values of its parameters, as they were when read.
+
+    `digests` are known of files already; sources that share them read a file once.
 
     Raises
     ------
     SceneError : the file or one that it includes cannot be read or is not valid XML.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(
+        self, path: Path, parameters: Mapping[str, str] | None = None, digests: dict[Path, str] | None = None
+    ) -> None:
         self.path = path
-        self.defaults = defaults(path)
-        self._files = list(_with_includes(path))
-        self._nodes = [node for file in self._files for node in ElementTree.parse(file).getroot().iter()]
+        self._parameters = parameters or {}
+        self._xml = read_xml(path, self._parameters)
+        self._nodes = self._xml.nodes
         sensors = [node for node in self._nodes if node.tag == "sensor"]
         # Children of the lens, where there is one and no other sensor.
         self._lens = list(sensors[0]) if [node.get("type") for node in sensors] == ["fspt_lens"] else []
-        self._digests: dict[str, str] = {}
+        self._digests = {} if digests is None else digests
 
     def lens_parameters(self) -> dict[str, tuple[str, ...]]:
         """Parameters that set numbers of the only `fspt_lens` and nothing else, with the names of these numbers."""
@@ -47,53 +51,38 @@ class Source:
         elsewhere = " ".join(text for node in self._nodes if node not in ours for text in node.attrib.values())
         return {name: numbers for name, numbers in found.items() if f"${name}" not in elsewhere}
 
-    def check(self, parameters: Mapping[str, str]) -> None:
+    def check(self) -> None:
         """Raise SceneError or OpticsError for a value that is no number where one is due, or that no lens can have."""
         for node in self._nodes:
             for attribute, text in node.attrib.items():
                 reference = REFERENCE.fullmatch(text)
-                if reference and reference[1] in parameters and _is_number_due(node, attribute):
-                    _require_number(reference[1], parameters[reference[1]])
-        self._check_lens(parameters)
+                if reference and reference[1] in self._parameters and _is_number_due(node, attribute):
+                    _require_number(reference[1], self._parameters[reference[1]])
+        self._check_lens()
 
-    def _check_lens(self, parameters: Mapping[str, str]) -> None:
+    def _check_lens(self) -> None:
         """Before the work, not after half of it; what the scene file does not say in so many words is left to it."""
-        given = {node.get("name", ""): self._fill_in(node.get("value", ""), parameters) for node in self._lens}
+        given = {node.get("name", ""): self._xml.fill_in(node.get("value", "")) for node in self._lens}
         numbers = {name: text for name, text in given.items() if name in NUMBERS}
         plain = all(map(_is_number, numbers.values())) and "include" not in {node.tag for node in self._lens}
         if plain and {"focal_length", "f_number"} <= set(numbers):
             model = given.get("model", "diaphragm")
             Lens.focused(model=model, **{name: float(text) for name, text in numbers.items()})  # type: ignore[arg-type]
 
-    def digests(self, parameters: Mapping[str, str]) -> list[tuple[str, str]]:
+    def digests(self) -> list[tuple[str, str]]:
         """Name and SHA-256 of the scene file, of what it includes and of every file that its attributes name."""
-        folders = [self.path.parent, *(file.parent for file in self._files), Path()]
-        folders += [self.path.parent / node.get("value", "") for node in self._nodes if node.tag == "path"]
-        found = {str(file): self._digest(file) for file in self._files}
+        found = set(self._xml.files)
         for text in {text for node in self._nodes for text in node.attrib.values()}:
-            name = self._fill_in(text, parameters)
-            file = next((folder / name for folder in folders if os.path.isfile(folder / name)), None)
-            if file is not None:
-                found[str(file)] = self._digest(file)
+            name = self._xml.fill_in(text)
+            for folder in {file.parent for file in self._xml.files}:
+                found.update(self._xml.places(name, folder))
         # A scene that moved with its data is the same scene.
-        return sorted((os.path.relpath(name, self.path.parent), digest) for name, digest in found.items())
+        return sorted({(os.path.relpath(file, self.path.parent), self._digest(file)) for file in found})
 
     def _digest(self, file: Path) -> str:
-        if str(file) not in self._digests:
-            self._digests[str(file)] = _sha256(file)
-        return self._digests[str(file)]
-
-    def _fill_in(self, text: str, parameters: Mapping[str, str]) -> str:
-        values = {**self.defaults, **parameters}
-        return REFERENCE.sub(lambda found: values.get(found[1], found[0]), text)
-
-
-def _with_includes(path: Path) -> Iterator[Path]:
-    yield path
-    for include in ElementTree.parse(path).getroot().iter("include"):
-        inner = path.parent / include.get("filename", "")
-        if inner.is_file():
-            yield from _with_includes(inner)
+        if file not in self._digests:
+            self._digests[file] = _sha256(file)
+        return self._digests[file]
 
 
 def _is_number_due(node: ElementTree.Element, attribute: str) -> bool:

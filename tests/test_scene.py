@@ -28,7 +28,7 @@ import mitsuba_fspt as fspt  # noqa: E402
 from mitsuba_fspt.errors import ExitanceError, SceneError  # noqa: E402
 from mitsuba_fspt.plugins import intersections  # noqa: E402
 from mitsuba_fspt.plugins.intersections import lost_rays  # noqa: E402
-from mitsuba_fspt.scene import defaults  # noqa: E402
+from mitsuba_fspt.scene_xml import read_xml  # noqa: E402
 
 PLY_XML = """
     <shape type="ply">
@@ -60,7 +60,33 @@ def test_parameters_replace_the_defaults_of_the_file(tmp_path):
     assert wide.sensors()[0].optics.f_number == pytest.approx(2.8)
     assert plain.id() == str(path)
     assert wide.id() == f"{path} f_number=2.8 distance=170"
-    assert defaults(path) == {"f_number": "8", "distance": "165"}
+    assert read_xml(path, {}).defaults == {"f_number": "8", "distance": "165"}
+
+
+def test_a_parameter_may_name_the_file_to_include_and_set_what_that_has(tmp_path):
+    """Its `<default>`s count from there on, as in the file itself. Seen to fail: no parameter 'radius'."""
+    path = write_scene(
+        tmp_path / "s.xml", shapes='<default name="part" value="p"/><include filename="$part_$part.xml"/>'
+    )
+    for name, radius in (("p_p.xml", 1), ("q_q.xml", 2)):
+        ball = BALL_XML.replace('"3"', '"$radius"')
+        (tmp_path / name).write_text(f'<scene version="3.0.0"><default name="radius" value="{radius}"/>{ball}</scene>')
+    for given, radius in (({}, 1), ({"part": "q"}, 2), ({"part": "q", "radius": 4}, 4)):
+        assert fspt.load(path, **given).shapes()[0].bbox().max.x == pytest.approx(radius)
+    with pytest.raises(SceneError, match=r"has no parameter 'size'\. .*: f_number, distance, part, radius\."):
+        fspt.load(path, size=1)
+
+
+def test_a_name_in_a_text_is_read_as_mitsuba_does(tmp_path):
+    """The longest name that fits, the first `<default>` of a name, and values of those before in those after."""
+    (tmp_path / "s.xml").write_text(
+        '<scene version="3.0.0"><default name="f" value="1"/><default name="f_n" value="$f.5"/>'
+        '<default name="f" value="9"/></scene>'
+    )
+    scene = read_xml(tmp_path / "s.xml", {})
+    assert scene.defaults == {"f": "1", "f_n": "1.5"}
+    assert [scene.fill_in(text) for text in ("$f_nx", "$f_m", "$g $")] == ["1.5x", "1_m", "$g $"]
+    assert read_xml(tmp_path / "s.xml", {"f": "2"}).fill_in("$f_n") == "2.5"
 
 
 def test_files_are_looked_for_beside_the_scene_and_nowhere_after(tmp_path, monkeypatch):

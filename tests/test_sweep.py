@@ -127,7 +127,7 @@ def test_one_load_a_geometry_and_the_bits_of_scenes_loaded_one_by_one(scene, tmp
 
 
 def test_values_are_numbers_arrays_text_or_one_alone(scene):
-    rows = fspt.sweep(scene, {"f_number": np.array([4.0, 5.6]), "distance": 170}, "o")
+    rows = fspt.sweep(scene, {"f_number": np.array([4.0, 5.6]), "distance": np.array(170)}, "o")
     assert [row.parameters for row in rows] == [{"f_number": f, "distance": "170"} for f in ("4.0", "5.6")]
     assert rows[1].file.name == "s_f_number=5.6_distance=170.exr"
 
@@ -222,6 +222,39 @@ def test_a_change_of_what_makes_an_image_makes_it_anew(tmp_path, calls, what):
     assert rendered == ([] if what == "nothing" else ["f_number=8"])
     if what == "data":
         assert after.power == pytest.approx(2 * before.power, rel=1e-5)
+
+
+@pytest.mark.parametrize("where", ["", "sub", "deep"])
+def test_a_change_of_what_an_included_file_includes_makes_an_image_anew(tmp_path, calls, where):
+    """The first name depends on a parameter. Seen to fail: the image of the old ball stayed, with its old row."""
+    for folder in ("sub", "deep/sub"):
+        (tmp_path / folder).mkdir(parents=True)
+    include = '<scene version="3.0.0">{}<include filename="inner.xml"/></scene>'
+    outer = "deep/outer" if where == "deep" else "outer"
+    shapes = '<default name="part" value=""/><path value="sub"/><include filename="$part.xml"/>'
+    path = write_scene(tmp_path / "x.xml", shapes=shapes)
+    (tmp_path / f"{outer}.xml").write_text(include.format('<path value="sub"/>'))
+    inner = tmp_path / os.path.dirname(outer) / where.replace("deep", "sub") / "inner.xml"
+    inner.write_text(f'<scene version="3.0.0">{BALL_XML}</scene>')
+    rendered, _ = calls
+    (before,) = fspt.sweep(path, {"part": outer}, "o")
+    inner.write_text(inner.read_text().replace('"3"', '"1.5"'))
+    (after,) = fspt.sweep(path, {"part": outer}, "o")
+    assert len(rendered) == 2
+    assert after.power < before.power / 3
+    assert fspt.sweep(path, {"part": outer}, "o") == [after]
+    assert len(rendered) == 2
+
+
+def test_a_parameter_of_a_file_that_another_parameter_names(tmp_path):
+    path = write_scene(tmp_path / "x.xml", shapes='<default name="part" value=""/><include filename="$part.xml"/>')
+    for name in ("a", "b"):
+        parameter, ball = f'<default name="{name}" value="3"/>', BALL_XML.replace('"3"', f'"${name}"')
+        (tmp_path / f"{name}.xml").write_text(f'<scene version="3.0.0">{parameter}{ball}</scene>')
+    small, large = fspt.sweep(path, {"part": "a", "a": [1.5, 3]}, "o")
+    assert large.power > 3 * small.power
+    with pytest.raises(SceneError, match=r"has no parameter 'a'\. Its <default> parameters: .*, part, b"):
+        fspt.sweep(path, {"part": ["a", "b"], "a": [1.5, 3]}, "o")
 
 
 # --- several processes ---
