@@ -43,11 +43,17 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
 
 
 def require_place(path: Path, error: type[FsptError] = FsptError) -> None:
-    """Raise `error` where no file can stand at `path`: a folder does, or something write-protected, or no folder is."""
+    """Raise `error` where no file can stand at `path`, for what stands there, for want of a folder or for its name."""
     if os.path.isdir(path):
         raise error(f"output file '{path}' is a folder. Give the name of a file in it.")
     if not os.path.isdir(path.parent):
         raise error(f"output file '{path}': the folder '{path.parent}' does not exist. Create it first.")
+    try:
+        os.lstat(path)
+    except FileNotFoundError:
+        pass
+    except OSError as cause:  # a name too long
+        raise error(f"output file '{path}' cannot be written: {cause.strerror}. Give another name.") from cause
     if os.path.exists(path) and not os.access(path, os.W_OK):
         raise error(f"output file '{path}' is write-protected. Give another name or remove it first.")
 

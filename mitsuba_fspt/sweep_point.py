@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from .sweep_source import Source
 
 Setting = str | int | float | None
 LONGEST = 60  # characters of a value in a file name
+MOST_BYTES = 250  # of a file name before its suffix: all file systems in use hold 255
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ class Point:
     def file(self) -> str:
         """Name of the image, 'nylon_cylinder_f_number=2.8_view=90.exr'."""
         values = (f"{name}={_in_a_name(value)}" for name, value in self.parameters.items())
-        return "_".join([self.path.stem, *values]) + ".exr"
+        name = "_".join([self.path.stem, *values])
+        return (name if len(os.fsencode(name)) <= MOST_BYTES else _shortened(name)) + ".exr"
 
 
 def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Setting]) -> list[Point]:
@@ -99,7 +102,17 @@ def _texts(name: str, given: object) -> list[str]:
 def _in_a_name(value: str) -> str:
     """`value`, or where a file name cannot hold it, what it can and a hash that keeps values apart."""
     plain = re.sub(r"[^\w.+-]", "-", value)[:LONGEST]
-    return plain if plain == value else f"{plain}-{hashlib.sha256(value.encode()).hexdigest()[:8]}"
+    return plain if plain == value else f"{plain}-{_short_hash(value)}"
+
+
+def _shortened(name: str) -> str:
+    """The beginning of a name that is too long, and a hash that keeps points apart."""
+    beginning = os.fsencode(name)[: MOST_BYTES - 9].decode(errors="ignore")
+    return f"{beginning}-{_short_hash(name)}"
+
+
+def _short_hash(text: str) -> str:
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:8]
 
 
 def _hash(*parts: object) -> str:

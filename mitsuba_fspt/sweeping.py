@@ -16,7 +16,8 @@ from .atomic import atomic_path
 from .errors import ImageError, SceneError
 from .image import Image, read
 from .interrupt import ctrl_c_held
-from .sweep_point import Point, points
+from .plain import number, whole
+from .sweep_point import Point, Setting, points
 
 if TYPE_CHECKING:
     from .rendering import Progress
@@ -86,8 +87,14 @@ def sweep(
     BackendError : no such scheduler, dask is missing, a worker died thrice at one point, no LLVM.
     """
     folder = Path(folder)
+    jobs = None if jobs is None else whole("sweep: 'jobs'", jobs, SceneError, "2")
     _check_jobs(jobs, scheduler)
-    settings = {"method": method, "rtol": rtol, "spp": spp, "seed": seed}
+    settings: dict[str, Setting] = {
+        "method": method,
+        "rtol": None if rtol is None else number("sweep: 'rtol'", rtol, SceneError, "1e-3"),
+        "spp": None if spp is None else whole("sweep: 'spp'", spp, SceneError, "256"),
+        "seed": None if seed is None else whole("sweep: 'seed'", seed, SceneError, "1"),
+    }
     wanted = points(Path(scene), parameters, settings)
     _check_names(wanted)
     _check_folder(folder)
@@ -144,7 +151,7 @@ def _by_geometry(missing: Iterable[Point]) -> list[Point]:
 
 def _finished(point: Point, folder: Path) -> Row | None:
     """The row of an image that is there, whole, and made from all that would make it now."""
-    if not (folder / point.file).is_file():
+    if not os.path.isfile(folder / point.file):
         return None
     try:
         image = read(folder / point.file)
@@ -185,10 +192,16 @@ def _check_names(wanted: list[Point]) -> None:
 
 def _check_folder(folder: Path) -> None:
     """Refuse a folder that cannot be written before the work, not after it."""
-    if folder.exists() and not folder.is_dir():
+    if os.path.exists(folder) and not folder.is_dir():
         raise ImageError(f"sweep: the folder '{folder}' is a file. Give another name with -o.")
-    standing = folder if folder.is_dir() else folder.parent
-    if not standing.is_dir():
+    standing = folder if os.path.isdir(folder) else folder.parent
+    if not os.path.isdir(standing):
         raise ImageError(f"sweep: '{folder}': the folder '{standing}' does not exist. Make it, or write elsewhere.")
     if not os.access(standing, os.W_OK):
         raise ImageError(f"sweep: the folder '{standing}' is not writable. Write elsewhere with -o.")
+    try:
+        os.stat(folder)
+    except FileNotFoundError:
+        pass
+    except OSError as cause:  # a name too long
+        raise ImageError(f"sweep: the folder '{folder}' cannot be made: {cause.strerror}. Give -o a name.") from cause

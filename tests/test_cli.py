@@ -18,7 +18,7 @@ import pytest
 from little_scenes import LENS_XML, SCENES, write_ply, write_scene
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt import doctor
+from mitsuba_fspt import doctor, rendering
 
 SMALL = ["-D", "width=12", "-D", "height=10", "-D", "pixel_pitch=2.304", "--rtol", "1e-2"]
 
@@ -192,6 +192,19 @@ def test_more_pixels_than_memory_holds(run, tmp_path):
     assert (code, err.count("\n")) == (2, 1)
     assert "out of memory" in err
     assert not (tmp_path / "o.exr").exists()
+
+
+@pytest.mark.parametrize("verb", ["render", "expose"])
+def test_a_name_too_long_is_refused_before_the_work(run, two_images, tmp_path, monkeypatch, verb):
+    """Seen to fail: code 1 with an OSError, and after the work."""
+    write_scene(tmp_path / "s.xml")
+    monkeypatch.setattr(rendering, "render", lambda *_, **__: pytest.fail("the work began"))
+    before, name = sorted(os.listdir(tmp_path)), "x" * 252 + ".exr"
+    what = ["s.xml"] if verb == "render" else ["a.exr", "--exposure-time", "1", "--wavelength-nm", "600"]
+    code, out, err = run(verb, *what, "-o", name)
+    assert (code, out) == (2, "")
+    assert err == f"fspt: output file '{name}' cannot be written: File name too long. Give another name.\n"
+    assert sorted(os.listdir(tmp_path)) == before
 
 
 def test_expose_does_not_overwrite_the_power(run, two_images):

@@ -141,6 +141,21 @@ def test_values_that_no_file_name_holds_stay_apart(tmp_path):
     assert rows[0].peak == rows[1].peak > 0
 
 
+def test_names_that_are_too_long_are_cut_and_stay_apart(tmp_path):
+    """Nine values of 60 letters: more than a file name holds. Seen to fail with an OSError."""
+    letters = "abcdefghi"
+    more = "".join(f'<default name="{name}" value=""/>' for name in letters)
+    shapes = BALL_XML.replace("<shape", f'<shape id="{"".join(f"${name}" for name in letters)}"')
+    path = write_scene(tmp_path / "m.xml", shapes=more + shapes)
+    values = {name: 30 * "é" for name in letters} | {"i": ["x", "y"]}
+    rows = fspt.sweep(path, values, "o")
+    names = [row.file.name for row in rows]
+    assert len(set(names)) == 2
+    assert all(name.startswith("m_a=éé") and len(os.fsencode(name)) <= 255 for name in names)
+    assert sorted(os.listdir("o")) == sorted([*names, "index.csv"])
+    assert fspt.sweep(path, values, "o") == rows
+
+
 def test_the_contact_sheet_shows_all_on_one_scale(scene, monkeypatch):
     rows = fspt.sweep(scene, VALUES, "o")
     figures = []
@@ -341,6 +356,7 @@ def test_a_cluster_started_here(run, tmp_path, serial):
         (["-D", "f_number=8,-2"], "fspt_lens: 'f_number' must be > 0 and finite, got -2. Give"),
         (["-D", "f_number=8", "-o", "s.xml"], "the folder 's.xml' is a file. Give another name with -o."),
         (["-D", "f_number=8", "-o", "no/where"], "the folder 'no' does not exist. Make it, or write elsewhere."),
+        (["-D", "f_number=8", "-o", "o" * 256], "cannot be made: File name too long. Give -o a name."),
         (["-D", "f_number=8", "--jobs", "0"], "'jobs' must be >= 1, got 0. Give a number of processes"),
         (["-D", "f_number=8", "--method", "magic"], "'method' must be one of integral, path, ptracer, got 'magic'."),
         (["-D", "f_number=8", "--scheduler", "tcp://[::1]:9", "--jobs", "2"], "'jobs' = 2 has no meaning for the"),
