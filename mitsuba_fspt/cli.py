@@ -16,7 +16,7 @@ from .arguments import Parameters, SceneFile, definitions, require_writable
 from .atomic import require_apart
 from .backend import quiet_mitsuba
 from .errors import FsptError, ImageError
-from .interrupt import ctrl_c_noted
+from .interrupt import ctrl_c_noted, terminated_as_by_ctrl_c
 from .sweep_cli import Interrupted
 from .terminal import progress_bar
 
@@ -224,7 +224,8 @@ _add_converge()
 
 
 def main() -> None:
-    """Entry point: run the command line and exit with 0, 2 for bad input or 130 for Ctrl-C."""
+    """Entry point: run the command line and exit with 0, 2 for bad input or 130 for Ctrl-C and SIGTERM."""
+    terminated_as_by_ctrl_c()
     code = run(sys.argv[1:])
     if code == INTERRUPTED:  # at once: the renderer, stopped while it recorded, may not survive being taken down
         sys.stdout.flush()

@@ -102,7 +102,7 @@ def converge(
             skipped[method.name] = str(refusal)
         else:
             skipped |= too_long
-    if not bench.trials:
+    if skipped and not bench.trials:
         name, why = next(iter(skipped.items()))
         raise SceneError(f"converge: nothing to time; {name}: {why}, 'budget' is {budget:g} s. Give a longer one.")
     raws = {raw: raw() for raw in (raw_rate(scene, lens, together) for together in (False, True))}

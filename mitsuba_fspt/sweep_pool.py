@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
+from threading import Thread
 
 from .errors import BackendError, FsptError
 from .image import Image
@@ -115,9 +116,18 @@ class _Worker:
         self.connection.close()
 
 
+def _end_with_parent() -> None:
+    """Where the process at the top was killed and could not end us, nobody waits for the point under way."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
 def _work(connection: Connection, threads: int) -> None:
     from .sweep_studio import Studio
 
+    Thread(target=_end_with_parent, daemon=True).start()
     studio = Studio(threads=threads, quiet=True)
     with suppress(EOFError, BrokenPipeError):  # the process at the top has gone
         while True:

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import subprocess
 import sys
 import time
 
@@ -372,3 +373,20 @@ def test_ctrl_c_leaves_nothing(tmp_path, capfd, monkeypatch):
     assert cli.run(["converge", "s.xml"]) == 130
     assert "interrupted" in capfd.readouterr().err
     assert os.listdir(tmp_path) == ["s.xml"]
+
+
+@pytest.mark.usefixtures("in_a_folder_of_its_own")
+def test_a_terminated_process_leaves_nothing(tmp_path):
+    """Seen to fail: its folder of kernels stayed."""
+    (tmp_path / "t").mkdir()
+    command = [sys.executable, "-m", "mitsuba_fspt", "converge", "s.xml"]
+    environment = os.environ | {"TMPDIR": str(tmp_path / "t")}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not list(tmp_path.glob("t/fspt-kernels-*/*")):
+        time.sleep(0.01)
+    process.terminate()
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "fspt: interrupted; nothing was written.\n")
+    assert os.listdir(tmp_path / "t") == []
+    assert sorted(os.listdir(tmp_path)) == ["s.xml", "t"]

@@ -449,6 +449,50 @@ def test_ctrl_c_leaves_one_line_and_what_is_done(tmp_path, calls, jobs):
     assert all(fspt.read(tmp_path / "o" / name).power.max() > 0 for name in done)
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_no_process_outlives_the_one_at_the_top(tmp_path, number):
+    """Each point would take minutes. Seen to fail: the workers went on with their points."""
+    slow = ["--method", "path", "--spp", "100000000", "--jobs", "2"]
+    command = [sys.executable, "-m", "mitsuba_fspt", "sweep", "s.xml", *DEFINE, "-o", "o", *slow]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    deadline = time.monotonic() + 60
+    workers: list[Path] = []
+    while time.monotonic() < deadline and sum(map(_seconds_of_work, workers)) < 5:
+        time.sleep(0.1)
+        workers = [Path(f"/proc/{child}") for child in children.read_text().split()]
+    process.send_signal(number)
+    deadline = time.monotonic() + 20
+    while any(map(_runs, workers)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    left = [worker for worker in workers if _runs(worker)]
+    for worker in left:
+        os.kill(int(worker.name), signal.SIGKILL)
+    out, err = process.communicate(timeout=20)
+    assert len(workers) >= 2
+    assert not left
+    assert out == ""
+    if number == signal.SIGTERM:
+        assert process.returncode == 130
+        assert err == "fspt: interrupted; finished images stay in o, the same command goes on from there.\n"
+
+
+def _runs(process):
+    """A process of /proc is there and no corpse that nobody has buried."""
+    try:
+        return (process / "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def _seconds_of_work(process):
+    try:
+        user, system = (process / "stat").read_text().rsplit(")", 1)[1].split()[11:13]
+    except OSError:
+        return 0
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
 @pytest.mark.parametrize("hit", ["write", "_write_index"])
 def test_ctrl_c_while_a_file_is_written_leaves_no_image_without_its_row(scene, monkeypatch, hit):
     holder = fspt.Image if hit == "write" else sweeping
