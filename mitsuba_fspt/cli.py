@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from contextlib import nullcontext, suppress
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
@@ -226,6 +227,8 @@ _add_converge()
 def main() -> None:
     """Entry point: run the command line and exit with 0, 2 for bad input or 130 for Ctrl-C and SIGTERM."""
     terminated_as_by_ctrl_c()
+    if isinstance(sys.stdout, TextIOWrapper):  # what a terminal or a pipe cannot show does not end the work
+        sys.stdout.reconfigure(errors="backslashreplace")
     code = run(sys.argv[1:])
     if code == INTERRUPTED:  # at once: the renderer, stopped while it recorded, may not survive being taken down
         sys.stdout.flush()

@@ -21,7 +21,9 @@ def sweep(
     scene: SceneFile,
     define: Annotated[
         list[str] | None,
-        typer.Option("-D", "--define", metavar="NAME=V1,V2,…", help="Values for a <default> of the scene; repeatable."),
+        typer.Option(
+            "-D", "--define", metavar="NAME=V1,V2,...", help="Values for a <default> of the scene; repeatable."
+        ),
     ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for the images, SCENE_sweep if left out.")

@@ -253,6 +253,20 @@ def test_doctor_says_whether_it_is_ready(run, monkeypatch, works):
     assert "mitsuba-fspt" in out
 
 
+def test_an_output_without_the_letters_does_not_end_the_work(tmp_path):
+    """Seen to fail with code 1 and a UnicodeEncodeError."""
+    write_scene(tmp_path / "ü.xml")
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+
+    def told(*arguments):
+        command = [sys.executable, "-m", "mitsuba_fspt", *arguments]
+        return subprocess.run(command, env=environment, check=True, capture_output=True).stdout.decode()
+
+    assert told("render", "ü.xml", "--rtol", "0.5").startswith("ü.exr: total ")
+    assert fspt.read("ü.exr").power.max() > 0
+    assert "NAME=V1,V2,..." in told("sweep", "--help")
+
+
 def test_version_and_help(run):
     code, out, err = run("--version")
     assert (code, err) == (0, "")
