@@ -9,7 +9,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from .errors import BackendError
+from .errors import BackendError, FsptError
 from .image import Image
 from .sweep_point import Point
 from .sweep_pool import deaf_to_ctrl_c, died, share_of_cores
@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 PATIENCE = 10  # seconds for a scheduler to answer, and for it to have a worker
 
 
-def images_of_cluster(points: list[Point], scheduler: str, jobs: int | None) -> Iterator[tuple[Point, Image]]:
+def images_of_cluster(
+    points: list[Point], scheduler: str, jobs: int | None
+) -> Iterator[tuple[Point, Image | FsptError]]:
     """Points and their images in the order they are done, by the workers of the scheduler at this address.
 
     'local' starts a scheduler and `jobs` workers here. A worker that dies costs its points another try.
 
-    Raises what rendering raises, and BackendError without dask, scheduler or workers, or where a point ended every
-    worker that tried it.
+    In place of an image what rendering raised of our own, and BackendError where the point ended every worker that
+    tried it. Raises BackendError without dask, scheduler or workers.
     """
     require_dask()
     from distributed import KilledWorker, as_completed
@@ -37,8 +39,8 @@ def images_of_cluster(points: list[Point], scheduler: str, jobs: int | None) -> 
             point = futures.pop(future)
             try:
                 image = future.result()
-            except KilledWorker as error:
-                raise died(point) from error
+            except KilledWorker:
+                image = died(point)
             except CancelledError as error:
                 raise BackendError(
                     f"sweep: the scheduler '{scheduler}' has gone. Start it and its workers again, and then the sweep."
@@ -100,7 +102,7 @@ def _mute(name: str) -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _image(point: Point, threads: int | None) -> Image:
+def _image(point: Point, threads: int | None) -> Image | FsptError:
     """Runs on a worker, which keeps its studio from point to point and renders one at a time."""
     from distributed import get_worker
 
@@ -108,4 +110,4 @@ def _image(point: Point, threads: int | None) -> Image:
 
     worker = get_worker()
     threads = worker.state.nthreads if threads is None else threads
-    return vars(worker).setdefault("fspt_studio", Studio(threads=threads, quiet=True)).image(point)
+    return vars(worker).setdefault("fspt_studio", Studio(threads=threads, quiet=True)).image_or_error(point)

@@ -19,10 +19,10 @@ from .sweep_point import Point
 TRIES = 3  # of a point that ends the process which renders it
 
 
-def images_of_processes(points: list[Point], jobs: int) -> Iterator[tuple[Point, Image]]:
+def images_of_processes(points: list[Point], jobs: int) -> Iterator[tuple[Point, Image | FsptError]]:
     """Points and their images in the order they are done, by at most `jobs` processes that share the cores.
 
-    Raises what rendering raises, and BackendError where a point ended its process thrice.
+    In place of an image what rendering raised of our own, and BackendError where the point ended its process thrice.
     """
     waiting, deaths = list(points), Counter[str]()
     jobs = min(jobs, len(points))
@@ -37,16 +37,17 @@ def images_of_processes(points: list[Point], jobs: int) -> Iterator[tuple[Point,
                 worker = workers[connection]
                 point, image = worker.point, worker.image()
                 if image is None:
-                    deaths[point.file] += 1
-                    if deaths[point.file] == TRIES:
-                        raise died(point)
-                    waiting.insert(0, point)
-                if image is None or not waiting:
                     workers.pop(connection).end()
-                else:
+                    deaths[point.file] += 1
+                    if deaths[point.file] < TRIES:
+                        waiting.insert(0, point)
+                        continue
+                    image = died(point)
+                elif waiting:
                     worker.take_from(waiting)
-                if image is not None:
-                    yield point, image
+                else:
+                    workers.pop(connection).end()
+                yield point, image
     finally:
         for worker in workers.values():
             worker.end()
@@ -99,13 +100,13 @@ class _Worker:
         with suppress(OSError):  # a process that died says so when asked for the image
             self.connection.send(self.point)
 
-    def image(self) -> Image | None:
-        """The image of `point`, None if the process died over it; raises what rendering raised."""
+    def image(self) -> Image | FsptError | None:
+        """The image of `point` or why there is none, None if the process died over it; raises what is no refusal."""
         try:
             answer = self.connection.recv()
         except (EOFError, OSError):
             return None
-        if isinstance(answer, Exception):
+        if isinstance(answer, Exception) and not isinstance(answer, FsptError):
             raise answer
         return answer
 
@@ -133,9 +134,7 @@ def _work(connection: Connection, threads: int) -> None:
         while True:
             point = connection.recv()
             try:
-                answer: Image | Exception = studio.image(point)
-            except FsptError as error:
-                answer = error
+                answer: Image | Exception = studio.image_or_error(point)
             except Exception as error:  # not every exception can travel
                 answer = RuntimeError(f"{point.label}: {type(error).__name__}: {error}")
             connection.send(answer)

@@ -38,6 +38,13 @@ class Studio:
         told = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint}
         return replace(image, metadata=image.metadata | told)
 
+    def image_or_error(self, point: Point) -> Image | FsptError:
+        """`image`, or what it raises: the other points can be rendered all the same."""
+        try:
+            return self.image(point)
+        except FsptError as error:
+            return error
+
     def _set_up(self, point: Point) -> mi.Scene:
         scene = self._scene if self._geometry == point.geometry else None
         self._scene = None  # should the set-up fail, nothing half changed is kept

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .atomic import atomic_path
-from .errors import ImageError, SceneError
+from .errors import FsptError, ImageError, SceneError
 from .image import Image, read
 from .interrupt import ctrl_c_held
 from .plain import number, whole
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from .rendering import Progress
 
 INDEX = "index.csv"
-Images = Generator[tuple[Point, Image], None, None]
+NAMED = 5  # points that failed, beside the first of them
+Images = Generator[tuple[Point, Image | FsptError], None, None]
 COLUMNS = ("file", "power", "peak", "largest_error", "wall_time")
 
 
@@ -82,7 +83,7 @@ def sweep(
     Raises
     ------
     SceneError, OpticsError, ExitanceError : a parameter, value or setting that cannot be used; where only the
-        rendering showed it, the message begins with the point.
+        rendering showed it, the message names the point, and comes when the others are done.
     ImageError : the folder cannot be written.
     BackendError : no such scheduler, dask is missing, a worker died thrice at one point, no LLVM.
     """
@@ -100,15 +101,21 @@ def sweep(
     _check_folder(folder)
     rows = {point.file: row for point in wanted if (row := _finished(point, folder)) is not None}
     missing = _by_geometry(point for point in wanted if point.file not in rows)
+    failed: dict[str, FsptError] = {}
 
     def tell() -> None:
         if progress:
-            progress(f"{len(rows)} of {len(wanted)} points", len(rows) / len(wanted))
+            done = len(rows) + len(failed)
+            progress(f"{done} of {len(wanted)} points", done / len(wanted))
 
     tell()
     try:
         with closing(_images(missing, jobs, scheduler)) as images:
             for point, image in images:
+                if isinstance(image, FsptError):
+                    failed[point.label] = image
+                    tell()
+                    continue
                 folder.mkdir(exist_ok=True)
                 with ctrl_c_held():  # no image without its row in the index
                     image.write(folder / point.file)
@@ -118,11 +125,24 @@ def sweep(
         if rows:
             with ctrl_c_held():
                 _write_index([rows[point.file] for point in wanted if point.file in rows], folder / INDEX)
+    _require_all(wanted, failed)
     return [rows[point.file] for point in wanted]
 
 
+def _require_all(wanted: list[Point], failed: Mapping[str, FsptError]) -> None:
+    """Raise the error of the only point that failed, or that of the first with the names of some others."""
+    labels = [point.label for point in wanted if point.label in failed]
+    if not labels:
+        return
+    error, others = failed[labels[0]], labels[1:]
+    if not others:
+        raise error
+    named = ", ".join(others[:NAMED]) + (" and more" if others[NAMED:] else "")
+    raise type(error)(f"{error} {len(labels)} of {len(wanted)} points failed; the others: {named}.") from error
+
+
 def _images(missing: list[Point], jobs: int | None, scheduler: str | None) -> Images:
-    """Points and their images as they come, from here, from other processes or from a cluster."""
+    """Points and their images, or why there is none, as they come: from here, other processes or a cluster."""
     if not missing:
         return
     if scheduler is not None:
@@ -138,7 +158,7 @@ def _images(missing: list[Point], jobs: int | None, scheduler: str | None) -> Im
 
         studio = Studio()
         for point in missing:
-            yield point, studio.image(point)
+            yield point, studio.image_or_error(point)
 
 
 def _by_geometry(missing: Iterable[Point]) -> list[Point]:

@@ -6,6 +6,7 @@ import csv
 import multiprocessing
 import operator
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -415,12 +416,22 @@ def test_a_parameter_named_like_a_column(tmp_path):
         fspt.sweep(path, {"power": [1, 2]}, "o")
 
 
-def test_a_point_that_fails_is_named_and_leaves_those_before(tmp_path):
+@pytest.mark.parametrize("how", [{}, {"jobs": 2}, {"jobs": 1, "scheduler": "local"}])
+def test_points_that_fail_are_named_and_leave_the_others(tmp_path, how):
+    """Seen to fail: what came after the first of them was not rendered."""
+    if "scheduler" in how:
+        pytest.importorskip("distributed")
     sensor = LENS_XML.replace('"0.8"', '"$pitch"')
     path = write_scene(tmp_path / "x.xml", sensor='<default name="pitch" value="1"/>' + sensor)
-    with pytest.raises(fspt.FsptError, match=r"^pitch=-1: .*'pixel_pitch' must be > 0 and finite, got -1"):
-        fspt.sweep(path, {"pitch": [0.8, -1, 0.4]}, "o")
-    assert sorted(os.listdir("o")) == ["index.csv", "x_pitch=0.8.exr"]
+    told = []
+    with pytest.raises(fspt.FsptError, match=r"^pitch=-1: .*'pixel_pitch' must be > 0 and finite, got -1\b.*\.$"):
+        fspt.sweep(path, {"pitch": [0.8, -1, 0.4]}, "o", progress=lambda what, share: told.append(share), **how)
+    assert told[-1] == 1
+    assert sorted(os.listdir("o")) == ["index.csv", "x_pitch=0.4.exr", "x_pitch=0.8.exr"]
+    assert len((tmp_path / "o" / "index.csv").read_text().splitlines()) == 3
+    with pytest.raises(fspt.FsptError) as caught:
+        fspt.sweep(path, {"pitch": [-1, 0.8, -2, -3]}, "o", **how)
+    assert re.search(r"^pitch=-1: .* 3 of 4 points failed; the others: pitch=-2, pitch=-3\.$", str(caught.value))
     assert len((tmp_path / "o" / "index.csv").read_text().splitlines()) == 2
 
 
