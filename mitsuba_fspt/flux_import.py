@@ -12,6 +12,7 @@ from .errors import ExitanceError, FluxError
 from .formats import MeshLike, RawMesh, SurfaceValues, ValuesLike, read_mesh, surface_values
 from .formats.length_unit import millimetres
 from .phantom import UNIT, Phantom, require_finite, require_single, shares
+from .plain import number
 from .surface import closure, face_areas
 
 TISSUE_INDEX = 1.37
@@ -61,6 +62,7 @@ def import_flux(
     if per not in (None, "vertex", "face"):
         raise FluxError(f"flux import: 'per' must be vertex or face, got '{per}'.")
     field = None if field is None else str(field)
+    n = None if n is None else number("flux import: 'n'", n, FluxError, "1.37")
     raw = read_mesh(mesh, values, field, format)
     found = surface_values(raw, field if values is None else None, per)
     found = replace(found, vertices=found.vertices * scale, faces=found.faces[:, ::-1] if flip else found.faces)

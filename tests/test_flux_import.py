@@ -328,6 +328,8 @@ def test_a_column_by_its_number(tmp_path, number):
     alone = import_flux((nodes, elements), table[:, 1], per="vertex")
     np.testing.assert_array_equal(by_file.exitance, alone.exitance)
     np.testing.assert_array_equal(by_array.exitance, alone.exitance)
+    with pytest.raises(FluxError, match=r"'n' must be a number, got '1\.4'\. Give for example 1\.37"):
+        import_flux((nodes, elements), table[:, 1], per="vertex", a="robin", n="1.4")
 
 
 @pytest.mark.parametrize("kind", ["stnd", "fluor", "blt"])

@@ -10,7 +10,7 @@ import threading
 import pytest
 
 from mitsuba_fspt.errors import SceneError
-from mitsuba_fspt.interrupt import ctrl_c_held, ctrl_c_noted
+from mitsuba_fspt.interrupt import ctrl_c_held, ctrl_c_noted, terminated_as_by_ctrl_c
 
 
 def press():
@@ -100,6 +100,34 @@ def test_where_ctrl_c_is_ignored_it_stays_ignored():
             work()
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_sigterm_is_noted_and_held_where_it_raises_like_ctrl_c():
+    """Seen to fail with Ctrl-C alone noted."""
+    steps = []
+
+    def terminate():
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def work():
+        with ctrl_c_held():
+            terminate()
+            steps.append("done")
+        steps.append("never")
+
+    before = signal.getsignal(signal.SIGTERM)
+    terminated_as_by_ctrl_c()
+    try:
+        with ctrl_c_noted() as check:
+            with pytest.raises(KeyboardInterrupt):
+                terminate()
+            with pytest.raises(KeyboardInterrupt):
+                check()
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert steps == ["done"]
 
 
 def test_the_handler_before_comes_back():
