@@ -17,7 +17,7 @@ from ..shortcuts import SHORTCUTS, Finding
 from . import pupil_form, surface_form
 from .checks import check_scene, check_surfaces_alone
 from .faces import Faces, edition_of, mark_of
-from .grid import BLOCK, Grid
+from .grid import Grid
 from .intersections import robust_scene
 from .lines import View
 from .narrow import NarrowLight, narrow_light
@@ -103,8 +103,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         narrow = self._narrow_light(scene, lens, window)
         where, least_peak = inside, 0.0
         if not everywhere:
-            bright = narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest
-            where = inside & _closed(bright) if bright.any() else bright
+            where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest)
             least_peak = narrow.brightest / 2
         if where.any():
             known = surface_form.solve(scene, lens, window, quadrature, where, least_peak)
@@ -188,13 +187,6 @@ def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
     grid = Grid(power.shape)
     x, y = grid.gradient(grid.lanes(power))
     return rounding * grid.array(grid.spread_max(dr.sqrt(x * x + y * y)))
-
-
-def _closed(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """`mask` and what is left between its pixels, too little to be probed on its own."""
-    grid = Grid(mask.shape)
-    grown = grid.dilate(grid.lanes(mask), BLOCK)
-    return mask | grid.array(~grid.dilate(~grown, BLOCK))
 
 
 def _outside(window: Window) -> Finding:

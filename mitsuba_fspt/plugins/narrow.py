@@ -21,7 +21,7 @@ from .exitance import texels_of
 from .grid import Grid
 from .window import Window
 
-OUTSHINES = 1.1  # a point is narrow if it is so many times brighter than any square around, seen sharp
+OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
 # Transects look closely at the limb of a wide body: where it is slanted (cosine to the lens), its squares are covered
 # (a share) and it is not so many times brighter than the body around.
 SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
