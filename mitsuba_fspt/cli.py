@@ -18,6 +18,7 @@ from .atomic import require_apart
 from .backend import quiet_mitsuba
 from .errors import FsptError, ImageError
 from .interrupt import ctrl_c_noted, terminated_as_by_ctrl_c
+from .scene_xml import read_xml
 from .sweep_cli import Interrupted
 from .terminal import progress_bar
 
@@ -58,19 +59,21 @@ def render(
     """Render a scene to an EXR with the power [W], its error and the coverage of every pixel."""
     output = output or Path((scene.stem or "image") + ".exr")
     require_writable(output, ".exr")
-    picture = output.with_suffix(".png")
+    picture, parameters = output.with_suffix(".png"), definitions(define)
     if png:
         from .picture import png_file, require_matplotlib
 
         require_writable(picture, ".png")
         require_matplotlib()
+    for written in (output, picture) if png else (output,):
+        require_apart(written, read_xml(scene, parameters).sources(), error=ImageError)
     with progress_bar() as progress:
         from .rendering import render
         from .scene import load
 
         quiet_mitsuba()
         image = render(
-            load(scene, **definitions(define)),
+            load(scene, **parameters),
             method=method,
             rtol=rtol,
             domain=domain,

@@ -201,6 +201,12 @@ def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
 
     own = scene.integrator()
     if method is None and own is not None:
+        # What else they give beside or instead of light is no power.
+        if own.class_name() == "DepthIntegrator" or own.aov_names():
+            raise SceneError(
+                f"scene: integrator {own.class_name()} gives no power. Give the scene an 'fspt_integral' or 'path', or "
+                "set 'method'."
+            )
         return own
     if method in (None, "integral"):
         return own if type(own).__name__ == "FsptIntegral" else mi.load_dict({"type": "fspt_integral"})

@@ -14,7 +14,7 @@ import numpy as np
 from . import backend
 from .errors import SceneError
 from .interrupt import ctrl_c_noted
-from .scene_xml import read_xml
+from .scene_xml import SceneXml, read_xml
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -37,6 +37,7 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     from .plugins.probe import probe_beside
 
     check_parameters(path, parameters)
+    _check_colours(path, parameters)
     texts = {name: parameter_text(value) for name, value in parameters.items()}
     config = mi.parser.ParserConfig(mi.variant())
     resolver = mi.file_resolver()
@@ -63,9 +64,24 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     return scene
 
 
+def _xml_of(path: Path, parameters: Mapping[str, object]) -> SceneXml:
+    return read_xml(path, {name: parameter_text(value) for name, value in parameters.items()})
+
+
+def _check_colours(path: Path, parameters: Mapping[str, object]) -> None:
+    """Raise SceneError where J_n is a colour, of which monochrome variants make its luminance without a word."""
+    emitters = (node for node in _xml_of(path, parameters).nodes if node.get("type") == "fspt_surface")
+    for child in (child for emitter in emitters for child in emitter):
+        if child.tag == "rgb" or child.get("type") == "d65":
+            raise SceneError(
+                f"{path}: '{child.get('name')}' of an fspt_surface is a colour (<{child.tag}>), J_n is one number. "
+                "Give W/mm² as a float or a texture of one channel."
+            )
+
+
 def check_parameters(path: Path, parameters: Mapping[str, object]) -> None:
     """Raise SceneError for a name that is no `<default>` of the file or of what it includes with these values."""
-    known = read_xml(path, {name: parameter_text(value) for name, value in parameters.items()}).defaults
+    known = _xml_of(path, parameters).defaults
     for name in parameters:
         if name not in known:
             names = ", ".join(known) or "none"
@@ -99,11 +115,11 @@ def _one_line(message: str) -> str:
         r"(?:At|Error while loading|While loading|Parsing of XML file) (.*?\(line \d+, col \d+\)):? (.*)", text
     )
     place, cause = (found[1] + ": ", found[2]) if found else ("", text)
-    ours = [line for line in lines if re.match(r"(\w+\.)*\w*Error: ", line)]
+    ours = [line for line in lines if re.match(r"(\w+\.)*\w*(Error|Exception): ", line)]
     unknown = re.match(r'Found \d+ unreferenced .* plugin of type "(\w+)": ', cause)
     broken = re.match(r'failed to instantiate (\w+) plugin of type "(\w+)": (.*)', cause)
     if ours:
-        cause = ours[-1].split("Error: ", 1)[1]
+        cause = ours[-1].split(": ", 1)[1]
     elif unknown:
         names = ", ".join(re.findall(r'- \w+ "(\w+)"', cause))
         cause = f"'{unknown[1]}' has no parameter {names}. Correct its name or leave it out."

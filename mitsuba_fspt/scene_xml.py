@@ -42,6 +42,12 @@ class SceneXml:
         there = [file for file in dict.fromkeys(tried) if os.path.isfile(file)]
         return there or [Path(name)] * os.path.isfile(name)
 
+    def sources(self) -> set[Path]:
+        """The scene file, what it includes and every file that an attribute may name."""
+        names = {self.fill_in(text) for node in self.nodes for text in node.attrib.values()}
+        folders = {file.parent for file in self.files}
+        return set(self.files).union(*(self.places(name, folder) for name in names for folder in folders))
+
 
 def read_xml(path: Path, given: Mapping[str, str]) -> SceneXml:
     """What a scene file says with these values for its parameters; SceneError where it cannot be read."""

@@ -71,13 +71,8 @@ class Source:
 
     def digests(self) -> list[tuple[str, str]]:
         """Name and SHA-256 of the scene file, of what it includes and of every file that its attributes name."""
-        found = set(self._xml.files)
-        for text in {text for node in self._nodes for text in node.attrib.values()}:
-            name = self._xml.fill_in(text)
-            for folder in {file.parent for file in self._xml.files}:
-                found.update(self._xml.places(name, folder))
         # A scene that moved with its data is the same scene.
-        return sorted({(os.path.relpath(file, self.path.parent), self._digest(file)) for file in found})
+        return sorted({(os.path.relpath(file, self.path.parent), self._digest(file)) for file in self._xml.sources()})
 
     def _digest(self, file: Path) -> str:
         if file not in self._digests:

@@ -136,6 +136,10 @@ FILES = {
     "camera inside": (of_ball('value="3"', 'value="300"'), "the lens stands inside the phantom"),
     "nothing glows": ({"shapes": '<shape type="sphere"/>'}, "nothing glows"),
     "nothing there": ({"shapes": ""}, "nothing glows"),
+    "a colour": (
+        of_ball('<float name="exitance" value="1e-3"/>', '<rgb name="exitance" value="1, 2, 3"/>'),
+        "'exitance' of an fspt_surface is a colour (<rgb>), J_n is one number",
+    ),
     "no mesh file": (mesh("gone.ply"), '"gone.ply": file not found'),
     "words for a mesh": (mesh("words.ply"), '"words.ply": invalid PLY header'),
     "half a mesh": (mesh("cut.ply"), '"cut.ply": could not parse'),
@@ -227,6 +231,12 @@ COMMANDS = {
     "parameter that cannot be": ((*RENDER, "-D", "f_number=0"), "'f_number' must be > 0 and finite, got 0"),
     "no such folder": ((*RENDER, "-o", "gone/o.exr"), "the folder 'gone' does not exist"),
     "another format": ((*RENDER, "-o", "o.png"), "must end in .exr"),
+    "the scene's own texture": (("render", "textured.xml"), "-o would overwrite 'textured.exr', which is needed too"),
+    "the scene's own texture, as PNG": (
+        ("render", "textured.xml", "-o", "map.exr", "--png"),
+        "-o would overwrite 'map.png', which is needed too",
+    ),
+    "a scene of depths": (("render", "depth.xml", "-o", "o.exr"), "integrator DepthIntegrator gives no power"),
     "a folder for a file": ((*RENDER, "-o", "folder.exr"), "'folder.exr' is a folder"),
     "rtol 0": ((*RENDER, "--rtol", "0"), "'rtol' must be in (0, 1), got 0"),
     "rtol negative": ((*RENDER, "--rtol", "-1"), "'rtol' must be in (0, 1), got -1"),
@@ -273,6 +283,12 @@ def files(folder):
     (folder / "broken.xml").write_text('<scene version="3.0.0"><')
     (folder / "bsdf.xml").write_text('<bsdf version="3.0.0" type="diffuse"/>')
     (folder / "old.xml").write_text("<scene></scene>")
+    textured = ("textured.exr", "map.png")
+    for name in textured:
+        (folder / name).write_text("a texture")
+    textures = (f'<texture type="bitmap"><string name="filename" value="{n}"/></texture>' for n in textured)
+    write_scene(folder / "textured.xml", more="".join(textures))
+    write_scene(folder / "depth.xml", integrator='<integrator type="depth"/>')
     (folder / "include.xml").write_text('<scene version="3.0.0"><include filename="gone.xml"/></scene>')
 
 
