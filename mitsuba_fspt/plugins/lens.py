@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import OpticsError
 from ..optics import NUMBERS, Lens
-from .film import default_sampler, number, own_film
+from .film import default_sampler, flat_share, number, own_film
 from .pupil import Pupil
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
@@ -120,7 +120,8 @@ class FsptLens(mi.Sensor):
         self._middle = mi.Point2f(*(dr.opaque(mi.Float, 0.5 * int(n)) for n in self.film().size()))
         # A_vd A_pupil/u² in double first: far away and stopped down, its factors leave the range of float32.
         self.etendue = self.virtual_pitch**2 * math.pi * (self.optics.discs[0].radius / self.optics.focus_distance) ** 2
-        self._etendue = dr.opaque(mi.Float, self.etendue)
+        self._flat = dr.opaque(mi.Float, flat_share())
+        self._etendue = dr.opaque(mi.Float, self.etendue * flat_share())
         self._solid_angle = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
         dr.make_opaque(self.m_to_world)
         # How far float32 may move a line of sight on the virtual detector plane [virtual pixels].
@@ -280,7 +281,7 @@ class FsptLens(mi.Sensor):
         ds.dist = dr.norm(ds.d)
         ds.d /= ds.dist
         ds.pdf = dr.select(inside, dr.rcp(solid_angle), 0)
-        return ds, mi.Spectrum(dr.select(inside, solid_angle / (size.x * size.y), 0))
+        return ds, mi.Spectrum(dr.select(inside, self._flat * solid_angle / (size.x * size.y), 0))
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         return dr.select(active, ds.pdf, 0)
