@@ -113,6 +113,11 @@ class Draft:
         source = rough & (self.error > self.tolerance) & ~self.outline
         return rough | self.grid.grow(source, *self.reach(self.nodes))
 
+    def doubt(self, rough: Mask) -> None:
+        """Where nothing finer follows, what may hide around `rough` pixels counts as error: nodes may agree past it."""
+        around = self.grid.spread_max(dr.select(rough, self.error, 0), self.reach(self.nodes)[1])
+        self.error = dr.select(self.grown(rough), dr.maximum(self.error, around), self.error)
+
     def cut_off(self) -> Image:
         """What the nodes may be wrong by where an edge crosses or hides between them and the pupil's rim.
 

@@ -37,11 +37,13 @@ def solve(view: View, window: Window, quadrature: Quadrature, known: Solution | 
     """
     draft = Draft(view, window, quadrature, known)
     rough = first_nodes(draft)
+    levels = rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
     if quadrature.max_nodes >= BOTH:
-        levels = rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
         rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
-        if dr.any(rough):
-            integrate_by_transects(draft, rough, levels)
+    if not levels:
+        draft.doubt(rough)
+    elif dr.any(rough):
+        integrate_by_transects(draft, rough, levels)
     return draft.solution()
 
 
