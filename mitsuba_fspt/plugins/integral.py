@@ -138,8 +138,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
         emitters = scene.emitters()
         editions = [(mark_of(emitter), getattr(emitter, "edition", 0)) for emitter in emitters]
-        state = (editions, glowing_boxes(scene), _view(lens), window)
-        return self._narrow.recall(state, lambda: narrow_light(emitters, lens, window))
+        state = (editions, glowing_boxes(scene), _places(scene.shapes()), _view(lens), window)
+        return self._narrow.recall(state, lambda: narrow_light(scene, lens, window))
 
     def render(
         self,
@@ -180,6 +180,19 @@ def _view(lens: mi.Sensor) -> tuple[object, ...]:
     film = lens.film()
     sizes = (int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
     return (lens.optics, lens.pixel_pitch, lens.placement, *sizes)
+
+
+def _places(shapes: list[mi.Shape]) -> list[tuple[float, ...]]:
+    """Where the bodies are that may hide one another; nothing of one alone."""
+    return [_place(shape) for shape in shapes] if len(shapes) > 1 else []
+
+
+def _place(shape: mi.Shape) -> tuple[float, ...]:
+    box = (*shape.bbox().min, *shape.bbox().max)
+    if shape.is_mesh():
+        return (shape.vertex_positions_buffer().index, *box)
+    parameters = mi.traverse(shape)
+    return (*box, *np.ravel(parameters["to_world"].matrix).tolist()) if "to_world" in parameters else box
 
 
 def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:

@@ -15,10 +15,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rules import PLASTIC
+from ..rules import PLASTIC, twelve
 from .elements import Elements, at_one_wavelength, elements_of, scalar
 from .exitance import texels_of
 from .grid import Grid
+from .lines import repeat
+from .occlusion import hidden
 from .window import Window
 
 OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
@@ -45,10 +47,10 @@ class NarrowLight:
     brightest: float
 
 
-def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) -> NarrowLight:
+def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
     """What `lens` sees of the light of narrow spots; nothing where no emitter is an `fspt_surface`."""
     on_pixels = np.zeros(window.shape)
-    parts = [_seen(emitter, lens) for emitter in emitters if type(emitter).__name__ == "FsptSurface"]
+    parts = [_seen(scene, emitter, lens) for emitter in scene.emitters() if type(emitter).__name__ == "FsptSurface"]
     if not parts or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0)
     points = _Points.joined(parts).on(window)
@@ -75,7 +77,7 @@ def narrow_light(emitters: list[mi.Emitter], lens: mi.Sensor, window: Window) ->
 class _Points:
     """Points all over surfaces, columns (n,).
 
-    radiance : to the lens; 0 where a point has no image
+    radiance : to the lens; 0 where a point has no image, or another body hides it
     area : of the sharp image that it stands for [pixels²]
     cosine, front : the largest cosine of the normal to a point of the pupil; > 0 if the pupil's middle sees the point
     apart : how far it is from the next; in pixels, or in blur radii where they are larger
@@ -162,7 +164,7 @@ def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) 
     return grid.array(grid.box_sum(grid.lanes(sums), reach))[reach : reach + height, reach : reach + width]
 
 
-def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
+def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
     """Points all over a surface as the lens sees them."""
     shape = emitter.get_shape()
     texels = texels_of(emitter.exitance)
@@ -171,14 +173,16 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
     else:
         elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
     counts = np.ones(elements.count, np.int64)
-    _, area, _, _, blur, _ = (column.numpy() for column in _look(emitter, elements, lens, counts))
+    _, area, _, _, blur, *_ = (column.numpy() for column in _look(emitter, elements, lens, counts))
     unit = np.maximum(blur, 1)
     reach = _reach(elements, lens) / unit
     # A long and thin element is many points, a quarter of a unit apart; one that is wide may be wide at one.
     long = np.isfinite(reach) & (reach > MOST_POINTS)  # points all along would be too far apart to tell
     thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
-    *columns, centre = _look(emitter, elements, lens, counts)
+    *columns, centre, place = _look(emitter, elements, lens, counts)
+    if len(scene.shapes()) > 1:
+        columns[0] = dr.select(_in_sight(scene, lens, place), columns[0], 0)
     seen = np.array([column.numpy() for column in (*columns, centre.x, centre.y)], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
     radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
@@ -189,9 +193,9 @@ def _seen(emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
 
 def _look(
     emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index
-) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f]:
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f, mi.Point3f]:
     """At so many points of each element, the first its middle, radiance to where the lens sees most of it, area of the
-    element's image from there, cosine, front, blur, place on film; see `_Points`.
+    element's image from there, cosine, front, blur, place on film, see `_Points`; and place in the world.
     """
     index = np.repeat(np.arange(elements.count), counts)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -206,9 +210,20 @@ def _look(
     cosine = dr.dot(si.n, to_lens)
     image = area * dr.abs(cosine / (dr.dot(axis, to_lens) * dr.square(scale)))
     front = dr.dot(si.n, lens.world_transform() @ mi.Point3f(0) - si.p)
-    columns = (scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre)
+    columns = (scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre, si.p)
     dr.eval(columns)
     return columns
+
+
+def _in_sight(scene: mi.Scene, lens: mi.Sensor, place: mi.Point3f) -> mi.Bool:
+    """True of points from which nothing hides one of twelve points of the pupil."""
+    x, y = (mi.Float(column) for column in twelve(False).pupil.T)
+
+    def look(k: mi.UInt32, seen: mi.Bool) -> tuple[mi.Bool]:
+        pupil = mi.Point2f(dr.gather(mi.Float, x, k), dr.gather(mi.Float, y, k))
+        return (seen | ~hidden(scene, place, lens.arrival(place, pupil)[1], ~seen),)
+
+    return repeat(dr.opaque(mi.UInt32, len(twelve(False))), look, mi.Bool(False))[0]
 
 
 def _rim_above(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Point3f:
