@@ -1,10 +1,10 @@
-"""J_n as a bitmap whose bright texels are smaller than pixels."""
+"""J_n as a bitmap: bright texels smaller than pixels, and pictures that are no W/mm²."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from little_scenes import lens, mi, scene_of
+from little_scenes import ball, lens, mi, scene_of
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.plugins.exitance import texels_of
@@ -81,3 +81,26 @@ def test_a_single_texel_of_four_million_is_not_refused():
     emitter = {"type": "fspt_surface", "exitance": one_bright_texel(1 << 11)}
     scene = scene_of(SHAPES["disk"] | {"emitter": emitter}, sensor=lens(size=8))
     assert np.isfinite(fspt.render(scene, max_nodes=4).power).all()
+
+
+@pytest.mark.parametrize(
+    ("pixels", "raw", "message"),
+    [
+        (np.ones((2, 4, 3), np.float32), True, "a bitmap of 3 channels, J_n is one number"),
+        (np.ones((2, 4, 3), np.uint8), False, "a bitmap of 3 channels"),
+        (np.full((2, 4, 1), 128, np.uint8), False, "a picture of 4 × 2 whole numbers, which are decoded as sRGB"),
+    ],
+    ids=["colours", "coloured picture", "grey picture"],
+)
+def test_bitmaps_that_are_no_watts_are_refused(pixels, raw, message):
+    """Mitsuba makes luminance of the one and bends the values of the other: 128 of 255 would be 0.22 W/mm²."""
+    with pytest.raises(RuntimeError, match=message):
+        scene_of(ball({"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": raw}))
+
+
+def test_whole_numbers_of_a_raw_bitmap_are_shares_of_the_largest():
+    pixels = np.full((2, 4, 1), 51, np.uint8)
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+    power, uniform = (fspt.render(scene_of(ball(exitance))).power for exitance in (bitmap, 0.2))
+    assert uniform.max() > 0
+    np.testing.assert_allclose(power, uniform, rtol=1e-3, atol=1e-3 * uniform.max())

@@ -25,7 +25,7 @@ CORNERS_AND_CENTRE = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
 def texture_of(props: mi.Properties) -> mi.Texture:
     """J_n as a texture; a number is the same at all wavelengths, where Mitsuba would make it white light.
 
-    ExitanceError for a colour, whose watts would depend on the variant.
+    ExitanceError for a colour, whose watts would depend on the variant, and for a bitmap that is none of W/mm².
     """
     value = props["exitance"]
     if not isinstance(value, int | float):
@@ -35,6 +35,7 @@ def texture_of(props: mi.Properties) -> mi.Texture:
                 f"fspt_surface: 'exitance' is a colour ({texture.class_name()}), J_n is one number. Give W/mm² as a "
                 "float or a texture of one channel."
             )
+        _check_bitmap(texture)
         return texture
     uniform = mi.Properties("uniform")
     uniform["value"] = float(value)
@@ -112,6 +113,24 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
         return values, values, values
     corner = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, count))
     return tuple(dr.gather(mi.Float, values, index) for index in corner)
+
+
+def _check_bitmap(texture: mi.Texture) -> None:
+    """ExitanceError if `texture` is a bitmap of several channels, or of whole numbers that Mitsuba takes for sRGB."""
+    values = mi.traverse(texture)
+    if "data" not in values:
+        return
+    height, width, channels = values["data"].shape
+    if channels > 1:
+        raise ExitanceError(
+            f"fspt_surface: 'exitance' is a bitmap of {channels} channels, J_n is one number. Give a bitmap of one "
+            "channel, as a float EXR."
+        )
+    if not dr.is_float_v(values["data"]) and "raw = 0" in str(texture):  # which nothing but its description tells
+        raise ExitanceError(
+            f"fspt_surface: 'exitance' is a picture of {width} × {height} whole numbers, which are decoded as sRGB. "
+            'Give W/mm² as a float EXR, or add <boolean name="raw" value="true"/> for shares of the largest number.'
+        )
 
 
 def is_uniform(texture: mi.Texture) -> bool:
