@@ -122,6 +122,29 @@ def test_pixels_that_see_nothing_cost_nothing():
     assert whole.metadata["nodes"] == part.metadata["nodes"]
 
 
+def test_what_lies_beside_a_crop_window_is_not_refined():
+    """Expected: of lines of sight that the field takes a tenth for one pixel of 768; the blur disc is 17 pixels wide.
+
+    Seen to fail (a half) where all pixels that one blur disc reaches are refined.
+    """
+    body = sphere(240.0, 8.0, 1.0)
+    field, pixel = (scene(body, f_number=1.4, crop=crop) for crop in ((4, 4, 32, 24), (20, 10, 1, 1)))
+    whole, part = fspt.render(field, rtol=1e-3), fspt.render(pixel, rtol=1e-3)
+    np.testing.assert_allclose(part.power, whole.power[6:7, 16:17], rtol=2e-3)
+    assert part.metadata["nodes"] < whole.metadata["nodes"] / 8
+
+
+@pytest.mark.parametrize("depth", [FOCUS, FOCUS + 3])
+def test_tolerance_is_a_share_of_what_a_crop_window_shows(depth):
+    """A ball beside a disk ten times as bright that ends at the edge of the window.
+
+    Seen to fail (0.1 of the brightest pixel) where what is computed around the window counts for the brightest, too.
+    """
+    disc = disk(depth, 4.0, 6.0) | {"glow": {"type": "fspt_surface", "exitance": 10.0}}
+    image = fspt.render(scene(disc, sphere(FOCUS + 12, 4.0, -3.0), crop=(18, 0, WIDTH - 18, HEIGHT)), rtol=1e-2)
+    assert image.error.max() <= 1e-2 * image.power.max()
+
+
 @pytest.mark.parametrize("pixel", ["centre", "area"])
 def test_smooth_pixels_take_four_lines_of_sight(pixel):
     """Expected: 4 at every pixel of a uniform disk, and twelve more at the one of sixteen that is probed.

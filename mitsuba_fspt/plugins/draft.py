@@ -35,6 +35,7 @@ class Draft:
     blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
     sharp : True where the least one is small
     outline : True within a pixel of both a hit and a miss
+    shown : False on the rim, True everywhere where there is none
     stopped, beyond : the border of the image-plane stop cuts the pixel, wherever its light comes from; or leaves it out
     open, known : False where the value is known from elsewhere, and that value
     """
@@ -47,6 +48,7 @@ class Draft:
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
         self.roughness = grid.full(mi.Float64, 0)
+        self.shown = grid.lanes(window.shown()) if window.count < len(grid) else mi.Bool(True)
         inside, cut = window.stopped(view.lens)
         self.stopped, self.beyond = grid.lanes(cut & self.area), grid.lanes(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
@@ -60,8 +62,12 @@ class Draft:
 
     @property
     def peak(self) -> Image:
-        """The largest value [W/mm²/sr], one lane."""
-        return dr.max(self.value)
+        """The largest value that is shown [W/mm²/sr], of all if those are dark, one lane."""
+        most = dr.max(self.value)
+        if len(self.shown) == 1:
+            return most
+        shown = dr.max(dr.select(self.shown, self.value, 0))
+        return dr.select(shown > 0, shown, most)
 
     @property
     def tolerance(self) -> Image:
@@ -135,6 +141,12 @@ class Draft:
         """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump."""
         reach, most = self.reach("transects")
         return dr.select(self.grid.grow(split, reach, most), UNSEEN_BY_TRANSECTS * self._whole(most), 0)
+
+    def wanted(self) -> Mask:
+        """Pixels that are shown, and of the rim those that may know of an edge which transects pass by there."""
+        if len(self.shown) == 1:
+            return self.shown
+        return self.grid.dilate(self.shown, self.reach("transects")[1])
 
     def near_edge(self, image: Image) -> Image:
         """Largest value around, as far as transects may pass an edge by."""

@@ -51,6 +51,7 @@ class _Ladder:
     """Which pixels the next transects go to, and what is known of them.
 
     where : pixels to look at
+    wanted : pixels that are shown, and those around that doubt them
     edges : which way transects go
     split : True where a transect met a jump
     smooth : True where node rules may do as well
@@ -59,7 +60,8 @@ class _Ladder:
     """
 
     def __init__(self, draft: Draft, rough: Mask) -> None:
-        self.draft, self.where, self.edges = draft, rough, edges_of(draft)
+        self.draft, self.edges, self.wanted = draft, edges_of(draft), draft.wanted()
+        self.where = rough & self.wanted
         self.split, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
         self.left = draft.grid.full(mi.Float64, 0)
         self.count = 0
@@ -96,7 +98,7 @@ class _Ladder:
         draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, self._doubt(known)), draft.error), unseen)
         tolerance = draft.tolerance
         dark = (tolerance <= 0) & dr.opaque(mi.Bool, level + 1 < DARK_LEVELS)
-        self.where = (where | (unseen > 0)) & ((draft.error > tolerance) | dark)
+        self.where = (where | (unseen > 0)) & ((draft.error > tolerance) | dark) & self.wanted
         self.count = len(rule)
         dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, self.where)
 
@@ -254,7 +256,7 @@ def _transect_sums(
     area = dr.opaque(mi.Float, float(draft.area))
     place = dr.select(sharp, even, gauss)
     curve = transect(draft.window.centres(pixel), angle, blur, place, area)
-    outline, least = mi.Float(2 * draft.peak), mi.Float(LEAST_JUMP * draft.tolerance)
+    outline, least = mi.Float(2 * dr.max(draft.value)), mi.Float(LEAST_JUMP * draft.tolerance)
     found = integrate_transect(draft.view, curve, phase, along, outline, least)
     value, hits, jumps, depth, looks = (mi.Float64(column) for column in found)
     share = mi.Float64(weight) * value

@@ -72,6 +72,10 @@ class Window:
         part[here] = image[there]
         return part
 
+    def shown(self) -> NDArray[np.bool_]:
+        """True (h, w) at pixels of the crop window, False on the rim."""
+        return self.cut(np.ones(self.full, bool))
+
     def _common(self) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
         """What both windows have, in this one and in the crop window."""
         ends = [
