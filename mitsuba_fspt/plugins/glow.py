@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import SceneError
 from .elements import Elements, elements_of
 from .exitance import function_on
-from .lanes import LANES, runs
+from .lanes import LANES, numbered, runs
 from .window import Window
 
 CELLS = 2.5  # balances the cells of the pupil with the size of the pieces, whatever the blur
@@ -43,9 +43,8 @@ class Batch:
 
     def lanes(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """Of every line of sight the element, its cuts and the line's number within the element."""
-        ends = np.cumsum(self.lines)
-        number = np.arange(ends[-1]) - np.repeat(ends - self.lines, self.lines)
-        row = mi.UInt32(np.repeat(np.arange(len(self.index)), self.lines).astype(np.uint32))
+        row, number = numbered(self.lines)
+        row = mi.UInt32(row.astype(np.uint32))
         index, cuts = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in (self.index, self.cuts))
         # Lanes beyond the last one gather 0, and whole numbers divided by 0 end the process.
         return index, dr.maximum(cuts, 1), mi.UInt32(number.astype(np.uint32))
@@ -118,7 +117,7 @@ class Glow:
             blur = np.maximum(blur, radius[:, 0])
         sides = np.where(np.isfinite(blur), np.hypot(*axes.transpose(2, 0, 1)).max(axis=0), UNBOUNDED)
         margin = BULGE * sides[:, None]
-        low, high = low - margin - film_corner(window), high + margin - film_corner(window)
+        low, high = low - margin - window.corner, high + margin - window.corner
         # Away for certain: between its corners a curved element may turn to the lens as far again as they differ.
         away = 2 * most - least <= 0
         dark = _dark(emitter, elements) if skip_dark else np.zeros(count, bool)
@@ -162,11 +161,6 @@ def cells_of(lines: int) -> int:
     ideal = min(max(CELLS * lines**0.25, 4), math.sqrt(lines))
     octave = 2 ** int(math.log2(ideal))
     return octave if ideal < 1.5 * octave else 3 * octave // 2
-
-
-def film_corner(window: Window) -> tuple[int, int]:
-    """Film position (x, y) [pixels] of the window's first pixel."""
-    return window.left + window.crop_offset[0], window.top + window.crop_offset[1]
 
 
 def _elements(shape: mi.Shape, lens: mi.Sensor, rtol: float) -> Elements:

@@ -33,3 +33,9 @@ def runs(lanes: NDArray[np.int64]) -> Iterator[slice]:
         last = max(first + 1, int(np.searchsorted(ends, done + LANES, side="right")))
         yield slice(first, last)
         first = last
+
+
+def numbered(lanes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Of every lane which item it is for, and its number among that item's, where item k takes `lanes[k]` of them."""
+    item = np.repeat(np.arange(len(lanes)), lanes)
+    return item, np.arange(len(item)) - np.repeat(np.cumsum(lanes) - lanes, lanes)

@@ -19,6 +19,7 @@ from ..rules import PLASTIC, twelve
 from .elements import Elements, at_one_wavelength, elements_of, scalar
 from .exitance import texels_of
 from .grid import Grid
+from .lanes import numbered
 from .lines import repeat
 from .occlusion import hidden
 from .window import Window
@@ -103,7 +104,7 @@ class _Points:
 
     def on(self, window: Window) -> _Points:
         """Places counted from the corner of a window."""
-        left, top = window.left + window.crop_offset[0], window.top + window.crop_offset[1]
+        left, top = window.corner
         return replace(self, x=self.x - left, y=self.y - top)
 
     def near(self, far: float | Column, shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -197,8 +198,7 @@ def _look(
     """At so many points of each element, the first its middle, radiance to where the lens sees most of it, area of the
     element's image from there, cosine, front, blur, place on film, see `_Points`; and place in the world.
     """
-    index = np.repeat(np.arange(elements.count), counts)
-    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    index, number = numbered(counts)
     sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
     si, area = elements.place(mi.UInt32(index), sample)
     to_lens = dr.normalize(_rim_above(si, lens) - si.p)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .elements import Elements, elements_of, scalar
-from .lanes import runs
+from .lanes import numbered, runs
 from .occlusion import hidden
 from .recording import recording
 
@@ -59,8 +59,8 @@ def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]
     columns, rows = np.maximum(last - first + 1, 0).T
     count = columns * rows
     for run in runs(count):
-        index = np.repeat(np.arange(run.start, run.stop), count[run])
-        number = np.arange(len(index)) - np.repeat(np.cumsum(count[run]) - count[run], count[run])
+        index, number = numbered(count[run])
+        index += run.start
         row, column = number // columns[index] + first[index, 1], number % columns[index] + first[index, 0]
         if len(index):
             yield index, row * size[0] + column

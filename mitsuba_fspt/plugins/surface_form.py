@@ -19,7 +19,7 @@ from ..quadrature import Quadrature, Solution
 from ..shortcuts import Finding
 from .elements import scalar
 from .footprint import Canvas
-from .glow import CORNERS, Batch, Glow, film_corner
+from .glow import CORNERS, Batch, Glow
 from .grid import Grid
 from .occlusion import hidden, hides_nothing
 from .window import Window
@@ -153,7 +153,7 @@ class _Refinement:
         etendue = dr.select(active, cos_s * weight * area * _area(cell) / (dr.pi * virtual_pixel), 0)
 
         discs = {at: lens.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
-        origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in film_corner(self.window)))
+        origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.window.corner))
         middle = _middle(i, j, m)
         images = [centre - origin + radius * middle for centre, radius, _ in discs.values()]
         # The image of a piece through the cell's middle or, where that is smaller than a cell's or a body's own blur

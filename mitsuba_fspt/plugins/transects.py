@@ -226,21 +226,21 @@ def apply_transects(
         dr.eval(images)
         rays += int(dr.sum(looks)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
-    value, hits, squares, trend, parted, blur = images
+    value, hits, squares, trend, split, blur = images
     number = dr.opaque(mi.Float64, len(rule))
     variance = squares - value * value
     blurred = dr.opaque(mi.Float64, KINK if len(rule) > 2 else SPREAD) * dr.safe_sqrt(variance - trend) / number
     # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
     slant = SLANT * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, CORNER * value / (number * number))
-    return Means(value, hits, parted > 0, dr.select(edges.sharp, sharp, blurred), blur)
+    return Means(value, hits, split > 0, dr.select(edges.sharp, sharp, blurred), blur)
 
 
 def _transect_sums(
     draft: Draft, part: mi.UInt32, edges: Edges, rule: rules.Transects, along: rules.AlongTransect
 ) -> list[Image]:
     """Of each listed pixel means over its transects of value, hits, value squared, what of that is a trend; how many
-    jump, and the blur of the most blurred edge; lines of sight taken.
+    a jump splits, and the blur of the most blurred edge; lines of sight taken.
     """
     count = dr.opaque(mi.UInt32, len(rule))
     lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
@@ -268,5 +268,5 @@ def _transect_sums(
     for polynomial in rule.trend:
         trend += dr.square(dr.block_sum(share * dr.gather(mi.Float64, mi.Float64(polynomial), number), len(rule)))
     ahead, behind = (dr.block_reduce(end, blur, len(rule)) for end in (dr.ReduceOp.Max, dr.ReduceOp.Min))
-    *sums, parted, looks = sums
-    return [*sums, trend, parted, _most_blurred(ahead, behind), looks]
+    *sums, split, looks = sums
+    return [*sums, trend, split, _most_blurred(ahead, behind), looks]

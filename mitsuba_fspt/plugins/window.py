@@ -35,6 +35,11 @@ class Window:
     blur: float
 
     @property
+    def corner(self) -> tuple[int, int]:
+        """Film position (x, y) [pixels] of the first pixel's corner."""
+        return self.left + self.crop_offset[0], self.top + self.crop_offset[1]
+
+    @property
     def count(self) -> int:
         """Pixels of the crop window in this one."""
         here, _ = self._common()
@@ -43,8 +48,7 @@ class Window:
     def centres(self, number: mi.UInt32) -> mi.Point2f:
         """Film positions [pixels] of the centres of the window's pixels of so much `number`, row by row."""
         width = dr.opaque(mi.UInt32, self.shape[1])
-        left = dr.opaque(mi.Float, self.left + self.crop_offset[0] + 0.5)
-        top = dr.opaque(mi.Float, self.top + self.crop_offset[1] + 0.5)
+        left, top = (dr.opaque(mi.Float, n + 0.5) for n in self.corner)
         return mi.Point2f(left + mi.Float(number % width), top + mi.Float(number // width))
 
     def stopped(self, lens: mi.Sensor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -52,8 +56,9 @@ class Window:
         if math.isinf(lens.optics.seen_field):
             return np.ones(self.shape, bool), np.zeros(self.shape, bool)
         width, height = (int(n) for n in lens.film().size())
-        x = np.abs(self.left + self.crop_offset[0] + np.arange(self.shape[1]) + 0.5 - width / 2)
-        y = np.abs(self.top + self.crop_offset[1] + np.arange(self.shape[0]) + 0.5 - height / 2)[:, None]
+        left, top = self.corner
+        x = np.abs(left + np.arange(self.shape[1]) + 0.5 - width / 2)
+        y = np.abs(top + np.arange(self.shape[0]) + 0.5 - height / 2)[:, None]
         radius = lens.optics.seen_field / lens.virtual_pitch
         inside = np.hypot(x + 0.5, y + 0.5) <= radius
         return inside, ~inside & (np.hypot(np.maximum(x - 0.5, 0), np.maximum(y - 0.5, 0)) < radius)
