@@ -20,15 +20,15 @@ def number(thing: str, value: object, error: type[FsptError], example: str) -> f
     try:
         return float(value)
     except OverflowError:
-        return math.inf if value > 0 else -math.inf
+        return math.inf if value > 0 else -math.inf  # type: ignore[operator]  # numbers.Real has no stub for it
 
 
 def whole(thing: str, value: object, error: type[FsptError], example: str) -> int:
     """`value` as an int; raises `error` for what is no whole number."""
     value = _without_axes(value)
     with suppress(OverflowError, ValueError):  # infinite, not a number
-        if isinstance(value, (Real, Decimal)) and value == int(value):
-            return int(value)
+        if isinstance(value, (Real, Decimal)) and value == (found := int(value)):  # type: ignore[arg-type]  # likewise
+            return found
     raise error(f"{thing} must be a whole number, got {_told(value)}. Give for example {example}.")
 
 
