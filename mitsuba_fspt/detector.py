@@ -26,9 +26,19 @@ from .exr import Metadata, write_exr
 from .image import Image
 from .plain import number, whole
 
-# Of a detector, and what an exposure's metadata call them: its `pixel_pitch` there is that of the pixels read out.
-NUMBERS = ("quantum_efficiency", "dark_current", "read_noise", "full_well", "gain", "bias", "bits", "pixel_pitch")
-RECORDED = {name: name for name in NUMBERS} | {"pixel_pitch": "detector_pixel_pitch"}
+# A detector's numbers, each with one to give. What an exposure's metadata call them: `pixel_pitch` there is that of the
+# pixels read out.
+EXAMPLES = {
+    "quantum_efficiency": "0.85",
+    "dark_current": "1e-3",
+    "read_noise": "3.5",
+    "full_well": "1e5",
+    "gain": "1.6",
+    "bias": "500",
+    "bits": "16",
+    "pixel_pitch": "0.0135",
+}
+RECORDED = {name: name for name in EXAMPLES} | {"pixel_pitch": "detector_pixel_pitch"}
 
 PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
 
@@ -148,10 +158,10 @@ class Detector:
         )
 
     def __post_init__(self) -> None:
-        for name in NUMBERS:
+        for name, example in EXAMPLES.items():
             value = getattr(self, name)
             if name != "pixel_pitch" or value is not None:
-                object.__setattr__(self, name, number(f"detector: '{name}'", value, DetectorError, "16"))
+                object.__setattr__(self, name, number(f"detector: '{name}'", value, DetectorError, example))
         eta, full_well, bits = self.quantum_efficiency, self.full_well, self.bits
         _require("quantum_efficiency", eta, 0 < eta <= 1, "in (0, 1], for example 0.85")
         _require("full_well", full_well, 0 < full_well <= 1e15, "in (0, 1e15] e-, for example 1e5")

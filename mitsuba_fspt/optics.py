@@ -17,6 +17,7 @@ MODELS = ("diaphragm", "hrrt", "pinhole", "ripoll")
 FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
 BORDERS = ("lens_diameter", "diaphragm_distance", "numerical_aperture", "image_stop_diameter")
 NUMBERS = ("focal_length", "f_number", *FOCUS, *BORDERS)  # of `Lens.focused`
+EXAMPLES = dict(zip(NUMBERS, ("55", "8", "165", "0.5", "82.5", "20", "5", "0.5", "20"), strict=True))
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class Lens:
     def __post_init__(self) -> None:
         for name in ("focal_length", "f_number", "focus_distance", *BORDERS):
             if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, number(f"fspt_lens: '{name}'", value, OpticsError, "20"))
+                object.__setattr__(self, name, number(f"fspt_lens: '{name}'", value, OpticsError, EXAMPLES[name]))
         _require_positive("focal_length", self.focal_length, "mm, for example 55")
         _require_positive("f_number", self.f_number, "f_number = F/D, for example 8")
         _require_positive("focus_distance", self.focus_distance, "mm, for example 165")
@@ -241,8 +242,8 @@ def configuration_factor(radius: float, distance: float, offset: float) -> float
 
 
 def _require_positive(name: str, value: float, example: str) -> float:
-    """`value` as a plain number."""
-    value = number(f"fspt_lens: '{name}'", value, OpticsError, "20")
+    """`value` as a plain number; OpticsError where it is none, not positive or beyond `LARGEST`."""
+    value = number(f"fspt_lens: '{name}'", value, OpticsError, EXAMPLES[name])
     if not (math.isfinite(value) and value > 0):
         raise OpticsError(f"fspt_lens: '{name}' must be > 0 and finite, got {value:g}. Give {example}.")
     if not 1 / LARGEST <= value <= LARGEST:

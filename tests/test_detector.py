@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from mitsuba_fspt.detector import Detector
+from mitsuba_fspt.detector import EXAMPLES, Detector
 from mitsuba_fspt.errors import BackendError, DetectorError, ImageError
 from mitsuba_fspt.exr import read_exr
 from mitsuba_fspt.image import Image
@@ -225,6 +226,14 @@ def test_counts_files_that_cannot_be_written(tmp_path, monkeypatch):
 def test_detectors_that_cannot_exist(name, value, rule):
     with pytest.raises(DetectorError, match=f"'{name}' must be finite and {rule}.*, for example .*, got {value}"):
         replace(CCD, **{name: value})
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_what_is_no_number_is_refused_with_one_that_would_do(name):
+    """Seen to fail: 16 for a quantum efficiency, which is 1 at the most."""
+    with pytest.raises(DetectorError, match=f"'{name}' must be a number, got 'many'") as caught:
+        replace(CCD, **{name: "many"})
+    replace(CCD, **{name: float(re.search(r"Give for example (.*)\.$", str(caught.value))[1])})
 
 
 @pytest.mark.parametrize(

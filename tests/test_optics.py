@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
 
 from mitsuba_fspt.errors import OpticsError
-from mitsuba_fspt.optics import Disc, Lens, configuration_factor
+from mitsuba_fspt.optics import BORDERS, Disc, Lens, configuration_factor
 
 FOCI = [{"focus_distance": 165.0}, {"magnification": 0.5}, {"image_distance": 82.5}]
 
@@ -154,5 +155,13 @@ def test_small_numbers_of_numpy_are_plain_numbers():
         assert lens == plain
         assert {type(value) for value in (lens.focal_length, lens.image_distance, lens.discs[0].radius)} == {float}
     assert Lens(np.int8(50), 8, np.int8(100)).image_distance == 100
-    with pytest.raises(OpticsError, match=r"'f_number' must be a number, got '8'\. Give for example"):
-        Lens(55.0, "8", 165.0)
+
+
+@pytest.mark.parametrize("name", ["focal_length", "f_number", "focus_distance", *BORDERS])
+def test_what_is_no_number_is_refused_with_one_that_would_do(name):
+    """Seen to fail: 20 for a numerical aperture, which is below 1."""
+    good = {"focal_length": 55.0, "f_number": 8.0, "focus_distance": 165.0, "lens_diameter": 30.0}
+    good |= {"model": "ripoll"} if name == "numerical_aperture" else {}
+    with pytest.raises(OpticsError, match=f"'{name}' must be a number, got '8'") as caught:
+        Lens(**good | {name: "8"})
+    Lens(**good | {name: float(re.search(r"Give for example (.*)\.$", str(caught.value))[1])})
