@@ -12,6 +12,7 @@ import numpy as np
 
 from . import backend
 from .extras import EXTRAS
+from .kinds import is_surface
 from .rendering import integrator_of, sensor_of
 from .scene import load
 from .shortcuts import SHORTCUTS, Finding
@@ -107,7 +108,7 @@ def _row(finding: Finding, lines: float | None, seconds: float | None) -> Row:
 def _never_done(scene: mi.Scene, variant: str) -> list[Row]:
     """What costs nothing because it is never begun."""
     loaded = [one.module for one in EXTRAS if one.module in sys.modules]
-    uniform = [type(emitter).__name__ == "FsptSurface" and emitter.is_uniform() for emitter in scene.emitters()]
+    uniform = [is_surface(emitter) and emitter.is_uniform() for emitter in scene.emitters()]
     return [
         Row("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),
         Row("gradients", True, "a picture asks for none"),

@@ -17,6 +17,7 @@ from . import backend, monte_carlo
 from .errors import SceneError
 from .image import Image
 from .interrupt import ctrl_c_noted
+from .kinds import is_integral
 from .optics import NUMBERS
 from .plain import whole
 from .quadrature import Quadrature
@@ -72,7 +73,7 @@ def render(
     integrator = integrator_of(scene, method)
     accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
     sampling = {"spp": spp, "seed": seed}
-    deterministic = type(integrator).__name__ == "FsptIntegral"
+    deterministic = is_integral(integrator)
     refused = sampling if deterministic else accuracy | {"shortcuts": None if shortcuts else False}
     _refuse(refused, "integral" if deterministic else "Monte Carlo")
     accuracy["shortcuts_off"] = None if shortcuts else frozenset(SHORTCUTS)
@@ -209,7 +210,7 @@ def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
             )
         return own
     if method in (None, "integral"):
-        return own if type(own).__name__ == "FsptIntegral" else mi.load_dict({"type": "fspt_integral"})
+        return own if is_integral(own) else mi.load_dict({"type": "fspt_integral"})
     if method not in METHODS:
         raise SceneError(f"render: 'method' must be one of {', '.join(METHODS)}, got '{method}'.")
     return monte_carlo.tracer(method)

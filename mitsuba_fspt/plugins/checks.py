@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import ExitanceError, SceneError
+from ..kinds import is_lens, is_surface
 from .elements import elements_of, triangles
 
 COARSEST = 0.1  # virtual pixels by which float32 may move a line of sight
@@ -29,7 +30,7 @@ def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
     if not scene.emitters():
         raise SceneError("scene: nothing glows. Give a shape an emitter of type 'fspt_surface' with its 'exitance'.")
     for emitter in scene.emitters():
-        if type(emitter).__name__ == "FsptSurface":
+        if is_surface(emitter):
             emitter.check()
             check_range(emitter, sensor)
             check_placement(emitter.get_shape())
@@ -40,7 +41,7 @@ def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
 def check_lens(sensor: mi.Sensor) -> None:
     """Raise SceneError unless the sensor is an `fspt_lens` with a film, OpticsError where it cannot exist."""
-    if type(sensor).__name__ != "FsptLens":
+    if not is_lens(sensor):
         raise SceneError(
             f"scene: the sensor is a {sensor.class_name()}, power on a pixel needs a lens. Use a sensor of type "
             "'fspt_lens'."

@@ -267,19 +267,3 @@ class ElementDistribution:
         index, area = self.elements.locate(si)
         chance = self._choice.pdf(mi.Point2u(index % self._side, index // self._side), active)
         return dr.select(active & si.is_valid() & (area > 0), chance / area, 0)
-
-
-WAVELENGTH_NM = 550.0  # where spectral variants look at spectrally flat quantities
-
-
-def at_one_wavelength(record: mi.Ray3f | mi.SurfaceInteraction3f) -> None:
-    """Give a ray or a surface point a wavelength; without one spectral variants read 0 everywhere."""
-    if mi.is_spectral:
-        record.wavelengths = type(record.wavelengths)(WAVELENGTH_NM)
-
-
-def scalar(spectrum: mi.Spectrum) -> mi.Float:
-    """The one number of a spectrally flat, unpolarised quantity, whatever the variant stores it in."""
-    flat = mi.unpolarized_spectrum(spectrum) if mi.is_polarized else spectrum
-    # `dr.mean` would write the number of lanes into the kernel, which then compiles anew for every picture.
-    return dr.sum(flat, axis=0) * (1 / len(flat))

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ExitanceError
-from .elements import at_one_wavelength, elements_of, scalar, triangles
+from .elements import elements_of, triangles
+from .spectra import at_one_wavelength, scalar
 
 SLIVER = 1e-6  # of the mean area: on a smaller face single precision may find no place to interpolate at
 ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero

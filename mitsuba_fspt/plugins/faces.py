@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..kinds import is_surface
 from .elements import elements_of
 
 
@@ -95,7 +96,7 @@ def _radiance_at_corners(mesh: mi.Shape) -> tuple[mi.Float, ...] | None:
     emitter = mesh.emitter()
     if emitter is None:
         return (dr.zeros(mi.Float, mesh.face_count()),) * 3
-    return emitter.radiance_at_corners() if type(emitter).__name__ == "FsptSurface" else None
+    return emitter.radiance_at_corners() if is_surface(emitter) else None
 
 
 def _table(mesh: mi.Shape, radiance: tuple[mi.Float, ...]) -> mi.Float:

@@ -6,14 +6,6 @@ import mitsuba as mi
 
 from ..errors import OpticsError
 
-# By which Mitsuba divides ∫ ȳ dλ of what spectral variants put on a film, and what that is of its own table [nm].
-CIE_NORM, CIE_TABLE = 106.7502593994140625, 106.85703
-
-
-def flat_share() -> float:
-    """What a film is to be given of a radiance that is the same at all wavelengths, for it to hold that number."""
-    return CIE_NORM / CIE_TABLE if mi.is_spectral else 1.0
-
 
 def own_film(props: mi.Properties) -> None:
     """Replace the film of the scene file by one of its size that stores power: monochrome, float32, box filter."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SceneError
+from ..kinds import is_surface
 from .elements import Elements, elements_of
 from .exitance import function_on
 from .lanes import LANES, numbered, runs
@@ -173,7 +174,7 @@ def _elements(shape: mi.Shape, lens: mi.Sensor, rtol: float) -> Elements:
 
 def _dark(emitter: mi.Emitter, elements: Elements) -> NDArray[np.bool_]:
     """True of elements on which J_n is 0: at all corners, between which a mesh attribute is linear."""
-    if type(emitter).__name__ != "FsptSurface" or not emitter.is_linear():
+    if not is_surface(emitter) or not emitter.is_linear():
         return np.zeros(elements.count, bool)
     exitance = function_on(emitter.get_shape(), emitter.exitance)
     index = dr.arange(mi.UInt32, elements.count)

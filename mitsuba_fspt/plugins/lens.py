@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ..errors import OpticsError
 from ..optics import NUMBERS, Lens
-from .film import default_sampler, flat_share, number, own_film
+from .film import default_sampler, number, own_film
 from .pupil import Pupil
+from .spectra import flat_share
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
 STRETCH = 1e-5  # by which float32 may make a rotation's matrix differ from one

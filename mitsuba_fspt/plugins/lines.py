@@ -15,8 +15,8 @@ import mitsuba as mi
 
 from .. import rules
 from ..shortcuts import Finding
-from .elements import at_one_wavelength, scalar
 from .faces import Faces
+from .spectra import at_one_wavelength, scalar
 
 if TYPE_CHECKING:
     from .window import Window

@@ -15,13 +15,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kinds import is_surface
 from ..rules import PLASTIC, twelve
-from .elements import Elements, at_one_wavelength, elements_of, scalar
+from .elements import Elements, elements_of
 from .exitance import texels_of
 from .grid import Grid
 from .lanes import numbered
 from .lines import repeat
 from .occlusion import hidden
+from .spectra import at_one_wavelength, scalar
 from .window import Window
 
 OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
@@ -51,7 +53,7 @@ class NarrowLight:
 def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
     """What `lens` sees of the light of narrow spots; nothing where no emitter is an `fspt_surface`."""
     on_pixels = np.zeros(window.shape)
-    parts = [_seen(scene, emitter, lens) for emitter in scene.emitters() if type(emitter).__name__ == "FsptSurface"]
+    parts = [_seen(scene, emitter, lens) for emitter in scene.emitters() if is_surface(emitter)]
     if not parts or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0)
     points = _Points.joined(parts).on(window)

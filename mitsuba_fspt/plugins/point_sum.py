@@ -14,10 +14,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .elements import Elements, elements_of, scalar
+from .elements import Elements, elements_of
 from .lanes import numbered, runs
 from .occlusion import hidden
 from .recording import recording
+from .spectra import scalar
 
 Image = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..kinds import is_surface
 from .elements import triangles
 from .intersections import traced_robustly
 
@@ -42,7 +43,7 @@ def probe_beside(scene: mi.Scene) -> None:
     if not mi.variant().startswith("cuda"):
         return
     for emitter in scene.emitters():
-        if type(emitter).__name__ == "FsptSurface":
+        if is_surface(emitter):
             emitter.trace_beside(scene)
 
 

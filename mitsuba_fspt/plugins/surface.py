@@ -12,6 +12,7 @@ from .emission import Lambert, law_of
 from .last_flight import LastFlight
 from .probe import Probe
 from .recording import aside, scene_is_checked
+from .spectra import sample_wavelengths
 
 
 class FsptSurface(mi.Emitter):
@@ -266,13 +267,6 @@ class FsptSurface(mi.Emitter):
 
     def to_string(self) -> str:
         return f"FsptSurface[\n  exitance = {self.exitance},\n  emission = {self.law}\n]"
-
-
-def sample_wavelengths(sample: mi.Float) -> tuple[mi.Wavelength, mi.UnpolarizedSpectrum]:
-    """Wavelengths [nm] and the inverse of their density, in spectral variants; nothing and 1 elsewhere."""
-    if not mi.is_spectral:
-        return mi.Color0f(), mi.UnpolarizedSpectrum(1)
-    return mi.sample_rgb_spectrum(mi.sample_shifted(sample))
 
 
 def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:

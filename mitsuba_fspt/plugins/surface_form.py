@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import Finding
-from .elements import scalar
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow
 from .grid import Grid
 from .occlusion import hidden, hides_nothing
+from .spectra import scalar
 from .window import Window
 
 # Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kinds import is_surface
 from ..rules import GAP
 
 Boxes = tuple[tuple[float, ...], ...]
@@ -102,7 +103,7 @@ def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -
 def glowing_boxes(scene: mi.Scene) -> Boxes:
     """Corners of the bounding boxes of what glows, as numbers: xyz of the lowest and of the highest."""
     emitters = scene.emitters()
-    direct = all(type(emitter).__name__ == "FsptSurface" for emitter in emitters)
+    direct = all(is_surface(emitter) for emitter in emitters)
     boxes = [emitter.bbox() for emitter in emitters] if direct else [scene.bbox()]
     return tuple((*map(float, box.min), *map(float, box.max)) for box in boxes)
 
