@@ -16,6 +16,11 @@ Parameters = Annotated[
     list[str] | None,
     typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
 ]
+Method = Annotated[str | None, typer.Option(help="integral, path or ptracer; the scene's own if left out.")]
+Rtol = Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")]
+Domain = Annotated[str | None, typer.Option(help="pupil or surface; the scene's own if left out.")]
+Spp = Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")]
+Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
 NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
 
 

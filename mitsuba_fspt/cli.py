@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from .arguments import Parameters, SceneFile, definitions, require_writable
+from .arguments import Domain, Method, Parameters, Rtol, SceneFile, Seed, Spp, definitions, require_writable
 from .atomic import require_apart
 from .backend import quiet_mitsuba
 from .errors import FsptError, ImageError
@@ -47,11 +47,11 @@ def fspt(version: Annotated[bool, typer.Option("--version", help="Print the vers
 def render(
     scene: SceneFile,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Image to write, .exr.")] = None,
-    method: Annotated[str | None, typer.Option(help="integral, path or ptracer; the scene's own if left out.")] = None,
-    rtol: Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")] = None,
-    domain: Annotated[str | None, typer.Option(help="pupil or surface; the scene's own if left out.")] = None,
-    spp: Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")] = None,
+    method: Method = None,
+    rtol: Rtol = None,
+    domain: Domain = None,
+    spp: Spp = None,
+    seed: Seed = None,
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
@@ -186,8 +186,8 @@ def stability(
 def explain(
     scene: SceneFile,
     define: Parameters = None,
-    rtol: Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")] = None,
-    domain: Annotated[str | None, typer.Option(help="pupil or surface; the scene's own if left out.")] = None,
+    rtol: Rtol = None,
+    domain: Domain = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
 ) -> None:
     """Tell what the integral leaves out of a scene, why, and what that saves: 'render --no-shortcuts' goes without."""

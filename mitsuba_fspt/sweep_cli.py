@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .arguments import SceneFile
+from .arguments import Method, Rtol, SceneFile, Seed, Spp
 from .backend import quiet_mitsuba
 from .errors import BackendError, FsptError, SceneError
 from .terminal import progress_bar
@@ -28,10 +28,10 @@ def sweep(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for the images, SCENE_sweep if left out.")
     ] = None,
-    method: Annotated[str | None, typer.Option(help="integral, path or ptracer; the scene's own if left out.")] = None,
-    rtol: Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")] = None,
-    spp: Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")] = None,
+    method: Method = None,
+    rtol: Rtol = None,
+    spp: Spp = None,
+    seed: Seed = None,
     jobs: Annotated[int | None, typer.Option(help="Processes on this machine.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
