@@ -20,7 +20,7 @@ from .converge_reference import Reference, own_reference, read_reference
 from .convergence import Convergence, Row
 from .errors import FsptError, SceneError
 from .plain import number, whole
-from .scene import load
+from .scene import loaded
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -81,48 +81,44 @@ def converge(
     budget = number("converge: 'budget'", budget, SceneError, str(BUDGET))
     if not (rounds >= 1 and 0 < budget < math.inf):
         raise SceneError(f"converge: 'rounds' must be >= 1 and 'budget' > 0 s and finite, got {rounds} and {budget:g}.")
-    if isinstance(scene, (str, os.PathLike)):
-        scene = load(scene)
-    variant = backend.ensure_variant()
+    scene = loaded(scene)
+    backend.ensure_variant()
     lens = rendering.sensor_of(scene, sensor)
     tell = progress or (lambda what, share: None)
-    width, height = (int(n) for n in _film(scene, lens).crop_size())
-    known = read_reference(reference, (height, width)) if reference is not None else None
-    tell("reference", 0.0)
-    known = known or own_reference(scene, lens, REFERENCE_TIME * budget)
-    judge = Judge(known, rendering.render(scene, method="integral", sensor=sensor, rtol=1e-3).coverage > WHOLE_CONE)
+    known = _reference(scene, lens, reference, budget, tell)
+    full = rendering.render(scene, method="integral", sensor=sensor, rtol=1e-3).coverage > WHOLE_CONE
+    bench = Bench(Judge(known, full), Path(kernels) if kernels is not None else None, budget)
+    skipped = bench.try_all(*methods(scene, lens, known.least_rtol), tell)
+    rate = bench.run_rounds(rounds, [raw_rate(scene, lens, together) for together in (False, True)], tell)
+    return _convergence(scene, bench, rounds, rate, skipped)
 
-    offered, skipped = methods(scene, lens, known.least_rtol)
-    bench = Bench(judge, Path(kernels) if kernels is not None else None, budget)
-    for k, method in enumerate(offered):
-        tell(f"first runs: {method.name}", 0.1 + 0.4 * k / len(offered))
-        try:
-            too_long = bench.try_ladder(method)
-        except FsptError as refusal:
-            skipped[method.name] = str(refusal)
-        else:
-            skipped |= too_long
-    if skipped and not bench.trials:
-        name, why = next(iter(skipped.items()))
-        raise SceneError(f"converge: nothing to time; {name}: {why}, 'budget' is {budget:g} s. Give a longer one.")
-    raws = {raw: raw() for raw in (raw_rate(scene, lens, together) for together in (False, True))}
-    raw_seconds: dict[object, list[float]] = {raw: [] for raw in raws}
-    for k in range(rounds):
-        for raw in raws:
-            raw_seconds[raw].append(_seconds(raw)[0])
-        for trial in bench.trials[:: -1 if k % 2 else 1]:
-            tell(f"round {k + 1}: {trial.method.name}", 0.5 + 0.5 * k / rounds)
-            trial.run_timed(judge)
+
+def _reference(
+    scene: mi.Scene, lens: mi.Sensor, path: str | os.PathLike[str] | None, budget: float, tell: Progress
+) -> Reference:
+    """What errors are counted from: the file's picture, or one of our own."""
+    width, height = (int(n) for n in _film(scene, lens).crop_size())
+    known = read_reference(path, (height, width)) if path is not None else None
+    tell("reference", 0.0)
+    return known or own_reference(scene, lens, REFERENCE_TIME * budget)
+
+
+def _convergence(scene: mi.Scene, bench: Bench, rounds: int, rate: float, skipped: dict[str, str]) -> Convergence:
+    """What was measured, as plain data."""
+    import mitsuba as mi
+
+    known = bench.judge.reference
+    height, width = known.power.shape
     return Convergence(
         scene=scene.id(),
-        machine=f"{os.cpu_count()} cores, {platform.machine()}, {variant}; {rounds} rounds",
+        machine=f"{os.cpu_count()} cores, {platform.machine()}, {mi.variant()}; {rounds} rounds",
         shape=(height, width),
         reference=known.name,
         check=known.check,
         stated=known.rms,
         stated_largest=known.largest,
-        full=int(judge.full.sum()),
-        raw_rate=max(rays / float(np.median(raw_seconds[raw])) for raw, rays in raws.items()),
+        full=int(bench.judge.full.sum()),
+        raw_rate=rate,
         rows=tuple(trial.row() for trial in bench.trials),
         skipped=skipped,
     )
@@ -187,6 +183,37 @@ class Bench:
     def __init__(self, judge: Judge, kernels: Path | None, budget: float) -> None:
         self.judge, self.kernels, self.budget = judge, kernels, budget
         self.trials: list[Trial] = []
+
+    def try_all(self, offered: list[Method], skipped: dict[str, str], tell: Progress) -> dict[str, str]:
+        """First runs of all methods; returns what is left out, those `skipped` already among it, and why.
+
+        SceneError where nothing is left to time.
+        """
+        left_out = dict(skipped)
+        for k, method in enumerate(offered):
+            tell(f"first runs: {method.name}", 0.1 + 0.4 * k / len(offered))
+            try:
+                left_out |= self.try_ladder(method)
+            except FsptError as refusal:
+                left_out[method.name] = str(refusal)
+        if left_out and not self.trials:
+            name, why = next(iter(left_out.items()))
+            raise SceneError(
+                f"converge: nothing to time; {name}: {why}, 'budget' is {self.budget:g} s. Give a longer one."
+            )
+        return left_out
+
+    def run_rounds(self, rounds: int, raws: list[Callable[[], int]], tell: Progress) -> float:
+        """The timed rounds; returns the rays per second of the faster of the `raws`, see `raw_rate`."""
+        rays = [raw() for raw in raws]
+        seconds: list[list[float]] = [[] for _ in raws]
+        for k in range(rounds):
+            for own, raw in zip(seconds, raws, strict=True):
+                own.append(_seconds(raw)[0])
+            for trial in self.trials[:: -1 if k % 2 else 1]:
+                tell(f"round {k + 1}: {trial.method.name}", 0.5 + 0.5 * k / rounds)
+                trial.run_timed(self.judge)
+        return max(count / float(np.median(own)) for count, own in zip(rays, seconds, strict=True))
 
     def try_ladder(self, method: Method) -> dict[str, str]:
         """Run a method's settings from coarse to fine until one takes longer than the budget; the first one stays.

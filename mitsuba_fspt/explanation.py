@@ -14,7 +14,7 @@ from . import backend
 from .extras import EXTRAS
 from .kinds import is_surface
 from .rendering import integrator_of, sensor_of
-from .scene import load
+from .scene import loaded
 from .shortcuts import SHORTCUTS, Finding
 
 if TYPE_CHECKING:
@@ -69,8 +69,7 @@ def explain(
 
     Parameters as of `render`, and so are the errors raised.
     """
-    if isinstance(scene, (str, os.PathLike)):
-        scene = load(scene)
+    scene = loaded(scene)
     variant = backend.ensure_variant()
     lens, integrator = sensor_of(scene, sensor), integrator_of(scene, "integral")
     wanted = {name: value for name, value in (("rtol", rtol), ("domain", domain)) if value is not None}

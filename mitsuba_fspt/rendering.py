@@ -21,7 +21,7 @@ from .kinds import is_integral
 from .optics import NUMBERS
 from .plain import whole
 from .quadrature import Quadrature
-from .scene import load
+from .scene import loaded
 from .shortcuts import SHORTCUTS
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ def render(
     ------
     SceneError, OpticsError, ExitanceError, BackendError : what is wrong and how to mend it.
     """
-    if not _is_scene(scene):
-        scene = load(scene)
+    scene = loaded(scene)
     backend.ensure_variant()
     sensor = whole("render: 'sensor'", sensor, SceneError, "0")
     lens = sensor_of(scene, sensor)
@@ -86,21 +85,19 @@ def render(
                 progress(what, share)
 
         if deterministic:
-            power, error, coverage, how = _integrate(scene, lens, integrator, accuracy, tell)
+            *planes, how = _integrate(scene, lens, integrator, accuracy, tell)
         else:
             spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
-            power, error, coverage, how = _sample(scene, lens, integrator, spp, seed, tell)
+            *planes, how = _sample(scene, lens, integrator, spp, seed, tell)
         check_interrupt()
     how["wall_time"] = time.perf_counter() - start
-    return Image(
-        power, error, coverage, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()}
-    )
+    return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
 
 
 def _integrate(
     scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress
 ) -> tuple:
-    """Arrays and metadata of the deterministic integral."""
+    """Power, error and coverage by the deterministic integral, and metadata."""
     own = asdict(integrator.quadrature)
     wanted = own | {name: value for name, value in accuracy.items() if value is not None}
     progress("integrating", 0.0)
@@ -120,7 +117,7 @@ def _sample(
     seed: int,
     progress: Progress,
 ) -> tuple:
-    """Mean and standard error of independent Monte Carlo passes, summed in double precision."""
+    """Mean and standard error of independent Monte Carlo passes, summed in double precision, coverage, and metadata."""
     from .plugins.checks import check_scene
     from .plugins.probe import probe_beside
     from .plugins.pupil_form import coverage
@@ -164,10 +161,6 @@ def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
     window = visible_window(scene, lens)
     inside, cut = window.stopped(lens)
     return window.expand((inside | cut).astype(np.float64)) > 0
-
-
-def _is_scene(scene: object) -> bool:
-    return not isinstance(scene, (str, os.PathLike))
 
 
 def sensor_of(scene: mi.Scene, number: int) -> mi.Sensor:

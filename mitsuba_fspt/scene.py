@@ -64,6 +64,11 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     return scene
 
 
+def loaded(scene: mi.Scene | str | os.PathLike[str]) -> mi.Scene:
+    """A scene itself, or that of the file so named."""
+    return load(scene) if isinstance(scene, (str, os.PathLike)) else scene
+
+
 def _xml_of(path: Path, parameters: Mapping[str, object]) -> SceneXml:
     return read_xml(path, {name: parameter_text(value) for name, value in parameters.items()})
 

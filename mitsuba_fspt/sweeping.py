@@ -90,15 +90,26 @@ def sweep(
     folder = Path(folder)
     jobs = None if jobs is None else whole("sweep: 'jobs'", jobs, SceneError, "2")
     _check_jobs(jobs, scheduler)
-    settings: dict[str, Setting] = {
+    wanted = points(Path(scene), parameters, _settings(method, rtol, spp, seed))
+    _check_names(wanted)
+    _check_folder(folder)
+    return _completed(wanted, folder, jobs, scheduler, progress)
+
+
+def _settings(method: str | None, rtol: float | None, spp: int | None, seed: int | None) -> dict[str, Setting]:
+    """What every point is rendered with; SceneError for what is no number."""
+    return {
         "method": method,
         "rtol": None if rtol is None else number("sweep: 'rtol'", rtol, SceneError, "1e-3"),
         "spp": None if spp is None else whole("sweep: 'spp'", spp, SceneError, "256"),
         "seed": None if seed is None else whole("sweep: 'seed'", seed, SceneError, "1"),
     }
-    wanted = points(Path(scene), parameters, settings)
-    _check_names(wanted)
-    _check_folder(folder)
+
+
+def _completed(
+    wanted: list[Point], folder: Path, jobs: int | None, scheduler: str | None, progress: Progress | None
+) -> list[Row]:
+    """Rows of all points, rendered where their image is not there yet; the index tells those that are."""
     rows = {point.file: row for point in wanted if (row := _finished(point, folder)) is not None}
     missing = _by_geometry(point for point in wanted if point.file not in rows)
     failed: dict[str, FsptError] = {}

@@ -144,6 +144,13 @@ def test_files_stay_short(name):
     assert len((PACKAGE / name).read_text().splitlines()) <= 300
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_functions_stay_short(name):
+    for node in ast.walk(tree_of(name)):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno < 60, f"{node.name}, line {node.lineno}"
+
+
 def test_the_public_list_is_this():
     assert sorted(fspt.__all__) == PUBLIC
     for name in PUBLIC:
