@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import select
+import shlex
 import signal
 import subprocess
 import sys
@@ -15,10 +16,11 @@ import time
 import numpy as np
 import OpenEXR
 import pytest
+import typer
 from little_scenes import LENS_XML, SCENES, write_ply, write_scene
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt import doctor, rendering
+from mitsuba_fspt import cli, doctor, rendering
 
 SMALL = ["-D", "width=12", "-D", "height=10", "-D", "pixel_pitch=2.304", "--rtol", "1e-2"]
 
@@ -282,6 +284,22 @@ def test_version_and_help(run):
 
 
 # --- processes ---
+
+
+DOCUMENTS = [SCENES.parent / "README.md", *sorted((SCENES.parent / "docs").glob("*.md"))]
+LINES = [line.strip() for document in DOCUMENTS for line in document.read_text().splitlines()]
+
+
+@pytest.mark.parametrize("line", [line for line in LINES if line.startswith("fspt ")])
+def test_the_documents_name_verbs_and_options_that_are_there(line):
+    """Parsed like any call and not run; what stands for something else, in brackets or after |, is left out."""
+    words = shlex.split(re.sub(r"\[|\]|\|\S+", " ", line), comments=True)[1:]
+    verb, name = typer.main.get_command(cli.app), "fspt"
+    while hasattr(verb, "commands"):
+        name = words.pop(0)
+        assert name in verb.commands
+        verb = verb.commands[name]
+    verb.make_context(name, [word for word in words if word != "…"])
 
 
 def test_python_dash_m_is_the_command():
