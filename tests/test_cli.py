@@ -283,9 +283,6 @@ def test_version_and_help(run):
         assert "Usage: fspt " + verb in out
 
 
-# --- processes ---
-
-
 DOCUMENTS = [SCENES.parent / "README.md", *sorted((SCENES.parent / "docs").glob("*.md"))]
 LINES = [line.strip() for document in DOCUMENTS for line in document.read_text().splitlines()]
 
@@ -299,7 +296,10 @@ def test_the_documents_name_verbs_and_options_that_are_there(line):
         name = words.pop(0)
         assert name in verb.commands
         verb = verb.commands[name]
-    verb.make_context(name, [word for word in words if word != "…"])
+    verb.make_context(name, words)
+
+
+# --- processes ---
 
 
 def test_python_dash_m_is_the_command():

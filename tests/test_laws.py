@@ -18,9 +18,10 @@ from small_scenes import (
     RADIUS,
     SIDE,
     WIDTH,
-    configuration_factor,
+    collected,
     disk,
     even_disc,
+    filled,
     load,
     over_pixels,
     power,
@@ -32,12 +33,6 @@ from small_scenes import (
 import mitsuba_fspt as fspt
 
 pytestmark = pytest.mark.usefixtures("mono")
-
-
-def filled(side=SIDE, nodes=1, radius=RADIUS, distance=FOCUS):
-    """Power on every pixel whose cone is filled by 1 W/mm²: A_vd times the configuration factor."""
-    factor = over_pixels(lambda x, y: configuration_factor(radius, distance, np.hypot(x, y)), side, nodes)
-    return side**2 * factor
 
 
 def cos4(side=SIDE):
@@ -129,25 +124,6 @@ def test_light_falls_off_with_the_fourth_power_of_the_cosine():
 
 
 # --- energy ---
-
-
-def collected(radius, centre, pupil=RADIUS):
-    """∫ J_n f dS [W]: what a uniform sphere on the axis (1 W/mm²) sends through the pupil.
-
-    Gauss rules over the polar angle of the sphere and over the pupil; only what faces a pupil point shines at it.
-    """
-    node, weight = np.polynomial.legendre.leggauss(400)
-    cosine, weight = -1 + 0.6 * (node + 1), 0.6 * weight  # the cap that looks at the lens, and a little more
-    sine = np.sqrt(1 - cosine**2)
-    rho, share = np.polynomial.legendre.leggauss(24)
-    turn = (np.arange(64) + 0.5) * 2 * np.pi / 64
-    rho = pupil * np.sqrt((rho + 1) / 2)[:, None]
-    px, py = (rho * np.cos(turn)).ravel(), (rho * np.sin(turn)).ravel()
-    part = np.repeat(share / 2, 64) / 64 * np.pi * pupil**2
-    x, z = radius * sine[:, None], centre + radius * cosine[:, None]
-    dx, d2 = px - x, (px - x) ** 2 + py**2 + z**2
-    shine = np.maximum(dx * sine[:, None] - z * cosine[:, None], 0) * z / (np.pi * d2**2)
-    return weight @ (shine @ part) * 2 * np.pi * radius**2
 
 
 @pytest.mark.parametrize("focus", [140.0, 165.0, 200.0])

@@ -13,18 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from reference_cases import EXITANCE, camera, pose, rms, sheet, uniform, wavy
+from small_scenes import configuration_factor
 
 from mitsuba_fspt import reference
 from mitsuba_fspt.errors import OpticsError
 from mitsuba_fspt.reference import collected_power, look_at, pupil_form, surface_form
 from mitsuba_fspt.reference_shapes import Cylinder, Disc, Rectangle, Sphere
-
-
-def configuration_factor(distance, radius, off_axis):
-    """From a point to a parallel disc at `distance` whose centre is `off_axis` from its normal."""
-    z = distance**2 + radius**2 + off_axis**2
-    s = np.sqrt((z - 2 * radius * off_axis) * (z + 2 * radius * off_axis))
-    return 2 * radius**2 * distance**2 / (s * (s + z - 2 * radius**2))
 
 
 @pytest.mark.parametrize("distance", [110.0, 165.0, 900.0])
@@ -39,7 +33,7 @@ def test_uniform_sheet_meets_the_closed_form(distance, pixel):
     side = 1.0 * (165 / 55 - 1)  # p/t
     x, y = (side * (np.arange(n)[:, None] + 0.5 + node / 2 - n / 2) for n in (6, 5))
     off_axis = np.hypot(x[None, :, None, :], y[:, None, :, None])
-    factor = configuration_factor(165, 55 / 2.8 / 2, off_axis) @ weight @ weight / 4
+    factor = configuration_factor(55 / 2.8 / 2, 165, off_axis) @ weight @ weight / 4
     np.testing.assert_allclose(power, EXITANCE * side**2 * factor, rtol=1e-9)
     assert error.max() < 1e-4 * power.max()
 

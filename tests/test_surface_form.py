@@ -6,8 +6,22 @@ import numpy as np
 import pytest
 import trimesh
 from little_scenes import glow, lens, scene_of, write_ply
-from small_scenes import FOCUS, HEIGHT, MAGNIFICATION, PITCH, RADIUS, SIDE, WIDTH, disk, even_disc, load, scene, sphere
-from test_laws import collected, filled
+from small_scenes import (
+    FOCUS,
+    HEIGHT,
+    MAGNIFICATION,
+    PITCH,
+    RADIUS,
+    SIDE,
+    WIDTH,
+    collected,
+    disk,
+    even_disc,
+    filled,
+    load,
+    scene,
+    sphere,
+)
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.errors import SceneError
