@@ -2,7 +2,7 @@
 
 phantom = Phantom(vertices, faces, exitance, "vertex", {"source": "my own code"})
 phantom.power
-phantom.write("mouse.ply")          # what fspt_surface reads as mesh_attribute vertex_exitance
+phantom.write("mouse.ply")  # what fspt_surface reads as mesh_attribute vertex_exitance
 """
 
 from __future__ import annotations

@@ -49,8 +49,8 @@ import numpy as np
 
 from .boundary import boundary_a
 from .cylinder import cylinder_tetrahedra
-from .elements import import_skfem
 from .errors import FluxError
+from .finite_elements import import_skfem
 from .medium import Medium, Source
 from .mesher import read_tetrahedra
 from .shapes import Ball, Rod, Shape

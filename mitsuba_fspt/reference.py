@@ -1,4 +1,4 @@
-"""Eq. 9 in float64 NumPy by brute force: the truth that tests measure the plugins against.
+"""Eq. 9 in float64 NumPy by brute force: the truth that tests, and figures of scripts/, measure the plugins against.
 
 It shares no code with them. Camera frame: lens plane z = 0, +z towards the object, +x to the left of the
 picture, +y up; virtual detector plane z = u. Lengths in mm, exitance J_n in W/mm², results in W on each

@@ -120,7 +120,7 @@ class Rod:
         return Nodes(local @ self.frame + np.asarray(self.centre), np.zeros(len(shares)), shares)
 
     def border(self) -> Array:
-        """Points of the rims and the end centres, (M, 3) [mm]."""
+        """Points of both rims and of the circle half-way between them, and the centres of all three, (M, 3) [mm]."""
         angle = np.arange(32) * (2 * math.pi / 32)
         rim = np.stack([self.radius * np.cos(angle), self.radius * np.sin(angle), 0 * angle], axis=1)
         rim = np.concatenate([rim, np.zeros((1, 3))])

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .elements import Solved
 from .errors import FluxError
+from .finite_elements import Solved
 from .free_field import FreeField
 from .lattice import border_lattice, nearest_points
 from .medium import Medium
 from .phantom import Phantom
 from .surface import face_areas
-from .tetrahedra import Tetrahedra, depth
+from .tetrahedra import OUTSIDE, Tetrahedra, depth
 from .volume import Volume, voxel_box
 
 Array = NDArray[np.float64]
@@ -25,6 +25,7 @@ Index = NDArray[np.int64]
 LARGEST_REMOVED = 1e-4
 # Of the search in curved cells; each one divides the error by about 8 radii of curvature over an edge.
 CURVED_STEPS = 6
+NEARBY = 0.5  # barycentric coordinates beyond a cell: further off curved cells are as good as straight ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +135,7 @@ class Solution:
         z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
         points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
         cells, local = self._curved(points, *self.mesh.locate(points))
-        inside = depth(local) > -1e-6
+        inside = depth(local) > -OUTSIDE
         fluence = np.empty(len(points))
         # 1/r has over a cube about its middle the mean 1/(0.42 edge): a point source keeps its voxel finite.
         fluence[inside] = self._fluence(points[inside], cells[inside], local[inside], 0.42 * voxel)
@@ -177,11 +178,11 @@ class Solution:
 
     def _curved(self, points: Array, cells: Index, local: Array) -> tuple[Index, Array]:
         """Cells and local coordinates in the curved mesh, from those in the straight one."""
-        near = np.flatnonzero(depth(local) > -0.5)
+        near = np.flatnonzero(depth(local) > -NEARBY)
         if self.basis.mesh.affine or len(near) == 0:
             return cells, local
         there = self._curved_local(points[near], cells[near])
-        converged = depth(there) > -0.5
+        converged = depth(there) > -NEARBY
         near = near[converged]
         local[near] = there[converged]
         for _ in range(CURVED_STEPS):

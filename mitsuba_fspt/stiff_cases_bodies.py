@@ -13,6 +13,7 @@ from .stiff_cases_scenes import (
     EXACT,
     FOCAL,
     FOCUS,
+    PUPIL,
     REFUSAL,
     ROUNDED,
     SAME,
@@ -128,7 +129,7 @@ def _slivers() -> float:
 def _pinhole_on_vertices() -> float:
     picture = power(scene(mesh(*_aligned(0.5)), model="pinhole"), pixel="centre")
     falloff = over_pixels(lambda x, y: FOCUS**4 / (FOCUS**2 + x**2 + y**2) ** 2, nodes=1)
-    return off_anywhere(picture, (FOCAL / 16 * SIDE / FOCUS) ** 2 * falloff)
+    return off_anywhere(picture, (PUPIL * SIDE / FOCUS) ** 2 * falloff)
 
 
 def body_cases() -> list[Case]:
@@ -146,12 +147,12 @@ def _two_circles() -> float:
 
     P = J_n/π · A_vd · (what the circles share) cos⁴θ/u².
     """
-    z, radius, pupil, pitch = 110.0, 0.8, FOCAL / 16, 0.1
+    z, radius, pitch = 110.0, 0.8, 0.1
     side = pitch * (FOCUS - FOCAL) / FOCAL
 
     def seen(x: Image, y: Image) -> Image:
         h = np.hypot(x, y)
-        return _shared(pupil, radius * FOCUS / (FOCUS - z), h * z / (FOCUS - z)) / (1 + (h / (FOCUS - z)) ** 2) ** 2
+        return _shared(PUPIL, radius * FOCUS / (FOCUS - z), h * z / (FOCUS - z)) / (1 + (h / (FOCUS - z)) ** 2) ** 2
 
     expected = side**2 / (np.pi * FOCUS**2) * over_pixels(seen, side, 30)
     return off(power(scene(disk(z, radius), pixel_pitch=pitch)), expected)

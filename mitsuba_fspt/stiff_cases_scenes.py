@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 24, 20
 FOCAL, F_NUMBER, FOCUS, PITCH = 55.0, 8.0, 165.0, 0.4
 SIDE = PITCH * (FOCUS - FOCAL) / FOCAL  # of a virtual pixel
+PUPIL = FOCAL / F_NUMBER / 2  # radius
 
 CONE = "filled cone: A_vd times the configuration factor"
 BALANCE = "power balance: what the disk sends through the pupil"
@@ -135,9 +136,7 @@ def power(of: mi.Scene, **accuracy: Any) -> Image:
     return np.asarray(image.power if np.isfinite(image.error).all() else np.full(image.shape, np.nan), np.float64)
 
 
-def filled(
-    focus: float = FOCUS, side: float = SIDE, radius: float = FOCAL / F_NUMBER / 2, nodes: int = 4, film: Any = None
-) -> Image:
+def filled(focus: float = FOCUS, side: float = SIDE, radius: float = PUPIL, nodes: int = 4, film: Any = None) -> Image:
     """Power on every pixel whose cone is filled by 1 W/mm²: A_vd times the mean configuration factor of the pupil."""
     factor = np.vectorize(configuration_factor)
     return side**2 * over_pixels(lambda x, y: factor(radius, focus, np.hypot(x, y)), side, nodes, film)
@@ -152,7 +151,7 @@ def over_pixels(of: Callable[[Image, Image], Image], side: float = SIDE, nodes: 
     return np.einsum("hwij,i,j->hw", values, weight / 2, weight / 2)
 
 
-def through_pupil(radius: float, z: float, pupil: float = FOCAL / F_NUMBER / 2) -> float:
+def through_pupil(radius: float, z: float, pupil: float = PUPIL) -> float:
     """What a disk of 1 W/mm² on the axis, parallel to the lens, sends through the pupil."""
     node, weight = np.polynomial.legendre.leggauss(12)
     a = radius * (node + 1) / 2
@@ -176,7 +175,7 @@ def off_anywhere(picture: Image, truth: Image) -> float:
 
 def cone(*bodies: Body, nodes: int = 4, film: tuple[int, int] | None = None, **lens: float) -> float:
     """Error of a picture all of whose cones are filled."""
-    focal, stop = lens.get("focal_length", FOCAL), lens.get("f_number", 8.0)
+    focal, stop = lens.get("focal_length", FOCAL), lens.get("f_number", F_NUMBER)
     t = lens.get("magnification") or focal / (lens.get("focus_distance", FOCUS) - focal)
     side, focus = lens.get("pixel_pitch", PITCH) / t, focal * (1 + 1 / t)
     picture = power(scene(*bodies, film=film or (WIDTH, HEIGHT), **lens), rtol=EXACT)
@@ -185,7 +184,7 @@ def cone(*bodies: Body, nodes: int = 4, film: tuple[int, int] | None = None, **l
 
 def balance(z: float, radius: float, domain: str = "pupil", rtol: float = 10 * EXACT, **lens: float) -> float:
     """Error of all power of a disk whose whole picture is on the film, relative to that power."""
-    expected = through_pupil(radius, z, FOCAL / lens.get("f_number", 8.0) / 2)
+    expected = through_pupil(radius, z, FOCAL / lens.get("f_number", F_NUMBER) / 2)
     return abs(float(power(scene(disk(z, radius), **lens), domain=domain, rtol=rtol).sum()) / expected - 1)
 
 

@@ -19,6 +19,7 @@ Index = NDArray[np.int64]
 STARTS = 4  # of the search for a point's cell
 MOST_STEPS = 200
 ROUND_OFF = 1e-9  # of a barycentric coordinate
+OUTSIDE = 1e-6  # likewise: a point no further beyond the border counts as inside
 # More take tens of gigabytes: tetrahedra in the solver, triangles of the surface.
 MOST_CELLS = 5_000_000
 MOST_FACES = 10_000_000
@@ -76,7 +77,7 @@ class Tetrahedra:
 
         Raises
         ------
-        FluxError : the edge is not positive, or there would be more than 10 million triangles.
+        FluxError : the edge is not positive, or there would be more than `MOST_FACES` triangles.
         """
         if not (math.isfinite(edge) and edge > 0):
             raise FluxError(f"surface: 'edge' must be > 0 and finite, got {edge:g}. Give mm.")
@@ -173,7 +174,7 @@ class Tetrahedra:
 
 
 def require_few(at_one: float, edge: float) -> None:
-    """Raise FluxError where a mesh with edges of `edge` [mm] would have more than 5 million tetrahedra.
+    """Raise FluxError where a mesh with edges of `edge` [mm] would have more than `MOST_CELLS` tetrahedra.
 
     `at_one` : how many it would have with edges of 1 mm
     """

@@ -20,12 +20,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .boundary import boundary_a
-from .elements import System
 from .errors import FluxError
+from .finite_elements import System
 from .free_field import FreeField
 from .medium import Medium, Source
 from .solution import Solution
-from .tetrahedra import Tetrahedra, depth
+from .tetrahedra import OUTSIDE, Tetrahedra, depth
 
 Progress = Callable[[str], None]
 
@@ -87,7 +87,7 @@ def _free_fields(mesh: Tetrahedra, media: Sequence[Medium], sources: Sequence[So
         raise FluxError("solve: there is no source. Give at least one.")
     parts = []
     for index, source in enumerate(sources, start=1):
-        outside = depth(mesh.locate(source.shape.border())[1]) < -1e-6
+        outside = depth(mesh.locate(source.shape.border())[1]) < -OUTSIDE
         if outside.any():
             raise FluxError(
                 f"source {index}: {source.shape} reaches out of the tissue. Its power would be lost; move it inside."

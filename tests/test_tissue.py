@@ -9,7 +9,7 @@ import pytest
 from closed_forms import ball_exitance, layers_fluence
 from numpy.typing import NDArray
 
-from mitsuba_fspt import elements
+from mitsuba_fspt import finite_elements
 from mitsuba_fspt.boundary import robin_a
 from mitsuba_fspt.cylinder import cylinder_tetrahedra
 from mitsuba_fspt.errors import FluxError
@@ -330,7 +330,7 @@ def test_sources_refused(sources: list[Source], message: str) -> None:
 
 
 def test_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(elements, "MOST_ITERATIONS", 3)
+    monkeypatch.setattr(finite_elements, "MOST_ITERATIONS", 3)
     with pytest.raises(FluxError, match="did not converge in 3 iterations"):
         solve(cylinder_tetrahedra(15, 30, 5), [NYLON], [POINT])
 
