@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .convergence import INTEGRAL, PATH, POINT_SUM, PTRACER, SURFACE_FORM
 from .monte_carlo import passes, tracer
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
 SAMPLERS = ("multijitter", "independent", "stratified", "orthogonal", "ldsampler")
-INTEGRAL, SURFACE_FORM, POINT_SUM, PTRACER = "integral", "integral, surface form", "sum over points", "ptracer"
 RTOL = (1.0, 0.5, 0.2, 0.05, 0.03, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
 RTOL_SURFACE = (0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)
 # Samples a pixel, sides of the squares; those of an orthogonal array are primes.
@@ -120,7 +120,7 @@ def _path(scene: mi.Scene, lens: mi.Sensor, sampler: str) -> Method:
     """Mitsuba's `path` of depth 1 from a twin of the lens that has the sampler; the twin is no part of the scene."""
     sides = {"multijitter": SIDES, "orthogonal": PRIMES}.get(sampler, POWERS_OF_TWO)
     twin = lens_with(lens, sampler)
-    return Method(f"path, {sampler}", "spp", _squares(sides), _monte_carlo("path", scene, twin))
+    return Method(PATH + sampler, "spp", _squares(sides), _monte_carlo("path", scene, twin))
 
 
 def _ptracer(scene: mi.Scene, lens: mi.Sensor) -> Method:

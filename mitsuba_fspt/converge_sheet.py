@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import picture
 from .atomic import atomic_path
-from .convergence import Convergence, Row
+from .convergence import INTEGRAL, PEER, POINT_SUM, PTRACER, SURFACE_FORM, Convergence, Row
 from .errors import ImageError
 
 if TYPE_CHECKING:
@@ -35,11 +35,11 @@ COLUMNS = (
 GREY, MARKERS = "0.55", "sD^vP"
 # The methods the figure is about; what is not here is one of several of its kind, thin and grey.
 STYLES: dict[str, dict[str, Any]] = {
-    "integral": {"color": "#0b5fa5", "marker": "o", "linewidth": 2.4, "markersize": 5.5, "zorder": 6},
-    "integral, surface form": {"color": "#35a6c8", "marker": "o", "linewidth": 1.6, "markersize": 4.5, "zorder": 5},
-    "sum over points": {"color": "#c03a2b", "marker": "X", "linewidth": 1.6, "markersize": 5, "zorder": 4},
-    "path, multijitter": {"color": "0.1", "marker": "s", "linewidth": 2.0, "markersize": 4.5, "zorder": 5},
-    "ptracer": {"color": "#d98a1f", "marker": "d", "linewidth": 1.6, "markersize": 5, "zorder": 4},
+    INTEGRAL: {"color": "#0b5fa5", "marker": "o", "linewidth": 2.4, "markersize": 5.5, "zorder": 6},
+    SURFACE_FORM: {"color": "#35a6c8", "marker": "o", "linewidth": 1.6, "markersize": 4.5, "zorder": 5},
+    POINT_SUM: {"color": "#c03a2b", "marker": "X", "linewidth": 1.6, "markersize": 5, "zorder": 4},
+    PEER: {"color": "0.1", "marker": "s", "linewidth": 2.0, "markersize": 4.5, "zorder": 5},
+    PTRACER: {"color": "#d98a1f", "marker": "d", "linewidth": 1.6, "markersize": 5, "zorder": 4},
 }
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .convergence import TARGETS, Convergence
+from .convergence import INTEGRAL, PATH, PEER, TARGETS, Convergence
 
 # Pixels ('full': those whose whole cone sees the phantom) and RMS errors at which the integral is set against `path`.
 PAIRS = (("all", 1e-3), ("all", 1e-4), ("all", 3e-5), ("all", 1e-5), ("full", 1e-4), ("full", 3e-5), ("full", 1e-5))
-OURS, PEER = "integral", "path, multijitter"
 NONE = "–"
 
 
@@ -55,20 +54,20 @@ def _methods(found: Convergence) -> list[list[str]]:
 
 def _beside_path(found: Convergence) -> list[list[str]]:
     """Times to an error, how many times longer `path` with Mitsuba's best sampler takes, and its other samplers."""
-    rows = [["pixels", "RMS error", OURS, PEER, "ratio (over the rounds)", "best other sampler"]]
-    others = [method for method in found.methods if method.startswith("path, ") and method != PEER]
+    rows = [["pixels", "RMS error", INTEGRAL, PEER, "ratio (over the rounds)", "best other sampler"]]
+    others = [method for method in found.methods if method.startswith(PATH) and method != PEER]
     for pixels, target in PAIRS:
         full = pixels == "full"
         if (full and found.full == 0) or target < found.stated:
             continue
-        ratio = found.ratio(OURS, PEER, target, full)
+        ratio = found.ratio(INTEGRAL, PEER, target, full)
         times = {method: found.time_to(method, target, full) for method in others}
-        best = min(((t, method[6:]) for method, t in times.items() if t is not None), default=None)
+        best = min(((t, method.removeprefix(PATH)) for method, t in times.items() if t is not None), default=None)
         rows.append(
             [
                 pixels,
                 f"{target:g}",
-                *(_time(found.time_to(method, target, full)) for method in (OURS, PEER)),
+                *(_time(found.time_to(method, target, full)) for method in (INTEGRAL, PEER)),
                 NONE if ratio is None else "{:.2g} ({:.2g} to {:.2g})".format(*ratio),
                 NONE if best is None else f"{best[1]}, {_time(best[0])}",
             ]

@@ -10,6 +10,10 @@ from typing import Any
 
 import numpy as np
 
+# Names of the methods. Monte Carlo from the camera is one with every sampler; `PEER` has Mitsuba's best.
+INTEGRAL, SURFACE_FORM, POINT_SUM, PTRACER = "integral", "integral, surface form", "sum over points", "ptracer"
+PATH = "path, "
+PEER = PATH + "multijitter"
 FLOOR = 3.0  # times the reference's stated error: errors below it say little about a method
 LEAST_CORRELATION = 0.7  # of the logarithms of work and error, for a power law to say something
 TARGETS = (1e-3, 1e-4, 1e-5)  # RMS errors over the brightest pixel

@@ -32,7 +32,7 @@ def cylinder_tetrahedra(radius: float, height: float, edge: float) -> Tetrahedra
             f"cylinder: the mesh edge {edge:g} mm must not exceed radius {radius:g} mm or height {height:g} "
             f"mm. Give {min(radius, height) / 10:.3g} or less."
         )
-    require_few(18 * radius * radius * height, edge)
+    require_few(18 * radius * radius * height, edge)  # three in each prism over 6 rings² triangles
     rings, layers = round(radius / edge), round(height / edge)
     disc, triangles = unit_disc(rings)
     z = np.linspace(-height / 2, height / 2, layers + 1)

@@ -19,6 +19,9 @@ from .lattice import nearest_points
 from .surface import boundary, closure
 from .tetrahedra import Tetrahedra, require_few
 
+ENVELOPE = 20  # an edge over this: how far the mesher may leave the surface, to which its border is brought back
+ROUNDS = 5  # of putting back vertices whose move has crushed a cell
+CRUSHED = 0.3  # of a cell's volume, or turned over: less must not be left of it
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -92,7 +95,7 @@ def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
             np.ascontiguousarray(vertices, dtype=np.float64),
             np.ascontiguousarray(faces, dtype=np.int32),
             edge_length_fac=edge / diagonal,
-            epsilon=edge / 20 / diagonal,
+            epsilon=edge / ENVELOPE / diagonal,
         )
     if len(cells) == 0:
         raise FluxError(f"geometry: the mesher filled the surface of {len(faces)} faces with nothing. Is it closed?")
@@ -122,9 +125,9 @@ def _on_surface(mesh: Tetrahedra, vertices: Array, faces: Index) -> Tetrahedra:
     border = np.unique(boundary(mesh.vertices, mesh.cells)[0])
     moved = mesh.vertices.copy()
     moved[border] = snap(moved[border])
-    for _ in range(5):
+    for _ in range(ROUNDS):
         # A flat cell can turn over; its vertices stay where they were.
-        crushed = _determinants(moved, mesh.cells) / _determinants(mesh.vertices, mesh.cells) < 0.3
+        crushed = _determinants(moved, mesh.cells) / _determinants(mesh.vertices, mesh.cells) < CRUSHED
         kept = np.unique(mesh.cells[crushed])
         moved[kept] = mesh.vertices[kept]
     return Tetrahedra(moved, mesh.cells, snap=snap)

@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
+from reference_cases import rms
 from scipy.stats import t as student
 from small_scenes import F_NUMBER, FOCAL, FOCUS, HEIGHT, PITCH, WIDTH, disk, load, power, scene, sphere
 
@@ -162,10 +163,6 @@ def test_integral_agrees_with_the_reference_where_one_body_hides_another():
     assert error.max() < 6e-3 * truth.max()
     assert rms(picture - truth) < 1e-3 * truth.max()
     np.testing.assert_allclose(picture, truth, atol=1e-3 * truth.max() + error.max())
-
-
-def rms(values):
-    return np.sqrt(np.mean(values**2))
 
 
 def test_integral_agrees_with_the_reference_on_a_mesh_with_exitance_at_its_vertices(tmp_path):
