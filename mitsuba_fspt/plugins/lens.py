@@ -285,11 +285,11 @@ class FsptLens(mi.Sensor):
         return ds, mi.Spectrum(dr.select(inside, self._flat * solid_angle / (size.x * size.y), 0))
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
+        """Density [1/sr] that `sample_direction` wrote into `ds`; of other records it knows nothing."""
         return dr.select(active, ds.pdf, 0)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
-        centre = self.m_to_world.translation()
-        corner = mi.ScalarPoint3f(*(float(c[0]) for c in centre))
+        corner = mi.ScalarPoint3f(*(float(c[0]) for c in self.m_to_world.translation()))
         return mi.ScalarBoundingBox3f(corner, corner)
 
     def to_string(self) -> str:
