@@ -191,4 +191,5 @@ def _z_test(difference: NDArray[np.float64], *errors: NDArray[np.floating] | Non
 
 
 def _size(image: Image) -> str:
-    return " × ".join(map(str, image.shape))
+    """Width × height, as all messages tell it; arrays have the shape (h, w)."""
+    return " × ".join(map(str, image.shape[::-1]))

@@ -240,7 +240,7 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
     height, width = charge.shape
     if binning < 1 or height % binning or width % binning:
         raise DetectorError(
-            f"detector: 'binning' = {binning} does not divide the image of {height} × {width} pixels. "
+            f"detector: 'binning' = {binning} does not divide the image of {width} × {height} pixels. "
             f"Give a divisor of {math.gcd(height, width)}."
         )
     blocks = charge.reshape(height // binning, binning, width // binning, binning)

@@ -158,7 +158,7 @@ def test_json():
 @pytest.mark.parametrize(
     ("calculated", "arguments", "message"),
     [
-        (Image(np.ones((2, 3))), {}, "calculated image has 2 × 3 pixels, the standard 2 × 2"),
+        (Image(np.ones((2, 3))), {}, "calculated image has 3 × 2 pixels, the standard 2 × 2"),
         (Image(np.zeros((2, 2))), {}, "calculated image is dark, its brightest pixel has 0 W"),
         (Image(np.full((2, 2), 0.5)), {}, "every pixel of the calculated image has 0.5 W"),
         (CALCULATED, {"rows": [2]}, r"row 2 does not exist. Give one in 0 … 1"),

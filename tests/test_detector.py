@@ -247,6 +247,10 @@ def test_what_is_no_number_is_refused_with_one_that_would_do(name):
         ({"seed": 1.5}, "'seed' must be a whole number, got 1.5. Give for example 1"),
         ({"seed": -1}, "'seed' must be finite and >= 0"),
         ({"binning": 3}, r"'binning' = 3 does not divide the image of 4 × 4 pixels. Give a divisor of 4"),
+        (
+            {"binning": 2, "image": Image(np.ones((2, 3)))},
+            "does not divide the image of 3 × 2 pixels",
+        ),
         ({"binning": 0}, "'binning' = 0 does not divide"),
         ({"image": Image([[1.0, -1e-12]])}, "power must be >= 0 on every pixel, got -1e-12 W"),
     ],

@@ -120,7 +120,7 @@ def test_pictures_that_cannot_be_written(tmp_path, monkeypatch):
         write_png(spot(), tmp_path / "a.jpg")
     with pytest.raises(ImageError, match="Create it first"):
         write_png(spot(), tmp_path / "none" / "a.png")
-    with pytest.raises(ImageError, match="calculated image has 8 × 12 pixels, the standard 9 × 12"):
+    with pytest.raises(ImageError, match="calculated image has 12 × 8 pixels, the standard 12 × 9"):
         write_comparison_png(spot(), spot(9), tmp_path / "a.png")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     for write in (write_png, lambda image, path: write_comparison_png(image, image, path)):
