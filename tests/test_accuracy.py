@@ -256,3 +256,24 @@ def test_kinks_finer_than_the_nodes_are_not_believed_smooth():
         expected[k] = np.mean(cos4 * np.interp((1 - on_sheet / half) / 2, place, values))
     expected *= (side * radius / FOCUS) ** 2
     np.testing.assert_allclose(image.power[0], expected, atol=RTOL * expected.max())
+
+
+@pytest.mark.parametrize(("width", "tilt"), [(0.9, 0.0), (1.1, 0.0), (1.35, 0.0), (1.3, 60.0)])
+def test_a_disk_between_single_lines_of_sight_is_seen(width, tilt):
+    """A sharp disk that four pixels share, about as wide as one, beside a large one as bright; one line a pixel.
+
+    Expected: a quarter of its image on each, to the default rtol. Seen to fail (0 W, error 0) without a look at what
+    lies between the lines.
+    """
+    magnification = 0.1
+    depth, side = FOCAL * (1 + 1 / magnification), 0.4 / magnification
+    small = disk(depth, width * side / 2, x=6 * side, y=4 * side, tilt=tilt)
+    of = scene(small, disk(depth, 5 * side, x=-8 * side, y=-5 * side), magnification=magnification, f_number=22)
+    image = fspt.render(of, rtol=1e-2)
+    lens = of.sensors()[0]
+    x, y = 6 * side, 4 * side
+    towards = (np.cos(np.radians(tilt)) * depth + np.sin(np.radians(tilt)) * x) / depth
+    share = np.pi / 16 * width**2 * towards * (1 + (x**2 + y**2) / depth**2) ** -2
+    row, column = HEIGHT // 2 - 4, WIDTH // 2 - 6
+    four = image.power[row - 1 : row + 1, column - 1 : column + 1] / lens.etendue * np.pi
+    np.testing.assert_allclose(four, share, atol=1e-2)

@@ -107,9 +107,9 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             least_peak = narrow.brightest / 2
         if where.any():
             known = surface_form.solve(scene, lens, window, quadrature, where, least_peak)
-            solution = known.completed_by(pupil_form.solve(view, window, quadrature, known))
+            solution = known.completed_by(pupil_form.solve(view, window, quadrature, narrow.in_focus, known))
         else:
-            solution = pupil_form.solve(view, window, quadrature)
+            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus)
         if not cut.any():
             return solution
         # There lines of sight may miss what is narrow.

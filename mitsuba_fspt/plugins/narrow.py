@@ -41,13 +41,15 @@ Image = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NarrowLight:
-    """Light of narrow spots on each pixel of the window (h, w), and of all surfaces on the brightest pixel.
+    """Light of narrow spots on each pixel of the window (h, w), of all surfaces on the brightest pixel, and of these on
+    each pixel as if they were in focus.
 
     Mean radiance on film [W/mm²/sr], to a factor of two.
     """
 
     on_pixels: Image
     brightest: float
+    in_focus: Image
 
 
 def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
@@ -55,11 +57,11 @@ def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLigh
     on_pixels = np.zeros(window.shape)
     parts = [_seen(scene, emitter, lens) for emitter in scene.emitters() if is_surface(emitter)]
     if not parts or not on_pixels.size:
-        return NarrowLight(on_pixels, 0.0)
+        return NarrowLight(on_pixels, 0.0, on_pixels)
     points = _Points.joined(parts).on(window)
     points = points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
     if not (points.radiance > 0).any():
-        return NarrowLight(on_pixels, 0.0)
+        return NarrowLight(on_pixels, 0.0, on_pixels)
     # A blur disc spreads a point's light over so many pixels; discs that overlap add up. More than all of a disc does
     # not come from an element, however wide.
     light = points.radiance * np.minimum(points.area / (math.pi * points.blur**2 + 1), 1)
@@ -73,7 +75,7 @@ def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLigh
         here &= there & (points.apart < 1)
         if here.any():
             on_pixels += _spread(light[here], points[here], reach, window.shape)
-    return NarrowLight(on_pixels, float(brightest))
+    return NarrowLight(on_pixels, float(brightest), points.on_pixels(light, window.shape))
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,12 @@ class _Points:
         """True less than `far` from a picture of this shape."""
         (height, width), (x, y) = shape, (self.x, self.y)
         return (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
+
+    def on_pixels(self, light: Column, shape: tuple[int, int]) -> Image:
+        """Sum of the points' `light` on each pixel of a picture of this shape, where they are seen sharp."""
+        here = self.near(0, shape)
+        column, row = (np.floor(c[here]).astype(np.int64) for c in (self.x, self.y))
+        return _Cells(shape, row * shape[1] + column).sums(light[here])
 
     def cells(self, side: float) -> _Cells:
         """Square cells of a `side` [pixels]; what is too far off falls into the last."""

@@ -21,6 +21,7 @@ BOTH = 4 + 12  # lines of sight a pixel, without which four must do
 POINT = 0.1  # of rtol: what the curvature of cos⁴θ over the pupil may make
 IN_PIXEL = 0.5  # blur radius that stays in the pixel
 SETTLED = 0.25  # of the tolerance: where the picture bends less, more nodes would change it by less than a tenth
+PASSED = 2.0  # times brighter than all lines of sight around saw is what they passed by
 TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
 MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
 # No difference between four and twelve nodes promises more than to shrink to the first; where it is as large as what
@@ -28,12 +29,15 @@ MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than th
 LEAST_GAIN, ROUGH_GAIN = 0.5, 2.0
 
 
-def first_nodes(draft: Draft) -> Mask:
-    """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle on their own."""
+def first_nodes(draft: Draft, light: Image | float = 0.0) -> Mask:
+    """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle on their own.
+
+    `light`: what surfaces are known to send to each pixel if they are in focus, to a factor of two.
+    """
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
     value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
-    if len(rule) == 1 and not dr.any(value > 0):  # what glows is thinner than a pixel
+    if len(rule) == 1 and dr.any(_passed_by(draft, value, light)):
         rule = rules.four(draft.area)
         value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
     draft.nodes = len(rule)
@@ -94,6 +98,17 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
 def _dark(draft: Draft) -> Mask:
     """True while no line of sight of any pixel has met light, one lane: what glows is on the film, or may be."""
     return ~dr.any(draft.value > 0)
+
+
+def _passed_by(draft: Draft, value: Image, light: Image | float) -> Mask:
+    """Pixels on which surfaces shine, and far more than one line of sight saw there and around.
+
+    What is up to √2 pixels wide may lie between the lines. All pixels while none has met light.
+    """
+    seen = dr.select(draft.open, value, draft.known)
+    least = dr.opaque(mi.Float64, draft.quadrature.rtol) * dr.max(seen)
+    passed = draft.open & ~draft.beyond & (light > dr.maximum(PASSED * draft.grid.spread_max(seen), least))
+    return passed | ~dr.any(value > 0)
 
 
 def _one_will_do(draft: Draft) -> bool:

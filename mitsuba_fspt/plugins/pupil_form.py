@@ -29,14 +29,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def solve(view: View, window: Window, quadrature: Quadrature, known: Solution | None = None) -> Solution:
+def solve(
+    view: View, window: Window, quadrature: Quadrature, light: NDArray[np.float64], known: Solution | None = None
+) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
-    Only pixels of the `window` are looked at, the others are dark. Where a partial solution is `known` no work is done,
-    and what comes back is rough.
+    Only pixels of the `window` are looked at, the others are dark. `light`: of surfaces as if in focus, see
+    `NarrowLight`. Where a partial solution is `known` no work is done, and what comes back is rough.
     """
     draft = Draft(view, window, quadrature, known)
-    rough = first_nodes(draft)
+    rough = first_nodes(draft, draft.grid.lanes(light))
     levels = rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
     if quadrature.max_nodes >= BOTH:
         rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
