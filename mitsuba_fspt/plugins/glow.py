@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +22,7 @@ CELLS = 2.5  # balances the cells of the pupil with the size of the pieces, what
 PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
 CURVED = 8.0  # over rtol: elements of a round body; below a pixel none is cut, and their middles have to do
 BULGE = 0.1  # how far a curved element may reach beyond its corners, in units of their distance
+MISPLACED = 1 / 8  # of a step in J_n along a row of elements, times their side squared, they misplace
 UNBOUNDED = 4.0  # side [pixels] counted for an element that reaches through the lens plane and has no image
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))  # of an element, once around
 
@@ -57,7 +58,8 @@ class Glow:
 
     sides, blur (count,): longer side of its image, radius of its blur disc; low, high (count, 2): bounds of its
     light in x and y, empty where it faces away from the lens or is one of those left out because they are `dark`.
-    small: a blur disc is larger than all that shines.
+    small: a blur disc is larger than all that shines. steps (count,): by how much the radiance differs between the
+    corners [W/mm²/sr].
     """
 
     emitter: mi.Emitter
@@ -66,6 +68,7 @@ class Glow:
     blur: Image
     low: Image
     high: Image
+    steps: Image
     dark: int
     small: bool
 
@@ -81,6 +84,11 @@ class Glow:
         cuts = cuts.clip(1, max(math.isqrt(LANES) // cells, 1))
         for run in runs((cuts * cells) ** 2):
             yield Batch(self, index[run], cuts[run], cells)
+
+    def finer(self, tolerance: float) -> Glow:
+        """With elements below a pixel cut like larger ones where they misplace more than so much light [W/mm²/sr]."""
+        misplaced = MISPLACED * self.sides**2 * self.steps / (1 + math.pi * self.blur**2)
+        return replace(self, sides=np.where(misplaced > tolerance, np.maximum(self.sides, 1), self.sides))
 
     def _touching(self, mark: NDArray[np.bool_]) -> Index:
         """Elements with a marked pixel in their bounds, by the sums over all rectangles that begin at pixel (0, 0)."""
@@ -105,16 +113,19 @@ class Glow:
         low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
         least, most = np.full(count, np.inf), np.full(count, -np.inf)
         axes, blur = np.zeros((2, count, 2)), np.zeros(count)
-        centres = []
+        centres, levels = [], []
+        exitance = _exitance(emitter)
         for corner in CORNERS:
             si, _ = elements.place(dr.arange(mi.UInt32, count), mi.Point2f(*corner))
             front = _front(si, lens)
-            dr.eval(si.p, front)
+            level = exitance(si) / dr.pi
+            dr.eval(si.p, front, level)
             centre, radius = lens.film_discs(si.p.numpy().T.astype(np.float64))
             low, high = np.minimum(low, centre - radius), np.maximum(high, centre + radius)
             least, most = np.minimum(least, front.numpy()), np.maximum(most, front.numpy())
             axes += (np.array(corner) - 0.5)[:, None, None] * centre
             centres.append(centre)
+            levels.append(np.broadcast_to(level.numpy(), count).astype(np.float64))
             blur = np.maximum(blur, radius[:, 0])
         sides = np.where(np.isfinite(blur), np.hypot(*axes.transpose(2, 0, 1)).max(axis=0), UNBOUNDED)
         margin = BULGE * sides[:, None]
@@ -128,9 +139,9 @@ class Glow:
         small = area < math.pi * blur.min(initial=np.inf) ** 2
         # An element below a pixel would stay in one piece for some levels, and what that costs would not be seen to
         # change. A piece of side s misplaces about s²/8 of a step in J_n, less of what a thick body blurs: if that is
-        # little, it may stay.
+        # little, it may stay, unless the picture turns out to be dim beside the step.
         thickness = max(1, area / extent) if small and extent > 0 else 1
-        sides = np.where(sides > math.sqrt(8 * rtol * thickness), np.maximum(sides, 1), sides)
+        sides = np.where(sides > math.sqrt(rtol * thickness / MISPLACED), np.maximum(sides, 1), sides)
         return cls(
             emitter,
             elements,
@@ -138,6 +149,7 @@ class Glow:
             np.minimum(blur, math.hypot(*window.shape)),
             low,
             high,
+            np.ptp(levels, axis=0),
             int(dark.sum()),
             bool(small),
         )
@@ -176,11 +188,18 @@ def _dark(emitter: mi.Emitter, elements: Elements) -> NDArray[np.bool_]:
     """True of elements on which J_n is 0: at all corners, between which a mesh attribute is linear."""
     if not is_surface(emitter) or not emitter.is_linear():
         return np.zeros(elements.count, bool)
-    exitance = function_on(emitter.get_shape(), emitter.exitance)
+    exitance = _exitance(emitter)
     index = dr.arange(mi.UInt32, elements.count)
     corners = [exitance(elements.place(index, mi.Point2f(*corner))[0]) for corner in elements.corners]
     dr.eval(corners)
     return np.max([np.broadcast_to(corner.numpy(), elements.count) for corner in corners], axis=0) == 0
+
+
+def _exitance(emitter: mi.Emitter) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
+    """J_n [W/mm²] at surface points; of other emitters than `fspt_surface` 0."""
+    if type(emitter).__name__ != "FsptSurface":
+        return lambda si: mi.Float(0)
+    return function_on(emitter.get_shape(), emitter.exitance)
 
 
 def _front(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Float:

@@ -81,6 +81,8 @@ class _Refinement:
         lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * FIRST_GROWTH)
         if mark.any():
             self.value, self.hits = (np.where(where, image, 0) for image in self._level(lines, mark))
+            tolerance = self.quadrature.rtol * max(self.value.max(), least_peak)
+            self.glows = [glow.finer(tolerance) for glow in self.glows]
         recent, grid = None, Grid(self.window.shape)
         while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
             value, hits = self._level(lines, mark)
