@@ -130,7 +130,7 @@ def test_scatter_says_where_transects_kink_and_where_they_only_lean():
     sensor = scene.sensors()[0]
     window = visible_window(scene, sensor)
     draft = Draft(View.of(scene, sensor, window), window, Quadrature(rtol=1e-4), None)
-    first_nodes(draft)
+    first_nodes(draft, np.zeros(draft.grid.shape))
     cut = parted(draft.hits)
     edges = edges_of(draft)
     edges.learn(draft, apply_transects(draft, cut, edges, rules.transects(2), rules.along_transect(0, 1e-4)), cut)

@@ -15,6 +15,9 @@ from .lanes import chunks
 from .lines import apply_rule
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from .grid import Image, Mask
 
 BOTH = 4 + 12  # lines of sight a pixel, without which four must do
@@ -29,7 +32,7 @@ MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than th
 LEAST_GAIN, ROUGH_GAIN = 0.5, 2.0
 
 
-def first_nodes(draft: Draft, light: Image | float = 0.0) -> Mask:
+def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle on their own.
 
     `light`: what surfaces are known to send to each pixel if they are in focus, to a factor of two.
@@ -37,7 +40,7 @@ def first_nodes(draft: Draft, light: Image | float = 0.0) -> Mask:
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
     value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
-    if len(rule) == 1 and dr.any(_passed_by(draft, value, light)):
+    if len(rule) == 1 and dr.any(_passed_by(draft, value, grid.lanes(light))):
         rule = rules.four(draft.area)
         value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
     draft.nodes = len(rule)
@@ -100,7 +103,7 @@ def _dark(draft: Draft) -> Mask:
     return ~dr.any(draft.value > 0)
 
 
-def _passed_by(draft: Draft, value: Image, light: Image | float) -> Mask:
+def _passed_by(draft: Draft, value: Image, light: Image) -> Mask:
     """Pixels on which surfaces shine, and far more than one line of sight saw there and around.
 
     What is up to √2 pixels wide may lie between the lines. All pixels while none has met light.

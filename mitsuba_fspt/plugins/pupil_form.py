@@ -38,7 +38,7 @@ def solve(
     `NarrowLight`. Where a partial solution is `known` no work is done, and what comes back is rough.
     """
     draft = Draft(view, window, quadrature, known)
-    rough = first_nodes(draft, draft.grid.lanes(light))
+    rough = first_nodes(draft, light)
     levels = rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
     if quadrature.max_nodes >= BOTH:
         rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
