@@ -41,8 +41,8 @@ Image = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NarrowLight:
-    """Light of narrow spots on each pixel of the window (h, w), of all surfaces on the brightest pixel, and of these on
-    each pixel as if they were in focus.
+    """Light of narrow spots on each pixel of the window (h, w), of all surfaces on the brightest pixel that is shown,
+    and of these on each pixel as if they were in focus.
 
     Mean radiance on film [W/mm²/sr], to a factor of two.
     """
@@ -66,10 +66,14 @@ def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLigh
     # not come from an element, however wide.
     light = points.radiance * np.minimum(points.area / (math.pi * points.blur**2 + 1), 1)
     level = np.round(np.log2(np.maximum(points.blur, 1)))
+    shown = points.shown_in(window)
+    if not (light[shown] > 0).any():
+        shown[:] = True
     brightest = 0.0
     for k in np.unique(level):
         here, reach = level == k, math.ceil(2 ** (k + 0.5))
-        brightest = max(brightest, points[here].cells(2**k).sums(light[here]).max())
+        if (there := here & shown).any():
+            brightest = max(brightest, points[there].cells(2**k).sums(light[there]).max())
         there = points.near(reach + 2 * 2**k, window.shape)  # beyond, those of this level have no neighbours
         here[there] &= _hidden(points[there], 2**k)
         here &= there & (points.apart < 1)
@@ -115,6 +119,12 @@ class _Points:
         """True less than `far` from a picture of this shape."""
         (height, width), (x, y) = shape, (self.x, self.y)
         return (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
+
+    def shown_in(self, window: Window) -> NDArray[np.bool_]:
+        """True where a blur disc reaches what is shown of a window."""
+        rows, columns = window.inner
+        moved = replace(self, x=self.x - columns.start, y=self.y - rows.start)
+        return moved.near(self.blur, (rows.stop - rows.start, columns.stop - columns.start))
 
     def on_pixels(self, light: Column, shape: tuple[int, int]) -> Image:
         """Sum of the points' `light` on each pixel of a picture of this shape, where they are seen sharp."""

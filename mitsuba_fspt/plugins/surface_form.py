@@ -77,12 +77,12 @@ class _Refinement:
     def run(self, where: NDArray[np.bool_] | None, least_peak: float) -> Solution:
         # To look for what may hide is quicker for a few pixels than to make sure that nothing does.
         self.hidden = where is not None or not self._hides_nothing()
-        mark = where = np.ones(self.window.shape, bool) if where is None else where
+        shown = self.window.shown()
+        mark = where = shown if where is None else where
         lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * FIRST_GROWTH)
         if mark.any():
             self.value, self.hits = (np.where(where, image, 0) for image in self._level(lines, mark))
-            tolerance = self.quadrature.rtol * max(self.value.max(), least_peak)
-            self.glows = [glow.finer(tolerance) for glow in self.glows]
+            self.glows = [glow.finer(self._tolerance(least_peak)) for glow in self.glows]
         recent, grid = None, Grid(self.window.shape)
         while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
             value, hits = self._level(lines, mark)
@@ -91,14 +91,18 @@ class _Refinement:
             estimate = recent if last is None else np.maximum(recent, MEMORY * last)
             # All elements with light on a marked pixel were refined: only there is the new picture whole.
             self.error[mark], self.value[mark], self.hits[mark] = estimate[mark], value[mark], hits[mark]
-            mark = self.error > self.quadrature.rtol * max(self.value.max(), least_peak)
-            mark |= where & (self.hits == 0) & (lines < DARK_LINES)
-        error = np.maximum(self.error, self.quadrature.least_error * self.value.max(initial=0.0))
+            mark = self.error > self._tolerance(least_peak)
+            mark = shown & (mark | where & (self.hits == 0) & (lines < DARK_LINES))
+        error = np.maximum(self.error, self.quadrature.least_error * self.window.brightest(self.value))
         error[self.hits == 0] = self.error[self.hits == 0]
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.hits, 0, 1))
         known = self.window.expand(where.astype(np.float64)) > 0
         return Solution(power, error, coverage, self.rays, tuple(self.levels), known, self._findings())
+
+    def _tolerance(self, least_peak: float) -> float:
+        """The error asked for [W/mm²/sr]."""
+        return self.quadrature.rtol * max(self.window.brightest(self.value), least_peak)
 
     def _hides_nothing(self) -> bool:
         return self.quadrature.takes("occlusion") and hides_nothing(self.scene)

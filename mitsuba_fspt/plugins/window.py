@@ -41,10 +41,14 @@ class Window:
         return self.left + self.crop_offset[0], self.top + self.crop_offset[1]
 
     @property
+    def inner(self) -> tuple[slice, slice]:
+        """Rows and columns of the crop window in this one; what is left is the rim."""
+        return self._common()[0]
+
+    @property
     def count(self) -> int:
         """Pixels of the crop window in this one."""
-        here, _ = self._common()
-        return math.prod(side.stop - side.start for side in here)
+        return math.prod(side.stop - side.start for side in self.inner)
 
     def centres(self, number: mi.UInt32) -> mi.Point2f:
         """Film positions [pixels] of the centres of the window's pixels of so much `number`, row by row."""
@@ -81,6 +85,10 @@ class Window:
     def shown(self) -> NDArray[np.bool_]:
         """True (h, w) at pixels of the crop window, False on the rim."""
         return self.cut(np.ones(self.full, bool))
+
+    def brightest(self, image: NDArray[np.float64]) -> float:
+        """Largest value of an image (h, w) that is shown, of all if those are 0."""
+        return float(image[self.inner].max(initial=0.0) or image.max(initial=0.0))
 
     def _common(self) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
         """What both windows have, in this one and in the crop window."""
