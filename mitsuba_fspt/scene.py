@@ -14,6 +14,7 @@ import numpy as np
 from . import backend
 from .errors import SceneError
 from .interrupt import ctrl_c_noted
+from .scene_rules import check_text
 from .scene_xml import SceneXml, read_xml
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
 
     Raises
     ------
-    SceneError : the file cannot be read, is no valid scene, or has no such parameter; one line with the cause.
+    SceneError : the file cannot be read, is no valid scene, has no such parameter, or none that takes such a value;
+        one line with the cause.
     """
     path = Path(path)
     backend.ensure_variant()
@@ -37,7 +39,7 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     from .plugins.probe import probe_beside
 
     check_parameters(path, parameters)
-    _check_colours(path, parameters)
+    check_text(path, _xml_of(path, parameters))
     texts = {name: parameter_text(value) for name, value in parameters.items()}
     config = mi.parser.ParserConfig(mi.variant())
     resolver = mi.file_resolver()
@@ -71,17 +73,6 @@ def loaded(scene: mi.Scene | str | os.PathLike[str]) -> mi.Scene:
 
 def _xml_of(path: Path, parameters: Mapping[str, object]) -> SceneXml:
     return read_xml(path, {name: parameter_text(value) for name, value in parameters.items()})
-
-
-def _check_colours(path: Path, parameters: Mapping[str, object]) -> None:
-    """Raise SceneError where J_n is a colour, of which monochrome variants make its luminance without a word."""
-    emitters = (node for node in _xml_of(path, parameters).nodes if node.get("type") == "fspt_surface")
-    for child in (child for emitter in emitters for child in emitter):
-        if child.tag == "rgb" or child.get("type") == "d65":
-            raise SceneError(
-                f"{path}: '{child.get('name')}' of an fspt_surface is a colour (<{child.tag}>), J_n is one number. "
-                "Give W/mm² as a float or a texture of one channel."
-            )
 
 
 def check_parameters(path: Path, parameters: Mapping[str, object]) -> None:

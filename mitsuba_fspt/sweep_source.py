@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import os
-import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
 
-from .errors import SceneError
 from .optics import NUMBERS, Lens
+from .scene_rules import REFERENCE, check_values, is_number
 from .scene_xml import read_xml
-
-REFERENCE = re.compile(r"\$(\w+)")
 
 
 class Source:
@@ -53,18 +48,14 @@ class Source:
 
     def check(self) -> None:
         """Raise SceneError or OpticsError for a value that is no number where one is due, or that no lens can have."""
-        for node in self._nodes:
-            for attribute, text in node.attrib.items():
-                reference = REFERENCE.fullmatch(text)
-                if reference and reference[1] in self._parameters and _is_number_due(node, attribute):
-                    _require_number(reference[1], self._parameters[reference[1]])
+        check_values(self.path, self._xml)
         self._check_lens()
 
     def _check_lens(self) -> None:
         """Before the work, not after half of it; what the scene file does not say in so many words is left to it."""
         given = {node.get("name", ""): self._xml.fill_in(node.get("value", "")) for node in self._lens}
         numbers = {name: text for name, text in given.items() if name in NUMBERS}
-        plain = all(map(_is_number, numbers.values())) and "include" not in {node.tag for node in self._lens}
+        plain = all(map(is_number, numbers.values())) and "include" not in {node.tag for node in self._lens}
         if plain and {"focal_length", "f_number"} <= set(numbers):
             model = given.get("model", "diaphragm")
             Lens.focused(model=model, **{name: float(text) for name, text in numbers.items()})  # type: ignore[arg-type]
@@ -78,22 +69,6 @@ class Source:
         if file not in self._digests:
             self._digests[file] = _sha256(file)
         return self._digests[file]
-
-
-def _is_number_due(node: ElementTree.Element, attribute: str) -> bool:
-    return attribute in ("x", "y", "z", "angle") or (attribute == "value" and node.tag in ("float", "integer"))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text)) and "_" not in text
-    except ValueError:
-        return False
-
-
-def _require_number(name: str, text: str) -> None:
-    if not _is_number(text):
-        raise SceneError(f"sweep: parameter '{name}' must be a finite number, got '{text}'. Correct this value.")
 
 
 def _sha256(file: Path) -> str:

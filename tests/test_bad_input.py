@@ -160,6 +160,18 @@ FILES = {
     "domain in the file": (integral('<string name="domain" value="x"/>'), "'domain' must be one of pupil, surface"),
     "a number in words": (lens('value="0.8"', 'value="big"'), 'could not parse floating point value "big"'),
     "a parameter without a value": (lens("$f_number", "$aperture"), "undefined parameter: $aperture"),
+    "a bitmap of nothing": (
+        of_ball('<float name="exitance" value="1e-3"/>', '<texture type="bitmap" name="exitance"/>'),
+        "s.xml: a texture 'bitmap' has no 'filename'. Give it one.",
+    ),
+    "a number twice": (
+        integral('<float name="rtol" value="1e-2"/><float name="rtol" value="1e-3"/>'),
+        "s.xml: 'fspt_integral' has 'rtol' more than once. Leave it there once.",
+    ),
+    "two bodies of one name": (
+        {"shapes": 2 * BALL_XML.replace("<shape", '<shape name="ball"')},
+        "s.xml: 'scene' has 'ball' more than once",
+    ),
     "a tag that is none": ({"more": '<lense type="fspt_lens"/>'}, "lense"),
 }
 
@@ -227,7 +239,23 @@ COMMANDS = {
         "f_number is 4 already",
     ),
     "parameter out of range": ((*RENDER, "-D", "f_number=1e-300"), "'f_number' must be in 1/1e+30"),
-    "parameter in words": ((*RENDER, "-D", "f_number=wide"), 'could not parse floating point value "wide"'),
+    "parameter in words": (
+        (*RENDER, "-D", "f_number=wide"),
+        "s.xml: parameter 'f_number' must be a finite number, got 'wide'. Correct this value.",
+    ),
+    "parameter with its unit": ((*RENDER, "-D", "f_number=8mm"), "'f_number' must be a finite number, got '8mm'"),
+    "place in words": ((*RENDER, "-D", "distance=far"), "'distance' must be a finite number, got 'far'"),
+    "place nowhere": ((*RENDER, "-D", "distance=nan"), "'distance' must be a finite number, got 'nan'"),
+    "pixels and a half": (
+        ("render", "given.xml", "-D", "width=8.5"),
+        "parameter 'width' must be a whole number, got '8.5'",
+    ),
+    "neither true nor false": (
+        ("render", "given.xml", "-D", "quick=yes"),
+        "parameter 'quick' must be true or false, got 'yes'",
+    ),
+    "angle nowhere": (("render", "given.xml", "-D", "view=inf"), "'view' must be a finite number, got 'inf'"),
+    "half a place": (("render", "given.xml", "-D", "at=0,0,O"), "'at' must be a finite number, got '0,0,O'"),
     "parameter that cannot be": ((*RENDER, "-D", "f_number=0"), "'f_number' must be > 0 and finite, got 0"),
     "no such folder": ((*RENDER, "-o", "gone/o.exr"), "the folder 'gone' does not exist"),
     "another format": ((*RENDER, "-o", "o.png"), "must end in .exr"),
@@ -288,6 +316,16 @@ def files(folder):
         (folder / name).write_text("a texture")
     textures = (f'<texture type="bitmap"><string name="filename" value="{n}"/></texture>' for n in textured)
     write_scene(folder / "textured.xml", more="".join(textures))
+    given = """<default name="width" value="8"/><default name="quick" value="true"/><default name="view" value="0"/>
+        <default name="at" value="0,0,0"/>"""
+    turned = '<transform name="to_world"><rotate z="1" angle="$view"/><translate value="$at"/></transform><emitter'
+    write_scene(
+        folder / "given.xml",
+        integrator='<integrator type="fspt_integral"><boolean name="shortcuts" value="$quick"/></integrator>',
+        **lens('name="width" value="8"', 'name="width" value="$width"'),
+        **of_ball("<emitter", turned),
+        more=given,
+    )
     write_scene(folder / "depth.xml", integrator='<integrator type="depth"/>')
     (folder / "include.xml").write_text('<scene version="3.0.0"><include filename="gone.xml"/></scene>')
 
