@@ -13,9 +13,9 @@ from .errors import FsptError
 
 
 def number(thing: str, value: object, error: type[FsptError], example: str) -> float:
-    """`value` as a float, infinite where it is beyond all floats; raises `error` for what is no real number."""
+    """`value` as a float, infinite where it is beyond all floats; `error` for what is no real number, True too."""
     value = _without_axes(value)
-    if not isinstance(value, (Real, Decimal)):
+    if isinstance(value, bool) or not isinstance(value, (Real, Decimal)):
         raise error(f"{thing} must be a number, got {_told(value)}. Give for example {example}.")
     try:
         return float(value)
@@ -24,10 +24,11 @@ def number(thing: str, value: object, error: type[FsptError], example: str) -> f
 
 
 def whole(thing: str, value: object, error: type[FsptError], example: str) -> int:
-    """`value` as an int; raises `error` for what is no whole number."""
+    """`value` as an int; raises `error` for what is no whole number, True too."""
     value = _without_axes(value)
     with suppress(OverflowError, ValueError):  # infinite, not a number
-        if isinstance(value, (Real, Decimal)) and value == (found := int(value)):  # type: ignore[arg-type]  # likewise
+        plain = isinstance(value, (Real, Decimal)) and not isinstance(value, bool)
+        if plain and value == (found := int(value)):  # type: ignore[arg-type]  # likewise
             return found
     raise error(f"{thing} must be a whole number, got {_told(value)}. Give for example {example}.")
 

@@ -117,8 +117,11 @@ def _one_line(message: str) -> str:
     if ours:
         cause = ours[-1].split(": ", 1)[1]
     elif unknown:
-        names = ", ".join(re.findall(r'- \w+ "(\w+)"', cause))
-        cause = f"'{unknown[1]}' has no parameter {names}. Correct its name or leave it out."
+        names = re.findall(r'- \w+ "(\w+)"', cause)
+        named = [name for name in names if not name.startswith("_arg_")]
+        cause = f"'{unknown[1]}' has no parameter {', '.join(named)}. Correct its name or leave it out."
+        if not named:  # Mitsuba's own names for what has none
+            cause = f"'{unknown[1]}' has no use for what stands in it without a name. Name it, or leave it out."
     elif broken:
         cause = f"cannot load the {broken[1]} '{broken[2]}': {broken[3].rstrip('.!')}. Check its file and parameters."
     return place + cause

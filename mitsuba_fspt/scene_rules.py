@@ -26,7 +26,7 @@ def check_text(path: Path, scene: SceneXml) -> None:
         _check_twins(path, node)
         _check_source(path, node, scene)
         if node.get("type") == "fspt_surface":
-            _check_colours(path, node)
+            _check_colours(path, node, scene)
 
 
 def check_values(path: Path, scene: SceneXml) -> None:
@@ -80,11 +80,13 @@ def _check_source(path: Path, node: ElementTree.Element, scene: SceneXml) -> Non
         raise SceneError(f"{path}: a texture '{kind}' has no '{needed[0]}'. Give it one.")
 
 
-def _check_colours(path: Path, emitter: ElementTree.Element) -> None:
-    """J_n as a colour, of which monochrome variants make its luminance without a word."""
+def _check_colours(path: Path, emitter: ElementTree.Element, scene: SceneXml) -> None:
+    """J_n as a colour or a spectrum, of which monochrome variants make its luminance without a word."""
     for child in emitter:
-        if child.tag == "rgb" or child.get("type") == "d65":
+        colour = child.tag == "rgb" or child.get("type") == "d65"
+        spectrum = child.tag == "spectrum" and ":" in scene.fill_in(child.get("value", ""))
+        if colour or spectrum or (child.tag == "spectrum" and child.get("filename")):
             raise SceneError(
-                f"{path}: '{child.get('name')}' of an fspt_surface is a colour (<{child.tag}>), J_n is one number. "
-                "Give W/mm² as a float or a texture of one channel."
+                f"{path}: '{child.get('name')}' of an fspt_surface is a {'colour' if colour else 'spectrum'} "
+                f"(<{child.tag}>), J_n is one number. Give W/mm² as a float or a texture of one channel."
             )

@@ -47,6 +47,13 @@ def integral(tag):
     return {"integrator": f'<integrator type="fspt_integral">{tag}</integrator>'}
 
 
+def law(tag):
+    return of_ball("<float", f'<string name="emission" value="fresnel"/>{tag}<float')
+
+
+BLACKBODY = '<texture type="blackbody" name="exitance"><float name="temperature" value="5000"/></texture>'
+
+
 def mesh(name, kind="vertex"):
     return {
         "shapes": f"""
@@ -104,6 +111,10 @@ LENSES = {
     "unknown model": (with_model("zoom"), "'model' must be one of diaphragm, hrrt, pinhole, ripoll, got 'zoom'"),
     "hrrt without a border": (with_model("hrrt"), "needs 'lens_diameter'"),
     "ripoll without its cone": (with_model("ripoll"), "needs 'numerical_aperture' in"),
+    "a distance that is true": (
+        lens("<transform", '<boolean name="diaphragm_distance" value="true"/><transform'),
+        "'diaphragm_distance' must be a number, got True",
+    ),
     "a camera that scales": (lens("<lookat", '<scale value="2"/><lookat'), "'to_world' scales lengths"),
 }
 
@@ -115,6 +126,21 @@ SURFACES = {
     "nan": (of_ball("1e-3", "nan"), "'exitance' of shape 'sphere' has NaN or infinite values"),
     "infinite": (of_ball("1e-3", "inf"), "has NaN or infinite values"),
     "zero": (of_ball("1e-3", "0"), "'exitance' of shape 'sphere' is 0 everywhere"),
+    "true": (
+        of_ball('<float name="exitance" value="1e-3"/>', '<boolean name="exitance" value="true"/>'),
+        "'exitance' must be a number or a texture, got True",
+    ),
+    "placed by itself": (
+        of_ball(
+            '<float name="exitance"', '<transform name="to_world"><scale value="2"/></transform><float name="exitance"'
+        ),
+        "fspt_surface: 'to_world' has no meaning, light comes from the shape. Give it to that.",
+    ),
+    "an index in words": (law('<string name="int_ior" value="water"/>'), "'int_ior' must be a number, got 'water'"),
+    "a spectrum by its plugin": (
+        of_ball('<float name="exitance" value="1e-3"/>', BLACKBODY),
+        "'exitance' is a spectrum (BlackBodySpectrum), J_n is one number",
+    ),
     "missing": (of_ball('<float name="exitance" value="1e-3"/>', ""), "'exitance' is missing"),
     "a vertex negative": (
         mesh("negative.ply"),
@@ -140,6 +166,10 @@ FILES = {
         of_ball('<float name="exitance" value="1e-3"/>', '<rgb name="exitance" value="1, 2, 3"/>'),
         "'exitance' of an fspt_surface is a colour (<rgb>), J_n is one number",
     ),
+    "a spectrum": (
+        of_ball('<float name="exitance" value="1e-3"/>', '<spectrum name="exitance" value="400:1, 700:2"/>'),
+        "'exitance' of an fspt_surface is a spectrum (<spectrum>), J_n is one number",
+    ),
     "no mesh file": (mesh("gone.ply"), '"gone.ply": file not found'),
     "words for a mesh": (mesh("words.ply"), '"words.ply": invalid PLY header'),
     "half a mesh": (mesh("cut.ply"), '"cut.ply": could not parse'),
@@ -154,6 +184,31 @@ FILES = {
     "unknown integral parameter": (
         integral('<float name="rtoll" value="1"/>'),
         "'fspt_integral' has no parameter rtoll",
+    ),
+    "a limit that is none here": (
+        integral('<integer name="max_depth" value="1"/>'),
+        "fspt_integral: 'max_depth' has no meaning, light goes straight to the lens",
+    ),
+    "emitters to hide": (integral('<boolean name="hide_emitters" value="true"/>'), "'hide_emitters' has no meaning"),
+    "rtol in words": (
+        integral('<string name="rtol" value="fine"/>'),
+        "fspt_integral: 'rtol' must be a number, got 'fine'",
+    ),
+    "a part of a line of sight": (
+        integral('<float name="max_nodes" value="100.7"/>'),
+        "'max_nodes' must be a whole number, got 100.7",
+    ),
+    "lines of sight that are true": (
+        integral('<boolean name="max_nodes" value="true"/>'),
+        "'max_nodes' must be a whole number, got True",
+    ),
+    "shortcuts in words": (
+        integral('<string name="shortcuts" value="no"/>'),
+        "fspt_integral: 'shortcuts' must be true or false, got 'no'. Give it as a boolean.",
+    ),
+    "an integrator in another": (
+        integral('<integrator type="path"/>'),
+        "'fspt_integral' has no use for what stands in it without a name",
     ),
     "unknown plugin": ({"integrator": '<integrator type="fspt_integrall"/>'}, 'Plugin "fspt_integrall" not found'),
     "rtol in the file": (integral('<float name="rtol" value="-1"/>'), "'rtol' must be in (0, 1), got -1"),

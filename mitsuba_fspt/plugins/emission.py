@@ -13,6 +13,7 @@ import mitsuba as mi
 from ..boundary import haskell_a
 from ..errors import ExitanceError, FluxError
 from ..medium import Medium
+from ..plain import number
 from .last_flight import LastFlight
 
 LAWS = ("lambert", "fresnel", "last_flight")
@@ -98,14 +99,20 @@ def law_of(props: mi.Properties) -> Law:
         return Lambert()
     if name not in LAWS:
         raise ExitanceError(f"fspt_surface: 'emission' must be one of {', '.join(LAWS)}, got '{name}'.")
-    n = float(_required(props, name, "int_ior", "a float"))
+    n = _number(props, name, "int_ior", "a float", "1.37")
     if name == "fresnel":
         return Fresnel(n)
-    mua, musp = (float(_required(props, name, key, "a float [1/mm]")) for key in ("mua", "musp"))
+    mua, musp = (
+        _number(props, name, key, "a float [1/mm]", example) for key, example in (("mua", "0.01"), ("musp", "1"))
+    )
     fluence = _required(props, name, "fluence", "a volume, such as a gridvolume")
     if not isinstance(fluence, mi.Volume):
         raise ExitanceError(f"fspt_surface: 'fluence' must be a volume, got {fluence!r}. Give a gridvolume.")
     return LastFlight(Medium(mua, musp, n), fluence)
+
+
+def _number(props: mi.Properties, law: str, name: str, kind: str, example: str) -> float:
+    return number(f"fspt_surface: '{name}'", _required(props, law, name, kind), ExitanceError, example)
 
 
 def _required(props: mi.Properties, law: str, name: str, kind: str) -> Any:

@@ -19,22 +19,30 @@ from .spectra import at_one_wavelength, scalar
 SLIVER = 1e-6  # of the mean area: on a smaller face single precision may find no place to interpolate at
 ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
 FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # of a shape's elements that are looked at, of the texels that tell how many
-COLOURS = ("SRGB", "D65")  # how the names of Mitsuba's classes begin that hold a colour
+# How the names of Mitsuba's classes begin that hold a colour, or a value for each wavelength.
+COLOURS, SPECTRA = ("SRGB", "D65"), ("Regular", "Irregular", "BlackBody")
 CORNERS_AND_CENTRE = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
 
 
 def texture_of(props: mi.Properties) -> mi.Texture:
     """J_n as a texture; a number is the same at all wavelengths, where Mitsuba would make it white light.
 
-    ExitanceError for a colour, whose watts would depend on the variant, and for a bitmap that is none of W/mm².
+    ExitanceError for a colour or a spectrum, whose watts would depend on the variant, for a bitmap that is none of
+    W/mm² and for what is no number.
     """
     value = props["exitance"]
+    if isinstance(value, bool):
+        raise ExitanceError(
+            f"fspt_surface: 'exitance' must be a number or a texture, got {value}. Give W/mm² as a float."
+        )
     if not isinstance(value, int | float):
         texture = props.get_emissive_texture("exitance")
-        if texture.class_name().startswith(COLOURS):
+        held = texture.class_name()
+        if held.startswith(COLOURS + SPECTRA):
+            kind = "colour" if held.startswith(COLOURS) else "spectrum"
             raise ExitanceError(
-                f"fspt_surface: 'exitance' is a colour ({texture.class_name()}), J_n is one number. Give W/mm² as a "
-                "float or a texture of one channel."
+                f"fspt_surface: 'exitance' is a {kind} ({held}), J_n is one number. Give W/mm² as a float or a texture "
+                "of one channel."
             )
         _check_bitmap(texture)
         return texture

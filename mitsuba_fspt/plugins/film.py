@@ -43,7 +43,10 @@ def _make(props: mi.Properties) -> mi.Object:
 
 def number(props: mi.Properties, name: str) -> mi.Float64:
     """A parameter of the lens, in double precision; OpticsError where it is no number."""
+    value = props[name]
     try:
-        return mi.Float64(float(props[name]))
-    except (TypeError, ValueError) as error:
-        raise OpticsError(f"fspt_lens: '{name}' must be a number, got {props[name]!r}. Give it as a float.") from error
+        if not isinstance(value, bool):
+            return mi.Float64(float(value))
+    except (TypeError, ValueError):
+        pass
+    raise OpticsError(f"fspt_lens: '{name}' must be a number, got {value!r}. Give it as a float.")

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import SceneError
 from ..quadrature import Quadrature, Solution
 from ..shortcuts import SHORTCUTS, Finding
 from . import pupil_form, surface_form
@@ -24,6 +25,7 @@ from .narrow import NarrowLight, narrow_light
 from .recording import recording
 from .window import Window, glowing_boxes, window_of
 
+MEANINGLESS = ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "timeout")
 ROUNDING = 1e-3  # pixels; more only far from the world's origin
 NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
 
@@ -60,15 +62,9 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
+        _refuse_meaningless(props)
         super().__init__(props)
-        defaults = Quadrature()
-        self.quadrature = Quadrature(
-            rtol=float(props.get("rtol", defaults.rtol)),
-            domain=str(props.get("domain", defaults.domain)),
-            pixel=str(props.get("pixel", defaults.pixel)),
-            max_nodes=int(props.get("max_nodes", defaults.max_nodes)),
-            shortcuts_off=frozenset() if props.get("shortcuts", True) else frozenset(SHORTCUTS),
-        )
+        self.quadrature = _quadrature_of(props)
         # What was found out about the last scene; the scene itself, whose child this is, must not be kept.
         self._sound: list[object] = []
         self._window, self._narrow, self._faces = Memory(), Memory(), Memory()
@@ -158,6 +154,30 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
     def to_string(self) -> str:
         return f"FsptIntegral[{self.quadrature}]"
+
+
+def _refuse_meaningless(props: mi.Properties) -> None:
+    """What Mitsuba's base classes take from every integrator, and would do nothing here."""
+    for name in MEANINGLESS:
+        if name in props:
+            raise SceneError(
+                f"fspt_integral: '{name}' has no meaning, light goes straight to the lens and nothing is sampled. "
+                "Leave it out; 'rtol' and 'max_nodes' set accuracy and time."
+            )
+
+
+def _quadrature_of(props: mi.Properties) -> Quadrature:
+    defaults = Quadrature()
+    shortcuts = props.get("shortcuts", True)
+    if not isinstance(shortcuts, bool):
+        raise SceneError(f"fspt_integral: 'shortcuts' must be true or false, got {shortcuts!r}. Give it as a boolean.")
+    return Quadrature(
+        rtol=props.get("rtol", defaults.rtol),
+        domain=str(props.get("domain", defaults.domain)),
+        pixel=str(props.get("pixel", defaults.pixel)),
+        max_nodes=props.get("max_nodes", defaults.max_nodes),
+        shortcuts_off=frozenset() if shortcuts else frozenset(SHORTCUTS),
+    )
 
 
 class Memory:

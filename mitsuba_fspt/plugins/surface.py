@@ -60,6 +60,8 @@ class FsptSurface(mi.Emitter):
         super().__init__(props)
         if "exitance" not in props:
             raise ExitanceError("fspt_surface: 'exitance' is missing. Give J_n in W/mm² as a float or a texture.")
+        if "to_world" in props:
+            raise ExitanceError("fspt_surface: 'to_world' has no meaning, light comes from the shape. Give it to that.")
         self.exitance = exitance.texture_of(props)
         self.law = law_of(props)
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
