@@ -46,6 +46,8 @@ def require_place(path: Path, error: type[FsptError] = FsptError) -> None:
     """Raise `error` where no file can stand at `path`, for what stands there, for want of a folder or for its name."""
     if os.path.isdir(path):
         raise error(f"output file '{path}' is a folder. Give the name of a file in it.")
+    if os.path.isfile(path.parent):
+        raise error(f"output file '{path}': '{path.parent}' is a file, not a folder. Give another place.")
     if not os.path.isdir(path.parent):
         raise error(f"output file '{path}': the folder '{path.parent}' does not exist. Create it first.")
     try:

@@ -108,7 +108,7 @@ def compare(
 
     Raises
     ------
-    ImageError : shapes differ, an image has no positive power or is constant (ME or CF then have no
+    ImageError : one is no `Image`, shapes differ, an image has no positive power or is constant (ME or CF then have no
         meaning), a row or column does not exist.
     """
     _check(calculated, standard)
@@ -131,6 +131,11 @@ def compare(
 
 
 def _check(calculated: Image, standard: Image) -> None:
+    for image in (calculated, standard):
+        if not isinstance(image, Image):
+            raise ImageError(
+                f"compare: must be given two images, got {type(image).__name__}. Give what `read` returns."
+            )
     if calculated.shape != standard.shape:
         raise ImageError(
             f"compare: the calculated image has {_size(calculated)} pixels, the standard {_size(standard)}. "

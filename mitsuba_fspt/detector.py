@@ -201,7 +201,7 @@ class Detector:
         exposure_time : [s], 0 … 1e12 (0 gives a bias frame)
         wavelength_nm : of the light in vacuum [nm], 1e-3 … 1e9
         binning : side of the square of pixels whose charge is summed before read-out, a divisor of h and w
-        seed : of the shot and read noise, >= 0
+        seed : of the shot and read noise, 0 … 2⁵³
 
         Raises
         ------
@@ -209,7 +209,9 @@ class Detector:
         """
         exposure_time, wavelength_nm = _light(exposure_time, wavelength_nm)
         seed, binning = _whole("seed", seed), _whole("binning", binning)
-        _require("seed", seed, seed >= 0, ">= 0, for example 1")
+        _require(
+            "seed", seed, 0 <= seed <= 1 << 53, ">= 0 and at most 2^53, for example 1"
+        )  # an EXR holds no larger one
         rng = np.random.default_rng(seed)
         mean = self.expected(image, exposure_time, wavelength_nm, binning=binning).mean
         # Means this far above the full well end there for certain; NumPy draws none beyond 9e18.

@@ -134,7 +134,7 @@ def _sample(
     count = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
     lens.sampler().set_sample_count(math.ceil(spp / count))
     each = lens.sampler().sample_count()  # some samplers take more: told once, not in every pass
-    seeds = [int(np.random.SeedSequence((seed, k)).generate_state(1)[0]) for k in range(count)]
+    seeds = (int(np.random.SeedSequence((seed, k)).generate_state(1)[0]) for k in range(count))
     total = squares = 0.0
     samples = 0
     progress("sampling", 0.0)

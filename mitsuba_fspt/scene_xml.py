@@ -52,12 +52,14 @@ class SceneXml:
 def read_xml(path: Path, given: Mapping[str, str]) -> SceneXml:
     """What a scene file says with these values for its parameters; SceneError where it cannot be read."""
     scene = SceneXml(given, folders=[path.parent])
-    _read(path, scene)
+    _read(path, scene, ())
     return scene
 
 
-def _read(path: Path, scene: SceneXml) -> None:
-    if path in scene.files:  # it includes itself: Mitsuba says so when it loads it
+def _read(path: Path, scene: SceneXml, outer: tuple[Path, ...]) -> None:
+    if os.path.realpath(path) in map(os.path.realpath, outer):
+        raise SceneError(f"{outer[0]}: {path} includes itself. Take that <include> out.")
+    if path in scene.files:  # a second time
         return
     scene.files.append(path)
     for node in _root(path).iter():
@@ -68,7 +70,7 @@ def _read(path: Path, scene: SceneXml) -> None:
             scene.folders.append(path.parent / scene.fill_in(node.get("value", "")))
         elif node.tag == "include":
             for inner in scene.places(scene.fill_in(node.get("filename", "")), path.parent)[:1]:
-                _read(inner, scene)
+                _read(inner, scene, (*outer, path))
 
 
 def _root(path: Path) -> ElementTree.Element:
@@ -76,5 +78,7 @@ def _root(path: Path) -> ElementTree.Element:
         return ElementTree.parse(path).getroot()
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene file: {error.strerror}. Check the name.") from error
+    except LookupError as error:
+        raise SceneError(f"{path}: {error}. Save the scene file as UTF-8, and say so in its first line.") from error
     except ElementTree.ParseError as error:
         raise SceneError(f"{path}: not valid XML: {error}. Mend that line.") from error

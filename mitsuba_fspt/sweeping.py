@@ -75,7 +75,8 @@ def sweep(
     parameters : values for `<default>` parameters of the scene, in a list or one alone
     folder : where the images go; made if its parent exists
     method, rtol, spp, seed : as in `render`
-    jobs : processes, >= 1; None renders in this one (with scheduler 'local': as many as the machine has cores)
+    jobs : processes, >= 1; None renders in this one (with scheduler 'local': as many as the machine has cores). Each
+        imports the script that calls: keep the call behind `if __name__ == "__main__":`
     scheduler : address of a dask.distributed scheduler, for example 'tcp://10.0.0.1:8786', or 'local' to start one
         on this machine; needs the extra `cluster`. Workers must find the scene under the same path.
     progress : called with what is being done and the share done

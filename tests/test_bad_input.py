@@ -320,6 +320,7 @@ COMMANDS = {
         "-o would overwrite 'map.png', which is needed too",
     ),
     "a scene of depths": (("render", "depth.xml", "-o", "o.exr"), "integrator DepthIntegrator gives no power"),
+    "a file for a folder": ((*RENDER, "-o", "s.xml/o.exr"), "'s.xml' is a file, not a folder. Give another place"),
     "a folder for a file": ((*RENDER, "-o", "folder.exr"), "'folder.exr' is a folder"),
     "rtol 0": ((*RENDER, "--rtol", "0"), "'rtol' must be in (0, 1), got 0"),
     "rtol negative": ((*RENDER, "--rtol", "-1"), "'rtol' must be in (0, 1), got -1"),
@@ -343,6 +344,15 @@ COMMANDS = {
     "broken XML": (("render", "broken.xml"), "broken.xml: not valid XML: "),
     "not a scene": (("render", "bsdf.xml"), "bsdf.xml: the root is <diffuse>, a scene file has <scene>"),
     "no version": (("render", "old.xml"), "missing version attribute"),
+    "an unknown encoding": (
+        ("render", "klingon.xml"),
+        "klingon.xml: unknown encoding: klingon. Save the scene file as UTF-8",
+    ),
+    "include of itself": (("render", "self.xml"), "self.xml: part.xml includes itself. Take that <include> out."),
+    "expose: a seed beyond all": (
+        ("expose", "good.exr", *EXPOSE[2:], "--seed", "99999999999999999999"),
+        "detector: 'seed' must be finite and >= 0 and at most 2^53, for example 1, got 99999999999999999999",
+    ),
     "include of nothing": (("render", "include.xml"), 'included file "gone.xml" not found'),
     "compare: no file": (("compare", "gone.exr", "gone.exr"), "image file 'gone.exr' does not exist"),
     "compare: no image": (("compare", "broken.xml", "broken.xml"), "no readable OpenEXR file"),
@@ -382,6 +392,10 @@ def files(folder):
         more=given,
     )
     write_scene(folder / "depth.xml", integrator='<integrator type="depth"/>')
+    (folder / "klingon.xml").write_text('<?xml version="1.0" encoding="klingon"?><scene version="3.0.0"/>')
+    for outer in ("self.xml", "part.xml"):
+        (folder / outer).write_text('<scene version="3.0.0"><include filename="part.xml"/></scene>')
+    fspt.Image(np.ones((2, 2))).write(folder / "good.exr")
     (folder / "include.xml").write_text('<scene version="3.0.0"><include filename="gone.xml"/></scene>')
 
 
@@ -422,6 +436,11 @@ sys.exit(cli.run(["render", "s.xml", "-o", "o.exr"]))
     assert done.stdout == ""
     assert sorted(os.listdir(tmp_path)) == ["o.exr", "s.xml"]
     assert (tmp_path / "o.exr").read_bytes() == b"the old one"
+
+
+def test_names_of_files_are_no_images():
+    with pytest.raises(ImageError, match=r"compare: must be given two images, got str\. Give what `read` returns\."):
+        fspt.compare("a.exr", "b.exr")  # type: ignore[arg-type]
 
 
 # --- odd, but not bad ---
