@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -201,12 +202,27 @@ def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
                 f"scene: integrator {own.class_name()} gives no power. Give the scene an 'fspt_integral' or 'path', or "
                 "set 'method'."
             )
+        _require_light(scene, own)
         return own
     if method in (None, "integral"):
         return own if is_integral(own) else mi.load_dict({"type": "fspt_integral"})
     if method not in METHODS:
         raise SceneError(f"render: 'method' must be one of {', '.join(METHODS)}, got '{method}'.")
     return monte_carlo.tracer(method)
+
+
+def _require_light(scene: mi.Scene, integrator: mi.Integrator) -> None:
+    """Light of a surface goes straight to the lens: a Monte Carlo without that would be dark all over."""
+    if not any(type(emitter).__name__ == "FsptSurface" for emitter in scene.emitters()):
+        return
+    hidden = "'hide_emitters' = true" if getattr(integrator, "hide_emitters", False) else None
+    if hidden is None and re.search(r"\bmax_depth = 0\b", str(integrator)):  # told by its description alone
+        hidden = "'max_depth' = 0"
+    if hidden:
+        raise SceneError(
+            f"scene: integrator {integrator.class_name()} with {hidden} leaves out what surfaces send straight to the "
+            "lens. Leave that parameter out, or set 'method'."
+        )
 
 
 def _refuse(settings: dict[str, object], method: str) -> None:

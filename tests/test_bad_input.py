@@ -170,6 +170,14 @@ FILES = {
         of_ball('<float name="exitance" value="1e-3"/>', '<spectrum name="exitance" value="400:1, 700:2"/>'),
         "'exitance' of an fspt_surface is a spectrum (<spectrum>), J_n is one number",
     ),
+    "a Monte Carlo that hides what glows": (
+        {"integrator": '<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'},
+        "integrator PathIntegrator with 'hide_emitters' = true leaves out what surfaces send straight to the lens",
+    ),
+    "a Monte Carlo of no depth": (
+        {"integrator": '<integrator type="ptracer"><integer name="max_depth" value="0"/></integrator>'},
+        "integrator ParticleTracerIntegrator with 'max_depth' = 0 leaves out what surfaces send",
+    ),
     "no mesh file": (mesh("gone.ply"), '"gone.ply": file not found'),
     "words for a mesh": (mesh("words.ply"), '"words.ply": invalid PLY header'),
     "half a mesh": (mesh("cut.ply"), '"cut.ply": could not parse'),
