@@ -88,6 +88,9 @@ def render(
     typer.echo(f"{output}: total {power:.6g} W, brightest pixel {peak:.6g} W, {image.metadata['wall_time']:.3g} s")
     if png:
         typer.echo(f"{picture}: the same to look at")
+    if peak == 0:
+        hint = "Check the lens's 'to_world', and that the faces' normals point outwards"
+        typer.echo(f"fspt: {output}: the picture is dark, no light reaches the lens. {hint}.", err=True)
 
 
 @app.command()

@@ -25,6 +25,7 @@ def check_text(path: Path, scene: SceneXml) -> None:
     for node in scene.nodes:
         _check_twins(path, node)
         _check_source(path, node, scene)
+        _check_homes(path, node)
         if node.get("type") == "fspt_surface":
             _check_colours(path, node, scene)
 
@@ -78,6 +79,13 @@ def _check_source(path: Path, node: ElementTree.Element, scene: SceneXml) -> Non
     needed = NEEDED.get(kind, ()) if node.tag == "texture" else ()
     if needed and not any(child.get("name") in needed for child in node):
         raise SceneError(f"{path}: a texture '{kind}' has no '{needed[0]}'. Give it one.")
+
+
+def _check_homes(path: Path, node: ElementTree.Element) -> None:
+    """A glow without a shape the integral passes over, and Monte Carlo fails on; one with an id may be referred to."""
+    for child in node if node.tag != "shape" else ():
+        if child.get("type") == "fspt_surface" and not child.get("id"):
+            raise SceneError(f"{path}: an fspt_surface stands in <{node.tag}>. Put it into the <shape> that glows.")
 
 
 def _check_colours(path: Path, emitter: ElementTree.Element, scene: SceneXml) -> None:

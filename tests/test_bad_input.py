@@ -178,6 +178,10 @@ FILES = {
         {"integrator": '<integrator type="ptracer"><integer name="max_depth" value="0"/></integrator>'},
         "integrator ParticleTracerIntegrator with 'max_depth' = 0 leaves out what surfaces send",
     ),
+    "a glow without a shape": (
+        {"more": '<emitter type="fspt_surface"><float name="exitance" value="1"/></emitter>'},
+        "s.xml: an fspt_surface stands in <scene>. Put it into the <shape> that glows.",
+    ),
     "no mesh file": (mesh("gone.ply"), '"gone.ply": file not found'),
     "words for a mesh": (mesh("words.ply"), '"words.ply": invalid PLY header'),
     "half a mesh": (mesh("cut.ply"), '"cut.ply": could not parse'),
@@ -452,6 +456,26 @@ def test_names_of_files_are_no_images():
 
 
 # --- odd, but not bad ---
+
+
+def test_a_dark_picture_is_written_and_said_to_be_dark(tmp_path, capfd, monkeypatch):
+    """A sphere that glows inwards: 0 W on every pixel, and on stderr what may be wrong; seen to be silent."""
+    monkeypatch.chdir(tmp_path)
+    inwards = BALL_XML.replace("<emitter", '<boolean name="flip_normals" value="true"/><emitter')
+    write_scene(tmp_path / "s.xml", shapes=inwards)
+    assert cli.run(["render", "s.xml"]) == 0
+    assert fspt.read("s.exr").power.max() == 0
+    assert re.fullmatch(
+        r"fspt: s\.exr: the picture is dark, no light reaches the lens\. Check [^\n]+ normals point outwards\.\n",
+        capfd.readouterr().err,
+    )
+
+
+def test_a_glow_may_stand_outside_and_be_referred_to(tmp_path):
+    glow = '<emitter type="fspt_surface" id="glow"><float name="exitance" value="1e-3"/></emitter>'
+    body = '<shape type="sphere"><float name="radius" value="3"/><ref id="glow"/></shape>'
+    image = fspt.render(write_scene(tmp_path / "s.xml", shapes=glow + body))
+    assert image.power.max() > 0
 
 
 def test_two_surfaces_and_faces_without_area_are_fine(folder, monkeypatch):
