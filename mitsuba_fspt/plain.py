@@ -27,9 +27,10 @@ def whole(thing: str, value: object, error: type[FsptError], example: str) -> in
     """`value` as an int; raises `error` for what is no whole number, True too."""
     value = _without_axes(value)
     with suppress(OverflowError, ValueError):  # infinite, not a number
-        plain = isinstance(value, (Real, Decimal)) and not isinstance(value, bool)
-        if plain and value == (found := int(value)):  # type: ignore[arg-type]  # likewise
-            return found
+        if isinstance(value, (Real, Decimal)) and not isinstance(value, bool):
+            found = int(value)  # type: ignore[arg-type]  # likewise
+            if found == value:
+                return found
     raise error(f"{thing} must be a whole number, got {_told(value)}. Give for example {example}.")
 
 

@@ -122,6 +122,7 @@ def _sample(
     from .plugins.checks import check_scene
     from .plugins.probe import probe_beside
     from .plugins.pupil_form import coverage
+    from .plugins.recording import recording
 
     check_scene(scene, lens)
     spp = whole("render: 'spp'", spp, SceneError, "256")
@@ -152,7 +153,9 @@ def _sample(
         "seed": seed,
     }
     error = monte_carlo.standard_error(mean, squares / count, count, samples)
-    return mean, np.where((mean > 0) | _can_see(scene, lens), error, 0), coverage(scene, lens), how
+    with recording():
+        met = coverage(scene, lens)
+    return mean, np.where((mean > 0) | _can_see(scene, lens), error, 0), met, how
 
 
 def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import wraps
 from typing import Any
 
 import drjit as dr
@@ -52,6 +53,22 @@ def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
     # What this thread records from now on comes after what that one left unevaluated: on CUDA the handle of a scene.
     dr.detail.new_scope(dr.backend_v(mi.Float))
     return built
+
+
+def dark_elsewhere(*kinds: str) -> Callable[[Callable], Callable]:
+    """Decorator of an emitter's method: zeros of these kinds where its surface is another scene's and unsound."""
+
+    def decorate(method: Callable) -> Callable:
+        @wraps(method)
+        def guarded(emitter: Any, *arguments: Any, **named: Any) -> Any:
+            if emitter.sound():
+                return method(emitter, *arguments, **named)
+            zeros = tuple(dr.zeros(getattr(mi, kind)) for kind in kinds)
+            return zeros if len(zeros) > 1 else zeros[0]
+
+        return guarded
+
+    return decorate
 
 
 def scene_is_checked() -> bool:

@@ -11,7 +11,7 @@ from .elements import ElementDistribution, elements_of
 from .emission import Lambert, law_of
 from .last_flight import LastFlight
 from .probe import Probe
-from .recording import aside, scene_is_checked
+from .recording import aside, dark_elsewhere, scene_is_checked
 from .spectra import sample_wavelengths
 
 
@@ -100,7 +100,7 @@ class FsptSurface(mi.Emitter):
 
     def _radiance(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Radiance [W/mm²/sr] towards a unit vector of the world, 0 on the inward side."""
-        if not self._sound():
+        if not self.sound():
             return mi.UnpolarizedSpectrum(0)
         outward = active & (dr.dot(si.n, direction) > 0)
         radiance = self.exitance.eval(si, outward) * self.law.profile(si, direction, outward)
@@ -110,6 +110,7 @@ class FsptSurface(mi.Emitter):
 
     # ------------------------------------------------------------------ sampling
 
+    @dark_elsewhere("PositionSample3f", "Float")
     def sample_position(
         self, time: mi.Float, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.PositionSample3f, mi.Float]:
@@ -119,9 +120,11 @@ class FsptSurface(mi.Emitter):
         ps.n, ps.time, ps.pdf, ps.delta = si.n, time, pdf, False
         return ps, _rcp(pdf)
 
+    @dark_elsewhere("Float")
     def pdf_position(self, ps: mi.PositionSample3f, active: mi.Bool = True) -> mi.Float:
         return self._distribution().pdf(self._surface_at(ps, active), active)
 
+    @dark_elsewhere("Ray3f", "Spectrum")
     def sample_ray(
         self,
         time: mi.Float,
@@ -139,6 +142,7 @@ class FsptSurface(mi.Emitter):
         power = self._radiance(si, direction, active) * (dr.pi * _rcp(pdf))
         return ray, mi.depolarizer(power * weight)
 
+    @dark_elsewhere("DirectionSample3f", "Spectrum")
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
@@ -154,16 +158,19 @@ class FsptSurface(mi.Emitter):
         si.wavelengths = it.wavelengths
         return ds, mi.depolarizer(self._radiance(si, -ds.d, active) * _rcp(ds.pdf))
 
+    @dark_elsewhere("Float")
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         pdf = self._distribution().pdf(self._surface_at(ds, active), active)
         return dr.select(active, _solid_angle(pdf, ds), 0)
 
+    @dark_elsewhere("Spectrum")
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
         """Radiance [W/mm²/sr] that arrives at `it` from the surface point of `ds`."""
         si = self._surface_at(ds, active)
         si.wavelengths = it.wavelengths
         return mi.depolarizer(self._radiance(si, -ds.d, active))
 
+    @dark_elsewhere("Wavelength", "Spectrum")
     def sample_wavelengths(
         self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
     ) -> tuple[mi.Wavelength, mi.Spectrum]:
@@ -205,10 +212,11 @@ class FsptSurface(mi.Emitter):
         self.brightest = aside(look, self._home())
         self._source = source
 
-    def _sound(self) -> bool:
+    def sound(self) -> bool:
         """True after `check`; False where it fails in a recording for another scene, which must not care."""
-        if self._source and scene_is_checked():
-            return True
+        if scene_is_checked() and (self._source or self._shape is None):
+            # Never looked at, it is none of that scene; where loading failed, its shape is gone and must not be asked.
+            return self._source is not None
         try:
             self.check()
         except ExitanceError:
