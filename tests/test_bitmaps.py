@@ -83,11 +83,14 @@ def test_a_single_texel_of_four_million_is_not_refused():
     assert np.isfinite(fspt.render(scene, max_nodes=4).power).all()
 
 
+RED_GREEN_BLUE = np.full((2, 4, 3), [3, 2, 1], np.float32)
+
+
 @pytest.mark.parametrize(
     ("pixels", "raw", "message"),
     [
-        (np.ones((2, 4, 3), np.float32), True, "a bitmap of 3 channels, J_n is one number"),
-        (np.ones((2, 4, 3), np.uint8), False, "a bitmap of 3 channels"),
+        (RED_GREEN_BLUE, True, "a bitmap of 3 channels that differ, J_n is one number"),
+        (RED_GREEN_BLUE.astype(np.uint8), False, "a bitmap of 3 channels that differ"),
         (np.full((2, 4, 1), 128, np.uint8), False, "a picture of 4 × 2 whole numbers, which are decoded as sRGB"),
     ],
     ids=["colours", "coloured picture", "grey picture"],
@@ -98,9 +101,11 @@ def test_bitmaps_that_are_no_watts_are_refused(pixels, raw, message):
         scene_of(ball({"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": raw}))
 
 
-def test_whole_numbers_of_a_raw_bitmap_are_shares_of_the_largest():
-    pixels = np.full((2, 4, 1), 51, np.uint8)
-    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("value", [np.uint8(51), np.float32(0.2)], ids=["whole", "float"])
+def test_raw_bitmaps_in_grey_are_watts(value, channels):
+    """Expected: those of a number; whole numbers are shares of the largest, 255."""
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 4, channels), value)), "raw": True}
     power, uniform = (fspt.render(scene_of(ball(exitance))).power for exitance in (bitmap, 0.2))
     assert uniform.max() > 0
     np.testing.assert_allclose(power, uniform, rtol=1e-3, atol=1e-3 * uniform.max())

@@ -125,15 +125,16 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
 
 
 def _check_bitmap(texture: mi.Texture) -> None:
-    """ExitanceError if `texture` is a bitmap of several channels, or of whole numbers that Mitsuba takes for sRGB."""
+    """ExitanceError if `texture` is a bitmap in colour, or of whole numbers that Mitsuba takes for sRGB."""
     values = mi.traverse(texture)
     if "data" not in values:
         return
     height, width, channels = values["data"].shape
-    if channels > 1:
+    texels = values["data"].numpy()
+    if channels > 1 and (texels != texels[..., :1]).any():
         raise ExitanceError(
-            f"fspt_surface: 'exitance' is a bitmap of {channels} channels, J_n is one number. Give a bitmap of one "
-            "channel, as a float EXR."
+            f"fspt_surface: 'exitance' is a bitmap of {channels} channels that differ, J_n is one number. Give one of "
+            "one channel, as a float EXR."
         )
     if not dr.is_float_v(values["data"]) and "raw = 0" in str(texture):  # which nothing but its description tells
         raise ExitanceError(
