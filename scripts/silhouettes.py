@@ -63,7 +63,7 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
     lens = scene.sensors()[0]
     window = visible_window(scene, lens)
     draft = Draft(View.of(scene, lens, window), window, Quadrature(rtol=RTOL), None)
-    first_nodes(draft)
+    first_nodes(draft, np.zeros(window.shape))
     cut = parted(draft.hits)
     pixels = np.array(dr.compress(cut))
     peak = float(draft.peak[0])

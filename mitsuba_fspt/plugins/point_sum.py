@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .checks import check_scene
 from .elements import Elements, elements_of
 from .lanes import numbered, runs
 from .occlusion import hidden
@@ -32,8 +33,10 @@ def points_of(scene: mi.Scene, minimum: int) -> int:
 def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Image, int]:
     """Power on the pixels of the crop window, shape (h, w) [W], and the number of pairs of a point and a pixel.
 
-    Every glowing shape has at least `minimum` points; with 1 those of a mesh are the centres of its faces.
+    Every glowing shape has at least `minimum` points; with 1 those of a mesh are the centres of its faces. Raises
+    SceneError or ExitanceError as in `check_scene`.
     """
+    check_scene(scene, lens)
     width, height = (int(n) for n in lens.film().crop_size())
     power, pairs = dr.zeros(mi.Float64, width * height), 0
     with recording(), dr.suspend_grad():
