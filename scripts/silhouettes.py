@@ -75,7 +75,7 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
 
     for rule in (rules.four(True), rules.twelve(True)):
         since = draft.rays
-        note(f"{len(rule)} nodes", apply_nodes(draft, rule, cut)[0], since)
+        note(f"{len(rule)} nodes", apply_nodes(draft, rule, cut).value, since)
     edges = edges_of(draft)
     for level, count in enumerate(rules.TRANSECT_LEVELS):
         since = draft.rays

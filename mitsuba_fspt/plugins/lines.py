@@ -89,34 +89,47 @@ def repeat(count: int | mi.UInt32, body: Callable[..., tuple], *state: Any) -> t
 # ---------------------------------------------------------------------- rules on every pixel
 
 
-def apply_rule(view: View, centre: mi.Point2f, rule: rules.Rule) -> tuple[mi.Float, ...]:
-    """Weighted sums of one rule at every pixel: value, contrast, first moments over the pupil, hits, depth range."""
+@dataclass
+class Sums:
+    """What the nodes of a rule see from a pixel, or from each of many.
+
+    value, x, y : integrand of Eq. 9 [W/mm²/sr], and times the place on the pupil, weighted and summed
+    contrast : how far the integrand bends, see `rules.Rule`
+    hits : share of the lines of sight that meet something
+    nearest, farthest : depths of what is met [mm]; inf and 0 where nothing is
+    """
+
+    value: mi.Float
+    contrast: mi.Float
+    x: mi.Float
+    y: mi.Float
+    hits: mi.Float
+    nearest: mi.Float
+    farthest: mi.Float
+
+
+NOTHING_SEEN = (0, 0, 0, 0, 0, math.inf, 0)
+
+
+def apply_rule(view: View, centre: mi.Point2f, rule: rules.Rule) -> Sums:
+    """What one rule sees from every pixel."""
     table = [mi.Float(column) for column in (*rule.pupil.T, *rule.pixel.T, rule.weight, rule.contrast)]
     together = view.detail <= NODES_TOGETHER
 
-    def node(
-        k: mi.UInt32,
-        value: mi.Float,
-        contrast: mi.Float,
-        moment: mi.Vector2f,
-        hits: mi.Float,
-        nearest: mi.Float,
-        farthest: mi.Float,
-    ) -> tuple:
+    def node(k: mi.UInt32, sums: Sums) -> tuple[Sums]:
         ax, ay, dx, dy, weight, null = (dr.gather(mi.Float, column, k) for column in table)
         f, _, body, depth = view.radiance_on_film(centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay), together)
         hit = body > 0
-        return (
-            value + weight * f,
-            contrast + null * f,
-            moment + weight * f * mi.Vector2f(ax, ay),
-            hits + dr.select(hit, weight, 0),
-            dr.select(hit, dr.minimum(nearest, depth), nearest),
-            dr.select(hit, dr.maximum(farthest, depth), farthest),
+        seen = Sums(
+            value=sums.value + weight * f,
+            contrast=sums.contrast + null * f,
+            x=sums.x + weight * f * ax,
+            y=sums.y + weight * f * ay,
+            hits=sums.hits + dr.select(hit, weight, 0),
+            nearest=dr.select(hit, dr.minimum(sums.nearest, depth), sums.nearest),
+            farthest=dr.select(hit, dr.maximum(sums.farthest, depth), sums.farthest),
         )
+        return (seen,)
 
-    zero = mi.Float(0)
-    value, contrast, moment, hits, nearest, farthest = repeat(
-        dr.opaque(mi.UInt32, len(rule)), node, zero, zero, mi.Vector2f(0), zero, mi.Float(dr.inf), zero
-    )
-    return value, contrast, moment.x, moment.y, hits, nearest, farthest
+    start = Sums(*map(mi.Float, NOTHING_SEEN))
+    return repeat(dr.opaque(mi.UInt32, len(rule)), node, start)[0]

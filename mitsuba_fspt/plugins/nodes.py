@@ -12,7 +12,7 @@ from ..shortcuts import Finding
 from .draft import Draft
 from .grid import ROUNDING, parted
 from .lanes import chunks
-from .lines import apply_rule
+from .lines import NOTHING_SEEN, Sums, apply_rule
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,17 +39,18 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     """
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
-    value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
-    if len(rule) == 1 and dr.any(_passed_by(draft, value, grid.lanes(light))):
+    seen = apply_nodes(draft, rule)
+    if len(rule) == 1 and dr.any(_passed_by(draft, seen.value, grid.lanes(light))):
         rule = rules.four(draft.area)
-        value, contrast, mx, my, hits, draft.nearest, farthest = apply_nodes(draft, rule)
+        seen = apply_nodes(draft, rule)
+    mx, my, draft.nearest = seen.x, seen.y, seen.nearest
     draft.nodes = len(rule)
-    draft.set_hits(hits)
-    draft.set_blur(farthest)
-    draft.value = value = dr.select(draft.open, value, draft.known)
+    draft.set_hits(seen.hits)
+    draft.set_blur(seen.farthest)
+    draft.value = value = dr.select(draft.open, seen.value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
     square = 16 * (mx * mx + my * my)
-    bend = dr.abs(contrast) + dr.select(value > 0, square * square / (4 * value * value * value), 0)
+    bend = dr.abs(seen.contrast) + dr.select(value > 0, square * square / (4 * value * value * value), 0)
     neighbours = draft.area or len(rule) == 1  # tell how the picture bends
     if neighbours:
         xx, yy = grid.second_differences(value)
@@ -129,15 +130,15 @@ def _one_will_do(draft: Draft) -> bool:
 
 def _refine(draft: Draft, where: Mask) -> Image:
     """Twelve nodes on the marked pixels; returns how far the first ones were off there, 0 elsewhere."""
-    value, _, _, _, hits, nearest, _ = apply_nodes(draft, rules.twelve(draft.area), where)
-    difference = dr.select(where, dr.abs(value - draft.value), 0)
+    seen = apply_nodes(draft, rules.twelve(draft.area), where)
+    difference = dr.select(where, dr.abs(seen.value - draft.value), 0)
     # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
     gain = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
-    draft.value = dr.select(where, value, draft.value)
-    draft.set_hits(dr.select(where, hits, draft.hits))
-    draft.nearest = dr.minimum(draft.nearest, nearest)
+    draft.value = dr.select(where, seen.value, draft.value)
+    draft.set_hits(dr.select(where, seen.hits, draft.hits))
+    draft.nearest = dr.minimum(draft.nearest, seen.nearest)
     left = difference * dr.clip(gain, LEAST_GAIN, ROUGH_GAIN)
-    rough = dr.select(parted(hits), 0, dr.maximum(left, difference))
+    rough = dr.select(parted(seen.hits), 0, dr.maximum(left, difference))
     rough, left = draft.grid.spread_all((rough, left))
     draft.roughness = dr.maximum(draft.roughness, rough)
     error = dr.maximum(left, draft.error / MOST_GAIN)
@@ -146,17 +147,17 @@ def _refine(draft: Draft, where: Mask) -> Image:
     return difference
 
 
-def apply_nodes(draft: Draft, rule: rules.Rule, where: Mask | None = None) -> list[Image]:
-    """Images of `apply_rule`'s sums at all or at the marked pixels, 0 (depths: inf, 0) elsewhere."""
+def apply_nodes(draft: Draft, rule: rules.Rule, where: Mask | None = None) -> Sums:
+    """Images of what a rule sees from all or from the marked pixels, as if of nothing elsewhere."""
     if where is None:
         index = draft.grid.pixels()
-        images = [dr.empty(mi.Float64, len(draft.grid)) for _ in range(7)]
+        images = Sums(*(dr.empty(mi.Float64, len(draft.grid)) for _ in NOTHING_SEEN))
     else:
         index = draft.grid.pixels(where)
-        images = [draft.grid.full(mi.Float64, fill) for fill in (0, 0, 0, 0, 0, dr.inf, 0)]
+        images = Sums(*(draft.grid.full(mi.Float64, fill) for fill in NOTHING_SEEN))
     for part in chunks(index):
-        sums = apply_rule(draft.view, draft.window.centres(part), rule)
-        for image, column in zip(images, sums, strict=True):
+        seen = apply_rule(draft.view, draft.window.centres(part), rule)
+        for image, column in zip(vars(images).values(), vars(seen).values(), strict=True):
             dr.scatter(image, mi.Float64(column), part)
         dr.eval(images)
     count = dr.width(index)

@@ -57,6 +57,6 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
     grid, view = Grid(window.shape), View.of(scene, lens, window)
     image = grid.full(mi.Float64, 0)
     for part in chunks(grid.number):
-        hits = apply_rule(view, window.centres(part), rules.twelve(True))[4]
+        hits = apply_rule(view, window.centres(part), rules.twelve(True)).hits
         dr.scatter(image, mi.Float64(hits), part)
     return window.expand(grid.array(image * open_share(lens, window, grid)))

@@ -80,8 +80,8 @@ class _Ladder:
         self.smooth = self.smooth & where & ~self.split
         value, hits, scatter = means.value, means.hits, means.scatter
         if 0 < level <= rules.SMOOTH_LEVELS and dr.any(self.smooth):
-            nodes, _, _, _, seen, *_ = apply_nodes(draft, rules.product(level, draft.area), self.smooth)
-            value, hits = dr.select(self.smooth, nodes, value), dr.select(self.smooth, seen, hits)
+            seen = apply_nodes(draft, rules.product(level, draft.area), self.smooth)
+            value, hits = dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.hits, hits)
         moved = dr.abs(value - draft.value)
         if level == 0:
             left, unseen = self._first(fresh, moved, scatter, parted(hits))
