@@ -194,17 +194,18 @@ def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
     else:
         elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
     counts = np.ones(elements.count, np.int64)
-    _, area, _, _, blur, *_ = (column.numpy() for column in _look(emitter, elements, lens, counts))
-    unit = np.maximum(blur, 1)
+    middles = _look(emitter, elements, lens, counts)
+    area, unit = middles.image.numpy(), np.maximum(middles.blur.numpy(), 1)
     reach = _reach(elements, lens) / unit
     # A long and thin element is many points, a quarter of a unit apart; one that is wide may be wide at one.
     long = np.isfinite(reach) & (reach > MOST_POINTS)  # points all along would be too far apart to tell
     thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
-    *columns, centre, place = _look(emitter, elements, lens, counts)
+    look = _look(emitter, elements, lens, counts)
     if len(scene.shapes()) > 1:
-        columns[0] = dr.select(_in_sight(scene, lens, place), columns[0], 0)
-    seen = np.array([column.numpy() for column in (*columns, centre.x, centre.y)], np.float64)
+        look.radiance = dr.select(_in_sight(scene, lens, look.place), look.radiance, 0)
+    columns = (look.radiance, look.image, look.cosine, look.front, look.blur, look.centre.x, look.centre.y)
+    seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
     radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
     # What is half as thick as a unit covers half of some square by itself.
@@ -212,12 +213,23 @@ def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
     return _Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
 
 
-def _look(
-    emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index
-) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float, mi.Point2f, mi.Point3f]:
-    """At so many points of each element, the first its middle, radiance to where the lens sees most of it, area of the
-    element's image from there, cosine, front, blur, place on film, see `_Points`; and place in the world.
+@dataclass
+class _Look:
+    """At points of elements: `radiance` to where the lens sees most of them, area of the element's `image` from there
+    [pixels²]; cosine, front, blur and `centre` on film as in `_Points`; `place` in the world.
     """
+
+    radiance: mi.Float
+    image: mi.Float
+    cosine: mi.Float
+    front: mi.Float
+    blur: mi.Float
+    centre: mi.Point2f
+    place: mi.Point3f
+
+
+def _look(emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index) -> _Look:
+    """At so many points of each element, the first its middle."""
     index, number = numbered(counts)
     sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
     si, area = elements.place(mi.UInt32(index), sample)
@@ -230,9 +242,9 @@ def _look(
     cosine = dr.dot(si.n, to_lens)
     image = area * dr.abs(cosine / (dr.dot(axis, to_lens) * dr.square(scale)))
     front = dr.dot(si.n, lens.world_transform() @ mi.Point3f(0) - si.p)
-    columns = (scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre, si.p)
-    dr.eval(columns)
-    return columns
+    look = _Look(scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre, si.p)
+    dr.eval(look)
+    return look
 
 
 def _in_sight(scene: mi.Scene, lens: mi.Sensor, place: mi.Point3f) -> mi.Bool:
