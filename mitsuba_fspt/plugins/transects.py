@@ -71,7 +71,7 @@ class _Ladder:
         """One round: values, what is left of the error, and whether a neighbour knows better."""
         draft, where = self.draft, self.where
         if self.means:
-            self.edges.learn(draft, self.means, self.split)
+            self.edges.learn(draft, self.means, self.split, across=level % 2 == 0)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
         # What hides light may be cut by outlines all over the pupil but where the light comes past it.
         lit = means.value > dr.opaque(mi.Float64, DIM) * draft.peak
@@ -152,10 +152,11 @@ class Edges:
     blur: Image
     sharp: Mask
 
-    def learn(self, draft: Draft, means: Means, split: Mask) -> None:
+    def learn(self, draft: Draft, means: Means, split: Mask, across: bool = False) -> None:
         """Blur of the edges that were met; pixels that see none are smooth, and none is sharp.
 
-        Whoever met none may see the tip of a neighbour's, and looks next towards where more or fewer lines hit.
+        Whoever met none may see the tip of a neighbour's, and looks next towards where more or fewer lines hit; at
+        every other level `across` that, for what dark bodies leave of the light may lie beside all such transects.
         """
         grid, jumps = draft.grid, means.jumps
         around = (means.blur, -means.blur, jumps, split | draft.outline)
@@ -165,7 +166,8 @@ class Edges:
         self.sharp = (dr.abs(self.blur) < SHARP) & near
         x, y = grid.gradient(grid.box_sum(draft.hits, _around(draft)))
         alike = dr.abs(x) + dr.abs(y) < ROUNDING
-        self.angle = dr.select(split | alike, self.angle, dr.atan2(y, x))
+        turn = dr.opaque(mi.Float64, math.pi / 2 if across else 0)
+        self.angle = dr.select(split | alike, self.angle, dr.atan2(y, x) + turn)
         dr.eval(self.angle, self.blur, self.sharp)
 
 
