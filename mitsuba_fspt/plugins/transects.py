@@ -28,6 +28,7 @@ LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be
 SPREAD, KINK, SLANT = 2.0, 6.0, 2.0
 UNSETTLED = 1.5  # times the tolerance: another level is needed, but not of the neighbours that doubt half of it
 DOUBT = 0.5  # of what a neighbour may be wrong by counts, unless it is by a sharp edge or one that it alone has met
+MISLED = 3.0  # times what was thought to be left, and beyond the tolerance: who moves so far had settled by chance
 BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
@@ -88,8 +89,9 @@ class _Ladder:
         else:
             left, unseen = self._later(level, fresh, moved, scatter, len(rule))
             self.smooth = self.smooth & (moved < BUMPY * value)
-        # Whose neighbour meets a jump at last may pass it by, settled or not, and be as wrong as that one was.
-        unseen = dr.select(self.split | ~draft.open, 0, unseen)
+        # Whose neighbour meets a jump at last, or was misled, may pass the same by and be as wrong as that one was:
+        # who met no jump, and who has settled.
+        unseen = dr.select((self.split & where) | ~draft.open, 0, unseen)
         self.left = dr.select(where, left, self.left)
         better = where if level else fresh  # where the first transects meet no jump nodes are
         draft.value = dr.select(better, value, draft.value)
@@ -125,7 +127,7 @@ class _Ladder:
         return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh | (draft.outline & ~draft.open))
 
     def _later(self, level: int, fresh: Mask, moved: Image, scatter: Image, count: int) -> tuple[Image, Image]:
-        """What may be left, and what neighbours of a jump that is met at last may be wrong by.
+        """What may be left, and what neighbours of a jump that is met at last, or of who was misled, may be wrong by.
 
         The less a level moved of what was left before the less is left, but lest two wrong values agree by chance no
         less than the order of convergence grants. What was moved until now says nothing of a fresh jump.
@@ -138,7 +140,8 @@ class _Ladder:
             # On what is smooth each step of the node rules gains more than it moves.
             left = dr.select(self.smooth, STEP_GAIN * moved, left)
         left = dr.select(fresh, self._unsettled(left), left)
-        return left, self.draft.near_edge(dr.select(fresh, moved, 0))
+        misled = self.where & (moved > dr.maximum(dr.opaque(mi.Float64, MISLED) * before, self.draft.tolerance))
+        return left, self.draft.near_edge(dr.select(fresh | misled, moved, 0))
 
 
 # ---------------------------------------------------------------------- which way transects go
