@@ -105,6 +105,13 @@ def test_same_bits_in_every_run():
             np.testing.assert_array_equal(getattr(image, plane), getattr(again, plane))
 
 
+def test_balls_that_poke_into_each_other_are_no_second_surface():
+    """One of the points at which a second surface is looked for lies on their common circle; seen to be refused."""
+    front = sphere(172.24108170659895, 1.9883699847893401, 0.07712417676777661, 1.5394461159644504)
+    back = sphere(172.75838990913695, 2.7974111028847615, 0.45245591722528644, -0.43217559420530804)
+    assert fspt.render(scene(back, front), rtol=0.1).power.any()
+
+
 # --- work ---
 
 

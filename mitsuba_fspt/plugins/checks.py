@@ -21,6 +21,7 @@ STRETCH = 1e-4  # by which float32 may make lengths and right angles differ
 ROUNDING = 1e-6  # of float32, in sums of products
 PROBES = 1 << 10  # surface points of a shape at which another one is looked for
 LIFT = 1e-6  # of the largest coordinate: what lies no further before a surface cannot be told from it
+PARALLEL = 0.999  # cosine of normals: bodies that poke into each other meet, too, but at an angle
 
 
 def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
@@ -147,7 +148,7 @@ def check_alone(scene: mi.Scene, emitter: mi.Emitter) -> None:
     if not dr.any(near):  # else only: what it is asks every shape of the scene
         return
     other = met.compute_surface_interaction(ray, active=near)
-    shared = near & (dr.dot(other.n, si.n) > 0)
+    shared = near & (dr.dot(other.n, si.n) > PARALLEL)
     if dr.any(shared):
         second = other.shape[int(np.argmax(shared.numpy()))]
         raise SceneError(
