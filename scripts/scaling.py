@@ -166,7 +166,7 @@ def draw(by_pixels: list[Setting], by_triangles: list[list[Setting]], path: Path
         (line,) = right.loglog(triangles, [s.nanoseconds for s in settings], "o-", label=label)
         bare = [s.bare_nanoseconds for s in settings]
         right.loglog(triangles, bare, "o--", color=line.get_color(), label=f"{label}, tracing alone")
-    right.set(xlabel="triangles", ylim=(1, None))
+    right.set(xlabel="triangles", ylim=(0.2, None))
     right.legend()
     for axes in (left, right):
         axes.grid(alpha=0.3)
