@@ -268,6 +268,29 @@ def test_kinks_finer_than_the_nodes_are_not_believed_smooth():
     np.testing.assert_allclose(image.power[0], expected, atol=RTOL * expected.max())
 
 
+def sheet(depth, x, *half):
+    """Rectangle that faces the lens, its half sides along x and y."""
+    import mitsuba as mi
+
+    place = mi.ScalarTransform4f().translate([x, 0, depth]).rotate([0, 1, 0], 180).scale([*half, 1])
+    return {"type": "rectangle", "to_world": place}
+
+
+def test_a_disk_between_single_lines_is_seen_beside_a_crop_window_too():
+    """The same disks, a sheet 100 times as bright beside the window; seen to fail (0 W) where that counts, too."""
+    depth, side = FOCAL * 11, 4.0
+    small, bright = disk(depth, 0.5 * side, 6 * side, 4 * side), sheet(depth, 18 * side, 5.8 * side, 40 * side)
+    bright["glow"] = {"type": "fspt_surface", "exitance": 100.0}
+    row, column = HEIGHT // 2 - 4, WIDTH // 2 - 6
+    crop = (column - 6, 0, WIDTH - column + 6, HEIGHT)
+    wide = disk(depth, 5 * side, -8 * side, -5 * side)
+    of = scene(small, wide, bright, magnification=0.1, f_number=22, crop=crop)
+    image = fspt.render(of, rtol=1e-2)
+    four = image.power[row - 1 : row + 1, 5:7] / of.sensors()[0].etendue * np.pi
+    share = np.pi / 16 * (1 + side**2 * 52 / depth**2) ** -2
+    np.testing.assert_allclose(four, share, atol=1e-2 * share)
+
+
 @pytest.mark.parametrize(("width", "tilt"), [(0.9, 0.0), (1.1, 0.0), (1.35, 0.0), (1.3, 60.0)])
 def test_a_disk_between_single_lines_of_sight_is_seen(width, tilt):
     """A sharp disk that four pixels share, about as wide as one, beside a large one as bright; one line a pixel.

@@ -132,7 +132,7 @@ class Glow:
         low, high = low - margin - window.corner, high + margin - window.corner
         # Away for certain: between its corners a curved element may turn to the lens as far again as they differ.
         away = 2 * most - least <= 0
-        dark = _dark(emitter, elements) if skip_dark else np.zeros(count, bool)
+        dark = _dark(emitter, np.max(levels, axis=0)) if skip_dark else np.zeros(count, bool)
         low[away | dark], high[away | dark] = np.inf, -np.inf
         lit = ~(away | dark)
         area, extent = _area(*centres)[lit].sum(), _extent(np.concatenate([corner[lit] for corner in centres]))
@@ -184,20 +184,15 @@ def _elements(shape: mi.Shape, lens: mi.Sensor, rtol: float) -> Elements:
     return elements_of(shape, int(min(max(ideal, fewest), MOST_ELEMENTS)))
 
 
-def _dark(emitter: mi.Emitter, elements: Elements) -> NDArray[np.bool_]:
-    """True of elements on which J_n is 0: at all corners, between which a mesh attribute is linear."""
-    if not is_surface(emitter) or not emitter.is_linear():
-        return np.zeros(elements.count, bool)
-    exitance = _exitance(emitter)
-    index = dr.arange(mi.UInt32, elements.count)
-    corners = [exitance(elements.place(index, mi.Point2f(*corner))[0]) for corner in elements.corners]
-    dr.eval(corners)
-    return np.max([np.broadcast_to(corner.numpy(), elements.count) for corner in corners], axis=0) == 0
+def _dark(emitter: mi.Emitter, brightest: Image) -> NDArray[np.bool_]:
+    """True of elements whose `brightest` corner is dark and J_n, a mesh attribute, linear between the corners."""
+    linear = is_surface(emitter) and emitter.is_linear()
+    return (brightest == 0) & linear
 
 
 def _exitance(emitter: mi.Emitter) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
     """J_n [W/mm²] at surface points; of other emitters than `fspt_surface` 0."""
-    if type(emitter).__name__ != "FsptSurface":
+    if not is_surface(emitter):
         return lambda si: mi.Float(0)
     return function_on(emitter.get_shape(), emitter.exitance)
 

@@ -72,8 +72,8 @@ def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLigh
     brightest = 0.0
     for k in np.unique(level):
         here, reach = level == k, math.ceil(2 ** (k + 0.5))
-        if (there := here & shown).any():
-            brightest = max(brightest, points[there].cells(2**k).sums(light[there]).max())
+        if (counts := here & shown).any():
+            brightest = max(brightest, points[counts].cells(2**k).sums(light[counts]).max())
         there = points.near(reach + 2 * 2**k, window.shape)  # beyond, those of this level have no neighbours
         here[there] &= _hidden(points[there], 2**k)
         here &= there & (points.apart < 1)

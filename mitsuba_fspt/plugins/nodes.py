@@ -40,7 +40,8 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     grid = draft.grid
     rule = rules.one() if _one_will_do(draft) else rules.four(draft.area)
     seen = apply_nodes(draft, rule)
-    if len(rule) == 1 and dr.any(_passed_by(draft, seen.value, grid.lanes(light))):
+    draft.value = dr.select(draft.open, seen.value, draft.known)
+    if len(rule) == 1 and (not dr.any(seen.value > 0) or dr.any(_passed_by(draft, grid.lanes(light)))):
         rule = rules.four(draft.area)
         seen = apply_nodes(draft, rule)
     mx, my, draft.nearest = seen.x, seen.y, seen.nearest
@@ -104,15 +105,13 @@ def _dark(draft: Draft) -> Mask:
     return ~dr.any(draft.value > 0)
 
 
-def _passed_by(draft: Draft, value: Image, light: Image) -> Mask:
+def _passed_by(draft: Draft, light: Image) -> Mask:
     """Pixels on which surfaces shine, and far more than one line of sight saw there and around.
 
-    What is up to √2 pixels wide may lie between the lines. All pixels while none has met light.
+    What is up to √2 pixels wide may lie between the lines.
     """
-    seen = dr.select(draft.open, value, draft.known)
-    least = dr.opaque(mi.Float64, draft.quadrature.rtol) * dr.max(seen)
-    passed = draft.open & ~draft.beyond & (light > dr.maximum(PASSED * draft.grid.spread_max(seen), least))
-    return passed | ~dr.any(value > 0)
+    least = dr.maximum(PASSED * draft.grid.spread_max(draft.value), draft.tolerance)
+    return draft.open & ~draft.beyond & (light > least)
 
 
 def _one_will_do(draft: Draft) -> bool:
