@@ -1,5 +1,5 @@
 """`python -m mitsuba_fspt` is the command line `fspt`."""
 
-from .cli import main
+from .cli.app import main
 
 main()

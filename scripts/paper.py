@@ -20,7 +20,7 @@ from paper_models import models
 from paper_stops import stops
 from paper_vignetting import vignetting
 
-from mitsuba_fspt import backend
+from mitsuba_fspt.runtime import backend
 
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("vignetting", "stops", "models", "agreement")

@@ -12,7 +12,7 @@ from tissue_batches import LEFT_RIGHT, mirrored
 from tissue_crosscheck import VIEWS, ratio, solve
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.phantom_file import PhantomFile
+from mitsuba_fspt.tissue.phantom_file import PhantomFile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

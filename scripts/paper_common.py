@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.atomic import atomic_path
-from mitsuba_fspt.phantom_file import PhantomFile
+from mitsuba_fspt.runtime.atomic_files import atomic_path
+from mitsuba_fspt.tissue.phantom_file import PhantomFile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -172,7 +172,7 @@ def figure(width: float, height: float) -> Figure:
 
 def panel(axes: Axes, image: fspt.Image, title: str, reach: float, high: float | None = None) -> None:
     """A picture with its colour bar, ± `reach` [mm on the sharp plane] of it; `high` [W/pixel]: end of the bar."""
-    from mitsuba_fspt.picture import draw_picture, scale_and_unit
+    from mitsuba_fspt.images.picture import draw_picture, scale_and_unit
 
     high = float(image.power.max()) if high is None else high
     scale, unit = scale_and_unit(np.array([high]))

@@ -32,9 +32,9 @@ def stops(folder: Path, output: Path) -> list[Table]:
 
 def naive_sum(scene: Any) -> fspt.Image:
     """Eq. 9 summed over the centres of the phantom's faces, as the paper does it."""
-    from mitsuba_fspt.plugins import point_sum
+    from mitsuba_fspt.validation import direct_summation
 
-    return fspt.Image(point_sum.solve(scene, scene.sensors()[0])[0])
+    return fspt.Image(direct_summation.solve(scene, scene.sensors()[0])[0])
 
 
 # ---------------------------------------------------------------------- numbers

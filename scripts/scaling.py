@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt import backend
-from mitsuba_fspt.atomic import atomic_path
-from mitsuba_fspt.converge_methods import raw_rate
+from mitsuba_fspt.runtime import backend
+from mitsuba_fspt.runtime.atomic_files import atomic_path
+from mitsuba_fspt.studies.converge_methods import raw_rate
 
 SIDES = (128, 256, 512, 1024, 2048)
 TRIANGLES = (10_000, 100_000, 1_000_000, 3_000_000)

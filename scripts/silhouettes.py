@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt import backend, rules
-from mitsuba_fspt.atomic import atomic_path
-from mitsuba_fspt.convergence import fitted_order
+from mitsuba_fspt.integral import node_rules
+from mitsuba_fspt.runtime import backend
+from mitsuba_fspt.runtime.atomic_files import atomic_path
+from mitsuba_fspt.studies.convergence import fitted_order
 
 SCENES = ("scenes/nylon_cylinder.xml", "scenes/two_spheres.xml")
 RTOL = 1e-5
@@ -51,13 +52,13 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
     backend.ensure_variant()
     import drjit as dr
 
-    from mitsuba_fspt.plugins.draft import Draft
-    from mitsuba_fspt.plugins.grid import parted
-    from mitsuba_fspt.plugins.lines import View
-    from mitsuba_fspt.plugins.nodes import apply_nodes, first_nodes
-    from mitsuba_fspt.plugins.transects import apply_transects, edges_of
-    from mitsuba_fspt.plugins.window import visible_window
-    from mitsuba_fspt.quadrature import Quadrature
+    from mitsuba_fspt.integral.draft import Draft
+    from mitsuba_fspt.integral.lines import View
+    from mitsuba_fspt.integral.nodes import apply_nodes, first_nodes
+    from mitsuba_fspt.integral.quadrature import Quadrature
+    from mitsuba_fspt.integral.transects import apply_transects, edges_of
+    from mitsuba_fspt.integral.window import visible_window
+    from mitsuba_fspt.jit.pixel_grid import parted
 
     scene = fspt.load(name, f_number=f_number)
     lens = scene.sensors()[0]
@@ -73,17 +74,17 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
         values[rule] = np.array(value)[pixels] / peak
         rays[rule] = (draft.rays - since) / len(pixels)
 
-    for rule in (rules.four(True), rules.twelve(True)):
+    for rule in (node_rules.four(True), node_rules.twelve(True)):
         since = draft.rays
         note(f"{len(rule)} nodes", apply_nodes(draft, rule, cut).value, since)
     edges = edges_of(draft)
-    for level, count in enumerate(rules.TRANSECT_LEVELS):
+    for level, count in enumerate(node_rules.TRANSECT_LEVELS):
         since = draft.rays
-        means = apply_transects(draft, cut, edges, rules.transects(count), rules.along_transect(level, RTOL))
+        means = apply_transects(draft, cut, edges, node_rules.transects(count), node_rules.along_transect(level, RTOL))
         note(f"{count} transects", means.value, since)
         if level == 0:  # the edges that were met say how blurred they are
             edges.learn(draft, means, cut)
-    finest = values.pop(f"{rules.TRANSECT_LEVELS[-1]} transects")
+    finest = values.pop(f"{node_rules.TRANSECT_LEVELS[-1]} transects")
     return [(rule, rays[rule], shares(np.abs(value - finest))) for rule, value in values.items()]
 
 

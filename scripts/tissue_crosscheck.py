@@ -40,10 +40,10 @@ from paper_common import MAGNIFICATION, SCENES, WHOLE_CONE, Array, Table, figure
 from tissue_batches import LEFT_RIGHT, TOP_BOTTOM, Batches, mirrored, summed
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt import backend
-from mitsuba_fspt.medium import Medium
-from mitsuba_fspt.phantom_file import PhantomFile
-from mitsuba_fspt.solution import Solution
+from mitsuba_fspt.optics.media import Medium
+from mitsuba_fspt.runtime import backend
+from mitsuba_fspt.tissue.phantom_file import PhantomFile
+from mitsuba_fspt.tissue.solution import Solution
 
 ROOT = Path(__file__).resolve().parent.parent
 VIEWS = {"front": 0, "left": 90, "back": 180}

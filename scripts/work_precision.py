@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_fspt.atomic import atomic_path
-from mitsuba_fspt.cli import run
-from mitsuba_fspt.reference import Camera, look_at
-from mitsuba_fspt.reference_mesh import load_ply, mesh_truth
+from mitsuba_fspt.cli.app import run
+from mitsuba_fspt.runtime.atomic_files import atomic_path
+from mitsuba_fspt.validation.reference import Camera, look_at
+from mitsuba_fspt.validation.reference_mesh import load_ply, mesh_truth
 
 ROOT = Path(__file__).resolve().parent.parent
 

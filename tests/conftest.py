@@ -14,10 +14,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 @pytest.fixture(scope="module")
 def mono():
     """Mitsuba in the variant llvm_ad_mono, quiet but for errors."""
-    from mitsuba_fspt import backend
-
-    backend.prepare()
     import mitsuba as mi
+
+    import mitsuba_fspt  # noqa: F401  # registers the plugins
 
     if mi.variant() != "llvm_ad_mono":
         mi.set_variant("llvm_ad_mono")
@@ -30,11 +29,11 @@ def mono():
 @pytest.fixture
 def run(capfd):
     """`run("render", …)`: exit code, stdout and stderr of the command line, whatever in the process wrote to them."""
-    from mitsuba_fspt import cli
+    from mitsuba_fspt.cli import app
 
     def run(*arguments):
         capfd.readouterr()
-        code = cli.run([str(argument) for argument in arguments])
+        code = app.run([str(argument) for argument in arguments])
         return code, *capfd.readouterr()
 
     return run

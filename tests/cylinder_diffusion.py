@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsuba_fspt.boundary import robin_a
+from mitsuba_fspt.optics.boundary import robin_a
 
 Array = NDArray[np.floating[Any]]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mitsuba_fspt import backend
+from mitsuba_fspt.runtime import backend
 
 backend.ensure_variant()
 

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import trimesh
 
-from mitsuba_fspt.reference import Camera
-from mitsuba_fspt.reference_shapes import Rectangle
+from mitsuba_fspt.validation.reference import Camera
+from mitsuba_fspt.validation.reference_shapes import Rectangle
 
 EXITANCE = 3e-7  # W/mm²
 

@@ -7,7 +7,7 @@ import sys
 
 import mitsuba as mi
 
-from ..errors import BackendError
+from ..runtime.errors import BackendError
 
 _NAMES = ("surface", "lens", "integral")
 _registered: set[str] = set()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..errors import OpticsError
+from ..runtime.errors import OpticsError
 
 
 def own_film(props: mi.Properties) -> None:

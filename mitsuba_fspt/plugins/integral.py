@@ -12,18 +12,18 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SceneError
-from ..quadrature import Quadrature, Solution
-from ..shortcuts import SHORTCUTS, Finding
-from . import pupil_form, surface_form
-from .checks import check_scene, check_surfaces_alone
-from .faces import Faces, edition_of, mark_of
-from .grid import Grid
-from .intersections import robust_scene
-from .lines import View
-from .narrow import NarrowLight, narrow_light
-from .recording import recording
-from .window import Window, glowing_boxes, window_of
+from ..emission.face_table import Faces, edition_of, mark_of
+from ..integral import pupil_form, surface_form
+from ..integral.lines import View
+from ..integral.narrow import NarrowLight, narrow_light
+from ..integral.quadrature import Quadrature, Solution
+from ..integral.scene_checks import check_scene, check_surfaces_alone
+from ..integral.shortcuts import SHORTCUTS, Finding
+from ..integral.window import Window, glowing_boxes, window_of
+from ..jit.pixel_grid import Grid
+from ..jit.recording import recording
+from ..jit.robust_tracing import robust_scene
+from ..runtime.errors import SceneError
 
 MEANINGLESS = ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "timeout")
 ROUNDING = 1e-3  # pixels; more only far from the world's origin

@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OpticsError
-from ..optics import NUMBERS, Lens
+from ..integral.pupil import Pupil
+from ..jit.spectra import flat_share
+from ..optics.thin_lens import NUMBERS, Lens
+from ..runtime.errors import OpticsError
 from .film import default_sampler, number, own_film
-from .pupil import Pupil
-from .spectra import flat_share
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
 STRETCH = 1e-5  # by which float32 may make a rotation's matrix differ from one

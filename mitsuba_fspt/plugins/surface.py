@@ -5,14 +5,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import ExitanceError
-from . import exitance
-from .elements import ElementDistribution, elements_of
-from .emission import Lambert, law_of
-from .last_flight import LastFlight
-from .probe import Probe
-from .recording import aside, dark_elsewhere, scene_is_checked
-from .spectra import sample_wavelengths
+from ..emission import exitance
+from ..emission.elements import ElementDistribution, elements_of
+from ..emission.face_probe import Probe
+from ..emission.last_flight import LastFlight
+from ..emission.laws import Lambert, law_of
+from ..jit.recording import aside, dark_elsewhere, scene_is_checked
+from ..jit.spectra import sample_wavelengths
+from ..runtime.errors import ExitanceError
 
 
 class FsptSurface(mi.Emitter):

@@ -1,0 +1,15 @@
+from .images.comparison import Comparison as Comparison
+from .images.comparison import compare as compare
+from .images.detector import Detector as Detector
+from .images.detector import Exposure as Exposure
+from .images.image import Image as Image
+from .images.image import read as read
+from .phantom.flux_import import import_flux as import_flux
+from .phantom.phantom import Phantom as Phantom
+from .rendering.render import render as render
+from .rendering.scene import load as load
+from .runtime.errors import FsptError as FsptError
+from .studies.converge import converge as converge
+from .studies.convergence import Convergence as Convergence
+from .studies.explain import explain as explain
+from .studies.sweep import sweep as sweep

@@ -1,0 +1,146 @@
+"""`fspt flux`: surface flux density from other codes and from diffusion, as a phantom to render."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import nullcontext
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from ..runtime.atomic_files import atomic_path, require_apart
+from ..runtime.errors import FluxError
+from .options import require_writable
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def flux() -> None:
+    """Make the phantom that a scene shows: J_n from other codes, or solved for."""
+
+
+class LengthUnit(str, Enum):
+    mm = "mm"
+    cm = "cm"
+    m = "m"
+
+
+class Per(str, Enum):
+    vertex = "vertex"
+    face = "face"
+
+
+@app.command("import")
+def import_(
+    mesh: Annotated[
+        Path,
+        typer.Argument(metavar="MESH", help="Mesh: .ply .stl .obj .off .glb .npz .vtu .vtk .msh .xdmf ..."),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The phantom to write, .ply.")],
+    values: Annotated[Path | None, typer.Option(help="File of one value per vertex or face.")] = None,
+    field: Annotated[str | None, typer.Option(help="Array, property or column that holds the values.")] = None,
+    per: Annotated[Per | None, typer.Option(help="What the values stand on, where that is open.")] = None,
+    format: Annotated[str, typer.Option(help="auto, mmc, nirfast, meshio, trimesh, ply, obj, off or npz.")] = "auto",
+    length_unit: Annotated[
+        LengthUnit, typer.Option(help="Of the mesh; the values are W per square of it.")
+    ] = LengthUnit.mm,
+    a: Annotated[
+        str | None, typer.Option(help="The values are fluence, J_n = phi/(2A): robin, haskell or a number.")
+    ] = None,
+    n: Annotated[float | None, typer.Option(help="Refractive index for A; 1.37 where not given.")] = None,
+    clip: Annotated[bool, typer.Option("--clip", help="Set negative values to 0 and say how much.")] = False,
+    flip: Annotated[bool, typer.Option("--flip", help="Turn all faces over.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Write a phantom from a mesh and values on it, as other codes write them.
+
+    Values are the surface flux density J_n in W per square of the mesh's
+    length unit, or, with --a, the fluence phi in that unit, J_n = phi/(2A).
+
+    MMC: MESH is node_ID.dat beside elem_ID.dat, --values SESSION_dref.dat,
+    the energy that leaves each face. NIRFAST: MESH is NAME.node beside
+    NAME.elem, --values the fluence at the nodes.
+    """
+    from ..phantom.flux_import import import_flux
+
+    require_writable(output, ".ply", FluxError)
+    # What lies beside a mesh (node, elem, param, ...) never ends in .ply.
+    require_apart(output, [mesh, values] if values else [mesh], error=FluxError)
+    phantom = import_flux(
+        mesh,
+        values,
+        field=field,
+        per=per.value if per else None,
+        format=format,
+        length_unit=length_unit.value,
+        a=a,
+        n=n,
+        clip=clip,
+        flip=flip,
+    )
+    phantom.write(output)
+    report = phantom.report() | {"output": str(output)}
+    typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
+
+
+@app.command()
+def solve(
+    description: Annotated[Path, typer.Argument(metavar="PHANTOM.toml", help="Geometry, optics, light sources, mesh.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The phantom to write, .ply.")],
+    volume: Annotated[
+        Path | None, typer.Option(help="Also write the fluence inside on a grid, for gridvolume: .vol.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Solve the diffusion equation in a phantom and write its surface with J_n.
+
+    The surface's power is what leaves by finite elements; absorbed and exit
+    power together are the sources' to the balance printed.
+    """
+    from ..tissue.phantom_file import PhantomFile
+
+    start = time.perf_counter()
+    require_writable(output, ".ply", FluxError)
+    if volume:
+        require_writable(volume, ".vol", FluxError)
+    told = PhantomFile.read(description)
+    require_apart(output, [description, *told.files], error=FluxError)
+    if volume:
+        require_apart(volume, [description, *told.files, output], "--volume", FluxError)
+    with Console(stderr=True).status("mesh") as status:
+        solution = told.solve(status.update)
+        status.update("surface")
+        phantom = solution.phantom(told.surface_edge)
+        report = phantom.report() | solution.report()
+        if volume is not None:
+            status.update("volume")
+            grid = solution.volume(told.voxel)
+            report |= {"volume": str(volume)} | grid.report()
+    with atomic_path(volume, FluxError) if volume else nullcontext() as beside:  # both files or none
+        if beside:
+            grid.write(beside)
+        phantom.write(output)
+    report |= {"seconds": time.perf_counter() - start, "output": str(output)}
+    typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
+
+
+def table(report: dict[str, object]) -> str:
+    """The report as lines of name, value and unit."""
+    units = {"area": "mm^2", "removed_percent": "% of the power", "seconds": "s"}
+    units |= dict.fromkeys(("power", "removed_power", "source_power", "absorbed_power", "exit_power"), "W")
+    units |= {"min": str(report["unit"]), "max": str(report["unit"])}
+    lines = []
+    for name, value in report.items():
+        if value is None:
+            text = "undecided (open surface)"
+        elif isinstance(value, bool):
+            text = "yes" if value else "no"
+        else:
+            text = f"{value:.6g}" if isinstance(value, float) else str(value)
+        lines.append(f"{name.replace('_', ' '):<16}{text} {units.get(name, '')}".rstrip())
+    return "\n".join(lines)

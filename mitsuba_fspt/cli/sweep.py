@@ -1,0 +1,92 @@
+"""`fspt sweep`: a scene over all combinations of some parameters' values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..runtime.backend import quiet_mitsuba
+from ..runtime.errors import BackendError, FsptError, SceneError
+from .options import Method, Rtol, SceneFile, Seed, Spp
+from .terminal import progress_bar
+
+
+class Interrupted(FsptError):
+    """Ctrl-C where what is done stays: the message says how to go on."""
+
+
+def sweep(
+    scene: SceneFile,
+    define: Annotated[
+        list[str] | None,
+        typer.Option(
+            "-D", "--define", metavar="NAME=V1,V2,...", help="Values for a <default> of the scene; repeatable."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for the images, SCENE_sweep if left out.")
+    ] = None,
+    method: Method = None,
+    rtol: Rtol = None,
+    spp: Spp = None,
+    seed: Seed = None,
+    jobs: Annotated[int | None, typer.Option(help="Processes on this machine.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
+    ] = None,
+) -> None:
+    """Render all combinations of values: an EXR each, index.csv and a contact sheet.
+
+    Run again, it renders only what is missing or was made from something
+    else: another scene, data file, value, setting or version.
+    """
+    from ..studies.sweep import INDEX, sweep
+
+    folder = output or Path(f"{scene.stem}_sweep")
+    values = _values(define)
+    try:
+        with progress_bar() as progress:
+            quiet_mitsuba()
+            rows = sweep(
+                scene,
+                values,
+                folder,
+                method=method,
+                rtol=rtol,
+                spp=spp,
+                seed=seed,
+                jobs=jobs,
+                scheduler=scheduler,
+                progress=progress,
+            )
+        total = sum(row.wall_time for row in rows)
+        typer.echo(f"{folder / INDEX}: {len(rows)} points, {total:.3g} s of rendering")
+        _write_sheet(rows, folder / "contact_sheet.png")
+    except KeyboardInterrupt as cause:
+        raise Interrupted(
+            f"interrupted; finished images stay in {folder}, the same command goes on from there."
+        ) from cause
+
+
+def _write_sheet(rows: list, path: Path) -> None:
+    from ..studies.contact_sheet import write_contact_sheet
+
+    try:
+        write_contact_sheet(rows, path)
+        typer.echo(f"{path}: all of them to look at")
+    except BackendError as error:
+        typer.echo(f"fspt: no contact sheet: {error}", err=True)
+
+
+def _values(define: list[str] | None) -> dict[str, list[str]]:
+    values: dict[str, list[str]] = {}
+    for text in define or ():
+        name, equals, several = text.partition("=")
+        if not (name and equals):
+            raise SceneError(f"-D {text}: must be NAME=V1,V2,…, for example -D f_number=2.8,5.6.")
+        if name in values:
+            raise SceneError(f"-D {text}: '{name}' is given twice. Put all values into one, -D {name}=1,2.")
+        values[name] = several.split(",")
+    return values

@@ -1,0 +1,260 @@
+"""Elements of an emitting surface: small patches with known area and power, to sample from and to integrate over.
+
+A mesh is cut into its faces, each into k² equal triangles where it has few; any other shape into a grid of its
+surface parameters (u, v). Elements know where they lie on the surface and which one holds a given surface point.
+
+Shapes and textures are called directly here, never through Dr.Jit pointers: elements may be built while a kernel is
+being recorded, and a pointer of the recording would find its way into what is evaluated aside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..jit.mesh_buffers import triangles
+
+MIN_ELEMENTS = 1 << 16
+# Share of the samples that goes everywhere alike, so that light smaller than an element is never excluded.
+UNIFORM_SHARE = 1e-3
+
+
+def elements_of(shape: mi.Shape, minimum: int = MIN_ELEMENTS) -> Elements:
+    """The elements of `shape`, at least `minimum` of them."""
+    return MeshElements(shape, minimum) if shape.is_mesh() else ParameterElements(shape, minimum)
+
+
+class Elements:
+    """Patches of one shape: `count` of them, element `index` placed by a point of the unit square."""
+
+    count: int
+    corners: tuple[tuple[int, int], ...]  # the samples at which `place` puts an element's corners
+    middle: tuple[float, float]  # and its middle
+
+    def __init__(self, shape: mi.Shape) -> None:
+        # A pointer array does not keep what it points at. Emitters keep elements and shapes their emitter: elements
+        # that kept the shape would close a circle through C++, which nobody ever frees.
+        self._shape = mi.ShapePtr(shape)
+
+    @property
+    def shape(self) -> mi.Shape:
+        return self._shape[0]
+
+    def place(
+        self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        """Surface point of element `index` at `sample` of [0, 1]², and dA/d(sample) there [mm²].
+
+        With `cut` > 1 that of the element's part number `part` of cut².
+        """
+        raise NotImplementedError
+
+    def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
+        """Element that holds `si`, and dA/d(sample) of `place` there [mm²]."""
+        raise NotImplementedError
+
+    def weigh(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, tuple[mi.Float, ...]]:
+        """Element that holds `si`, and the weights by which values at its corners are interpolated there."""
+        raise NotImplementedError
+
+    def areas(self) -> mi.Float:
+        """Area of each element [mm²], the mean of dA over a few points."""
+        index = dr.arange(mi.UInt32, self.count)
+        total = dr.zeros(mi.Float, self.count)
+        for point in _FIVE_POINTS:
+            total += self.place(index, mi.Point2f(*point))[1]
+        return total / len(_FIVE_POINTS)
+
+
+_FIVE_POINTS = ((0.5, 0.5), (0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))
+
+
+class MeshElements(Elements):
+    """Faces of a triangle mesh, each cut into k² congruent triangles."""
+
+    corners = ((0, 0), (1, 0), (0, 1))
+    middle = (5 / 9, 1 / 2)  # which `place` puts at the centroid
+
+    def __init__(self, shape: mi.Shape, minimum: int) -> None:
+        super().__init__(shape)
+        self._positions, self._faces = triangles(shape)
+        faces = dr.width(self._faces) // 3
+        self.k = math.ceil(math.sqrt(minimum / max(1, faces)))
+        self.count = faces * self.k**2
+
+    def place(
+        self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        face, own = index // (self.k * self.k), index % (self.k * self.k)
+        within = _of_part(mi.UInt32(part), mi.UInt32(cut), mi.warp.square_to_uniform_triangle(sample))
+        si, area = self._interaction(face, _of_part(own, mi.UInt32(self.k), within))
+        return si, area / dr.square(mi.Float(cut))
+
+    def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
+        p0, e1, e2 = self._corners(si.prim_index)
+        return self._part(si.prim_index, _barycentric(si.p - p0, e1, e2))[0], self._area(e1, e2)
+
+    def weigh(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, tuple[mi.Float, ...]]:
+        p0, e1, e2 = self._corners(si.prim_index)
+        index, b = self._part(si.prim_index, _barycentric(si.p - p0, e1, e2))
+        return index, (1 - b.x - b.y, b.x, b.y)
+
+    def _part(self, face: mi.UInt32, b: mi.Point2f) -> tuple[mi.UInt32, mi.Point2f]:
+        """The part of a face at its coordinates (b1, b2), and the coordinates in that part."""
+        k = self.k
+        x, y = k * (b.x + b.y), k * b.y
+        row, half = dr.clip(dr.floor(x), 0, k - 1), dr.floor(y)
+        upside_down = y - half > x - row
+        column = dr.clip(2 * half + dr.select(upside_down, 1, 0), 0, 2 * row)
+        x, y = x - row, y - half
+        within = dr.select(upside_down, mi.Point2f(x, y - x), mi.Point2f(x - y, y))
+        return face * (k * k) + mi.UInt32(row * row + column), within
+
+    def _interaction(self, face: mi.UInt32, uv: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        p0, e1, e2 = self._corners(face)
+        pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(face))
+        pi.valid, pi.t, pi.prim_index, pi.prim_uv = True, 1.0, face, uv
+        si = self.shape.compute_surface_interaction(mi.Ray3f(p0, dr.cross(e2, e1)), pi, mi.RayFlags.All)
+        return si, self._area(e1, e2)
+
+    def _corners(self, face: mi.UInt32) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
+        f = dr.gather(mi.Point3u, self._faces, face)
+        p0, p1, p2 = (dr.gather(mi.Point3f, self._positions, f[n]) for n in range(3))
+        return p0, mi.Vector3f(p1 - p0), mi.Vector3f(p2 - p0)
+
+    def _area(self, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Float:
+        return dr.norm(dr.cross(e1, e2)) / (2 * self.k**2)
+
+
+class ParameterElements(Elements):
+    """Grid of equal cells in the surface parameters (u, v) of an analytic shape."""
+
+    corners = ((0, 0), (1, 0), (0, 1), (1, 1))
+    middle = (1 / 2, 1 / 2)
+
+    def __init__(self, shape: mi.Shape, minimum: int) -> None:
+        super().__init__(shape)
+        self.side = math.ceil(math.sqrt(minimum))
+        self.count = self.side**2
+        self._round = _ROUND.get(shape.class_name())
+        if self._round:
+            self._to_world = mi.Transform4f(mi.traverse(shape)["to_world"])
+
+    def place(
+        self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        cell = mi.Point2f(mi.Point2u(index % self.side, index // self.side))
+        number, cut = mi.UInt32(part), mi.UInt32(cut)
+        within = (mi.Point2f(mi.Point2u(number % cut, number // cut)) + sample) / mi.Float(cut)
+        # A hair inside: what still looks for its points misses some at the very ends of its parameters.
+        uv = dr.clip((cell + within) / self.side, 2.0**-21, 1 - 2.0**-21)
+        si = self.at(uv)
+        return si, self._area(si) / dr.square(mi.Float(cut))
+
+    def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
+        cell = self._cell(si)
+        return cell.x + cell.y * self.side, self._area(si)
+
+    def weigh(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, tuple[mi.Float, ...]]:
+        cell = self._cell(si)
+        x = si.uv * self.side - mi.Point2f(cell)
+        weights = ((1 - x.x) * (1 - x.y), x.x * (1 - x.y), (1 - x.x) * x.y, x.x * x.y)
+        return cell.x + cell.y * self.side, weights
+
+    def at(self, uv: mi.Point2f) -> mi.SurfaceInteraction3f:
+        """The surface record at (u, v) of [0, 1]².
+
+        Mitsuba's spheres, cylinders and disks look for their own points along a ray. Turned by 90° the first two look
+        past some of them, along the normal that they would have unturned; a tilted disk misses a third of its rim.
+        """
+        if not self._round:
+            return self.shape.eval_parameterization(uv)
+        local, normal = self._round(uv)
+        p, n = self._to_world @ local, dr.normalize(self._to_world @ normal)
+        pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(uv))
+        pi.valid, pi.t, pi.prim_uv = True, 1.0, mi.Point2f(local.x, local.y)
+        return self.shape.compute_surface_interaction(mi.Ray3f(p + n, -n), pi, mi.RayFlags.All)
+
+    def _cell(self, si: mi.SurfaceInteraction3f) -> mi.Point2u:
+        return mi.Point2u(dr.clip(si.uv * self.side, 0, self.side - 1))
+
+    def _area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / self.count
+
+
+def _on_sphere(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
+    """Point and normal of the unit sphere at its parameters: longitude/2π from +x, polar angle/π from +z."""
+    sin_phi, cos_phi = dr.sincos(dr.two_pi * uv.x)
+    sin_theta, cos_theta = dr.sincos(dr.pi * uv.y)
+    local = mi.Vector3f(cos_phi * sin_theta, sin_phi * sin_theta, cos_theta)
+    return mi.Point3f(local), mi.Normal3f(local)
+
+
+def _on_cylinder(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
+    """Point and normal of the unit cylinder from z = 0 to 1 at its parameters: longitude/2π from +x, height."""
+    sin_phi, cos_phi = dr.sincos(dr.two_pi * uv.x)
+    return mi.Point3f(cos_phi, sin_phi, uv.y), mi.Normal3f(cos_phi, sin_phi, 0)
+
+
+def _on_disk(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
+    """Point and normal of the unit disk at its parameters: radius, longitude/2π from +x."""
+    sin_phi, cos_phi = dr.sincos(dr.two_pi * uv.y)
+    return mi.Point3f(uv.x * cos_phi, uv.x * sin_phi, 0), mi.Normal3f(0, 0, 1)
+
+
+_ROUND = {"Sphere": _on_sphere, "Cylinder": _on_cylinder, "Disk": _on_disk}
+
+
+def _of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:
+    """Coordinates (b1, b2) in a triangle of the point `b` of one of its k² parts.
+
+    Part r² + c lies in row r of k rows; odd c are the triangles that stand upside down.
+    """
+    row = mi.UInt32(dr.sqrt(mi.Float(part) + 0.5))
+    column = part - row * row
+    i, j, upright = mi.Float(row), mi.Float(column // 2), (column % 2) == 0
+    x = i + dr.select(upright, b.x + b.y, b.x)
+    y = j + dr.select(upright, b.y, b.x + b.y)
+    return mi.Point2f(x - y, y) / mi.Float(k)
+
+
+def _barycentric(d: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Point2f:
+    """Coordinates (b1, b2) of d = b1 e1 + b2 e2 in the plane of the two edges."""
+    n = dr.cross(e1, e2)
+    scale = dr.rcp(dr.squared_norm(n))
+    return mi.Point2f(dr.dot(dr.cross(d, e2), n) * scale, dr.dot(dr.cross(e1, d), n) * scale)
+
+
+class ElementDistribution:
+    """Surface points with a density ∝ the exitance of their element [1/mm²]."""
+
+    def __init__(self, elements: Elements, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
+        self.elements = elements
+        index = dr.arange(mi.UInt32, elements.count)
+        power = dr.zeros(mi.Float, elements.count)
+        for point in _FIVE_POINTS:
+            si, area = elements.place(index, mi.Point2f(*point))
+            power += area * dr.maximum(exitance(si), 0)
+        share = power + (UNIFORM_SHARE * dr.mean(power) / dr.mean(elements.areas())) * elements.areas()
+        # A row of elements, then one of the row: the 24 bits of one random number cannot tell 10⁵ elements apart
+        # evenly (1% of the power of each goes astray), those of two can.
+        self._side = math.ceil(math.sqrt(elements.count))
+        table = np.zeros(self._side**2, np.float32)
+        table[: elements.count] = share.numpy()
+        self._choice = mi.DiscreteDistribution2D(table.reshape(self._side, self._side))
+
+    def sample(self, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        """Surface point drawn with two uniform numbers, and its density [1/mm²]."""
+        cell, chance, within = self._choice.sample(sample, active)
+        si, area = self.elements.place(cell.x + cell.y * self._side, within)
+        return si, dr.select(area > 0, chance / area, 0)
+
+    def pdf(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+        """Density of `sample` at `si` [1/mm²]."""
+        index, area = self.elements.locate(si)
+        chance = self._choice.pdf(mi.Point2u(index % self._side, index // self._side), active)
+        return dr.select(active & si.is_valid() & (area > 0), chance / area, 0)

@@ -1,0 +1,115 @@
+"""Scenes of meshes as one table of their faces, read where a line of sight ends.
+
+Mitsuba's surface record gathers the corners of the face, looks for the place between them anew and asks shape, emitter
+and texture through pointers. Where J_n is linear on every face and the radiance alike in all outward directions, its
+values at three corners and the normal are all there is to know, and they lie in half a cache line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..runtime.plugin_types import is_surface
+from .elements import elements_of
+
+
+@dataclass(frozen=True)
+class Faces:
+    """All faces of a scene's meshes.
+
+    first : of each shape, by its number, at which face of all its own begin
+    table : eight numbers a face: the least radiance at its corners, how much more it is at each of them [W/mm²/sr],
+        its normal, 0
+    sources : the meshes' buffers, kept lest others take their numbers in `edition_of`
+    """
+
+    first: mi.UInt32
+    table: mi.Float
+    sources: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, meshes: Sequence[mi.Shape]) -> Faces | None:
+        """The faces of these meshes; None unless all that glow do so by Lambert's law with a linear J_n."""
+        first: dict[int, int] = {}
+        tables, begin = [], 0
+        for mesh in meshes:
+            radiance = _radiance_at_corners(mesh)
+            if radiance is None:
+                return None
+            tables.append(_table(mesh, radiance))
+            first[_number_of(mesh)] = begin
+            begin += mesh.face_count()
+        starts = mi.UInt32([first.get(number, 0) for number in range(max(first, default=0) + 1)])
+        table = dr.concat(tables)
+        dr.eval(starts, table)
+        return cls(starts, table, tuple(_buffers(mesh) for mesh in meshes))
+
+    def radiance(self, pi: mi.PreliminaryIntersection3f, direction: mi.Vector3f) -> mi.Float:
+        """Radiance [W/mm²/sr] where a ray with `direction` meets a face, towards its origin; 0 on the inward side."""
+        met = pi.is_valid()
+        face = dr.gather(mi.UInt32, self.first, _number(pi.shape), met) + pi.prim_index
+        least, normal = (dr.gather(mi.Vector4f, self.table, 2 * face + half, met) for half in (0, 1))
+        u, v = pi.prim_uv.x, pi.prim_uv.y
+        radiance = least.x + dr.maximum(1 - u - v, 0) * least.y + u * least.z + v * least.w
+        towards = normal.x * direction.x + normal.y * direction.y + normal.z * direction.z
+        return dr.select(met & (towards < 0), radiance, 0)
+
+
+def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
+    """What `Faces.of` follows from once a scene is checked; None where not all shapes are meshes."""
+    if not all(shape.is_mesh() for shape in shapes):
+        return None
+    return [_edition(shape) for shape in shapes]
+
+
+def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
+    emitter = mesh.emitter()
+    places = (buffer.index for buffer in _buffers(mesh))
+    return _number_of(mesh), *places, mark_of(emitter), getattr(emitter, "edition", 0)
+
+
+def mark_of(emitter: mi.Emitter | None) -> object:
+    """What tells an emitter from others, to be kept in its stead."""
+    return getattr(emitter, "mark", None) or dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]
+
+
+def _buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
+    # Copies, which share the data: what a mesh hands out keeps it alive.
+    return mi.Float(mesh.vertex_positions_buffer()), mi.UInt32(mesh.faces_buffer())
+
+
+def _number(shape: mi.ShapePtr) -> mi.UInt32:
+    return dr.reinterpret_array(mi.UInt32, shape)
+
+
+def _number_of(shape: mi.Shape) -> int:
+    return int(_number(mi.ShapePtr(shape))[0])
+
+
+def _radiance_at_corners(mesh: mi.Shape) -> tuple[mi.Float, ...] | None:
+    """Radiance [W/mm²/sr] at the three corners of every face, 0 where nothing glows; None as in `Faces.of`."""
+    emitter = mesh.emitter()
+    if emitter is None:
+        return (dr.zeros(mi.Float, mesh.face_count()),) * 3
+    return emitter.radiance_at_corners() if is_surface(emitter) else None
+
+
+def _table(mesh: mi.Shape, radiance: tuple[mi.Float, ...]) -> mi.Float:
+    """Eight numbers for each face of a mesh, see `Faces`."""
+    elements = elements_of(mesh, minimum=1)
+    si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
+    # On a sliver a normal or J_n may be no number: it is dark.
+    sound = dr.all(dr.isfinite(si.n)) & dr.all(dr.isfinite(mi.Vector3f(*radiance)))
+    # From the least one on: where all are alike so is all between, and a dim one beside a bright one is not lost.
+    least = dr.minimum(dr.minimum(radiance[0], radiance[1]), radiance[2])
+    columns = [least, *(corner - least for corner in radiance), si.n.x, si.n.y, si.n.z, mi.Float(0)]
+    table = dr.empty(mi.Float, 8 * elements.count)
+    index = 8 * dr.arange(mi.UInt32, elements.count)
+    for k, column in enumerate(columns):
+        dr.scatter(table, dr.select(sound, column, 0), index + k)
+    return table

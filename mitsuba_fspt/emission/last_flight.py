@@ -1,0 +1,132 @@
+"""The law of the last flight: what leaves tissue is what scatters last, so the fluence inside tells its directions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..jit.loops import repeat
+from ..optics.media import Medium
+from ..runtime.errors import ExitanceError
+from .elements import elements_of
+
+NODES = 8  # along the line of sight
+RINGS, SPOKES = 8, 8  # of the hemisphere that is to carry J_n
+
+
+class LastFlight:
+    r"""Light scattered for the last time on the refracted line of sight ω_i inside the tissue.
+
+    L(r, ω) ∝ T/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds by Gauss–Laguerre, with a factor that makes the
+    hemisphere carry J_n at every point r. Φ, the `fluence`, is a volume of the world; only its course matters, not
+    its unit. Scattering counts as isotropic. Beyond the border Φ goes on as the volume does.
+
+    Raises
+    ------
+    FluxError : a number of the medium is out of its range.
+    """
+
+    def __init__(self, medium: Medium, fluence: mi.Volume) -> None:
+        self.medium, self.fluence = medium, fluence
+        self._n = dr.opaque(mi.Float, medium.n)
+        flight, weight = np.polynomial.laguerre.laggauss(NODES)
+        self._flight = mi.Float(flight / (medium.mua + medium.musp))
+        self._weight = mi.Float(weight)
+        self._hemisphere = _hemisphere()
+        self._total: _Table | None = None
+        self._values: mi.Float | None = None  # of the volume that is tabulated
+
+    def prepare(self, shape: mi.Shape) -> None:
+        """Tabulate what the hemisphere over each point of the surface carries; ExitanceError where Φ gives nothing."""
+        inside, outside = shape.bbox(), self.fluence.bbox()
+        if not (outside.contains(inside.min) and outside.contains(inside.max)):
+            raise ExitanceError(
+                f"fspt_surface: the volume 'fluence', {_extent(outside)}, does not hold shape '{shape.id()}', "
+                f"{_extent(inside)}. Set its 'use_grid_bbox' or 'to_world'."
+            )
+        self._total, self._values = _Table(shape, self._carried), _values_of(self.fluence)
+        if not self._total.positive():
+            raise ExitanceError(
+                f"fspt_surface: the volume 'fluence' has values <= 0 or not finite under shape '{shape.id()}'. Write "
+                "it with 'fspt flux solve --volume'."
+            )
+
+    def renewed(self) -> bool:
+        return self._values is not None and self._values.index != _values_of(self.fluence).index
+
+    def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        return self._seen(si, direction, active) / self._total(si)
+
+    def _seen(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """T · Σ wₖ Φ(r − sₖ ω_i): the radiance towards an outward unit vector, up to a factor."""
+        mu = dr.dot(si.n, direction)
+        reflectance, cos_inner, _, _ = mi.fresnel(mu, self._n)
+        inside = (direction - mu * si.n) / self._n + dr.abs(cos_inner) * si.n
+
+        def node(k: mi.UInt32, total: mi.Float) -> tuple[mi.Float]:
+            at = dr.zeros(mi.Interaction3f)
+            at.p = si.p - dr.gather(mi.Float, self._flight, k) * inside
+            return (total + dr.gather(mi.Float, self._weight, k) * self.fluence.eval_1(at, active),)
+
+        (total,) = repeat(NODES, node, mi.Float(0))
+        return (1 - reflectance) * total
+
+    def _carried(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """∫ of `_seen` times µ over the hemisphere."""
+        frame = mi.Frame3f(si.n)
+
+        def add(k: mi.UInt32, total: mi.Float) -> tuple[mi.Float]:
+            x, y, z, weight = (dr.gather(mi.Float, column, k) for column in self._hemisphere)
+            return (total + weight * self._seen(si, frame.to_world(mi.Vector3f(x, y, z)), mi.Bool(True)),)
+
+        return repeat(RINGS * SPOKES, add, mi.Float(0))[0]
+
+    def __str__(self) -> str:
+        m = self.medium
+        return f"last_flight, mua = {m.mua:g}, musp = {m.musp:g}, int_ior = {m.n:g}"
+
+
+class _Table:
+    """A function of the surface, known at the corners of its elements and interpolated between them."""
+
+    def __init__(self, shape: mi.Shape, function: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
+        self._elements = elements_of(shape, minimum=1 << 14)
+        index = dr.arange(mi.UInt32, self._elements.count)
+        places = (self._elements.place(index, mi.Point2f(*corner))[0] for corner in self._elements.corners)
+        self._values = [function(si) for si in places]
+        dr.eval(self._values)
+
+    def positive(self) -> bool:
+        return all(dr.all((value > 0) & dr.isfinite(value)) for value in self._values)
+
+    def __call__(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        index, weights = self._elements.weigh(si)
+        return sum(w * dr.gather(mi.Float, value, index) for w, value in zip(weights, self._values, strict=True))
+
+
+def _values_of(volume: mi.Volume) -> mi.Float:
+    """The numbers that a volume updated by itself changes; none where it holds no grid."""
+    parameters = mi.traverse(volume)
+    return mi.Float(parameters["data"].array) if "data" in parameters else mi.Float()
+
+
+def _hemisphere() -> tuple[mi.Float, ...]:
+    """Unit vectors (x, y, z) about +z and weights such that Σ w f is ∫ f µ dΩ.
+
+    Rings at µ = x², x the Gauss nodes: transmittance is steep at grazing exit. Each is turned against the next.
+    """
+    x, weight = np.polynomial.legendre.leggauss(RINGS)
+    x, weight = (x + 1) / 2, weight / 2
+    mu, ring = x**2, 2 * np.pi / SPOKES * x**2 * 2 * x * weight
+    azimuth = 2 * np.pi * (np.arange(SPOKES) + np.arange(RINGS)[:, None] / RINGS) / SPOKES
+    sine = np.sqrt(1 - mu**2)[:, None]
+    columns = (sine * np.cos(azimuth), sine * np.sin(azimuth), mu[:, None], ring[:, None])
+    return tuple(mi.Float(np.broadcast_to(column, azimuth.shape).ravel()) for column in columns)
+
+
+def _extent(box: mi.BoundingBox3f) -> str:
+    low, high = ([float(c) for c in corner] for corner in (box.min, box.max))
+    return "from ({:g}, {:g}, {:g}) to ({:g}, {:g}, {:g}) mm".format(*low, *high)

@@ -1,0 +1,200 @@
+"""How far a calculated image is from a standard: the paper's ME and CF, absolute errors and a z-test."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..runtime.errors import ImageError
+from ..runtime.numbers import whole
+from .image import Image
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Power along one row or column of both images.
+
+    `line` is 'row' or 'column', `index` its number from the top or the left, from 0 on; `calculated` and
+    `standard` are arrays of shape (w,) or (h,) [W].
+    """
+
+    line: str
+    index: int
+    calculated: NDArray[np.float64]
+    standard: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ZTest:
+    """Differences in units of their standard deviation, z = (P_cal − P_std) / √(error_cal² + error_std²).
+
+    Attributes
+    ----------
+    max_z : the largest |z|
+    chi2 : mean of z², about 1 where the errors are true
+    p_value : probability that `pixels` independent normal z reach `max_z`, p = 1 − (1 − p_1)^pixels with
+        p_1 = erfc(max_z/√2) of one pixel (Šidák's correction); a small one says that the images differ
+    pixels : how many pixels have an error to be judged by
+    unjudged : how many pixels differ though both errors are 0; they are not part of the test
+    """
+
+    max_z: float
+    chi2: float
+    p_value: float
+    pixels: int
+    unjudged: int
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What `compare` finds.
+
+    Attributes
+    ----------
+    me : mean error, Σ|P_cal/max P_cal − P_std/max P_std| / N over the N pixels (paper, section 3), >= 0
+    cf : correlation factor, Pearson's, with sums over N − 1 (paper, section 3), in [−1, 1]
+    max_error : max|P_cal − P_std| / max P_std, absolute powers: only the standard's peak scales both
+    rms : √(Σ(P_cal − P_std)² / N) / max P_std, likewise absolute
+    ratio : Σ P_cal / Σ P_std of the absolute powers; None where the standard's add up to 0
+    profiles : power along rows and columns
+    z_test : differences against their errors; None where no image has an error above 0
+    """
+
+    me: float
+    cf: float
+    max_error: float
+    rms: float
+    ratio: float | None
+    profiles: tuple[Profile, ...] = field(repr=False)
+    z_test: ZTest | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same as numbers, text, lists and dicts only, as JSON takes them."""
+        numbers = {name: getattr(self, name) for name in ("me", "cf", "max_error", "rms", "ratio")}
+        profiles = [
+            {
+                "line": profile.line,
+                "index": profile.index,
+                "calculated": profile.calculated.tolist(),
+                "standard": profile.standard.tolist(),
+            }
+            for profile in self.profiles
+        ]
+        return numbers | {"z_test": self.z_test and asdict(self.z_test), "profiles": profiles}
+
+
+def compare(
+    calculated: Image,
+    standard: Image,
+    *,
+    rows: ArrayLike | None = None,
+    columns: ArrayLike | None = None,
+) -> Comparison:
+    """Distance of a calculated image from a standard of the same shape (h, w).
+
+    Parameters
+    ----------
+    calculated, standard : power [W], for example the integral and a Monte Carlo image
+    rows, columns : numbers of the rows and columns to take profiles of, in 0 … h − 1 and 0 … w − 1, one alone or
+        several; where neither is given, those through the standard's brightest pixel
+
+    The z-test counts `error` as a standard deviation and the two as independent; a deterministic method's is
+    a bound and makes the test milder. A Monte Carlo pixel that few samples have lit knows its error badly and
+    makes it too strict: give such images samples enough.
+
+    Raises
+    ------
+    ImageError : one is no `Image`, shapes differ, an image has no positive power or is constant (ME or CF then have no
+        meaning), a row or column does not exist.
+    """
+    _check(calculated, standard)
+    p_cal, p_std = (image.power.astype(np.float64) for image in (calculated, standard))
+    peak = p_std.max()
+    normalised_cal, normalised_std = p_cal / p_cal.max(), p_std / peak
+    difference = np.abs(p_cal - p_std)
+    if rows is None and columns is None:
+        row, column = np.unravel_index(p_std.argmax(), p_std.shape)
+        rows, columns = [int(row)], [int(column)]
+    return Comparison(
+        me=float(np.abs(normalised_cal - normalised_std).mean()),
+        cf=float(np.corrcoef(normalised_cal.ravel(), normalised_std.ravel())[0, 1]),
+        max_error=float(difference.max() / peak),
+        rms=float(np.sqrt(np.square(difference / peak).mean())),
+        ratio=_ratio(float(p_cal.sum()), float(p_std.sum())),
+        profiles=_profiles(p_cal, p_std, () if rows is None else rows, () if columns is None else columns),
+        z_test=_z_test(difference, calculated.error, standard.error),
+    )
+
+
+def _check(calculated: Image, standard: Image) -> None:
+    for image in (calculated, standard):
+        if not isinstance(image, Image):
+            raise ImageError(
+                f"compare: must be given two images, got {type(image).__name__}. Give what `read` returns."
+            )
+    if calculated.shape != standard.shape:
+        raise ImageError(
+            f"compare: the calculated image has {_size(calculated)} pixels, the standard {_size(standard)}. "
+            "Render both with the same film."
+        )
+    for name, image in (("calculated image", calculated), ("standard", standard)):
+        peak = image.power.max()
+        if not peak > 0:
+            raise ImageError(
+                f"compare: the {name} is dark, its brightest pixel has {peak:g} W; nothing to normalise by. "
+                "Check that the camera sees the phantom."
+            )
+        if image.power.min() == peak:
+            raise ImageError(
+                f"compare: every pixel of the {name} has {peak:g} W; the correlation with a constant (CF) is "
+                "not defined. Give an image with some structure."
+            )
+
+
+def _ratio(calculated: float, standard: float) -> float | None:
+    ratio = calculated / standard if standard else math.inf
+    return ratio if math.isfinite(ratio) else None
+
+
+def _profiles(
+    p_cal: NDArray[np.float64], p_std: NDArray[np.float64], rows: ArrayLike, columns: ArrayLike
+) -> tuple[Profile, ...]:
+    profiles = []
+    for line, indices, cal, std in (("row", rows, p_cal, p_std), ("column", columns, p_cal.T, p_std.T)):
+        for given in np.atleast_1d(indices):
+            index = whole(f"compare: the number of a {line}", given, ImageError, "0")
+            if not 0 <= index < len(std):
+                raise ImageError(f"compare: {line} {index} does not exist. Give one in 0 … {len(std) - 1}.")
+            profiles.append(Profile(line, index, cal[index], std[index]))
+    return tuple(profiles)
+
+
+def _z_test(difference: NDArray[np.float64], *errors: NDArray[np.floating] | None) -> ZTest | None:
+    deviation = np.zeros_like(difference)
+    for error in errors:
+        if error is not None:
+            deviation = np.hypot(deviation, error)
+    judged = deviation > 0
+    pixels = int(judged.sum())
+    if pixels == 0:
+        return None
+    z = difference[judged] / deviation[judged]
+    max_z = float(z.max())
+    p_one = math.erfc(max_z / math.sqrt(2))
+    return ZTest(
+        max_z=max_z,
+        chi2=float(np.square(z).mean()),
+        # log1p and expm1 keep a p_one far below 1e-16 alive, which 1 − (1 − p_one)^pixels would round to 0.
+        p_value=abs(math.expm1(pixels * math.log1p(-p_one))) if p_one < 1 else 1.0,
+        pixels=pixels,
+        unjudged=int(np.count_nonzero(difference[~judged])),
+    )
+
+
+def _size(image: Image) -> str:
+    """Width × height, as all messages tell it; arrays have the shape (h, w)."""
+    return " × ".join(map(str, image.shape[::-1]))

@@ -1,0 +1,267 @@
+"""The CCD behind the lens, in the terms of EMVA 1288: from power on a pixel to electrons and counts.
+
+    photons    μ_p = P t λ / (h c)
+    electrons  μ_e = η μ_p + I_dark t,  summed over the pixels of a bin,  σ_e² = μ_e + σ_read²
+    counts     y   = bias + round(electrons / gain)
+
+The charge of a bin is Poisson distributed about μ_e (shot noise), its read-out adds a normal one, σ_read.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.atomic_files import atomic_path
+from ..runtime.errors import BackendError, DetectorError, ImageError
+from ..runtime.numbers import number, whole
+from .exr import Metadata, write_exr
+from .image import Image
+
+# A detector's numbers, each with one to give. What an exposure's metadata call them: `pixel_pitch` there is that of the
+# pixels read out.
+EXAMPLES = {
+    "quantum_efficiency": "0.85",
+    "dark_current": "1e-3",
+    "read_noise": "3.5",
+    "full_well": "1e5",
+    "gain": "1.6",
+    "bias": "500",
+    "bits": "16",
+    "pixel_pitch": "0.0135",
+}
+RECORDED = {name: name for name in EXAMPLES} | {"pixel_pitch": "detector_pixel_pitch"}
+
+PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """One read-out of a detector.
+
+    Attributes
+    ----------
+    electrons : float32 array, shape (h, w) [e-], before the conversion to counts; where there is hardly any
+        light, read noise can make them negative
+    counts : uint16 array, shape (h, w) [DN]
+    metadata : those of the image and the detector's numbers; `quantity` is electrons, `unit` e-
+    """
+
+    electrons: NDArray[np.float32]
+    counts: NDArray[np.uint16]
+    metadata: Metadata
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the electrons to an EXR file: channel `Y`, the metadata under `fspt:`.
+
+        Raises ImageError where the suffix is not .exr or the file cannot be written.
+        """
+        write_exr(path, {"Y": self.electrons}, self.metadata)
+
+    def write_counts(self, path: str | os.PathLike[str]) -> None:
+        """Write the counts, unscaled, to a 16-bit greyscale PNG or TIFF; metadata as JSON in its description.
+
+        Raises
+        ------
+        ImageError : the suffix is neither .png nor .tif(f), or the file cannot be written.
+        BackendError : Pillow is not installed.
+        """
+        with self.counts_file(path):
+            pass
+
+    @contextmanager
+    def counts_file(self, path: str | os.PathLike[str]) -> Iterator[None]:
+        """The file of `write_counts`, written before a block, in its place when the block ends well. Raises as that."""
+        path = Path(path)
+        if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+            raise ImageError(f"counts file '{path}': counts are written as PNG or TIFF. Give a .png or .tif.")
+        try:
+            from PIL import Image as Picture
+            from PIL.PngImagePlugin import PngInfo
+        except ImportError as cause:
+            raise BackendError(
+                "detector: Pillow, which writes counts, is not installed. pip install 'mitsuba-fspt[plot]'."
+            ) from cause
+        description = json.dumps(self.metadata | {"quantity": "counts", "unit": "DN"})
+        picture = Picture.fromarray(self.counts)
+        with atomic_path(path, ImageError) as temporary:
+            if path.suffix.lower() == ".png":
+                text = PngInfo()
+                text.add_text("Description", description)
+                picture.save(temporary, pnginfo=text)
+            else:
+                picture.save(temporary, description=description)
+            yield
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Mean [e-] and variance [e-²] of an exposure's pixels, arrays of shape (h, w), without the full well."""
+
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A CCD by the numbers of EMVA 1288, the same for all its pixels.
+
+    Parameters
+    ----------
+    quantum_efficiency : η, electrons per photon, in (0, 1]
+    dark_current : [e-/px/s], >= 0
+    read_noise : σ_read [e-] of one read-out, >= 0
+    full_well : [e-], > 0; what a read-out pixel, binned or not, delivers at most
+    gain : [e-/DN], > 0; 1/K in EMVA 1288
+    bias : [DN], >= 0
+    bits : of the converter, 1 … 16; counts end at 2^bits − 1
+    pixel_pitch : [mm] of the pixel that `dark_current` belongs to. An image whose metadata have another
+        `pixel_pitch` gets dark current by area; None: it belongs to the image's pixels, whatever their pitch
+    name : goes into the files
+
+    Raises
+    ------
+    DetectorError : a number outside its range.
+    """
+
+    quantum_efficiency: float
+    dark_current: float
+    read_noise: float
+    full_well: float
+    gain: float
+    bias: float
+    bits: int
+    pixel_pitch: float | None = None
+    name: str = "detector"
+
+    @classmethod
+    def typical_ccd(cls) -> Detector:
+        """A cooled back-illuminated 2048² CCD of 13.5 µm pixels: typical, not a data sheet."""
+        return cls(
+            quantum_efficiency=0.85,
+            dark_current=1e-3,
+            read_noise=3.5,
+            full_well=1e5,
+            gain=1.6,
+            bias=500,
+            bits=16,
+            pixel_pitch=0.0135,
+            name="typical, not a data sheet",
+        )
+
+    def __post_init__(self) -> None:
+        for name, example in EXAMPLES.items():
+            value = getattr(self, name)
+            if name != "pixel_pitch" or value is not None:
+                object.__setattr__(self, name, number(f"detector: '{name}'", value, DetectorError, example))
+        eta, full_well, bits = self.quantum_efficiency, self.full_well, self.bits
+        _require("quantum_efficiency", eta, 0 < eta <= 1, "in (0, 1], for example 0.85")
+        _require("full_well", full_well, 0 < full_well <= 1e15, "in (0, 1e15] e-, for example 1e5")
+        _require("gain", self.gain, self.gain > 0, "> 0 e-/DN, for example 1.6")
+        _require("dark_current", self.dark_current, self.dark_current >= 0, ">= 0 e-/px/s, for example 1e-3")
+        _require("read_noise", self.read_noise, self.read_noise >= 0, ">= 0 e-, for example 3.5")
+        _require("bias", self.bias, self.bias >= 0, ">= 0 DN, for example 500")
+        _require("bits", bits, bits in range(1, 17), "a whole number in 1 … 16, for example 16")
+        object.__setattr__(self, "bits", int(bits))
+        if self.pixel_pitch is not None:
+            _require("pixel_pitch", self.pixel_pitch, self.pixel_pitch > 0, "> 0 mm, for example 0.0135")
+
+    def expected(self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1) -> Expectation:
+        """Mean and variance of the electrons that `expose` draws, before the full well cuts them.
+
+        Parameters and errors as for `expose`.
+        """
+        exposure_time, wavelength_nm = _light(exposure_time, wavelength_nm)
+        if (darkest := image.power.min()) < 0:
+            raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
+        energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
+        photons = image.power.astype(np.float64) * (exposure_time / energy)
+        pitch = image.metadata.get("pixel_pitch")
+        area = 1.0 if self.pixel_pitch is None or pitch is None else (float(pitch) / self.pixel_pitch) ** 2
+        charge = self.quantum_efficiency * photons + self.dark_current * exposure_time * area
+        mean = _binned(charge, _whole("binning", binning))
+        return Expectation(mean, mean + self.read_noise**2)
+
+    def expose(
+        self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
+    ) -> Exposure:
+        """One exposure of the detector to an image; the same seed gives the same bits.
+
+        Parameters
+        ----------
+        image : power [W], shape (h, w), monochromatic
+        exposure_time : [s], 0 … 1e12 (0 gives a bias frame)
+        wavelength_nm : of the light in vacuum [nm], 1e-3 … 1e9
+        binning : side of the square of pixels whose charge is summed before read-out, a divisor of h and w
+        seed : of the shot and read noise, 0 … 2⁵³
+
+        Raises
+        ------
+        DetectorError : a number outside its range, or a binning that does not divide the image.
+        """
+        exposure_time, wavelength_nm = _light(exposure_time, wavelength_nm)
+        seed, binning = _whole("seed", seed), _whole("binning", binning)
+        _require(
+            "seed", seed, 0 <= seed <= 1 << 53, ">= 0 and at most 2^53, for example 1"
+        )  # an EXR holds no larger one
+        rng = np.random.default_rng(seed)
+        mean = self.expected(image, exposure_time, wavelength_nm, binning=binning).mean
+        # Means this far above the full well end there for certain; NumPy draws none beyond 9e18.
+        charge = rng.poisson(np.minimum(mean, 2 * self.full_well + 1e6))
+        electrons = np.minimum(charge + rng.normal(0.0, self.read_noise, mean.shape), self.full_well)
+        full = electrons >= self.full_well
+        electrons = electrons.astype(np.float32)  # what the EXR holds is what is counted
+        top = 2**self.bits - 1
+        counts = np.clip(np.rint(self.bias + electrons / np.float64(self.gain)), 0, top)
+        metadata = image.metadata | {
+            "quantity": "electrons",
+            "unit": "e-",
+            "detector": self.name,
+            "exposure_time": exposure_time,
+            "wavelength_nm": wavelength_nm,
+            "binning": binning,
+            "detector_seed": seed,
+            "saturated_pixels": int(np.sum(full | (counts >= top))),
+        }
+        metadata |= {told: getattr(self, name) for name, told in RECORDED.items() if getattr(self, name) is not None}
+        if "pixel_pitch" in image.metadata:
+            metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
+        return Exposure(electrons, counts.astype(np.uint16), metadata)
+
+
+def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
+    """Sums over squares of `binning` × `binning` pixels, shape (h/binning, w/binning)."""
+    height, width = charge.shape
+    if binning < 1 or height % binning or width % binning:
+        raise DetectorError(
+            f"detector: 'binning' = {binning} does not divide the image of {width} × {height} pixels. "
+            f"Give a divisor of {math.gcd(height, width)}."
+        )
+    blocks = charge.reshape(height // binning, binning, width // binning, binning)
+    return blocks.sum(axis=(1, 3))
+
+
+def _light(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
+    """Both as plain numbers, in bounds that keep dark pixels dark: 0 W times infinitely many photons is no number."""
+    time = number("detector: 'exposure_time'", exposure_time, DetectorError, "60")
+    wavelength = number("detector: 'wavelength_nm'", wavelength_nm, DetectorError, "650")
+    _require("exposure_time", time, 0 <= time <= 1e12, "in 0 … 1e12 s, for example 60")
+    _require("wavelength_nm", wavelength, 1e-3 <= wavelength <= 1e9, "in 1e-3 … 1e9 nm, for example 650")
+    return time, wavelength
+
+
+def _whole(name: str, value: int) -> int:
+    return whole(f"detector: '{name}'", value, DetectorError, "1")
+
+
+def _require(name: str, value: float, holds: bool, rule: str) -> None:
+    if not (holds and math.isfinite(value)):
+        raise DetectorError(f"detector: '{name}' must be finite and {rule}, got {value}.")

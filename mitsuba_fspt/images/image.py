@@ -1,0 +1,122 @@
+"""The picture of a camera: power in W on every pixel, how sure it is, and how it was made."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..runtime.errors import ImageError
+from .exr import Metadata, read_exr, write_exr
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """Power on the pixels of a detector; row 0 is the top of the upright picture.
+
+    Parameters
+    ----------
+    power : array, shape (h, w) [W], the power on each pixel
+    error : array, shape (h, w) [W], its estimated absolute error (Monte Carlo: the standard error), or None
+    coverage : array, shape (h, w), share in [0, 1] of a pixel's lines of sight that meet the phantom, or None
+    metadata : text and numbers that say how the image was made; `quantity` and `unit` are added
+
+    The arrays are held as read-only views, at least 32-bit floats.
+
+    Raises
+    ------
+    ImageError : an array is not of shape (h, w), the shapes differ, a value is NaN or infinite, or the
+        metadata say that the values are no power.
+    """
+
+    power: NDArray[np.floating]
+    error: NDArray[np.floating] | None = None
+    coverage: NDArray[np.floating] | None = None
+    metadata: Metadata = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.power)
+        for name in ("power", "error", "coverage"):
+            values = getattr(self, name)
+            if values is None and name != "power":
+                continue
+            plane = _plane(name, values)
+            if plane.shape != shape:
+                raise ImageError(f"image: '{name}' must have the shape {shape} of 'power', got {plane.shape}. Crop it.")
+            object.__setattr__(self, name, plane)
+        metadata: Metadata = {"quantity": "power", "unit": "W"}
+        metadata |= {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
+        if (metadata["quantity"], metadata["unit"]) != ("power", "W"):
+            raise ImageError(
+                f"image: the values are {metadata['quantity']} in {metadata['unit']}, not power in W. "
+                "Give an image as the camera renders it."
+            )
+        object.__setattr__(self, "metadata", metadata)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(h, w)."""
+        return self.power.shape
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y` (float32), metadata under `fspt:`.
+
+        The file is whole or not there. Single pixels may vanish below float32's 1e-38; an image whose
+        brightest pixel does is refused.
+
+        Raises
+        ------
+        ImageError : the suffix is not .exr, a value does not fit into float32 or the file cannot be written.
+        """
+        peak = np.abs(self.power).max()
+        if 0 < peak < np.finfo(np.float32).tiny:
+            raise ImageError(
+                f"image: the brightest pixel has {peak:g} W, below what the file can hold (1.2e-38 W). "
+                "Scale the exitance up."
+            )
+        planes = {"Y": self.power, "error.Y": self.error, "coverage.Y": self.coverage}
+        write_exr(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
+
+
+def read(path: str | os.PathLike[str]) -> Image:
+    """Image from an EXR file, one of ours or any with a channel `Y`, whose values then count as W on a pixel.
+
+    `error` and `coverage` are None where the file has no channel `error.Y`, `coverage.Y`.
+
+    Raises
+    ------
+    ImageError : no such file, not an EXR file, a damaged one, no channel `Y`, values that are not finite or
+        no power.
+    """
+    channels, metadata = read_exr(path)
+    if "Y" not in channels:
+        raise ImageError(
+            f"image file '{path}' has no channel 'Y' (power in W), its channels are {', '.join(channels)}. "
+            "Give a file that fspt wrote."
+        )
+    try:
+        return Image(channels["Y"], channels.get("error.Y"), channels.get("coverage.Y"), metadata)
+    except ImageError as cause:
+        raise ImageError(f"image file '{path}': {cause}") from cause
+
+
+def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:
+    """`values` as a read-only array of at least 32-bit floats; refuses what is no image."""
+    array = np.asarray(values)
+    if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "fiu":
+        raise ImageError(
+            f"image: '{name}' must be numbers of shape (h, w), got {array.dtype} of shape {array.shape}. "
+            "Give one value a pixel."
+        )
+    finite = np.isfinite(array)
+    if not finite.all():
+        row, column = np.argwhere(~finite)[0]
+        raise ImageError(
+            f"image: '{name}' must be finite, got {array[row, column]} at row {row}, column {column} "
+            f"({np.sum(~finite)} such pixels). Check the exitance."
+        )
+    view = array.astype(np.result_type(array.dtype, np.float32), copy=False).view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,163 @@
+"""The picture of the pupil form while it is refined, and where in it an edge may hide between lines of sight."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from ..jit.pixel_grid import ROUNDING, Grid, parted
+from . import node_rules
+from .lines import View
+from .quadrature import Quadrature, Solution
+from .window import Window
+
+if TYPE_CHECKING:
+    from ..jit.pixel_grid import Image, Mask
+
+FULL = 1e-6  # of all lines of sight hit but for so many, as far as a sum of float32 weights knows
+# A straight silhouette makes a rule wrong by at most this share of the light, sharp or blurred, where it parts the
+# nodes and where it passes through the rule's gap at the rim of the pupil.
+CUT = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
+UNSEEN = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
+UNSEEN_BY_TRANSECTS = 0.0125
+IN_FOCUS = 0.3  # blur radius [pixels] below which an edge counts as sharp in these tables
+
+
+class Draft:
+    """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `hits`.
+
+    nodes : of the rule that saw the last edges
+    roughness : how far four nodes and twelve differ near by, silhouettes left out
+    nearest : depth of what is nearest [mm], inf where nothing is met
+    blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
+    sharp : True where the least one is small
+    outline : True within a pixel of both a hit and a miss
+    shown : False on the rim, True everywhere where there is none
+    stopped, beyond : the border of the image-plane stop cuts the pixel, wherever its light comes from; or leaves it out
+    open, known : False where the value is known from elsewhere, and that value
+    """
+
+    def __init__(self, view: View, window: Window, quadrature: Quadrature, known: Solution | None) -> None:
+        self.view, self.lens, self.window, self.quadrature = view, view.lens, window, quadrature
+        self.area = quadrature.pixel == "area"
+        self.grid = grid = Grid(window.shape)
+        self.value, self.error, self.hits, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
+        self.sharp = grid.full(mi.Bool, False)
+        self.nearest = grid.full(mi.Float64, dr.inf)
+        self.roughness = grid.full(mi.Float64, 0)
+        self.shown = grid.lanes(window.shown()) if window.count < len(grid) else mi.Bool(True)
+        inside, cut = window.stopped(view.lens)
+        self.stopped, self.beyond = grid.lanes(cut & self.area), grid.lanes(~(inside | cut))
+        self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
+        self.open, self.known = grid.full(mi.Bool, True), grid.full(mi.Float64, 0)
+        if known is not None:
+            self.open = grid.lanes(~window.cut(known.where))
+            self.known = grid.lanes(window.cut(known.power) / view.lens.etendue)
+        self.nodes = self.rays = 0
+        self.levels: list[str] = []
+        self.findings = [view.finding()]
+
+    @property
+    def peak(self) -> Image:
+        """The largest value that is shown [W/mm²/sr], of all if those are dark, one lane."""
+        most = dr.max(self.value)
+        if len(self.shown) == 1:
+            return most
+        shown = dr.max(dr.select(self.shown, self.value, 0))
+        return dr.select(shown > 0, shown, most)
+
+    @property
+    def tolerance(self) -> Image:
+        """The error asked for [W/mm²/sr], one lane."""
+        return dr.opaque(mi.Float64, self.quadrature.rtol) * self.peak
+
+    def solution(self) -> Solution:
+        """The picture as it is, on the crop window."""
+        least = dr.opaque(mi.Float64, self.quadrature.least_error) * self.peak
+        error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, least))
+        hits = dr.select(self.hits > 1 - FULL, 1, dr.maximum(self.hits, 0))
+        etendue = dr.opaque(mi.Float64, self.lens.etendue)
+        power, error = etendue * self.value, etendue * dr.select(self.beyond, 0, error)
+        images = (power, error, hits * open_share(self.lens, self.window, self.grid))
+        dr.eval(images)
+        arrays = (self.window.expand(self.grid.array(image)) for image in images)
+        return Solution(*arrays, self.rays, tuple(self.levels), findings=tuple(self.findings))
+
+    def count(self, what: str, pixels_touched: int, rays: int) -> None:
+        """Note a rung of the ladder."""
+        self.rays += rays
+        self.levels.append(f"{what}: {pixels_touched} pixels")
+
+    # ------------------------------------------------------------------ where an edge may hide
+
+    def set_blur(self, farthest: Image) -> None:
+        """From depths: of what is nearest or farthest, for from the sharp plane on blur grows either way."""
+        seen = dr.isfinite(self.nearest)
+        front, back = (dr.abs(self.lens.blur_radius(depth)) for depth in (self.nearest, farthest))
+        most = dr.opaque(mi.Float64, max(self.grid.shape))
+        blur = dr.select(seen, dr.minimum(dr.maximum(front, back), most), 0)
+        sharp = seen & (dr.minimum(front, back) < IN_FOCUS)
+        dr.eval(blur, sharp)
+        self.most_blur = float(dr.max(blur)[0])
+        self.blur, near = self.grid.spread_all((blur, sharp))
+        self.sharp = self.grid.dilate(near, math.ceil(IN_FOCUS))
+
+    def reach(self, rule: int | str) -> tuple[mi.Int, int]:
+        """How far from where a rule sees an edge it may hide from it, at each pixel and at most [pixels]."""
+        reach = 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, node_rules.GAP[rule]) * self.blur))
+        return reach, 1 + math.ceil(node_rules.GAP[rule] * self.most_blur)
+
+    def set_hits(self, hits: Image) -> None:
+        """Shares of lines of sight that hit, and with them the outline."""
+        self.hits, self.outline = hits, self.grid.outline(hits)
+
+    def grown(self, rough: Mask) -> Mask:
+        """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `cut_off` knows."""
+        source = rough & (self.error > self.tolerance) & ~self.outline
+        return rough | self.grid.grow(source, *self.reach(self.nodes))
+
+    def doubt(self, rough: Mask) -> None:
+        """Where nothing finer follows, what may hide around `rough` pixels counts as error: nodes may agree past it."""
+        around = self.grid.spread_max(dr.select(rough, self.error, 0), self.reach(self.nodes)[1])
+        self.error = dr.select(self.grown(rough), dr.maximum(self.error, around), self.error)
+
+    def cut_off(self) -> Image:
+        """What the nodes may be wrong by where an edge crosses or hides between them and the pupil's rim.
+
+        A silhouette or the image-plane stop.
+        """
+        reach, most = self.reach(self.nodes)
+        cut, unseen = (
+            dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[self.nodes])) for share in (CUT, UNSEEN)
+        )
+        share = dr.select(self.grid.grow(self.outline, reach - 1, most - 1), unseen, 0)
+        share = dr.select(parted(self.hits) | self.stopped, cut, share)
+        return share * self._whole(most)
+
+    def unseen_by_transects(self, split: Mask) -> Image:
+        """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump."""
+        reach, most = self.reach("transects")
+        return dr.select(self.grid.grow(split, reach, most), UNSEEN_BY_TRANSECTS * self._whole(most), 0)
+
+    def wanted(self) -> Mask:
+        """Pixels that are shown, and of the rim those that may know of an edge which transects pass by there."""
+        if len(self.shown) == 1:
+            return self.shown
+        return self.grid.dilate(self.shown, self.reach("transects")[1])
+
+    def near_edge(self, image: Image) -> Image:
+        """Largest value around, as far as transects may pass an edge by."""
+        return self.grid.spread_max(image, self.reach("transects")[1])
+
+    def _whole(self, reach: int) -> Image:
+        """Largest value within `reach`, if no line of sight missed."""
+        whole = dr.select(self.hits > ROUNDING, self.value / self.hits, 0)
+        return self.grid.spread_max(whole, reach)
+
+
+def open_share(lens: mi.Sensor, window: Window, grid: Grid) -> Image:
+    """Share of the pupil that a second border of the lens leaves open to the centre of each pixel."""
+    return mi.Float64(lens.open_pupil(window.centres(grid.number), mi.Point2f(0))[1])

@@ -1,0 +1,236 @@
+"""The integral along one transect: its jumps are found by bisection, the pieces between them integrated each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..jit.loops import repeat
+from .lines import TRANSECTS_TOGETHER, View
+from .node_rules import MOST_JUMPS, AlongTransect
+from .transect import Transect
+
+MOST_STEPS = 2  # of jumps within a body: beside two the scan has too little left to tell a third from a slope
+STEEP = 4.0  # a jump is so many times larger than the mean of the transect's other steps
+SHIFT = 0.1  # of an interval: by which scanned points are moved, as the phase wants
+SHORTEST = 1e-6  # half of a piece, lest its moments are divided by nothing
+FLAT = 1e-4  # variance of z over nodes that lie in one place
+
+
+def integrate_transect(
+    view: View,
+    transect: Transect,
+    phase: mi.Float,
+    along: AlongTransect,
+    outline: mi.Float,
+    least: mi.Float,
+) -> tuple[mi.Float, ...]:
+    """Of a transect means of integrand and hits, number of jumps, depth of the edge at the largest, lines of sight.
+
+    It is split at its `MOST_JUMPS` largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points,
+    then bisected towards the larger difference; every piece that is not dark gets `along.nodes` at even distances, the
+    first of them at `phase` of one; a transect without a jump is one piece. In units of the integrand an `outline`
+    counts so much as a jump of the radiance, and less than `least` does not.
+    """
+    together = view.detail <= TRANSECTS_TOGETHER
+
+    def look(s: mi.Float) -> mi.Point3f:
+        position, pupil, _ = transect.at(s)
+        return mi.Point3f(*view.radiance_on_film(position, pupil, together)[1:])
+
+    found = _search(look, phase, along, outline, least)
+    jumps, places = found.jumps, found.places()
+    nodes = dr.opaque(mi.UInt32, along.nodes)
+
+    # Pieces 0 … jumps between -1, the places and 1; an outer one on which every point looked past the phantom is dark.
+    def integrate(
+        piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, value: mi.Float, hits: mi.Float, looks: mi.UInt32
+    ) -> tuple:
+        at_start, at_end = piece > 0, piece < jumps
+        high = mi.Float(1)
+        for k, place in enumerate(places):
+            high = dr.select(at_end & (piece == k), place, high)
+        middle, half = 0.5 * (low + high), dr.maximum(0.5 * (high - low), SHORTEST)
+        dark = dr.select(at_start, ~at_end & (found.lit.y < low), found.lit.x > high)
+        count = dr.select(dark, 0, nodes)
+
+        def add(number: mi.UInt32, sums: _Sums) -> tuple[_Sums]:
+            share, slope = _towards_jumps((mi.Float(number) + phase) / mi.Float(nodes), at_start, at_end)
+            s = low + (high - low) * share
+            position, pupil, density = transect.at(s)
+            f, _, body, _ = view.radiance_on_film(position, pupil, together)
+            return (sums.plus(slope * density, (s - middle) / half, f, body),)
+
+        (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))
+        until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
+        more_value, more_hits = sums.corrected(_about(until - since, middle, half))
+        return high, until, value + more_value, hits + more_hits, looks + count
+
+    start = (mi.Float(-1), mi.Vector2d(0), mi.Float(0), mi.Float(0), found.looks)
+    _, _, value, hits, looks = repeat(jumps + 1, integrate, *start)
+    depth = dr.select(jumps > 0, found.largest[0].depth(), 0)
+    return value, hits, mi.Float(jumps), depth, mi.Float(looks)
+
+
+# ---------------------------------------------------------------------- where it jumps
+
+
+@dataclass
+class _Jump:
+    """Two neighbouring points of a transect: their places `at`, and radiance, number of the body and depth at each."""
+
+    at: mi.Point2f
+    before: mi.Point3f
+    after: mi.Point3f
+
+    def middle(self) -> mi.Float:
+        """The place half-way between the two."""
+        return 0.5 * (self.at.x + self.at.y)
+
+    def depth(self) -> mi.Float:
+        """Of what is nearer, and hides the other [mm]."""
+        before, after = (dr.select(seen.y > 0, seen.z, dr.inf) for seen in (self.before, self.after))
+        return dr.minimum(before, after)
+
+    def size(self, outline: mi.Float) -> mi.Float:
+        """How much the radiance changes; an `outline` outranks whatever steep but smooth change lies elsewhere."""
+        return dr.abs(self.after.x - self.before.x) + dr.select(self.before.y != self.after.y, outline, 0)
+
+
+@dataclass
+class _Search:
+    """What is known of the jumps of a transect after so many `looks`.
+
+    largest : the `MOST_JUMPS` largest steps of the scan, the largest first, then bisected one by one
+    place, seen : the last point of the scan
+    total : all its steps together
+    lit : first and last place where anything was met
+    jumps : how many of the largest are jumps, known when the scan is over
+    """
+
+    largest: list[_Jump]
+    place: mi.Float
+    seen: mi.Point3f
+    total: mi.Float
+    lit: mi.Point2f
+    jumps: mi.UInt32
+    looks: mi.UInt32
+
+    def places(self) -> list[mi.Float]:
+        """Where the jumps are, in order along the transect, and 1 for each that is none."""
+        ordered: list[mi.Float] = []
+        for k, jump in enumerate(self.largest):
+            place = dr.select(self.jumps > k, jump.middle(), 1)
+            for i, other in enumerate(ordered):
+                ordered[i], place = dr.minimum(other, place), dr.maximum(other, place)
+            ordered.append(place)
+        return ordered
+
+
+def _search(
+    look: Callable[[mi.Float], mi.Point3f], phase: mi.Float, along: AlongTransect, outline: mi.Float, least: mi.Float
+) -> _Search:
+    """Jumps of what lines of sight `look` at; scan and bisection are one loop, so that it is compiled once."""
+    intervals, bisections = dr.opaque(mi.UInt32, along.scan), dr.opaque(mi.UInt32, along.bisections)
+    number = mi.Float(intervals)
+    # Where edges run along pixels they would lie on points to bisect, and rounding choose the side.
+    shift = SHIFT * (phase - 0.5)
+
+    def scan(found: _Search, s: mi.Float, seen: mi.Point3f) -> _Search:
+        new = _Jump(mi.Point2f(found.place, s), found.seen, seen)
+        size = dr.select(found.looks > 0, new.size(outline), 0)
+        total = rest = found.total + size
+        # An outline is a jump. A step of one body's radiance that is not much larger than the rest is a slope; on a
+        # parabola one is at most 3 times their mean.
+        largest, jumps, large = [], mi.UInt32(0), found.looks == intervals
+        for k, old in enumerate(found.largest):
+            old_size = old.size(outline)
+            larger, most = size > old_size, dr.maximum(size, old_size)
+            largest.append(dr.select(larger, new, old))
+            new, size = dr.select(larger, old, new), dr.minimum(size, old_size)
+            rest = rest - most  # not `-=`, which would change the total with it
+            jump = most >= outline
+            if k < MOST_STEPS:
+                jump = jump | (most > dr.maximum(STEEP * rest / (number - (k + 1)), least))
+            large &= jump
+            jumps += dr.select(large, mi.UInt32(1), 0)
+        lit = dr.select(seen.y > 0, mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
+        return _Search(largest, s, seen, total, lit, jumps, found.looks)
+
+    def bisect(found: _Search, turn: mi.UInt32, jump: _Jump, s: mi.Float, seen: mi.Point3f) -> _Search:
+        left = _Jump(mi.Point2f(jump.at.x, s), jump.before, seen)
+        right = _Jump(mi.Point2f(s, jump.at.y), seen, jump.after)
+        half = dr.select(left.size(outline) >= right.size(outline), left, right)
+        largest = [dr.select(turn == k, half, old) for k, old in enumerate(found.largest)]
+        return replace(found, largest=largest)
+
+    def once(found: _Search) -> tuple[_Search]:
+        k = found.looks
+        scans, inside = k <= intervals, (k > 0) & (k < intervals)
+        even = dr.select(inside, 2 * (mi.Float(k) + shift) / number, dr.select(k > 0, 2, 0)) - 1
+        turn = (k - intervals - 1) // bisections
+        jump = found.largest[0]
+        for i, other in enumerate(found.largest[1:], 1):
+            jump = dr.select(turn == i, other, jump)
+        s = dr.select(scans, even, jump.middle())
+        seen = look(s)
+        found = dr.select(scans, scan(found, s, seen), bisect(found, turn, jump, s, seen))
+        found.looks = k + 1
+        return (found,)
+
+    # Not `dr.zeros`: of a dataclass's fields it keeps the types of the variant that it meets first.
+    none = [_Jump(mi.Point2f(0), mi.Point3f(0), mi.Point3f(0)) for _ in range(MOST_JUMPS)]
+    start = _Search(none, mi.Float(0), mi.Point3f(0), mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
+    return dr.while_loop((start,), lambda found: found.looks <= intervals + found.jumps * bisections, once)[0]
+
+
+# ---------------------------------------------------------------------- the pieces between jumps
+
+
+def _towards_jumps(x: mi.Float, at_start: mi.Bool, at_end: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """Place in a piece, x in [0, 1] drawn towards the ends that are jumps, and its derivative.
+
+    There a silhouette's square root (of the cosine, of the place on the surface) becomes linear.
+    """
+    y = 1 - x
+    place = dr.select(at_start, dr.select(at_end, x * x * (3 - 2 * x), x * x), dr.select(at_end, 1 - y * y, x))
+    slope = dr.select(at_start, dr.select(at_end, 6 * x * y, 2 * x), dr.select(at_end, 2 * y, 1))
+    return place, slope
+
+
+def _about(moments: mi.Vector2d, middle: mi.Float, half: mi.Float) -> mi.Vector2f:
+    """Moments of 1 and z = (s - middle) / half from those of 1 and s."""
+    first = (moments.y - mi.Float64(middle) * moments.x) / mi.Float64(half)
+    return mi.Vector2f(mi.Float(moments.x), mi.Float(first))
+
+
+@dataclass
+class _Sums:
+    """Over the nodes of a piece, of weights times 1, z and z²; times f, z f; times hits; z ∈ [-1, 1] is the place."""
+
+    one: mi.Vector3f
+    f: mi.Vector2f
+    hits: mi.Float
+
+    def plus(self, weight: mi.Float, z: mi.Float, f: mi.Float, body: mi.Float) -> _Sums:
+        """The sums with one more node."""
+        return _Sums(
+            self.one + weight * mi.Vector3f(1, z, z * z),
+            self.f + weight * f * mi.Vector2f(1, z),
+            self.hits + dr.select(body > 0, weight, 0),
+        )
+
+    def corrected(self, exact: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
+        """Integrals of f and of the hits by weights times α + β z, for which those of 1 and z are `exact`.
+
+        The density has kinks that a few nodes do not see, and f is almost linear.
+        """
+        scale, mean = exact.x / self.one.x, self.one.y / self.one.x
+        variance = self.one.z - self.one.y * mean
+        tilt = dr.select(variance > FLAT * self.one.x, (exact.y - exact.x * mean) / variance, 0)
+        found = self.one.x > 0  # on a piece of no measure there is nothing to correct
+        value = scale * self.f.x + tilt * (self.f.y - mean * self.f.x)
+        return dr.select(found, value, 0), dr.select(found, scale * self.hits, 0)

@@ -1,0 +1,276 @@
+"""Light too narrow for lines of sight from the pixels: what is far below a pixel and outshines all around it.
+
+Four nodes a pixel find what is as large as a pixel at the phantom, or as its blur disc where that is larger. Smaller
+bodies and spots they meet by chance or not at all, and no estimate made of them knows; the surface form starts where
+the light does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..emission.elements import Elements, elements_of
+from ..emission.exitance import texels_of
+from ..jit.batches import numbered
+from ..jit.loops import repeat
+from ..jit.pixel_grid import Grid
+from ..jit.spectra import at_one_wavelength, scalar
+from ..runtime.plugin_types import is_surface
+from .node_rules import PLASTIC, twelve
+from .occlusion import hidden
+from .window import Window
+
+OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
+# Transects look closely at the limb of a wide body: where it is slanted (cosine to the lens), its squares are covered
+# (a share) and it is not so many times brighter than the body around.
+SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
+FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
+WIDE, MOST_POINTS = 2.0, 1 << 12  # so thick [pixels, blur radii] no element is narrow; points of a thin one
+LARGEST_GRID = 1 << 12  # pixels along each side that are told apart
+
+Column = NDArray[np.float64]
+Index = NDArray[np.int64]
+Image = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NarrowLight:
+    """Light of narrow spots on each pixel of the window (h, w), of all surfaces on the brightest pixel that is shown,
+    and of these on each pixel as if they were in focus.
+
+    Mean radiance on film [W/mm²/sr], to a factor of two.
+    """
+
+    on_pixels: Image
+    brightest: float
+    in_focus: Image
+
+
+def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
+    """What `lens` sees of the light of narrow spots; nothing where no emitter is an `fspt_surface`."""
+    on_pixels = np.zeros(window.shape)
+    parts = [_seen(scene, emitter, lens) for emitter in scene.emitters() if is_surface(emitter)]
+    if not parts or not on_pixels.size:
+        return NarrowLight(on_pixels, 0.0, on_pixels)
+    points = _Points.joined(parts).on(window)
+    points = points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
+    if not (points.radiance > 0).any():
+        return NarrowLight(on_pixels, 0.0, on_pixels)
+    # A blur disc spreads a point's light over so many pixels; discs that overlap add up. More than all of a disc does
+    # not come from an element, however wide.
+    light = points.radiance * np.minimum(points.area / (math.pi * points.blur**2 + 1), 1)
+    level = np.round(np.log2(np.maximum(points.blur, 1)))
+    shown = points.shown_in(window)
+    if not (light[shown] > 0).any():
+        shown[:] = True
+    brightest = 0.0
+    for k in np.unique(level):
+        here, reach = level == k, math.ceil(2 ** (k + 0.5))
+        if (counts := here & shown).any():
+            brightest = max(brightest, points[counts].cells(2**k).sums(light[counts]).max())
+        there = points.near(reach + 2 * 2**k, window.shape)  # beyond, those of this level have no neighbours
+        here[there] &= _hidden(points[there], 2**k)
+        here &= there & (points.apart < 1)
+        if here.any():
+            on_pixels += _spread(light[here], points[here], reach, window.shape)
+    return NarrowLight(on_pixels, float(brightest), points.on_pixels(light, window.shape))
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Points all over surfaces, columns (n,).
+
+    radiance : to the lens; 0 where a point has no image, or another body hides it
+    area : of the sharp image that it stands for [pixels²]
+    cosine, front : the largest cosine of the normal to a point of the pupil; > 0 if the pupil's middle sees the point
+    apart : how far it is from the next; in pixels, or in blur radii where they are larger
+    blur, x, y : on film [pixels]
+    """
+
+    radiance: Column
+    area: Column
+    cosine: Column
+    front: Column
+    apart: Column
+    blur: Column
+    x: Column
+    y: Column
+
+    @classmethod
+    def joined(cls, parts: list[_Points]) -> _Points:
+        """All of them."""
+        return cls(*(np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)))
+
+    def __getitem__(self, which: NDArray[np.bool_]) -> _Points:
+        return _Points(*(column[which] for column in vars(self).values()))
+
+    def on(self, window: Window) -> _Points:
+        """Places counted from the corner of a window."""
+        left, top = window.corner
+        return replace(self, x=self.x - left, y=self.y - top)
+
+    def near(self, far: float | Column, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """True less than `far` from a picture of this shape."""
+        (height, width), (x, y) = shape, (self.x, self.y)
+        return (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
+
+    def shown_in(self, window: Window) -> NDArray[np.bool_]:
+        """True where a blur disc reaches what is shown of a window."""
+        rows, columns = window.inner
+        moved = replace(self, x=self.x - columns.start, y=self.y - rows.start)
+        return moved.near(self.blur, (rows.stop - rows.start, columns.stop - columns.start))
+
+    def on_pixels(self, light: Column, shape: tuple[int, int]) -> Image:
+        """Sum of the points' `light` on each pixel of a picture of this shape, where they are seen sharp."""
+        here = self.near(0, shape)
+        column, row = (np.floor(c[here]).astype(np.int64) for c in (self.x, self.y))
+        return _Cells(shape, row * shape[1] + column).sums(light[here])
+
+    def cells(self, side: float) -> _Cells:
+        """Square cells of a `side` [pixels]; what is too far off falls into the last."""
+        column, row = (
+            np.clip(np.floor((c - c.min()) / side), 0, LARGEST_GRID - 1).astype(np.int64) for c in (self.x, self.y)
+        )
+        width = int(column.max()) + 1
+        return _Cells((int(row.max()) + 1, width), row * width + column)
+
+
+def _hidden(points: _Points, side: float) -> NDArray[np.bool_]:
+    """True of points that outshine the squares of a `side` [pixels] around, and are not the limb of a wide body.
+
+    Beyond the limb lies what only a part of the pupil sees, beside what its middle does.
+    """
+    cells = points.cells(side)
+    grid = Grid(cells.shape)
+    share = np.minimum(points.area / side**2, 1)
+    light, covered, front = (
+        cells.sums(weight) for weight in (points.radiance * share, share, (points.front > 0).astype(np.float64))
+    )
+    mean = np.divide(light, covered, out=np.zeros_like(light), where=covered > 0)
+    around, mean_around, most, facing = (
+        grid.array(grid.spread_max(grid.lanes(image))).ravel()[cells.number] for image in (light, mean, covered, front)
+    )
+    limb = (points.cosine < SLANTED) & (most > COVERED) & (points.radiance <= GLARES * mean_around)
+    limb |= (points.front <= 0) & (facing > 0)
+    return (points.radiance > OUTSHINES * around) & ~limb
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Cells with points in them: `shape` (h, w) of their grid and, row by row, the `number` of each point's."""
+
+    shape: tuple[int, int]
+    number: Index
+
+    def sums(self, weight: Column) -> Image:
+        """Sum of the points' weights on each cell."""
+        return np.bincount(self.number, weight, minlength=math.prod(self.shape)).reshape(self.shape)
+
+
+def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) -> Image:
+    """Sums of `light` within `reach` pixels of each pixel of the window, (h, w)."""
+    height, width = shape
+    reach = min(reach, height + width)
+    row, column = (np.floor(c).astype(np.int64) + reach for c in (points.y, points.x))
+    on = (row >= 0) & (row < height + 2 * reach) & (column >= 0) & (column < width + 2 * reach)
+    sums = np.zeros((height + 2 * reach, width + 2 * reach))
+    np.add.at(sums, (row[on], column[on]), light[on])
+    grid = Grid(sums.shape)
+    return grid.array(grid.box_sum(grid.lanes(sums), reach))[reach : reach + height, reach : reach + width]
+
+
+def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
+    """Points all over a surface as the lens sees them."""
+    shape = emitter.get_shape()
+    texels = texels_of(emitter.exitance)
+    if shape.is_mesh():  # whose elements lie across the texels
+        elements: Elements = elements_of(shape, 4 * texels if texels > 1 else 1)
+    else:
+        elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
+    counts = np.ones(elements.count, np.int64)
+    middles = _look(emitter, elements, lens, counts)
+    area, unit = middles.image.numpy(), np.maximum(middles.blur.numpy(), 1)
+    reach = _reach(elements, lens) / unit
+    # A long and thin element is many points, a quarter of a unit apart; one that is wide may be wide at one.
+    long = np.isfinite(reach) & (reach > MOST_POINTS)  # points all along would be too far apart to tell
+    thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
+    counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
+    look = _look(emitter, elements, lens, counts)
+    if len(scene.shapes()) > 1:
+        look.radiance = dr.select(_in_sight(scene, lens, look.place), look.radiance, 0)
+    columns = (look.radiance, look.image, look.cosine, look.front, look.blur, look.centre.x, look.centre.y)
+    seen = np.array([column.numpy() for column in columns], np.float64)
+    unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
+    radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    # What is half as thick as a unit covers half of some square by itself.
+    apart = np.repeat(np.where(area < unit**2 * reach, reach / counts, np.inf), counts)
+    return _Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
+
+
+@dataclass
+class _Look:
+    """At points of elements: `radiance` to where the lens sees most of them, area of the element's `image` from there
+    [pixels²]; cosine, front, blur and `centre` on film as in `_Points`; `place` in the world.
+    """
+
+    radiance: mi.Float
+    image: mi.Float
+    cosine: mi.Float
+    front: mi.Float
+    blur: mi.Float
+    centre: mi.Point2f
+    place: mi.Point3f
+
+
+def _look(emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index) -> _Look:
+    """At so many points of each element, the first its middle."""
+    index, number = numbered(counts)
+    sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
+    si, area = elements.place(mi.UInt32(index), sample)
+    to_lens = dr.normalize(_rim_above(si, lens) - si.p)
+    si.initialize_sh_frame()
+    si.wi = si.to_local(to_lens)
+    at_one_wavelength(si)
+    centre, blur, scale = lens.blur_disc(si.p)
+    axis = lens.world_transform() @ mi.Vector3f(0, 0, 1)
+    cosine = dr.dot(si.n, to_lens)
+    image = area * dr.abs(cosine / (dr.dot(axis, to_lens) * dr.square(scale)))
+    front = dr.dot(si.n, lens.world_transform() @ mi.Point3f(0) - si.p)
+    look = _Look(scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre, si.p)
+    dr.eval(look)
+    return look
+
+
+def _in_sight(scene: mi.Scene, lens: mi.Sensor, place: mi.Point3f) -> mi.Bool:
+    """True of points from which nothing hides one of twelve points of the pupil."""
+    x, y = (mi.Float(column) for column in twelve(False).pupil.T)
+
+    def look(k: mi.UInt32, seen: mi.Bool) -> tuple[mi.Bool]:
+        pupil = mi.Point2f(dr.gather(mi.Float, x, k), dr.gather(mi.Float, y, k))
+        return (seen | ~hidden(scene, place, lens.arrival(place, pupil)[1], ~seen),)
+
+    return repeat(dr.opaque(mi.UInt32, len(twelve(False))), look, mi.Bool(False))[0]
+
+
+def _rim_above(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Point3f:
+    """The point of the pupil farthest above the tangent plane, the only side that a grazing surface shines on."""
+    normal = lens.world_transform().inverse() @ mi.Vector3f(si.n)
+    across = dr.norm(mi.Vector2f(normal.x, normal.y))
+    return lens.arrival(si.p, dr.select(across > 0, mi.Point2f(normal.x, normal.y) / across, 0))[1]
+
+
+def _reach(elements: Elements, lens: mi.Sensor) -> Column:
+    """How far the corners of each element lie from its middle on the film [pixels]; inf where one has no image."""
+    index = dr.arange(mi.UInt32, elements.count)
+    centre, _, scale = lens.blur_disc(elements.place(index, mi.Point2f(0.5))[0].p)
+    reach = dr.zeros(mi.Float, elements.count)
+    for corner in elements.corners:
+        there, _, side = lens.blur_disc(elements.place(index, mi.Point2f(*corner))[0].p)
+        reach = dr.maximum(reach, dr.select(side * scale > 0, dr.norm(there - centre), dr.inf))
+    return np.nan_to_num(reach.numpy().astype(np.float64), nan=np.inf, posinf=np.inf)

@@ -1,0 +1,164 @@
+"""Nodes over pupil and pixel: one or four at every pixel, twelve where the picture bends or four mislead."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from ..jit.batches import chunks
+from ..jit.pixel_grid import ROUNDING, parted
+from . import node_rules
+from .draft import Draft
+from .lines import NOTHING_SEEN, Sums, apply_rule
+from .shortcuts import Finding
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..jit.pixel_grid import Image, Mask
+
+BOTH = 4 + 12  # lines of sight a pixel, without which four must do
+POINT = 0.1  # of rtol: what the curvature of cos⁴θ over the pupil may make
+IN_PIXEL = 0.5  # blur radius that stays in the pixel
+SETTLED = 0.25  # of the tolerance: where the picture bends less, more nodes would change it by less than a tenth
+PASSED = 2.0  # times brighter than all lines of sight around saw is what they passed by
+TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
+MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
+# No difference between four and twelve nodes promises more than to shrink to the first; where it is as large as what
+# four were thought to be wrong by, both are but samples of something rough, and may agree by chance.
+LEAST_GAIN, ROUGH_GAIN = 0.5, 2.0
+
+
+def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
+    """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle on their own.
+
+    `light`: what surfaces are known to send to each pixel if they are in focus, to a factor of two.
+    """
+    grid = draft.grid
+    rule = node_rules.one() if _one_will_do(draft) else node_rules.four(draft.area)
+    seen = apply_nodes(draft, rule)
+    draft.value = dr.select(draft.open, seen.value, draft.known)
+    if len(rule) == 1 and (not dr.any(seen.value > 0) or dr.any(_passed_by(draft, grid.lanes(light)))):
+        rule = node_rules.four(draft.area)
+        seen = apply_nodes(draft, rule)
+    mx, my, draft.nearest = seen.x, seen.y, seen.nearest
+    draft.nodes = len(rule)
+    draft.set_hits(seen.hits)
+    draft.set_blur(seen.farthest)
+    draft.value = value = dr.select(draft.open, seen.value, draft.known)
+    # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
+    square = 16 * (mx * mx + my * my)
+    bend = dr.abs(seen.contrast) + dr.select(value > 0, square * square / (4 * value * value * value), 0)
+    neighbours = draft.area or len(rule) == 1  # tell how the picture bends
+    if neighbours:
+        xx, yy = grid.second_differences(value)
+        dr.eval(xx, yy)
+        xxxx, yyyy = grid.second_differences(xx)[0], grid.second_differences(yy)[1]
+        bend += (dr.abs(xxxx) + dr.abs(yyyy)) / 12
+        if len(rule) == 1:
+            more = node_rules.one_spread(xx + yy, draft.blur, draft.area)
+        else:
+            turn = node_rules.four_turn(grid.gradient(mx)[1] - grid.gradient(my)[0], xx + yy)
+            more = -grid.mean_where(turn, ~draft.outline, TURN_REACH)
+        draft.value = dr.maximum(value + dr.select(draft.hits > 1 - ROUNDING, more, 0), 0)
+    bend = grid.spread_max(bend)
+    draft.error = dr.maximum(bend, draft.cut_off())
+    tolerance = draft.tolerance
+    rough = (draft.error > tolerance) | (bend > SETTLED * tolerance)
+    dr.eval(draft.error, rough)
+    if (neighbours and min(grid.shape) < 3) or not draft.quadrature.takes("smooth"):
+        rough = grid.full(mi.Bool, True)
+    return (rough | _dark(draft)) & draft.open
+
+
+def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
+    """Twelve nodes over pupil and pixel on the rough pixels and their surroundings, and where four mislead.
+
+    Returns the pixels that twelve do not settle either. Four nodes cannot see all that they miss, so a lattice of
+    pixels is probed with twelve: what four were off by there counts for the pixels around.
+    """
+    rough = draft.grown(rough) & draft.open
+    dr.eval(rough)
+    smooth = int(dr.count(~rough & (draft.hits > 0))[0])
+    why = f"{smooth} of {len(draft.grid)} pixels looked at see the surface, smooth and no edge of it"
+    draft.findings.append(Finding("smooth", smooth > 0, why))
+    # What parts four nodes parts twelve, too: transects can begin at once.
+    begun = parted(draft.hits) & (draft.error > draft.tolerance) & dr.opaque(mi.Bool, transects_follow)
+    probes = draft.grid.lattice() & (draft.hits > 0) & ~rough & draft.open
+    draft.nodes = 12
+    difference = _refine(draft, (rough & ~begun) | probes)
+    doubt = draft.grid.spread_over_lattice(dr.select(probes, difference, 0))
+    draft.error = dr.select(rough, draft.error, dr.maximum(draft.error, doubt))
+    misled = ~rough & (draft.hits > 0) & (draft.error > draft.tolerance) & draft.open
+    dr.eval(draft.error, misled)
+    if dr.any(misled):
+        _refine(draft, misled & ~probes)
+    rough = rough | misled
+    return rough & (draft.grown(rough & (draft.error > draft.tolerance)) | _dark(draft))
+
+
+def _dark(draft: Draft) -> Mask:
+    """True while no line of sight of any pixel has met light, one lane: what glows is on the film, or may be."""
+    return ~dr.any(draft.value > 0)
+
+
+def _passed_by(draft: Draft, light: Image) -> Mask:
+    """Pixels on which surfaces shine, and far more than one line of sight saw there and around.
+
+    What is up to √2 pixels wide may lie between the lines.
+    """
+    least = dr.maximum(PASSED * draft.grid.spread_max(draft.value), draft.tolerance)
+    return draft.open & ~draft.beyond & (light > least)
+
+
+def _one_will_do(draft: Draft) -> bool:
+    """True where lines of sight differ over the pupil, if at all, like the picture over the pixel."""
+    lens, blur = draft.lens.optics, draft.window.blur
+    curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
+    will_do = curvature <= POINT * draft.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
+    lambert = all(getattr(emitter, "is_lambertian", bool)() for emitter in draft.view.scene.emitters())
+    taken = will_do and lambert and draft.quadrature.takes("one line")
+    why = f"cos⁴θ differs by {curvature:.1e} over the pupil, blur discs reach {blur:.2g} pixels"
+    why += "" if lambert else ", the radiance depends on direction"
+    draft.findings.append(Finding("one line", taken, why))
+    return taken
+
+
+def _refine(draft: Draft, where: Mask) -> Image:
+    """Twelve nodes on the marked pixels; returns how far the first ones were off there, 0 elsewhere."""
+    seen = apply_nodes(draft, node_rules.twelve(draft.area), where)
+    difference = dr.select(where, dr.abs(seen.value - draft.value), 0)
+    # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
+    gain = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
+    draft.value = dr.select(where, seen.value, draft.value)
+    draft.set_hits(dr.select(where, seen.hits, draft.hits))
+    draft.nearest = dr.minimum(draft.nearest, seen.nearest)
+    left = difference * dr.clip(gain, LEAST_GAIN, ROUGH_GAIN)
+    rough = dr.select(parted(seen.hits), 0, dr.maximum(left, difference))
+    rough, left = draft.grid.spread_all((rough, left))
+    draft.roughness = dr.maximum(draft.roughness, rough)
+    error = dr.maximum(left, draft.error / MOST_GAIN)
+    draft.error = dr.select(where, dr.maximum(error, draft.cut_off()), draft.error)
+    dr.eval(draft.value, draft.error, draft.roughness, draft.nearest, difference)
+    return difference
+
+
+def apply_nodes(draft: Draft, rule: node_rules.Rule, where: Mask | None = None) -> Sums:
+    """Images of what a rule sees from all or from the marked pixels, as if of nothing elsewhere."""
+    if where is None:
+        index = draft.grid.pixels()
+        images = Sums(*(dr.empty(mi.Float64, len(draft.grid)) for _ in NOTHING_SEEN))
+    else:
+        index = draft.grid.pixels(where)
+        images = Sums(*(draft.grid.full(mi.Float64, fill) for fill in NOTHING_SEEN))
+    for part in chunks(index):
+        seen = apply_rule(draft.view, draft.window.centres(part), rule)
+        for image, column in zip(vars(images).values(), vars(seen).values(), strict=True):
+            dr.scatter(image, mi.Float64(column), part)
+        dr.eval(images)
+    count = dr.width(index)
+    draft.count(f"{len(rule)} nodes", count, count * len(rule))
+    return images

@@ -1,0 +1,77 @@
+"""The pupil in the lens plane: the disc that lines of sight start on, and what a second border leaves open of it."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..jit.disc_segments import segment, segment_height
+from ..optics.thin_lens import Lens
+
+
+class Pupil:
+    """The discs of a lens plane as kernel parameters; a point of the pupil is one of the unit disc.
+
+    shift, radius : of the first disc, whose centre `shift`·x is seen from virtual point x [1, mm]; a pinhole's radius
+        is 0
+    """
+
+    def __init__(self, optics: Lens) -> None:
+        self.shift, self.radius = (dr.opaque(mi.Float, n) for n in (optics.discs[0].shift, optics.pupil_radius))
+        self._borders = [tuple(dr.opaque(mi.Float, n) for n in (d.shift, d.radius)) for d in optics.discs[1:]]
+
+    def on_lens(self, x: mi.Point2f, pupil: mi.Point2f) -> mi.Point2f:
+        """Point [mm] of the lens plane at which virtual point x sees a `pupil` point."""
+        return self.shift * x + self.radius * pupil
+
+    def passes(self, x: mi.Point2f, a: mi.Point2f) -> mi.Bool:
+        """True where the line through virtual point x and lens point a passes a second border (Eq. 5)."""
+        passes = mi.Bool(True)
+        for shift, radius in self._borders:
+            passes &= dr.squared_norm(a - shift * x) <= dr.square(radius)
+        return passes
+
+    def opened(self, x: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
+        """Pupil point that a second border leaves open to virtual point x, and the share of the pupil that is.
+
+        Even on the open part if `pupil` is on the disc, so that rules over the disc need not know of the border.
+        """
+        share = mi.Float(1)
+        for shift, radius in self._borders:
+            centre = (shift - self.shift) / self.radius * mi.Vector2f(x)
+            pupil, share = onto_overlap(pupil, centre, radius / self.radius)
+        return pupil, share
+
+
+def onto_overlap(point: mi.Point2f, centre: mi.Vector2f, radius: mi.Float) -> tuple[mi.Point2f, mi.Float]:
+    """Point of the overlap of the unit disc with the disc of `radius` about `centre`, for a `point` of the unit disc.
+
+    The map is continuous and preserves area but for the factor that comes back second, overlap over unit disc: no rule
+    over the disc has to know of a border. A chord at right angles to the line of centres goes to the chord with the
+    same share of area below it, a point of it to the point at the same share of its length. Below the height where the
+    circles meet the second disc bounds the overlap, above it the unit disc.
+    """
+    distance = dr.norm(centre)
+    up = dr.select(distance > 0, centre / distance, mi.Vector2f(1, 0))
+    meet = (dr.square(distance) + (1 - radius) * (1 + radius)) / (2 * distance)
+    meet = dr.select(distance <= radius - 1, -1, dr.select(distance <= 1 - radius, 1, dr.clip(meet, -1, 1)))
+    # Of a large disc the segment is a small share, which single precision would lose.
+    lower = mi.Float(dr.square(mi.Float64(radius)) * segment(mi.Float64((meet - distance) / radius)))
+    lower = dr.select(meet > -1, lower, 0)
+    area = lower + 1 - segment(meet)
+    height, across = dr.dot(point, up), dr.dot(point, turned(up))
+    below = segment(height) * area
+    low, high = segment_height(below / dr.square(radius)), -segment_height(area - below)
+    bounded = below < lower
+    half_chord = dr.select(bounded, radius * _half_chord(low), _half_chord(high))
+    across = dr.select(dr.abs(height) < 1, across / _half_chord(height), 0) * half_chord
+    return mi.Point2f(dr.select(bounded, distance + radius * low, high) * up + across * turned(up)), area
+
+
+def turned(v: mi.Vector2f) -> mi.Vector2f:
+    """`v` turned left by a right angle."""
+    return mi.Vector2f(-v.y, v.x)
+
+
+def _half_chord(height: mi.Float) -> mi.Float:
+    return dr.safe_sqrt(1 - dr.square(height))

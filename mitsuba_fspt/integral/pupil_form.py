@@ -1,0 +1,62 @@
+"""Eq. 9 in its pupil form: P = étendue · mean over pixel and pupil of cos⁴θ · L(first surface point on the line).
+
+A ladder of three rules. Four nodes over pupil and pixel serve every pixel, one where the pupil is as good as a point
+and blur stays in the pixel; where the picture bends, twelve; where the line of sight jumps (a silhouette, an occluder,
+an edge of J_n), transects: curves across the edge through pixel and pupil together. Along each the jumps are found by
+bisection and the pieces between them are integrated on their own, so that only what changes along the edge is left to
+sample.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..jit.batches import chunks
+from ..jit.pixel_grid import Grid
+from . import node_rules
+from .draft import Draft, open_share
+from .lines import View, apply_rule
+from .nodes import BOTH, first_nodes, twelve_nodes
+from .quadrature import Quadrature, Solution
+from .transects import integrate_by_transects
+from .window import Window, visible_window
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def solve(
+    view: View, window: Window, quadrature: Quadrature, light: NDArray[np.float64], known: Solution | None = None
+) -> Solution:
+    """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
+
+    Only pixels of the `window` are looked at, the others are dark. `light`: of surfaces as if in focus, see
+    `NarrowLight`. Where a partial solution is `known` no work is done, and what comes back is rough.
+    """
+    draft = Draft(view, window, quadrature, known)
+    rough = first_nodes(draft, light)
+    levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
+    if quadrature.max_nodes >= BOTH:
+        rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
+    if not levels:
+        draft.doubt(rough)
+    elif dr.any(rough):
+        integrate_by_transects(draft, rough, levels)
+    return draft.solution()
+
+
+def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
+    """Share of each pixel's lines of sight that meet a surface, by twelve of them; shape (h, w)."""
+    window = visible_window(scene, lens)
+    if 0 in window.shape:
+        return np.zeros(window.full)
+    grid, view = Grid(window.shape), View.of(scene, lens, window)
+    image = grid.full(mi.Float64, 0)
+    for part in chunks(grid.number):
+        hits = apply_rule(view, window.centres(part), node_rules.twelve(True)).hits
+        dr.scatter(image, mi.Float64(hits), part)
+    return window.expand(grid.array(image * open_share(lens, window, grid)))

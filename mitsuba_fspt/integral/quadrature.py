@@ -1,0 +1,94 @@
+"""The accuracy asked for and the picture that comes out: plain data between the integrator and its callers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.errors import SceneError
+from ..runtime.numbers import number, whole
+from .shortcuts import SHORTCUTS, Finding
+
+DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
+# That two rules agree says little about what both miss, and float32 tells lines of sight apart only so far: shares of
+# the tolerance and of the brightest pixel below which no error is said to be.
+LEAST_CLAIM, FLOAT32_FLOOR = 0.05, 2e-7
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """All accuracy knobs of the deterministic integral, each with the error it bounds.
+
+    rtol : absolute error of every pixel, relative to the brightest pixel; 0 < rtol < 1 (default 1e-3)
+    domain : 'pupil' (lines of sight from the pixel) or 'surface' (power spread from surface elements)
+    pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
+    max_nodes : lines of sight a pixel may take at most, four in any case (domain 'surface': on average, 256 in any
+        case); bounds the time, and where it is reached the error says so
+    shortcuts_off : names of `SHORTCUTS` that are not taken; they change no more than the error asked for
+    """
+
+    rtol: float = 1e-3
+    domain: str = "pupil"
+    pixel: str = "area"
+    max_nodes: int = 200_000
+    shortcuts_off: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rtol", number("fspt_integral: 'rtol'", self.rtol, SceneError, "1e-3"))
+        nodes = whole("fspt_integral: 'max_nodes'", self.max_nodes, SceneError, "200000")
+        object.__setattr__(self, "max_nodes", nodes)
+        if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
+            raise SceneError(f"fspt_integral: 'rtol' must be in (0, 1), got {self.rtol:g}. Give for example 1e-3.")
+        if self.domain not in DOMAINS:
+            raise SceneError(f"fspt_integral: 'domain' must be one of {', '.join(DOMAINS)}, got '{self.domain}'.")
+        if self.pixel not in PIXELS:
+            raise SceneError(f"fspt_integral: 'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
+        if self.max_nodes < 1:
+            raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 200000.")
+        if unknown := set(self.shortcuts_off) - set(SHORTCUTS):
+            raise SceneError(
+                f"fspt_integral: 'shortcuts_off' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}."
+            )
+
+    @property
+    def least_error(self) -> float:
+        """Share of the brightest pixel below which no error is said to be."""
+        return max(FLOAT32_FLOOR, LEAST_CLAIM * self.rtol)
+
+    def takes(self, shortcut: str) -> bool:
+        """True unless this one of `SHORTCUTS` is switched off."""
+        return shortcut not in self.shortcuts_off
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
+
+    `rays` counts the lines of sight of all pixels together, in the EXR header `nodes`; `levels` tells humans what each
+    rung of the refinement did.
+    A partial solution is the whole picture only on the pixels `where`. `findings`: what was left out, and why.
+    """
+
+    power: NDArray[np.float64]
+    error: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+    rays: int
+    levels: tuple[str, ...] = field(default=())
+    where: NDArray[np.bool_] = field(default_factory=lambda: np.ones((), bool))
+    findings: tuple[Finding, ...] = field(default=())
+
+    def completed_by(self, rest: Solution) -> Solution:
+        """This partial solution on its own pixels, `rest` elsewhere."""
+        planes = zip((self.power, self.error, self.coverage), (rest.power, rest.error, rest.coverage), strict=True)
+        power, error, coverage = (np.where(self.where, own, other) for own, other in planes)
+        return Solution(
+            power,
+            error,
+            coverage,
+            self.rays + rest.rays,
+            self.levels + rest.levels,
+            findings=self.findings + rest.findings,
+        )

@@ -1,0 +1,191 @@
+"""What a scene must be before anything is traced: float32 can tell its lengths and its light apart, something glows,
+J_n is sane, the camera stands outside, no surface lies in another."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..emission.elements import elements_of
+from ..jit.mesh_buffers import triangles
+from ..runtime.errors import ExitanceError, SceneError
+from ..runtime.plugin_types import is_lens, is_surface
+
+COARSEST = 0.1  # virtual pixels by which float32 may move a line of sight
+# W/mm² and W that leave room in float32 for the shares and the faint parts of a picture.
+EXITANCES, FAINTEST = (1e-32, 1e32), 1e-36
+STRETCH = 1e-4  # by which float32 may make lengths and right angles differ
+ROUNDING = 1e-6  # of float32, in sums of products
+PROBES = 1 << 10  # surface points of a shape at which another one is looked for
+LIFT = 1e-6  # of the largest coordinate: what lies no further before a surface cannot be told from it
+PARALLEL = 0.999  # cosine of normals: bodies that poke into each other meet, too, but at an angle
+
+
+def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
+    """Raise SceneError or ExitanceError where the scene cannot give a picture; the message says how to mend it."""
+    check_lens(sensor)
+    check_rounding(sensor)
+    if not scene.emitters():
+        raise SceneError("scene: nothing glows. Give a shape an emitter of type 'fspt_surface' with its 'exitance'.")
+    for emitter in scene.emitters():
+        if is_surface(emitter):
+            emitter.check()
+            check_range(emitter, sensor)
+            check_placement(emitter.get_shape())
+            with dr.suspend_grad():
+                check_alone(scene, emitter)
+    check_outside(scene, sensor)
+
+
+def check_lens(sensor: mi.Sensor) -> None:
+    """Raise SceneError unless the sensor is an `fspt_lens` with a film, OpticsError where it cannot exist."""
+    if not is_lens(sensor):
+        raise SceneError(
+            f"scene: the sensor is a {sensor.class_name()}, power on a pixel needs a lens. Use a sensor of type "
+            "'fspt_lens'."
+        )
+    if sensor.fault:  # the last update was refused
+        raise sensor.fault
+    width, height = (int(n) for n in sensor.film().crop_size())
+    if not (width and height):
+        raise SceneError(f"scene: the film has {width} x {height} pixels. Give it at least one.")
+
+
+def check_rounding(lens: mi.Sensor) -> None:
+    """Raise SceneError where float32 cannot tell the lines of sight of neighbouring pixels apart."""
+    if lens.rounding <= COARSEST:
+        return
+    side = lens.virtual_pitch
+    raise SceneError(
+        f"fspt_lens: single precision places lines of sight to {lens.rounding * side:.2g} mm, a pixel is {side:.2g} mm "
+        f"wide on the virtual detector plane and must be at least {1 / COARSEST:g} times that. Give a larger "
+        "'pixel_pitch' or, where the scene lies far from the world's origin, move it there."
+    )
+
+
+def check_surfaces_alone(scene: mi.Scene) -> None:
+    """Raise SceneError where light comes from beyond all surfaces: the integral counts that of surfaces."""
+    for emitter in scene.emitters():
+        if emitter.is_environment():
+            raise SceneError(
+                f"fspt_integral: emitter {emitter.class_name()} shines from beyond all surfaces, whose light alone is "
+                "counted. Leave it out, or render with method path."
+            )
+
+
+def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
+    """Raise ExitanceError where J_n or the power that comes of it leaves the range of float32."""
+    brightest = emitter.brightest
+    name = f"fspt_surface: 'exitance' of shape '{emitter.get_shape().id()}'"
+    if not EXITANCES[0] <= brightest <= EXITANCES[1]:
+        raise ExitanceError(
+            f"{name} reaches {brightest:.3g} W/mm², single precision needs {EXITANCES[0]:g} … {EXITANCES[1]:g}. Give "
+            "J_n on another scale and rescale the picture, which is linear in it."
+        )
+    power = brightest / math.pi * lens.etendue
+    if power < FAINTEST:
+        raise ExitanceError(
+            f"{name} reaches {brightest:.3g} W/mm², of which a pixel gets {power:.1g} W; single precision needs "
+            f"{FAINTEST:g}. Give larger pixels, a smaller f_number, or J_n on another scale."
+        )
+
+
+def check_placement(shape: mi.Shape) -> None:
+    """Raise SceneError where a sphere, cylinder or disk is not traced where its parameters say."""
+    kind = shape.class_name().lower()
+    if kind not in ("sphere", "cylinder", "disk"):
+        return
+    placement = mi.traverse(shape)["to_world"]
+    axes, back = (np.array(t.matrix, np.float64).reshape(4, 4)[:3, :3] for t in (placement, placement.inverse()))
+    # Mitsuba inverts each step of a transform by rule, a rotation by its transpose, whatever its axis.
+    if (np.abs(axes @ back - np.eye(3)) > STRETCH + ROUNDING * (np.abs(axes) @ np.abs(back))).any():
+        raise SceneError(
+            f"scene: 'to_world' of {kind} '{shape.id()}' is not undone by the inverse that Mitsuba traces with. Give "
+            "every rotation an axis of length 1, or a mesh."
+        )
+    if kind == "disk":
+        return
+    lengths = np.linalg.norm(axes, axis=0)
+    alike = lengths[: 3 if kind == "sphere" else 2]  # a cylinder is as long as it likes
+    cosines = axes.T @ axes / np.outer(lengths, lengths) - np.eye(3)
+    if np.ptp(alike) > STRETCH * alike.max() or np.abs(cosines).max() > STRETCH:
+        # Mitsuba traces it round, its parameters are not.
+        raise SceneError(
+            f"scene: 'to_world' of {kind} '{shape.id()}' stretches or shears it, which it cannot follow. Give a "
+            "rotation (about an axis of length 1), a translation and one scale, or a mesh."
+        )
+
+
+def check_alone(scene: mi.Scene, emitter: mi.Emitter) -> None:
+    """Raise SceneError where a second surface lies in this one: which of them is seen would be chance."""
+    shape = emitter.get_shape()
+    doubled = 0
+    if shape.is_mesh():
+        buffers = triangles(shape)
+        # Looked at once for as long as the mesh stays the same.
+        if [b.index for b in buffers] != [b.index for b in emitter.single_faces]:
+            doubled = _doubled_faces(*buffers)
+            emitter.single_faces = () if doubled else buffers
+    if doubled:
+        raise SceneError(
+            f"scene: shape '{shape.id()}' has {doubled} faces more than once, its light would count as often. Merge "
+            "them, for example with trimesh: mesh.update_faces(mesh.unique_faces())."
+        )
+    if len(scene.shapes()) < 2:
+        return
+    elements = elements_of(shape, PROBES)
+    count = min(elements.count, PROBES)
+    index = dr.arange(mi.UInt32, count) * (elements.count // count)
+    si, area = elements.place(index, mi.Point2f(0.5))
+    lift = LIFT * dr.max(dr.abs(si.p))
+    ray = mi.Ray3f(si.p + lift * si.n, -si.n)
+    ray.maxt = 2 * lift
+    met = scene.ray_intersect_preliminary(ray, active=area > 0)
+    near = met.is_valid() & (met.shape != mi.ShapePtr(shape))
+    if not dr.any(near):  # else only: what it is asks every shape of the scene
+        return
+    other = met.compute_surface_interaction(ray, active=near)
+    shared = near & (dr.dot(other.n, si.n) > PARALLEL)
+    if dr.any(shared):
+        second = other.shape[int(np.argmax(shared.numpy()))]
+        raise SceneError(
+            f"scene: shapes '{shape.id()}' and '{second.id()}' lie in the same place in part; which of them is seen "
+            "there would be chance. Move them apart or leave one out."
+        )
+
+
+def _doubled_faces(positions: mi.Float, faces: mi.UInt32) -> int:
+    """How many faces with an area have the same three corners, in any order, as one before."""
+    corner = positions.numpy().reshape(-1, 3) + np.float32(0)  # -0 becomes 0
+    face = faces.numpy().reshape(-1, 3)
+    # One number a place, alike for all vertices there; three of them add up to the face's, in any order.
+    number = np.zeros(len(corner), np.uint64)
+    for bits in corner.view(np.uint32).T:
+        number = (number ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+        number ^= number >> np.uint64(29)
+    number *= np.uint64(0xBF58476D1CE4E5B9)
+    number ^= number >> np.uint64(32)
+    keys = number[face[:, 0]] + number[face[:, 1]] + number[face[:, 2]]
+    order = np.argsort(keys)
+    again = order[1:][np.diff(keys[order]) == 0]
+    a, b, c = (corner[face[again, k]] for k in range(3))
+    return int((np.cross(b - a, c - a) != 0).any(axis=1).sum())
+
+
+def check_outside(scene: mi.Scene, lens: mi.Sensor) -> None:
+    """Raise SceneError where the lens centre is inside a closed surface: all around it shows its inward side."""
+    if not scene.bbox().contains(mi.ScalarPoint3f(lens.placement[3:12:4])):
+        return
+    directions = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], np.float32)
+    # Turned a little, so that no direction runs along the faces of an axis-aligned box.
+    rays = mi.Ray3f(lens.world_transform() @ mi.Point3f(0, 0, 0), dr.normalize(mi.Vector3f(directions.T + 0.1234)))
+    si = scene.ray_intersect(rays)
+    if dr.all(si.is_valid() & (dr.dot(si.n, rays.d) > 0)):
+        raise SceneError(
+            "fspt_lens: the lens stands inside the phantom, where it sees only dark inner sides. Move it out with "
+            "'to_world'."
+        )

@@ -1,0 +1,236 @@
+"""Eq. 9 in its surface form: P = ∫ L |cosθ_s| dS dΩ over the surface and over the pupil as a surface point sees it.
+
+The surface is cut into pieces, the pupil into M × M cells. What a piece sends through a cell is found along one line of
+sight and laid on the film where the image of the piece through the cell's middle lies: a polygon, shared out exactly
+among the pixels. Neighbours share the cells' middles, so that their images tile the film without gap or overlap, and
+all power lands, once. What makes the form stiff where pixels look for surface points, the blur disc that shrinks to
+nothing at z = u, is here only a small shift of images. Of a body smaller than its blur disc it is the other way round:
+there the cells, seen through the piece's middle, tile the disc.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..jit.pixel_grid import Grid
+from ..jit.spectra import scalar
+from .footprint import Canvas
+from .glow import CORNERS, Batch, Glow
+from .occlusion import hidden, hides_nothing
+from .quadrature import Quadrature, Solution
+from .shortcuts import Finding
+from .window import Window
+
+# Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second
+# level both pieces and cells are refined, or what one of them does wrong would pass for converged.
+FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
+BLURRED = 0.5  # of the blur radius: a piece of a small body that is smaller is sent as one point
+DARK_LINES = 4096  # lines of sight a pixel before one is dark that no light has reached: two levels may pass it by
+SAFETY = 3.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
+MEMORY = 0.4  # of what the level before was thought to leave may be left: two levels may agree by chance
+# No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
+# bits, and thousands of roundings on a pixel stay below 1e-9 of any but the faintest.
+HEADROOM, RESOLUTION, COVERAGE_QUANTUM = 2.0**4, 2.0**-56, 2.0**-50
+# Steps of a Kronecker sequence in four dimensions, 1/g … 1/g⁴ with g⁵ = g + 1, and from element to element (golden
+# ratio), in units of 2⁻³²: whole numbers, so that the sequence stays exact however long it gets.
+STEPS, STRIDE = (3679390609, 3152041523, 2700274807, 2313257605), 2654435769
+
+Image = NDArray[np.float64]
+
+
+def solve(
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    window: Window,
+    quadrature: Quadrature,
+    where: NDArray[np.bool_] | None = None,
+    least_peak: float = 0.0,
+) -> Solution:
+    """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
+
+    Only pixels of the `window` are looked at, the others are dark. With `where`, of its shape, only the pixels marked
+    there are the whole picture; 0 elsewhere. `least_peak`: mean radiance on film [W/mm²/sr] that the brightest pixel is
+    known to have at least.
+
+    `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
+    Coverage counts the lines of sight that meet a glowing surface, not those that meet a dark one. Raises SceneError
+    where an emitter has no surface.
+    """
+    return _Refinement(scene, lens, window, quadrature).run(where, least_peak)
+
+
+class _Refinement:
+    """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
+
+    def __init__(self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature) -> None:
+        self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
+        dark = quadrature.takes("dark")
+        self.glows = [Glow.seen(emitter, lens, window, quadrature.rtol, dark) for emitter in scene.emitters()]
+        self.value, self.error, self.hits = (np.zeros(self.window.shape) for _ in range(3))
+        self.peak = float(np.finfo(np.float32).tiny)
+        self.rays = 0
+        self.levels: list[str] = []
+
+    def run(self, where: NDArray[np.bool_] | None, least_peak: float) -> Solution:
+        # To look for what may hide is quicker for a few pixels than to make sure that nothing does.
+        self.hidden = where is not None or not self._hides_nothing()
+        shown = self.window.shown()
+        mark = where = shown if where is None else where
+        lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * FIRST_GROWTH)
+        if mark.any():
+            self.value, self.hits = (np.where(where, image, 0) for image in self._level(lines, mark))
+            self.glows = [glow.finer(self._tolerance(least_peak)) for glow in self.glows]
+        recent, grid = None, Grid(self.window.shape)
+        while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
+            value, hits = self._level(lines, mark)
+            change = np.where(mark, np.abs(value - self.value), 0)
+            recent, last = SAFETY * grid.array(grid.spread_max(grid.lanes(change))), recent
+            estimate = recent if last is None else np.maximum(recent, MEMORY * last)
+            # All elements with light on a marked pixel were refined: only there is the new picture whole.
+            self.error[mark], self.value[mark], self.hits[mark] = estimate[mark], value[mark], hits[mark]
+            mark = self.error > self._tolerance(least_peak)
+            mark = shown & (mark | where & (self.hits == 0) & (lines < DARK_LINES))
+        error = np.maximum(self.error, self.quadrature.least_error * self.window.brightest(self.value))
+        error[self.hits == 0] = self.error[self.hits == 0]
+        power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
+        coverage = self.window.expand(np.clip(self.hits, 0, 1))
+        known = self.window.expand(where.astype(np.float64)) > 0
+        return Solution(power, error, coverage, self.rays, tuple(self.levels), known, self._findings())
+
+    def _tolerance(self, least_peak: float) -> float:
+        """The error asked for [W/mm²/sr]."""
+        return self.quadrature.rtol * max(self.window.brightest(self.value), least_peak)
+
+    def _hides_nothing(self) -> bool:
+        return self.quadrature.takes("occlusion") and hides_nothing(self.scene)
+
+    def _findings(self) -> tuple[Finding, ...]:
+        dark, count = (sum(getattr(glow, name) for glow in self.glows) for name in ("dark", "count"))
+        seen = "one surface may hide another" if self.hidden else "one convex body hides nothing of itself"
+        return (
+            Finding("occlusion", not self.hidden, seen),
+            Finding("dark", dark > 0, f"{dark} of {count} elements are dark"),
+        )
+
+    def _level(self, lines: int, mark: NDArray[np.bool_]) -> list[Image]:
+        """Value and hits from all elements with light on a marked pixel, at so many lines of sight a pixel."""
+        while True:
+            quanta = (self.peak * RESOLUTION, COVERAGE_QUANTUM)
+            canvas = Canvas(self.window.shape, quanta, self.quadrature.pixel == "centre")
+            peak, rays = 0.0, 0
+            for glow in self.glows:
+                for batch in glow.batches(lines, mark):
+                    peak = max(peak, self._lay(canvas, batch))
+                    rays += int(batch.lines.sum())
+            self.rays += rays
+            if peak <= HEADROOM * self.peak:
+                break
+            self.peak = peak  # brighter than foreseen: once more in coarser steps
+        self.levels.append(f"{lines} lines a pixel: {np.count_nonzero(mark)} pixels, {rays} lines")
+        return canvas.pictures()
+
+    def _lay(self, canvas: Canvas, batch: Batch) -> float:
+        """Lay the light of a batch on the canvas, one line of sight a lane; the largest radiance it met."""
+        elements, lens = batch.glow.elements, self.lens
+        (index, cut, number), m = batch.lanes(), dr.opaque(mi.UInt32, batch.cells)
+        part, i, j = number // (m * m), number % m, number // m % m
+        within, aim = _strata(i, j, m, index * STRIDE + part)
+
+        # What is smooth comes from a piece's middle, by the midpoint rule: normals that differed from line to line
+        # would make a round body noisy. What may jump within a piece, J_n and what hides it, comes from spots all over.
+        middle, area = elements.place(index, mi.Point2f(*elements.middle), cut, part)
+        spot, _ = elements.place(index, within, cut, part)
+        _, lens_point, weight, cos_theta = lens.arrival(middle.p, mi.warp.square_to_uniform_disk_concentric(aim))
+        to_lens = dr.normalize(lens_point - middle.p)
+        cos_s = dr.dot(middle.n, to_lens)
+        active = (cos_s > 0) & (weight > 0)
+        if self.hidden:
+            active &= ~hidden(self.scene, spot.p, lens_point, active)
+        spot.sh_frame.n = spot.n  # not the normal that a mesh is shaded with
+        spot.initialize_sh_frame()
+        spot.wi = spot.to_local(_turned_along(to_lens, middle.n, spot.n))
+        radiance = dr.select(active, scalar(batch.glow.emitter.eval(spot, active)), 0)
+        # dΩ dS |cosθ_s| over A_vd A_pupil/u², that the film's value is a mean radiance whatever the lengths.
+        virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
+        cell = [_corner(i + x, j + y, m) for x, y in CORNERS]
+        etendue = dr.select(active, cos_s * weight * area * _area(cell) / (dr.pi * virtual_pixel), 0)
+
+        discs = {at: lens.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
+        origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.window.corner))
+        middle = _middle(i, j, m)
+        images = [centre - origin + radius * middle for centre, radius, _ in discs.values()]
+        # The image of a piece through the cell's middle or, where that is smaller than a cell's or a body's own blur
+        # disc holds all of it, of the cell through the piece's middle: either way what lies side by side, on the
+        # surface or on the pupil, lies side by side on the film.
+        share = 1 / len(elements.corners)
+        centre = sum((discs[at][0] for at in elements.corners), mi.Point2f(0)) * share - origin
+        radius = sum((discs[at][1] for at in elements.corners), mi.Float(0)) * share
+        least = dr.opaque(mi.Float, BLURRED**2 if batch.glow.small else 0)
+        blurred = _size(images) < dr.square(radius) * dr.maximum(dr.two_pi / dr.square(mi.Float(m)), least)
+        polygon = [dr.select(blurred, centre + radius * own, other) for own, other in zip(cell, images, strict=True)]
+        for _, _, scale in discs.values():  # no image where a piece reaches through the lens plane
+            active &= scale * discs[CORNERS[0]][2] > 0
+        lights = (mi.Float64(radiance) * mi.Float64(etendue), mi.Float64(etendue / dr.square(dr.square(cos_theta))))
+        canvas.lay(lights, polygon, active)
+        dr.eval(radiance, canvas.layers)
+        return float(dr.max(radiance)[0])
+
+
+def _turned_along(direction: mi.Vector3f, normal: mi.Normal3f, other: mi.Normal3f) -> mi.Vector3f:
+    """A direction turned the shortest way that takes one normal to the `other`: as slanted to that as it was."""
+    a, b = mi.Vector3f(normal), mi.Vector3f(other)
+    return direction - dr.dot(a + b, direction) / (1 + dr.dot(a, b)) * (a + b) + 2 * dr.dot(a, direction) * b
+
+
+def _strata(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, number: mi.UInt32) -> tuple[mi.Point2f, mi.Point2f]:
+    """Points of a piece and of the pupil, both in [0, 1]², for the line of sight through the pupil's cell (i, j).
+
+    The lines of a piece take each of its M × M parts and each cell of the pupil once: part = (turn + √-1) × cell
+    modulo M, as complex numbers, a lattice without short vectors in four dimensions. They lie off the middles,
+    differently in every piece `number`, and in turns opposite ways, so that what is linear is integrated exactly.
+    """
+    turn = 2 * mi.UInt32(dr.round(0.5 * dr.sqrt(mi.Float(m))))  # even: 1 + turn² has neither 2 nor 3 in common with M
+    strata = ((turn * i + (m - 1) * j) % m, (i + turn * j) % m, i, j)
+    way = dr.select((i + j) % 2 == 0, 1.0, -1.0)
+    off = [way * (mi.Float(number * step) * 2.0**-32 - 0.5) for step in STEPS]
+    x = [(mi.Float(stratum) + 0.5 + o) / mi.Float(m) for stratum, o in zip(strata, off, strict=True)]
+    return mi.Point2f(x[0], x[1]), mi.Point2f(x[2], x[3])
+
+
+def _middle(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32) -> mi.Point2f:
+    """Middle of the pupil's cell (i, j) in the unit disc, moved outwards for M middles to have the disc's blur.
+
+    Their mean r² would be ½ - 1/M², what a cell spreads around its middle is missing.
+    """
+    return _on_pupil(i, j, m, 0.5, 0.5) * dr.rsqrt(1 - 2 / dr.square(mi.Float(m)))
+
+
+def _corner(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32) -> mi.Point2f:
+    """Corner (i, j) of the pupil's cells in the unit disc, moved outwards for polygons to have the areas of rings.
+
+    The corners of ring k are those of a regular polygon of 8 k sides, but for its arcs as large as the disc inside.
+    """
+    half = mi.Int(m // 2)
+    ring = dr.maximum(dr.abs(mi.Int(i) - half), dr.abs(mi.Int(j) - half))
+    turn = dr.pi / (4 * mi.Float(dr.maximum(ring, 1)))
+    return _on_pupil(i, j, m, 0, 0) * dr.sqrt(turn / dr.sin(turn))
+
+
+def _on_pupil(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, x: float, y: float) -> mi.Point2f:
+    """Point (x, y) of [0, 1]² in the cell (i, j) of the pupil, in the unit disc."""
+    return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(mi.Float(i) + x, mi.Float(j) + y) / mi.Float(m))
+
+
+def _area(polygon: list[mi.Point2f]) -> mi.Float:
+    a, b, c, d = polygon
+    across, along = mi.Vector2f(c - a), mi.Vector2f(d - b)
+    return 0.5 * dr.abs(across.x * along.y - across.y * along.x)
+
+
+def _size(polygon: list[mi.Point2f]) -> mi.Float:
+    """The longer diagonal, squared."""
+    a, b, c, d = polygon
+    return dr.maximum(dr.squared_norm(c - a), dr.squared_norm(d - b))

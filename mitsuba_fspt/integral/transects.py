@@ -1,0 +1,277 @@
+"""Transects through pixel × pupil where the line of sight jumps: more of them until no pixel around moves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from ..jit.batches import chunks
+from ..jit.pixel_grid import ROUNDING, parted
+from . import node_rules
+from .draft import Draft
+from .jumps import integrate_transect
+from .nodes import apply_nodes
+from .transect import transect
+
+if TYPE_CHECKING:
+    from ..jit.pixel_grid import Image, Mask
+
+# Of the difference to nodes may be left in the first transects, and in nodes that no transect parts.
+FIRST_GAIN, NODES_GAIN = 0.2, 0.9
+LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be left
+# What transects that differ may be wrong by, in units of their deviation over their number: two; more of them, what a
+# trend explains taken off, for a kink may hide between them; by a sharp edge, over the root of their number once more.
+SPREAD, KINK, SLANT = 2.0, 6.0, 2.0
+UNSETTLED = 1.5  # times the tolerance: another level is needed, but not of the neighbours that doubt half of it
+DOUBT = 0.5  # of what a neighbour may be wrong by counts, unless it is by a sharp edge or one that it alone has met
+MISLED = 3.0  # times what was thought to be left, and beyond the tolerance: who moves so far had settled by chance
+BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
+STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
+CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
+LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
+DIM = 1e-5  # of the brightest pixel: less light says nothing of the edges of brighter bodies
+DARK_LEVELS = 3  # while no light is found anywhere
+FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
+SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
+
+
+def integrate_by_transects(draft: Draft, rough: Mask, levels: list[tuple[int, node_rules.AlongTransect]]) -> None:
+    """More transects each round on the pixels that the last round still moved, or moved a neighbour of."""
+    ladder = _Ladder(draft, rough)
+    for level, (count, along) in enumerate(levels):
+        if not dr.any(ladder.where):
+            break
+        ladder.climb(level, node_rules.transects(count), along)
+
+
+class _Ladder:
+    """Which pixels the next transects go to, and what is known of them.
+
+    where : pixels to look at
+    wanted : pixels that are shown, and those around that doubt them
+    edges : which way transects go
+    split : True where a transect met a jump
+    smooth : True where node rules may do as well
+    left : what the value may be wrong by, of every pixel on its own
+    count, means : of the last round, how many transects and what they found
+    """
+
+    def __init__(self, draft: Draft, rough: Mask) -> None:
+        self.draft, self.edges, self.wanted = draft, edges_of(draft), draft.wanted()
+        self.where = rough & self.wanted
+        self.split, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
+        self.left = draft.grid.full(mi.Float64, 0)
+        self.count = 0
+        self.means: Means | None = None
+
+    def climb(self, level: int, rule: node_rules.Transects, along: node_rules.AlongTransect) -> None:
+        """One round: values, what is left of the error, and whether a neighbour knows better."""
+        draft, where = self.draft, self.where
+        if self.means:
+            self.edges.learn(draft, self.means, self.split, across=level % 2 == 0)
+        self.means = means = apply_transects(draft, where, self.edges, rule, along)
+        # What hides light may be cut by outlines all over the pupil but where the light comes past it.
+        lit = means.value > dr.opaque(mi.Float64, DIM) * draft.peak
+        fresh = where & means.jumps & lit & ~self.split
+        self.split |= fresh
+        self.smooth = self.smooth & where & ~self.split
+        value, hits, scatter = means.value, means.hits, means.scatter
+        if 0 < level <= node_rules.SMOOTH_LEVELS and dr.any(self.smooth):
+            seen = apply_nodes(draft, node_rules.product(level, draft.area), self.smooth)
+            value, hits = dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.hits, hits)
+        moved = dr.abs(value - draft.value)
+        if level == 0:
+            left, unseen = self._first(fresh, moved, scatter, parted(hits))
+        else:
+            left, unseen = self._later(level, fresh, moved, scatter, len(rule))
+            self.smooth = self.smooth & (moved < BUMPY * value)
+        # Whose neighbour meets a jump at last, or was misled, may pass the same by and be as wrong as that one was:
+        # who met no jump, and who has settled.
+        unseen = dr.select((self.split & where) | ~draft.open, 0, unseen)
+        self.left = dr.select(where, left, self.left)
+        better = where if level else fresh  # where the first transects meet no jump nodes are
+        draft.value = dr.select(better, value, draft.value)
+        draft.set_hits(dr.select(better, hits, draft.hits))
+        known = self.split & ~fresh
+        draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, self._doubt(known)), draft.error), unseen)
+        tolerance = draft.tolerance
+        dark = (tolerance <= 0) & dr.opaque(mi.Bool, level + 1 < DARK_LEVELS)
+        self.where = (where | (unseen > 0)) & ((draft.error > tolerance) | dark) & self.wanted
+        self.count = len(rule)
+        dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, self.where)
+
+    def _unsettled(self, left: Image) -> Image:
+        """What is left, or so much that another level is needed."""
+        return dr.maximum(left, UNSETTLED * self.draft.tolerance)
+
+    def _doubt(self, known: Mask) -> Image:
+        """What pixels may be wrong by for all that neighbours know; `known`: which pixels know an edge themselves."""
+        near, edge = self.draft.grid.spread_all((self.left, dr.select(self.split, self.left, 0)))
+        doubt = dr.maximum(dr.opaque(mi.Float64, DOUBT) * near, dr.select(known, 0, edge))
+        return dr.select(self.edges.sharp, near, doubt)
+
+    def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Image, Image]:
+        """What may be left after the first transects, and what they pass by beside a jump.
+
+        That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
+        """
+        draft = self.draft
+        left = dr.maximum(FIRST_GAIN * moved, scatter)
+        left = dr.select(silhouette, left, self._unsettled(left))
+        missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, draft.roughness))
+        # Who is known from elsewhere takes no transects, and knows of the silhouette all the same.
+        return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh | (draft.outline & ~draft.open))
+
+    def _later(self, level: int, fresh: Mask, moved: Image, scatter: Image, count: int) -> tuple[Image, Image]:
+        """What may be left, and what neighbours of a jump that is met at last, or of who was misled, may be wrong by.
+
+        The less a level moved of what was left before the less is left, but lest two wrong values agree by chance no
+        less than the order of convergence grants. What was moved until now says nothing of a fresh jump.
+        """
+        before = self.left
+        change = dr.maximum(moved, before * dr.opaque(mi.Float64, (self.count / count) ** node_rules.TRANSECT_ORDER))
+        gain = dr.clip(dr.select(before > 0, MOST_GAIN * change / before, MOST_GAIN), LEAST_GAIN, MOST_GAIN)
+        left = dr.maximum(change * gain, scatter)
+        if level <= node_rules.SMOOTH_LEVELS:
+            # On what is smooth each step of the node rules gains more than it moves.
+            left = dr.select(self.smooth, STEP_GAIN * moved, left)
+        left = dr.select(fresh, self._unsettled(left), left)
+        misled = self.where & (moved > dr.maximum(dr.opaque(mi.Float64, MISLED) * before, self.draft.tolerance))
+        return left, self.draft.near_edge(dr.select(fresh | misled, moved, 0))
+
+
+# ---------------------------------------------------------------------- which way transects go
+
+
+@dataclass
+class Edges:
+    """Of the edge a pixel may see: `angle` across it, signed `blur` radius [pixels], whether it counts as `sharp`."""
+
+    angle: Image
+    blur: Image
+    sharp: Mask
+
+    def learn(self, draft: Draft, means: Means, split: Mask, across: bool = False) -> None:
+        """Blur of the edges that were met; pixels that see none are smooth, and none is sharp.
+
+        Whoever met none may see the tip of a neighbour's, and looks next towards where more or fewer lines hit; at
+        every other level `across` that, for what dark bodies leave of the light may lie beside all such transects.
+        """
+        grid, jumps = draft.grid, means.jumps
+        around = (means.blur, -means.blur, jumps, split | draft.outline)
+        ahead, behind, known, near = grid.spread_all(around)
+        blur = dr.select(jumps, means.blur, _most_blurred(ahead, -behind))
+        self.blur = dr.select(known & ~draft.stopped, blur, self.blur)
+        self.sharp = (dr.abs(self.blur) < SHARP) & near
+        x, y = grid.gradient(grid.box_sum(draft.hits, _around(draft)))
+        alike = dr.abs(x) + dr.abs(y) < ROUNDING
+        turn = dr.opaque(mi.Float64, math.pi / 2 if across else 0)
+        self.angle = dr.select(split | alike, self.angle, dr.atan2(y, x) + turn)
+        dr.eval(self.angle, self.blur, self.sharp)
+
+
+def _around(draft: Draft) -> int:
+    """From how far around a pixel learns which way its edge runs [pixels]."""
+    return 1 + math.ceil(draft.most_blur / 2)
+
+
+def _most_blurred(ahead: Image, behind: Image) -> Image:
+    """Of two signed blur radii the larger: between them, where neither edge is sharp, the mean may be."""
+    return dr.select(ahead > -behind, ahead, behind)
+
+
+def edges_of(draft: Draft) -> Edges:
+    """Across the change of the picture around, with the blur of what is nearest to the lens.
+
+    The image-plane stop is sharp.
+    """
+    grid = draft.grid
+    angle = grid.principal_angle(*grid.gradient(draft.value), _around(draft))
+    nearest = grid.spread_max(-draft.nearest)
+    # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
+    farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
+    nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
+    blur = dr.select(draft.stopped, 0, draft.lens.blur_radius(nearest))
+    return Edges(angle, blur, dr.abs(blur) < SHARP)
+
+
+# ---------------------------------------------------------------------- many transects in one launch
+
+
+@dataclass(frozen=True)
+class Means:
+    """Of each marked pixel mean radiance on film, share of hits, whether a transect is split by a jump.
+
+    scatter : what the value may be wrong by for all that the transects differ
+    blur : signed radius of the most blurred edge that a transect met, 0 where none did [pixels]
+    """
+
+    value: Image
+    hits: Image
+    jumps: Mask
+    scatter: Image
+    blur: Image
+
+
+def apply_transects(
+    draft: Draft, where: Mask, edges: Edges, rule: node_rules.Transects, along: node_rules.AlongTransect
+) -> Means:
+    """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
+    index = draft.grid.pixels(where)
+    images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
+    rays = 0
+    for part in chunks(index, len(rule)):
+        *sums, looks = _transect_sums(draft, part, edges, rule, along)
+        for image, column in zip(images, sums, strict=True):
+            dr.scatter(image, column, part)
+        dr.eval(images)
+        rays += int(dr.sum(looks)[0])
+    draft.count(f"{len(rule)} transects", dr.width(index), rays)
+    value, hits, squares, trend, split, blur = images
+    number = dr.opaque(mi.Float64, len(rule))
+    variance = squares - value * value
+    blurred = dr.opaque(mi.Float64, KINK if len(rule) > 2 else SPREAD) * dr.safe_sqrt(variance - trend) / number
+    # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
+    slant = SLANT * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
+    sharp = dr.maximum(slant, CORNER * value / (number * number))
+    return Means(value, hits, split > 0, dr.select(edges.sharp, sharp, blurred), blur)
+
+
+def _transect_sums(
+    draft: Draft, part: mi.UInt32, edges: Edges, rule: node_rules.Transects, along: node_rules.AlongTransect
+) -> list[Image]:
+    """Of each listed pixel means over its transects of value, hits, value squared, what of that is a trend; how many
+    a jump splits, and the blur of the most blurred edge; lines of sight taken.
+    """
+    count = dr.opaque(mi.UInt32, len(rule))
+    lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
+    pixel, number = dr.gather(mi.UInt32, part, lane // count), lane % count
+    angle, blur = (mi.Float(dr.gather(mi.Float64, image, pixel)) for image in (edges.angle, edges.blur))
+    sharp = dr.gather(mi.Bool, edges.sharp, pixel)
+    even, gauss = (
+        mi.Point3f(*(dr.gather(mi.Float, mi.Float(column), number) for column in place.T))
+        for place in (rule.sharp, rule.blurred)
+    )
+    weight, phase = (dr.gather(mi.Float, mi.Float(column), number) for column in (rule.weight, rule.phase))
+    weight = dr.select(sharp, dr.opaque(mi.Float, 1 / len(rule)), weight)
+    area = dr.opaque(mi.Float, float(draft.area))
+    place = dr.select(sharp, even, gauss)
+    curve = transect(draft.window.centres(pixel), angle, blur, place, area)
+    outline, least = mi.Float(2 * dr.max(draft.value)), mi.Float(LEAST_JUMP * draft.tolerance)
+    found = integrate_transect(draft.view, curve, phase, along, outline, least)
+    value, hits, jumps, depth, looks = (mi.Float64(column) for column in found)
+    share = mi.Float64(weight) * value
+    blur = dr.select(jumps > 0, draft.lens.blur_radius(dr.minimum(depth, FAR)), 0)
+    columns = [share, mi.Float64(weight) * hits, share * value, dr.minimum(jumps, 1), looks]
+    dr.eval(columns, blur)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
+    sums = [dr.block_sum(column, len(rule)) for column in columns]
+    trend = dr.zeros(mi.Float64, dr.width(part))
+    for polynomial in rule.trend:
+        trend += dr.square(dr.block_sum(share * dr.gather(mi.Float64, mi.Float64(polynomial), number), len(rule)))
+    ahead, behind = (dr.block_reduce(end, blur, len(rule)) for end in (dr.ReduceOp.Max, dr.ReduceOp.Min))
+    *sums, split, looks = sums
+    return [*sums, trend, split, _most_blurred(ahead, behind), looks]

@@ -1,0 +1,144 @@
+"""The effective virtual space (Eq. 4) on the film: the pixels whose lines of sight can meet the phantom at all."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.plugin_types import is_surface
+from .node_rules import GAP
+
+Boxes = tuple[tuple[float, ...], ...]
+
+MOST_RIM = 16  # pixels: no further is looked beyond the crop window for a silhouette that four nodes may miss
+
+
+@dataclass(frozen=True)
+class Window:
+    """Rectangle of pixels: `top`, `left` of its first one from that of the crop window, `shape` (h, w); `full` (h, w).
+
+    It may reach a rim of pixels beyond the crop window, which are computed but not shown: their neighbours inside have
+    to know of a silhouette there. `blur`: the largest radius of a blur disc of what glows [pixels].
+    """
+
+    top: int
+    left: int
+    shape: tuple[int, int]
+    full: tuple[int, int]
+    crop_offset: tuple[int, int]
+    blur: float
+
+    @property
+    def corner(self) -> tuple[int, int]:
+        """Film position (x, y) [pixels] of the first pixel's corner."""
+        return self.left + self.crop_offset[0], self.top + self.crop_offset[1]
+
+    @property
+    def inner(self) -> tuple[slice, slice]:
+        """Rows and columns of the crop window in this one; what is left is the rim."""
+        return self._common()[0]
+
+    @property
+    def count(self) -> int:
+        """Pixels of the crop window in this one."""
+        return math.prod(side.stop - side.start for side in self.inner)
+
+    def centres(self, number: mi.UInt32) -> mi.Point2f:
+        """Film positions [pixels] of the centres of the window's pixels of so much `number`, row by row."""
+        width = dr.opaque(mi.UInt32, self.shape[1])
+        left, top = (dr.opaque(mi.Float, n + 0.5) for n in self.corner)
+        return mi.Point2f(left + mi.Float(number % width), top + mi.Float(number // width))
+
+    def stopped(self, lens: mi.Sensor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Pixels (h, w) that lie inside the image-plane stop, and those that its border cuts."""
+        if math.isinf(lens.optics.seen_field):
+            return np.ones(self.shape, bool), np.zeros(self.shape, bool)
+        width, height = (int(n) for n in lens.film().size())
+        left, top = self.corner
+        x = np.abs(left + np.arange(self.shape[1]) + 0.5 - width / 2)
+        y = np.abs(top + np.arange(self.shape[0]) + 0.5 - height / 2)[:, None]
+        radius = lens.optics.seen_field / lens.virtual_pitch
+        inside = np.hypot(x + 0.5, y + 0.5) <= radius
+        return inside, ~inside & (np.hypot(np.maximum(x - 0.5, 0), np.maximum(y - 0.5, 0)) < radius)
+
+    def expand(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The crop window with `image` of this window in its place, 0 around it."""
+        whole = np.zeros(self.full)
+        here, there = self._common()
+        whole[there] = image[here]
+        return whole
+
+    def cut(self, image: NDArray[Any]) -> NDArray[Any]:
+        """This window's part of an image of the crop window, 0 beyond it."""
+        part = np.zeros(self.shape, image.dtype)
+        here, there = self._common()
+        part[here] = image[there]
+        return part
+
+    def shown(self) -> NDArray[np.bool_]:
+        """True (h, w) at pixels of the crop window, False on the rim."""
+        return self.cut(np.ones(self.full, bool))
+
+    def brightest(self, image: NDArray[np.float64]) -> float:
+        """Largest value of an image (h, w) that is shown, of all if those are 0."""
+        return float(image[self.inner].max(initial=0.0) or image.max(initial=0.0))
+
+    def _common(self) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+        """What both windows have, in this one and in the crop window."""
+        ends = [
+            (max(start, 0), max(min(start + size, most), max(start, 0)))
+            for start, size, most in zip((self.top, self.left), self.shape, self.full, strict=True)
+        ]
+        here = tuple(slice(a - start, b - start) for (a, b), start in zip(ends, (self.top, self.left), strict=True))
+        return here, tuple(slice(a, b) for a, b in ends)
+
+
+def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -> Window:
+    """Window of the pixels with a line of sight into the bounding box of what glows; all if it surrounds the lens.
+
+    Or all `everywhere`. Light of other emitters than `fspt_surface` can come from any surface of the scene.
+    """
+    return window_of(glowing_boxes(scene), lens, everywhere)
+
+
+def glowing_boxes(scene: mi.Scene) -> Boxes:
+    """Corners of the bounding boxes of what glows, as numbers: xyz of the lowest and of the highest."""
+    emitters = scene.emitters()
+    direct = all(is_surface(emitter) for emitter in emitters)
+    boxes = [emitter.bbox() for emitter in emitters] if direct else [scene.bbox()]
+    return tuple((*map(float, box.min), *map(float, box.max)) for box in boxes)
+
+
+def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False) -> Window:
+    """As `visible_window`. Perspective keeps straight lines straight, so that corners bound a box's blurred image."""
+    film = lens.film()
+    width, height = (int(n) for n in film.crop_size())
+    offset = (int(film.crop_offset()[0]), int(film.crop_offset()[1]))
+    ends = np.array(boxes, np.float64).reshape(-1, 2, 3)
+    points = np.array([ends[:, list(pick), range(3)] for pick in itertools.product((0, 1), repeat=3)]).reshape(-1, 3)
+    discs, radii = lens.film_discs(points)
+    blur = radii.max(initial=0.0)
+    low, high = (discs - radii).min(axis=0, initial=np.inf), (discs + radii).max(axis=0, initial=-np.inf)
+    if everywhere or not len(points):
+        low, high = np.full(2, -np.inf), np.full(2, np.inf)
+    middle, radius = 0.5 * np.array(film.size(), np.float64), lens.optics.seen_field / lens.virtual_pitch
+    low, high = np.maximum(low, middle - radius), np.minimum(high, middle + radius)
+    rim = 1 + math.ceil(min(GAP[4] * blur, MOST_RIM - 1))
+    # One pixel more than needed on each side keeps second differences and rounding inside.
+    (left, right), (top, bottom) = (
+        (
+            int(np.clip(np.floor(low[k]) - offset[k] - 1, -rim, size + rim)),
+            int(np.clip(np.ceil(high[k]) - offset[k] + 1, -rim, size + rim)),
+        )
+        for k, size in enumerate((width, height))
+    )
+    if left >= width or top >= height or right <= 0 or bottom <= 0:  # only the rim sees it
+        right, bottom = left, top
+    return Window(top, left, (max(0, bottom - top), max(0, right - left)), (height, width), offset, float(blur))

@@ -1,0 +1,59 @@
+"""What tissue does to light and where light comes from: media and sources."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ..runtime.errors import FluxError
+from .shapes import Shape
+
+LARGEST = 1e6  # 1/mm: a mean free path of 1 nm, far below a wavelength
+LARGEST_POWER = 1e30  # W
+
+
+@dataclass(frozen=True)
+class Medium:
+    """Absorption `mua` >= 0, reduced scattering `musp` > 0 [1/mm], both <= 1e6; relative refractive index `n` >= 1.
+
+    Raises
+    ------
+    FluxError : a number is out of its range.
+    """
+
+    mua: float
+    musp: float
+    n: float = 1.37
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.mua <= LARGEST:
+            raise FluxError(f"medium: 'mua' must be >= 0 and at most {LARGEST:g}, got {self.mua:g}. Give 1/mm.")
+        if not 0 < self.musp <= LARGEST:
+            raise FluxError(
+                f"medium: 'musp' must be > 0 and at most {LARGEST:g}, got {self.musp:g}. Give 1/mm; diffusion needs "
+                "scattering."
+            )
+        if not (math.isfinite(self.n) and self.n >= 1):
+            raise FluxError(f"medium: 'n' must be >= 1 and finite, got {self.n:g}. Give for example 1.37.")
+
+    @property
+    def diffusion(self) -> float:
+        """D = 1/(3 (µa + µs')) [mm]."""
+        return 1 / (3 * (self.mua + self.musp))
+
+
+@dataclass(frozen=True)
+class Source:
+    """Isotropic light of `power` [W] > 0 and <= 1e30, uniform over the `shape`.
+
+    Raises
+    ------
+    FluxError : the power is not positive, or above 1e30.
+    """
+
+    shape: Shape
+    power: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.power <= LARGEST_POWER:
+            raise FluxError(f"source: 'power' must be > 0 and at most {LARGEST_POWER:g}, got {self.power:g}. Give W.")

@@ -1,0 +1,155 @@
+"""Surface flux density J_n from the results of other codes: read, converted to W/mm², checked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..optics.boundary import boundary_a
+from ..runtime.errors import ExitanceError, FluxError
+from ..runtime.numbers import number
+from .formats import MeshLike, RawMesh, SurfaceValues, ValuesLike, read_mesh, surface_values
+from .formats.length_unit import millimetres
+from .phantom import UNIT, Phantom, require_finite, require_single, shares
+from .surface_mesh import closure, face_areas
+
+TISSUE_INDEX = 1.37
+
+
+def import_flux(
+    mesh: MeshLike,
+    values: ValuesLike | None = None,
+    *,
+    field: str | int | None = None,
+    per: str | None = None,
+    format: str = "auto",
+    length_unit: str = "mm",
+    a: str | float | None = None,
+    n: float | None = None,
+    clip: bool = False,
+    flip: bool = False,
+) -> Phantom:
+    """Phantom from a mesh and values on it, as other codes write them.
+
+    Parameters
+    ----------
+    mesh : a file, or arrays (points (V, 3), cells). Cells are triangles (F, 3) or tetrahedra (T, 4), whose
+        boundary becomes the surface; from 0, or from 1 with format 'mmc' or 'nirfast'.
+    values : one value for each vertex, triangle, tetrahedron or boundary face: a file or an array. None:
+        `mesh` has them.
+    field : which array, property or column holds them; of a table its name or its number from 1
+    per : 'vertex' or 'face', what the values stand on; needed where their number or name leaves that open
+    format : 'auto' (by the file's name) or one of `formats.FORMATS`
+    length_unit : 'mm', 'cm' or 'm', of the mesh **and** of its values: W per square of it. MMC's values are
+        the power of a face, whatever the unit.
+    a : the values are fluence, J_n = phi/(2A): A by 'robin', 'haskell' (see `boundary`), or the number
+        itself. None: they are J_n; NIRFAST's are fluence always, and A is its own 'robin' then.
+    n : refractive index of the tissue for A; None: what the file says, else 1.37
+    clip : set negative values to 0 and record their power
+    flip : turn all faces over
+
+    Raises
+    ------
+    FluxError : unreadable or contradictory input; a closed surface that shows inward; faces that contradict
+        each other.
+    ExitanceError : values that are NaN or infinite, negative without `clip`, or zero everywhere; J_n beyond
+        single precision.
+    BackendError : the format needs an optional package.
+    """
+    scale = millimetres(length_unit, "flux import")
+    if per not in (None, "vertex", "face"):
+        raise FluxError(f"flux import: 'per' must be vertex or face, got '{per}'.")
+    field = None if field is None else str(field)
+    n = None if n is None else number("flux import: 'n'", n, FluxError, "1.37")
+    raw = read_mesh(mesh, values, field, format)
+    found = surface_values(raw, field if values is None else None, per)
+    found = replace(found, vertices=found.vertices * scale, faces=found.faces[:, ::-1] if flip else found.faces)
+    require_finite(found.values, found.per)
+    source = raw.source if values is not None else f"{raw.source} '{found.name}'"
+    with np.errstate(over="ignore"):  # inf is refused next
+        exitance, provenance = _exitance(raw, found, scale, a, n)
+    require_single(exitance)
+    provenance = {"source": source, **provenance}
+    exitance, negatives, removed = _without_negatives(found, exitance, clip)
+    phantom = Phantom(found.vertices, found.faces, exitance, found.per, provenance, negatives, removed)
+    _require_outward(phantom, flip)
+    return phantom
+
+
+def _exitance(
+    raw: RawMesh, found: SurfaceValues, scale: float, a: str | float | None, n: float | None
+) -> tuple[NDArray[np.float64], dict[str, str]]:
+    """J_n [W/mm²] of the values as they stand in the file, and how it came about."""
+    if a is None and raw.quantity == "fluence":
+        a = "robin"
+    if n is not None and a not in ("robin", "haskell"):
+        raise FluxError(f"flux import: 'n' = {n:g} goes with 'a' = robin or haskell, got a = {a}. Leave it out.")
+    if raw.quantity == "power":
+        if a is not None:
+            raise FluxError(f"{raw.source}: is the power that leaves each face already, not fluence. Leave out --a.")
+        areas = face_areas(found.vertices, found.faces)
+        if (flat := (areas == 0) & (found.values != 0)).any():
+            raise FluxError(f"{raw.source}: {np.count_nonzero(flat)} faces without area carry power. Repair the mesh.")
+        return np.divide(found.values, areas, out=np.zeros_like(areas), where=areas > 0), {}
+    values = found.values / scale**2
+    if a is None:
+        return values, {}
+    factor, told = _boundary_factor(a, n, found, raw.source)
+    return values / (2 * factor), {"boundary_factor": told}
+
+
+def _boundary_factor(
+    a: str | float, n: float | None, found: SurfaceValues, source: str
+) -> tuple[float | NDArray[np.float64], str]:
+    """A, one for all or one for each value, and what to record of it."""
+    if n is None and found.index is not None and a in ("robin", "haskell"):
+        index = found.index if found.per == "vertex" else found.index[found.faces].mean(axis=1)
+        if np.isnan(index).any():
+            raise FluxError(f"{source}: its .param tells no refractive index n for A. Give --n.")
+    else:
+        index = np.array([TISSUE_INDEX if n is None else n])
+    indices, where = np.unique(index, return_inverse=True)
+    factors = np.array([boundary_a(a, float(value)) for value in indices])
+    told = " to ".join(f"{f:.6g}" for f in np.unique(factors[[0, -1]]))
+    if a in ("robin", "haskell"):
+        told += f" ({a}, n = {' to '.join(f'{i:.6g}' for i in np.unique(indices[[0, -1]]))})"
+    return (float(factors[0]) if len(factors) == 1 else factors[where.ravel()]), told
+
+
+def _require_outward(phantom: Phantom, flip: bool) -> None:
+    """Refuse faces that contradict each other, and a closed surface that shows inward: dark parts."""
+    shape = phantom.closure
+    if shape.twisted:
+        raise FluxError(
+            f"mesh: on {shape.twisted} edges the two faces show to opposite sides, each face must show "
+            "outward. Repair it, for example by trimesh.repair.fix_winding."
+        )
+    if shape.inside_out:
+        turned = closure(phantom.vertices, phantom.faces[:, ::-1])
+        if turned.outward:
+            mend = "Leave out" if flip else "Give"
+            raise FluxError(f"mesh: the closed surface is inside out, its light would stay inside. {mend} --flip.")
+        raise FluxError(
+            f"mesh: {shape.inside_out} of its {shape.pieces} closed pieces are inside out. Turn those over in the mesh."
+        )
+
+
+def _without_negatives(
+    found: SurfaceValues, exitance: NDArray[np.float64], clip: bool
+) -> tuple[NDArray[np.float64], int, float]:
+    """J_n >= 0, the number of values that were negative, and their power [W]."""
+    negative = exitance < 0
+    count = int(np.count_nonzero(negative))
+    if count == 0:
+        return exitance, 0, 0.0
+    power = shares(found.vertices, found.faces, found.per) * exitance
+    removed, kept = -float(power[negative].sum()), float(power[~negative].sum())
+    if not clip:
+        share = f" ({removed / kept:.3g} of the rest)" if kept > 0 else ""
+        raise ExitanceError(
+            f"exitance: {count} of {len(exitance)} values are negative, down to {exitance.min():.3g} "
+            f"{UNIT}; their power is {-removed:.3g} W{share}. J_n must be >= 0. Set them to 0 by --clip."
+        )
+    return np.where(negative, 0.0, exitance), count, removed

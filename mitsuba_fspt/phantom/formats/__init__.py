@@ -1,0 +1,108 @@
+"""Meshes with values from other codes: which reader takes which file, and what comes out of all of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...runtime.errors import FluxError
+from .meshio_files import FORMATS as MESHIO
+from .meshio_files import read_meshio
+from .mmc import mmc_mesh, read_mmc
+from .nirfast import nirfast_mesh, read_nirfast
+from .ply import read_ply
+from .raw import Field, RawMesh, SurfaceValues, surface_values
+from .surface_files import read_arrays, read_obj, read_off, read_trimesh
+from .table import column, read_values
+
+MeshLike = str | os.PathLike[str] | tuple[NDArray, NDArray]
+ValuesLike = str | os.PathLike[str] | NDArray
+
+READERS: dict[str, Callable[[Path], RawMesh]] = {
+    "nirfast": read_nirfast,
+    "meshio": read_meshio,
+    "trimesh": read_trimesh,
+    "ply": lambda path: read_ply(path)[0],
+    "obj": read_obj,
+    "off": read_off,
+    "npz": read_arrays,
+}
+FORMATS = ("auto", "mmc", *READERS)
+
+__all__ = [
+    "FORMATS",
+    "Field",
+    "MeshLike",
+    "RawMesh",
+    "SurfaceValues",
+    "ValuesLike",
+    "read_mesh",
+    "surface_values",
+]
+
+
+def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, format: str) -> RawMesh:
+    """The mesh of a file or of arrays (points, cells), with `values` as its only field where they are given.
+
+    Raises
+    ------
+    FluxError : an unknown format, or what the format's reader refuses.
+    """
+    if format not in FORMATS:
+        raise FluxError(f"flux import: 'format' must be one of {', '.join(FORMATS)}, got '{format}'.")
+    if isinstance(mesh, tuple):
+        return _from_arrays(mesh, values, field, format)
+    path = Path(mesh)
+    if not os.path.exists(path) and format != "nirfast":  # its name may come without a suffix
+        raise FluxError(f"mesh '{path}' does not exist. Check the name.")
+    if format == "auto":
+        format = _detect(path)
+    if format == "mmc":
+        if field is not None or isinstance(values, np.ndarray):
+            raise FluxError(f"MMC: '{path}' goes with a file SESSION_dref.dat and no field. Give --values.")
+        return read_mmc(path, None if values is None else Path(values))
+    raw = READERS[format](path)
+    return raw if values is None else _with_values(raw, values, field)
+
+
+def _detect(path: Path) -> str:
+    """The format of a file by its name."""
+    suffix = path.suffix.lower()
+    if suffix == ".dat" and path.name.startswith(("node_", "elem_")):
+        return "mmc"
+    if suffix in (".node", ".elem"):
+        return "nirfast"
+    if suffix in (".ply", ".obj", ".off", ".npz"):
+        return suffix[1:]
+    return "meshio" if suffix in MESHIO else "trimesh"
+
+
+def _from_arrays(mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field: str | None, format: str) -> RawMesh:
+    """Points and cells in memory; those of MMC and NIRFAST count from 1, all others from 0."""
+    points, cells = np.asarray(mesh[0], np.float64), np.asarray(mesh[1])
+    if values is None:
+        raise FluxError("flux import: a mesh in memory needs 'values'. Give one for each vertex or face.")
+    if format == "mmc":
+        if field is not None or not isinstance(values, np.ndarray):
+            raise FluxError("MMC: a mesh in memory has no fields. Give dref in memory, (faces, gates).")
+        return mmc_mesh(points, cells, values, "MMC dref")
+    if format == "nirfast":
+        return _with_values(nirfast_mesh(points, cells, "NIRFAST mesh"), values, field)
+    if format != "auto":
+        raise FluxError(f"flux import: format '{format}' reads files. Give auto, mmc or nirfast to a mesh in memory.")
+    return _with_values(RawMesh(points, cells, "arrays"), values, field)
+
+
+def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh:
+    """The mesh with these values in place of its own fields."""
+    if isinstance(values, (str, os.PathLike)):
+        name, array = Path(values).name, read_values(Path(values), field)
+    else:
+        name, array = "values", column(np.asarray(values), [], field, "values")
+    source = f"{raw.source} with {name}" + (f" '{field}'" if field else "")
+    return replace(raw, source=source, fields=(Field(name, array, None),))

@@ -1,0 +1,103 @@
+"""Meshes with point and cell data by meshio: VTU, legacy VTK, Gmsh, XDMF, MEDIT, Abaqus (extra `mesh`)."""
+
+from __future__ import annotations
+
+import re
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...runtime.errors import BackendError, FluxError
+from .gmsh import put_in_order
+from .raw import Field, RawMesh, scalars
+from .table import one_line, require_file
+
+FORMATS = {
+    ".vtu": "vtu",
+    ".vtk": "vtk",
+    ".msh": "gmsh",
+    ".xdmf": "xdmf",
+    ".xmf": "xdmf",
+    ".mesh": "medit",
+    ".inp": "abaqus",
+}
+# Cells and their number of corner nodes; the other nodes of second-order cells are passed over.
+TRIANGLES = {"triangle": 3, "triangle6": 3, "triangle7": 3}
+TETRAHEDRA = {"tetra": 4, "tetra10": 4}
+IGNORED = ("vertex", "line", "line3")
+LABELS = "gmsh:"  # meshio's names for what Gmsh numbers parts by
+
+
+def read_meshio(path: Path) -> RawMesh:
+    """Tetrahedra of the file, or else its triangles, with its scalar point and cell data.
+
+    Cell data of a file with both kinds is passed over; `source` says so.
+
+    Raises
+    ------
+    FluxError : the file cannot be read, or holds other cells than these.
+    BackendError : meshio is not installed, or h5py for an XDMF or MEDIT file with HDF5 data.
+    """
+    mesh = _load(path)
+    if path.suffix.lower() == ".vtu":
+        _require_one_piece(path)
+    kinds = {block.type for block in mesh.cells}
+    wanted = TETRAHEDRA if kinds & set(TETRAHEDRA) else TRIANGLES
+    other = kinds - set(TRIANGLES) - set(TETRAHEDRA) - set(IGNORED)
+    if other or not kinds & set(wanted):
+        listed = ", ".join(sorted(other or kinds)) or "no cells"
+        raise FluxError(f"'{path}' holds {listed}; triangles or tetrahedra are read. Split its cells first.")
+    if FORMATS.get(path.suffix.lower()) == "gmsh" and _has_values(mesh):
+        put_in_order(mesh, path)
+    blocks = [k for k, block in enumerate(mesh.cells) if block.type in wanted]
+    cells = np.concatenate([mesh.cells[k].data[:, : wanted[mesh.cells[k].type]] for k in blocks]).astype(np.int64)
+    fields = [Field(name, values, "vertex") for name, values in mesh.point_data.items()]
+    source = path.name
+    if kinds & set(TRIANGLES) and kinds & set(TETRAHEDRA):
+        # Which of the two carry the values? A guess could take the wrong ones.
+        source += " (its cell data passed over: both on triangles and on tetrahedra)"
+    else:
+        for name, data in mesh.cell_data.items():
+            if not name.startswith(LABELS):
+                fields.append(Field(name, np.concatenate([data[k] for k in blocks]), "cell"))
+    return RawMesh(np.asarray(mesh.points, np.float64), cells, source, scalars(fields))
+
+
+def _has_values(mesh: Any) -> bool:
+    """Whether there is more than labels."""
+    return not all(name.startswith(LABELS) for name in (*mesh.point_data, *mesh.cell_data))
+
+
+def _require_one_piece(path: Path) -> None:
+    """Refuse a VTU of several pieces: meshio takes the cells of the last one alone."""
+    pieces = len(re.findall(rb"<Piece[\s>/]", path.read_bytes()))
+    if pieces > 1:
+        raise FluxError(
+            f"'{path}' has {pieces} pieces, only one can be read. Save them as one, for example by ParaView."
+        )
+
+
+def _load(path: Path):
+    """meshio's mesh; what meshio prints or exits with becomes an error."""
+    try:
+        import meshio
+    except ImportError as cause:
+        raise BackendError(
+            f"flux import: meshio, which reads '{path.name}', is not installed. pip install 'mitsuba-fspt[mesh]'."
+        ) from cause
+    require_file(path)
+    said = StringIO()
+    try:
+        with redirect_stdout(said), redirect_stderr(said):
+            return meshio.read(path, file_format=FORMATS.get(path.suffix.lower()))
+    except ImportError as cause:
+        raise BackendError(
+            f"flux import: '{path.name}' needs {cause.name or 'h5py'}, which is not installed. "
+            f"pip install {cause.name or 'h5py'}."
+        ) from cause
+    except (Exception, SystemExit) as cause:  # a damaged file makes meshio's readers raise anything, or exit
+        reason = " ".join(said.getvalue().split()) or one_line(cause)
+        raise FluxError(f"'{path}' cannot be read by meshio: {reason[:200].rstrip('.')}. Save it anew.") from cause

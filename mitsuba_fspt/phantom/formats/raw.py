@@ -1,0 +1,177 @@
+"""What a file holds before it is a phantom: points, cells, fields; and the choice of one field."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...runtime.errors import FluxError
+from ..surface_mesh import Indices, Points, boundary, compact
+from .table import pick, quoted
+
+LABELS = "medit:"  # numbers of the parts of a mesh: good for media, never values
+
+
+@dataclass(frozen=True)
+class Field:
+    """Named values of shape (N,), one on each 'vertex', 'cell' (triangle or tetrahedron) or boundary 'face'.
+
+    `on` None leaves it to the number of values. `by_name`: never chosen but by its name.
+    """
+
+    name: str
+    values: NDArray
+    on: str | None
+    by_name: bool = False
+
+
+def scalars(fields: Iterable[Field]) -> tuple[Field, ...]:
+    """Those of the fields that hold one real number each, as shape (N,)."""
+    return tuple(
+        replace(f, values=f.values.ravel())
+        for f in fields
+        if f.values.dtype.kind in "fiu" and f.values.size == len(f.values)
+    )
+
+
+@dataclass(frozen=True)
+class RawMesh:
+    """Points (V, 3), cells (C, 3) triangles or (C, 4) tetrahedra that count from 0, and the file's fields.
+
+    quantity : what the values are: 'exitance' and 'fluence' [W per square of the file's length unit], or
+        'power', W of each face
+    point_order : False where the file has no vertices of its own, so that values cannot be in their order
+    index : the refractive index at the points (V,), where the file knows it; NaN where it should and does not
+    """
+
+    points: Points
+    cells: Indices
+    source: str
+    fields: tuple[Field, ...] = ()
+    quantity: str = "exitance"
+    point_order: bool = True
+    index: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        points, cells = self.points, self.cells
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+            raise FluxError(f"{self.source}: vertices must have shape (V, 3), got {points.shape}. Give x, y and z.")
+        if cells.ndim != 2 or cells.shape[1] not in (3, 4) or len(cells) == 0:
+            raise FluxError(
+                f"{self.source}: cells must be triangles (F, 3) or tetrahedra (T, 4), got shape {cells.shape}. "
+                "Split other cells."
+            )
+        if cells.dtype.kind not in "iu":
+            raise FluxError(f"{self.source}: cells must be integers, got {cells.dtype}. Give numbers of vertices.")
+        object.__setattr__(self, "points", points.astype(np.float64))
+        object.__setattr__(self, "cells", cells.astype(np.int64))
+        if cells.min() < 0 or cells.max() >= len(points):
+            raise FluxError(
+                f"{self.source}: cells name vertices {cells.min()} to {cells.max()} (counted from 0), there "
+                f"are {len(points)}. Is the mesh complete, does it count from 0 or from 1?"
+            )
+        if not np.isfinite(points).all() and not np.isfinite(points[cells]).all():
+            raise FluxError(f"{self.source}: vertices of cells must be finite, some are NaN or inf. Mend the mesh.")
+
+
+@dataclass(frozen=True)
+class SurfaceValues:
+    """Values on a triangle surface, per 'vertex' (V,) or per 'face' (F,), in the file's units.
+
+    index : the refractive index at its vertices (V,), where the file knows it
+    """
+
+    vertices: Points
+    faces: Indices
+    values: NDArray[np.float64]
+    per: str
+    name: str
+    index: NDArray[np.float64] | None
+
+
+def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceValues:
+    """The surface of `mesh` (of tetrahedra their boundary, outward) with the chosen field on it.
+
+    `name` chooses the field, `per` ('vertex' or 'face') where name or number leave it open.
+
+    Raises
+    ------
+    FluxError : no or several fields fit, or the number of values fits nothing.
+    """
+    if mesh.cells.shape[1] == 4:
+        faces, owner = boundary(mesh.points, mesh.cells)
+    else:
+        faces, owner = mesh.cells, np.arange(len(mesh.cells))
+    chosen = _choose(mesh, name, per)
+    on = chosen.on or _place(chosen, mesh, len(faces), per)
+    vertices, faces, kept = compact(mesh.points, faces)
+    if on == "vertex":
+        if not mesh.point_order:
+            raise FluxError(
+                f"{mesh.source}: an STL file has no vertices in an order, so that values per vertex fit "
+                "nothing. Give values per face, or the mesh as PLY or OBJ."
+            )
+        values = chosen.values[kept]
+    else:
+        values = chosen.values if on == "face" else chosen.values[owner]
+    per = "vertex" if on == "vertex" else "face"
+    index = None if mesh.index is None else mesh.index[kept]
+    return SurfaceValues(vertices, faces, values.astype(np.float64), per, chosen.name, index)
+
+
+def _choose(mesh: RawMesh, name: str | None, per: str | None) -> Field:
+    """The one field of that name; without a name the only one of real numbers: whole ones label something."""
+    fields = [f for f in mesh.fields if not f.name.startswith(LABELS)]
+    fitting = [f for f in fields if per is None or f.on is None or (f.on == "vertex") == (per == "vertex")]
+    if fields and not fitting:
+        stand = "vertices" if per == "face" else "faces"
+        raise FluxError(f"{mesh.source}: its values stand on {stand}, not per {per}. Leave out --per.")
+    names = {f.name: f.values for f in fitting}
+    if name is None:
+        real = {f.name: f.values for f in fitting if f.values.dtype.kind == "f" and not f.by_name}
+        if names and not real:
+            raise FluxError(
+                f"{mesh.source}: which field holds the values? All it has are whole numbers or texture coordinates: "
+                f"{quoted(names)}. Choose one by --field NAME, or give --values FILE."
+            )
+        name = pick(real, None, mesh.source)
+    else:  # a PLY property jn_x is Mitsuba's attribute jn
+        name = pick(names, f"{name}_x" if name not in names and f"{name}_x" in names else name, mesh.source)
+    same = [f for f in fitting if f.name == name]
+    if len(same) > 1:
+        raise FluxError(
+            f"{mesh.source}: '{name}' stands on vertices and on faces. Choose by --per vertex or --per face."
+        )
+    return same[0]
+
+
+def _place(chosen: Field, mesh: RawMesh, faces: int, per: str | None) -> str:
+    """Where values stand, by their number: 'vertex', 'face' or 'cell'."""
+    counts = {"vertex": len(mesh.points), "face": faces, "cell": len(mesh.cells)}
+    if mesh.cells.shape[1] == 3:
+        del counts["cell"]
+    count = len(chosen.values)
+    places = [
+        place
+        for place, there_are in counts.items()
+        if there_are == count and (per is None or (place == "vertex") == (per == "vertex"))
+    ]
+    if len(places) == 1:
+        return places[0]
+    if per == "face" and places:  # as many tetrahedra as boundary faces
+        return "face"
+    names = {
+        "vertex": "vertices",
+        "face": "faces" if len(counts) == 2 else "boundary faces",
+        "cell": "tetrahedra",
+    }
+    listed = ", ".join(f"{there_are} {names[place]}" for place, there_are in counts.items())
+    if places:
+        raise FluxError(f"{chosen.name}: {count} values fit {' and '.join(names[p] for p in places)}. Give --per.")
+    asked = f" (asked for per {per})" if per else ""
+    raise FluxError(
+        f"{chosen.name}: {count} values fit nothing{asked}, {mesh.source} has {listed}. Give one value for each."
+    )

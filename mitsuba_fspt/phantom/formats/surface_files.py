@@ -1,0 +1,159 @@
+"""Surface meshes: `.npz`, OBJ, OFF, and what trimesh loads (STL, GLB, ...), with the fields they carry."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...runtime.errors import BackendError, FluxError
+from ..surface_mesh import merge
+from .raw import Field, RawMesh, scalars
+from .table import one_line, read_npz, require_file
+
+if TYPE_CHECKING:
+    import trimesh
+
+# What trimesh reads by itself; other kinds it would pass on to meshio.
+KINDS = ("stl", "off", "glb", "gltf", "3mf", "dae", "zae", "3dxml", "xaml", "ctm", "step", "stp")
+
+
+def read_arrays(path: Path) -> RawMesh:
+    """A `.npz` with `vertices` (V, 3), `faces` (F, 3) or `tetrahedra` (T, 4) from 0, and fields of any name.
+
+    `vertices_mm` goes for `vertices`, and so on: the words may have a suffix.
+    """
+    arrays = read_npz(path)
+    points = _named(arrays, ("vertices", "nodes"), path)
+    cells = _named(arrays, ("faces", "tetrahedra"), path)
+    fields = tuple(
+        Field(name, values, None)
+        for name, values in arrays.items()
+        if values.dtype.kind in "fiu" and values.shape in (points.shape[:1], cells.shape[:1])
+    )
+    return RawMesh(points.astype(np.float64), cells, path.name, fields)
+
+
+def _named(arrays: dict[str, NDArray], words: tuple[str, ...], path: Path) -> NDArray:
+    """The one array of two axes whose name is a word or starts with it and an underscore."""
+    fitting = [n for n, a in arrays.items() if a.ndim == 2 and any(n == w or n.startswith(f"{w}_") for w in words)]
+    if len(fitting) != 1:
+        listed = ", ".join(f"'{name}' {array.shape}" for name, array in arrays.items())
+        raise FluxError(f"'{path}' must have one array named {' or '.join(words)}, of two axes. It has {listed}.")
+    return arrays[fitting[0]]
+
+
+def read_obj(path: Path) -> RawMesh:
+    """Vertices and triangles of an OBJ in the order of its lines, which values beside it count on.
+
+    Normals, texture coordinates and materials are passed over: loaders that make use of them split and sort
+    the vertices.
+    """
+    try:
+        text = path.read_bytes()
+    except OSError as cause:
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
+    vertices = re.findall(rb"^[ \t]*v[ \t]+([^\r\n]*)", text, re.MULTILINE)
+    faces = re.sub(rb"/\S*", b"", b"\n".join(re.findall(rb"^[ \t]*f[ \t]+([^\r\n]*)", text, re.MULTILINE)))
+    if not vertices or not faces:
+        raise FluxError(f"'{path}' has no vertices or no faces. Give an OBJ with lines v and f.")
+    try:
+        points = np.loadtxt([line.decode("ascii") for line in vertices], ndmin=2, usecols=(0, 1, 2))
+        cells = np.loadtxt(faces.decode("ascii").split("\n"), ndmin=2, dtype=np.int64)
+    except ValueError as cause:  # not a number, or faces with different numbers of corners
+        raise FluxError(f"'{path}' is not an OBJ of triangles: {one_line(cause)}. Triangulate it first.") from cause
+    if cells.shape[1] != 3 or cells.min() < 1:
+        what = f"{cells.shape[1]} corners a face" if cells.shape[1] != 3 else "relative vertex numbers"
+        raise FluxError(f"'{path}' has {what}. Save it with triangles and vertices numbered from 1.")
+    return RawMesh(points, cells - 1, path.name)
+
+
+def read_off(path: Path) -> RawMesh:
+    """Vertices and triangles of an OFF in its order; one with more in it (colours, polygons) as trimesh loads it."""
+    return _plain_off(path) or read_trimesh(path)
+
+
+def _plain_off(path: Path) -> RawMesh | None:
+    """An OFF that holds nothing but points and triangles, which trimesh reads line by line, many times slower."""
+    try:
+        text = re.sub(rb"#[^\r\n]*", b"", path.read_bytes()).lstrip()
+    except OSError as cause:
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # what NumPy gives where a word is no number
+            numbers = np.fromstring(text[3:], sep=" ")
+    except (DeprecationWarning, ValueError):
+        return None
+    if not re.match(rb"OFF\s", text) or len(numbers) < 3:
+        return None
+    points, triangles = (int(n) if 0 < n < len(numbers) else 0 for n in numbers[:2])
+    if not triangles or len(numbers) != 3 + 3 * points + 4 * triangles:
+        return None
+    cells = numbers[3 + 3 * points :].reshape(-1, 4)
+    if not np.array_equal(cells, np.floor(cells)) or (cells[:, 0] != 3).any():
+        return None
+    return RawMesh(numbers[3 : 3 + 3 * points].reshape(-1, 3), cells[:, 1:].astype(np.int64), path.name)
+
+
+def read_trimesh(path: Path) -> RawMesh:
+    """A mesh that trimesh loads, unchanged in order, with its scalar fields on vertices and faces.
+
+    The corners of an STL are merged where they are equal; its faces keep their order.
+
+    Raises
+    ------
+    FluxError : trimesh does not know the format or cannot read the file, or finds no triangles in it.
+    BackendError : the format needs a package that is not installed.
+    """
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in KINDS:
+        raise FluxError(
+            f"'{path}': no reader for '.{kind}'. Known: .ply .stl .obj .off .glb .npz .vtu .vtk .msh .xdmf "
+            ".mesh .inp, node_ID.dat (MMC), .node (NIRFAST). Convert it, or choose one by --format."
+        )
+    loaded = load_triangles(path, kind)
+    points, cells = np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)
+    if kind == "stl":
+        points, cells = merge(points, cells)
+        return RawMesh(points, cells, path.name, point_order=False)
+    return RawMesh(points, cells, path.name, _fields(loaded))
+
+
+def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
+    """trimesh's mesh of a file, its vertices and faces as they are.
+
+    Raises
+    ------
+    FluxError : the file cannot be read, or has no faces.
+    BackendError : its format needs a package that is not installed.
+    """
+    import trimesh  # takes longer to load than most meshes
+
+    require_file(path)
+    try:
+        mesh = trimesh.load_scene(path, process=False, **options).to_mesh()
+        count = len(mesh.faces)
+    except OSError as cause:
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
+    except ImportError as cause:
+        raise BackendError(
+            f"'{path}' as .{kind} needs a package that is not installed: {one_line(cause)}. Install it by pip, or save "
+            "the mesh anew, as .ply."
+        ) from cause
+    except Exception as cause:  # a damaged file makes trimesh's loaders raise anything
+        raise FluxError(f"'{path}' cannot be read as .{kind}: {one_line(cause)}. Is the file damaged?") from cause
+    if count == 0:
+        raise FluxError(f"'{path}' holds no triangles, only points or lines. Give a surface mesh.")
+    return mesh
+
+
+def _fields(mesh: trimesh.Trimesh) -> tuple[Field, ...]:
+    """Scalar attributes on the vertices and faces."""
+    on_vertices = [Field(name, np.asarray(v), "vertex") for name, v in mesh.vertex_attributes.items()]
+    on_faces = [Field(name, np.asarray(v), "cell") for name, v in mesh.face_attributes.items()]
+    return scalars(on_vertices + on_faces)

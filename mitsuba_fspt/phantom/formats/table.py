@@ -1,0 +1,223 @@
+"""Files of bare values, one per vertex or per face: text (CSV, TSV, spaces), NumPy and MATLAB arrays."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from io import StringIO
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...runtime.errors import BackendError, FluxError
+
+
+def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
+    """The values of a file as shape (N,), in its order.
+
+    `field` chooses where there are several: a column by its name in the header line or by its number from 1,
+    an array of an `.npz` or a variable of a `.mat` by its name. Text may have comments (#), a header line,
+    and commas, semicolons, tabs or spaces between its columns.
+
+    Raises
+    ------
+    FluxError : the file cannot be read, or holds several columns or arrays and `field` names none of them.
+    BackendError : a `.mat` file without SciPy.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        array = _load_numpy(path)
+        if not isinstance(array, np.ndarray):
+            raise FluxError(f"'{path}' holds several arrays. Name such a file .npz.")
+        return column(array, [], field, str(path))
+    if suffix in (".npz", ".mat"):
+        arrays = read_npz(path) if suffix == ".npz" else _read_mat(path)
+        numbers = {name: array for name, array in arrays.items() if array.dtype.kind in "fiuc"}
+        name, _, number = (field or "").partition(":")  # `phi:2` is column 2 of phi
+        name = pick(numbers, name or None, str(path))
+        return column(numbers[name], [], number or None, f"{path} '{name}'")
+    table, names = read_table(path)
+    return column(table, names, field, str(path))
+
+
+def pick(candidates: dict[str, NDArray], field: str | None, where: str) -> str:
+    """The name asked for; without one, `exitance`, or the only candidate.
+
+    Raises
+    ------
+    FluxError : no such name, none at all, or several; the message lists them.
+    """
+    if field is not None:
+        if field not in candidates:
+            raise FluxError(f"{where}: there is no field '{field}'. Fields it has: {quoted(candidates)}.")
+        return field
+    for name in ("exitance", "exitance_x"):
+        if name in candidates:
+            return name
+    if len(candidates) != 1:
+        mend = "Choose one by --field NAME." if candidates else "Give the values by --values FILE."
+        raise FluxError(f"{where}: which field holds the values? Fields it has: {quoted(candidates)}. {mend}")
+    return next(iter(candidates))
+
+
+def quoted(names: Iterable[str]) -> str:
+    """The names in quotes."""
+    return ", ".join(f"'{name}'" for name in names) or "none"
+
+
+def column(array: NDArray, names: list[str], field: str | None, where: str) -> NDArray[np.float64]:
+    """One column of `array` as float64 of shape (N,); `field` is its name in `names` or its number from 1.
+
+    Raises
+    ------
+    FluxError : not real numbers, more than two axes, several columns and no `field`, or no such column.
+    """
+    if array.dtype.kind not in "fiu":
+        kind = "complex numbers" if array.dtype.kind == "c" else f"of type {array.dtype}"
+        raise FluxError(f"{where}: values must be real numbers, these are {kind}. Save their amplitude.")
+    if array.ndim == 2 and array.shape[0] == 1 and field is None and not names:
+        array = array.T
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2:
+        raise FluxError(f"{where}: values must have shape (N,) or (N, columns), got {array.shape}. Reshape them.")
+    count = array.shape[1]
+    if field is None and count == 1:
+        return array[:, 0].astype(np.float64)
+    labels = names or [str(k + 1) for k in range(count)]
+    if field is not None and (same := labels.count(field)) > 1:
+        raise FluxError(f"{where}: {same} columns are named '{field}'. Choose one by its number.")
+    if field in labels:
+        return array[:, labels.index(field)].astype(np.float64)
+    if field is not None and re.fullmatch(r"\d+", field) and 1 <= int(field) <= count:
+        return array[:, int(field) - 1].astype(np.float64)
+    asked = "which of" if field is None else f"there is no column '{field}' among"
+    raise FluxError(
+        f"{where}: {asked} its {count} columns? Choose one by --field, by name or number: {quoted(labels[:20])}."
+    )
+
+
+def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], list[str]]:
+    """A text table: numbers of shape (rows, columns), and the names in its header line, if it has one.
+
+    Raises
+    ------
+    FluxError : the file is missing, empty, binary, or a line does not fit; the message names the line.
+    """
+    text = _text(path)
+    names, delimiter, skip = _layout(text, skip_lines)
+    if skip is None:
+        raise FluxError(f"'{path}' holds no values. Give one number a line.")
+    try:
+        table = np.loadtxt(StringIO(text), delimiter=delimiter, skiprows=skip, ndmin=2)
+    except ValueError as cause:
+        raise FluxError(f"'{path}' is not a table of numbers: {one_line(cause)}. Mend that line.") from cause
+    return table, names if len(names) == table.shape[1] else []
+
+
+def _text(path: Path) -> str:
+    """What stands in a text file, read once: a pipe holds it only once."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as cause:
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise FluxError(f"'{path}' is binary, a text table was expected. Save it as text.")
+    return text
+
+
+def _layout(text: str, skip_lines: int) -> tuple[list[str], str | None, int | None]:
+    """Column names ([]: no header), delimiter (None: blanks), number of lines above the first numbers (None: none)."""
+    header = ""
+    for number, line in enumerate(map(str.strip, StringIO(text))):
+        if number < skip_lines or not line:
+            continue
+        headed = bool(header) and not header.startswith("#")
+        if line.startswith("#") or not (headed or _is_numeric(line)):
+            header = line
+            continue
+        delimiter = next((mark for mark in ",;\t" if mark in line), None)
+        names = [name.strip(' "') for name in header.lstrip("# ").split(delimiter)] if header else []
+        return names, delimiter, number
+    return [], None, None
+
+
+def _is_numeric(line: str) -> bool:
+    """Whether a line holds numbers (or nothing) between its delimiters."""
+    try:
+        _ = [float(token) for token in re.split(r"[,;\t]|\s+", line) if token.strip()]
+    except ValueError:
+        return False
+    return True
+
+
+def read_npz(path: Path) -> dict[str, NDArray]:
+    """The arrays of an `.npz` file by name.
+
+    Raises
+    ------
+    FluxError : the file cannot be read or is none.
+    """
+    loaded = _load_numpy(path)
+    if isinstance(loaded, np.ndarray):
+        raise FluxError(f"'{path}' holds one array without a name. Name such a file .npy.")
+    return loaded
+
+
+def _load_numpy(path: Path) -> NDArray | dict[str, NDArray]:
+    """The array of a `.npy` or those of a `.npz`, whichever the file is."""
+    try:
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
+    except OSError as cause:
+        raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
+    except (ValueError, EOFError, BadZipFile) as cause:
+        raise FluxError(
+            f"'{path}' cannot be read as a NumPy file: {one_line(cause)}. Save it anew by numpy.save."
+        ) from cause
+
+
+def _read_mat(path: Path) -> dict[str, NDArray]:
+    """Numeric variables of a MATLAB file; the member phi of a struct data is called data.phi."""
+    try:
+        from scipy.io import loadmat
+        from scipy.io.matlab import MatReadError
+        from scipy.sparse import issparse
+    except ImportError as cause:
+        raise BackendError(
+            "flux import: SciPy, which reads .mat files, is not installed. pip install 'mitsuba-fspt[tissue]'."
+        ) from cause
+    try:
+        variables = loadmat(path, squeeze_me=False)
+    except NotImplementedError as cause:  # MATLAB 7.3 is HDF5
+        raise FluxError(f"'{path}' is a MATLAB 7.3 file. Save it with save(..., '-v7').") from cause
+    except (OSError, ValueError, MatReadError) as cause:
+        raise FluxError(f"'{path}' cannot be read as a MATLAB file: {one_line(cause)}. Save it anew.") from cause
+    arrays: dict[str, Any] = {}
+    for name, value in variables.items():
+        if name.startswith("__"):
+            continue
+        if not issparse(value) and value.dtype.names and value.size == 1:
+            arrays |= {f"{name}.{member}": value[member].item() for member in value.dtype.names}
+        else:
+            arrays[name] = value
+    return {name: value.toarray() if issparse(value) else np.asarray(value) for name, value in arrays.items()}
+
+
+def require_file(path: Path) -> None:
+    """Raise FluxError where there is no file, but nothing or a folder."""
+    if not os.path.isfile(path):
+        what = "it is a folder" if os.path.isdir(path) else "there is no such file"
+        raise FluxError(f"'{path}' cannot be read: {what}. Check the name.")
+
+
+def one_line(cause: BaseException) -> str:
+    """The cause's own text on one line, without its full stop."""
+    return " ".join(str(cause).split()).rstrip(".") or type(cause).__name__

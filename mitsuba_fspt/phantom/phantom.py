@@ -1,0 +1,207 @@
+"""The phantom: a triangle surface in mm that gives off light, its exitance J_n in W/mm² on vertices or faces.
+
+phantom = Phantom(vertices, faces, exitance, "vertex", {"source": "my own code"})
+phantom.power
+phantom.write("mouse.ply")  # what fspt_surface reads as mesh_attribute vertex_exitance
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.errors import ExitanceError, FluxError
+from .formats.ply import read_ply, write_ply
+from .surface_mesh import Closure, Indices, Points, closure, face_areas
+
+UNIT = "W/mm^2"
+# What the renderer's 32-bit numbers hold.
+LEAST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+# Words of the report and the PLY's comments that no provenance may overwrite.
+RESERVED = {
+    *("area", "power", "min", "max", "zeros", "negatives", "removed_power", "removed_percent", "quantity"),
+    *("unit", "length_unit", "watertight", "outward", "per", "vertices", "faces"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Phantom:
+    """Triangle surface with exitance, ready for a camera.
+
+    vertices : (V, 3) [mm]
+    faces : (F, 3), numbers of vertices from 0, anticlockwise seen from outside
+    exitance : J_n, (V,) or (F,) as `per` says, finite, >= 0, not all 0 [W/mm²]; linear between vertices
+    per : 'vertex' or 'face'
+    provenance : where the values come from, single words to texts, for the report and the PLY's comments
+    negatives, removed_power : how many values were negative and became 0, and their power, >= 0 [W]
+
+    Raises
+    ------
+    ExitanceError : exitance that is not finite, is negative, or zero everywhere.
+    FluxError : arrays whose shapes do not fit each other, or a surface without area.
+    """
+
+    vertices: Points
+    faces: Indices
+    exitance: NDArray[np.float64]
+    per: str
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    negatives: int = 0
+    removed_power: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, kind in (("vertices", np.float64), ("faces", np.int64), ("exitance", np.float64)):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
+        if self.per not in ("vertex", "face"):
+            raise FluxError(f"phantom: 'per' must be vertex or face, got '{self.per}'.")
+        count = len(self.vertices if self.per == "vertex" else self.faces)
+        if self.vertices.shape[1:] != (3,) or self.faces.shape[1:] != (3,) or self.exitance.shape != (count,):
+            raise FluxError(
+                f"phantom: vertices (V, 3), faces (F, 3) and exitance per {self.per} must fit, got shapes "
+                f"{self.vertices.shape}, {self.faces.shape} and {self.exitance.shape}. Give one value each."
+            )
+        if len(self.faces) == 0 or self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
+            raise FluxError(f"phantom: faces must be numbers of the {len(self.vertices)} vertices. Count from 0.")
+        for key in self.provenance:
+            if key in RESERVED or key.split() != [key]:
+                raise FluxError(f"phantom: '{key}' is taken or no single word. Name the provenance otherwise.")
+        require_finite(self.exitance, self.per)
+        require_single(self.exitance)
+        if self.exitance.min() < 0:
+            raise ExitanceError(f"exitance: must be >= 0, the least is {self.exitance.min():.6g} {UNIT}. Clip it.")
+        if (far := np.abs(self.vertices[self.faces]).max()) > LARGEST:
+            raise FluxError(f"phantom: a vertex lies at {far:.3g} mm, the renderer holds {LARGEST:.2g}. Scale it.")
+        if not self.area > 0:
+            raise FluxError(f"phantom: the surface has no area ({self.area:g} mm^2). Mend its vertices.")
+        if not self.power > 0:
+            raise ExitanceError("exitance: zero everywhere, the phantom would be black. Check the field's name.")
+
+    @cached_property
+    def area(self) -> float:
+        """Area of the surface [mm²]."""
+        return float(face_areas(self.vertices, self.faces).sum())
+
+    @cached_property
+    def power(self) -> float:
+        """Σ J_n A [W]; on a face the mean of its corners where J_n stands on vertices."""
+        return float(shares(self.vertices, self.faces, self.per) @ self.exitance)
+
+    @cached_property
+    def closure(self) -> Closure:
+        """Whether the surface is closed and outward."""
+        return closure(self.vertices, self.faces)
+
+    def report(self) -> dict[str, object]:
+        """What to look at before use: numbers, truth values and texts, ready for JSON.
+
+        area [mm²], power [W], min and max [W/mm²], zeros and negatives (how many values; negative ones have
+        become zeros), watertight, outward (None: open, undecided), unit, removed_power [W], per, vertices,
+        faces, and the provenance. `removed_percent` is relative to the power that stays.
+        """
+        return {
+            "area": self.area,
+            "power": self.power,
+            "min": float(self.exitance.min()),
+            "max": float(self.exitance.max()),
+            "zeros": int(np.count_nonzero(self.exitance == 0)),
+            "negatives": self.negatives,
+            "watertight": self.closure.watertight,
+            "outward": self.closure.outward,
+            "unit": UNIT,
+            "removed_power": self.removed_power,
+            "removed_percent": 100 * self.removed_power / self.power,
+            "per": self.per,
+            "vertices": len(self.vertices),
+            "faces": len(self.faces),
+            **self.provenance,
+        }
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write a binary PLY, whole or not at all, with the exitance where Mitsuba's `ply` plugin finds it.
+
+        The property `exitance_x` becomes the mesh attribute `vertex_exitance` or `face_exitance`. Numbers are
+        doubles. Comments tell quantity, units, power and provenance.
+
+        Raises
+        ------
+        FluxError : the suffix is not .ply, or the file cannot be written.
+        """
+        comments = {
+            "quantity": "exitance",
+            "unit": UNIT,
+            "length_unit": "mm",
+            "power": f"{self.power!r} W",
+            "negatives": str(self.negatives),
+            "removed_power": f"{self.removed_power!r} W",
+            **self.provenance,
+        }
+        write_ply(Path(path), self.vertices, self.faces, {"exitance_x": self.exitance}, self.per, comments)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Phantom:
+        """The phantom that `write` wrote, its numbers bit by bit.
+
+        Raises
+        ------
+        FluxError : the file cannot be read, or its comments name other units.
+        ExitanceError : it has no property `exitance_x`; `import_flux` reads others.
+        """
+        raw, comments = read_ply(Path(path))
+        exitance = {f.on: f.values for f in raw.fields if f.name == "exitance_x"}
+        if len(exitance) != 1:
+            names = ", ".join(f"'{f.name}'" for f in raw.fields) or "none"
+            raise ExitanceError(
+                f"'{path}' must have one property 'exitance_x', on vertices or on faces. Properties it has: "
+                f"{names}. Make a phantom of it by fspt flux import --field NAME."
+            )
+        for key, expected in (("quantity", "exitance"), ("unit", UNIT), ("length_unit", "mm")):
+            if comments.pop(key, expected) != expected:
+                raise FluxError(f"'{path}': the {key} of a phantom must be {expected}. Import it by fspt flux import.")
+        try:
+            negatives = int(comments.pop("negatives", "0"))
+            removed = float(comments.pop("removed_power", "0 W").removesuffix(" W"))
+        except ValueError as cause:
+            raise FluxError(
+                f"'{path}': its comments negatives and removed_power must be numbers. Import it anew."
+            ) from cause
+        comments = {key: text for key, text in comments.items() if key not in RESERVED}
+        ((on, values),) = exitance.items()
+        per = "vertex" if on == "vertex" else "face"
+        return cls(raw.points, raw.cells, values.astype(np.float64), per, comments, negatives, removed)
+
+
+def shares(vertices: Points, faces: Indices, per: str) -> NDArray[np.float64]:
+    """Area [mm²] that each value stands for, (V,) or (F,): Σ shares · J_n is the power.
+
+    A face for its own area, a vertex for a third of each of its faces': the exact integral of linear J_n.
+    """
+    areas = face_areas(vertices, faces)
+    if per == "face":
+        return areas
+    return np.bincount(faces.ravel(), np.repeat(areas / 3, 3), len(vertices)).astype(np.float64)
+
+
+def require_finite(exitance: NDArray[np.float64], per: str) -> None:
+    """Raise ExitanceError where a value is NaN or infinite, with the first one's number."""
+    finite = np.isfinite(exitance)
+    if not finite.all():
+        raise ExitanceError(
+            f"exitance: {np.count_nonzero(~finite)} of {len(exitance)} values are NaN or inf, the first on "
+            f"{per} {np.argmin(finite)} (counted from 0). Every value must be finite; repair the data."
+        )
+
+
+def require_single(exitance: NDArray[np.float64]) -> None:
+    """Raise ExitanceError where the renderer's single precision would make inf of a value, or 0 of all of them."""
+    largest = float(np.abs(exitance).max(initial=0.0))
+    if largest > LARGEST or 0 < largest < LEAST:
+        raise ExitanceError(
+            f"exitance: the largest value is {largest:.3g} {UNIT}, the renderer holds {LEAST:.2g} to "
+            f"{LARGEST:.2g}. Check its unit, or scale it."
+        )

@@ -1,0 +1,249 @@
+"""Pictures of a scene: by the deterministic integral, or by Mitsuba's own Monte Carlo with its standard error."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..images.image import Image
+from ..integral.quadrature import Quadrature
+from ..integral.shortcuts import SHORTCUTS
+from ..optics.thin_lens import NUMBERS
+from ..runtime import backend
+from ..runtime.errors import SceneError
+from ..runtime.interrupt import ctrl_c_noted
+from ..runtime.numbers import whole
+from ..runtime.plugin_types import is_integral
+from . import monte_carlo
+from .scene import loaded
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+METHODS = ("integral", "path", "ptracer")
+PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
+LANES = 1 << 23  # Monte Carlo samples in flight
+Progress = Callable[[str, float], None]
+
+
+def render(
+    scene: mi.Scene | str | os.PathLike[str],
+    *,
+    method: str | None = None,
+    sensor: int = 0,
+    rtol: float | None = None,
+    domain: str | None = None,
+    pixel: str | None = None,
+    max_nodes: int | None = None,
+    shortcuts: bool = True,
+    spp: int | None = None,
+    seed: int | None = None,
+    progress: Progress | None = None,
+) -> Image:
+    """Image of a scene, power in W on every pixel, with its error and coverage.
+
+    Parameters
+    ----------
+    scene : Mitsuba scene (see `load`) or the name of a scene file
+    method : 'integral' (Eq. 9, deterministic), 'path' or 'ptracer' (Monte Carlo); None takes the scene's own
+    sensor : number of the sensor, an `fspt_lens`
+    rtol, domain, pixel, max_nodes : accuracy of the integral, see `Quadrature`; None takes the scene's own
+    shortcuts : False to leave out nothing of the integral, see `SHORTCUTS`; True takes the scene's own
+    spp : Monte Carlo samples a pixel, >= 2 (default 256); their error is the standard error of independent passes,
+        and where no sample met light, but one could have, about what a single one brings
+    seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
+    progress : called with what is being done and the share done
+
+    Raises
+    ------
+    SceneError, OpticsError, ExitanceError, BackendError : what is wrong and how to mend it.
+    """
+    scene = loaded(scene)
+    backend.ensure_variant()
+    sensor = whole("render: 'sensor'", sensor, SceneError, "0")
+    lens = sensor_of(scene, sensor)
+    integrator = integrator_of(scene, method)
+    accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
+    sampling = {"spp": spp, "seed": seed}
+    deterministic = is_integral(integrator)
+    refused = sampling if deterministic else accuracy | {"shortcuts": None if shortcuts else False}
+    _refuse(refused, "integral" if deterministic else "Monte Carlo")
+    accuracy["shortcuts_off"] = None if shortcuts else frozenset(SHORTCUTS)
+    start = time.perf_counter()
+    with ctrl_c_noted() as check_interrupt:
+
+        def tell(what: str, share: float) -> None:
+            check_interrupt()
+            if progress:
+                progress(what, share)
+
+        if deterministic:
+            *planes, how = _integrate(scene, lens, integrator, accuracy, tell)
+        else:
+            spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
+            *planes, how = _sample(scene, lens, integrator, spp, seed, tell)
+        check_interrupt()
+    how["wall_time"] = time.perf_counter() - start
+    return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
+
+
+def _integrate(
+    scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress
+) -> tuple:
+    """Power, error and coverage by the deterministic integral, and metadata."""
+    own = asdict(integrator.quadrature)
+    wanted = own | {name: value for name, value in accuracy.items() if value is not None}
+    progress("integrating", 0.0)
+    quadrature = Quadrature(**wanted)
+    solution = integrator.solve(scene, lens, quadrature)
+    how = {"method": "integral", **asdict(quadrature), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
+    how["shortcuts_off"] = ", ".join(sorted(quadrature.shortcuts_off)) or "nothing"
+    how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
+    return solution.power, solution.error, solution.coverage, how
+
+
+def _sample(
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    integrator: mi.Integrator,
+    spp: int,
+    seed: int,
+    progress: Progress,
+) -> tuple:
+    """Mean and standard error of independent Monte Carlo passes, summed in double precision, coverage, and metadata."""
+    from ..emission.face_probe import probe_beside
+    from ..integral.pupil_form import coverage
+    from ..integral.scene_checks import check_scene
+    from ..jit.recording import recording
+
+    check_scene(scene, lens)
+    spp = whole("render: 'spp'", spp, SceneError, "256")
+    seed = whole("render: 'seed'", seed, SceneError, "1")
+    if spp < 2:
+        raise SceneError(f"render: 'spp' must be >= 2 for a standard error, got {spp}. Give for example 256.")
+    if not 0 <= seed < 1 << 32:
+        raise SceneError(f"render: 'seed' must be in 0 … 2^32 - 1, got {seed}. Give for example 1.")
+    probe_beside(scene)
+    pixels = math.prod(int(n) for n in lens.film().crop_size())
+    count = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
+    lens.sampler().set_sample_count(math.ceil(spp / count))
+    each = lens.sampler().sample_count()  # some samplers take more: told once, not in every pass
+    seeds = (int(np.random.SeedSequence((seed, k)).generate_state(1)[0]) for k in range(count))
+    total = squares = 0.0
+    samples = 0
+    progress("sampling", 0.0)
+    for k, (power, taken) in enumerate(monte_carlo.passes(scene, lens, integrator, seeds, each), 1):
+        total, squares, samples = total + power, squares + power * power, samples + taken
+        progress("sampling", k / count)
+    mean = total / count
+    name = {"PathIntegrator": "path", "ParticleTracerIntegrator": "ptracer", "VolumetricPathIntegrator": "volpath"}
+    how = {
+        "method": name.get(integrator.class_name(), integrator.class_name()),
+        "sampler": lens.sampler().class_name(),
+        "spp": samples,
+        "passes": count,
+        "seed": seed,
+    }
+    error = monte_carlo.standard_error(mean, squares / count, count, samples)
+    with recording():
+        met = coverage(scene, lens)
+    return mean, np.where((mean > 0) | _can_see(scene, lens), error, 0), met, how
+
+
+def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
+    """True on pixels with lines of sight to where something glows (Eq. 4) that no image-plane stop holds back."""
+    from ..integral.window import visible_window
+
+    window = visible_window(scene, lens)
+    inside, cut = window.stopped(lens)
+    return window.expand((inside | cut).astype(np.float64)) > 0
+
+
+def sensor_of(scene: mi.Scene, number: int) -> mi.Sensor:
+    """Sensor `number` of a scene; SceneError where there is none, or what is given is no scene of this variant."""
+    _check_kind(scene)
+    sensors = scene.sensors()
+    if not 0 <= number < len(sensors):
+        rule = f"Give 0 to {len(sensors) - 1}." if sensors else "Give it an 'fspt_lens'."
+        raise SceneError(f"scene: sensor {number} does not exist, the scene has {len(sensors)}. {rule}")
+    return sensors[number]
+
+
+def _check_kind(scene: object) -> None:
+    import mitsuba as mi
+
+    if isinstance(scene, mi.Scene):
+        return
+    home = getattr(scene, "variant_name", None)
+    if type(scene).__name__ == "Scene" and home is not None:
+        raise SceneError(
+            f"scene: loaded in the variant {home()}, which none but that can render; the active one is {mi.variant()}. "
+            "Load it again, or set its variant."
+        )
+    raise SceneError(
+        f"scene: must be a Mitsuba scene or the name of a file, got {type(scene).__name__}. Give what `load` returns."
+    )
+
+
+def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
+    """The integrator of a method, see `METHODS`, the scene's own where it is that; SceneError where there is none."""
+    import mitsuba as mi
+
+    own = scene.integrator()
+    if method is None and own is not None:
+        # What else they give beside or instead of light is no power.
+        if own.class_name() == "DepthIntegrator" or own.aov_names():
+            raise SceneError(
+                f"scene: integrator {own.class_name()} gives no power. Give the scene an 'fspt_integral' or 'path', or "
+                "set 'method'."
+            )
+        _require_light(scene, own)
+        return own
+    if method in (None, "integral"):
+        return own if is_integral(own) else mi.load_dict({"type": "fspt_integral"})
+    if method not in METHODS:
+        raise SceneError(f"render: 'method' must be one of {', '.join(METHODS)}, got '{method}'.")
+    return monte_carlo.tracer(method)
+
+
+def _require_light(scene: mi.Scene, integrator: mi.Integrator) -> None:
+    """Light of a surface goes straight to the lens: a Monte Carlo without that would be dark all over."""
+    if not any(type(emitter).__name__ == "FsptSurface" for emitter in scene.emitters()):
+        return
+    hidden = "'hide_emitters' = true" if getattr(integrator, "hide_emitters", False) else None
+    if hidden is None and re.search(r"\bmax_depth = 0\b", str(integrator)):  # told by its description alone
+        hidden = "'max_depth' = 0"
+    if hidden:
+        raise SceneError(
+            f"scene: integrator {integrator.class_name()} with {hidden} leaves out what surfaces send straight to the "
+            "lens. Leave that parameter out, or set 'method'."
+        )
+
+
+def _refuse(settings: dict[str, object], method: str) -> None:
+    for name, value in settings.items():
+        if value is not None:
+            raise SceneError(f"render: '{name}' = {value} has no meaning for {method}. Leave it out or set 'method'.")
+
+
+def _lens_numbers(lens: mi.Sensor) -> dict[str, float | int | str]:
+    optics = lens.optics
+    numbers = {name: getattr(optics, name) for name in ("model", *NUMBERS, "diaphragm_diameter")}
+    numbers["pixel_pitch"] = lens.pixel_pitch
+    return {name: value for name, value in numbers.items() if value is not None}
+
+
+def _versions() -> dict[str, str]:
+    import mitsuba as mi
+
+    packages = ("mitsuba-fspt", "mitsuba", "drjit", "numpy")
+    return {"variant": mi.variant(), "versions": ", ".join(f"{name} {version(name)}" for name in packages)}

@@ -1,0 +1,100 @@
+"""What the XML of a scene must be before Mitsuba reads it, which would say less of the matter, nothing, or crash."""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from ..runtime.errors import SceneError
+from .scene_xml import SceneXml
+
+REFERENCE = re.compile(r"\$(\w+)")
+NO_PROPERTIES = ("default", "alias", "include", "path", "resource")
+LISTS = {  # attributes that hold numbers, one or several, by element
+    **dict.fromkeys(("point", "vector", "translate", "scale", "rotate", "matrix"), ("value",)),
+    "lookat": ("origin", "target", "up"),
+}
+NEEDED = {"bitmap": ("filename", "data", "bitmap"), "volume": ("volume",)}  # or these textures crash the process
+
+
+def check_text(path: Path, scene: SceneXml) -> None:
+    """Raise SceneError for what the text of a scene cannot be, see `check_values` and below; one line."""
+    check_values(path, scene)
+    for node in scene.nodes:
+        _check_twins(path, node)
+        _check_source(path, node, scene)
+        _check_homes(path, node)
+        if node.get("type") == "fspt_surface":
+            _check_colours(path, node, scene)
+
+
+def check_values(path: Path, scene: SceneXml) -> None:
+    """Raise SceneError for a given value that is no number, whole number or boolean where one is due.
+
+    Mitsuba would tell the line it ends up in, and not the parameter's name.
+    """
+    for node in scene.nodes:
+        for attribute, text in node.attrib.items():
+            for piece in re.split(r"[\s,]+", text):
+                reference = REFERENCE.fullmatch(piece)
+                if reference and reference[1] in scene.given:
+                    _check_value(path, reference[1], scene.given[reference[1]], node.tag, attribute)
+
+
+def is_number(text: str) -> bool:
+    """True for a finite number as Mitsuba spells it."""
+    try:
+        return math.isfinite(float(text)) and text.isascii() and "_" not in text
+    except ValueError:
+        return False
+
+
+def _check_value(path: Path, name: str, text: str, tag: str, attribute: str) -> None:
+    due = None
+    if (tag, attribute) == ("integer", "value"):
+        due = None if re.fullmatch(r"\s*-?[0-9]+\s*", text) else "a whole number"
+    elif (tag, attribute) == ("boolean", "value"):
+        due = None if text.lower() in ("true", "false") else "true or false"
+    elif (tag, attribute) == ("float", "value") or attribute in ("x", "y", "z", "angle"):
+        due = None if is_number(text) else "a finite number"
+    elif attribute in LISTS.get(tag, ()):
+        due = None if all(map(is_number, re.split(r"[\s,]+", text.strip()))) else "a finite number"
+    if due:
+        raise SceneError(f"{path}: parameter '{name}' must be {due}, got '{text}'. Correct this value.")
+
+
+def _check_twins(path: Path, node: ElementTree.Element) -> None:
+    """Of two with one name Mitsuba cannot parse the second, or takes one of them without a word."""
+    names = [child.get("name") for child in node if child.tag not in NO_PROPERTIES and child.get("name")]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        thing = node.get("type", node.tag)
+        raise SceneError(f"{path}: '{thing}' has '{twice}' more than once. Leave it there once.")
+
+
+def _check_source(path: Path, node: ElementTree.Element, scene: SceneXml) -> None:
+    kind = scene.fill_in(node.get("type", ""))
+    needed = NEEDED.get(kind, ()) if node.tag == "texture" else ()
+    if needed and not any(child.get("name") in needed for child in node):
+        raise SceneError(f"{path}: a texture '{kind}' has no '{needed[0]}'. Give it one.")
+
+
+def _check_homes(path: Path, node: ElementTree.Element) -> None:
+    """A glow without a shape the integral passes over, and Monte Carlo fails on; one with an id may be referred to."""
+    for child in node if node.tag != "shape" else ():
+        if child.get("type") == "fspt_surface" and not child.get("id"):
+            raise SceneError(f"{path}: an fspt_surface stands in <{node.tag}>. Put it into the <shape> that glows.")
+
+
+def _check_colours(path: Path, emitter: ElementTree.Element, scene: SceneXml) -> None:
+    """J_n as a colour or a spectrum, of which monochrome variants make its luminance without a word."""
+    for child in emitter:
+        colour = child.tag == "rgb" or child.get("type") == "d65"
+        spectrum = child.tag == "spectrum" and ":" in scene.fill_in(child.get("value", ""))
+        if colour or spectrum or (child.tag == "spectrum" and child.get("filename")):
+            raise SceneError(
+                f"{path}: '{child.get('name')}' of an fspt_surface is a {'colour' if colour else 'spectrum'} "
+                f"(<{child.tag}>), J_n is one number. Give W/mm² as a float or a texture of one channel."
+            )

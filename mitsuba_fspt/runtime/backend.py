@@ -1,0 +1,198 @@
+"""Dr.Jit's backend: a working LLVM before Dr.Jit loads, our plugins in every variant, the variant to take.
+
+Importing this package must load neither Dr.Jit nor Mitsuba, yet act when somebody else does, in either order.
+So `prepare` puts a watcher before Python's import finders. It finds no module itself; two names make it act:
+
+- `drjit`, the moment before Dr.Jit binds libLLVM for good: one that works is chosen and handed over;
+- `mitsuba.<variant>`, which `mi.set_variant` imports at its first use: a broken LLVM is refused while the old
+  variant still stands, and the callback is added that registers our plugins after every switch.
+"""
+
+import ctypes
+import os
+import sys
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from . import libllvm
+from .errors import BackendError
+from .interrupt import ctrl_c_held
+
+if TYPE_CHECKING:
+    from importlib.machinery import ModuleSpec
+
+INSTALL = (
+    f"Install LLVM {libllvm.MIN_MAJOR} or newer: "
+    "with pip (Linux, Apple silicon, Windows with Python 3.12+): pip install 'mitsuba-fspt[llvm]'; "
+    "Debian 12+, Ubuntu 24.04+: sudo apt install libllvm19 libatomic1; "
+    "Fedora: sudo dnf install llvm-libs libatomic; "
+    "macOS: brew install llvm; "
+    "Windows: winget install LLVM.LLVM; "
+    "conda: conda install -c conda-forge libllvm19 (on Windows libllvm-c19). "
+    f"Or set {libllvm.ENVIRONMENT_NAME} to the library's file before Python starts."
+)
+
+
+class ImportWatch:
+    """The watcher.
+
+    selection : what Dr.Jit was told to load; None until then, or if Dr.Jit came first
+    register : called after each switch of the variant
+    """
+
+    selection: libllvm.Selection | None = None
+    register: Callable[[], None] = staticmethod(lambda: None)
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> "ModuleSpec | None":
+        """Always None: the finders behind this one find the module."""
+        if name == "drjit":
+            self.before_drjit()
+        elif name.startswith(("mitsuba.llvm_", "mitsuba.cuda_", "mitsuba.scalar_")):
+            require_working_llvm(name.removeprefix("mitsuba."))
+            sys.modules["mitsuba"].detail.add_variant_callback(_on_variant)
+        return None
+
+    def before_drjit(self) -> None:
+        """Name a missing libatomic, which Dr.Jit would not, then set DRJIT_LIBLLVM_PATH."""
+        if sys.platform == "linux" and not _loads("libatomic.so.1"):
+            raise BackendError(
+                "Dr.Jit needs the system library libatomic.so.1, which is missing. Install it: "
+                "Debian, Ubuntu: sudo apt install libatomic1; Fedora: sudo dnf install libatomic; "
+                "conda: conda install -c conda-forge libgcc."
+            )
+        if self.selection is None:
+            self.selection = libllvm.select()
+        if self.selection.path:
+            os.environ[libllvm.ENVIRONMENT_NAME] = self.selection.path
+
+
+_watch = ImportWatch()
+
+
+def prepare(register: Callable[[], None]) -> None:
+    """Arrange all of this; called when the package is imported. Calling it again changes `register` alone.
+
+    `register` is called after each switch of the variant, to register the plugins.
+
+    Raises BackendError if an LLVM variant is active on an LLVM that would abort the process.
+    """
+    _watch.register = register
+    if _watch not in sys.meta_path:
+        sys.meta_path.insert(0, _watch)
+    mitsuba = sys.modules.get("mitsuba")
+    if mitsuba is not None:
+        mitsuba.detail.add_variant_callback(_on_variant)
+        if mitsuba.variant() is not None:
+            _on_variant(None, mitsuba.variant())
+
+
+def _on_variant(_old: str | None, new: str) -> None:
+    """Mitsuba calls this after each switch; what it raises comes out of `mi.set_variant`."""
+    require_working_llvm(new)
+    _watch.register()
+
+
+def selection() -> libllvm.Selection | None:
+    """What Dr.Jit was told to load, and why; None if it is not imported yet, or was before mitsuba_fspt."""
+    return _watch.selection
+
+
+def choose_variant(kind: str = "mono") -> str:
+    """`cuda_ad_<kind>` where there is a CUDA device that works, else `llvm_ad_<kind>`.
+
+    `kind`: mono (one wavelength), rgb, spectral, mono_polarized or spectral_polarized.
+    Raises BackendError if neither works, with what to install; or if Mitsuba has no such kind.
+    """
+    import mitsuba
+
+    kinds = [name.removeprefix("llvm_ad_") for name in mitsuba.variants() if name.startswith("llvm_ad_")]
+    if kind not in kinds:
+        raise BackendError(f"kind of variant: {kind!r} is none of Mitsuba's. Give one of {', '.join(kinds)}.")
+    no_cuda = cuda_problem()
+    if no_cuda is None:
+        return f"cuda_ad_{kind}"
+    no_llvm = llvm_problem()
+    if no_llvm is None:
+        return f"llvm_ad_{kind}"
+    raise BackendError(f"no backend to compute on: {no_cuda}; {no_llvm}")
+
+
+@ctrl_c_held()
+def ensure_variant() -> str:
+    """The active variant; where there is none, `choose_variant()` is set first.
+
+    Raises BackendError if the active one is scalar, if its LLVM does not work, or if no backend works.
+    """
+    import mitsuba
+
+    active: str | None = mitsuba.variant()
+    if active is None:
+        active = choose_variant()
+        mitsuba.set_variant(active)
+    elif active.startswith("scalar"):
+        raise BackendError(
+            f"the active variant {active} is scalar, mitsuba_fspt needs a vectorised one."
+            " Call mi.set_variant('llvm_ad_mono') or 'cuda_ad_mono' first, or set none."
+        )
+    require_working_llvm(active)
+    return active
+
+
+def quiet_mitsuba() -> None:
+    """A variant, and none of Mitsuba's warnings: they would break the one line that the command line promises."""
+    ensure_variant()
+    import mitsuba
+
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+
+
+def require_working_llvm(variant: str) -> None:
+    """Raise BackendError if `variant` is one of LLVM's and Dr.Jit is bound to an LLVM that does not work."""
+    problem = llvm_problem() if variant.startswith("llvm_") else None
+    if problem:
+        raise BackendError(f"{variant}: {problem}")
+
+
+def llvm_problem() -> str | None:
+    """Why the LLVM that Dr.Jit is bound to cannot be used, and the mend; None if it can."""
+    import drjit
+
+    bound = drjit.detail.llvm_version()
+    if bound[0] >= libllvm.MIN_MAJOR:
+        return None
+    loaded = f"LLVM {'.'.join(map(str, bound))}" if bound[0] > 0 else "no LLVM"
+    rule = f"Dr.Jit has bound {loaded} and needs {libllvm.MIN_MAJOR} or newer"
+    chosen = _watch.selection or libllvm.select()
+    reasons = "; ".join(f"{loser.path}: {loser.reason}" for loser in chosen.rejected)
+    if chosen.path is None:
+        return f"{rule}; {chosen.why}{f' ({reasons})' if reasons else ''}. {INSTALL}"
+    if chosen.version is None:
+        other = libllvm.select({})
+        mend = f"Unset it: {other.path} works." if other.path else f"Unset it. {INSTALL}"
+        return f"{rule}; {libllvm.ENVIRONMENT_NAME} is set to {reasons}. {mend}"
+    if _watch.selection is None:
+        return f"{rule}; it was imported before mitsuba_fspt. Import mitsuba_fspt first: {chosen.path} works."
+    return f"{rule}; it refused {chosen.path} ({chosen.why}). {INSTALL}"
+
+
+def cuda_problem() -> str | None:
+    """Why CUDA cannot be used; None if it can."""
+    import drjit
+
+    if not drjit.has_backend(drjit.JitBackend.CUDA):
+        return "no CUDA device that Dr.Jit can use"
+    optix = os.environ.get("DRJIT_LIBOPTIX_PATH") or "libnvoptix.so.1"
+    if sys.platform == "linux" and not _loads(optix):
+        return f"a CUDA device, but without OptiX ({optix} of the NVIDIA driver does not load)"
+    return None
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,211 @@
+"""What `fspt doctor` tells: versions, which LLVM and why, CUDA devices, a timed first kernel, what is absent.
+
+Every backend is tried in a process of its own on an empty kernel cache: a driver or an LLVM that aborts the
+process becomes a line of the report, and the first kernel is a cold one.
+"""
+
+import ctypes
+import json
+import math
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from itertools import pairwise
+from pathlib import Path
+
+from . import backend, libllvm
+from .errors import BackendError
+from .extras import EXTRAS
+
+CORE = ("mitsuba-fspt", "mitsuba", "drjit", "numpy", "trimesh", "OpenEXR", "typer", "rich")
+
+VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
+
+_TRIAL = "import json, sys; from mitsuba_fspt.runtime import doctor; print(json.dumps(doctor.try_variant(sys.argv[1])))"
+_TRIAL_TIMEOUT = 300.0  # s; a driver that hangs
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the report; `ok` is False where something is missing or does not work."""
+
+    section: str
+    name: str
+    value: str
+    ok: bool = True
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole report; `usable` if at least one backend computed the right result."""
+
+    rows: tuple[Row, ...]
+    usable: bool
+
+    def render_text(self) -> str:
+        """The report as plain text, a section after the other, `!` before the rows that are not ok."""
+        width = max(len(row.name) for row in self.rows)
+        lines: list[str] = []
+        section = ""
+        for row in self.rows:
+            if row.section != section:
+                section = row.section
+                lines += ["", section] if lines else [section]
+            lines.append(f" {' ' if row.ok else '!'} {row.name:<{width}}  {row.value}".rstrip())
+        verdict = "ready" if self.usable else "no backend works: see the lines marked !"
+        return "\n".join([*lines, "", verdict])
+
+
+def diagnose() -> Diagnosis:
+    """Look at everything; takes a second or two for each backend. Raises nothing for what is missing."""
+    devices = cuda_devices()
+    trials = {name: run_trial(name) for name in VARIANTS if devices or not name.startswith("cuda")}
+    rows = [*_versions(), *_llvm(), *_cuda(devices), *_backends(trials), *_optional(), *_cache()]
+    return Diagnosis(tuple(rows), usable=any(isinstance(trial, dict) for trial in trials.values()))
+
+
+def try_variant(variant: str) -> dict[str, float]:
+    """Seconds a computation takes in this process, by step: `import`, `variant`, `scene`, `first`, `second`.
+
+    The kernel sends a grid of parallel rays, 4 wide, at a unit sphere and counts the hits, so that the ray
+    tracer is tried too (Embree for LLVM, OptiX for CUDA). Raises BackendError if the variant does not work,
+    or if the share of rays that hit is not pi/16, the sphere's shadow on the grid, within 1 %.
+    """
+    times = [time.perf_counter()]
+    import drjit
+    import mitsuba
+
+    times.append(time.perf_counter())
+    mitsuba.set_variant(variant)
+    times.append(time.perf_counter())
+    scene = mitsuba.load_dict({"type": "scene", "sphere": {"type": "sphere"}})
+    times.append(time.perf_counter())
+    for _ in range(2):
+        x, y = drjit.meshgrid(*2 * [drjit.linspace(mitsuba.Float, -2, 2, 512)])
+        origin = mitsuba.Point3f(x, y, drjit.minimum(x, -5))  # a float minimum: what LLVM 15 and 16 abort at
+        hits = scene.ray_test(mitsuba.Ray3f(origin, mitsuba.Vector3f(0, 0, 1))).numpy()
+        times.append(time.perf_counter())
+    share = float(hits.mean())
+    if not math.isclose(share, math.pi / 16, rel_tol=0.01):
+        raise BackendError(f"{variant}: computes {share:.6g} where {math.pi / 16:.6g} is right")
+    names = ("import", "variant", "scene", "first", "second")
+    return {name: end - start for name, (start, end) in zip(names, pairwise(times), strict=True)}
+
+
+def run_trial(variant: str) -> dict[str, float] | str:
+    """`try_variant` in a fresh process without cached kernels; where it fails, the reason in one line."""
+    package_home = str(Path(__file__).resolve().parents[2])
+    search = os.pathsep.join(filter(None, [package_home, os.environ.get("PYTHONPATH")]))
+    with tempfile.TemporaryDirectory() as cache:
+        environ = {**os.environ, "PYTHONPATH": search, "DRJIT_CACHE_DIR": cache}
+        command = [sys.executable, "-c", _TRIAL, variant]
+        try:
+            done = subprocess.run(
+                command,
+                env=environ,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=_TRIAL_TIMEOUT,
+            )
+        except subprocess.TimeoutExpired:
+            return f"did not finish within {_TRIAL_TIMEOUT:g} s"
+    if done.returncode < 0:
+        return f"the process was ended by {signal.Signals(-done.returncode).name}"
+    if done.returncode > 0:
+        last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+        return last.removeprefix("mitsuba_fspt.runtime.errors.BackendError: ")
+    times: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return times
+
+
+def cuda_devices() -> list[str]:
+    """Names of the CUDA devices the NVIDIA driver knows; empty without driver or device."""
+    name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+    try:
+        cuda = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or name)
+    except OSError:
+        return []
+    count = ctypes.c_int()
+    if cuda.cuInit(0) != 0 or cuda.cuDeviceGetCount(ctypes.byref(count)) != 0:
+        return []
+    names = []
+    for ordinal in range(count.value):
+        text = ctypes.create_string_buffer(256)
+        cuda.cuDeviceGetName(text, len(text), ordinal)  # a CUdevice is its ordinal
+        names.append(text.value.decode(errors="replace"))
+    return names
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _versions() -> Iterator[Row]:
+    yield Row("versions", "python", f"{platform.python_version()}, {sys.executable}")
+    yield Row("versions", "platform", f"{platform.platform()}, {os.cpu_count()} CPUs")
+    for name in CORE:
+        version = _version(name)
+        missing = "runs from its source folder" if name == "mitsuba-fspt" else "not installed"
+        yield Row("versions", name, version or missing, ok=version is not None or name == "mitsuba-fspt")
+
+
+def _llvm() -> Iterator[Row]:
+    chosen = backend.selection()
+    if chosen is None:
+        if "drjit" in sys.modules:
+            why = "Dr.Jit was imported before mitsuba_fspt and chose by itself; a fresh process would take:"
+            yield Row("LLVM", "here", why, ok=False)
+        chosen = libllvm.select()
+    usable = chosen.version is not None
+    version = ".".join(map(str, chosen.version)) if chosen.version else "none that works"
+    yield Row("LLVM", "version", version, ok=usable)
+    yield Row("LLVM", "library", chosen.path or "none", ok=usable)
+    yield Row("LLVM", "why", chosen.why, ok=usable)
+    for loser in chosen.rejected:
+        yield Row("LLVM", "rejected", f"{loser.path}: {loser.reason}")
+
+
+def _cuda(devices: list[str]) -> Iterator[Row]:
+    for number, name in enumerate(devices):
+        yield Row("CUDA", f"device {number}", name)
+    if not devices:
+        yield Row("CUDA", "device", "none")
+
+
+def _backends(trials: dict[str, dict[str, float] | str]) -> Iterator[Row]:
+    for variant, trial in trials.items():
+        if isinstance(trial, str):
+            yield Row("backends", variant, trial, ok=False)
+            continue
+        yield Row("backends", variant, "works")
+        yield Row("backends", "  start", f"{trial['import']:.2f} s import, {trial['variant']:.2f} s variant")
+        yield Row("backends", "  kernel", f"{trial['first']:.3f} s the first, {trial['second']:.3f} s the second")
+
+
+def _optional() -> Iterator[Row]:
+    for one in EXTRAS:
+        missing = f"not installed: pip install 'mitsuba-fspt[{one.extra}]'"
+        yield Row("extras", one.distribution, _version(one.distribution) or missing)
+
+
+def _cache() -> Iterator[Row]:
+    """Where Dr.Jit keeps compiled kernels between runs."""
+    default = Path(tempfile.gettempdir(), "drjit") if sys.platform == "win32" else Path("~/.drjit").expanduser()
+    folder = Path(os.environ.get("DRJIT_CACHE_DIR") or default)
+    try:
+        sizes = [file.stat().st_size for file in folder.glob("*.bin")]
+    except OSError as error:
+        yield Row("kernel cache", "folder", str(error), ok=False)
+    else:
+        yield Row("kernel cache", "folder", f"{folder}: {len(sizes)} kernels, {sum(sizes) / 1e6:.1f} MB")

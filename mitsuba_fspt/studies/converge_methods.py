@@ -1,0 +1,213 @@
+"""All ways to one picture, each over its own knob: the integral in both forms, the paper's sum and Monte Carlo."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..rendering.monte_carlo import passes, tracer
+from .convergence import INTEGRAL, PATH, POINT_SUM, PTRACER, SURFACE_FORM
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+SAMPLERS = ("multijitter", "independent", "stratified", "orthogonal", "ldsampler")
+RTOL = (1.0, 0.5, 0.2, 0.05, 0.03, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
+RTOL_SURFACE = (0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)
+# Samples a pixel, sides of the squares; those of an orthogonal array are primes.
+SIDES = (2, 4, 6, 8, 10, 12, 16, 23, 32, 45, 64, 91, 128)
+PRIMES = (2, 5, 11, 17, 23, 31, 47, 67, 89, 127)
+POWERS_OF_TWO = (2, 4, 8, 16, 32, 64, 128)
+LANES = 1 << 26  # Monte Carlo samples in one pass: 1024 a pixel of 256 x 256
+POINTS, MOST_POINTS = 1 << 10, 1 << 26  # of the paper's sum
+
+Picture = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture: power, shape (h, w) [W]; the rays it took; the knob as it came out, where that is rounded."""
+
+    power: Picture
+    rays: int
+    knob: float
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to a picture: `ladder`, the settings of its `knob` from coarse to fine; `prepare` makes one ready to run.
+
+    What a method finds out once about a scene it finds out in the first run of what `prepare` returns.
+    """
+
+    name: str
+    knob: str
+    ladder: tuple[float, ...]
+    prepare: Callable[[float], Callable[[], Shot]]
+
+
+def methods(scene: mi.Scene, lens: mi.Sensor, least_rtol: float = 0.0) -> tuple[list[Method], dict[str, str]]:
+    """All methods that apply to a scene, and why others do not; `least_rtol`: of the integral's pupil form."""
+    found = [integral(scene, lens, "pupil", tuple(rtol for rtol in RTOL if rtol >= least_rtol))]
+    skipped = {}
+    surfaces, reason = _surfaces_and_pupil(scene, lens)
+    if surfaces:
+        found += [integral(scene, lens, "surface", RTOL_SURFACE), _point_sum(scene, lens)]
+    else:
+        skipped = dict.fromkeys((SURFACE_FORM, POINT_SUM, PTRACER), reason)
+    found += [_path(scene, lens, sampler) for sampler in SAMPLERS]
+    found += [_ptracer(scene, lens)] if surfaces else []
+    return found, skipped
+
+
+def integral(scene: mi.Scene, lens: mi.Sensor, domain: str, ladder: tuple[float, ...]) -> Method:
+    """The deterministic integral over rtol, over the area of the pixels whatever the scene's own integrator does.
+
+    At rtol = 1 four lines of sight a pixel, whatever comes out.
+    """
+    import mitsuba as mi
+
+    def prepare(rtol: float) -> Callable[[], Shot]:
+        accuracy = {"rtol": rtol} if rtol < 1 else {"rtol": 0.5, "max_nodes": 4}
+        integrator = mi.load_dict({"type": "fspt_integral", "domain": domain, **accuracy})
+
+        def run() -> Shot:
+            solution = integrator.solve(scene, lens)
+            return Shot(solution.power, solution.rays, rtol)
+
+        return run
+
+    return Method(INTEGRAL if domain == "pupil" else SURFACE_FORM, "rtol", ladder, prepare)
+
+
+def _surfaces_and_pupil(scene: mi.Scene, lens: mi.Sensor) -> tuple[bool, str]:
+    """Whether light can be followed from the surface to the pupil, and why not."""
+    import mitsuba as mi
+
+    if lens.optics.model == "pinhole":
+        return False, "a pinhole is no disc that light from the surface could meet"
+    for emitter in scene.emitters():
+        if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
+            return False, f"the emitter {emitter.class_name()} has no surface"
+    return True, ""
+
+
+def _point_sum(scene: mi.Scene, lens: mi.Sensor) -> Method:
+    from ..validation import direct_summation
+
+    # The first one has the faces of a mesh as they are; settings that come to the same number are one.
+    minima = (1, *itertools.takewhile(lambda n: n <= MOST_POINTS, (POINTS * 4**k for k in itertools.count())))
+    counts = {direct_summation.points_of(scene, minimum): minimum for minimum in reversed(minima)}
+
+    def prepare(points: float) -> Callable[[], Shot]:
+        def run() -> Shot:
+            power, pairs = direct_summation.solve(scene, lens, counts[int(points)])
+            return Shot(power, pairs, points)
+
+        return run
+
+    ladder = tuple(float(count) for count in sorted(counts) if count > 2)
+    return Method(POINT_SUM, "points", ladder, prepare)
+
+
+def _path(scene: mi.Scene, lens: mi.Sensor, sampler: str) -> Method:
+    """Mitsuba's `path` of depth 1 from a twin of the lens that has the sampler; the twin is no part of the scene."""
+    sides = {"multijitter": SIDES, "orthogonal": PRIMES}.get(sampler, POWERS_OF_TWO)
+    twin = lens_with(lens, sampler)
+    return Method(PATH + sampler, "spp", _squares(sides), _monte_carlo("path", scene, twin))
+
+
+def _ptracer(scene: mi.Scene, lens: mi.Sensor) -> Method:
+    twin = lens_with(lens, "independent")
+    return Method(PTRACER, "spp", _squares(POWERS_OF_TWO), _monte_carlo("ptracer", scene, twin))
+
+
+def _squares(sides: tuple[int, ...]) -> tuple[float, ...]:
+    return tuple(float(side * side) for side in sides)
+
+
+def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
+    """The same `fspt_lens` and film with another sampler."""
+    import mitsuba as mi
+
+    own = dict(mi.traverse(lens))
+    numbers = {name: float(value[0]) for name, value in own.items() if isinstance(value, mi.Float64)}
+    film = lens.film()
+    names = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+    sizes = (int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
+    return mi.load_dict(
+        {
+            "type": "fspt_lens",
+            **numbers,
+            "model": lens.optics.model,
+            "to_world": mi.ScalarTransform4f(np.array(lens.world_transform().matrix, np.float64).reshape(4, 4)),
+            "film": {"type": "hdrfilm", "pixel_format": "luminance", **dict(zip(names, sizes, strict=True))},
+            "sampler": {"type": sampler},
+        }
+    )
+
+
+def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], Shot]]:
+    """Settings over the samples a pixel, in as few passes as memory allows; every run has another seed."""
+    from ..emission.face_probe import probe_beside
+
+    probe_beside(scene)
+    integrator, seed = tracer(kind), itertools.count(1)
+    pixels = math.prod(int(n) for n in lens.film().crop_size())
+
+    def prepare(spp: float) -> Callable[[], Shot]:
+        count = math.ceil(spp * pixels / LANES)
+
+        def run() -> Shot:
+            total, samples = np.zeros(()), 0
+            for power, taken in passes(scene, lens, integrator, itertools.islice(seed, count), math.ceil(spp / count)):
+                total, samples = total + power, samples + taken
+            return Shot(total / count, samples * pixels, samples)
+
+        return run
+
+    return prepare
+
+
+def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 << 20) -> Callable[[], int]:
+    """A run of nothing but Embree or OptiX: rays in memory to hits in memory; it returns their number.
+
+    Lines of sight like the integral's: four nodes on every pixel that can see what glows, turned about the pupil's
+    middle until there are `least` rays; those of neighbouring pixels lie side by side, and are traced `together`, in
+    packets, or each on its own. Rays beside it, which cost far less, are none of them: a method whose rays are many
+    such may get more than this out of Embree.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    from ..integral import node_rules
+    from ..integral.window import visible_window
+    from ..jit.pixel_grid import Grid
+
+    window = visible_window(scene, lens)
+    pixels = math.prod(window.shape)
+    rule = node_rules.four(True)
+    turns = max(1, math.ceil(least / (len(rule) * pixels)))
+    angle = np.arange(turns)[:, None] * (math.pi * (3 - math.sqrt(5)))
+    x, y = rule.pupil.T
+    pupil = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
+    columns = np.concatenate([pupil.reshape(2, -1), np.tile(rule.pixel.T, turns)])
+    node = dr.arange(mi.UInt32, pixels * columns.shape[1])
+    pixel, node = dr.gather(mi.UInt32, Grid(window.shape).pixels(), node % pixels), node // pixels
+    ax, ay, dx, dy = (dr.gather(mi.Float, mi.Float(column), node) for column in columns)
+    ray, _, _ = lens.line_of_sight(window.centres(pixel) + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
+    dr.eval(ray)
+
+    def run() -> int:
+        hits = scene.ray_intersect_preliminary(ray, coherent=together)
+        dr.eval(hits)
+        dr.sync_thread()
+        return len(node)
+
+    return run

@@ -1,0 +1,116 @@
+"""What `fspt explain` tells: what the integral of a scene leaves out, why, and what that is seen to save."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..integral.shortcuts import SHORTCUTS, Finding
+from ..rendering.render import integrator_of, sensor_of
+from ..rendering.scene import loaded
+from ..runtime import backend
+from ..runtime.extras import EXTRAS
+from ..runtime.plugin_types import is_surface
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import mitsuba as mi
+
+    from ..integral.quadrature import Quadrature, Solution
+
+ROUNDS = 3  # a median of; once where a round takes longer than LONG [s]
+LONG = 5.0
+WHAT_WIDTH = 1 + max(len(what) for what in SHORTCUTS.values())
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    what : is left out or not (`left_out`), and `why`
+    lines_saved, time_saved : shares in [0, 1] of the lines of sight and of the time it would take without the shortcut,
+        measured; None where it is not taken or nothing to switch off
+    """
+
+    what: str
+    left_out: bool
+    why: str
+    lines_saved: float | None = None
+    time_saved: float | None = None
+
+    def render_text(self) -> str:
+        """The row as text: what, left out or kept, lines of sight and time saved, why."""
+        verdict = "left out" if self.left_out else "kept"
+        lines, seconds = ("" if s is None else f"{100 * s:.0f} %" for s in (self.lines_saved, self.time_saved))
+        return f"{self.what:<{WHAT_WIDTH}} {verdict:<9} {lines:>6} {seconds:>6}  {self.why}"
+
+    def to_dict(self) -> dict[str, str | bool | float | None]:
+        """The row as plain data for JSON."""
+        return asdict(self)
+
+
+HEADER = f"{'':<{WHAT_WIDTH}} {'':<9} {'lines':>6} {'time':>6}  (saved)"
+
+
+def explain(
+    scene: mi.Scene | str | os.PathLike[str],
+    *,
+    sensor: int = 0,
+    rtol: float | None = None,
+    domain: str | None = None,
+) -> list[Row]:
+    """What the integral leaves out of a scene: every shortcut that is taken is switched off once to see what it saves.
+
+    Parameters as of `render`, and so are the errors raised.
+    """
+    scene = loaded(scene)
+    variant = backend.ensure_variant()
+    lens, integrator = sensor_of(scene, sensor), integrator_of(scene, "integral")
+    wanted = {name: value for name, value in (("rtol", rtol), ("domain", domain)) if value is not None}
+    quadrature = replace(integrator.quadrature, **wanted)
+
+    def solve(quadrature: Quadrature) -> tuple[Solution, float]:
+        start = time.perf_counter()
+        solution = integrator.solve(scene, lens, quadrature)
+        return solution, time.perf_counter() - start
+
+    solution, _ = solve(quadrature)
+    rows = []
+    for finding in solution.findings:
+        without = replace(quadrature, shortcuts_off=quadrature.shortcuts_off | {finding.name})
+        saved = _saved(solve, quadrature, without) if finding.taken else (None, None)
+        rows.append(_row(finding, *saved))
+    return rows + _never_done(scene, variant)
+
+
+def _saved(
+    solve: Callable[[Quadrature], tuple[Solution, float]], quadrature: Quadrature, without: Quadrature
+) -> tuple[float, float]:
+    """Shares of the lines of sight and of the time that a shortcut saves, by rounds in pairs after a first one."""
+    long, seconds = solve(without)
+    rounds = ROUNDS if seconds < LONG else 1
+    pairs = [(solve(quadrature), solve(without)) for _ in range(rounds)]
+    short = pairs[0][0][0]
+    return 1 - short.rays / max(1, long.rays), float(np.median([1 - on[1] / off[1] for on, off in pairs]))
+
+
+def _row(finding: Finding, lines: float | None, seconds: float | None) -> Row:
+    return Row(SHORTCUTS[finding.name], finding.taken, finding.why, lines, seconds)
+
+
+def _never_done(scene: mi.Scene, variant: str) -> list[Row]:
+    """What costs nothing because it is never begun."""
+    loaded = [one.module for one in EXTRAS if one.module in sys.modules]
+    uniform = [is_surface(emitter) and emitter.is_uniform() for emitter in scene.emitters()]
+    return [
+        Row("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),
+        Row("gradients", True, "a picture asks for none"),
+        Row("optional packages", not loaded, f"imported: {', '.join(loaded) or 'none'}"),
+        Row("further variants", True, f"{variant} alone is set"),
+    ]

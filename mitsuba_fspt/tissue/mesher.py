@@ -1,0 +1,139 @@
+"""Tetrahedra from files: a tetrahedral mesh as it is, or a closed surface through the mesher fTetWild."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+from trimesh.remesh import subdivide_to_size
+
+from ..phantom.formats import read_mesh
+from ..phantom.formats.length_unit import millimetres
+from ..phantom.surface_mesh import boundary, closure
+from ..runtime.errors import BackendError, FluxError
+from .border_surface import nearest_points
+from .tetrahedra import Tetrahedra, require_few
+
+ENVELOPE = 20  # an edge over this: how far the mesher may leave the surface, to which its border is brought back
+ROUNDS = 5  # of putting back vertices whose move has crushed a cell
+CRUSHED = 0.3  # of a cell's volume, or turned over: less must not be left of it
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def read_tetrahedra(
+    path: str | os.PathLike[str], edge: float, length_unit: str = "mm", labels: str | None = None
+) -> Tetrahedra:
+    """Tetrahedra of a file, or those that fill its closed surface with edges of about `edge` [mm].
+
+    `labels` names the file's field of whole numbers, one a tetrahedron, which become the mesh's regions as
+    they are. Any format of `fspt flux import` will do.
+
+    Raises
+    ------
+    FluxError : the file cannot be read, its surface is open, or it lacks the field of labels.
+    BackendError : a package to read or to mesh it is missing.
+    """
+    scale = millimetres(length_unit, "geometry")
+    raw = read_mesh(path, None, None, "auto")
+    points = raw.points * scale
+    if raw.cells.shape[1] == 3:
+        if labels is not None:
+            raise FluxError(
+                f"geometry: '{path}' is a surface, it has no labels '{labels}' of tetrahedra. Leave them out."
+            )
+        return tetrahedralize(points, raw.cells, edge)
+    if labels is None:
+        return Tetrahedra(points, raw.cells)
+    found = [f for f in raw.fields if f.name == labels and f.values.shape == (len(raw.cells),)]
+    if not found:
+        names = ", ".join(f"'{f.name}'" for f in raw.fields) or "none"
+        raise FluxError(
+            f"geometry: '{path}' has no field '{labels}' with one value a tetrahedron. Fields it has: {names}."
+        )
+    values = found[0].values
+    if not (values == np.round(values)).all():
+        raise FluxError(f"geometry: the labels '{labels}' of '{path}' must be whole numbers. Name another field.")
+    return Tetrahedra(points, raw.cells, values.astype(np.int64))
+
+
+def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
+    """Tetrahedra with edges of about `edge` [mm] in a closed surface, `vertices` (V, 3) [mm], `faces` (F, 3).
+
+    By fTetWild; the border's vertices lie on the surface. The mesh differs a little from run to run.
+
+    Raises
+    ------
+    FluxError : the surface is open, nothing comes out, or there would be more than 5 million tetrahedra.
+    BackendError : pytetwild is not installed.
+    """
+    if not closure(vertices, faces).watertight:
+        raise FluxError(
+            f"geometry: the surface of {len(faces)} faces is not closed, so nothing is inside. Close its holes first."
+        )
+    try:
+        import pytetwild
+    except ImportError as cause:
+        raise BackendError(
+            f"flux solve: a mesher is needed to fill a surface ({cause}). pip install "
+            "'mitsuba-fspt[mesher]', or give a tetrahedral mesh."
+        ) from cause
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not 0 < edge <= diagonal:
+        raise FluxError(
+            f"geometry: the mesh edge must be > 0 and at most the size {diagonal:.3g} mm, got {edge:g}. Give mm."
+        )
+    volume = abs(float(np.linalg.det(vertices[faces]).sum())) / 6
+    require_few(6 * math.sqrt(2) * volume, edge)  # regular ones
+    with _in_temporary_folder():  # the mesher leaves a file where it runs
+        points, cells = pytetwild.tetrahedralize(
+            np.ascontiguousarray(vertices, dtype=np.float64),
+            np.ascontiguousarray(faces, dtype=np.int32),
+            edge_length_fac=edge / diagonal,
+            epsilon=edge / ENVELOPE / diagonal,
+        )
+    if len(cells) == 0:
+        raise FluxError(f"geometry: the mesher filled the surface of {len(faces)} faces with nothing. Is it closed?")
+    return _on_surface(Tetrahedra(points, cells), vertices, faces)
+
+
+@contextmanager
+def _in_temporary_folder() -> Iterator[None]:
+    here = os.getcwd()
+    with TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            yield
+        finally:
+            os.chdir(here)
+
+
+def _on_surface(mesh: Tetrahedra, vertices: Array, faces: Index) -> Tetrahedra:
+    """The mesh with the vertices of its border on the surface it fills; `snap` brings other points there."""
+    # Triangles of one size, so that the nearest one is among the few with the nearest centroids.
+    fine, parts = subdivide_to_size(vertices, faces, mesh.edge / 2, max_iter=20)
+    surface = fine[parts]
+
+    def snap(points: Array) -> Array:
+        return nearest_points(points, surface)
+
+    border = np.unique(boundary(mesh.vertices, mesh.cells)[0])
+    moved = mesh.vertices.copy()
+    moved[border] = snap(moved[border])
+    for _ in range(ROUNDS):
+        # A flat cell can turn over; its vertices stay where they were.
+        crushed = _determinants(moved, mesh.cells) / _determinants(mesh.vertices, mesh.cells) < CRUSHED
+        kept = np.unique(mesh.cells[crushed])
+        moved[kept] = mesh.vertices[kept]
+    return Tetrahedra(moved, mesh.cells, snap=snap)
+
+
+def _determinants(vertices: Array, cells: Index) -> Array:
+    """Six times the signed volume of each cell [mm³]."""
+    corners = vertices[cells]
+    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))

@@ -1,0 +1,220 @@
+"""The description of a phantom in TOML, lengths in mm, powers in W.
+
+[geometry]
+shape = "cylinder"       # about the z axis, centred at the origin
+radius = 15
+height = 30
+# Or, in place of these three: tetrahedra or a closed surface in a file beside this one, any format of fspt flux import,
+# file = "mouse.vtu"
+# length_unit = "cm"     # mm where left out
+# labels = "tissue"      # the field of whole numbers that labels the tetrahedra
+
+[optical]
+mua = 0.0138             # absorption, 1/mm
+musp = 0.91              # reduced scattering, 1/mm
+n = 1.37                 # refractive index relative to outside
+a = "robin"              # boundary factor: robin, haskell or a number
+
+[[regions]]              # optional; sphere, cylinder, or label = 3 in place of a shape
+shape = "sphere"
+centre = [-5, 0, 0]
+radius = 3
+mua = 0.05
+musp = 1.2               # and n, where it is another
+
+[[sources]]              # shape: point, sphere or cylinder
+shape = "cylinder"
+centre = [8, 0, -1]
+radius = 1
+length = 1
+axis = [0, 0, 1]
+power = 1
+
+[mesh]
+edge = 1.5               # of the tetrahedra
+order = 2                # 1 or 2
+
+[output]
+edge = 0.35              # of the triangles of the surface
+voxel = 0.4              # of the volume
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..optics.boundary import boundary_a
+from ..optics.media import Medium, Source
+from ..optics.shapes import Ball, Rod, Shape
+from ..runtime.errors import FluxError
+from .cylinder_mesh import cylinder_tetrahedra
+from .diffusion import Progress, solve
+from .finite_elements import import_skfem
+from .mesher import read_tetrahedra
+from .solution import Solution
+from .tetrahedra import Tetrahedra
+from .toml_table import Table
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Cylinder about the z axis, centred at the origin: `radius` and `height` [mm]."""
+
+    radius: float
+    height: float
+
+    def mesh(self, edge: float) -> Tetrahedra:
+        """Its tetrahedra with edges of about `edge` [mm]."""
+        return cylinder_tetrahedra(self.radius, self.height, edge)
+
+
+@dataclass(frozen=True)
+class File:
+    """Tetrahedra or a closed surface in a file, in `length_unit`; `labels`: the field that labels its cells."""
+
+    path: Path
+    length_unit: str = "mm"
+    labels: str | None = None
+
+    def mesh(self, edge: float) -> Tetrahedra:
+        """Its tetrahedra, or those with edges of about `edge` [mm] that fill it."""
+        return read_tetrahedra(self.path, edge, self.length_unit, self.labels)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the tissue with a `medium` of its own: a shape, or a label of the mesh file."""
+
+    where: Shape | int
+    medium: Medium
+
+
+@dataclass(frozen=True)
+class PhantomFile:
+    """A phantom to be solved: what the TOML file says. `medium` is that of all tissue outside the `regions`.
+
+    `edge` of the tetrahedra, `surface_edge` of the surface's triangles and `voxel` [mm]; `order` 1 or 2; `a`
+    the boundary factor's name or value.
+    """
+
+    geometry: Cylinder | File
+    medium: Medium
+    sources: tuple[Source, ...]
+    regions: tuple[Region, ...] = ()
+    a: str | float = "robin"
+    edge: float = 1.5
+    order: int = 2
+    surface_edge: float = 0.35
+    voxel: float = 0.4
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> PhantomFile:
+        """The description in a TOML file. A file it names is looked for beside it.
+
+        Raises
+        ------
+        FluxError : the file cannot be read, a key is missing, unknown or of a wrong kind, a number out of
+        range.
+        """
+        path = Path(path)
+        file = Table.load(path)
+        optical = file.table("optical")
+        mesh, output = file.table("mesh", {}), file.table("output", {})
+        medium = _medium(optical, 1.37)
+        result = cls(
+            _geometry(file.table("geometry"), path.parent),
+            medium,
+            tuple(_source(table) for table in file.tables("sources")),
+            tuple(_region(table, medium.n) for table in file.tables("regions")),
+            optical.text_or_number("a", cls.a),
+            mesh.number("edge", cls.edge),
+            mesh.whole("order", cls.order),
+            output.number("edge", cls.surface_edge),
+            output.number("voxel", cls.voxel),
+        )
+        boundary_a(result.a, medium.n)
+        for table in (optical, mesh, output, file):
+            table.done()
+        return result
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that it reads besides itself."""
+        return (self.geometry.path,) if isinstance(self.geometry, File) else ()
+
+    def mesh(self) -> Tetrahedra:
+        """The tetrahedra with the number of their region, 1, 2, …, 0 for the rest; of several the last.
+
+        Raises
+        ------
+        FluxError, BackendError : see cylinder_tetrahedra and read_tetrahedra; or a label that no tetrahedron
+        has.
+        """
+        mesh = self.geometry.mesh(self.edge)
+        labels, region = mesh.region, np.zeros(len(mesh.cells), dtype=np.int64)
+        for number, part in enumerate(self.regions, start=1):
+            inside = labels == part.where if isinstance(part.where, int) else mesh.inside(part.where)
+            if not inside.any():
+                raise FluxError(
+                    f"region {number}: no tetrahedron of the mesh is in it ({part.where}). Check place and "
+                    f"size, or give a mesh edge below {self.edge:g} mm."
+                )
+            region[inside] = number
+        return replace(mesh, region=region)
+
+    def solve(self, progress: Progress | None = None) -> Solution:
+        """Mesh the phantom and solve it; see `tissue.solve`."""
+        import_skfem()  # before the mesher's minutes
+        if progress:
+            progress("mesh")
+        mesh = self.mesh()
+        mesh.cuts(self.surface_edge)  # refuses what cannot be, before the solver's minutes
+        media = (self.medium, *(part.medium for part in self.regions))
+        return solve(mesh, media, self.sources, a=self.a, order=self.order, progress=progress)
+
+
+def _geometry(table: Table, folder: Path) -> Cylinder | File:
+    """The geometry of the table [geometry]."""
+    if "file" in table.left:
+        result: Cylinder | File = File(
+            folder / table.text("file"), table.text("length_unit", "mm"), table.optional_text("labels")
+        )
+    else:
+        table.choice("shape", ("cylinder",))
+        result = Cylinder(table.number("radius"), table.number("height"))
+    table.done()
+    return result
+
+
+def _medium(table: Table, n: float) -> Medium:
+    return Medium(table.number("mua"), table.number("musp"), table.number("n", n))
+
+
+def _region(table: Table, n: float) -> Region:
+    """A table of [[regions]]; its refractive index is that of [optical] unless it names one."""
+    where = table.whole("label") if "label" in table.left else _shape(table, ("sphere", "cylinder"))
+    result = Region(where, _medium(table, n))
+    table.done()
+    return result
+
+
+def _source(table: Table) -> Source:
+    """A table of [[sources]]."""
+    result = Source(_shape(table, ("point", "sphere", "cylinder")), table.number("power", 1.0))
+    table.done()
+    return result
+
+
+def _shape(table: Table, choices: tuple[str, ...]) -> Shape:
+    shape = table.choice("shape", choices)
+    centre = table.vector("centre")
+    if shape == "point":
+        return Ball(centre)
+    if shape == "sphere":
+        return Ball(centre, table.number("radius"))
+    axis = table.vector("axis", (0.0, 0.0, 1.0))
+    return Rod(centre, table.number("length"), table.number("radius"), axis)

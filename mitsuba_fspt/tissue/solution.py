@@ -1,0 +1,205 @@
+"""A solved phantom: fluence and exitance at any point, the border as a phantom, the fluence as a volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..optics.media import Medium
+from ..phantom.phantom import Phantom
+from ..phantom.surface_mesh import face_areas
+from ..runtime.errors import FluxError
+from .border_surface import border_lattice, nearest_points
+from .finite_elements import Solved
+from .fluence_volume import Volume, voxel_box
+from .free_field import FreeField
+from .tetrahedra import OUTSIDE, Tetrahedra, depth
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Share of the exit power that values below 0, an error of the mesh, may take away before it is refused.
+LARGEST_REMOVED = 1e-4
+# Of the search in curved cells; each one divides the error by about 8 radii of curvature over an edge.
+CURVED_STEPS = 6
+NEARBY = 0.5  # barycentric coordinates beyond a cell: further off curved cells are as good as straight ones
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """φ = free fields of the sources + the rest `solved.rest` on the finite element `basis` of `mesh`.
+
+    `media` and boundary `factors` A: one a region of the mesh; `source_power` [W].
+    """
+
+    mesh: Tetrahedra
+    basis: Any
+    media: tuple[Medium, ...]
+    factors: tuple[float, ...]
+    fields: tuple[FreeField, ...]
+    source_power: float
+    solved: Solved
+
+    @property
+    def balance(self) -> float:
+        """(absorbed + exit power)/source power - 1, no unit: what quadrature on the border misses of the sources."""
+        return (self.solved.absorbed + self.solved.exited) / self.source_power - 1
+
+    def report(self) -> dict[str, float | int]:
+        """Power balance and size, ready for JSON.
+
+        source_power, absorbed_power, exit_power [W]; exit_fraction; balance (see there); nodes (unknowns), cells,
+        iterations.
+        """
+        absorbed, leaving = self.solved.absorbed, self.solved.exited
+        return {
+            "source_power": self.source_power,
+            "absorbed_power": absorbed,
+            "exit_power": leaving,
+            "exit_fraction": leaving / self.source_power,
+            "balance": self.balance,
+            "nodes": int(self.basis.N),
+            "cells": len(self.mesh.cells),
+            "iterations": self.solved.iterations,
+        }
+
+    def fluence_at(self, points: Array, core: float = 0.0) -> Array:
+        """φ [W/mm²] at `points` (N, 3) [mm] in the tissue, shape (N,).
+
+        Just outside, the rest w is that of the nearest point of a nearby cell. Closer than `core` [mm] to a
+        point source φ stays constant; with core 0 it is infinite there.
+        """
+        cells, local = self._locate(points)
+        return self._fluence(points, cells, local, core)
+
+    def exitance_at(self, points: Array) -> Array:
+        """J_n = φ/(2A) [W/mm²] at `points` (N, 3) [mm] of the border, shape (N,)."""
+        cells, local = self._locate(points)
+        factor = np.asarray(self.factors)[self.mesh.region[cells]]
+        return self._fluence(points, cells, local, 0.0) / (2 * factor)
+
+    def phantom(self, edge: float) -> Phantom:
+        """The border with J_n on its vertices, the edges of its triangles about `edge` [mm] > 0 or shorter.
+
+        One factor, near 1, makes the sum over triangles of area times mean value the finite elements' exit
+        power; the provenance has it as `scale`. Values below 0 become 0 and are counted.
+
+        Raises
+        ------
+        FluxError : the edge is not positive or far too short, no light leaves, or the values below 0 matter: the
+            mesh is too coarse.
+        """
+        if not self.solved.exited > 0:
+            raise FluxError(
+                f"solve: the exit power is {self.solved.exited:g} W of {self.source_power:g} W, the phantom would be "
+                "black. Give smaller mua and musp, or a source closer to the border."
+            )
+        vertices, faces = self._border(edge)
+        exitance = self.exitance_at(vertices)
+        areas = face_areas(vertices, faces)
+        removed = float(areas @ np.maximum(-exitance, 0)[faces].mean(axis=1))
+        if removed > LARGEST_REMOVED * self.solved.exited:
+            raise FluxError(
+                f"solve: exitance below 0 takes away {removed:.3g} W of {self.solved.exited:.3g} W. The mesh "
+                f"is too coarse for these optics; give an edge below {self.mesh.edge:.3g} mm."
+            )
+        clipped = np.maximum(exitance, 0)
+        scale = self.solved.exited / float(areas @ clipped[faces].mean(axis=1))
+        provenance = {
+            "source": "diffusion equation by finite elements",
+            "boundary_factor": " ".join(f"{factor:.6g}" for factor in self.factors),
+            "media": "; ".join(f"mua {m.mua:g}/mm, musp {m.musp:g}/mm, n {m.n:g}" for m in self.media),
+            "source_power": f"{self.source_power!r} W",
+            "scale": f"{scale!r}",
+        }
+        negatives = int(np.count_nonzero(exitance < 0))
+        return Phantom(vertices, faces, clipped * scale, "vertex", provenance, negatives, removed)
+
+    def volume(self, voxel: float) -> Volume:
+        """φ [W/mm²] in the middle of cubes of edge `voxel` [mm], in a box one of them wider than the tissue.
+
+        Outside, φ goes on from the nearest point of the border as exp(-distance/(2AD)), the slope of the
+        boundary condition, so that trilinear interpolation up to the surface meets no jump.
+
+        Raises
+        ------
+        FluxError : the voxel's edge is not positive, or there would be too many of them.
+        """
+        # Too many voxels are refused before the border is cut as fine.
+        voxel_box(self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0), voxel)
+        border, faces = self._border(voxel)
+        low, high, axes = voxel_box(border.min(axis=0), border.max(axis=0), voxel)
+        z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+        points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+        cells, local = self._curved(points, *self.mesh.locate(points))
+        inside = depth(local) > -OUTSIDE
+        fluence = np.empty(len(points))
+        # 1/r has over a cube about its middle the mean 1/(0.42 edge): a point source keeps its voxel finite.
+        fluence[inside] = self._fluence(points[inside], cells[inside], local[inside], 0.42 * voxel)
+        nearest = self._snap(nearest_points(points[~inside], border[faces]))
+        fluence[~inside] = self._continued(points[~inside], nearest)
+        return Volume(fluence.reshape(x.shape).astype(np.float32), low, high)
+
+    def _continued(self, points: Array, nearest: Array) -> Array:
+        """φ at `points` outside, from the nearest points of the border."""
+        cells, local = self._locate(nearest)
+        region = self.mesh.region[cells]
+        length = np.array([2 * a * m.diffusion for a, m in zip(self.factors, self.media, strict=True)])[region]
+        distance = np.linalg.norm(points - nearest, axis=1)
+        return self._fluence(nearest, cells, local, 0.0) * np.exp(-distance / length)
+
+    def _border(self, edge: float) -> tuple[Array, Index]:
+        """The border as vertices and faces with edges of about `edge` [mm] or less, on the true surface."""
+        vertices, faces = border_lattice(self.basis.mesh, self.mesh.cuts(edge))
+        return self._snap(vertices), faces
+
+    def _snap(self, points: Array) -> Array:
+        """Points near the border on the true one, where the mesh knows it."""
+        return points if self.mesh.snap is None else self.mesh.snap(points)
+
+    def _fluence(self, points: Array, cells: Index, local: Array, core: float) -> Array:
+        dofs = self.basis.element_dofs[:, cells]
+        rest = sum(self.solved.rest[dof] * shape for dof, shape in zip(dofs, self._shapes(local), strict=True))
+        return np.asarray(rest + sum(field.fluence(points, core) for field in self.fields))
+
+    def _shapes(self, local: Array) -> list[Array]:
+        """The basis functions of a cell at local coordinates (N, 3)."""
+        return [self.basis.elem.lbasis(local.T, i)[0] for i in range(self.basis.Nbfun)]
+
+    def _locate(self, points: Array) -> tuple[Index, Array]:
+        """Cells and local coordinates of points, held inside the cell."""
+        cells, local = self._curved(points, *self.mesh.locate(points))
+        rest = np.maximum(1 - local.sum(axis=1, keepdims=True), 0)
+        local = np.maximum(local, 0)
+        return cells, local / (local.sum(axis=1, keepdims=True) + rest)
+
+    def _curved(self, points: Array, cells: Index, local: Array) -> tuple[Index, Array]:
+        """Cells and local coordinates in the curved mesh, from those in the straight one."""
+        near = np.flatnonzero(depth(local) > -NEARBY)
+        if self.basis.mesh.affine or len(near) == 0:
+            return cells, local
+        there = self._curved_local(points[near], cells[near])
+        converged = depth(there) > -NEARBY
+        near = near[converged]
+        local[near] = there[converged]
+        for _ in range(CURVED_STEPS):
+            # A facet that ends in a curved edge is curved too: the point can be in the next cell.
+            behind = self.mesh.behind(cells[near], local[near])
+            near, behind = near[behind >= 0], behind[behind >= 0]
+            there = self._curved_local(points[near], behind)
+            better = depth(there) > depth(local[near])
+            near = near[better]
+            cells[near], local[near] = behind[better], there[better]
+        return cells, local
+
+    def _curved_local(self, points: Array, cells: Index) -> Array:
+        """Local coordinates of points in curved cells, which differ from straight ones by little: a fixed point."""
+        nodes = self.basis.mesh.doflocs[:, self.basis.element_dofs[:, cells]].swapaxes(0, 1)
+        local = self.mesh.local(points, cells)
+        for _ in range(CURVED_STEPS):
+            mapped = sum(node * shape for node, shape in zip(nodes, self._shapes(local), strict=True))
+            local += np.einsum("nij,nj->ni", self.mesh.inverse[cells], points - np.asarray(mapped).T)
+        return local

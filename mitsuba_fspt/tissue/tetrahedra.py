@@ -1,0 +1,191 @@
+"""A tetrahedral mesh of tissue: its regions, and which cell a point is in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..optics.shapes import Shape
+from ..runtime.errors import FluxError
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+STARTS = 4  # of the search for a point's cell
+MOST_STEPS = 200
+ROUND_OFF = 1e-9  # of a barycentric coordinate
+OUTSIDE = 1e-6  # likewise: a point no further beyond the border counts as inside
+# More take tens of gigabytes: tetrahedra in the solver, triangles of the surface.
+MOST_CELLS = 5_000_000
+MOST_FACES = 10_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Tetrahedra:
+    """Tetrahedral mesh.
+
+    `vertices` (V, 3) [mm]; `cells` (T, 4), indices of vertices in either orientation; `region` (T,), the
+    label of each cell, all 0 where left out; `snap` brings points (N, 3) near the border onto the true,
+    curved one.
+
+    Raises
+    ------
+    FluxError : an array has another shape, a vertex is not finite, an index out of range, or a cell is flat.
+    """
+
+    vertices: Array
+    cells: Index
+    region: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    snap: Callable[[Array], Array] | None = None
+
+    def __post_init__(self) -> None:
+        vertices, cells = np.asarray(self.vertices, dtype=np.float64), np.asarray(self.cells, dtype=np.int64)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+            raise FluxError(
+                f"tetrahedra: vertices must be finite, shape (V, 3), got shape {vertices.shape}. Mend them."
+            )
+        if cells.ndim != 2 or cells.shape[1] != 4 or len(cells) == 0:
+            raise FluxError(
+                f"tetrahedra: cells must have shape (T, 4), T > 0, got {cells.shape}. Give four corners each."
+            )
+        if cells.min() < 0 or cells.max() >= len(vertices):
+            raise FluxError(
+                f"tetrahedra: cells refer to vertices {cells.min()} to {cells.max()}, there are "
+                f"{len(vertices)}, counted from 0. Subtract 1 from indices that count from 1."
+            )
+        region = np.asarray(self.region, dtype=np.int64) if len(self.region) else np.zeros(len(cells), np.int64)
+        if region.shape != (len(cells),):
+            raise FluxError(
+                f"tetrahedra: {len(cells)} cells need as many region labels, got {region.shape}. Give one each."
+            )
+        for name, value in (("vertices", vertices), ("cells", cells), ("region", region)):
+            object.__setattr__(self, name, value)
+        flat = self.volumes <= 1e-12 * np.ptp(vertices, axis=0).max() ** 3 / len(cells)
+        if flat.any():
+            raise FluxError(
+                f"tetrahedra: {np.count_nonzero(flat)} of {len(cells)} cells have no volume, the first is "
+                f"cell {np.argmax(flat)}. Mesh again or remove the slivers."
+            )
+
+    def cuts(self, edge: float) -> int:
+        """Into how many parts the border's edges are to be cut for triangles with edges of about `edge` [mm].
+
+        Raises
+        ------
+        FluxError : the edge is not positive, or there would be more than `MOST_FACES` triangles.
+        """
+        if not (math.isfinite(edge) and edge > 0):
+            raise FluxError(f"surface: 'edge' must be > 0 and finite, got {edge:g}. Give mm.")
+        facets = np.count_nonzero(self.neighbours < 0)
+        parts = max(1.0, self.edge / edge)
+        if parts * parts * facets > MOST_FACES:
+            raise FluxError(
+                f"surface: edges of {edge:g} mm make {parts * parts * facets:.3g} triangles, at most {MOST_FACES:.0e} "
+                f"can be. Give an edge above {self.edge * math.sqrt(facets / MOST_FACES):.2g} mm."
+            )
+        return math.ceil(parts)
+
+    @property
+    def edges(self) -> Array:
+        """The three edge vectors of each cell from its first vertex, as columns; (T, 3, 3) [mm]."""
+        corners = self.vertices[self.cells]
+        return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+
+    @property
+    def volumes(self) -> Array:
+        """Volume of each cell, (T,) [mm³]."""
+        return np.asarray(np.abs(np.linalg.det(self.edges)) / 6)
+
+    @property
+    def edge(self) -> float:
+        """Edge of the regular tetrahedron of mean volume [mm]."""
+        return float((6 * np.sqrt(2) * self.volumes.mean()) ** (1 / 3))
+
+    def inside(self, shape: Shape) -> NDArray[np.bool_]:
+        """Whether the centroid of each cell lies in the shape; (T,)."""
+        return shape.contains(self.vertices[self.cells].mean(axis=1))
+
+    def locate(self, points: Array) -> tuple[Index, Array]:
+        """The cell each of `points` (N, 3) [mm] is in; outside, one close to it.
+
+        Returns the cells (N,) and the points' local coordinates (N, 3): the barycentric coordinates of the
+        cell's second to fourth vertex; they and their complement to 1 are >= 0 (see `depth`) where the point
+        is inside.
+        """
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(self.vertices[self.cells].mean(axis=1))
+        starts = tree.query(points, k=min(STARTS, len(self.cells)))[1].reshape(len(points), -1)
+        cells, local = self._walk(points, starts[:, 0])
+        for start in starts.T[1:]:
+            # Stuck at the border: outside, or on the other side of a cleft. Another start tells which.
+            lost = np.flatnonzero(depth(local) < -ROUND_OFF)
+            other, there = self._walk(points[lost], start[lost])
+            better = depth(there) > depth(local[lost])
+            cells[lost[better]], local[lost[better]] = other[better], there[better]
+        return cells, local
+
+    def _walk(self, points: Array, start: Index) -> tuple[Index, Array]:
+        """From cell to cell, each time through the facet that the point is farthest behind."""
+        cells, local = start.copy(), np.empty((len(points), 3))
+        moving = np.arange(len(points))
+        for _ in range(MOST_STEPS):
+            local[moving] = self.local(points[moving], cells[moving])
+            behind = self.behind(cells[moving], local[moving])
+            moving, behind = moving[behind >= 0], behind[behind >= 0]
+            cells[moving] = behind
+            if len(moving) == 0:
+                break
+        else:
+            local[moving] = -np.inf  # going round in circles
+        return cells, local
+
+    def local(self, points: Array, cells: Index) -> Array:
+        """Local coordinates (N, 3) of `points` (N, 3) [mm] in one cell each (N,)."""
+        return np.einsum("nij,nj->ni", self.inverse[cells], points - self.vertices[self.cells[cells, 0]])
+
+    def behind(self, cells: Index, local: Array) -> Index:
+        """The next cell towards each point with these local coordinates, (N,); -1 in its own cell and at the border."""
+        weights = np.column_stack([1 - local.sum(axis=1), local])
+        weights[self.neighbours[cells] < 0] = 0
+        through = np.argmin(weights, axis=1)
+        row = np.arange(len(cells))
+        return np.where(weights[row, through] < -ROUND_OFF, self.neighbours[cells, through], -1)
+
+    @cached_property
+    def inverse(self) -> Array:
+        """Inverse of each cell's edge matrix, (T, 3, 3) [1/mm]."""
+        return np.asarray(np.linalg.inv(self.edges))
+
+    @cached_property
+    def neighbours(self) -> Index:
+        """The cell behind the facet opposite to each vertex of each cell, (T, 4); -1 at the border."""
+        facets = np.sort(self.cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+        order = np.lexsort(facets.T)
+        pair = np.flatnonzero((facets[order[1:]] == facets[order[:-1]]).all(axis=1))
+        neighbours = np.full(len(facets), -1)
+        neighbours[order[pair]], neighbours[order[pair + 1]] = order[pair + 1] // 4, order[pair] // 4
+        return neighbours.reshape(-1, 4)
+
+
+def require_few(at_one: float, edge: float) -> None:
+    """Raise FluxError where a mesh with edges of `edge` [mm] would have more than `MOST_CELLS` tetrahedra.
+
+    `at_one` : how many it would have with edges of 1 mm
+    """
+    cells = at_one / edge / edge / edge
+    if cells > MOST_CELLS:
+        raise FluxError(
+            f"geometry: mesh edges of {edge:g} mm make about {cells:.3g} tetrahedra, at most {MOST_CELLS:.0e} can be. "
+            f"Give an edge above {(at_one / MOST_CELLS) ** (1 / 3):.2g} mm."
+        )
+
+
+def depth(local: Array) -> Array:
+    """Smallest barycentric coordinate of local coordinates (..., 3): negative outside the cell."""
+    return np.minimum(local.min(axis=-1), 1 - local.sum(axis=-1))

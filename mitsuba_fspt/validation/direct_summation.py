@@ -1,0 +1,105 @@
+"""Eq. 9 as the paper sums it: over surface points, at the middle of every pixel.
+
+A point r adds L cosθ_s dS · A_vd cosθ_d/|r_vd − r|² to each pixel r_vd whose line to it meets the diaphragm (β), that
+is, to those with their middle in its blur disc, where nothing hides it along that line (α). Here to be measured: the
+blur disc shrinks to nothing on the sharp plane, and points whose disc holds no middle are lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..emission.elements import Elements, elements_of
+from ..integral.occlusion import hidden
+from ..integral.scene_checks import check_scene
+from ..jit.batches import numbered, runs
+from ..jit.recording import recording
+from ..jit.spectra import scalar
+
+Image = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def points_of(scene: mi.Scene, minimum: int) -> int:
+    """Number of points that `solve` sums over: faces, each cut into k² alike, or cells of (u, v)."""
+    return sum(elements_of(emitter.get_shape(), minimum).count for emitter in scene.emitters())
+
+
+def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Image, int]:
+    """Power on the pixels of the crop window, shape (h, w) [W], and the number of pairs of a point and a pixel.
+
+    Every glowing shape has at least `minimum` points; with 1 those of a mesh are the centres of its faces. Raises
+    SceneError or ExitanceError as in `check_scene`.
+    """
+    check_scene(scene, lens)
+    width, height = (int(n) for n in lens.film().crop_size())
+    power, pairs = dr.zeros(mi.Float64, width * height), 0
+    with recording(), dr.suspend_grad():
+        for emitter in scene.emitters():
+            elements = elements_of(emitter.get_shape(), minimum)
+            for index, pixel in _pairs(elements, lens):
+                pairs += len(index)
+                _add(power, scene, lens, emitter, elements, index, pixel)
+                dr.eval(power)
+    return power.numpy().reshape(height, width), pairs
+
+
+def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]:
+    """Elements and the flat numbers of the pixels around their blur discs, some `LANES` pairs at a time."""
+    si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
+    centre, radius = lens.film_discs(si.p.numpy().T.astype(np.float64))
+    size, offset = (
+        np.array([int(n) for n in corner]) for corner in (lens.film().crop_size(), lens.film().crop_offset())
+    )
+    # Whole numbers k with |k + ½ - centre| <= radius, a float32's rounding more.
+    reach = np.where(np.isfinite(radius), radius * (1 + 1e-4) + 1e-3, np.inf)
+    first = np.clip(np.ceil(centre - reach - 0.5 - offset), 0, size).astype(np.int64)
+    last = np.clip(np.floor(centre + reach - 0.5 - offset), -1, size - 1).astype(np.int64)
+    columns, rows = np.maximum(last - first + 1, 0).T
+    count = columns * rows
+    for run in runs(count):
+        index, number = numbered(count[run])
+        index += run.start
+        row, column = number // columns[index] + first[index, 1], number % columns[index] + first[index, 0]
+        if len(index):
+            yield index, row * size[0] + column
+
+
+def _add(
+    power: mi.Float64,
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    emitter: mi.Emitter,
+    elements: Elements,
+    index: Index,
+    pixel: Index,
+) -> None:
+    """Add what the elements give to their pixels, a pair a lane, in one kernel."""
+    number = mi.UInt32(pixel.astype(np.uint32))
+    width = dr.opaque(mi.UInt32, int(lens.film().crop_size()[0]))
+    corner = mi.Point2f(*(dr.opaque(mi.Float, int(n) + 0.5) for n in lens.film().crop_offset()))
+    position = corner + mi.Vector2f(mi.Float(number % width), mi.Float(number // width))
+
+    si, area = elements.place(mi.UInt32(index.astype(np.uint32)), mi.Point2f(*elements.middle))
+    centre, radius, _ = lens.blur_disc(si.p)
+    pupil = mi.Point2f((position - centre) / radius)
+    _, lens_point, passes, cos_d = lens.arrival(si.p, pupil)
+    to_lens = lens_point - si.p
+    distance = dr.norm(to_lens)
+    to_lens /= distance
+    cos_s = dr.dot(si.n, to_lens)
+    lit = (dr.squared_norm(pupil) <= 1) & (passes > 0) & (cos_s > 0)
+    lit &= ~hidden(scene, si.p, lens_point, lit)
+    si.initialize_sh_frame()
+    si.wi = si.to_local(to_lens)
+    radiance = dr.select(lit, scalar(emitter.eval(si, lit)), 0)
+    # |r_vd - r| = |u - z|/cosθ_d; A_vd last, so that nothing leaves float32 on the way.
+    defocus = dr.opaque(mi.Float, lens.optics.focus_distance) - distance * cos_d
+    solid_angle = cos_d * dr.square(cos_d * dr.opaque(mi.Float, lens.virtual_pitch) / defocus)
+    added = mi.Float64(radiance * cos_s) * mi.Float64(area) * mi.Float64(solid_angle)
+    dr.scatter_add(power, dr.select(lit, added, 0), number, lit)

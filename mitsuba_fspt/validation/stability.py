@@ -1,0 +1,79 @@
+"""What `fspt stability` tells: stiff and extreme cases, each right to its tolerance or refused, and what it reached."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ..runtime.errors import FsptError
+
+NAME_WIDTH = 46  # characters of the longest case's name
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the table.
+
+    name : what is stiff or extreme
+    why : where the truth comes from
+    run : returns the worst relative error against it, >= 0 (no unit); a picture that is not finite gives NaN
+    tolerance : what that error may be, > 0; None where float32 cannot be right and a refusal is
+    slow : left out unless everything is asked for
+    """
+
+    name: str
+    why: str
+    run: Callable[[], float]
+    tolerance: float | None
+    slow: bool = False
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a case came to: its `error`, or the message of its `refusal`, and how long it took [s]."""
+
+    case: Case
+    error: float | None
+    refusal: str | None
+    seconds: float
+
+    @property
+    def ok(self) -> bool:
+        """True if the case was right to its tolerance, or refused where that is what is right. NaN is never right."""
+        if self.case.tolerance is None or self.error is None:
+            return self.case.tolerance is None and self.refusal is not None
+        return 0 <= self.error <= self.case.tolerance
+
+    def render_text(self) -> str:
+        """The row as text: case, tolerance, error or 'refused', ok or FAIL, seconds; last a refusal's message."""
+        tolerance = "refuse" if self.case.tolerance is None else f"{self.case.tolerance:.0e}"
+        reached = "refused" if self.error is None else f"{self.error:.1e}"
+        verdict = "ok" if self.ok else "FAIL"
+        row = f"{self.case.name:<{NAME_WIDTH}}  {tolerance:>6}  {reached:>7}  {verdict:<4}  {self.seconds:6.2f} s"
+        return f"{row}  {self.refusal}" if self.refusal else row
+
+    def to_dict(self) -> dict[str, str | float | bool | None]:
+        """The row as plain data for JSON; an error that is not finite is null, like one that was not reached."""
+        error = self.error if self.error is not None and math.isfinite(self.error) else None
+        return {
+            "case": self.case.name,
+            "truth": self.case.why,
+            "tolerance": self.case.tolerance,
+            "error": error,
+            "refusal": self.refusal,
+            "ok": self.ok,
+            "seconds": round(self.seconds, 3),
+        }
+
+
+def check(case: Case) -> Result:
+    """Run a case. Errors of this package are its refusal; any other exception is a fault of the code and comes out."""
+    start = time.perf_counter()
+    error, refusal = None, None
+    try:
+        error = float(case.run())
+    except FsptError as refused:
+        refusal = str(refused)
+    return Result(case, error, refusal, time.perf_counter() - start)

@@ -1,0 +1,375 @@
+"""The command line: what each verb prints, writes and returns, and what the header of its image tells."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import shlex
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import OpenEXR
+import pytest
+import typer
+from little_scenes import LENS_XML, SCENES, write_ply, write_scene
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.cli import app
+from mitsuba_fspt.rendering import render
+from mitsuba_fspt.runtime import doctor
+
+SMALL = ["-D", "width=12", "-D", "height=10", "-D", "pixel_pitch=2.304", "--rtol", "1e-2"]
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def header(path):
+    """Header attributes under `fspt:` as OpenEXR reads them."""
+    with OpenEXR.File(str(path)) as file:
+        return {key: value for key, value in file.header().items() if key.startswith("fspt:")}
+
+
+# --- render ---
+
+
+def test_render_writes_the_scenes_name_into_the_current_folder(run, tmp_path):
+    code, out, err = run("render", SCENES / "two_spheres.xml", *SMALL)
+    assert (code, err) == (0, "")
+    assert re.fullmatch(r"two_spheres\.exr: total \S+ W, brightest pixel \S+ W, \S+ s\n", out)
+    assert os.listdir(tmp_path) == ["two_spheres.exr"]
+    image = fspt.read("two_spheres.exr")
+    assert image.shape == (10, 12)
+    assert float(re.search(r"total (\S+) W", out)[1]) == pytest.approx(image.power.sum(), rel=1e-5)
+    with OpenEXR.File("two_spheres.exr", separate_channels=True) as file:
+        assert set(file.channels()) == {"Y", "error.Y", "coverage.Y"}
+        assert {channel.pixels.dtype for channel in file.channels().values()} == {np.dtype(np.float32)}
+
+
+@pytest.mark.parametrize("scene", sorted(SCENES.glob("*.xml")), ids=lambda path: path.stem)
+def test_every_scene_of_the_package_renders(run, scene):
+    """By its own integrator, small."""
+    integral = "fspt_integral" in scene.read_text()
+    few = SMALL[-2:] if integral else ["--spp", "2"]
+    code, _, err = run("render", scene, "-o", "o.exr", *SMALL[:-2], *few)
+    assert (code, err) == (0, "")
+    image = fspt.read("o.exr")
+    assert image.power.max() > 0
+    assert image.metadata["method"] == "integral" or not integral
+
+
+def test_render_with_a_picture_beside(run, tmp_path):
+    code, out, err = run("render", SCENES / "l_shape.xml", *SMALL, "-o", "letter.exr", "--png")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[1].startswith("letter.png: ")
+    assert set(os.listdir(tmp_path)) == {"letter.exr", "letter.png"}
+
+
+def test_mitsubas_warnings_stay_out_of_the_output(run, tmp_path):
+    """A film in colour draws one from Mitsuba, a scene that loses rays one from the integrator."""
+    import little_scenes
+
+    write_ply(tmp_path / "a.ply", [(0, -3, -3), (0, 3, -3), (0, 3, 3)], [(0, 1, 2)], vertex=[1, 1, 1])
+    sensor = little_scenes.LENS_XML.replace('value="luminance"', 'value="rgb"')
+    write_scene(tmp_path / "s.xml", sensor=sensor)
+    for method in ("integral", "path"):
+        code, out, err = run("render", "s.xml", "--method", method, *(["--spp", 4] if method == "path" else []))
+        assert (code, err, len(out.splitlines())) == (0, "", 1)
+
+
+# --- the header ---
+
+LENS_NUMBERS = {
+    "model": "diaphragm",
+    "focal_length": 55.0,
+    "f_number": 4.0,
+    "diaphragm_diameter": 13.75,
+    "focus_distance": 165.0,
+    "image_distance": 82.5,
+    "magnification": 0.5,
+    "pixel_pitch": 0.8,
+}
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--rtol", "5e-3"], {"method": "integral", "rtol": 5e-3, "domain": "pupil", "pixel": "area"}),
+        (["--domain", "surface", "--rtol", "1e-2"], {"method": "integral", "rtol": 1e-2, "domain": "surface"}),
+        (["--method", "path", "--spp", "70", "--seed", "9"], {"method": "path", "seed": 9, "spp": 96, "passes": 32}),
+        (["--method", "ptracer", "--spp", "64"], {"method": "ptracer", "seed": 0, "spp": 64, "passes": 32}),
+    ],
+)
+def test_the_header_tells_all_and_reproduces_the_file(run, tmp_path, options, told):
+    write_scene(tmp_path / "s.xml")
+    code, *_ = run("render", "s.xml", *options, "-D", "f_number=4", "-D", "distance=170", "-o", "first.exr")
+    assert code == 0
+    raw, image = header("first.exr"), fspt.read("first.exr")
+    story = image.metadata
+    assert {f"fspt:{key}" for key in story} == set(raw)
+    expected = {"quantity": "power", "unit": "W", "scene": "s.xml f_number=4 distance=170"} | LENS_NUMBERS | told
+    for key, value in expected.items():
+        assert story[key] == (pytest.approx(value) if isinstance(value, float) else value), key
+    for package in ("mitsuba-fspt", "mitsuba", "drjit", "numpy"):
+        assert re.search(rf"(^|, ){package} \d+\.\d+", story["versions"])
+    assert story["variant"].split("_")[0] in ("llvm", "cuda")
+    assert 0 < story["wall_time"] < 600
+    if told["method"] == "integral":
+        assert story["nodes"] > 0
+        again = ["--rtol", story["rtol"], "--domain", story["domain"]]
+    else:
+        again = ["--spp", story["spp"], "--seed", story["seed"]]
+    scene, *parameters = story["scene"].split(" ")
+    define = [word for parameter in parameters for word in ("-D", parameter)]
+    assert run("render", scene, *define, "--method", story["method"], *again, "-o", "again.exr")[0] == 0
+    repeated = fspt.read("again.exr")
+    for name in ("power", "error", "coverage"):
+        tolerance = 1e-5 * getattr(image, name).max() if told["method"] == "ptracer" else 0
+        np.testing.assert_allclose(getattr(repeated, name), getattr(image, name), rtol=0, atol=tolerance)
+
+
+# --- the other verbs ---
+
+
+@pytest.fixture
+def two_images(tmp_path):
+    y, x = np.mgrid[0:6, 0:8]
+    for name, factor in (("a.exr", 1.0), ("b.exr", 1.1)):
+        fspt.Image(1e-9 * (1 + x + factor * y)).write(tmp_path / name)
+    return "a.exr", "b.exr"
+
+
+def test_compare_prints_the_metrics(run, two_images):
+    code, out, err = run("compare", *two_images)
+    assert (code, err) == (0, "")
+    truth = fspt.compare(*map(fspt.read, two_images))
+    assert f"ME     {truth.me:.3e}" in out
+    assert f"CF     {truth.cf:.7f}" in out
+    assert f"max    {truth.max_error:.3e}" in out
+    assert f"RMS    {truth.rms:.3e}" in out
+    assert f"ratio  {truth.ratio:.6f}" in out
+
+
+def test_compare_as_json_is_one_object(run, two_images):
+    code, out, err = run("compare", *two_images, "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    truth = fspt.compare(*map(fspt.read, two_images))
+    assert told["me"] == truth.me
+    assert told["cf"] == truth.cf
+    assert told["rms"] == truth.rms
+    assert [profile["line"] for profile in told["profiles"]] == ["row", "column"]
+    assert told["profiles"][0]["standard"] == pytest.approx(fspt.read("b.exr").power[5].tolist())
+
+
+def test_expose_writes_electrons_and_counts(run, two_images, tmp_path):
+    options = ["--exposure-time", "1", "--wavelength-nm", "600"]
+    code, out, err = run("expose", "a.exr", "-o", "e.exr", *options, "--counts", "n.png")
+    assert (code, err) == (0, "")
+    assert re.fullmatch(r"e\.exr: brightest pixel \S+ electrons, \d+ pixels saturated\n", out)
+    assert {"e.exr", "n.png"} < set(os.listdir(tmp_path))
+    assert header("e.exr")["fspt:quantity"] == "electrons"
+
+
+@pytest.mark.parametrize("counts", ["n.jpg", "nowhere/n.png", ""])
+def test_expose_leaves_both_files_or_none(run, two_images, tmp_path, counts):
+    """Fails with the electrons written before the counts' place is looked at."""
+    before = set(os.listdir(tmp_path))
+    options = ["--exposure-time", "1", "--wavelength-nm", "600", "--counts", counts]
+    code, _, err = run("expose", "a.exr", "-o", "e.exr", *options)
+    assert code == 2
+    assert err.count("\n") == 1
+    assert set(os.listdir(tmp_path)) == before
+
+
+def test_more_pixels_than_memory_holds(run, tmp_path):
+    sensor = LENS_XML.replace('"width" value="8"', '"width" value="1000000"').replace('value="6"', 'value="1000000"')
+    code, _, err = run("render", write_scene(tmp_path / "s.xml", sensor=sensor), "-o", tmp_path / "o.exr")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "out of memory" in err
+    assert not (tmp_path / "o.exr").exists()
+
+
+@pytest.mark.parametrize("verb", ["render", "expose"])
+def test_a_name_too_long_is_refused_before_the_work(run, two_images, tmp_path, monkeypatch, verb):
+    """Seen to fail: code 1 with an OSError, and after the work."""
+    write_scene(tmp_path / "s.xml")
+    monkeypatch.setattr(render, "render", lambda *_, **__: pytest.fail("the work began"))
+    before, name = sorted(os.listdir(tmp_path)), "x" * 252 + ".exr"
+    what = ["s.xml"] if verb == "render" else ["a.exr", "--exposure-time", "1", "--wavelength-nm", "600"]
+    code, out, err = run(verb, *what, "-o", name)
+    assert (code, out) == (2, "")
+    assert err == f"fspt: output file '{name}' cannot be written: File name too long. Give another name.\n"
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+def test_expose_does_not_overwrite_the_power(run, two_images):
+    before = fspt.read("a.exr").metadata
+    code, _, err = run("expose", "a.exr", "-o", "a.exr", "--exposure-time", "1", "--wavelength-nm", "600")
+    assert code == 2
+    assert "output file 'a.exr': -o would overwrite 'a.exr', which is needed too. Give another name." in err
+    assert fspt.read("a.exr").metadata == before
+
+
+@pytest.mark.parametrize("output", ["", ".exr", "picture"])
+def test_render_wants_a_name_for_its_image(run, tmp_path, output):
+    code, _, err = run("render", write_scene(tmp_path / "s.xml"), "-o", output)
+    assert code == 2
+    assert err.endswith("must end in .exr. Give a name such as image.exr.\n")
+
+
+def test_flux_import_makes_a_phantom_that_renders(run, tmp_path):
+    vertices = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
+    write_ply(tmp_path / "sheet.ply", vertices, [(0, 1, 2), (0, 2, 3)])
+    (tmp_path / "values.txt").write_text("1e-3\n2e-3\n3e-3\n2e-3\n")
+    options = ["--values", "values.txt", "--per", "vertex", "-o", "phantom.ply", "--json"]
+    code, out, err = run("flux", "import", "sheet.ply", *options)
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert report["power"] == pytest.approx(36 * 2e-3)
+    shapes = """
+    <shape type="ply"><string name="filename" value="phantom.ply"/><emitter type="fspt_surface">
+        <texture type="mesh_attribute" name="exitance"><string name="name" value="vertex_exitance"/></texture>
+    </emitter></shape>"""
+    write_scene(tmp_path / "s.xml", shapes=shapes)
+    assert run("render", "s.xml", "--rtol", "1e-2")[0] == 0
+    assert fspt.read("s.exr").power.max() > 0
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_doctor_says_whether_it_is_ready(run, monkeypatch, works):
+    """The trials of the backends are another file's tests; here, what becomes of their outcome."""
+    times = {name: 0.1 for name in ("import", "variant", "scene", "first", "second")}
+    monkeypatch.setattr(doctor, "run_trial", lambda variant: times if works else "no LLVM here")
+    code, out, err = run("doctor")
+    assert err == ""
+    assert code == (0 if works else 2)
+    assert ("ready" in out) is works
+    assert "LLVM" in out
+    assert "mitsuba-fspt" in out
+
+
+def test_an_output_without_the_letters_does_not_end_the_work(tmp_path):
+    """Seen to fail with code 1 and a UnicodeEncodeError."""
+    write_scene(tmp_path / "ü.xml")
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+
+    def told(*arguments):
+        command = [sys.executable, "-m", "mitsuba_fspt", *arguments]
+        return subprocess.run(command, env=environment, check=True, capture_output=True).stdout.decode()
+
+    assert told("render", "ü.xml", "--rtol", "0.5").startswith("ü.exr: total ")
+    assert fspt.read("ü.exr").power.max() > 0
+    assert "NAME=V1,V2,..." in told("sweep", "--help")
+
+
+def test_version_and_help(run):
+    code, out, err = run("--version")
+    assert (code, err) == (0, "")
+    assert re.fullmatch(r"mitsuba-fspt \d+\.\d+\.\d+\S*\n", out)
+    code, out, err = run("--help")
+    assert (code, err) == (0, "")
+    for verb in ("render", "compare", "expose", "doctor", "flux", "converge"):
+        assert verb in out
+    for verb in ("render", "compare", "expose", "doctor", "flux", "converge"):
+        code, out, err = run(verb, "--help")
+        assert (code, err) == (0, "")
+        assert "Usage: fspt " + verb in out
+
+
+DOCUMENTS = [SCENES.parent / "README.md", *sorted((SCENES.parent / "docs").glob("*.md"))]
+LINES = [line.strip() for document in DOCUMENTS for line in document.read_text().splitlines()]
+
+
+@pytest.mark.parametrize("line", [line for line in LINES if line.startswith("fspt ")])
+def test_the_documents_name_verbs_and_options_that_are_there(line):
+    """Parsed like any call and not run; what stands for something else, in brackets or after |, is left out."""
+    words = shlex.split(re.sub(r"\[|\]|\|\S+", " ", line), comments=True)[1:]
+    verb, name = typer.main.get_command(app.app), "fspt"
+    while hasattr(verb, "commands"):
+        name = words.pop(0)
+        assert name in verb.commands
+        verb = verb.commands[name]
+    verb.make_context(name, words)
+
+
+# --- processes ---
+
+
+def test_python_dash_m_is_the_command():
+    done = subprocess.run([sys.executable, "-m", "mitsuba_fspt", "--version"], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stdout.startswith("mitsuba-fspt ")
+    assert done.stderr == ""
+
+
+def test_a_closed_pipe_is_no_error():
+    """`fspt --help | head -1`."""
+    done = subprocess.run(
+        f"{sys.executable} -m mitsuba_fspt --help | head -c 1", shell=True, capture_output=True, text=True
+    )
+    assert done.stderr == ""
+
+
+def test_ctrl_c_while_the_picture_is_drawn_leaves_no_image(run, tmp_path, monkeypatch):
+    """Seen to fail with the image written first."""
+    from matplotlib.figure import Figure
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Figure, "savefig", interrupted)
+    write_scene(tmp_path / "s.xml")
+    code, out, err = run("render", tmp_path / "s.xml", "-o", tmp_path / "a.exr", "--png")
+    assert (code, out, err) == (130, "", "fspt: interrupted; nothing was written.\n")
+    assert os.listdir(tmp_path) == ["s.xml"]
+
+
+def test_ctrl_c_leaves_one_line_and_no_file(tmp_path):
+    """On a terminal, which shows progress: the signal comes once the sampling has begun."""
+    write_scene(tmp_path / "s.xml")
+    terminal, slave = pty.openpty()
+    command = [sys.executable, "-m", "mitsuba_fspt", "render", "s.xml", "--method", "path", "--spp", "10000000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=slave, cwd=tmp_path)
+    os.close(slave)
+    shown, sent, deadline = b"", False, time.monotonic() + 100
+    while time.monotonic() < deadline:
+        ready, _, _ = select.select([terminal], [], [], 1)
+        try:
+            shown += os.read(terminal, 65536) if ready else b""
+        except OSError:  # the process has gone
+            break
+        if not sent and b"sampling" in shown:
+            process.send_signal(signal.SIGINT)
+            sent = True
+    os.close(terminal)
+    assert process.wait(100) == 130
+    out = process.stdout.read()
+    process.stdout.close()
+    assert sent
+    text = re.sub(rb"\x1b\[[0-9;?]*[a-zA-Z]", b"", shown).decode()
+    lines = [
+        line for line in re.split(r"[\r\n]+", text) if line.strip() and "sampling" not in line and "loading" not in line
+    ]
+    assert lines == ["fspt: interrupted; nothing was written."]
+    assert out == b""
+    assert os.listdir(tmp_path) == ["s.xml"]
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.png"])
+def test_a_folder_in_the_place_of_a_file_is_refused_before_the_work(run, tmp_path, monkeypatch, name):
+    """Seen to fail with the picture's place looked at last: all was rendered, and nothing written."""
+    write_scene(tmp_path / "s.xml")
+    (tmp_path / name).mkdir()
+    monkeypatch.setattr("mitsuba_fspt.rendering.render.render", None)
+    code, out, err = run("render", tmp_path / "s.xml", "-o", tmp_path / "a.exr", "--png")
+    assert (code, out) == (2, "")
+    assert err == f"fspt: output file '{tmp_path / name}' is a folder. Give the name of a file in it.\n"

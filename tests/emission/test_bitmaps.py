@@ -1,0 +1,111 @@
+"""J_n as a bitmap: bright texels smaller than pixels, and pictures that are no W/mm²."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from little_scenes import ball, lens, mi, scene_of
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.emission.exitance import texels_of
+
+
+def one_bright_texel(side, tiles=1):
+    """A bitmap of side² texels of which one is 1 W/mm², `tiles` times along u and v."""
+    data = np.zeros((side, side, 1), np.float32)
+    data[side // 8, side // 5] = 1
+    to_uv = mi.ScalarTransform4f().scale([tiles, tiles, 1])
+    return {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest", "to_uv": to_uv}
+
+
+SHAPES = {
+    "sphere": {"type": "sphere", "radius": 9.0},
+    "cylinder": {"type": "cylinder", "p0": [0, 0, -9], "p1": [0, 0, 9], "radius": 9.0},
+    "disk": {"type": "disk", "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale(9)},
+}
+
+
+@pytest.mark.parametrize("tiles", [3, 8])
+@pytest.mark.parametrize("kind", SHAPES)
+def test_bright_texels_of_a_tiled_bitmap_keep_their_light(kind, tiles):
+    """Expected: the power of the surface form, which begins at the texels.
+
+    Seen to fail where texels are counted once, whatever `to_uv` (black, or a third missing), and where spots on a
+    slanted surface are taken for its limb (the cylinder, a third missing).
+    """
+    emitter = {"type": "fspt_surface", "exitance": one_bright_texel(32, tiles)}
+    scene = scene_of(SHAPES[kind] | {"emitter": emitter}, sensor=lens(size=(24, 20), pitch=0.6, f_number=4.0))
+    pupil, surface = (fspt.render(scene, domain=domain, rtol=1e-2, max_nodes=4000) for domain in ("pupil", "surface"))
+    assert surface.power.sum() > 0
+    assert pupil.power.sum() == pytest.approx(surface.power.sum(), rel=1e-2)
+
+
+def test_who_sees_the_tip_of_a_small_checkerboard_gets_its_light():
+    """A rectangle of 5 x 5 texels, two pixels high, against counting over the pupil at pixels' centres.
+
+    To its left the centre of one pixel is lit through a hundredth of the pupil. Seen to fail (0 W, error 0, for 0.016
+    of the brightest pixel) where the rectangle's upper and lower edges, which the picture around changes across more,
+    tell which way to look for it at all levels; and where those whom the surface form lights are not asked for their
+    silhouette.
+    """
+    checkers = (np.indices((5, 5)).sum(axis=0) % 2).astype(np.float32)
+    bitmap = {"type": "bitmap", "data": mi.TensorXf(checkers[..., None]), "raw": True, "filter_type": "nearest"}
+    place = mi.ScalarTransform4f().translate([2.41, 3.0, 155.2]).rotate([0, 1, 0], 180).scale([1.35, 0.845, 1])
+    rectangle = {"type": "rectangle", "to_world": place, "emitter": {"type": "fspt_surface", "exitance": bitmap}}
+    optics = {"f_number": 2.75, "magnification": None, "focus_distance": 180.0, "to_world": None}
+    scene = scene_of(rectangle, sensor=lens(size=(12, 10), pitch=0.572, **optics))
+    camera = scene.sensors()[0]
+    ax, ay = np.meshgrid(*2 * [(np.arange(500) + 0.5) / 250 - 1])
+    ax, ay = (camera.optics.pupil_radius * a[ax**2 + ay**2 <= 1] for a in (ax, ay))
+    light = np.zeros((10, 12))
+    for i, j in np.ndindex(light.shape):
+        x, y = camera.virtual_pitch * (5.5 - j), camera.virtual_pitch * (4.5 - i)
+        along = ((ax, x, 2.41, 1.35), (ay, y, 3, 0.845))
+        u, v = (0.5 + (a + (c - a) * 155.2 / 180 - middle) / (2 * half) for a, c, middle, half in along)
+        met = (u > 0) & (u < 1) & (v > 0) & (v < 1)
+        lit = met & ((np.floor(5 * u) + np.floor(5 * v)) % 2 == 1)
+        light[i, j] = (lit / ((x - ax) ** 2 / 180**2 + (y - ay) ** 2 / 180**2 + 1) ** 2).mean()
+    truth = camera.etendue / np.pi * light
+    image = fspt.render(scene, pixel="centre")
+    assert (np.abs(image.power - truth) <= 3 * image.error + 1e-3 * truth.max()).all()
+
+
+def test_texels_are_counted_as_often_as_they_lie_on_the_surface():
+    assert texels_of(mi.load_dict(one_bright_texel(32, 3))) == 9 * 32**2
+    assert texels_of(mi.load_dict(one_bright_texel(32))) == 32**2
+    assert texels_of(mi.load_dict({"type": "uniform", "value": 1.0})) == 1
+
+
+def test_a_single_texel_of_four_million_is_not_refused():
+    """Rationale: points all over the shape may miss it, and J_n passed for zero everywhere."""
+    emitter = {"type": "fspt_surface", "exitance": one_bright_texel(1 << 11)}
+    scene = scene_of(SHAPES["disk"] | {"emitter": emitter}, sensor=lens(size=8))
+    assert np.isfinite(fspt.render(scene, max_nodes=4).power).all()
+
+
+RED_GREEN_BLUE = np.full((2, 4, 3), [3, 2, 1], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "raw", "message"),
+    [
+        (RED_GREEN_BLUE, True, "a bitmap of 3 channels that differ, J_n is one number"),
+        (RED_GREEN_BLUE.astype(np.uint8), False, "a bitmap of 3 channels that differ"),
+        (np.full((2, 4, 1), 128, np.uint8), False, "a picture of 4 × 2 whole numbers, which are decoded as sRGB"),
+    ],
+    ids=["colours", "coloured picture", "grey picture"],
+)
+def test_bitmaps_that_are_no_watts_are_refused(pixels, raw, message):
+    """Mitsuba makes luminance of the one and bends the values of the other: 128 of 255 would be 0.22 W/mm²."""
+    with pytest.raises(RuntimeError, match=message):
+        scene_of(ball({"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": raw}))
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("value", [np.uint8(51), np.float32(0.2)], ids=["whole", "float"])
+def test_raw_bitmaps_in_grey_are_watts(value, channels):
+    """Expected: those of a number; whole numbers are shares of the largest, 255."""
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 4, channels), value)), "raw": True}
+    power, uniform = (fspt.render(scene_of(ball(exitance))).power for exitance in (bitmap, 0.2))
+    assert uniform.max() > 0
+    np.testing.assert_allclose(power, uniform, rtol=1e-3, atol=1e-3 * uniform.max())

@@ -1,0 +1,177 @@
+"""Metrics: against hand-computed numbers, and the z-test against seeded noise of known size."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitsuba_fspt.images.comparison import compare
+from mitsuba_fspt.images.image import Image
+from mitsuba_fspt.runtime.errors import ImageError
+
+STANDARD = Image(np.array([[0.0, 2.0], [4.0, 8.0]]) * 1e-9)
+CALCULATED = Image(np.array([[1.0, 2.0], [2.0, 5.0]]) * 1e-9)
+
+
+def test_metrics_by_hand():
+    """Normalised: standard 0, .25, .5, 1; calculated .2, .4, .4, 1. Differences .2, .15, .1, 0: ME = .45/4.
+
+    Absolute: differences 1, 0, 2, 3 of a peak of 8. Seen to fail without the normalisation of either image,
+    with the calculated peak in place of the standard's, and with the square root of the rms dropped.
+    """
+    comparison = compare(CALCULATED, STANDARD)
+    assert comparison.me == pytest.approx(0.1125, rel=1e-12)
+    assert comparison.max_error == pytest.approx(3 / 8, rel=1e-12)
+    assert comparison.rms == pytest.approx(math.sqrt(14 / 4) / 8, rel=1e-12)
+    assert comparison.ratio == pytest.approx(10 / 14, rel=1e-12)
+    # Deviations from the means 3.5 and 2.5: (-3.5, -1.5, .5, 4.5) and (-1.5, -.5, -.5, 2.5).
+    assert comparison.cf == pytest.approx(17 / math.sqrt(35 * 9), rel=1e-12)
+
+
+def test_scale_of_one_image_shows_in_the_absolute_numbers_only():
+    doubled = Image(2 * CALCULATED.power)
+    once, twice = compare(CALCULATED, STANDARD), compare(doubled, STANDARD)
+    assert twice.me == pytest.approx(once.me, rel=1e-12)
+    assert twice.cf == pytest.approx(once.cf, rel=1e-12)
+    assert twice.ratio == pytest.approx(2 * once.ratio, rel=1e-12)
+    assert twice.max_error == pytest.approx(2 / 8, rel=1e-12)  # (2, 2, 0, 2) of 8
+
+
+def test_equal_images_differ_by_nothing():
+    comparison = compare(STANDARD, STANDARD)
+    assert (comparison.me, comparison.max_error, comparison.rms, comparison.ratio) == (0, 0, 0, 1)
+    assert comparison.cf == pytest.approx(1, abs=1e-15)
+    assert comparison.z_test is None
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-200, 1e200])
+def test_metrics_do_not_depend_on_the_scale_of_both(scale):
+    comparison = compare(Image(CALCULATED.power * scale), Image(STANDARD.power * scale))
+    reference = compare(CALCULATED, STANDARD)
+    for name in ("me", "cf", "max_error", "rms", "ratio"):
+        assert getattr(comparison, name) == pytest.approx(getattr(reference, name), rel=1e-12)
+
+
+def test_float32_images_are_compared_in_double():
+    """A difference of 1e-7 of the peak survives; the sum of a million float32 pixels would lose it."""
+    power = np.random.default_rng(1).random((1000, 1000), dtype=np.float32)
+    power[0, 0] = 1
+    comparison = compare(Image(power), Image(power.astype(np.float64) * (1 + 1e-7)))
+    assert comparison.ratio - 1 == pytest.approx(-1e-7, rel=1e-6)
+    assert comparison.max_error == pytest.approx(1e-7, rel=1e-6)
+
+
+def test_profiles():
+    """The default goes through the standard's peak, which here is in the last row and the last column."""
+    row, column = compare(CALCULATED, STANDARD).profiles
+    assert (row.line, row.index, column.line, column.index) == ("row", 1, "column", 1)
+    np.testing.assert_array_equal(row.calculated, np.array([2, 5]) * 1e-9)
+    np.testing.assert_array_equal(row.standard, np.array([4, 8]) * 1e-9)
+    np.testing.assert_array_equal(column.calculated, np.array([2, 5]) * 1e-9)
+    np.testing.assert_array_equal(column.standard, np.array([2, 8]) * 1e-9)
+    (column,) = compare(CALCULATED, STANDARD, columns=[0]).profiles
+    np.testing.assert_array_equal(column.standard, np.array([0, 4]) * 1e-9)
+    assert compare(CALCULATED, STANDARD, rows=[]).profiles == ()
+
+
+def test_profiles_of_an_array_of_rows_or_of_one_alone():
+    """Seen to fail with a ValueError and a TypeError."""
+    profiles = compare(CALCULATED, STANDARD, rows=np.arange(2), columns=1).profiles
+    assert [(profile.line, profile.index) for profile in profiles] == [("row", 0), ("row", 1), ("column", 1)]
+    json.dumps(compare(CALCULATED, STANDARD, rows=np.arange(2)).to_dict())
+    for wrong in ([0.5], ["0"], [None]):
+        with pytest.raises(ImageError, match=r"number of a row must be a whole number, got .*Give for example 0"):
+            compare(CALCULATED, STANDARD, rows=wrong)
+
+
+def test_powers_that_add_up_to_0_have_no_ratio(run, tmp_path):
+    """Seen to fail: a warning of NumPy, 'nan' and a NaN that is no JSON."""
+    image = Image(np.array([[1.0, -1.0], [2.0, -2.0]]))
+    image.write(tmp_path / "z.exr")
+    assert compare(STANDARD, image).ratio is None
+    assert compare(image, STANDARD).ratio == 0
+    code, out, err = run("compare", tmp_path / "z.exr", tmp_path / "z.exr")
+    assert (code, err) == (0, "")
+    assert "ratio  none       the standard's powers add up to 0\n" in out
+    code, out, err = run("compare", tmp_path / "z.exr", tmp_path / "z.exr", "--json", "--png", tmp_path / "z.png")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["ratio"] is None
+
+
+def test_z_by_hand():
+    """Differences 1, 0, 2, 3 over deviations 5 = √(3² + 4²), 0, 2, 0: z = .2 and 1; the 3 is not judged."""
+    calculated = replace(CALCULATED, error=np.array([[3, 0], [2, 0]]) * 1e-9)
+    standard = replace(STANDARD, error=np.array([[4, 0], [0, 0]]) * 1e-9)
+    z = compare(calculated, standard).z_test
+    assert z.max_z == pytest.approx(1, rel=1e-12)
+    assert z.chi2 == pytest.approx((0.04 + 1) / 2, rel=1e-12)
+    assert (z.pixels, z.unjudged) == (2, 1)
+    # Outside ±1 sigma lies 0.31731 of a normal distribution.
+    assert z.p_value == pytest.approx(1 - (1 - 0.3173105078629141) ** 2, rel=1e-12)
+
+
+def test_z_of_true_noise_and_of_a_bias():
+    """Rationale: for true errors p-values are uniform and chi2 is 1; a bias of six sigma is seen.
+
+    Expected: over 400 seeded pairs of 256 pixels the p-values have mean 1/2 ± 4/√(12 · 400), chi2 has mean
+    1 ± 4 √(2/(256 · 400)). Seen to fail without Šidák's exponent and with one of the two errors left out.
+    """
+    rng = np.random.default_rng(11)
+    truth = 10 + rng.random((16, 16))
+
+    def z_test(bias):
+        calculated, standard = (truth + sigma * rng.normal(size=truth.shape) for sigma in (0.3, 0.4))
+        error = np.full_like(truth, 0.3), np.full_like(truth, 0.4)
+        return compare(Image(calculated + bias, error[0]), Image(standard, error[1])).z_test
+
+    true = [z_test(0) for _ in range(400)]
+    assert np.mean([z.p_value for z in true]) == pytest.approx(0.5, abs=4 / math.sqrt(12 * 400))
+    assert np.mean([z.chi2 for z in true]) == pytest.approx(1, abs=4 * math.sqrt(2 / (256 * 400)))
+    assert z_test(3.0).p_value < 1e-9
+
+
+def test_p_value_at_its_ends():
+    error = np.full((2, 2), 1e-9)
+    same = compare(replace(STANDARD, error=error), STANDARD).z_test
+    assert (same.max_z, same.chi2, same.p_value) == (0, 0, 1)
+    # z = 12 in four pixels: p = 4 · erfc(12/√2), far below 1e-16.
+    apart = compare(replace(STANDARD, power=STANDARD.power + 12e-9, error=error), STANDARD).z_test
+    assert apart.p_value == pytest.approx(4 * math.erfc(12 / math.sqrt(2)), rel=1e-6)
+    assert compare(replace(STANDARD, power=STANDARD.power + 1, error=error), STANDARD).z_test.p_value == 0
+
+
+def test_json():
+    found = json.loads(json.dumps(compare(replace(CALCULATED, error=np.ones((2, 2))), STANDARD).to_dict()))
+    assert found["ratio"] == pytest.approx(10 / 14)
+    assert found["z_test"]["pixels"] == 4
+    assert found["profiles"][0] == {
+        "line": "row",
+        "index": 1,
+        "calculated": [2e-9, 5e-9],
+        "standard": [4e-9, 8e-9],
+    }
+    assert compare(CALCULATED, STANDARD).to_dict()["z_test"] is None
+
+
+@pytest.mark.parametrize(
+    ("calculated", "arguments", "message"),
+    [
+        (Image(np.ones((2, 3))), {}, "calculated image has 3 × 2 pixels, the standard 2 × 2"),
+        (Image(np.zeros((2, 2))), {}, "calculated image is dark, its brightest pixel has 0 W"),
+        (Image(np.full((2, 2), 0.5)), {}, "every pixel of the calculated image has 0.5 W"),
+        (CALCULATED, {"rows": [2]}, r"row 2 does not exist. Give one in 0 … 1"),
+        (CALCULATED, {"columns": [-1]}, r"column -1 does not exist"),
+    ],
+)
+def test_what_cannot_be_compared(calculated, arguments, message):
+    with pytest.raises(ImageError, match=message):
+        compare(calculated, STANDARD, **arguments)
+
+
+def test_the_standard_is_checked_too():
+    with pytest.raises(ImageError, match="the standard is dark"):
+        compare(STANDARD, Image(np.zeros((2, 2))))
+    with pytest.raises(ImageError, match="every pixel of the standard"):
+        compare(STANDARD, Image(np.ones((2, 2))))

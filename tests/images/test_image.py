@@ -1,0 +1,267 @@
+"""Images: what goes into the file comes out of it, and a file is whole or not there."""
+
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mitsuba_fspt.images.exr import read_exr, write_exr
+from mitsuba_fspt.images.image import Image, read
+from mitsuba_fspt.runtime.atomic_files import atomic_path
+from mitsuba_fspt.runtime.errors import FsptError, ImageError
+
+resource = pytest.importorskip("resource")  # not on Windows
+
+RNG = np.random.default_rng(7)
+METADATA = {
+    "method": "integral",
+    "scene": "scenes/zylinder µ.xml",
+    "f_number": 2.8,
+    "focal_length": 55.000000001,  # not a float32
+    "rtol": 1e-4,
+    "seed": -3,
+    "samples": 2**40,
+    "note": "",
+    "a_key_longer_than_the_31_characters_of_old_exr_files": 1,
+}
+
+
+def picture(height: int = 5, width: int = 7) -> Image:
+    power = RNG.random((height, width)) * 1e-9
+    return Image(power, power * 1e-3, RNG.random((height, width)), dict(METADATA))
+
+
+def test_round_trip(tmp_path):
+    """Rows, columns and channels keep their places: no two of the three channels or 35 pixels are equal."""
+    image = picture()
+    image.write(tmp_path / "a.exr")
+    back = read(tmp_path / "a.exr")
+    for name in ("power", "error", "coverage"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(image, name).astype(np.float32))
+    assert back.metadata == METADATA | {"quantity": "power", "unit": "W"}
+    kinds = {key: type(value) for key, value in back.metadata.items()}
+    assert kinds["f_number"] is float
+    assert kinds["seed"] is int
+    assert kinds["scene"] is str
+
+
+def test_file_as_other_tools_see_it(tmp_path):
+    """Channel names, 32-bit floats and the `fspt:` attributes are what scripts outside rely on."""
+    picture().write(tmp_path / "a.exr")
+    file = OpenEXR.File(str(tmp_path / "a.exr"))
+    assert {name: c.pixels.dtype for name, c in file.channels().items()} == dict.fromkeys(
+        ("Y", "error.Y", "coverage.Y"), np.float32
+    )
+    header = file.header()
+    assert header["fspt:quantity"] == "power"
+    assert header["fspt:unit"] == "W"
+    assert header["fspt:f_number"] == 2.8  # a double: 2.8 in 32 bits differs
+    assert header["fspt:seed"] == -3
+    assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+
+
+def test_without_error_and_coverage(tmp_path):
+    Image(np.ones((1, 1))).write(tmp_path / "one.exr")
+    image = read(tmp_path / "one.exr")
+    assert image.error is None
+    assert image.coverage is None
+    assert image.shape == (1, 1)
+    assert image.power[0, 0] == 1
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.uint32])
+def test_foreign_file(tmp_path, kind):
+    """A half-float file and one with further channels can be read; the values are in range of each type."""
+    values = np.arange(12, dtype=kind).reshape(3, 4)
+    channels = {"Y": values, "A": np.ones_like(values), "R": values + 1, "G": values, "B": values}
+    OpenEXR.File({}, {name: OpenEXR.Channel(v) for name, v in channels.items()}).write(str(tmp_path / "f.exr"))
+    image = read(tmp_path / "f.exr")
+    np.testing.assert_array_equal(image.power, values)
+    assert image.power.dtype.itemsize >= 4
+    assert image.metadata == {"quantity": "power", "unit": "W"}
+
+
+def test_images_cannot_be_written_into():
+    values = np.ones((2, 2))
+    image = Image(values)
+    with pytest.raises(ValueError, match="read-only"):
+        image.power[0, 0] = 2
+    values[0, 0] = 3  # the caller's own array stays the caller's
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"power": np.ones(3)}, "'power' must be numbers of shape"),
+        ({"power": np.ones((0, 3))}, "'power' must be numbers of shape"),
+        ({"power": np.ones((2, 2), complex)}, "'power' must be numbers of shape"),
+        (
+            {"power": [[1, np.nan], [np.nan, 1]]},
+            r"'power' must be finite, got nan at row 0, column 1 \(2 such",
+        ),
+        (
+            {"power": np.ones((2, 2)), "error": [[1, 1], [np.inf, 1]]},
+            "'error' must be finite, got inf at row 1",
+        ),
+        ({"power": np.ones((2, 2)), "coverage": np.ones((2, 3))}, r"'coverage' must have the shape \(2, 2\)"),
+        ({"power": np.ones((2, 2)), "metadata": {"unit": "e-"}}, "values are power in e-, not power in W"),
+    ],
+)
+def test_what_is_no_image(arguments, message):
+    with pytest.raises(ImageError, match=message):
+        Image(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (Image([[1e39, 0]]), "'Y' is 1e.39 at row 0, column 0.*Scale the exitance down"),
+        (Image([[1.0, 0]], [[0, 1e300]]), "'error.Y' is 1e.300 at row 0, column 1"),
+        (Image([[1e-39, 0]]), "brightest pixel has 1e-39 W.*Scale the exitance up"),
+        (Image([[1.0]], metadata={"seed": 2**60}), "'seed' = 1152921504606846976 is too large"),
+        (Image([[1.0]], metadata={"lens": (1, 2)}), "'lens' must be text or a number, got tuple"),
+    ],
+)
+def test_what_no_file_can_hold(tmp_path, image, message):
+    with pytest.raises(ImageError, match=message):
+        image.write(tmp_path / "a.exr")
+    assert os.listdir(tmp_path) == []
+
+
+def test_dark_pixels_may_vanish_and_dark_images_be_written(tmp_path):
+    Image([[1e-3, 1e-60]]).write(tmp_path / "a.exr")
+    np.testing.assert_array_equal(read(tmp_path / "a.exr").power, np.float32([[1e-3, 0]]))
+    Image(np.zeros((2, 2))).write(tmp_path / "a.exr")
+    assert not read(tmp_path / "a.exr").power.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.png", "Give a name that ends in .exr"),
+        ("none/a.exr", "folder '.*none' does not exist. Create it first"),
+        ("folder.exr", "is a folder"),
+        ("x" * 300 + ".exr", "cannot be written: File name too long"),
+        ("/proc/a.exr", "'/proc/a.exr' cannot be written"),
+    ],
+)
+def test_places_that_cannot_be_written(tmp_path, name, message):
+    (tmp_path / "folder.exr").mkdir()
+    with pytest.raises(ImageError, match=message) as caught:
+        picture().write(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert os.listdir(tmp_path) == ["folder.exr"]
+
+
+def test_write_protected_file_stays(tmp_path, monkeypatch):
+    """The superuser may write anywhere, so the answer of the system is given here."""
+    (tmp_path / "a.exr").write_text("old")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(ImageError, match="write-protected"):
+        picture().write(tmp_path / "a.exr")
+    assert (tmp_path / "a.exr").read_text() == "old"
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
+def test_full_disk_leaves_the_old_file(tmp_path, share):
+    """A limit on the file size stops OpenEXR as a full disk does: at the start, half-way and at the end."""
+    image = picture(64, 64)
+    image.write(tmp_path / "a.exr")
+    size = (tmp_path / "a.exr").stat().st_size
+    before = (tmp_path / "a.exr").read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(size * share), limits[1]))
+    try:
+        with pytest.raises(ImageError, match=r"Failed to write pixel data to image file .*a\.exr") as caught:
+            image.write(tmp_path / "a.exr")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(caught.value)
+    assert os.listdir(tmp_path) == ["a.exr"]
+    assert (tmp_path / "a.exr").read_bytes() == before
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt, OSError("no space"), MemoryError])
+def test_interrupted_writing_leaves_nothing(tmp_path, interruption):
+    def write(name):
+        with atomic_path(tmp_path / name) as temporary:
+            temporary.write_text("half")
+            assert temporary.parent == tmp_path
+            assert temporary.suffix == ".ply"
+            raise interruption
+
+    (tmp_path / "old.ply").write_text("old")
+    for name in ("old.ply", "new.ply"):
+        with pytest.raises(FsptError if isinstance(interruption, OSError) else interruption):
+            write(name)
+    assert os.listdir(tmp_path) == ["old.ply"]
+    assert (tmp_path / "old.ply").read_text() == "old"
+
+
+def test_new_files_have_the_usual_permissions(tmp_path):
+    picture().write(tmp_path / "a.exr")
+    (tmp_path / "usual").touch()
+    assert (tmp_path / "a.exr").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: b"", "no readable OpenEXR"),
+        (lambda content: b"some text", "no readable OpenEXR"),
+        (lambda content: content[:6], "damaged or incomplete"),
+        (lambda content: content[:60], "damaged or incomplete"),
+        (lambda content: content[:500], "damaged or incomplete"),
+        (lambda content: content[: len(content) // 2], "damaged or incomplete"),
+        (lambda content: content[:-1], "damaged or incomplete"),
+        (lambda content: content[:-90] + bytes(90), "damaged or incomplete"),
+    ],
+)
+def test_damaged_files(tmp_path, capfd, change, message):
+    """One line each, and nothing printed by the library, which would add lines of its own."""
+    # A ramp, since noise is stored uncompressed and then any bytes are pixels.
+    Image(np.add.outer(np.arange(64), np.arange(64))).write(tmp_path / "a.exr")
+    (tmp_path / "a.exr").write_bytes(change((tmp_path / "a.exr").read_bytes()))
+    with pytest.raises(ImageError, match=message) as caught:
+        read(tmp_path / "a.exr")
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_reading_in_several_threads_leaves_the_streams_as_they_were(tmp_path, capfd):
+    """Seen to fail without the lock: standard output was a buffer and standard error /dev/null for good."""
+    Image(np.ones((8, 8))).write(tmp_path / "a.exr")
+    streams = sys.stdout, os.fstat(2).st_ino
+    with ThreadPoolExecutor(8) as threads:
+        images = list(threads.map(read, [tmp_path / "a.exr"] * 400))
+    assert (sys.stdout, os.fstat(2).st_ino) == streams
+    assert all((image.power == 1).all() for image in images)
+    os.write(2, b"heard")
+    assert capfd.readouterr() == ("", "heard")
+
+
+def test_files_without_power(tmp_path):
+    with pytest.raises(ImageError, match=r"none\.exr' does not exist"):
+        read(tmp_path / "none.exr")
+    OpenEXR.File({}, {"RGB": np.zeros((2, 2, 3), np.float32)}).write(str(tmp_path / "rgb.exr"))
+    with pytest.raises(ImageError, match=r"no channel 'Y'.*its channels are B, G, R"):
+        read(tmp_path / "rgb.exr")
+    write_exr(tmp_path / "e.exr", {"Y": np.ones((2, 2))}, {"quantity": "electrons", "unit": "e-"})
+    with pytest.raises(ImageError, match=r"e\.exr': image: the values are electrons in e-, not power"):
+        read(tmp_path / "e.exr")
+
+
+def test_values_of_a_foreign_file_must_be_finite(tmp_path):
+    OpenEXR.File({}, {"Y": np.full((2, 2), np.nan, np.float32)}).write(str(tmp_path / "nan.exr"))
+    with pytest.raises(ImageError, match=r"image file '.*nan\.exr': image: 'power' must be finite"):
+        read(tmp_path / "nan.exr")
+
+
+def test_channels_of_any_quantity(tmp_path):
+    write_exr(tmp_path / "e.exr", {"Y": np.eye(3)}, {"quantity": "electrons", "unit": "e-"})
+    channels, metadata = read_exr(tmp_path / "e.exr")
+    np.testing.assert_array_equal(channels["Y"], np.eye(3))
+    assert metadata == {"quantity": "electrons", "unit": "e-"}

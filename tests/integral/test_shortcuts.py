@@ -1,0 +1,224 @@
+"""What the integral leaves out: taken where it may be, not where it may not, and the picture is the same without."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from little_scenes import SCENES, attribute, ball, glow, lens, scene_of, write_ply
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.cli import app
+from mitsuba_fspt.integral.quadrature import Quadrature
+from mitsuba_fspt.integral.shortcuts import SHORTCUTS
+from mitsuba_fspt.runtime.errors import SceneError
+
+RTOL = 1e-2
+
+
+def mesh_of(body, path, vertex=None, face=None):
+    """A trimesh as a glowing shape; alike everywhere unless values are given."""
+    write_ply(path, body.vertices, body.faces, vertex=vertex, face=face)
+    values = {"vertex_exitance": vertex, "face_exitance": face}
+    name = next((name for name, given in values.items() if given is not None), None)
+    emitter = glow(attribute(name) if name else 1e-3)
+    return {"type": "ply", "filename": str(path), "face_normals": True, "emitter": emitter}
+
+
+def half_dark(path):
+    body = trimesh.creation.icosphere(3, radius=5)
+    return scene_of(mesh_of(body, path, face=np.where(body.triangles_center[:, 2] > 0, 1e-3, 0)), sensor=lens(24))
+
+
+def soft_spot(path):
+    """A sheet in focus that glows like a Gauss curve, 8 pixels wide: the lens is stopped down far."""
+    y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-24, 24, 193), np.linspace(-24, 24, 193)))
+    corner = np.arange(193 * 192).reshape(192, 193)[:, :-1].ravel()[:, None]
+    faces = np.concatenate([corner + np.array(other) for other in ((0, 1, 194), (0, 194, 193))])
+    sheet = trimesh.Trimesh(np.column_stack([0 * y, y, z]), faces, process=False)
+    return scene_of(mesh_of(sheet, path, vertex=np.exp(-(y**2 + z**2) / 12.8**2 / 2)), sensor=lens(24, f_number=100.0))
+
+
+CASES = {
+    "outside": (lambda path: scene_of(ball(), sensor=lens(40)), "pupil"),
+    "one line": (soft_spot, "pupil"),
+    "smooth": (lambda path: scene_of(ball(radius=12.0), sensor=lens(24, f_number=2.8)), "pupil"),
+    "record": (half_dark, "pupil"),
+    "occlusion": (lambda path: scene_of(ball(), sensor=lens(24)), "surface"),
+    "dark": (half_dark, "surface"),
+}
+
+
+def solved(scene, domain="pupil", without=(), rtol=RTOL):
+    quadrature = Quadrature(rtol=rtol, domain=domain, shortcuts_off=frozenset(without))
+    return scene.integrator().solve(scene, scene.sensors()[0], quadrature)
+
+
+def found(solution, name):
+    (finding,) = [finding for finding in solution.findings if finding.name == name]
+    return finding.taken
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_shortcut_changes_no_pixel_by_a_tenth_of_rtol(name, tmp_path):
+    """Seen to fail with `one_spread` left out, and with all but the brightest elements taken for dark."""
+    build, domain = CASES[name]
+    scene = build(tmp_path / "body.ply")
+    rtol = RTOL if domain == "surface" else 1e-3
+    short, long = solved(scene, domain, rtol=rtol), solved(scene, domain, [name], rtol=rtol)
+    assert found(short, name)
+    assert not found(long, name)
+    assert np.abs(short.power - long.power).max() <= rtol / 10 * long.power.max()
+    assert short.rays < long.rays or name in ("record", "occlusion")
+
+
+def test_every_shortcut_has_its_case():
+    assert set(CASES) == set(SHORTCUTS)
+
+
+def shell(path):
+    """A bowl that is open to the lens: its inner side shows, too, and the rim stands before some of it."""
+    body = trimesh.creation.icosphere(3, radius=5)
+    body.update_faces(body.triangles_center[:, 0] < 0)
+    body.invert()
+    return scene_of(mesh_of(body, path))
+
+
+def dumbbell(path):
+    """Two balls in one mesh, one behind the other: each is convex, both are not."""
+    balls = [trimesh.creation.icosphere(3, radius=3).apply_translation([x, 1.5, 0]) for x in (-5, 5)]
+    return scene_of(mesh_of(trimesh.util.concatenate(balls), path))
+
+
+def torus(path):
+    return scene_of(mesh_of(trimesh.creation.torus(5, 2).apply_transform(_QUARTER_TURN), path))
+
+
+def two_balls(path):
+    return scene_of(ball(), ball(radius=2.0, center=(9, 0, 0)))
+
+
+def inside_out(path):
+    return scene_of({"type": "sphere", "radius": 5.0, "flip_normals": True, "emitter": glow()})
+
+
+_QUARTER_TURN = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
+
+
+@pytest.mark.parametrize("build", [shell, dumbbell, torus, inside_out, two_balls])
+def test_what_may_hide_is_looked_for(build, tmp_path):
+    assert not found(solved(build(tmp_path / "body.ply"), "surface"), "occlusion")
+
+
+def test_a_wide_pupil_and_a_wide_blur_take_all_lines_of_sight():
+    assert not found(solved(scene_of(ball(), sensor=lens(24, f_number=2.8))), "one line")  # at 1e-2, f/8 takes one
+    assert not found(solved(scene_of(ball(), sensor=lens(24, f_number=100.0, pitch=0.005))), "one line")
+
+
+def dented(path):
+    """A ball with a shallow dent around its waist, so fine a mesh that no edge tells."""
+    body = trimesh.creation.uv_sphere(radius=5, count=[800, 60])
+    body.vertices *= (1 - 0.1 * np.exp(-((body.vertices[:, 2] / 1.5) ** 2)))[:, None]
+    return scene_of(mesh_of(body, path))
+
+
+def test_a_shallow_dent_in_a_fine_mesh_may_hide(tmp_path):
+    """`trimesh.is_convex` says that it is convex. Seen to fail with all bodies taken for convex."""
+    assert not found(solved(dented(tmp_path / "body.ply"), "surface", rtol=0.3), "occlusion")
+
+
+def test_radiance_that_depends_on_direction_takes_all_lines_of_sight():
+    dull = ball()
+    dull["emitter"] |= {"emission": "fresnel", "int_ior": 1.37}
+    assert not found(solved(scene_of(dull, sensor=lens(24, f_number=100.0))), "one line")
+
+
+def test_what_is_thinner_than_a_pixel_and_between_two_rows_is_seen():
+    """A plate edge-on through the sharp plane: on each pixel lines of sight from one half of the pupil meet it.
+
+    Expected: what random lines of sight find, on every pixel. Seen to fail, dark with no error, with one line of sight
+    a pixel and nothing more where none meets anything; and by 0.4 of the peak, for a hundredth, where three levels of
+    transects had their places at the same two heights.
+    """
+    import mitsuba as mi
+
+    place = mi.ScalarTransform4f().rotate([0, 0, 1], 20).scale([6, 6, 0.02])
+    plate = {"type": "cube", "to_world": place, "emitter": glow()}
+    scene = scene_of(plate, sensor=lens(28, pitch=0.216))
+    by_light = fspt.render(scene, method="ptracer", spp=1024, seed=1)
+    noise = np.sqrt((by_light.error**2).sum())
+    assert noise < 0.05 * by_light.power.sum()
+    assert solved(scene, rtol=3e-2).power.sum() == pytest.approx(by_light.power.sum(), abs=4 * noise)
+    random = fspt.render(scene, method="path", spp=16384, seed=1).power
+    np.testing.assert_allclose(solved(scene, rtol=1e-2).power, random, atol=0.03 * random.max())
+
+
+def test_a_pinhole_takes_one_line_of_sight_a_pixel():
+    solution = solved(scene_of(ball(radius=30.0), sensor=lens(24, model="pinhole", pitch=0.2)))
+    assert solution.rays < 3 * solution.power.size  # with the rim and the probes; four a pixel would be 5.6
+
+
+def test_the_image_tells_what_was_left_out_and_what_was_not_allowed_to_be():
+    scene = scene_of(ball(), sensor=lens(40))
+    image, without = fspt.render(scene, rtol=RTOL), fspt.render(scene, rtol=RTOL, shortcuts=False)
+    assert SHORTCUTS["outside"] in image.metadata["left_out"]
+    assert image.metadata["shortcuts_off"] == "nothing"
+    assert without.metadata["left_out"] == "nothing"
+    assert without.metadata["shortcuts_off"] == ", ".join(sorted(SHORTCUTS))
+    assert np.abs(image.power - without.power).max() <= RTOL / 10 * image.power.max()
+
+
+def test_a_scene_file_can_switch_them_off():
+    scene = scene_of(ball(), integrator={"type": "fspt_integral", "shortcuts": False})
+    assert scene.integrator().quadrature.shortcuts_off == frozenset(SHORTCUTS)
+
+
+def test_an_unknown_shortcut_is_refused():
+    with pytest.raises(SceneError, match=r"'shortcuts_off' must be some of .* got 'haste'"):
+        Quadrature(shortcuts_off=frozenset(["haste"]))
+
+
+def test_explain_measures_what_each_shortcut_saves():
+    rows = fspt.explain(scene_of(ball(), sensor=lens(40, f_number=2.8)), rtol=RTOL)
+    by_what = {row.what: row for row in rows}
+    outside, one = by_what[SHORTCUTS["outside"]], by_what[SHORTCUTS["one line"]]
+    assert outside.left_out
+    assert 0 < outside.lines_saved < 1
+    assert not one.left_out
+    assert one.lines_saved is None
+    assert by_what["J_n look-ups"].left_out
+    assert SHORTCUTS["occlusion"] not in by_what  # the surface form's own
+    other = fspt.explain(scene_of(ball()), rtol=RTOL, domain="surface")
+    assert SHORTCUTS["occlusion"] in {row.what for row in other}
+
+
+def test_no_more_pixels_are_told_of_than_the_picture_has():
+    """Where the phantom reaches beyond the picture so does what is looked at: pixels around know of silhouettes."""
+    solution = solved(scene_of(ball(radius=60.0), sensor=lens(8, f_number=2.8)))
+    (outside,) = [finding for finding in solution.findings if finding.name == "outside"]
+    assert (outside.taken, outside.why) == (False, "64 of 64 pixels can see what glows")
+
+
+def test_explain_and_render_without_shortcuts_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = ["-D", "width=12", "-D", "height=10", "-D", "pixel_pitch=2.304", "--rtol", "1e-2"]
+    scene = str(SCENES / "two_spheres.xml")
+    assert app.run(["explain", scene, *small]) == 0
+    table = capsys.readouterr().out
+    assert all(what in table for what in (SHORTCUTS["outside"], SHORTCUTS["smooth"], "gradients"))
+    assert app.run(["explain", scene, *small, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert {"what", "left_out", "why", "lines_saved", "time_saved"} == set(rows[0])
+    assert app.run(["render", scene, *small, "--no-shortcuts"]) == 0
+    assert fspt.read("two_spheres.exr").metadata["shortcuts_off"] == ", ".join(sorted(SHORTCUTS))
+
+
+@pytest.mark.parametrize("arguments", [["none.xml"], [str(SCENES / "two_spheres.xml"), "--domain", "lens"]])
+def test_explain_refuses_in_one_line(arguments, capsys):
+    assert app.run(["explain", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert arguments[-1] in err
+    assert err.count("\n") == 1

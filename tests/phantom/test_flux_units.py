@@ -1,0 +1,311 @@
+"""Importing J_n: what a value means, in which unit, and what is refused."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from mitsuba_fspt.cli.flux import app
+from mitsuba_fspt.phantom.flux_import import import_flux
+from mitsuba_fspt.runtime.errors import BackendError, ExitanceError, FluxError
+
+BOX = trimesh.creation.box((2.0, 3.0, 4.0))
+VERTICES, FACES = np.array(BOX.vertices), np.array(BOX.faces)
+MESH = (VERTICES, FACES)
+
+
+@pytest.mark.parametrize(
+    ("a", "n", "expected"),
+    [
+        ("haskell", 1.37, 2.7586),
+        ("haskell", 1.53, 3.846),
+        ("robin", 1.37, 2.5701),
+        ("robin", 1.53, 3.5706),
+        ("robin", None, 2.5701),
+        (2.7, None, 2.7),
+        ("2.7", None, 2.7),
+    ],
+)
+def test_uniform_fluence_leaves_area_phi_over_2a(a, n, expected):
+    """Power = area · phi/(2A), A as published (Haskell 1994; NIRFAST). Fails without the 2, or with A = 1."""
+    phantom = import_flux(MESH, np.full(8, 0.4), a=a, n=n)
+    assert phantom.power == pytest.approx(52 * 0.4 / (2 * expected), rel=2e-4)
+    assert phantom.provenance["boundary_factor"].startswith(f"{expected:.4g}"[:4])
+
+
+@pytest.mark.parametrize(("unit", "millimetres"), [("cm", 10.0), ("m", 1000.0)])
+def test_length_unit_goes_for_the_mesh_and_its_values(unit, millimetres):
+    """The same body in cm or m has the same power: W per (length unit)². Fails where only lengths scale."""
+    exitance = np.linspace(0.1, 0.8, 8)
+    expected = import_flux(MESH, exitance)
+    phantom = import_flux((VERTICES / millimetres, FACES), exitance * millimetres**2, length_unit=unit)
+    assert phantom.power == pytest.approx(expected.power, rel=1e-12)
+    assert phantom.area == pytest.approx(52)
+    np.testing.assert_allclose(phantom.exitance, exitance)
+
+
+def test_power_per_vertex_is_the_integral_of_linear_exitance():
+    """Σ A · mean of the corners; for a linear J_n that is the face's J_n at its centroid, exactly."""
+    law = lambda points: 1 + points @ np.array([0.1, 0.05, 0.02])  # noqa: E731
+    on_vertices = import_flux(MESH, law(VERTICES))
+    on_faces = import_flux(MESH, law(VERTICES[FACES].mean(axis=1)))
+    assert (on_vertices.per, on_faces.per) == ("vertex", "face")
+    assert on_vertices.power == pytest.approx(on_faces.power, rel=1e-12)
+    assert on_vertices.power == pytest.approx(52.0)  # the box is centred: the slopes cancel
+    uneven = import_flux(MESH, np.where(VERTICES[:, 2] > 0, 3.0, 0.0))
+    assert uneven.power == pytest.approx(3 * 6 + (52 - 12) * 1.5)  # top 2 × 3 at 3 W/mm², sides at 1.5 on average
+
+
+def test_negative_values_need_clip_and_clip_tells_their_power():
+    values = np.full(12, 0.5)
+    values[np.flatnonzero(np.isclose(BOX.area_faces, 3.0))[0]] = -0.01  # half of a 2 × 3 side
+    with pytest.raises(ExitanceError, match=r"1 of 12 values are negative, down to -0.01 .*-0.03 W .*--clip"):
+        import_flux(MESH, values)
+    report = import_flux(MESH, values, clip=True).report()
+    assert (report["negatives"], report["zeros"], report["min"]) == (1, 1, 0.0)
+    assert report["removed_power"] == pytest.approx(0.03)
+    assert report["power"] == pytest.approx(0.5 * 49)
+    assert report["removed_percent"] == pytest.approx(100 * 0.03 / 24.5)
+
+
+@pytest.mark.parametrize("clip", [False, True])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_nan_and_inf_are_refused_always(bad, clip):
+    values = np.ones(8)
+    values[5] = bad
+    with pytest.raises(ExitanceError, match=r"1 of 8 values are NaN or inf, the first on vertex 5"):
+        import_flux(MESH, values, clip=clip)
+
+
+@pytest.mark.parametrize("values", [np.zeros(8), np.full(8, -1.0)])
+def test_a_black_phantom_is_refused(values):
+    with pytest.raises(ExitanceError, match="zero everywhere"):
+        import_flux(MESH, values, clip=True)
+
+
+def test_inside_out_is_refused_until_flipped():
+    with pytest.raises(FluxError, match=r"inside out.*Give --flip"):
+        import_flux((VERTICES, FACES[:, ::-1]), np.ones(8))
+    with pytest.raises(FluxError, match=r"Leave out --flip"):
+        import_flux(MESH, np.ones(8), flip=True)
+    phantom = import_flux((VERTICES, FACES[:, ::-1]), np.arange(8.0), flip=True)
+    assert np.array_equal(phantom.faces, FACES)
+    assert np.array_equal(phantom.exitance, np.arange(8.0))
+
+
+def test_faces_that_contradict_each_other_are_refused():
+    twisted = FACES.copy()
+    twisted[3] = twisted[3, ::-1]
+    with pytest.raises(FluxError, match=r"on 3 edges .* opposite sides"):
+        import_flux((VERTICES, twisted), np.ones(8))
+
+
+def test_an_open_surface_is_taken_and_said_to_be_open():
+    report = import_flux((VERTICES, FACES[2:]), np.ones(10)).report()
+    assert (report["watertight"], report["outward"]) == (False, None)
+
+
+def test_vertices_that_no_face_uses_do_not_count():
+    values = np.append(np.ones(8), np.nan)
+    phantom = import_flux((np.vstack([VERTICES, [[9, 9, 9]]]), FACES), values)
+    assert len(phantom.vertices) == 8
+
+
+@pytest.mark.parametrize(
+    ("values", "options", "largest"),
+    [
+        (np.full(8, 1e308), {}, r"1e\+308"),
+        (np.linspace(-1e308, 1, 8), {"clip": True}, r"1e\+308"),
+        (np.full(8, 1e-40), {}, "1e-40"),
+        (np.ones(8), {"a": 1e-320}, "inf"),
+        (np.full(8, 1e-40), {"length_unit": "m"}, "1e-46"),
+    ],
+)
+def test_what_single_precision_cannot_hold_is_refused(values, options, largest):
+    """Rationale: J_n = 1e308 was written, and its power told as inf; Mitsuba counts in 32 bits."""
+    with pytest.raises(ExitanceError, match=rf"largest value is {largest} W/mm\^2, the renderer holds 1.2e-38 to 3.4e"):
+        import_flux(MESH, values, **options)
+    assert import_flux(MESH, np.full(8, 1e38)).power == pytest.approx(52e38)
+
+
+def test_vertices_that_single_precision_cannot_hold_are_refused():
+    with pytest.raises(FluxError, match=r"a vertex lies at 2e\+39 mm, the renderer holds 3.4"):
+        import_flux((VERTICES * 1e39, FACES), np.ones(8))
+
+
+TETRAHEDRON = (np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "values", "options", "message"),
+    [
+        (MESH, np.ones(9), {}, r"9 values fit nothing, arrays with values has 8 vertices, 12 faces"),
+        (MESH, np.ones(12), {"per": "vertex"}, r"asked for per vertex"),
+        (TETRAHEDRON, np.ones(4), {}, r"4 values fit vertices and faces\. Give --per"),
+        (MESH, np.ones((8, 2)), {}, r"which of its 2 columns\?.*'1', '2'"),
+        (MESH, np.ones((8, 2, 2)), {}, r"shape \(N,\) or \(N, columns\)"),
+        (MESH, np.ones(8) * 1j, {}, r"real numbers"),
+        (MESH, None, {}, r"needs 'values'"),
+        (MESH, np.ones(8), {"length_unit": "inch"}, r"'length_unit' must be one of mm, cm, m, got 'inch'"),
+        (MESH, np.ones(8), {"per": "edge"}, r"'per' must be vertex or face, got 'edge'"),
+        (MESH, np.ones(8), {"format": "mose"}, r"'format' must be one of auto, mmc, .*got 'mose'"),
+        (MESH, np.ones(8), {"format": "obj"}, r"reads files"),
+        (MESH, np.ones(8), {"a": "exact"}, r"'a' must be robin, haskell or a number > 0, got 'exact'"),
+        (MESH, np.ones(8), {"a": "robin", "n": 0.9}, r"n must be >= 1"),
+        (MESH, np.ones(8), {"a": "robin", "n": 1e9}, r"n must be >= 1 and at most 100, got 1e\+09"),
+        (MESH, np.ones(8), {"n": 1.4}, r"'n' = 1.4 goes with 'a'"),
+        (MESH, np.ones(8), {"a": 2.5, "n": 1.4}, r"'n' = 1.4 goes with 'a'"),
+        ((VERTICES, FACES + 1), np.ones(8), {}, r"vertices 1 to 8 \(counted from 0\), there are 8"),
+        ((VERTICES, FACES * 1.0), np.ones(8), {}, r"cells must be integers"),
+        ((VERTICES[:, :2], FACES), np.ones(8), {}, r"shape \(V, 3\)"),
+        ((VERTICES, FACES[:, :2]), np.ones(8), {}, r"triangles \(F, 3\) or tetrahedra"),
+        ((VERTICES * np.nan, FACES), np.ones(8), {}, r"some are NaN"),
+        ((VERTICES * [0, 0, 1], FACES), np.ones(8), {}, r"no area"),
+        (
+            (VERTICES, np.array([[0, 1, 2, 4]] * 3)),
+            np.ones(8),
+            {},
+            r"share the face",
+        ),
+    ],
+)
+def test_bad_arrays(mesh, values, options, message):
+    with pytest.raises(FluxError, match=message):
+        import_flux(mesh, values, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("v.csv", "a,b\n1,2\n3,4\n", r"which of its 2 columns.*'a', 'b'"),
+        ("v.csv", "1,2\n3,x\n", r"not a table of numbers.*'x'"),
+        ("v.csv", "1,2\n3,x\n", r"not a table of numbers.*\. Mend that line\."),
+        ("v.csv", "1\n\n", r"1 values fit nothing"),
+        ("v.csv", "# nothing\n", r"holds no values"),
+        ("v.csv", "", r"holds no values"),
+        ("v.txt", b"\x00\x01\xff\xfe" * 9, r"is binary"),
+        ("v.npy", b"no numpy", r"cannot be read as a NumPy file: .*\. Save it anew"),
+        ("v.npz", b"PK\x03\x04 broken", r"cannot be read as a NumPy file: .*\. Save it anew"),
+        ("v.mat", b"broken", r"cannot be read as a MATLAB file: .*\. Save it anew"),
+        ("missing.csv", None, r"missing.csv' cannot be read: No such file"),
+    ],
+)
+def test_bad_value_files(tmp_path, name, content, message):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(FluxError, match=message) as caught:
+        import_flux(MESH, path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "field"),
+    [
+        ("phi;J_n\n0;1\n" + "0;2\n" * 7, "J_n"),
+        ("# made by hand\n# phi J_n\n0 1\n" + "0 2\n" * 7, "J_n"),
+        ("1,1\n" + "2,2\n" * 7, "2"),
+        ("\ufeffJ_n\n\n1\n" + "2\n" * 7, None),
+    ],
+)
+def test_columns_by_name_or_number(tmp_path, content, field):
+    (tmp_path / "v.csv").write_text(content, encoding="utf-8")
+    assert import_flux(MESH, tmp_path / "v.csv", field=field).exitance.tolist() == [1.0] + [2.0] * 7
+
+
+@pytest.mark.parametrize("field", ["jn", "2"])
+def test_a_table_of_one_row(tmp_path, field):
+    """Rationale: the row was taken for a column of two values, and then asked for its second column."""
+    path = tmp_path / "v.csv"
+    path.write_text("id,jn\n7,0.5\n")
+    one = (VERTICES[FACES[0]], np.array([[0, 1, 2]]))
+    assert import_flux(one, path, field=field, per="face").exitance.tolist() == [0.5]
+    with pytest.raises(FluxError, match=r"which of its 2 columns.*'id', 'jn'"):
+        import_flux(one, path, per="face")
+
+
+def test_columns_of_one_name(tmp_path):
+    path = tmp_path / "v.csv"
+    path.write_text("jn,jn\n" + "1,2\n" * 8)
+    with pytest.raises(FluxError, match=r"2 columns are named 'jn'\. Choose one by its number"):
+        import_flux(MESH, path, field="jn")
+    assert import_flux(MESH, path, field="2").exitance.tolist() == [2.0] * 8
+
+
+@pytest.mark.skipif(not os.path.isdir("/dev/fd"), reason="no names for open files")
+def test_values_from_a_pipe():
+    """Rationale: the second look into it found nothing."""
+    source, sink = os.pipe()
+    os.write(sink, b"jn\n" + b"1\n" * 7 + b"2\n")
+    os.close(sink)
+    assert import_flux(MESH, f"/dev/fd/{source}").exitance.tolist() == [1.0] * 7 + [2.0]
+    os.close(source)
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["variable", "member"])
+def test_a_sparse_vector_of_matlab(tmp_path, inside):
+    scipy = pytest.importorskip("scipy")
+    values = scipy.sparse.csc_matrix(np.arange(8.0)[:, None])
+    scipy.io.savemat(tmp_path / "v.mat", {"data": {"phi": values}} if inside else {"phi": values})
+    assert import_flux(MESH, tmp_path / "v.mat").exitance.tolist() == list(range(8))
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "off", "glb", "vtu", "vtk", "msh", "xdmf", "npz", "step"])
+@pytest.mark.parametrize("content", [b"", b"neither fish nor fowl\n" * 20, b"ply\nelement vertex 3\n"])
+def test_broken_mesh_files_give_one_line(tmp_path, suffix, content, capfd):
+    path = tmp_path / f"broken.{suffix}"
+    path.write_bytes(content)
+    with pytest.raises((FluxError, BackendError), match="broken") as caught:
+        import_flux(path, np.ones(8))
+    assert "\n" not in str(caught.value)
+    assert "".join(capfd.readouterr()) == ""
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["import", *map(str, arguments)])
+
+
+def test_cli_writes_and_reports(tmp_path):
+    BOX.export(tmp_path / "box.off")
+    np.save(tmp_path / "jn.npy", np.linspace(-0.1, 1, 8))
+    arguments = [tmp_path / "box.off", "--values", tmp_path / "jn.npy", "--length-unit", "cm", "--clip"]
+    result = run(*arguments, "--json", "-o", tmp_path / "box.ply")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert report["area"] == pytest.approx(5200)
+    assert (report["negatives"], report["zeros"], report["watertight"], report["outward"]) == (
+        1,
+        1,
+        True,
+        True,
+    )
+    assert report["unit"] == "W/mm^2"
+    assert report["max"] == pytest.approx(0.01)
+    again = import_flux(tmp_path / "box.ply").report()
+    assert again["power"] == report["power"]
+    table = run(*arguments, "-o", tmp_path / "box.ply").stdout
+    for name in (
+        "area",
+        "power",
+        "min",
+        "max",
+        "zeros",
+        "negatives",
+        "watertight",
+        "outward",
+        "unit",
+        "removed",
+    ):
+        assert f"\n{name}" in "\n" + table
+    assert "W/mm^2" in table
+
+
+def test_cli_refusal_leaves_no_file(tmp_path):
+    BOX.export(tmp_path / "box.off")
+    np.save(tmp_path / "jn.npy", np.linspace(-0.1, 1, 8))
+    result = run(tmp_path / "box.off", "--values", tmp_path / "jn.npy", "-o", tmp_path / "box.ply")
+    assert isinstance(result.exception, ExitanceError)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["box.off", "jn.npy"]

@@ -1,0 +1,106 @@
+"""The phantom: what its PLY holds, for Mitsuba and for reading again, and what a phantom cannot be."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mitsuba_fspt.phantom.phantom import Phantom
+from mitsuba_fspt.runtime.errors import ExitanceError, FluxError
+
+SPHERE = trimesh.creation.icosphere(subdivisions=1, radius=2.0)
+VERTICES, FACES = np.array(SPHERE.vertices), np.array(SPHERE.faces)
+
+
+def phantom(per="vertex", **changes):
+    """Sphere with values that no single-precision number holds exactly, over nine decades, some of them 0."""
+    count = len(VERTICES if per == "vertex" else FACES)
+    exitance = np.logspace(-12, -3, count) / 3
+    exitance[::7] = 0
+    return Phantom(**{"vertices": VERTICES, "faces": FACES, "exitance": exitance, "per": per} | changes)
+
+
+@pytest.mark.parametrize("per", ["vertex", "face"])
+def test_ply_comes_back_bit_by_bit(tmp_path, per):
+    provenance = {"source": "Mäuse,\n2 of them", "boundary_factor": "2.57 (robin, n = 1.37)"}
+    written = phantom(per, provenance=provenance, negatives=3, removed_power=1.25e-7)
+    written.write(tmp_path / "p.ply")
+    read = Phantom.read(tmp_path / "p.ply")
+    for name in ("vertices", "faces", "exitance"):
+        assert np.array_equal(getattr(read, name), getattr(written, name))
+    assert read.per == per
+    assert read.provenance["boundary_factor"] == "2.57 (robin, n = 1.37)"
+    assert read.provenance["source"] == "Mäuse, 2 of them"
+    assert read.report() | {"source": ""} == written.report() | {"source": ""}
+    header = (tmp_path / "p.ply").read_bytes().split(b"end_header")[0].decode("utf-8")
+    for line in ("quantity exitance", "unit W/mm^2", "length_unit mm", f"power {written.power!r} W"):
+        assert f"comment {line}\n" in header
+    assert "comment source Mäuse, 2 of them\n" in header
+
+
+@pytest.mark.parametrize("per", ["vertex", "face"])
+def test_mitsuba_finds_the_exitance(tmp_path, per):
+    """The attribute is there under its name and holds each value, rounded to single precision once."""
+    written = phantom(per, provenance={"source": "Mäuse"})
+    written.write(tmp_path / "p.ply")
+    mi.set_variant("llvm_ad_mono")
+    mesh = mi.load_dict({"type": "ply", "filename": str(tmp_path / "p.ply")})
+    parameters = mi.traverse(mesh)
+    assert np.array_equal(np.array(parameters[f"{per}_exitance"]), written.exitance.astype(np.float32))
+    assert np.array_equal(np.array(parameters["faces"]).reshape(-1, 3), FACES)
+    assert np.array_equal(np.array(parameters["vertex_positions"]).reshape(-1, 3), VERTICES.astype(np.float32))
+
+
+def test_power_of_a_sphere():
+    """J_n A for uniform J_n; the sphere of triangles is a little smaller than 16π mm²."""
+    for per, count in (("vertex", 42), ("face", 80)):
+        uniform = phantom(per, exitance=np.full(count, 0.25))
+        assert uniform.power == pytest.approx(0.25 * SPHERE.area, rel=1e-12)
+        assert uniform.area == pytest.approx(16 * np.pi, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"exitance": np.ones(5)}, FluxError, r"must fit, got shapes \(42, 3\), \(80, 3\) and \(5,\)"),
+        ({"exitance": np.full(42, np.nan)}, ExitanceError, r"42 of 42 values are NaN or inf"),
+        ({"exitance": np.full(42, -1.0)}, ExitanceError, r"must be >= 0, the least is -1 W/mm\^2"),
+        ({"exitance": np.zeros(42)}, ExitanceError, r"zero everywhere"),
+        ({"per": "edge"}, FluxError, r"'per' must be vertex or face, got 'edge'"),
+        ({"faces": FACES + 1}, FluxError, r"numbers of the 42 vertices"),
+        ({"faces": FACES[:0]}, FluxError, r"numbers of the 42 vertices"),
+        ({"vertices": VERTICES * 0}, FluxError, r"no area"),
+        ({"provenance": {"power": "1 W"}}, FluxError, r"'power' is taken"),
+        ({"provenance": {"two words": "x"}}, FluxError, r"'two words' is taken or no single word"),
+    ],
+)
+def test_what_a_phantom_cannot_be(changes, error, message):
+    with pytest.raises(error, match=message):
+        phantom(**changes)
+
+
+@pytest.mark.parametrize("name", ["p.obj", "missing/p.ply"])
+def test_refused_output_leaves_nothing(tmp_path, name):
+    with pytest.raises(FluxError, match="output file"):
+        phantom().write(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_ply_of_another_kind_is_refused(tmp_path):
+    mesh = SPHERE.copy()
+    mesh.vertex_attributes["jn"] = np.ones(42)
+    mesh.export(tmp_path / "mesh.ply")
+    with pytest.raises(ExitanceError, match=r"'exitance_x'.* Properties it has: 'jn'.* fspt flux import"):
+        Phantom.read(tmp_path / "mesh.ply")
+    phantom().write(tmp_path / "p.ply")
+    other = (tmp_path / "p.ply").read_bytes().replace(b"comment unit W/mm^2", b"comment unit W/cm^2")
+    (tmp_path / "p.ply").write_bytes(other)
+    with pytest.raises(FluxError, match=r"the unit of a phantom must be W/mm\^2"):
+        Phantom.read(tmp_path / "p.ply")
+
+
+@pytest.mark.parametrize(("name", "what"), [("gone.ply", "there is no such file"), ("", "it is a folder")])
+def test_no_file_to_read(tmp_path, name, what):
+    """Rationale: the loader's words were that the file is damaged."""
+    with pytest.raises(FluxError, match=rf"cannot be read: {what}\. Check the name\."):
+        Phantom.read(tmp_path / name)

@@ -1,0 +1,352 @@
+"""Loading scenes, and the same scene by every road: load and render, plain mi.load_file and mi.render, load_dict."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsuba_fspt.runtime import backend
+
+backend.ensure_variant()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+from little_scenes import (  # noqa: E402
+    BALL_XML,
+    LENS_XML,
+    SCENES,
+    attribute,
+    ball,
+    glow,
+    lens,
+    scene_of,
+    write_ply,
+    write_scene,
+)
+
+import mitsuba_fspt as fspt  # noqa: E402
+from mitsuba_fspt.jit import robust_tracing  # noqa: E402
+from mitsuba_fspt.jit.robust_tracing import lost_rays  # noqa: E402
+from mitsuba_fspt.rendering.scene_xml import read_xml  # noqa: E402
+from mitsuba_fspt.runtime.errors import ExitanceError, SceneError  # noqa: E402
+
+PLY_XML = """
+    <shape type="ply">
+        <string name="filename" value="{name}"/>
+        <boolean name="face_normals" value="true"/>
+        <emitter type="fspt_surface">
+            <texture type="mesh_attribute" name="exitance"><string name="name" value="vertex_exitance"/></texture>
+        </emitter>
+    </shape>"""
+
+
+def sheet(path, cells=2, half=3.0, value=lambda y, z: 1e-3 + 0 * y):
+    """A square that faces the lens, of cells × cells squares of two triangles, J_n = value(y, z) on its vertices."""
+    side = np.linspace(-half, half, cells + 1)
+    y, z = (g.ravel() for g in np.meshgrid(side, side))
+    corner = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = (g.ravel() for g in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    return write_ply(path, np.stack([0 * y, y, z], -1), faces, vertex=value(y, z))
+
+
+# --- what load does ---
+
+
+def test_parameters_replace_the_defaults_of_the_file(tmp_path):
+    path = write_scene(tmp_path / "s.xml")
+    plain, wide = fspt.load(path), fspt.load(path, f_number=2.8, distance="170")
+    assert plain.sensors()[0].optics.f_number == 8
+    assert wide.sensors()[0].optics.f_number == pytest.approx(2.8)
+    assert plain.id() == str(path)
+    assert wide.id() == f"{path} f_number=2.8 distance=170"
+    assert read_xml(path, {}).defaults == {"f_number": "8", "distance": "165"}
+
+
+def test_a_parameter_may_name_the_file_to_include_and_set_what_that_has(tmp_path):
+    """Its `<default>`s count from there on, as in the file itself. Seen to fail: no parameter 'radius'."""
+    path = write_scene(
+        tmp_path / "s.xml", shapes='<default name="part" value="p"/><include filename="$part_$part.xml"/>'
+    )
+    for name, radius in (("p_p.xml", 1), ("q_q.xml", 2)):
+        ball = BALL_XML.replace('"3"', '"$radius"')
+        (tmp_path / name).write_text(f'<scene version="3.0.0"><default name="radius" value="{radius}"/>{ball}</scene>')
+    for given, radius in (({}, 1), ({"part": "q"}, 2), ({"part": "q", "radius": 4}, 4)):
+        assert fspt.load(path, **given).shapes()[0].bbox().max.x == pytest.approx(radius)
+    with pytest.raises(SceneError, match=r"has no parameter 'size'\. .*: f_number, distance, part, radius\."):
+        fspt.load(path, size=1)
+
+
+def test_a_name_in_a_text_is_read_as_mitsuba_does(tmp_path):
+    """The longest name that fits, the first `<default>` of a name, and values of those before in those after."""
+    (tmp_path / "s.xml").write_text(
+        '<scene version="3.0.0"><default name="f" value="1"/><default name="f_n" value="$f.5"/>'
+        '<default name="f" value="9"/></scene>'
+    )
+    scene = read_xml(tmp_path / "s.xml", {})
+    assert scene.defaults == {"f": "1", "f_n": "1.5"}
+    assert [scene.fill_in(text) for text in ("$f_nx", "$f_m", "$g $")] == ["1.5x", "1_m", "$g $"]
+    assert read_xml(tmp_path / "s.xml", {"f": "2"}).fill_in("$f_n") == "2.5"
+
+
+def test_files_are_looked_for_beside_the_scene_and_nowhere_after(tmp_path, monkeypatch):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    sheet(tmp_path / "scene" / "sheet.ply")
+    path = write_scene(tmp_path / "scene" / "s.xml", shapes=PLY_XML.format(name="sheet.ply"))
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    before = str(mi.file_resolver())
+    assert fspt.render(fspt.load(path), max_nodes=4).power.max() > 0
+    assert str(mi.file_resolver()) == before
+    with pytest.raises(SceneError):
+        fspt.load(write_scene(path, sensor=LENS_XML.replace("0.8", "0")))
+    assert str(mi.file_resolver()) == before
+
+
+def test_included_files_and_their_defaults_count(tmp_path):
+    (tmp_path / "camera.xml").write_text(
+        f'<scene version="3.0.0"><default name="f_number" value="4"/>{LENS_XML}</scene>'.replace("$distance", "165")
+    )
+    path = tmp_path / "s.xml"
+    path.write_text(f'<scene version="3.0.0"><include filename="camera.xml"/>{BALL_XML}</scene>')
+    assert fspt.load(path).sensors()[0].optics.f_number == 4
+    assert fspt.load(path, f_number=5.6).sensors()[0].optics.f_number == pytest.approx(5.6)
+    with pytest.raises(SceneError, match=r"no parameter 'iso'. Its <default> parameters: f_number"):
+        fspt.load(path, iso=100)
+
+
+def test_a_parameter_may_be_called_path_but_not_filename(tmp_path):
+    more = '<default name="path" value="1"/><default name="filename" value="1"/><default name="switch" value="false"/>'
+    shapes = BALL_XML.replace('value="3"', 'value="$path"').replace(
+        "<emitter", '<boolean name="flip_normals" value="$switch"/><emitter'
+    )
+    path = write_scene(tmp_path / "s.xml", shapes=more + shapes)
+    assert fspt.load(path, path=2.5, switch=True).shapes()[0].bbox().max.x == 2.5
+    with pytest.raises(SceneError, match="cannot set a parameter 'filename'"):
+        fspt.load(path, filename="x")
+
+
+def test_unnamed_shapes_and_sensors_get_names_that_stay(tmp_path):
+    path = write_scene(tmp_path / "s.xml", shapes=BALL_XML * 2 + BALL_XML.replace("<shape", '<shape id="mouse"'))
+    keys = [set(mi.traverse(fspt.load(path)).keys()) for _ in range(2)]
+    assert keys[0] == keys[1]
+    for name in ("sphere.emitter", "sphere_2.emitter", "mouse.emitter"):
+        assert f"{name}.exitance.value" in keys[0]
+    for name in ("f_number", "focal_length", "magnification", "pixel_pitch", "to_world"):
+        assert f"fspt_lens.{name}" in keys[0]
+
+
+def test_loading_makes_no_plugin_by_load_dict(monkeypatch, tmp_path):
+    """`mi.load_dict` swaps the process's file resolver while other threads of the loader look for files.
+
+    Lens and emitter once called it in their constructors, and one load in a thousand failed with
+    'basic_string::_M_create', when a thread read a resolver that was freed meanwhile.
+    """
+
+    def refuse(*arguments, **options):
+        raise AssertionError("load_dict during a load")
+
+    monkeypatch.setattr(mi, "load_dict", refuse)
+    assert fspt.load(write_scene(tmp_path / "s.xml")).sensors()[0].film() is not None
+
+
+# --- the same scene by every road ---
+
+
+def same_power(image, other):
+    """Equal but for the rounding of float32."""
+    peak = other.max()
+    np.testing.assert_allclose(image, other, rtol=0, atol=1e-6 * peak)
+
+
+@pytest.mark.parametrize("name", ["two_spheres", "textured_sphere", "l_shape"])
+def test_plain_mitsuba_renders_the_scene_files_alike(name):
+    """mi.load_file and mi.render with the scene's own fspt_integral: the same numbers as fspt.render."""
+    small = {"width": 16, "height": 16, "pixel_pitch": 1.728, "rtol": 1e-2}
+    image = fspt.render(fspt.load(SCENES / f"{name}.xml", **small))
+    plain = np.array(mi.render(mi.load_file(str(SCENES / f"{name}.xml"), **small)))
+    assert plain.shape == (16, 16, 1)
+    assert image.power.max() > 0
+    same_power(plain[..., 0], image.power)
+
+
+@pytest.mark.parametrize("method", ["path", "ptracer"])
+def test_plain_mitsuba_renders_monte_carlo_in_the_same_unit(tmp_path, method):
+    """A scene file with a stock integrator, by mi.load_file and mi.render; expected within the noise of fspt.render."""
+    integrator = f'<integrator type="{method}"><integer name="max_depth" value="1"/></integrator>'
+    path = write_scene(tmp_path / "s.xml", integrator=integrator)
+    image = fspt.render(fspt.load(path), spp=4000)
+    assert image.metadata["method"] == method
+    plain = np.array(mi.render(mi.load_file(str(path)), spp=4000))[..., 0]
+    assert np.all(np.abs(plain - image.power) < 7 * image.error + 1e-6 * image.power.max())
+    integral = fspt.render(fspt.load(path), method="integral")
+    assert image.power.sum() == pytest.approx(integral.power.sum(), abs=5 * np.linalg.norm(image.error))
+
+
+def test_a_scene_from_a_dictionary_is_the_scene_of_the_file(tmp_path):
+    path = write_scene(tmp_path / "s.xml")
+    scene = scene_of(ball(radius=3.0), sensor=lens(size=(8, 6)))
+    same_power(fspt.render(scene).power, fspt.render(path).power)
+
+
+def test_the_scene_files_film_does_not_matter(tmp_path):
+    """Half floats flush 1e-9 W to zero and a Gaussian filter blurs: the lens takes neither from the file."""
+    film = LENS_XML.replace(
+        '<string name="pixel_format" value="luminance"/>',
+        '<string name="pixel_format" value="rgba"/><string name="component_format" value="float16"/>'
+        '<rfilter type="gaussian"/>',
+    )
+    dim = BALL_XML.replace("1e-3", "1e-9")
+    images = []
+    for number, sensor in enumerate((LENS_XML, film)):
+        path = write_scene(tmp_path / f"{number}.xml", sensor=sensor, shapes=dim)
+        scene = mi.load_file(str(path))
+        path_image = mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 1}), spp=64)
+        images.append([np.array(mi.render(scene)), np.array(path_image)])
+    assert images[0][0].max() < 1e-11
+    for plain, odd in zip(*images, strict=True):
+        assert plain.max() > 0
+        np.testing.assert_array_equal(plain, odd)
+
+
+def test_textures_nest_in_a_scene_file(tmp_path):
+    """A raw bitmap far above 1 inside the emitter; it fills the view: J_n A_vd sin²θ on the pixels near the axis."""
+    mi.Bitmap(np.full((2, 2, 1), 7.5e3, np.float32)).write(str(tmp_path / "even.exr"))
+    shapes = """
+    <shape type="rectangle">
+        <transform name="to_world"><rotate y="1" angle="90"/><scale value="30"/></transform>
+        <emitter type="fspt_surface">
+            <texture type="bitmap" name="exitance">
+                <string name="filename" value="even.exr"/><boolean name="raw" value="true"/>
+            </texture>
+        </emitter>
+    </shape>"""
+    image = fspt.render(write_scene(tmp_path / "s.xml", shapes=shapes))
+    radius = 55 / 8 / 2
+    truth = 7.5e3 * 1.6**2 * radius**2 / (radius**2 + 165**2)
+    np.testing.assert_allclose(image.power, truth, rtol=5e-3)  # 3e-3 by cos⁴θ in the corners
+
+
+# --- what may change after loading ---
+
+
+def test_updating_a_number_scales_the_picture():
+    scene = scene_of(ball(1e-3))
+    before = fspt.render(scene, max_nodes=4).power
+    parameters = mi.traverse(scene)
+    parameters["shape_0.emitter.exitance.value"] = 3e-3
+    parameters.update()
+    same_power(fspt.render(scene, max_nodes=4).power, 3 * before)
+
+
+@pytest.fixture
+def graded(tmp_path):
+    """A scene of one sheet whose J_n rises along y, and its parameters."""
+    path = sheet(tmp_path / "sheet.ply", value=lambda y, z: 1e-3 * (5 + y))
+    shape = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute())}
+    scene = scene_of(shape, sensor=lens(size=8))
+    return scene, mi.traverse(scene)
+
+
+def test_updating_vertex_values_changes_every_method(graded):
+    """All three, of which the particle tracer also has to sample anew."""
+    scene, parameters = graded
+    methods = ({}, {"method": "path", "spp": 400}, {"method": "ptracer", "spp": 4000})
+    before = [fspt.render(scene, **options) for options in methods]
+    key = "shape_0.vertex_exitance"
+    parameters[key] = mi.Float(np.where(np.array(parameters[key]) > 5e-3, 5.0, 1.0) * np.array(parameters[key]))
+    parameters.update()
+    truth = fspt.render(scene)
+    assert truth.power.sum() > 2 * before[0].power.sum()
+    for options, old in zip(methods, before, strict=True):
+        image = fspt.render(scene, **options)
+        assert image.power.sum() > 2 * old.power.sum()
+        assert image.power.sum() == pytest.approx(truth.power.sum(), abs=4 * np.linalg.norm(image.error))
+
+
+@pytest.mark.parametrize("value", [-1e-3, np.nan, 0.0])
+def test_updating_to_values_that_cannot_be_is_refused_at_every_render(graded, value):
+    scene, parameters = graded
+    fspt.render(scene, max_nodes=4)
+    good = np.array(parameters["shape_0.vertex_exitance"])
+    parameters["shape_0.vertex_exitance"] = mi.Float(np.full_like(good, value))
+    parameters.update()
+    for options in ({}, {}, {"method": "path", "spp": 4}, {"method": "ptracer", "spp": 4}):
+        with pytest.raises(ExitanceError, match="'exitance' of shape 'shape_0'"):
+            fspt.render(scene, **options)
+    parameters["shape_0.vertex_exitance"] = mi.Float(good)
+    parameters.update()
+    assert fspt.render(scene, max_nodes=4).power.max() > 0
+
+
+def test_a_moved_shape_is_seen_where_it_went():
+    scene = scene_of(ball(radius=2.0), sensor=lens(size=9))
+    parameters = mi.traverse(scene)
+    parameters["shape_0.to_world"] = mi.Transform4f().translate([0, 4, 0]).scale(2)
+    parameters.update()
+    moved = fspt.render(scene, rtol=1e-2).power
+    column = moved.sum(0)
+    assert column @ np.arange(9) / column.sum() == pytest.approx(4 + 4 / 1.6, abs=0.05)  # +y is to the right
+
+
+# --- rays that Embree loses ---
+
+
+@pytest.fixture
+def aligned(tmp_path):
+    """A sheet in the sharp plane with a vertex in every pixel's middle, in a file that asks for no robust mode."""
+    sheet(tmp_path / "grid.ply", cells=16, half=8 * 1.6)
+    shapes = PLY_XML.format(name="grid.ply") + '<boolean name="embree_use_robust_intersections" value="false"/>'
+    sensor = LENS_XML.replace('value="8"', 'value="7"').replace('value="6"', 'value="7"')
+    return write_scene(tmp_path / "s.xml", sensor=sensor, shapes=shapes)
+
+
+llvm_only = pytest.mark.skipif(not mi.variant().startswith("llvm"), reason="Embree traces for LLVM only")
+
+
+@llvm_only
+def test_load_turns_robust_tracing_on_whatever_the_file_says(aligned):
+    plain, ours = mi.load_file(str(aligned)), fspt.load(aligned)
+    assert lost_rays(plain, plain.sensors()[0]) > 0
+    assert lost_rays(ours, ours.sensors()[0]) == 0
+
+
+@llvm_only
+@pytest.mark.parametrize("cells", [3, 4, 16])
+def test_lost_rays_are_found_however_few_the_vertices(tmp_path, cells):
+    """Seen to fail with rays to the vertices alone, of which three or four cells have few inside."""
+    sheet(tmp_path / "grid.ply", cells=cells, half=12.8)
+    shapes = PLY_XML.format(name="grid.ply") + '<boolean name="embree_use_robust_intersections" value="false"/>'
+    path = write_scene(tmp_path / "s.xml", shapes=shapes)
+    plain, ours = mi.load_file(str(path)), fspt.load(path)
+    assert lost_rays(plain, plain.sensors()[0]) > 0
+    assert lost_rays(ours, ours.sensors()[0]) == 0
+
+
+def test_a_scene_that_no_robust_mode_mends_is_taken_as_it_is(aligned, monkeypatch, capfd):
+    scene = fspt.load(aligned)
+    monkeypatch.setattr(robust_tracing, "lost_rays", lambda *_: 3)
+    assert robust_tracing.robust_scene(scene, scene.sensors()[0]) is scene
+    assert "loses rays" not in "".join(capfd.readouterr())
+
+
+@llvm_only
+def test_the_integral_is_right_where_the_scene_lost_rays_and_says_so(aligned, capfd):
+    truth = fspt.render(fspt.load(aligned), pixel="centre")
+    scene = mi.load_file(str(aligned))
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Warn)
+    try:
+        image = fspt.render(scene, pixel="centre")
+    finally:
+        mi.set_log_level(level)
+    warning = "".join(capfd.readouterr())
+    assert "this scene loses rays that meet mesh edges" in warning
+    assert "embree_use_robust_intersections" in warning
+    same_power(image.power, truth.power)
+    np.testing.assert_allclose(image.coverage, 1, atol=5e-3)
+    # What is lost without: a share of the lines of sight through the vertices.
+    along = dr.linspace(mi.Float, 0, 1, 500)
+    pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(along, along))
+    ray, _, _ = scene.sensors()[0].line_of_sight(mi.Point2f(3.5, 3.5), pupil)
+    assert not dr.all(scene.ray_intersect_preliminary(ray).is_valid())

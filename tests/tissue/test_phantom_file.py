@@ -1,0 +1,278 @@
+"""Phantoms described in TOML, meshes of tissue from files, and `fspt flux solve` over them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from mitsuba_fspt.cli.flux import app
+from mitsuba_fspt.optics.media import Medium, Source
+from mitsuba_fspt.optics.shapes import Ball, Rod
+from mitsuba_fspt.phantom.phantom import Phantom
+from mitsuba_fspt.runtime.errors import BackendError, FluxError
+from mitsuba_fspt.tissue import phantom_file
+from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
+from mitsuba_fspt.tissue.diffusion import solve
+from mitsuba_fspt.tissue.mesher import read_tetrahedra, tetrahedralize
+from mitsuba_fspt.tissue.phantom_file import Cylinder, PhantomFile, Region
+
+pytest.importorskip("skfem")
+SCENES = Path(__file__).parent.parent / "scenes"
+SMALL = """
+[geometry]
+shape = "cylinder"
+radius = 6
+height = 8
+[optical]
+mua = 0.05
+musp = 1
+[[sources]]
+shape = "point"
+centre = [1, 0, -1]
+power = 2.5
+[mesh]
+edge = 2
+[output]
+edge = 1
+voxel = 1
+"""
+
+
+def described(tmp_path: Path, text: str) -> PhantomFile:
+    (tmp_path / "phantom.toml").write_text(text, encoding="utf-8")
+    return PhantomFile.read(tmp_path / "phantom.toml")
+
+
+def solved_description(tmp_path: Path, text: str) -> Phantom:
+    phantom = described(tmp_path, text)
+    return phantom.solve().phantom(phantom.surface_edge)
+
+
+def test_the_papers_phantoms() -> None:
+    """Rationale: the files say what the paper says: R 15, H 30, a hole of 1 mm radius 8 mm off the axis."""
+    for name, length in (("nylon_cylinder", 1.0), ("nylon_cylinder_6mm", 6.0)):
+        phantom = PhantomFile.read(SCENES / f"{name}.toml")
+        assert phantom.geometry == Cylinder(15, 30)
+        assert phantom.medium == Medium(0.0138, 0.91, 1.37)
+        ((source,), power) = phantom.sources, phantom.sources[0].power
+        assert isinstance(source.shape, Rod)
+        assert (source.shape.length, source.shape.radius, power) == (length, 1, 1)
+        assert source.shape.centre[:2] == (8, 0)
+        assert source.shape.centre[2] - length / 2 == -1.5
+
+
+def test_the_documented_example(tmp_path: Path) -> None:
+    """The docstring's file is one, and says what the defaults are."""
+    assert phantom_file.__doc__
+    phantom = described(tmp_path, phantom_file.__doc__.split("\n", 1)[1])
+    plain = PhantomFile(phantom.geometry, phantom.medium, phantom.sources, phantom.regions)
+    assert phantom == plain
+    assert phantom.regions[0].medium == Medium(0.05, 1.2, 1.37)
+
+
+def test_everything_a_file_can_say(tmp_path: Path) -> None:
+    """Every kind of source and region, and all that has a default."""
+    text = SMALL.replace("musp = 1", 'musp = 1\nn = 1.4\na = "haskell"') + (
+        '[[sources]]\nshape = "sphere"\ncentre = [0, 0.5, 1]\nradius = 0.5\n'
+        '[[sources]]\nshape = "cylinder"\ncentre = [0, 0, 0]\nradius = 0\nlength = 2\naxis = [0, 1, 0]\npower = 3\n'
+        '[[regions]]\nshape = "sphere"\ncentre = [-2, 0, 0]\nradius = 2\nmua = 0.1\nmusp = 2\n'
+        '[[regions]]\nshape = "cylinder"\ncentre = [0, 0, 3]\nradius = 9\nlength = 2\nmua = 0.2\nmusp = 3\nn = 1.5\n'
+    )
+    phantom = described(tmp_path, text)
+    assert phantom.medium == Medium(0.05, 1, 1.4)
+    assert phantom.a == "haskell"
+    assert phantom.sources == (
+        Source(Ball((1, 0, -1)), 2.5),
+        Source(Ball((0, 0.5, 1), 0.5), 1),
+        Source(Rod((0, 0, 0), 2, 0, (0, 1, 0)), 3),
+    )
+    assert phantom.regions == (
+        Region(Ball((-2, 0, 0), 2), Medium(0.1, 2, 1.4)),
+        Region(Rod((0, 0, 3), 2, 9), Medium(0.2, 3, 1.5)),
+    )
+    assert (phantom.edge, phantom.order, phantom.surface_edge, phantom.voxel) == (2, 2, 1, 1)
+    mesh = phantom.mesh()
+    centroids = mesh.vertices[mesh.cells].mean(axis=1)
+    np.testing.assert_array_equal(mesh.region == 2, centroids[:, 2] > 2)
+    assert set(mesh.region) == {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("radius = 6", "", r"\[geometry\]: 'radius' is missing"),
+        ("radius = 6", "radius = true", "'radius' must be a number, for example 1.5, got True"),
+        ("radius = 6", "radius = -6", "'radius' must be > 0"),
+        ("radius = 6", "raduis = 6\nradius = 6", r"\[geometry\]: 'raduis' means nothing here"),
+        ('shape = "cylinder"', 'shape = "cube"', "'shape' must be one of cylinder, got 'cube'"),
+        ("mua = 0.05", "mua = -1", "'mua' must be >= 0"),
+        ("musp = 1", "musp = 1\na = 'exact'", "'a' must be robin, haskell or a number > 0, got 'exact'"),
+        ("[mesh]", "[mesh]\norder = 2.0", "'order' must be a whole number"),
+        ("[mesh]", "[mesh]\norder = 3", "'order' must be 1 or 2, got 3"),
+        ("centre = [1, 0, -1]", "centre = [1, 0]", r"\[\[sources\]\] number 1: 'centre' must be three numbers"),
+        ("centre = [1, 0, -1]", "centre = [1, 0, 7]", "source 1: .* reaches out of the tissue"),
+        ("[output]", "[outptu]", r"'phantom.toml': 'outptu' means nothing here"),
+        ("power = 2.5", "power = 0", "'power' must be > 0"),
+        ("[mesh]", "[[regions]]\nlabel = 4\nmua = 1\nmusp = 1\n[mesh]", "region 1: no tetrahedron"),
+        ("edge = 2", "edge = 20", "must not exceed radius"),
+        ("edge = 1\n", "edge = 0\n", "'edge' must be > 0"),
+        ("[geometry]", "[geometry", "is no TOML file"),
+    ],
+)
+def test_wrong_descriptions(tmp_path: Path, old: str, new: str, message: str) -> None:
+    """One line that names table, key, value and rule."""
+    assert old in SMALL
+    with pytest.raises(FluxError, match=message) as caught:
+        solved_description(tmp_path, SMALL.replace(old, new, 1))
+    assert "\n" not in str(caught.value)
+
+
+def test_absent_file(tmp_path: Path) -> None:
+    with pytest.raises(FluxError, match="cannot be read: No such file"):
+        PhantomFile.read(tmp_path / "nothing.toml")
+
+
+def test_tetrahedra_with_labels_from_a_file(tmp_path: Path) -> None:
+    """Rationale: a labelled mesh in cm, written by meshio, is the same phantom as the shape it was labelled by."""
+    meshio = pytest.importorskip("meshio")
+    mesh = cylinder_tetrahedra(6, 8, 2)
+    inside = mesh.inside(Ball((-2, 0, 0), 2.5))
+    labels = np.where(inside, 7, 3)
+    meshio.write_points_cells(
+        tmp_path / "tissue.vtu", mesh.vertices / 10, [("tetra", mesh.cells)], cell_data={"tissue": [labels]}
+    )
+    text = SMALL.replace('shape = "cylinder"\nradius = 6\nheight = 8', 'file = "tissue.vtu"\nlength_unit = "cm"')
+    region = "[[regions]]\n{}\nmua = 0.3\nmusp = 2\n"
+    by_label = text.replace('"cm"', '"cm"\nlabels = "tissue"') + region.format("label = 7")
+    by_shape = text + region.format('shape = "sphere"\ncentre = [-2, 0, 0]\nradius = 2.5')
+    exited = []
+    for description in (text, by_label, by_shape):
+        solution = described(tmp_path, description).solve()
+        assert solution.balance == pytest.approx(0, abs=1e-5)
+        exited.append(solution.solved.exited)
+    assert exited[1] == pytest.approx(exited[2], rel=1e-12)
+    assert exited[1] < 0.99 * exited[0]
+    straight = solve(cylinder_tetrahedra(6, 8, 2), [Medium(0.05, 1)], [Source(Ball((1, 0, -1)), 2.5)], order=1)
+    assert exited[0] == pytest.approx(straight.solved.exited, rel=0.02)
+    with pytest.raises(FluxError, match=r"no field 'organ' .* Fields it has: 'tissue'"):
+        read_tetrahedra(tmp_path / "tissue.vtu", 2, labels="organ")
+    with pytest.raises(FluxError, match="'length_unit' must be one of mm, cm, m, got 'inch'"):
+        read_tetrahedra(tmp_path / "tissue.vtu", 2, "inch")
+
+
+def test_surface_without_a_mesher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A missing mesher is named with its extra; an open surface is refused before it is asked for."""
+    monkeypatch.setitem(sys.modules, "pytetwild", None)
+    ball = trimesh.creation.icosphere(2, 6.0)
+    ball.export(tmp_path / "ball.ply")
+    with pytest.raises(BackendError, match=r"pip install 'mitsuba-fspt\[mesher\]'"):
+        read_tetrahedra(tmp_path / "ball.ply", 2)
+    with pytest.raises(FluxError, match="not closed"):
+        tetrahedralize(ball.vertices, ball.faces[1:], 2)
+    with pytest.raises(FluxError, match="it has no labels 'organ'"):
+        read_tetrahedra(tmp_path / "ball.ply", 2, labels="organ")
+
+
+def test_surface_through_the_mesher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rationale: the mesher fills a ball, and curved elements on its surface give the exact total from its middle.
+
+    Expected behaviour: within 0.1 %, ripple below 0.5 %. Seen to fail with the border left where the mesher put it
+    (0.5 % of the total).
+    """
+    pytest.importorskip("pytetwild")
+    monkeypatch.chdir(tmp_path)
+    ball = trimesh.creation.icosphere(5, 10.0)
+    solution = solve(tetrahedralize(ball.vertices, ball.faces, 3), [Medium(0.0138, 0.91)], [Source(Ball((0, 0, 0)))])
+    assert not list(tmp_path.iterdir())
+    assert solution.solved.exited == pytest.approx(0.47367, rel=1e-3)
+    phantom = solution.phantom(0.7)
+    assert phantom.closure.watertight
+    assert phantom.closure.outward
+    assert np.ptp(phantom.exitance) / phantom.exitance.mean() < 5e-3
+
+
+def test_scikit_fem_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "skfem", None)
+    with pytest.raises(BackendError, match=r"scikit-fem .* pip install 'mitsuba-fspt\[tissue\]'"):
+        solve(cylinder_tetrahedra(6, 8, 2), [Medium(0.05, 1)], [Source(Ball((1, 0, -1)))])
+
+
+def test_flux_solve(tmp_path: Path) -> None:
+    """Rationale: the command writes surface and volume and reports the balance as one JSON object."""
+    (tmp_path / "small.toml").write_text(SMALL, encoding="utf-8")
+    ply, vol = tmp_path / "small.ply", tmp_path / "small.vol"
+    command = ["solve", str(tmp_path / "small.toml"), "-o", str(ply), "--volume", str(vol)]
+    result = CliRunner().invoke(app, [*command, "--json"])
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert report["source_power"] == 2.5
+    assert report["absorbed_power"] + report["exit_power"] == pytest.approx(2.5, rel=1e-5)
+    assert report["exit_fraction"] == pytest.approx(report["power"] / 2.5)
+    assert report["volume_low"] == [-7, -7, -5]
+    assert report["volume_voxels"] == [14, 14, 10]
+    assert report["watertight"] is True
+    phantom = Phantom.read(ply)
+    assert phantom.power == pytest.approx(report["exit_power"], rel=1e-12)
+    assert len(phantom.vertices) == report["vertices"]
+    assert vol.stat().st_size == 48 + 4 * 14 * 14 * 10
+    table = CliRunner().invoke(app, command)
+    assert "balance" in table.stdout
+    assert "exit fraction" in table.stdout
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("edge = 1\n", "edge = 1e-3\n", r"surface: edges of 0.001 mm make .*e\+09 triangles, at most 1e\+07 can be"),
+        (
+            "edge = 1\n",
+            "edge = 1e-300\n",
+            r"surface: edges of 1e-300 mm make inf triangles.* Give an edge above 0\.\d+ mm",
+        ),
+        ("edge = 2\n", "edge = 1e-3\n", r"geometry: mesh edges of 0.001 mm make about 5.18e\+12 tetrahedra"),
+        ("edge = 2\n", "edge = 1e-300\n", r"geometry: .* about inf tetrahedra.* Give an edge above 0\.1 mm"),
+    ],
+)
+def test_what_no_memory_holds_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, message: str
+) -> None:
+    """Rationale: the process was killed for its memory after a minute, without a word."""
+    monkeypatch.setattr(phantom_file, "solve", None)
+    assert old in SMALL
+    with pytest.raises(FluxError, match=message):
+        described(tmp_path, SMALL.replace(old, new)).solve()
+
+
+def test_a_filling_that_no_memory_holds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cube of 1 mm³ has 8.5 regular tetrahedra of 1 mm. The mesher is not asked."""
+    monkeypatch.setitem(sys.modules, "pytetwild", object())
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    with pytest.raises(
+        FluxError, match=r"edges of 0.005 mm make about 6.79e\+07 tetrahedra.* Give an edge above 0.012 mm"
+    ):
+        tetrahedralize(np.array(cube.vertices), np.array(cube.faces), 0.005)
+
+
+def test_flux_solve_leaves_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL.replace("[1, 0, -1]", "[9, 0, -1]"), encoding="utf-8")
+    result = CliRunner().invoke(app, ["solve", str(tmp_path / "small.toml"), "-o", str(tmp_path / "small.ply")])
+    assert isinstance(result.exception, FluxError)
+    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
+
+
+def test_flux_solve_writes_both_files_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: Phantom, path: Path) -> None:
+        raise FluxError("the disk is full")
+
+    monkeypatch.setattr(Phantom, "write", fail)
+    (tmp_path / "small.toml").write_text(SMALL, encoding="utf-8")
+    description, ply, vol = (str(tmp_path / name) for name in ("small.toml", "small.ply", "small.vol"))
+    result = CliRunner().invoke(app, ["solve", description, "-o", ply, "--volume", vol])
+    assert isinstance(result.exception, FluxError)
+    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
