@@ -65,7 +65,7 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
     window = visible_window(scene, lens)
     draft = Draft(View.of(scene, lens, window), window, Quadrature(rtol=RTOL), None)
     first_nodes(draft, np.zeros(window.shape))
-    cut = parted(draft.hits)
+    cut = parted(draft.coverage)
     pixels = np.array(dr.compress(cut))
     peak = float(draft.peak[0])
     values, rays = {}, {}

@@ -31,7 +31,8 @@ import sys, time
 times = [time.perf_counter()]
 def lap():
     times.append(time.perf_counter())
-from mitsuba_fspt import backend, load, render
+from mitsuba_fspt import load, render
+from mitsuba_fspt.runtime import backend
 backend.ensure_variant(); lap()
 scene = load(sys.argv[1]); lap()
 render(scene); lap()

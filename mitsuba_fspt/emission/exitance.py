@@ -18,7 +18,7 @@ from ..runtime.errors import ExitanceError
 from .elements import elements_of
 
 SLIVER = 1e-6  # of the mean area: on a smaller face single precision may find no place to interpolate at
-ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
+NEGATIVE_ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
 FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # of a shape's elements that are looked at, of the texels that tell how many
 # How the names of Mitsuba's classes begin that hold a colour, or a value for each wavelength.
 COLOURS, SPECTRA = ("SRGB", "D65"), ("Regular", "Irregular", "BlackBody")
@@ -53,7 +53,7 @@ def texture_of(props: mi.Properties) -> mi.Texture:
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class ExitanceState:
     """Where J_n comes from: the values of the mesh attribute or of the bitmap that `texture` reads, None where it reads
     none, and its plain numbers, `value` or `scale`.
     """
@@ -63,7 +63,7 @@ class Source:
     numbers: tuple[float, ...]
 
     @classmethod
-    def of(cls, shape: mi.Shape, texture: mi.Texture) -> Source:
+    def of(cls, shape: mi.Shape, texture: mi.Texture) -> ExitanceState:
         """As it is now; a mesh that lacks the attribute has none."""
         name, parameters = _attribute_name(texture), mi.traverse(texture)
         on_mesh = {} if name is None else mi.traverse(shape)
@@ -98,7 +98,7 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
             f"fspt_surface: shape '{shape.id()}' has no mesh attribute '{name}'. In a PLY name the {kind} property "
             f"'{plain}_x', or bring the values in with 'fspt flux import'."
         )
-    values = Source.of(shape, texture).attribute
+    values = ExitanceState.of(shape, texture).attribute
     if values is not None and dr.width(values) != _places(shape, name):
         raise ExitanceError(
             f"fspt_surface: mesh attribute '{name}' of shape '{shape.id()}' has several numbers for each "
@@ -115,7 +115,7 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
     if is_uniform(texture):
         everywhere = function_on(mesh, texture)(dr.zeros(mi.SurfaceInteraction3f)) + dr.zeros(mi.Float, count)
         return everywhere, everywhere, everywhere
-    name, values = _attribute_name(texture), Source.of(mesh, texture).attribute
+    name, values = _attribute_name(texture), ExitanceState.of(mesh, texture).attribute
     if name is None or values is None or dr.width(values) != _places(mesh, name):
         return None
     values = values * float(mi.traverse(texture)["scale"])
@@ -171,13 +171,13 @@ def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
     if not finite[areas > SLIVER * areas.mean()].all():
         raise ExitanceError(f"{name} has NaN or infinite values. Mend the data before rendering.")
     values = values[finite]
-    if values.min() < -ROUNDING * values.max(initial=0):
+    if values.min() < -NEGATIVE_ROUNDING * values.max(initial=0):
         raise ExitanceError(
             f"{name} must be >= 0 W/mm², its lowest value is {values.min():.4g}. Clip it on import: "
             "'fspt flux import --clip'."
         )
     brightest = float(values.max())
-    texels = Source.of(shape, texture).bitmap
+    texels = ExitanceState.of(shape, texture).bitmap
     if brightest == 0 and texels is not None:  # points all over the shape may miss the only bright one
         brightest = float(dr.max(texels)[0])
     if brightest <= 0:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from ..jit.pixel_grid import ROUNDING, Grid, parted
+from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
 from . import node_rules
 from .lines import View
 from .quadrature import Quadrature, Solution
 from .window import Window
 
 if TYPE_CHECKING:
-    from ..jit.pixel_grid import Image, Mask
+    from ..jit.pixel_grid import Mask, PixelArray
 
 FULL = 1e-6  # of all lines of sight hit but for so many, as far as a sum of float32 weights knows
 # A straight silhouette makes a rule wrong by at most this share of the light, sharp or blurred, where it parts the
@@ -27,7 +27,7 @@ IN_FOCUS = 0.3  # blur radius [pixels] below which an edge counts as sharp in th
 
 
 class Draft:
-    """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `hits`.
+    """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `coverage`.
 
     nodes : of the rule that saw the last edges
     roughness : how far four nodes and twelve differ near by, silhouettes left out
@@ -36,7 +36,7 @@ class Draft:
     sharp : True where the least one is small
     outline : True within a pixel of both a hit and a miss
     shown : False on the rim, True everywhere where there is none
-    stopped, beyond : the border of the image-plane stop cuts the pixel, wherever its light comes from; or leaves it out
+    clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
     open, known : False where the value is known from elsewhere, and that value
     """
 
@@ -44,24 +44,24 @@ class Draft:
         self.view, self.lens, self.window, self.quadrature = view, view.lens, window, quadrature
         self.area = quadrature.pixel == "area"
         self.grid = grid = Grid(window.shape)
-        self.value, self.error, self.hits, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
+        self.value, self.error, self.coverage, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
         self.roughness = grid.full(mi.Float64, 0)
-        self.shown = grid.lanes(window.shown()) if window.count < len(grid) else mi.Bool(True)
-        inside, cut = window.stopped(view.lens)
-        self.stopped, self.beyond = grid.lanes(cut & self.area), grid.lanes(~(inside | cut))
+        self.shown = grid.flat(window.shown()) if window.count < len(grid) else mi.Bool(True)
+        inside, cut = window.field_stop(view.lens)
+        self.clipped, self.outside = grid.flat(cut & self.area), grid.flat(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
         self.open, self.known = grid.full(mi.Bool, True), grid.full(mi.Float64, 0)
         if known is not None:
-            self.open = grid.lanes(~window.cut(known.where))
-            self.known = grid.lanes(window.cut(known.power) / view.lens.etendue)
+            self.open = grid.flat(~window.cut(known.where))
+            self.known = grid.flat(window.cut(known.power) / view.lens.etendue)
         self.nodes = self.rays = 0
         self.levels: list[str] = []
         self.findings = [view.finding()]
 
     @property
-    def peak(self) -> Image:
+    def peak(self) -> PixelArray:
         """The largest value that is shown [W/mm²/sr], of all if those are dark, one lane."""
         most = dr.max(self.value)
         if len(self.shown) == 1:
@@ -70,18 +70,18 @@ class Draft:
         return dr.select(shown > 0, shown, most)
 
     @property
-    def tolerance(self) -> Image:
+    def tolerance(self) -> PixelArray:
         """The error asked for [W/mm²/sr], one lane."""
         return dr.opaque(mi.Float64, self.quadrature.rtol) * self.peak
 
     def solution(self) -> Solution:
         """The picture as it is, on the crop window."""
         least = dr.opaque(mi.Float64, self.quadrature.least_error) * self.peak
-        error = dr.select(self.hits == 0, self.error, dr.maximum(self.error, least))
-        hits = dr.select(self.hits > 1 - FULL, 1, dr.maximum(self.hits, 0))
+        error = dr.select(self.coverage == 0, self.error, dr.maximum(self.error, least))
+        coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))
         etendue = dr.opaque(mi.Float64, self.lens.etendue)
-        power, error = etendue * self.value, etendue * dr.select(self.beyond, 0, error)
-        images = (power, error, hits * open_share(self.lens, self.window, self.grid))
+        power, error = etendue * self.value, etendue * dr.select(self.outside, 0, error)
+        images = (power, error, coverage * open_share(self.lens, self.window, self.grid))
         dr.eval(images)
         arrays = (self.window.expand(self.grid.array(image)) for image in images)
         return Solution(*arrays, self.rays, tuple(self.levels), findings=tuple(self.findings))
@@ -93,7 +93,7 @@ class Draft:
 
     # ------------------------------------------------------------------ where an edge may hide
 
-    def set_blur(self, farthest: Image) -> None:
+    def set_blur(self, farthest: PixelArray) -> None:
         """From depths: of what is nearest or farthest, for from the sharp plane on blur grows either way."""
         seen = dr.isfinite(self.nearest)
         front, back = (dr.abs(self.lens.blur_radius(depth)) for depth in (self.nearest, farthest))
@@ -110,9 +110,9 @@ class Draft:
         reach = 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, node_rules.GAP[rule]) * self.blur))
         return reach, 1 + math.ceil(node_rules.GAP[rule] * self.most_blur)
 
-    def set_hits(self, hits: Image) -> None:
+    def set_coverage(self, coverage: PixelArray) -> None:
         """Shares of lines of sight that hit, and with them the outline."""
-        self.hits, self.outline = hits, self.grid.outline(hits)
+        self.coverage, self.outline = coverage, self.grid.outline(coverage)
 
     def grown(self, rough: Mask) -> Mask:
         """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `cut_off` knows."""
@@ -124,7 +124,7 @@ class Draft:
         around = self.grid.spread_max(dr.select(rough, self.error, 0), self.reach(self.nodes)[1])
         self.error = dr.select(self.grown(rough), dr.maximum(self.error, around), self.error)
 
-    def cut_off(self) -> Image:
+    def cut_off(self) -> PixelArray:
         """What the nodes may be wrong by where an edge crosses or hides between them and the pupil's rim.
 
         A silhouette or the image-plane stop.
@@ -134,10 +134,10 @@ class Draft:
             dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[self.nodes])) for share in (CUT, UNSEEN)
         )
         share = dr.select(self.grid.grow(self.outline, reach - 1, most - 1), unseen, 0)
-        share = dr.select(parted(self.hits) | self.stopped, cut, share)
+        share = dr.select(parted(self.coverage) | self.clipped, cut, share)
         return share * self._whole(most)
 
-    def unseen_by_transects(self, split: Mask) -> Image:
+    def unseen_by_transects(self, split: Mask) -> PixelArray:
         """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump."""
         reach, most = self.reach("transects")
         return dr.select(self.grid.grow(split, reach, most), UNSEEN_BY_TRANSECTS * self._whole(most), 0)
@@ -148,16 +148,16 @@ class Draft:
             return self.shown
         return self.grid.dilate(self.shown, self.reach("transects")[1])
 
-    def near_edge(self, image: Image) -> Image:
+    def near_edge(self, image: PixelArray) -> PixelArray:
         """Largest value around, as far as transects may pass an edge by."""
         return self.grid.spread_max(image, self.reach("transects")[1])
 
-    def _whole(self, reach: int) -> Image:
+    def _whole(self, reach: int) -> PixelArray:
         """Largest value within `reach`, if no line of sight missed."""
-        whole = dr.select(self.hits > ROUNDING, self.value / self.hits, 0)
+        whole = dr.select(self.coverage > COVERAGE_ROUNDING, self.value / self.coverage, 0)
         return self.grid.spread_max(whole, reach)
 
 
-def open_share(lens: mi.Sensor, window: Window, grid: Grid) -> Image:
+def open_share(lens: mi.Sensor, window: Window, grid: Grid) -> PixelArray:
     """Share of the pupil that a second border of the lens leaves open to the centre of each pixel."""
     return mi.Float64(lens.open_pupil(window.centres(grid.number), mi.Point2f(0))[1])

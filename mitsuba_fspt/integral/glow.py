@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..emission.elements import Elements, elements_of
 from ..emission.exitance import function_on
-from ..jit.batches import LANES, numbered, runs
+from ..jit.batches import BATCH, batch_slices, numbered
 from ..runtime.errors import SceneError
 from ..runtime.plugin_types import is_surface
 from .window import Window
@@ -26,7 +26,7 @@ MISPLACED = 1 / 8  # of a step in J_n along a row of elements, times their side 
 UNBOUNDED = 4.0  # side [pixels] counted for an element that reaches through the lens plane and has no image
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))  # of an element, once around
 
-Image = NDArray[np.float64]
+Plane = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
@@ -64,11 +64,11 @@ class Glow:
 
     emitter: mi.Emitter
     elements: Elements
-    sides: Image
-    blur: Image
-    low: Image
-    high: Image
-    steps: Image
+    sides: Plane
+    blur: Plane
+    low: Plane
+    high: Plane
+    steps: Plane
     dark: int
     small: bool
 
@@ -77,12 +77,12 @@ class Glow:
         return self.elements.count
 
     def batches(self, lines: int, mark: NDArray[np.bool_]) -> Iterator[Batch]:
-        """The lines of sight of all elements with light on a marked pixel, some `LANES` at a time."""
+        """The lines of sight of all elements with light on a marked pixel, some `BATCH` at a time."""
         index = self._touching(mark)
         cells = cells_of(lines)
         cuts = np.round(self.sides[index] * math.sqrt(lines) / cells).astype(np.int64)
-        cuts = cuts.clip(1, max(math.isqrt(LANES) // cells, 1))
-        for run in runs((cuts * cells) ** 2):
+        cuts = cuts.clip(1, max(math.isqrt(BATCH) // cells, 1))
+        for run in batch_slices((cuts * cells) ** 2):
             yield Batch(self, index[run], cuts[run], cells)
 
     def finer(self, tolerance: float) -> Glow:
@@ -155,13 +155,13 @@ class Glow:
         )
 
 
-def _area(a: Image, b: Image, c: Image, d: Image) -> Image:
+def _area(a: Plane, b: Plane, c: Plane, d: Plane) -> Plane:
     """Areas of quadrangles (count,), from their corners (count, 2) once around."""
     across, along = c - a, d - b
     return 0.5 * np.abs(across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0])
 
 
-def _extent(points: Image) -> float:
+def _extent(points: Plane) -> float:
     """Longer side of the box around points (count, 2)."""
     return float((points.max(axis=0) - points.min(axis=0)).max()) if len(points) else 0.0
 
@@ -184,7 +184,7 @@ def _elements(shape: mi.Shape, lens: mi.Sensor, rtol: float) -> Elements:
     return elements_of(shape, int(min(max(ideal, fewest), MOST_ELEMENTS)))
 
 
-def _dark(emitter: mi.Emitter, brightest: Image) -> NDArray[np.bool_]:
+def _dark(emitter: mi.Emitter, brightest: Plane) -> NDArray[np.bool_]:
     """True of elements whose `brightest` corner is dark and J_n, a mesh attribute, linear between the corners."""
     linear = is_surface(emitter) and emitter.is_linear()
     return (brightest == 0) & linear

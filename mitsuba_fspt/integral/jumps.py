@@ -28,7 +28,7 @@ def integrate_transect(
     outline: mi.Float,
     least: mi.Float,
 ) -> tuple[mi.Float, ...]:
-    """Of a transect means of integrand and hits, number of jumps, depth of the edge at the largest, lines of sight.
+    """Of a transect means of integrand and coverage, number of jumps, depth of the edge at the largest, lines of sight.
 
     It is split at its `MOST_JUMPS` largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points,
     then bisected towards the larger difference; every piece that is not dark gets `along.nodes` at even distances, the
@@ -47,7 +47,7 @@ def integrate_transect(
 
     # Pieces 0 … jumps between -1, the places and 1; an outer one on which every point looked past the phantom is dark.
     def integrate(
-        piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, value: mi.Float, hits: mi.Float, looks: mi.UInt32
+        piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, value: mi.Float, coverage: mi.Float, looks: mi.UInt32
     ) -> tuple:
         at_start, at_end = piece > 0, piece < jumps
         high = mi.Float(1)
@@ -66,13 +66,13 @@ def integrate_transect(
 
         (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))
         until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
-        more_value, more_hits = sums.corrected(_about(until - since, middle, half))
-        return high, until, value + more_value, hits + more_hits, looks + count
+        more_value, more_coverage = sums.corrected(_about(until - since, middle, half))
+        return high, until, value + more_value, coverage + more_coverage, looks + count
 
     start = (mi.Float(-1), mi.Vector2d(0), mi.Float(0), mi.Float(0), found.looks)
-    _, _, value, hits, looks = repeat(jumps + 1, integrate, *start)
+    _, _, value, coverage, looks = repeat(jumps + 1, integrate, *start)
     depth = dr.select(jumps > 0, found.largest[0].depth(), 0)
-    return value, hits, mi.Float(jumps), depth, mi.Float(looks)
+    return value, coverage, mi.Float(jumps), depth, mi.Float(looks)
 
 
 # ---------------------------------------------------------------------- where it jumps
@@ -209,22 +209,22 @@ def _about(moments: mi.Vector2d, middle: mi.Float, half: mi.Float) -> mi.Vector2
 
 @dataclass
 class _Sums:
-    """Over the nodes of a piece, of weights times 1, z and z²; times f, z f; times hits; z ∈ [-1, 1] is the place."""
+    """Over the nodes of a piece, of weights times 1, z and z²; times f, z f; times coverage; z ∈ [-1, 1]."""
 
     one: mi.Vector3f
     f: mi.Vector2f
-    hits: mi.Float
+    coverage: mi.Float
 
     def plus(self, weight: mi.Float, z: mi.Float, f: mi.Float, body: mi.Float) -> _Sums:
         """The sums with one more node."""
         return _Sums(
             self.one + weight * mi.Vector3f(1, z, z * z),
             self.f + weight * f * mi.Vector2f(1, z),
-            self.hits + dr.select(body > 0, weight, 0),
+            self.coverage + dr.select(body > 0, weight, 0),
         )
 
     def corrected(self, exact: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
-        """Integrals of f and of the hits by weights times α + β z, for which those of 1 and z are `exact`.
+        """Integrals of f and of the coverage by weights times α + β z, for which those of 1 and z are `exact`.
 
         The density has kinks that a few nodes do not see, and f is almost linear.
         """
@@ -233,4 +233,4 @@ class _Sums:
         tilt = dr.select(variance > FLAT * self.one.x, (exact.y - exact.x * mean) / variance, 0)
         found = self.one.x > 0  # on a piece of no measure there is nothing to correct
         value = scale * self.f.x + tilt * (self.f.y - mean * self.f.x)
-        return dr.select(found, value, 0), dr.select(found, scale * self.hits, 0)
+        return dr.select(found, value, 0), dr.select(found, scale * self.coverage, 0)

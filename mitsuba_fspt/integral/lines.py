@@ -89,7 +89,7 @@ class Sums:
 
     value, x, y : integrand of Eq. 9 [W/mm²/sr], and times the place on the pupil, weighted and summed
     contrast : how far the integrand bends, see `rules.Rule`
-    hits : share of the lines of sight that meet something
+    coverage : share of the lines of sight that meet something
     nearest, farthest : depths of what is met [mm]; inf and 0 where nothing is
     """
 
@@ -97,7 +97,7 @@ class Sums:
     contrast: mi.Float
     x: mi.Float
     y: mi.Float
-    hits: mi.Float
+    coverage: mi.Float
     nearest: mi.Float
     farthest: mi.Float
 
@@ -119,7 +119,7 @@ def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule) -> Sums:
             contrast=sums.contrast + null * f,
             x=sums.x + weight * f * ax,
             y=sums.y + weight * f * ay,
-            hits=sums.hits + dr.select(hit, weight, 0),
+            coverage=sums.coverage + dr.select(hit, weight, 0),
             nearest=dr.select(hit, dr.minimum(sums.nearest, depth), sums.nearest),
             farthest=dr.select(hit, dr.maximum(sums.farthest, depth), sums.farthest),
         )

@@ -36,7 +36,7 @@ LARGEST_GRID = 1 << 12  # pixels along each side that are told apart
 
 Column = NDArray[np.float64]
 Index = NDArray[np.int64]
-Image = NDArray[np.float64]
+PixelArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class NarrowLight:
     Mean radiance on film [W/mm²/sr], to a factor of two.
     """
 
-    on_pixels: Image
+    on_pixels: PixelArray
     brightest: float
-    in_focus: Image
+    in_focus: PixelArray
 
 
 def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
@@ -126,7 +126,7 @@ class _Points:
         moved = replace(self, x=self.x - columns.start, y=self.y - rows.start)
         return moved.near(self.blur, (rows.stop - rows.start, columns.stop - columns.start))
 
-    def on_pixels(self, light: Column, shape: tuple[int, int]) -> Image:
+    def on_pixels(self, light: Column, shape: tuple[int, int]) -> PixelArray:
         """Sum of the points' `light` on each pixel of a picture of this shape, where they are seen sharp."""
         here = self.near(0, shape)
         column, row = (np.floor(c[here]).astype(np.int64) for c in (self.x, self.y))
@@ -154,7 +154,7 @@ def _hidden(points: _Points, side: float) -> NDArray[np.bool_]:
     )
     mean = np.divide(light, covered, out=np.zeros_like(light), where=covered > 0)
     around, mean_around, most, facing = (
-        grid.array(grid.spread_max(grid.lanes(image))).ravel()[cells.number] for image in (light, mean, covered, front)
+        grid.array(grid.spread_max(grid.flat(image))).ravel()[cells.number] for image in (light, mean, covered, front)
     )
     limb = (points.cosine < SLANTED) & (most > COVERED) & (points.radiance <= GLARES * mean_around)
     limb |= (points.front <= 0) & (facing > 0)
@@ -168,12 +168,12 @@ class _Cells:
     shape: tuple[int, int]
     number: Index
 
-    def sums(self, weight: Column) -> Image:
+    def sums(self, weight: Column) -> PixelArray:
         """Sum of the points' weights on each cell."""
         return np.bincount(self.number, weight, minlength=math.prod(self.shape)).reshape(self.shape)
 
 
-def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) -> Image:
+def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) -> PixelArray:
     """Sums of `light` within `reach` pixels of each pixel of the window, (h, w)."""
     height, width = shape
     reach = min(reach, height + width)
@@ -182,7 +182,7 @@ def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) 
     sums = np.zeros((height + 2 * reach, width + 2 * reach))
     np.add.at(sums, (row[on], column[on]), light[on])
     grid = Grid(sums.shape)
-    return grid.array(grid.box_sum(grid.lanes(sums), reach))[reach : reach + height, reach : reach + width]
+    return grid.array(grid.box_sum(grid.flat(sums), reach))[reach : reach + height, reach : reach + width]
 
 
 def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> _Points:

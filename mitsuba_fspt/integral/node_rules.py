@@ -21,7 +21,7 @@ PLASTIC = (0.7548776662466927, 0.5698402909980532)  # steps of the R₂ sequence
 # or beside the first transects.
 GAP = {1: 1.0, 4: 0.6, 12: 0.25, "transects": 0.1}
 
-Image = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
+PixelArray = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def four(area: bool) -> Rule:
     return Rule(_polar(np.sqrt(0.5), angle), _polar(step, angle + np.pi / 2), np.full(4, 0.25), contrast)
 
 
-def one_spread(laplacian: Image, blur: Image, area: bool) -> Image:
+def one_spread(laplacian: PixelArray, blur: PixelArray, area: bool) -> PixelArray:
     """What `one` has too little: half the second moments of pixel and blur disc along each axis, 1/12 and r²/4.
 
     `laplacian` of the picture [1/pixels²], `blur` r [pixels].
@@ -67,7 +67,7 @@ def one_spread(laplacian: Image, blur: Image, area: bool) -> Image:
     return (float(area) / 24 + blur**2 / 8) * laplacian
 
 
-def four_turn(curl: Image, laplacian: Image) -> Image:
+def four_turn(curl: PixelArray, laplacian: PixelArray) -> PixelArray:
     """What `four` has too much where the blur changes over the picture; `curl` is ∂M_x/∂y - ∂M_y/∂x of its moments.
 
     Steps at right angles leave c (∂²f/∂a_x∂y - ∂²f/∂a_y∂x), c = Σ w a_x y = √3/12, of pupil a and pixel (x, y). The

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from ..jit.batches import chunks
-from ..jit.pixel_grid import ROUNDING, parted
+from ..jit.batches import batches
+from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
 from . import node_rules
 from .draft import Draft
 from .lines import NOTHING_SEEN, Sums, apply_rule
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..jit.pixel_grid import Image, Mask
+    from ..jit.pixel_grid import Mask, PixelArray
 
 BOTH = 4 + 12  # lines of sight a pixel, without which four must do
 POINT = 0.1  # of rtol: what the curvature of cos⁴θ over the pupil may make
@@ -41,12 +41,12 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     rule = node_rules.one() if _one_will_do(draft) else node_rules.four(draft.area)
     seen = apply_nodes(draft, rule)
     draft.value = dr.select(draft.open, seen.value, draft.known)
-    if len(rule) == 1 and (not dr.any(seen.value > 0) or dr.any(_passed_by(draft, grid.lanes(light)))):
+    if len(rule) == 1 and (not dr.any(seen.value > 0) or dr.any(_passed_by(draft, grid.flat(light)))):
         rule = node_rules.four(draft.area)
         seen = apply_nodes(draft, rule)
     mx, my, draft.nearest = seen.x, seen.y, seen.nearest
     draft.nodes = len(rule)
-    draft.set_hits(seen.hits)
+    draft.set_coverage(seen.coverage)
     draft.set_blur(seen.farthest)
     draft.value = value = dr.select(draft.open, seen.value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
@@ -63,7 +63,7 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
         else:
             turn = node_rules.four_turn(grid.gradient(mx)[1] - grid.gradient(my)[0], xx + yy)
             more = -grid.mean_where(turn, ~draft.outline, TURN_REACH)
-        draft.value = dr.maximum(value + dr.select(draft.hits > 1 - ROUNDING, more, 0), 0)
+        draft.value = dr.maximum(value + dr.select(draft.coverage > 1 - COVERAGE_ROUNDING, more, 0), 0)
     bend = grid.spread_max(bend)
     draft.error = dr.maximum(bend, draft.cut_off())
     tolerance = draft.tolerance
@@ -82,17 +82,17 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
     """
     rough = draft.grown(rough) & draft.open
     dr.eval(rough)
-    smooth = int(dr.count(~rough & (draft.hits > 0))[0])
+    smooth = int(dr.count(~rough & (draft.coverage > 0))[0])
     why = f"{smooth} of {len(draft.grid)} pixels looked at see the surface, smooth and no edge of it"
     draft.findings.append(Finding("smooth", smooth > 0, why))
     # What parts four nodes parts twelve, too: transects can begin at once.
-    begun = parted(draft.hits) & (draft.error > draft.tolerance) & dr.opaque(mi.Bool, transects_follow)
-    probes = draft.grid.lattice() & (draft.hits > 0) & ~rough & draft.open
+    begun = parted(draft.coverage) & (draft.error > draft.tolerance) & dr.opaque(mi.Bool, transects_follow)
+    probes = draft.grid.probes() & (draft.coverage > 0) & ~rough & draft.open
     draft.nodes = 12
     difference = _refine(draft, (rough & ~begun) | probes)
-    doubt = draft.grid.spread_over_lattice(dr.select(probes, difference, 0))
+    doubt = draft.grid.spread_over_probes(dr.select(probes, difference, 0))
     draft.error = dr.select(rough, draft.error, dr.maximum(draft.error, doubt))
-    misled = ~rough & (draft.hits > 0) & (draft.error > draft.tolerance) & draft.open
+    misled = ~rough & (draft.coverage > 0) & (draft.error > draft.tolerance) & draft.open
     dr.eval(draft.error, misled)
     if dr.any(misled):
         _refine(draft, misled & ~probes)
@@ -105,13 +105,13 @@ def _dark(draft: Draft) -> Mask:
     return ~dr.any(draft.value > 0)
 
 
-def _passed_by(draft: Draft, light: Image) -> Mask:
+def _passed_by(draft: Draft, light: PixelArray) -> Mask:
     """Pixels on which surfaces shine, and far more than one line of sight saw there and around.
 
     What is up to √2 pixels wide may lie between the lines.
     """
     least = dr.maximum(PASSED * draft.grid.spread_max(draft.value), draft.tolerance)
-    return draft.open & ~draft.beyond & (light > least)
+    return draft.open & ~draft.outside & (light > least)
 
 
 def _one_will_do(draft: Draft) -> bool:
@@ -127,17 +127,17 @@ def _one_will_do(draft: Draft) -> bool:
     return taken
 
 
-def _refine(draft: Draft, where: Mask) -> Image:
+def _refine(draft: Draft, where: Mask) -> PixelArray:
     """Twelve nodes on the marked pixels; returns how far the first ones were off there, 0 elsewhere."""
     seen = apply_nodes(draft, node_rules.twelve(draft.area), where)
     difference = dr.select(where, dr.abs(seen.value - draft.value), 0)
     # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
     gain = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
     draft.value = dr.select(where, seen.value, draft.value)
-    draft.set_hits(dr.select(where, seen.hits, draft.hits))
+    draft.set_coverage(dr.select(where, seen.coverage, draft.coverage))
     draft.nearest = dr.minimum(draft.nearest, seen.nearest)
     left = difference * dr.clip(gain, LEAST_GAIN, ROUGH_GAIN)
-    rough = dr.select(parted(seen.hits), 0, dr.maximum(left, difference))
+    rough = dr.select(parted(seen.coverage), 0, dr.maximum(left, difference))
     rough, left = draft.grid.spread_all((rough, left))
     draft.roughness = dr.maximum(draft.roughness, rough)
     error = dr.maximum(left, draft.error / MOST_GAIN)
@@ -154,7 +154,7 @@ def apply_nodes(draft: Draft, rule: node_rules.Rule, where: Mask | None = None) 
     else:
         index = draft.grid.pixels(where)
         images = Sums(*(draft.grid.full(mi.Float64, fill) for fill in NOTHING_SEEN))
-    for part in chunks(index):
+    for part in batches(index):
         seen = apply_rule(draft.view, draft.window.centres(part), rule)
         for image, column in zip(vars(images).values(), vars(seen).values(), strict=True):
             dr.scatter(image, mi.Float64(column), part)

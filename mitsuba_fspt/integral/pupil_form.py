@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit.batches import chunks
+from ..jit.batches import batches
 from ..jit.pixel_grid import Grid
 from . import node_rules
 from .draft import Draft, open_share
@@ -56,7 +56,7 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
         return np.zeros(window.full)
     grid, view = Grid(window.shape), View.of(scene, lens, window)
     image = grid.full(mi.Float64, 0)
-    for part in chunks(grid.number):
-        hits = apply_rule(view, window.centres(part), node_rules.twelve(True)).hits
-        dr.scatter(image, mi.Float64(hits), part)
+    for part in batches(grid.number):
+        coverage = apply_rule(view, window.centres(part), node_rules.twelve(True)).coverage
+        dr.scatter(image, mi.Float64(coverage), part)
     return window.expand(grid.array(image * open_share(lens, window, grid)))

@@ -19,7 +19,7 @@ COARSEST = 0.1  # virtual pixels by which float32 may move a line of sight
 # W/mm² and W that leave room in float32 for the shares and the faint parts of a picture.
 EXITANCES, FAINTEST = (1e-32, 1e32), 1e-36
 STRETCH = 1e-4  # by which float32 may make lengths and right angles differ
-ROUNDING = 1e-6  # of float32, in sums of products
+MATRIX_ROUNDING = 1e-6  # of float32, in sums of products
 PROBES = 1 << 10  # surface points of a shape at which another one is looked for
 LIFT = 1e-6  # of the largest coordinate: what lies no further before a surface cannot be told from it
 PARALLEL = 0.999  # cosine of normals: bodies that poke into each other meet, too, but at an angle
@@ -102,7 +102,7 @@ def check_placement(shape: mi.Shape) -> None:
     placement = mi.traverse(shape)["to_world"]
     axes, back = (np.array(t.matrix, np.float64).reshape(4, 4)[:3, :3] for t in (placement, placement.inverse()))
     # Mitsuba inverts each step of a transform by rule, a rotation by its transpose, whatever its axis.
-    if (np.abs(axes @ back - np.eye(3)) > STRETCH + ROUNDING * (np.abs(axes) @ np.abs(back))).any():
+    if (np.abs(axes @ back - np.eye(3)) > STRETCH + MATRIX_ROUNDING * (np.abs(axes) @ np.abs(back))).any():
         raise SceneError(
             f"scene: 'to_world' of {kind} '{shape.id()}' is not undone by the inverse that Mitsuba traces with. Give "
             "every rotation an axis of length 1, or a mesh."

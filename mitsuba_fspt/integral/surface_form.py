@@ -38,7 +38,7 @@ HEADROOM, RESOLUTION, COVERAGE_QUANTUM = 2.0**4, 2.0**-56, 2.0**-50
 # ratio), in units of 2⁻³²: whole numbers, so that the sequence stays exact however long it gets.
 STEPS, STRIDE = (3679390609, 3152041523, 2700274807, 2313257605), 2654435769
 
-Image = NDArray[np.float64]
+Plane = NDArray[np.float64]
 
 
 def solve(
@@ -69,7 +69,7 @@ class _Refinement:
         self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
         dark = quadrature.takes("dark")
         self.glows = [Glow.seen(emitter, lens, window, quadrature.rtol, dark) for emitter in scene.emitters()]
-        self.value, self.error, self.hits = (np.zeros(self.window.shape) for _ in range(3))
+        self.value, self.error, self.coverage = (np.zeros(self.window.shape) for _ in range(3))
         self.peak = float(np.finfo(np.float32).tiny)
         self.rays = 0
         self.levels: list[str] = []
@@ -81,22 +81,22 @@ class _Refinement:
         mark = where = shown if where is None else where
         lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * FIRST_GROWTH)
         if mark.any():
-            self.value, self.hits = (np.where(where, image, 0) for image in self._level(lines, mark))
+            self.value, self.coverage = (np.where(where, image, 0) for image in self._level(lines, mark))
             self.glows = [glow.finer(self._tolerance(least_peak)) for glow in self.glows]
         recent, grid = None, Grid(self.window.shape)
         while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
-            value, hits = self._level(lines, mark)
+            value, coverage = self._level(lines, mark)
             change = np.where(mark, np.abs(value - self.value), 0)
-            recent, last = SAFETY * grid.array(grid.spread_max(grid.lanes(change))), recent
+            recent, last = SAFETY * grid.array(grid.spread_max(grid.flat(change))), recent
             estimate = recent if last is None else np.maximum(recent, MEMORY * last)
             # All elements with light on a marked pixel were refined: only there is the new picture whole.
-            self.error[mark], self.value[mark], self.hits[mark] = estimate[mark], value[mark], hits[mark]
+            self.error[mark], self.value[mark], self.coverage[mark] = estimate[mark], value[mark], coverage[mark]
             mark = self.error > self._tolerance(least_peak)
-            mark = shown & (mark | where & (self.hits == 0) & (lines < DARK_LINES))
+            mark = shown & (mark | where & (self.coverage == 0) & (lines < DARK_LINES))
         error = np.maximum(self.error, self.quadrature.least_error * self.window.brightest(self.value))
-        error[self.hits == 0] = self.error[self.hits == 0]
+        error[self.coverage == 0] = self.error[self.coverage == 0]
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
-        coverage = self.window.expand(np.clip(self.hits, 0, 1))
+        coverage = self.window.expand(np.clip(self.coverage, 0, 1))
         known = self.window.expand(where.astype(np.float64)) > 0
         return Solution(power, error, coverage, self.rays, tuple(self.levels), known, self._findings())
 
@@ -115,8 +115,8 @@ class _Refinement:
             Finding("dark", dark > 0, f"{dark} of {count} elements are dark"),
         )
 
-    def _level(self, lines: int, mark: NDArray[np.bool_]) -> list[Image]:
-        """Value and hits from all elements with light on a marked pixel, at so many lines of sight a pixel."""
+    def _level(self, lines: int, mark: NDArray[np.bool_]) -> list[Plane]:
+        """Value and coverage from all elements with light on a marked pixel, at so many lines of sight a pixel."""
         while True:
             quanta = (self.peak * RESOLUTION, COVERAGE_QUANTUM)
             canvas = Canvas(self.window.shape, quanta, self.quadrature.pixel == "centre")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from ..jit.batches import chunks
-from ..jit.pixel_grid import ROUNDING, parted
+from ..jit.batches import batches
+from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
 from . import node_rules
 from .draft import Draft
 from .jumps import integrate_transect
@@ -18,7 +18,7 @@ from .nodes import apply_nodes
 from .transect import transect
 
 if TYPE_CHECKING:
-    from ..jit.pixel_grid import Image, Mask
+    from ..jit.pixel_grid import Mask, PixelArray
 
 # Of the difference to nodes may be left in the first transects, and in nodes that no transect parts.
 FIRST_GAIN, NODES_GAIN = 0.2, 0.9
@@ -79,13 +79,13 @@ class _Ladder:
         fresh = where & means.jumps & lit & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
-        value, hits, scatter = means.value, means.hits, means.scatter
+        value, coverage, scatter = means.value, means.coverage, means.scatter
         if 0 < level <= node_rules.SMOOTH_LEVELS and dr.any(self.smooth):
             seen = apply_nodes(draft, node_rules.product(level, draft.area), self.smooth)
-            value, hits = dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.hits, hits)
+            value, coverage = dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.coverage, coverage)
         moved = dr.abs(value - draft.value)
         if level == 0:
-            left, unseen = self._first(fresh, moved, scatter, parted(hits))
+            left, unseen = self._first(fresh, moved, scatter, parted(coverage))
         else:
             left, unseen = self._later(level, fresh, moved, scatter, len(rule))
             self.smooth = self.smooth & (moved < BUMPY * value)
@@ -95,7 +95,7 @@ class _Ladder:
         self.left = dr.select(where, left, self.left)
         better = where if level else fresh  # where the first transects meet no jump nodes are
         draft.value = dr.select(better, value, draft.value)
-        draft.set_hits(dr.select(better, hits, draft.hits))
+        draft.set_coverage(dr.select(better, coverage, draft.coverage))
         known = self.split & ~fresh
         draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, self._doubt(known)), draft.error), unseen)
         tolerance = draft.tolerance
@@ -104,17 +104,19 @@ class _Ladder:
         self.count = len(rule)
         dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, self.where)
 
-    def _unsettled(self, left: Image) -> Image:
+    def _unsettled(self, left: PixelArray) -> PixelArray:
         """What is left, or so much that another level is needed."""
         return dr.maximum(left, UNSETTLED * self.draft.tolerance)
 
-    def _doubt(self, known: Mask) -> Image:
+    def _doubt(self, known: Mask) -> PixelArray:
         """What pixels may be wrong by for all that neighbours know; `known`: which pixels know an edge themselves."""
         near, edge = self.draft.grid.spread_all((self.left, dr.select(self.split, self.left, 0)))
         doubt = dr.maximum(dr.opaque(mi.Float64, DOUBT) * near, dr.select(known, 0, edge))
         return dr.select(self.edges.sharp, near, doubt)
 
-    def _first(self, fresh: Mask, moved: Image, scatter: Image, silhouette: Mask) -> tuple[Image, Image]:
+    def _first(
+        self, fresh: Mask, moved: PixelArray, scatter: PixelArray, silhouette: Mask
+    ) -> tuple[PixelArray, PixelArray]:
         """What may be left after the first transects, and what they pass by beside a jump.
 
         That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
@@ -122,11 +124,13 @@ class _Ladder:
         draft = self.draft
         left = dr.maximum(FIRST_GAIN * moved, scatter)
         left = dr.select(silhouette, left, self._unsettled(left))
-        missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.hits), draft.error, draft.roughness))
+        missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.coverage), draft.error, draft.roughness))
         # Who is known from elsewhere takes no transects, and knows of the silhouette all the same.
         return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh | (draft.outline & ~draft.open))
 
-    def _later(self, level: int, fresh: Mask, moved: Image, scatter: Image, count: int) -> tuple[Image, Image]:
+    def _later(
+        self, level: int, fresh: Mask, moved: PixelArray, scatter: PixelArray, count: int
+    ) -> tuple[PixelArray, PixelArray]:
         """What may be left, and what neighbours of a jump that is met at last, or of who was misled, may be wrong by.
 
         The less a level moved of what was left before the less is left, but lest two wrong values agree by chance no
@@ -151,8 +155,8 @@ class _Ladder:
 class Edges:
     """Of the edge a pixel may see: `angle` across it, signed `blur` radius [pixels], whether it counts as `sharp`."""
 
-    angle: Image
-    blur: Image
+    angle: PixelArray
+    blur: PixelArray
     sharp: Mask
 
     def learn(self, draft: Draft, means: Means, split: Mask, across: bool = False) -> None:
@@ -165,10 +169,10 @@ class Edges:
         around = (means.blur, -means.blur, jumps, split | draft.outline)
         ahead, behind, known, near = grid.spread_all(around)
         blur = dr.select(jumps, means.blur, _most_blurred(ahead, -behind))
-        self.blur = dr.select(known & ~draft.stopped, blur, self.blur)
+        self.blur = dr.select(known & ~draft.clipped, blur, self.blur)
         self.sharp = (dr.abs(self.blur) < SHARP) & near
-        x, y = grid.gradient(grid.box_sum(draft.hits, _around(draft)))
-        alike = dr.abs(x) + dr.abs(y) < ROUNDING
+        x, y = grid.gradient(grid.box_sum(draft.coverage, _around(draft)))
+        alike = dr.abs(x) + dr.abs(y) < COVERAGE_ROUNDING
         turn = dr.opaque(mi.Float64, math.pi / 2 if across else 0)
         self.angle = dr.select(split | alike, self.angle, dr.atan2(y, x) + turn)
         dr.eval(self.angle, self.blur, self.sharp)
@@ -179,7 +183,7 @@ def _around(draft: Draft) -> int:
     return 1 + math.ceil(draft.most_blur / 2)
 
 
-def _most_blurred(ahead: Image, behind: Image) -> Image:
+def _most_blurred(ahead: PixelArray, behind: PixelArray) -> PixelArray:
     """Of two signed blur radii the larger: between them, where neither edge is sharp, the mean may be."""
     return dr.select(ahead > -behind, ahead, behind)
 
@@ -195,7 +199,7 @@ def edges_of(draft: Draft) -> Edges:
     # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
     farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
     nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
-    blur = dr.select(draft.stopped, 0, draft.lens.blur_radius(nearest))
+    blur = dr.select(draft.clipped, 0, draft.lens.blur_radius(nearest))
     return Edges(angle, blur, dr.abs(blur) < SHARP)
 
 
@@ -204,17 +208,17 @@ def edges_of(draft: Draft) -> Edges:
 
 @dataclass(frozen=True)
 class Means:
-    """Of each marked pixel mean radiance on film, share of hits, whether a transect is split by a jump.
+    """Of each marked pixel mean radiance on film, share of coverage, whether a transect is split by a jump.
 
     scatter : what the value may be wrong by for all that the transects differ
     blur : signed radius of the most blurred edge that a transect met, 0 where none did [pixels]
     """
 
-    value: Image
-    hits: Image
+    value: PixelArray
+    coverage: PixelArray
     jumps: Mask
-    scatter: Image
-    blur: Image
+    scatter: PixelArray
+    blur: PixelArray
 
 
 def apply_transects(
@@ -224,28 +228,28 @@ def apply_transects(
     index = draft.grid.pixels(where)
     images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
     rays = 0
-    for part in chunks(index, len(rule)):
+    for part in batches(index, len(rule)):
         *sums, looks = _transect_sums(draft, part, edges, rule, along)
         for image, column in zip(images, sums, strict=True):
             dr.scatter(image, column, part)
         dr.eval(images)
         rays += int(dr.sum(looks)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
-    value, hits, squares, trend, split, blur = images
+    value, coverage, squares, trend, split, blur = images
     number = dr.opaque(mi.Float64, len(rule))
     variance = squares - value * value
     blurred = dr.opaque(mi.Float64, KINK if len(rule) > 2 else SPREAD) * dr.safe_sqrt(variance - trend) / number
     # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
     slant = SLANT * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, CORNER * value / (number * number))
-    return Means(value, hits, split > 0, dr.select(edges.sharp, sharp, blurred), blur)
+    return Means(value, coverage, split > 0, dr.select(edges.sharp, sharp, blurred), blur)
 
 
 def _transect_sums(
     draft: Draft, part: mi.UInt32, edges: Edges, rule: node_rules.Transects, along: node_rules.AlongTransect
-) -> list[Image]:
-    """Of each listed pixel means over its transects of value, hits, value squared, what of that is a trend; how many
-    a jump splits, and the blur of the most blurred edge; lines of sight taken.
+) -> list[PixelArray]:
+    """Of each listed pixel means over its transects of value, coverage, value squared, what of that is a trend; how
+    many a jump splits, and the blur of the most blurred edge; lines of sight taken.
     """
     count = dr.opaque(mi.UInt32, len(rule))
     lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
@@ -263,10 +267,10 @@ def _transect_sums(
     curve = transect(draft.window.centres(pixel), angle, blur, place, area)
     outline, least = mi.Float(2 * dr.max(draft.value)), mi.Float(LEAST_JUMP * draft.tolerance)
     found = integrate_transect(draft.view, curve, phase, along, outline, least)
-    value, hits, jumps, depth, looks = (mi.Float64(column) for column in found)
+    value, coverage, jumps, depth, looks = (mi.Float64(column) for column in found)
     share = mi.Float64(weight) * value
     blur = dr.select(jumps > 0, draft.lens.blur_radius(dr.minimum(depth, FAR)), 0)
-    columns = [share, mi.Float64(weight) * hits, share * value, dr.minimum(jumps, 1), looks]
+    columns = [share, mi.Float64(weight) * coverage, share * value, dr.minimum(jumps, 1), looks]
     dr.eval(columns, blur)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
     sums = [dr.block_sum(column, len(rule)) for column in columns]
     trend = dr.zeros(mi.Float64, dr.width(part))

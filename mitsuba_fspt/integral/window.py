@@ -56,7 +56,7 @@ class Window:
         left, top = (dr.opaque(mi.Float, n + 0.5) for n in self.corner)
         return mi.Point2f(left + mi.Float(number % width), top + mi.Float(number // width))
 
-    def stopped(self, lens: mi.Sensor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def field_stop(self, lens: mi.Sensor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Pixels (h, w) that lie inside the image-plane stop, and those that its border cuts."""
         if math.isinf(lens.optics.seen_field):
             return np.ones(self.shape, bool), np.zeros(self.shape, bool)

@@ -1,4 +1,4 @@
-"""How much is computed at once: kernels so wide that they pay, whatever the size of the picture."""
+"""Batches: work cut into kernels wide enough to pay and small enough to bound the memory."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-LANES = 1 << 22  # lines of sight in flight: bounds the memory, not the picture
+BATCH = 1 << 22  # lines of sight in one kernel: bounds the memory, whatever the size of the picture
 
 
-def chunks(index: mi.UInt32, lanes_each: int = 1) -> list[mi.UInt32]:
-    """The listed numbers, in runs that take at most `LANES` lanes, so many each."""
-    size, count = max(1, LANES // lanes_each), dr.width(index)
+def batches(index: mi.UInt32, lines_each: int = 1) -> list[mi.UInt32]:
+    """The listed numbers in batches of at most `BATCH` lines of sight, where each number takes `lines_each`."""
+    size, count = max(1, BATCH // lines_each), dr.width(index)
     if count <= size:
         return [index] if count else []
     starts = range(0, count, size)
@@ -24,18 +24,21 @@ def chunks(index: mi.UInt32, lanes_each: int = 1) -> list[mi.UInt32]:
     ]
 
 
-def runs(lanes: NDArray[np.int64]) -> Iterator[slice]:
-    """Runs of neighbours that take at most `LANES` lanes together, of so many `lanes` each; at least one a run."""
-    ends = np.cumsum(lanes)
+def batch_slices(lines: NDArray[np.int64]) -> Iterator[slice]:
+    """Slices of consecutive items that take at most `BATCH` lines of sight together; at least one item a slice.
+
+    `lines`, shape (n,): lines of sight that each item takes.
+    """
+    ends = np.cumsum(lines)
     first = 0
-    while first < len(lanes):
+    while first < len(lines):
         done = ends[first - 1] if first else 0
-        last = max(first + 1, int(np.searchsorted(ends, done + LANES, side="right")))
+        last = max(first + 1, int(np.searchsorted(ends, done + BATCH, side="right")))
         yield slice(first, last)
         first = last
 
 
-def numbered(lanes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Of every lane which item it is for, and its number among that item's, where item k takes `lanes[k]` of them."""
-    item = np.repeat(np.arange(len(lanes)), lanes)
-    return item, np.arange(len(item)) - np.repeat(np.cumsum(lanes) - lanes, lanes)
+def numbered(lines: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Item of each line of sight and its number within that item, both of shape (Σ lines,); item k has `lines[k]`."""
+    item = np.repeat(np.arange(len(lines)), lines)
+    return item, np.arange(len(item)) - np.repeat(np.cumsum(lines) - lines, lines)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    Image = mi.Float64  # of h · w lanes, row by row; masks likewise
+    PixelArray = mi.Float64  # of h · w lanes, row by row; masks likewise
     Mask = mi.Bool
 
-ROUNDING = 1e-4  # of a share of hits: a sum of float32 weights
+COVERAGE_ROUNDING = 1e-4  # of a share of coverage: a sum of float32 weights
 AROUND = [(dx, dy) for dx, dy in itertools.product((-1, 0, 1), repeat=2) if (dx, dy) != (0, 0)]
 BLOCK = 4  # side of the squares of pixels that are looked at together, each of which holds one of the lattice
 
@@ -60,8 +60,8 @@ class Grid:
         """An image that has the same value everywhere."""
         return dr.full(kind, value, len(self))
 
-    def lanes(self, array: NDArray[Any]) -> Any:
-        """Image or mask from an array (h, w)."""
+    def flat(self, array: NDArray[Any]) -> Any:
+        """PixelArray or mask from an array (h, w)."""
         flat = np.ascontiguousarray(array).ravel()
         return mi.Bool(flat) if flat.dtype == bool else mi.Float64(flat)
 
@@ -128,7 +128,7 @@ class Grid:
         _, most = dr.while_loop((mi.Int(-2), left), lambda j, most: j <= 2, row)
         return most
 
-    def box_sum(self, image: Image, radius: int) -> Image:
+    def box_sum(self, image: PixelArray, radius: int) -> PixelArray:
         """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
         reach = dr.opaque(mi.Int, radius)
         rows = _sliding_sum(image, self.y * self._width, self.x, self._width, reach)
@@ -137,7 +137,7 @@ class Grid:
         turned = dr.gather(mi.Float64, rows, mi.UInt32((number - column * self._height) * self._width + column))
         return _sliding_sum(turned, self.x * self._height, self.y, self._height, reach)
 
-    def mean_where(self, image: Image, mask: Mask, radius: int) -> Image:
+    def mean_where(self, image: PixelArray, mask: Mask, radius: int) -> PixelArray:
         """Mean of the marked pixels among the (2 radius + 1)² around each; 0 where there is none."""
         sums = dr.select(mask, image, 0), dr.select(mask, mi.Float64(1), 0)
         for dx, dy in ((1, 0), (0, 1)):
@@ -149,7 +149,7 @@ class Grid:
         dr.eval(mean)
         return mean
 
-    def _beside(self, images: tuple[Image, ...], dx: int, dy: int) -> list[Image]:
+    def _beside(self, images: tuple[PixelArray, ...], dx: int, dy: int) -> list[PixelArray]:
         """Values (dx, dy) pixels away, 0 beside the grid."""
         x, y = self.x + dx, self.y + dy
         here = (x >= 0) & (x < self._width) & (y >= 0) & (y < self._height)
@@ -158,11 +158,11 @@ class Grid:
 
     # ------------------------------------------------------------------ one pixel of sixteen
 
-    def lattice(self) -> Mask:
+    def probes(self) -> Mask:
         """True on one pixel of sixteen, in every row and column at other places than in the next (rank-1 lattice)."""
         return ((self.x - 5 * self.y) & (BLOCK * BLOCK - 1)) == 0
 
-    def spread_over_lattice(self, image: Image) -> Image:
+    def spread_over_probes(self, image: PixelArray) -> PixelArray:
         """Largest value on the lattice in the 3 × 3 blocks of 4 × 4 pixels around each pixel's block."""
         dr.eval(image)
         near = []
@@ -175,21 +175,21 @@ class Grid:
 
     # ------------------------------------------------------------------ how an image changes
 
-    def gradient(self, image: Image) -> tuple[Image, Image]:
+    def gradient(self, image: PixelArray) -> tuple[PixelArray, PixelArray]:
         """Central differences along x and y, one-sided at the border; 0 along an axis of a single pixel."""
         near = self._neighbours(image)
         at_border = [(n == 0) | (n == side - 1) for n, side in ((self.x, self._width), (self.y, self._height))]
         along_x, along_y = near[1, 0] - near[-1, 0], near[0, 1] - near[0, -1]
         return along_x * dr.select(at_border[0], 1.0, 0.5), along_y * dr.select(at_border[1], 1.0, 0.5)
 
-    def second_differences(self, image: Image) -> tuple[Image, Image]:
+    def second_differences(self, image: PixelArray) -> tuple[PixelArray, PixelArray]:
         """P(k - 1) - 2 P(k) + P(k + 1) along x and y; the outermost take their neighbours', 0 on less than three."""
         x, y = dr.clip(self.x, 1, self._width - 2), dr.clip(self.y, 1, self._height - 2)
         along_x = self.at(image, x - 1, self.y) - 2 * self.at(image, x, self.y) + self.at(image, x + 1, self.y)
         along_y = self.at(image, self.x, y - 1) - 2 * self.at(image, self.x, y) + self.at(image, self.x, y + 1)
         return dr.select(self._width > 2, along_x, 0), dr.select(self._height > 2, along_y, 0)
 
-    def principal_angle(self, x: Image, y: Image, radius: int) -> Image:
+    def principal_angle(self, x: PixelArray, y: PixelArray, radius: int) -> PixelArray:
         """Angle of the axis along which the vectors (x, y) of a neighbourhood mostly point (structure tensor)."""
         products = x * y, x * x - y * y
         dr.eval(products)
@@ -198,11 +198,11 @@ class Grid:
 
     # ------------------------------------------------------------------ silhouettes
 
-    def outline(self, hits: Image) -> Mask:
+    def outline(self, coverage: PixelArray) -> Mask:
         """True within a pixel of both a hit and a miss, where lines of sight may pass a silhouette."""
-        near = self._neighbours(hits).values()
-        most, least = reduce(dr.maximum, near, hits), reduce(dr.minimum, near, hits)
-        outline = (most > ROUNDING) & (least < 1 - ROUNDING)
+        near = self._neighbours(coverage).values()
+        most, least = reduce(dr.maximum, near, coverage), reduce(dr.minimum, near, coverage)
+        outline = (most > COVERAGE_ROUNDING) & (least < 1 - COVERAGE_ROUNDING)
         dr.eval(outline)
         return outline
 
@@ -211,12 +211,12 @@ def _larger(a: Any, b: Any) -> Any:
     return a | b if dr.is_mask_v(a) else dr.maximum(a, b)
 
 
-def parted(hits: Image) -> Mask:
+def parted(coverage: PixelArray) -> Mask:
     """True where some lines of sight of a pixel hit and some miss."""
-    return (hits > ROUNDING) & (hits < 1 - ROUNDING)
+    return (coverage > COVERAGE_ROUNDING) & (coverage < 1 - COVERAGE_ROUNDING)
 
 
-def _sliding_sum(image: Image, start: mi.Int, place: mi.Int, length: mi.Int, reach: mi.Int) -> Image:
+def _sliding_sum(image: PixelArray, start: mi.Int, place: mi.Int, length: mi.Int, reach: mi.Int) -> PixelArray:
     """Sums within `reach` of a `place` along lines of pixels that are stored from `start` on and have a `length`."""
     total = dr.cumsum(image)
     last = start + dr.minimum(place + reach, length - 1)

@@ -1,4 +1,4 @@
-"""Balls and rods in space: where light sources and inclusions are. Lengths in mm, NumPy float64."""
+"""Spheres and cylinders in space: where light sources and inclusions are. Lengths in mm, NumPy float64."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Small uniform balls that together stand for a shape.
+    """Small uniform spheres that together stand for a shape.
 
     `centres` (K, 3) [mm]; `radii` (K,) [mm], 0 for a point; `shares` (K,), no unit, sum 1: of the shape's
     power.
@@ -28,8 +28,8 @@ class Nodes:
 
 
 @dataclass(frozen=True)
-class Ball:
-    """Ball about `centre` (x, y, z) [mm] of `radius` [mm] >= 0; radius 0 is a point.
+class Sphere:
+    """Sphere about `centre` (x, y, z) [mm] of `radius` [mm] >= 0; radius 0 is a point.
 
     Raises
     ------
@@ -45,11 +45,11 @@ class Ball:
             raise FluxError(f"sphere: 'radius' must be >= 0 and finite, got {self.radius:g}. Give mm.")
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each of `points` (N, 3) [mm] lies in the ball, its border included; shape (N,)."""
+        """Whether each of `points` (N, 3) [mm] lies in the sphere, its border included; shape (N,)."""
         return np.asarray(np.linalg.norm(points - np.asarray(self.centre), axis=1) <= self.radius)
 
     def nodes(self, spacing: float) -> Nodes:
-        """The ball itself, whatever the spacing [mm]: its field is known in closed form."""
+        """The sphere itself, whatever the spacing [mm]: its field is known in closed form."""
         return Nodes(np.array([self.centre], dtype=float), np.array([self.radius]), np.ones(1))
 
     def border(self) -> Array:
@@ -65,7 +65,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Rod:
+class Cylinder:
     """Solid cylinder about `centre` (x, y, z) [mm], `length` > 0 and `radius` >= 0 [mm], along `axis`.
 
     Radius 0 is a line segment; the axis may have any length but 0.
@@ -128,7 +128,7 @@ class Rod:
         return np.concatenate([rim - end, rim, rim + end]) @ self.frame + np.asarray(self.centre)
 
 
-Shape = Ball | Rod
+Shape = Sphere | Cylinder
 
 
 def _gauss(count: int) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ from ..jit.robust_tracing import robust_scene
 from ..runtime.errors import SceneError
 
 MEANINGLESS = ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "timeout")
-ROUNDING = 1e-3  # pixels; more only far from the world's origin
+LEAST_DISPLACEMENT = 1e-3  # pixels; more only far from the world's origin
 NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
 
 
@@ -67,7 +67,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         self.quadrature = _quadrature_of(props)
         # What was found out about the last scene; the scene itself, whose child this is, must not be kept.
         self._sound: list[object] = []
-        self._window, self._narrow, self._faces = Memory(), Memory(), Memory()
+        self._window, self._narrow, self._faces = CachedValue(), CachedValue(), CachedValue()
 
     def solve(self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None) -> Solution:
         """Power, error and coverage of the sensor's crop window, with another `quadrature` than the integrator's own.
@@ -82,7 +82,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
             solution = self._solve_in(window, traced, sensor, quadrature)
         error = solution.error
-        if sensor.rounding >= ROUNDING and 0 not in window.shape:  # by less lines of sight move at random
+        if sensor.rounding >= LEAST_DISPLACEMENT and 0 not in window.shape:  # by less lines of sight move at random
             error = error + window.expand(_moved(window.cut(solution.power), sensor.rounding))
         return replace(solution, error=error, findings=(_outside(window), *solution.findings))
 
@@ -92,7 +92,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             return Solution(*np.zeros((3, *window.full)), rays=0)
         view = View.of(scene, lens, window, self._faces_of(scene) if quadrature.takes("record") else None)
         # Light from the surface knows no border on the film: pixels that the image-plane stop cuts take lines of sight.
-        inside, cut = window.stopped(lens)
+        inside, cut = window.field_stop(lens)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
             return surface_form.solve(scene, lens, window, quadrature)
@@ -180,7 +180,7 @@ def _quadrature_of(props: mi.Properties) -> Quadrature:
     )
 
 
-class Memory:
+class CachedValue:
     """The last thing found out, for as long as the `state` that it follows from is the same."""
 
     def __init__(self) -> None:
@@ -218,7 +218,7 @@ def _place(shape: mi.Shape) -> tuple[float, ...]:
 def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
     """What lines of sight that float32 moves by `rounding` [pixels] may change."""
     grid = Grid(power.shape)
-    x, y = grid.gradient(grid.lanes(power))
+    x, y = grid.gradient(grid.flat(power))
     return rounding * grid.array(grid.spread_max(dr.sqrt(x * x + y * y)))
 
 

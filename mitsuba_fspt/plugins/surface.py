@@ -68,7 +68,7 @@ class FsptSurface(mi.Emitter):
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
         self._positions: ElementDistribution | None = None
         self._probe: Probe | None = None
-        self._source: exitance.Source | None = None  # known after `check`
+        self._source: exitance.ExitanceState | None = None  # known after `check`
         self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
         self.brightest = 0.0  # largest J_n [W/mm²], known after `check`
         # For those who remember something about it: what tells it from all others, and counts the changes of J_n. Who
@@ -197,7 +197,7 @@ class FsptSurface(mi.Emitter):
 
     def check(self) -> None:
         """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
-        source = exitance.Source.of(self._home(), self.exitance)
+        source = exitance.ExitanceState.of(self._home(), self.exitance)
         # Mitsuba does not tell an emitter of new values on its mesh, nor of what is updated by itself.
         if self._source and (self._source.state() != source.state() or self.law.renewed()):
             self._forget_exitance()

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 ALIKE = 3.0  # by less than this factor do the errors of neighbours differ that see the same
 FEW = 20  # events on a pixel; fewer say too little of their variance
-Picture = NDArray[np.float64]
+Plane = NDArray[np.float64]
 
 
 def tracer(method: str) -> mi.Integrator:
@@ -26,7 +26,7 @@ def tracer(method: str) -> mi.Integrator:
 
 def passes(
     scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, seeds: Iterable[int], spp: int
-) -> Iterator[tuple[Picture, int]]:
+) -> Iterator[tuple[Plane, int]]:
     """Power [W], shape (h, w), and samples a pixel of one pass for each seed."""
     import drjit as dr
 
@@ -38,7 +38,7 @@ def passes(
         yield np.array(image, np.float64)[..., 0], lens.sampler().sample_count()
 
 
-def standard_error(mean: Picture, mean_square: Picture, count: int, samples: int) -> Picture:
+def standard_error(mean: Plane, mean_square: Plane, count: int, samples: int) -> Plane:
     """Standard error s [W], shape (h, w), of the `mean` ⟨P⟩ of `count` passes with so many `samples` a pixel in all.
 
     s² = (⟨P²⟩ - ⟨P⟩²)/(count - 1) where the passes tell. Where light comes in events that bring w each, s² = w ⟨P⟩, so
@@ -53,14 +53,14 @@ def standard_error(mean: Picture, mean_square: Picture, count: int, samples: int
 
     grid = Grid(mean.shape)
 
-    def largest_around(image: Picture) -> Picture:
-        return grid.array(grid.spread_max(grid.lanes(image)))
+    def largest_around(image: Plane) -> Plane:
+        return grid.array(grid.spread_max(grid.flat(image)))
 
     variance = np.maximum(mean_square - mean * mean, 0) / (count - 1)
     own, met = np.sqrt(variance), mean > 0
     event = np.maximum(np.divide(variance, mean, out=np.zeros_like(mean), where=met), mean / samples)
     few = mean * mean <= FEW * variance
-    pooled = np.sqrt(grid.array(grid.mean_where(grid.lanes(variance), grid.lanes(few & met), 1)))  # (a)
+    pooled = np.sqrt(grid.array(grid.mean_where(grid.flat(variance), grid.flat(few & met), 1)))  # (a)
     counted = np.where(met, pooled, np.maximum(pooled, largest_around(event)))  # (b)
     near = largest_around(own)
     missed = np.where(near > ALIKE * own, np.minimum(near, mean / samples), 0)  # (c)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
-LANES = 1 << 23  # Monte Carlo samples in flight
+SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples in flight
 Progress = Callable[[str, float], None]
 
 
@@ -134,7 +134,7 @@ def _sample(
         raise SceneError(f"render: 'seed' must be in 0 … 2^32 - 1, got {seed}. Give for example 1.")
     probe_beside(scene)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
-    count = max(min(PASSES, spp), math.ceil(spp * pixels / LANES))
+    count = max(min(PASSES, spp), math.ceil(spp * pixels / SAMPLES_IN_FLIGHT))
     lens.sampler().set_sample_count(math.ceil(spp / count))
     each = lens.sampler().sample_count()  # some samplers take more: told once, not in every pass
     seeds = (int(np.random.SeedSequence((seed, k)).generate_state(1)[0]) for k in range(count))
@@ -164,7 +164,7 @@ def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
     from ..integral.window import visible_window
 
     window = visible_window(scene, lens)
-    inside, cut = window.stopped(lens)
+    inside, cut = window.field_stop(lens)
     return window.expand((inside | cut).astype(np.float64)) > 0
 
 

@@ -33,7 +33,7 @@ _TRIAL_TIMEOUT = 300.0  # s; a driver that hangs
 
 
 @dataclass(frozen=True)
-class Row:
+class ReportLine:
     """One line of the report; `ok` is False where something is missing or does not work."""
 
     section: str
@@ -46,7 +46,7 @@ class Row:
 class Diagnosis:
     """The whole report; `usable` if at least one backend computed the right result."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[ReportLine, ...]
     usable: bool
 
     def render_text(self) -> str:
@@ -151,61 +151,63 @@ def _version(distribution: str) -> str | None:
         return None
 
 
-def _versions() -> Iterator[Row]:
-    yield Row("versions", "python", f"{platform.python_version()}, {sys.executable}")
-    yield Row("versions", "platform", f"{platform.platform()}, {os.cpu_count()} CPUs")
+def _versions() -> Iterator[ReportLine]:
+    yield ReportLine("versions", "python", f"{platform.python_version()}, {sys.executable}")
+    yield ReportLine("versions", "platform", f"{platform.platform()}, {os.cpu_count()} CPUs")
     for name in CORE:
         version = _version(name)
         missing = "runs from its source folder" if name == "mitsuba-fspt" else "not installed"
-        yield Row("versions", name, version or missing, ok=version is not None or name == "mitsuba-fspt")
+        yield ReportLine("versions", name, version or missing, ok=version is not None or name == "mitsuba-fspt")
 
 
-def _llvm() -> Iterator[Row]:
+def _llvm() -> Iterator[ReportLine]:
     chosen = backend.selection()
     if chosen is None:
         if "drjit" in sys.modules:
             why = "Dr.Jit was imported before mitsuba_fspt and chose by itself; a fresh process would take:"
-            yield Row("LLVM", "here", why, ok=False)
+            yield ReportLine("LLVM", "here", why, ok=False)
         chosen = libllvm.select()
     usable = chosen.version is not None
     version = ".".join(map(str, chosen.version)) if chosen.version else "none that works"
-    yield Row("LLVM", "version", version, ok=usable)
-    yield Row("LLVM", "library", chosen.path or "none", ok=usable)
-    yield Row("LLVM", "why", chosen.why, ok=usable)
+    yield ReportLine("LLVM", "version", version, ok=usable)
+    yield ReportLine("LLVM", "library", chosen.path or "none", ok=usable)
+    yield ReportLine("LLVM", "why", chosen.why, ok=usable)
     for loser in chosen.rejected:
-        yield Row("LLVM", "rejected", f"{loser.path}: {loser.reason}")
+        yield ReportLine("LLVM", "rejected", f"{loser.path}: {loser.reason}")
 
 
-def _cuda(devices: list[str]) -> Iterator[Row]:
+def _cuda(devices: list[str]) -> Iterator[ReportLine]:
     for number, name in enumerate(devices):
-        yield Row("CUDA", f"device {number}", name)
+        yield ReportLine("CUDA", f"device {number}", name)
     if not devices:
-        yield Row("CUDA", "device", "none")
+        yield ReportLine("CUDA", "device", "none")
 
 
-def _backends(trials: dict[str, dict[str, float] | str]) -> Iterator[Row]:
+def _backends(trials: dict[str, dict[str, float] | str]) -> Iterator[ReportLine]:
     for variant, trial in trials.items():
         if isinstance(trial, str):
-            yield Row("backends", variant, trial, ok=False)
+            yield ReportLine("backends", variant, trial, ok=False)
             continue
-        yield Row("backends", variant, "works")
-        yield Row("backends", "  start", f"{trial['import']:.2f} s import, {trial['variant']:.2f} s variant")
-        yield Row("backends", "  kernel", f"{trial['first']:.3f} s the first, {trial['second']:.3f} s the second")
+        yield ReportLine("backends", variant, "works")
+        yield ReportLine("backends", "  start", f"{trial['import']:.2f} s import, {trial['variant']:.2f} s variant")
+        yield ReportLine(
+            "backends", "  kernel", f"{trial['first']:.3f} s the first, {trial['second']:.3f} s the second"
+        )
 
 
-def _optional() -> Iterator[Row]:
+def _optional() -> Iterator[ReportLine]:
     for one in EXTRAS:
         missing = f"not installed: pip install 'mitsuba-fspt[{one.extra}]'"
-        yield Row("extras", one.distribution, _version(one.distribution) or missing)
+        yield ReportLine("extras", one.distribution, _version(one.distribution) or missing)
 
 
-def _cache() -> Iterator[Row]:
+def _cache() -> Iterator[ReportLine]:
     """Where Dr.Jit keeps compiled kernels between runs."""
     default = Path(tempfile.gettempdir(), "drjit") if sys.platform == "win32" else Path("~/.drjit").expanduser()
     folder = Path(os.environ.get("DRJIT_CACHE_DIR") or default)
     try:
         sizes = [file.stat().st_size for file in folder.glob("*.bin")]
     except OSError as error:
-        yield Row("kernel cache", "folder", str(error), ok=False)
+        yield ReportLine("kernel cache", "folder", str(error), ok=False)
     else:
-        yield Row("kernel cache", "folder", f"{folder}: {len(sizes)} kernels, {sum(sizes) / 1e6:.1f} MB")
+        yield ReportLine("kernel cache", "folder", f"{folder}: {len(sizes)} kernels, {sum(sizes) / 1e6:.1f} MB")

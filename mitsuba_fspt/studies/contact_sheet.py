@@ -10,14 +10,14 @@ import numpy as np
 from ..images import picture
 from ..images.image import read
 from ..runtime.errors import ImageError
-from .sweep import Row
+from .sweep import SweepRow
 
 WIDEST = 8  # images in a row, where the parameters do not say how many
 GAP = 0.04  # between the images, over their larger side
 CAPTION = 0.1  # above an image, likewise
 
 
-def write_contact_sheet(rows: Sequence[Row], path: str | os.PathLike[str]) -> None:
+def write_contact_sheet(rows: Sequence[SweepRow], path: str | os.PathLike[str]) -> None:
     """Write the images of a sweep to a PNG file, what varies above each, one colour bar for all [W/pixel].
 
     A column for every value of the last parameter that varies, where several do. Where the images differ in
@@ -55,7 +55,7 @@ def write_contact_sheet(rows: Sequence[Row], path: str | os.PathLike[str]) -> No
     picture.save_figure(figure, file)
 
 
-def _parameters(rows: Sequence[Row]) -> tuple[list, list]:
+def _parameters(rows: Sequence[SweepRow]) -> tuple[list, list]:
     """Names and values of the parameters with several values, and of those with one."""
     values = {name: list(dict.fromkeys(row.parameters[name] for row in rows)) for name in rows[0].parameters}
     varied = [(name, of) for name, of in values.items() if len(of) > 1]

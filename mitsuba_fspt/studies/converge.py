@@ -21,7 +21,7 @@ from ..runtime.errors import FsptError, SceneError
 from ..runtime.numbers import number, whole
 from .converge_methods import Method, Shot, methods, raw_rate
 from .converge_reference import Reference, own_reference, read_reference
-from .convergence import Convergence, Row
+from .convergence import Convergence, Measurement
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -35,7 +35,7 @@ BURST = 0.1  # s
 WHOLE_CONE = 1 - 1e-4  # of the lines of sight: a sum of float32 weights
 MIB = 1 << 20
 
-Picture = NDArray[np.float64]
+Plane = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
@@ -131,7 +131,7 @@ class Judge:
     def __init__(self, reference: Reference, full: Mask) -> None:
         self.reference, self.full = reference, full
 
-    def __call__(self, power: Picture) -> tuple[float, float, float]:
+    def __call__(self, power: Plane) -> tuple[float, float, float]:
         error = (power - self.reference.power) / self.reference.peak
         square = np.square(error)
         full = float(np.mean(square[self.full])) if self.full.any() else np.nan
@@ -161,10 +161,10 @@ class Trial:
         self.seconds.append(float(np.median(times)))
         self.errors.append(judge(self.shot.power))
 
-    def row(self) -> Row:
+    def row(self) -> Measurement:
         """Monte Carlo's errors differ from seed to seed: the root of the mean square over the rounds."""
         square, full, _ = np.mean(self.errors, axis=0)
-        return Row(
+        return Measurement(
             method=self.method.name,
             knob=self.method.knob,
             value=self.shot.knob,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..rendering.monte_carlo import passes, tracer
-from .convergence import INTEGRAL, PATH, POINT_SUM, PTRACER, SURFACE_FORM
+from .convergence import DIRECT_SUM, INTEGRAL, PATH, PTRACER, SURFACE_FORM
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -24,17 +24,17 @@ RTOL_SURFACE = (0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)
 SIDES = (2, 4, 6, 8, 10, 12, 16, 23, 32, 45, 64, 91, 128)
 PRIMES = (2, 5, 11, 17, 23, 31, 47, 67, 89, 127)
 POWERS_OF_TWO = (2, 4, 8, 16, 32, 64, 128)
-LANES = 1 << 26  # Monte Carlo samples in one pass: 1024 a pixel of 256 x 256
+PASS_SAMPLES = 1 << 26  # Monte Carlo samples in one pass: 1024 a pixel of 256 x 256
 POINTS, MOST_POINTS = 1 << 10, 1 << 26  # of the paper's sum
 
-Picture = NDArray[np.float64]
+Plane = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Shot:
     """One picture: power, shape (h, w) [W]; the rays it took; the knob as it came out, where that is rounded."""
 
-    power: Picture
+    power: Plane
     rays: int
     knob: float
 
@@ -60,7 +60,7 @@ def methods(scene: mi.Scene, lens: mi.Sensor, least_rtol: float = 0.0) -> tuple[
     if surfaces:
         found += [integral(scene, lens, "surface", RTOL_SURFACE), _point_sum(scene, lens)]
     else:
-        skipped = dict.fromkeys((SURFACE_FORM, POINT_SUM, PTRACER), reason)
+        skipped = dict.fromkeys((SURFACE_FORM, DIRECT_SUM, PTRACER), reason)
     found += [_path(scene, lens, sampler) for sampler in SAMPLERS]
     found += [_ptracer(scene, lens)] if surfaces else []
     return found, skipped
@@ -113,7 +113,7 @@ def _point_sum(scene: mi.Scene, lens: mi.Sensor) -> Method:
         return run
 
     ladder = tuple(float(count) for count in sorted(counts) if count > 2)
-    return Method(POINT_SUM, "points", ladder, prepare)
+    return Method(DIRECT_SUM, "points", ladder, prepare)
 
 
 def _path(scene: mi.Scene, lens: mi.Sensor, sampler: str) -> Method:
@@ -162,7 +162,7 @@ def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float
     pixels = math.prod(int(n) for n in lens.film().crop_size())
 
     def prepare(spp: float) -> Callable[[], Shot]:
-        count = math.ceil(spp * pixels / LANES)
+        count = math.ceil(spp * pixels / PASS_SAMPLES)
 
         def run() -> Shot:
             total, samples = np.zeros(()), 0

@@ -23,7 +23,7 @@ RTOL = {"pupil": (1e-4, 1e-5, 1e-6), "surface": (1e-2, 1e-3, 1e-4, 1e-5)}
 GROWTH = 8.0  # of the time from one to the next
 COARSER = 10.0  # times the reference's rtol: finer settings of the same form are not judged by it
 
-Picture = NDArray[np.float64]
+Plane = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,8 @@ class Reference:
     `least_rtol`: of the integral's pupil form, finer ones are the reference's own kin and cannot be judged by it.
     """
 
-    power: Picture
-    error: Picture
+    power: Plane
+    error: Plane
     name: str
     check: str = ""
     least_rtol: float = 0.0
@@ -81,7 +81,7 @@ def read_reference(path: str | os.PathLike[str], shape: tuple[int, int]) -> Refe
     return Reference(power.astype(np.float64), error.astype(np.float64), str(path))
 
 
-def _arrays(path: Path) -> tuple[Picture, Picture]:
+def _arrays(path: Path) -> tuple[Plane, Plane]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             power, error = np.asarray(stored["power"]), np.asarray(stored["error"])

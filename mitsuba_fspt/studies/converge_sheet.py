@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..images import picture
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import ImageError
-from .convergence import INTEGRAL, PEER, POINT_SUM, PTRACER, SURFACE_FORM, Convergence, Row
+from .convergence import DIRECT_SUM, INTEGRAL, PEER, PTRACER, SURFACE_FORM, Convergence, Measurement
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +37,7 @@ GREY, MARKERS = "0.55", "sD^vP"
 STYLES: dict[str, dict[str, Any]] = {
     INTEGRAL: {"color": "#0b5fa5", "marker": "o", "linewidth": 2.4, "markersize": 5.5, "zorder": 6},
     SURFACE_FORM: {"color": "#35a6c8", "marker": "o", "linewidth": 1.6, "markersize": 4.5, "zorder": 5},
-    POINT_SUM: {"color": "#c03a2b", "marker": "X", "linewidth": 1.6, "markersize": 5, "zorder": 4},
+    DIRECT_SUM: {"color": "#c03a2b", "marker": "X", "linewidth": 1.6, "markersize": 5, "zorder": 4},
     PEER: {"color": "0.1", "marker": "s", "linewidth": 2.0, "markersize": 4.5, "zorder": 5},
     PTRACER: {"color": "#d98a1f", "marker": "d", "linewidth": 1.6, "markersize": 5, "zorder": 4},
 }
@@ -57,7 +57,7 @@ def write_csv(found: Convergence, path: str | os.PathLike[str]) -> None:
         rows.writerows(_line(row, found.raw_rate) for row in found.rows)
 
 
-def _line(row: Row, raw_rate: float) -> dict[str, str | int]:
+def _line(row: Measurement, raw_rate: float) -> dict[str, str | int]:
     values: tuple[str | int, ...] = (
         row.method,
         row.knob,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 # Names of the methods. Monte Carlo from the camera is one with every sampler; `PEER` has Mitsuba's best.
-INTEGRAL, SURFACE_FORM, POINT_SUM, PTRACER = "integral", "integral, surface form", "sum over points", "ptracer"
+INTEGRAL, SURFACE_FORM, DIRECT_SUM, PTRACER = "integral", "integral, surface form", "sum over points", "ptracer"
 PATH = "path, "
 PEER = PATH + "multijitter"
 FLOOR = 3.0  # times the reference's stated error: errors below it say little about a method
@@ -20,7 +20,7 @@ TARGETS = (1e-3, 1e-4, 1e-5)  # RMS errors over the brightest pixel
 
 
 @dataclass(frozen=True)
-class Row:
+class Measurement:
     """One method at one setting of its `knob`. Errors are relative to the reference's brightest pixel.
 
     cold : first run [s], with the compiling and what is found out once about a scene
@@ -76,7 +76,7 @@ class Convergence:
     stated_largest: float
     full: int
     raw_rate: float
-    rows: tuple[Row, ...]
+    rows: tuple[Measurement, ...]
     skipped: dict[str, str]
 
     @property
@@ -84,7 +84,7 @@ class Convergence:
         """Names in the order of the rows."""
         return list(dict.fromkeys(row.method for row in self.rows))
 
-    def of(self, method: str) -> list[Row]:
+    def of(self, method: str) -> list[Measurement]:
         """The rows of a method."""
         return [row for row in self.rows if row.method == method]
 

@@ -30,7 +30,7 @@ WHAT_WIDTH = 1 + max(len(what) for what in SHORTCUTS.values())
 
 
 @dataclass(frozen=True)
-class Row:
+class Explanation:
     """One line of the table.
 
     what : is left out or not (`left_out`), and `why`
@@ -64,7 +64,7 @@ def explain(
     sensor: int = 0,
     rtol: float | None = None,
     domain: str | None = None,
-) -> list[Row]:
+) -> list[Explanation]:
     """What the integral leaves out of a scene: every shortcut that is taken is switched off once to see what it saves.
 
     Parameters as of `render`, and so are the errors raised.
@@ -100,17 +100,17 @@ def _saved(
     return 1 - short.rays / max(1, long.rays), float(np.median([1 - on[1] / off[1] for on, off in pairs]))
 
 
-def _row(finding: Finding, lines: float | None, seconds: float | None) -> Row:
-    return Row(SHORTCUTS[finding.name], finding.taken, finding.why, lines, seconds)
+def _row(finding: Finding, lines: float | None, seconds: float | None) -> Explanation:
+    return Explanation(SHORTCUTS[finding.name], finding.taken, finding.why, lines, seconds)
 
 
-def _never_done(scene: mi.Scene, variant: str) -> list[Row]:
+def _never_done(scene: mi.Scene, variant: str) -> list[Explanation]:
     """What costs nothing because it is never begun."""
     loaded = [one.module for one in EXTRAS if one.module in sys.modules]
     uniform = [is_surface(emitter) and emitter.is_uniform() for emitter in scene.emitters()]
     return [
-        Row("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),
-        Row("gradients", True, "a picture asks for none"),
-        Row("optional packages", not loaded, f"imported: {', '.join(loaded) or 'none'}"),
-        Row("further variants", True, f"{variant} alone is set"),
+        Explanation("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),
+        Explanation("gradients", True, "a picture asks for none"),
+        Explanation("optional packages", not loaded, f"imported: {', '.join(loaded) or 'none'}"),
+        Explanation("further variants", True, f"{variant} alone is set"),
     ]

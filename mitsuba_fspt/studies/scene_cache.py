@@ -1,4 +1,4 @@
-"""The studio of a sweep: a phantom that stays while only the lens before it changes."""
+"""The cache of a sweep: a phantom that stays while only the lens before it changes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from ..rendering.render import render
 from ..rendering.scene import load
 from ..runtime.backend import ensure_variant
 from ..runtime.errors import FsptError
-from .sweep_point import Point
+from .sweep_point import SweepPoint
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
 
-class Studio:
+class SceneCache:
     """Renders points one at a time and keeps the last scene; bits as from a scene loaded anew."""
 
     def __init__(self, *, threads: int | None = None, quiet: bool = False) -> None:
@@ -28,7 +28,7 @@ class Studio:
         self._one_at_a_time = Lock()
         self.loads = 0
 
-    def image(self, point: Point) -> Image:
+    def image(self, point: SweepPoint) -> Image:
         """Image of a point, `fingerprint` in its metadata; raises as `load` and `render` do, the point named first."""
         try:
             with self._one_at_a_time:
@@ -38,14 +38,14 @@ class Studio:
         told = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint}
         return replace(image, metadata=image.metadata | told)
 
-    def image_or_error(self, point: Point) -> Image | FsptError:
+    def image_or_error(self, point: SweepPoint) -> Image | FsptError:
         """`image`, or what it raises: the other points can be rendered all the same."""
         try:
             return self.image(point)
         except FsptError as error:
             return error
 
-    def _set_up(self, point: Point) -> mi.Scene:
+    def _set_up(self, point: SweepPoint) -> mi.Scene:
         scene = self._scene if self._geometry == point.geometry else None
         self._scene = None  # should the set-up fail, nothing half changed is kept
         if scene is not None:
@@ -69,7 +69,7 @@ class Studio:
             dr.set_thread_count(self._threads)
 
 
-def _set_lens(scene: mi.Scene, point: Point) -> None:
+def _set_lens(scene: mi.Scene, point: SweepPoint) -> None:
     import mitsuba as mi
 
     numbers = mi.traverse(scene.sensors()[0])

@@ -17,19 +17,19 @@ from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import FsptError, ImageError, SceneError
 from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import number, whole
-from .sweep_point import Point, Setting, points
+from .sweep_point import Setting, SweepPoint, points
 
 if TYPE_CHECKING:
     from ..rendering.render import Progress
 
 INDEX = "index.csv"
 NAMED = 5  # points that failed, beside the first of them
-Images = Generator[tuple[Point, Image | FsptError], None, None]
+Images = Generator[tuple[SweepPoint, Image | FsptError], None, None]
 COLUMNS = ("file", "power", "peak", "largest_error", "wall_time")
 
 
 @dataclass(frozen=True)
-class Row:
+class SweepRow:
     """One point of a sweep, as the index tells it.
 
     parameters : name and value, as text
@@ -59,7 +59,7 @@ def sweep(
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
-) -> list[Row]:
+) -> list[SweepRow]:
     """Rows of the index, one for every combination of the values, the last parameter changing fastest.
 
         fspt.sweep("scenes/nylon_cylinder.xml", {"f_number": [2.8, 5.6], "view": [0, 90]}, "nylon")
@@ -108,8 +108,8 @@ def _settings(method: str | None, rtol: float | None, spp: int | None, seed: int
 
 
 def _completed(
-    wanted: list[Point], folder: Path, jobs: int | None, scheduler: str | None, progress: Progress | None
-) -> list[Row]:
+    wanted: list[SweepPoint], folder: Path, jobs: int | None, scheduler: str | None, progress: Progress | None
+) -> list[SweepRow]:
     """Rows of all points, rendered where their image is not there yet; the index tells those that are."""
     rows = {point.file: row for point in wanted if (row := _finished(point, folder)) is not None}
     missing = _by_geometry(point for point in wanted if point.file not in rows)
@@ -141,7 +141,7 @@ def _completed(
     return [rows[point.file] for point in wanted]
 
 
-def _require_all(wanted: list[Point], failed: Mapping[str, FsptError]) -> None:
+def _require_all(wanted: list[SweepPoint], failed: Mapping[str, FsptError]) -> None:
     """Raise the error of the only point that failed, or that of the first with the names of some others."""
     labels = [point.label for point in wanted if point.label in failed]
     if not labels:
@@ -153,7 +153,7 @@ def _require_all(wanted: list[Point], failed: Mapping[str, FsptError]) -> None:
     raise type(error)(f"{error} {len(labels)} of {len(wanted)} points failed; the others: {named}.") from error
 
 
-def _images(missing: list[Point], jobs: int | None, scheduler: str | None) -> Images:
+def _images(missing: list[SweepPoint], jobs: int | None, scheduler: str | None) -> Images:
     """Points and their images, or why there is none, as they come: from here, other processes or a cluster."""
     if not missing:
         return
@@ -166,22 +166,22 @@ def _images(missing: list[Point], jobs: int | None, scheduler: str | None) -> Im
 
         yield from images_of_processes(missing, jobs)
     else:
-        from .scene_cache import Studio
+        from .scene_cache import SceneCache
 
-        studio = Studio()
+        cache = SceneCache()
         for point in missing:
-            yield point, studio.image_or_error(point)
+            yield point, cache.image_or_error(point)
 
 
-def _by_geometry(missing: Iterable[Point]) -> list[Point]:
+def _by_geometry(missing: Iterable[SweepPoint]) -> list[SweepPoint]:
     """The points with those together that one load of the scene serves."""
-    groups: dict[str, list[Point]] = {}
+    groups: dict[str, list[SweepPoint]] = {}
     for point in missing:
         groups.setdefault(point.geometry, []).append(point)
     return [point for group in groups.values() for point in group]
 
 
-def _finished(point: Point, folder: Path) -> Row | None:
+def _finished(point: SweepPoint, folder: Path) -> SweepRow | None:
     """The row of an image that is there, whole, and made from all that would make it now."""
     if not os.path.isfile(folder / point.file):
         return None
@@ -192,15 +192,15 @@ def _finished(point: Point, folder: Path) -> Row | None:
     return _row(point, folder, image) if image.metadata.get("fingerprint") == point.fingerprint else None
 
 
-def _row(point: Point, folder: Path, image: Image) -> Row:
+def _row(point: SweepPoint, folder: Path, image: Image) -> SweepRow:
     # As the file has it, in float32: a row says the same when it is made anew from the file.
     power = image.power.astype(np.float32)
     error = None if image.error is None else float(image.error.astype(np.float32).max())
     total, peak = float(power.sum(dtype=np.float64)), float(power.max())
-    return Row(point.parameters, folder / point.file, total, peak, error, float(image.metadata["wall_time"]))
+    return SweepRow(point.parameters, folder / point.file, total, peak, error, float(image.metadata["wall_time"]))
 
 
-def _write_index(rows: list[Row], path: Path) -> None:
+def _write_index(rows: list[SweepRow], path: Path) -> None:
     with atomic_path(path, ImageError) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*rows[0].parameters, *COLUMNS])
@@ -216,7 +216,7 @@ def _check_jobs(jobs: int | None, scheduler: str | None) -> None:
         raise SceneError(f"sweep: 'jobs' = {jobs} has no meaning for the scheduler '{scheduler}'. Leave it out.")
 
 
-def _check_names(wanted: list[Point]) -> None:
+def _check_names(wanted: list[SweepPoint]) -> None:
     for name in wanted[0].parameters:
         if name in COLUMNS:
             raise SceneError(f"sweep: parameter '{name}' has the name of a column of {INDEX}. Rename the <default>.")

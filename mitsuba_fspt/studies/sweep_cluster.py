@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from ..images.image import Image
 from ..runtime.errors import BackendError, FsptError
-from .sweep_point import Point
+from .sweep_point import SweepPoint
 from .sweep_pool import deaf_to_ctrl_c, died, share_of_cores
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ PATIENCE = 10  # seconds for a scheduler to answer, and for it to have a worker
 
 
 def images_of_cluster(
-    points: list[Point], scheduler: str, jobs: int | None
-) -> Iterator[tuple[Point, Image | FsptError]]:
+    points: list[SweepPoint], scheduler: str, jobs: int | None
+) -> Iterator[tuple[SweepPoint, Image | FsptError]]:
     """Points and their images in the order they are done, by the workers of the scheduler at this address.
 
     'local' starts a scheduler and `jobs` workers here. A worker that dies costs its points another try.
@@ -102,12 +102,12 @@ def _mute(name: str) -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _image(point: Point, threads: int | None) -> Image | FsptError:
-    """Runs on a worker, which keeps its studio from point to point and renders one at a time."""
+def _image(point: SweepPoint, threads: int | None) -> Image | FsptError:
+    """Runs on a worker, which keeps its cache from point to point and renders one at a time."""
     from distributed import get_worker
 
-    from .scene_cache import Studio
+    from .scene_cache import SceneCache
 
     worker = get_worker()
     threads = worker.state.nthreads if threads is None else threads
-    return vars(worker).setdefault("fspt_studio", Studio(threads=threads, quiet=True)).image_or_error(point)
+    return vars(worker).setdefault("fspt_scene_cache", SceneCache(threads=threads, quiet=True)).image_or_error(point)

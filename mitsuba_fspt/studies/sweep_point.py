@@ -14,7 +14,7 @@ from pathlib import Path
 
 from ..rendering.scene import check_parameters, parameter_text
 from ..runtime.errors import SceneError
-from .sweep_source import Source
+from .sweep_source import SceneSource
 
 Setting = str | int | float | None
 LONGEST = 60  # characters of a value in a file name
@@ -22,7 +22,7 @@ MOST_BYTES = 250  # of a file name before its suffix: all file systems in use ho
 
 
 @dataclass(frozen=True)
-class Point:
+class SweepPoint:
     """One image of a sweep and all that makes it; plain data that travels to other processes.
 
     scene : the scene file as given
@@ -55,7 +55,7 @@ class Point:
         return (name if len(os.fsencode(name)) <= MOST_BYTES else _shortened(name)) + ".exr"
 
 
-def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Setting]) -> list[Point]:
+def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Setting]) -> list[SweepPoint]:
     """All combinations of the values over a scene, the last parameter changing fastest.
 
     Raises
@@ -72,9 +72,11 @@ def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Set
     return [_point(scene, parameters, digests, dict(settings)) for parameters in every]
 
 
-def _point(scene: Path, parameters: dict[str, str], digests: dict[Path, str], settings: dict[str, Setting]) -> Point:
+def _point(
+    scene: Path, parameters: dict[str, str], digests: dict[Path, str], settings: dict[str, Setting]
+) -> SweepPoint:
     check_parameters(scene, parameters)
-    source = Source(scene, parameters, digests)
+    source = SceneSource(scene, parameters, digests)
     source.check()
     lens = source.lens_parameters()
     moving = {name: lens[name] for name in parameters if name in lens}
@@ -83,7 +85,7 @@ def _point(scene: Path, parameters: dict[str, str], digests: dict[Path, str], se
     geometry = _hash(versions, source.digests(), standing)
     fingerprint = _hash(geometry, {name: parameters[name] for name in moving}, settings)
     path = source.path
-    return Point(str(path), path.absolute(), parameters, moving, settings, geometry, fingerprint)
+    return SweepPoint(str(path), path.absolute(), parameters, moving, settings, geometry, fingerprint)
 
 
 def _texts(name: str, given: object) -> list[str]:

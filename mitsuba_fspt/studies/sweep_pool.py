@@ -14,12 +14,12 @@ from threading import Thread
 
 from ..images.image import Image
 from ..runtime.errors import BackendError, FsptError
-from .sweep_point import Point
+from .sweep_point import SweepPoint
 
 TRIES = 3  # of a point that ends the process which renders it
 
 
-def images_of_processes(points: list[Point], jobs: int) -> Iterator[tuple[Point, Image | FsptError]]:
+def images_of_processes(points: list[SweepPoint], jobs: int) -> Iterator[tuple[SweepPoint, Image | FsptError]]:
     """Points and their images in the order they are done, by at most `jobs` processes that share the cores.
 
     In place of an image what rendering raised of our own, and BackendError where the point ended its process thrice.
@@ -53,7 +53,7 @@ def images_of_processes(points: list[Point], jobs: int) -> Iterator[tuple[Point,
             worker.end()
 
 
-def died(point: Point) -> BackendError:
+def died(point: SweepPoint) -> BackendError:
     """What to say where a point ended every process that tried it."""
     return BackendError(
         f"sweep: {TRIES} worker processes died at {point.label}. Give it more memory, or fewer jobs at a time."
@@ -82,7 +82,7 @@ def deaf_to_ctrl_c() -> Iterator[None]:
 class _Worker:
     """A process that renders one point after the other."""
 
-    point: Point
+    point: SweepPoint
 
     def __init__(self, threads: int) -> None:
         context = multiprocessing.get_context("spawn")  # a fork would share Dr.Jit's threads
@@ -92,7 +92,7 @@ class _Worker:
             self._process.start()
         theirs.close()
 
-    def take_from(self, waiting: list[Point]) -> None:
+    def take_from(self, waiting: list[SweepPoint]) -> None:
         """Start on the next point, rather one that the scene loaded last serves."""
         geometry = getattr(getattr(self, "point", None), "geometry", None)
         self.point = next((point for point in waiting if point.geometry == geometry), waiting[0])
@@ -126,15 +126,15 @@ def _end_with_parent() -> None:
 
 
 def _work(connection: Connection, threads: int) -> None:
-    from .scene_cache import Studio
+    from .scene_cache import SceneCache
 
     Thread(target=_end_with_parent, daemon=True).start()
-    studio = Studio(threads=threads, quiet=True)
+    cache = SceneCache(threads=threads, quiet=True)
     with suppress(EOFError, BrokenPipeError):  # the process at the top has gone
         while True:
             point = connection.recv()
             try:
-                answer: Image | Exception = studio.image_or_error(point)
+                answer: Image | Exception = cache.image_or_error(point)
             except Exception as error:  # not every exception can travel
                 answer = RuntimeError(f"{point.label}: {type(error).__name__}: {error}")
             connection.send(answer)

@@ -12,7 +12,7 @@ from ..rendering.scene_rules import REFERENCE, check_values, is_number
 from ..rendering.scene_xml import read_xml
 
 
-class Source:
+class SceneSource:
     """A scene file and the files it includes with some values of its parameters, as they were when read.
 
     `digests` are known of files already; sources that share them read a file once.

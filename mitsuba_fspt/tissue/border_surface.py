@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-def border_lattice(grid: Any, cuts: int) -> tuple[Array, Index]:
+def refined_border(grid: Any, cuts: int) -> tuple[Array, Index]:
     """Points (P, 3) [mm] and triangles (F cuts², 3), outward, of the boundary facets of a scikit-fem mesh.
 
     `cuts` >= 1: the number of parts of each edge. Curved facets give points on the curve. The surface is as

@@ -7,7 +7,7 @@ known exactly, its singularity and its power included. The finite elements carry
 that both orders of element reach their full rate and the mesh need not know where the sources are.
 
     mesh = cylinder_tetrahedra(radius=15, height=30, edge=1.5)
-    solution = solve(mesh, [Medium(0.0138, 0.91, 1.37)], [Source(Ball((8, 0, 0)))])
+    solution = solve(mesh, [Medium(0.0138, 0.91, 1.37)], [Source(Sphere((8, 0, 0)))])
     solution.solved.exited                                # 0.3128 W of 1 W
     solution.phantom(edge=0.35).write("phantom.ply")
 """
@@ -24,7 +24,7 @@ from ..optics.media import Medium, Source
 from ..runtime.errors import FluxError
 from .finite_elements import System
 from .free_field import FreeField
-from .solution import Solution
+from .solution import DiffusionSolution
 from .tetrahedra import OUTSIDE, Tetrahedra, depth
 
 Progress = Callable[[str], None]
@@ -40,8 +40,8 @@ def solve(
     a: str | float = "robin",
     order: int = 2,
     progress: Progress | None = None,
-) -> Solution:
-    """Solution of the diffusion equation on a mesh, with its power balance.
+) -> DiffusionSolution:
+    """DiffusionSolution of the diffusion equation on a mesh, with its power balance.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def solve(
     tell("solve")
     solved = system.solve(fields)
     power = math.fsum(source.power for source in sources)
-    solution = Solution(mesh, system.basis, tuple(media), tuple(factors), fields, power, solved)
+    solution = DiffusionSolution(mesh, system.basis, tuple(media), tuple(factors), fields, power, solved)
     if abs(solution.balance) > LARGEST_IMBALANCE:
         raise FluxError(
             f"solve: absorbed + exited power is {1 + solution.balance:.6g} of the source's. A source is too close "

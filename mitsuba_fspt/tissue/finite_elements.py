@@ -139,7 +139,7 @@ class System:
         return np.asarray(cKDTree(centres).query(middle.T)[0] < 2 * size)
 
     def _conjugate_gradients(self, load: Array) -> tuple[Array, int]:
-        """Solution of the linear system and the number of iterations, with a Jacobi preconditioner.
+        """DiffusionSolution of the linear system and the number of iterations, with a Jacobi preconditioner.
 
         SciPy's own takes dot products by threaded BLAS, whose threads wait for each other on a busy machine:
         five times the time.

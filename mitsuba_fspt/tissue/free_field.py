@@ -1,4 +1,4 @@
-"""Fluence of uniform balls of light in endless homogeneous tissue: the exactly known part of the solution.
+"""Fluence of uniform spheres of light in endless homogeneous tissue: the exactly known part of the solution.
 
 -D ∇²φ + µa φ = q has φ = P/(4πDr) · exp(−kr) around a point of power P, k = √(µa/D). Outside a uniform ball
 of radius a the same holds with P · 3 i₁(ka)/(ka) in place of P (mean value property), i₁ the modified
@@ -23,7 +23,7 @@ PAIRS_AT_ONCE = 500_000
 
 @dataclass(frozen=True, eq=False)
 class FreeField:
-    """Field of K balls of light in endless tissue.
+    """Field of K spheres of light in endless tissue.
 
     `centres` (K, 3) [mm], `radii` (K,) [mm] (0: a point), `powers` (K,) [W], `diffusion` D [mm], `mua`
     [1/mm].
@@ -53,7 +53,7 @@ class FreeField:
     def with_gradient(self, points: Array) -> tuple[Array, Array, Array]:
         """φ [W/mm²], shape (N,), ∇φ [W/mm³] and Σ P r/(4πr³) [W/mm²], shape (N, 3), at `points` (N, 3) [mm].
 
-        The last one is what -D ∇φ would be outside the balls if nothing were absorbed.
+        The last one is what -D ∇φ would be outside the spheres if nothing were absorbed.
         """
         fluence, gradient = np.empty(len(points)), np.empty((len(points), 3))
         outflow = np.empty_like(gradient)
@@ -74,7 +74,7 @@ class FreeField:
             yield part, cdist(points[part], self.centres)
 
     def _along(self, points: Array, weights: Array) -> Array:
-        """Σ weight · (point - centre) over the balls, (N, 3), of weights (N, K)."""
+        """Σ weight · (point - centre) over the spheres, (N, 3), of weights (N, K)."""
         return points * weights.sum(axis=1, keepdims=True) - weights @ self.centres
 
     def _fluence_of_balls(self, r: Array) -> Array:

@@ -49,19 +49,19 @@ import numpy as np
 
 from ..optics.boundary import boundary_a
 from ..optics.media import Medium, Source
-from ..optics.shapes import Ball, Rod, Shape
+from ..optics.shapes import Cylinder, Shape, Sphere
 from ..runtime.errors import FluxError
 from .cylinder_mesh import cylinder_tetrahedra
 from .diffusion import Progress, solve
 from .finite_elements import import_skfem
 from .mesher import read_tetrahedra
-from .solution import Solution
+from .solution import DiffusionSolution
 from .tetrahedra import Tetrahedra
 from .toml_table import Table
 
 
 @dataclass(frozen=True)
-class Cylinder:
+class CylinderGeometry:
     """Cylinder about the z axis, centred at the origin: `radius` and `height` [mm]."""
 
     radius: float
@@ -73,7 +73,7 @@ class Cylinder:
 
 
 @dataclass(frozen=True)
-class File:
+class MeshGeometry:
     """Tetrahedra or a closed surface in a file, in `length_unit`; `labels`: the field that labels its cells."""
 
     path: Path
@@ -101,7 +101,7 @@ class PhantomFile:
     the boundary factor's name or value.
     """
 
-    geometry: Cylinder | File
+    geometry: CylinderGeometry | MeshGeometry
     medium: Medium
     sources: tuple[Source, ...]
     regions: tuple[Region, ...] = ()
@@ -144,7 +144,7 @@ class PhantomFile:
     @property
     def files(self) -> tuple[Path, ...]:
         """The files that it reads besides itself."""
-        return (self.geometry.path,) if isinstance(self.geometry, File) else ()
+        return (self.geometry.path,) if isinstance(self.geometry, MeshGeometry) else ()
 
     def mesh(self) -> Tetrahedra:
         """The tetrahedra with the number of their region, 1, 2, …, 0 for the rest; of several the last.
@@ -166,7 +166,7 @@ class PhantomFile:
             region[inside] = number
         return replace(mesh, region=region)
 
-    def solve(self, progress: Progress | None = None) -> Solution:
+    def solve(self, progress: Progress | None = None) -> DiffusionSolution:
         """Mesh the phantom and solve it; see `tissue.solve`."""
         import_skfem()  # before the mesher's minutes
         if progress:
@@ -177,15 +177,15 @@ class PhantomFile:
         return solve(mesh, media, self.sources, a=self.a, order=self.order, progress=progress)
 
 
-def _geometry(table: Table, folder: Path) -> Cylinder | File:
+def _geometry(table: Table, folder: Path) -> CylinderGeometry | MeshGeometry:
     """The geometry of the table [geometry]."""
     if "file" in table.left:
-        result: Cylinder | File = File(
+        result: CylinderGeometry | MeshGeometry = MeshGeometry(
             folder / table.text("file"), table.text("length_unit", "mm"), table.optional_text("labels")
         )
     else:
         table.choice("shape", ("cylinder",))
-        result = Cylinder(table.number("radius"), table.number("height"))
+        result = CylinderGeometry(table.number("radius"), table.number("height"))
     table.done()
     return result
 
@@ -213,8 +213,8 @@ def _shape(table: Table, choices: tuple[str, ...]) -> Shape:
     shape = table.choice("shape", choices)
     centre = table.vector("centre")
     if shape == "point":
-        return Ball(centre)
+        return Sphere(centre)
     if shape == "sphere":
-        return Ball(centre, table.number("radius"))
+        return Sphere(centre, table.number("radius"))
     axis = table.vector("axis", (0.0, 0.0, 1.0))
-    return Rod(centre, table.number("length"), table.number("radius"), axis)
+    return Cylinder(centre, table.number("length"), table.number("radius"), axis)

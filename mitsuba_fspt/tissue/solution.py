@@ -12,7 +12,7 @@ from ..optics.media import Medium
 from ..phantom.phantom import Phantom
 from ..phantom.surface_mesh import face_areas
 from ..runtime.errors import FluxError
-from .border_surface import border_lattice, nearest_points
+from .border_surface import nearest_points, refined_border
 from .finite_elements import Solved
 from .fluence_volume import Volume, voxel_box
 from .free_field import FreeField
@@ -29,7 +29,7 @@ NEARBY = 0.5  # barycentric coordinates beyond a cell: further off curved cells 
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class DiffusionSolution:
     """φ = free fields of the sources + the rest `solved.rest` on the finite element `basis` of `mesh`.
 
     `media` and boundary `factors` A: one a region of the mesh; `source_power` [W].
@@ -153,7 +153,7 @@ class Solution:
 
     def _border(self, edge: float) -> tuple[Array, Index]:
         """The border as vertices and faces with edges of about `edge` [mm] or less, on the true surface."""
-        vertices, faces = border_lattice(self.basis.mesh, self.mesh.cuts(edge))
+        vertices, faces = refined_border(self.basis.mesh, self.mesh.cuts(edge))
         return self._snap(vertices), faces
 
     def _snap(self, points: Array) -> Array:

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from ..emission.elements import Elements, elements_of
 from ..integral.occlusion import hidden
 from ..integral.scene_checks import check_scene
-from ..jit.batches import numbered, runs
+from ..jit.batches import batch_slices, numbered
 from ..jit.recording import recording
 from ..jit.spectra import scalar
 
-Image = NDArray[np.float64]
+Plane = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
@@ -30,7 +30,7 @@ def points_of(scene: mi.Scene, minimum: int) -> int:
     return sum(elements_of(emitter.get_shape(), minimum).count for emitter in scene.emitters())
 
 
-def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Image, int]:
+def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Plane, int]:
     """Power on the pixels of the crop window, shape (h, w) [W], and the number of pairs of a point and a pixel.
 
     Every glowing shape has at least `minimum` points; with 1 those of a mesh are the centres of its faces. Raises
@@ -50,7 +50,7 @@ def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Image, in
 
 
 def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]:
-    """Elements and the flat numbers of the pixels around their blur discs, some `LANES` pairs at a time."""
+    """Elements and the flat numbers of the pixels around their blur discs, some `BATCH` pairs at a time."""
     si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
     centre, radius = lens.film_discs(si.p.numpy().T.astype(np.float64))
     size, offset = (
@@ -62,7 +62,7 @@ def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]
     last = np.clip(np.floor(centre + reach - 0.5 - offset), -1, size - 1).astype(np.int64)
     columns, rows = np.maximum(last - first + 1, 0).T
     count = columns * rows
-    for run in runs(count):
+    for run in batch_slices(count):
         index, number = numbered(count[run])
         index += run.start
         row, column = number // columns[index] + first[index, 1], number % columns[index] + first[index, 0]

@@ -20,7 +20,7 @@ from .stiff_cases_scenes import (
     SHARP,
     SIDE,
     WIDTH,
-    Image,
+    Plane,
     ball,
     cone,
     disk,
@@ -150,7 +150,7 @@ def _two_circles() -> float:
     z, radius, pitch = 110.0, 0.8, 0.1
     side = pitch * (FOCUS - FOCAL) / FOCAL
 
-    def seen(x: Image, y: Image) -> Image:
+    def seen(x: Plane, y: Plane) -> Plane:
         h = np.hypot(x, y)
         return _shared(PUPIL, radius * FOCUS / (FOCUS - z), h * z / (FOCUS - z)) / (1 + (h / (FOCUS - z)) ** 2) ** 2
 
@@ -158,7 +158,7 @@ def _two_circles() -> float:
     return off(power(scene(disk(z, radius), pixel_pitch=pitch)), expected)
 
 
-def _shared(r: float, s: float, apart: Image) -> Image:
+def _shared(r: float, s: float, apart: Plane) -> Plane:
     """Area that two circles of radii r and s share, `apart` between their centres."""
     apart = np.clip(apart, abs(r - s) + 1e-12, r + s)
     a = np.arccos(np.clip((apart**2 + r**2 - s**2) / (2 * apart * r), -1, 1))

@@ -35,7 +35,7 @@ REFUSAL = "a refusal"
 EXACT, SHARP, AGREED = 1e-5, 5e-4, 2e-3
 ROUNDED = 1e-4  # at the usual rtol: float32 that rounds otherwise lets a bisection end beside where it did
 
-Image = NDArray[np.float64]
+Plane = NDArray[np.float64]
 
 
 def scene(
@@ -92,7 +92,7 @@ def sphere(z: float, radius: float, x: float = 0.0, y: float = 0.0, exitance: fl
     return place
 
 
-def mesh(vertices: ArrayLike, faces: ArrayLike, exitance: float | Image = 1.0) -> Body:
+def mesh(vertices: ArrayLike, faces: ArrayLike, exitance: float | Plane = 1.0) -> Body:
     """Triangles with one J_n or one for every vertex or face (as many values tell which)."""
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.uint32)
 
@@ -118,7 +118,7 @@ def mesh(vertices: ArrayLike, faces: ArrayLike, exitance: float | Image = 1.0) -
     return place
 
 
-def grid(x: ArrayLike, y: ArrayLike, z: float) -> tuple[Image, NDArray[np.int64]]:
+def grid(x: ArrayLike, y: ArrayLike, z: float) -> tuple[Plane, NDArray[np.int64]]:
     """Vertices and faces of a plane at z that faces the lens, two triangles a cell of the lines `x` and `y`."""
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     vertices = np.stack([*(lines.ravel() for lines in np.meshgrid(x, y)), np.full(x.size * y.size, z)], axis=1)
@@ -130,19 +130,19 @@ def grid(x: ArrayLike, y: ArrayLike, z: float) -> tuple[Image, NDArray[np.int64]
 # ---------------------------------------------------------------------- pictures and what they should be
 
 
-def power(of: mi.Scene, **accuracy: Any) -> Image:
+def power(of: mi.Scene, **accuracy: Any) -> Plane:
     """Power on every pixel [W] by the integral; NaN everywhere where its own error is not finite."""
     image = render(of, method="integral", **accuracy)
     return np.asarray(image.power if np.isfinite(image.error).all() else np.full(image.shape, np.nan), np.float64)
 
 
-def filled(focus: float = FOCUS, side: float = SIDE, radius: float = PUPIL, nodes: int = 4, film: Any = None) -> Image:
+def filled(focus: float = FOCUS, side: float = SIDE, radius: float = PUPIL, nodes: int = 4, film: Any = None) -> Plane:
     """Power on every pixel whose cone is filled by 1 W/mm²: A_vd times the mean configuration factor of the pupil."""
     factor = np.vectorize(configuration_factor)
     return side**2 * over_pixels(lambda x, y: factor(radius, focus, np.hypot(x, y)), side, nodes, film)
 
 
-def over_pixels(of: Callable[[Image, Image], Image], side: float = SIDE, nodes: int = 4, film: Any = None) -> Image:
+def over_pixels(of: Callable[[Plane, Plane], Plane], side: float = SIDE, nodes: int = 4, film: Any = None) -> Plane:
     """Mean of a function of (x, y) over every virtual pixel, (h, w), by nodes² Gauss nodes."""
     node, weight = np.polynomial.legendre.leggauss(nodes)
     width, height = film or (WIDTH, HEIGHT)
@@ -159,12 +159,12 @@ def through_pupil(radius: float, z: float, pupil: float = PUPIL) -> float:
     return float(np.pi * radius * (weight @ (factor * a)))
 
 
-def off(picture: Image, truth: Image) -> float:
+def off(picture: Plane, truth: Plane) -> float:
     """Largest error of any pixel over the brightest pixel of the truth."""
     return float(np.abs(picture - truth).max() / truth.max())
 
 
-def off_anywhere(picture: Image, truth: Image) -> float:
+def off_anywhere(picture: Plane, truth: Plane) -> float:
     """Largest error of any pixel over the truth of that pixel; where that is 0, so must the picture be."""
     away = np.where(truth == 0, np.where(picture == 0, 0, np.inf), np.abs(picture / np.where(truth == 0, 1, truth) - 1))
     return float(away.max())
@@ -206,7 +206,7 @@ def same(*bodies: Callable[[], Body], factor: float = 1.0, place: Any = None, **
 
 
 @cache
-def usual(*bodies: Callable[[], Body]) -> Image:
+def usual(*bodies: Callable[[], Body]) -> Plane:
     """Picture [W] of these bodies by the usual lens on the usual film; kept, as many rows compare with it."""
     return power(scene(*(body() for body in bodies)))
 

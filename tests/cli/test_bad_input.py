@@ -433,7 +433,8 @@ def test_a_disk_full_half_way_leaves_the_old_file_and_nothing_else(tmp_path):
     (tmp_path / "o.exr").write_bytes(b"the old one")
     code = """
 import resource, signal, sys
-from mitsuba_fspt import cli, image
+from mitsuba_fspt import cli
+from mitsuba_fspt.images import image
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 write = image.write_exr
 def write_to_full_disk(*arguments):

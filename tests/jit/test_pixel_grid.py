@@ -23,8 +23,8 @@ def grid_of(shape):
 def on_grid(method, *images_and_numbers):
     """What a method of `Grid` makes of arrays (h, w): arrays again."""
     grid = grid_of(images_and_numbers[0].shape)
-    lanes = [grid.lanes(i) if isinstance(i, np.ndarray) else i for i in images_and_numbers]
-    found = getattr(grid, method)(*lanes)
+    flat = [grid.flat(i) if isinstance(i, np.ndarray) else i for i in images_and_numbers]
+    found = getattr(grid, method)(*flat)
     return tuple(map(grid.array, found)) if isinstance(found, tuple) else grid.array(found)
 
 
@@ -89,7 +89,7 @@ def test_grow_takes_every_pixel_as_far_as_it_reaches(shape, most):
     grid = grid_of(mask.shape)
     import mitsuba as mi
 
-    grown = grid.array(grid.grow(grid.lanes(mask), mi.Int(reach.ravel()), most))
+    grown = grid.array(grid.grow(grid.flat(mask), mi.Int(reach.ravel()), most))
     y, x = np.mgrid[: shape[0], : shape[1]]
     distance = [np.maximum(abs(x - j), abs(y - i)) for i, j in np.argwhere(mask)]
     within = [d <= max(1, reach[i, j]) for d, (i, j) in zip(distance, np.argwhere(mask), strict=True)]
@@ -99,7 +99,7 @@ def test_grow_takes_every_pixel_as_far_as_it_reaches(shape, most):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_no_film_is_too_small(shape):
     planes = (*on_grid("second_differences", image(shape)), on_grid("spread_max", image(shape)))
-    for plane in (*planes, on_grid("spread_over_lattice", image(shape))):
+    for plane in (*planes, on_grid("spread_over_probes", image(shape))):
         assert np.isfinite(plane).all()
         assert plane.shape == shape
 
@@ -116,25 +116,25 @@ def test_pixels_come_in_squares(shape):
     order = np.array(grid.pixels())
     assert sorted(order) == list(range(len(grid)))
     mask = image(shape) > 0
-    np.testing.assert_array_equal(grid.pixels(grid.lanes(mask)), order[mask.ravel()[order]])
+    np.testing.assert_array_equal(grid.pixels(grid.flat(mask)), order[mask.ravel()[order]])
     for first in range(0, shape[0] // 4 * 4 * w, 4 * w):
         for sixteen in order[first : first + w // 4 * 16].reshape(-1, 16):
             y, x = np.divmod(sixteen, w)
             assert (np.ptp(x), np.ptp(y)) == (3, 3)
-    assert dr.width(grid.pixels(grid.lanes(np.zeros(shape, bool)))) == 0
+    assert dr.width(grid.pixels(grid.flat(np.zeros(shape, bool)))) == 0
 
 
 def test_lattice_takes_one_pixel_of_sixteen_and_is_near_to_all():
     """Expected: in every row and column of 16, at all places modulo 4, and within two pixels' reach of every block."""
     grid = grid_of((32, 48))
-    mask = grid.array(grid.lattice())
+    mask = grid.array(grid.probes())
     assert mask.sum() == 32 * 48 // 16
     assert mask.sum(axis=0).tolist() == [2] * 48
     assert mask.sum(axis=1).tolist() == [3] * 32
     values = np.where(mask, image(mask.shape), -np.inf)
     blocks = values.reshape(8, 4, 12, 4).max(axis=(1, 3))
     expected = [[block.max() for block in row] for row in around(blocks, 1)]
-    np.testing.assert_array_equal(on_grid("spread_over_lattice", values), np.kron(expected, np.ones((4, 4))))
+    np.testing.assert_array_equal(on_grid("spread_over_probes", values), np.kron(expected, np.ones((4, 4))))
 
 
 @pytest.mark.parametrize("angle", [-1.2, -0.4, 0.0, 0.3, 1.0, 1.5])

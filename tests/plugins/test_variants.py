@@ -16,7 +16,7 @@ import pytest
 
 from mitsuba_fspt.runtime import backend, libllvm
 
-TESTS = Path(__file__).resolve().parent
+TESTS = Path(__file__).resolve().parents[1]
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral", "llvm_ad_spectral_polarized")
 # One process each; the first switches there and back.
 RUNS = (("llvm_ad_mono", "llvm_ad_spectral_polarized", "llvm_ad_mono"), *((name,) for name in VARIANTS[1:4]))

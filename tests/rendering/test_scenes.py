@@ -15,7 +15,7 @@ from cylinder_diffusion import Phantom, exitance
 
 from mitsuba_fspt.cli import app
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SCENES = ROOT / "scenes"
 NAMES = ("l_shape", "nylon_cylinder", "textured_sphere", "two_spheres", "uniform_disk")
 

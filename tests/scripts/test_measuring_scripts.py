@@ -12,7 +12,7 @@ import pytest
 from little_scenes import write_scene
 
 pytestmark = pytest.mark.usefixtures("mono")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 import scaling  # noqa: E402
 import silhouettes  # noqa: E402

@@ -10,7 +10,7 @@ import pytest
 
 import mitsuba_fspt as fspt
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "scripts"))
 
 import paper_common  # noqa: E402

@@ -11,7 +11,7 @@ import pytest
 
 import mitsuba_fspt as fspt
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "scripts"))
 
 import tissue_crosscheck  # noqa: E402

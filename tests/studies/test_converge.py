@@ -23,7 +23,7 @@ from mitsuba_fspt.runtime.errors import ImageError, SceneError
 from mitsuba_fspt.studies import converge, converge_methods, converge_reference
 from mitsuba_fspt.studies.converge_sheet import COLUMNS, png_file, write_csv
 from mitsuba_fspt.studies.converge_table import render_text
-from mitsuba_fspt.studies.convergence import Convergence, Row, fitted_order, time_to
+from mitsuba_fspt.studies.convergence import Convergence, Measurement, fitted_order, time_to
 
 ALL = ["integral", "integral, surface form", "sum over points"]
 ALL += [f"path, {sampler}" for sampler in converge_methods.SAMPLERS] + ["ptracer"]
@@ -33,7 +33,7 @@ ALL += [f"path, {sampler}" for sampler in converge_methods.SAMPLERS] + ["ptracer
 
 def row(method="a", rms=1e-2, seconds=(1.0, 1.0), rays=100, **other):
     told = {"knob": "k", "value": 1.0, "cold": 2.0, "rms_full": rms, "largest": rms, "memory": 1.0}
-    return Row(method=method, seconds=tuple(seconds), rays=rays, rms=rms, **(told | other))
+    return Measurement(method=method, seconds=tuple(seconds), rays=rays, rms=rms, **(told | other))
 
 
 def found(*rows, stated=1e-7):

@@ -24,7 +24,7 @@ from mitsuba_fspt.images import picture
 from mitsuba_fspt.runtime.errors import BackendError, ImageError, SceneError
 from mitsuba_fspt.studies import scene_cache, sweep, sweep_pool
 from mitsuba_fspt.studies.contact_sheet import write_contact_sheet
-from mitsuba_fspt.studies.sweep_source import Source
+from mitsuba_fspt.studies.sweep_source import SceneSource
 
 F_NUMBERS, DISTANCES = ("2.8", "8"), ("165", "175")
 VALUES = {"f_number": F_NUMBERS, "distance": DISTANCES}
@@ -50,7 +50,7 @@ def scene(tmp_path, monkeypatch):
 def calls(monkeypatch):
     """Points rendered and scenes loaded in this process, by label and parameters."""
     rendered, loaded = [], []
-    image, load = scene_cache.Studio.image, scene_cache.load
+    image, load = scene_cache.SceneCache.image, scene_cache.load
 
     def counting_image(self, point):
         rendered.append(point.label)
@@ -60,7 +60,7 @@ def calls(monkeypatch):
         loaded.append(parameters)
         return load(path, **parameters)
 
-    monkeypatch.setattr(scene_cache.Studio, "image", counting_image)
+    monkeypatch.setattr(scene_cache.SceneCache, "image", counting_image)
     monkeypatch.setattr(scene_cache, "load", counting_load)
     return rendered, loaded
 
@@ -189,7 +189,7 @@ def test_the_contact_sheet_shows_all_on_one_scale(scene, monkeypatch):
     ],
 )
 def test_a_lens_parameter_sets_numbers_of_the_only_lens_and_nothing_else(tmp_path, more, sensor, expected):
-    assert Source(write_scene(tmp_path / "x.xml", more=more, sensor=sensor)).lens_parameters() == expected
+    assert SceneSource(write_scene(tmp_path / "x.xml", more=more, sensor=sensor)).lens_parameters() == expected
 
 
 # --- what is there is not rendered again ---

@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 
 from mitsuba_fspt.optics.boundary import robin_a
 from mitsuba_fspt.optics.media import Medium, Source
-from mitsuba_fspt.optics.shapes import Ball, Rod
+from mitsuba_fspt.optics.shapes import Cylinder, Sphere
 from mitsuba_fspt.runtime.errors import FluxError
 from mitsuba_fspt.tissue import finite_elements
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import solve
 from mitsuba_fspt.tissue.free_field import FreeField
-from mitsuba_fspt.tissue.solution import Solution
+from mitsuba_fspt.tissue.solution import DiffusionSolution
 from mitsuba_fspt.tissue.tetrahedra import Tetrahedra, depth
 
 skfem = pytest.importorskip("skfem")
 
 Array = NDArray[np.float64]
 NYLON = Medium(0.0138, 0.91, 1.37)
-POINT = Source(Ball((8.0, 0.0, 0.0)))
+POINT = Source(Sphere((8.0, 0.0, 0.0)))
 
 
 def ball_mesh(radius: float, refinements: int) -> Tetrahedra:
@@ -44,7 +44,7 @@ def circle(radius: float, cosine: Array) -> Array:
 
 
 @pytest.fixture(scope="module")
-def nylon() -> Solution:
+def nylon() -> DiffusionSolution:
     """The cylinder R 15, H 30 with a point source 8 mm off the axis at mid height, on a coarse mesh."""
     return solve(cylinder_tetrahedra(15, 30, 3), [NYLON], [POINT])
 
@@ -67,7 +67,7 @@ def test_order_of_convergence_on_a_ball(order: int, local: tuple[float, float], 
     assert exact.max() > 3 * exact.min() > 0
     edges, errors = [], []
     for refinements in range(3 - order, 6 - order):
-        solution = solve(ball_mesh(10, refinements), [NYLON], [Source(Ball((0.0, 0.0, 3.0)))], order=order)
+        solution = solve(ball_mesh(10, refinements), [NYLON], [Source(Sphere((0.0, 0.0, 3.0)))], order=order)
         difference = solution.exitance_at(circle(10, cosine)) - exact
         power = solution.solved.exited / (4 * np.pi * 100 * mean) - 1
         edges.append(solution.mesh.edge)
@@ -86,11 +86,11 @@ def test_slab_of_two_layers(upper: Medium) -> None:
     matter, within 1 % of the face's peak. Seen to fail without the gradient in the integral over the other
     layer (27 % low); without its other term the powers do not balance.
     """
-    lower, interface = Medium(0.1, 1.0, 1.37), Rod((0.0, 0.0, 3.0), 6, 30)
+    lower, interface = Medium(0.1, 1.0, 1.37), Cylinder((0.0, 0.0, 3.0), 6, 30)
     mesh = cylinder_tetrahedra(20, 12, 2)
     mesh = Tetrahedra(mesh.vertices, mesh.cells, mesh.inside(interface), mesh.snap)
     assert np.bincount(mesh.region).tolist() == [len(mesh.cells) // 2] * 2
-    solution = solve(mesh, [lower, upper], [Source(Ball((0.0, 0.0, -3.0)))])
+    solution = solve(mesh, [lower, upper], [Source(Sphere((0.0, 0.0, -3.0)))])
     across = np.linspace(0, 8, 9)
     for height in (-6.0, 6.0):
         exact = layers_fluence(
@@ -114,7 +114,7 @@ def test_endless_medium() -> None:
     4π.
     """
     medium = Medium(0.08, 1.0)
-    solution = solve(ball_mesh(40, 2), [medium], [Source(Ball((1.0, 2.0, -3.0)), 2.5)])
+    solution = solve(ball_mesh(40, 2), [medium], [Source(Sphere((1.0, 2.0, -3.0)), 2.5)])
     r = np.linspace(1, 15, 8)
     points = np.array([1.0, 2.0, -3.0]) + r[:, None] * np.array([0.6, 0.0, 0.8])
     d = 1 / (3 * 1.08)
@@ -141,7 +141,7 @@ def test_independent_monte_carlo(n: float, exit_fraction: float, peak: float) ->
     assert -0.022 < other.solved.exited / exit_fraction - 1 < -0.016
 
 
-def test_power_balance(nylon: Solution) -> None:
+def test_power_balance(nylon: DiffusionSolution) -> None:
     """Rationale: absorbed + exited = source to 1e-5, and absorbed is what ∫ µa φ dV by another rule says.
 
     The other rule: Gauss points in spherical coordinates about the source, so that r² takes 1/r away. Seen to
@@ -166,9 +166,9 @@ def test_power_balance(nylon: Solution) -> None:
     assert NYLON.mua * (ray @ solid_angle) == pytest.approx(nylon.solved.absorbed, rel=1e-3)
 
 
-def test_linear_in_the_sources(nylon: Solution) -> None:
+def test_linear_in_the_sources(nylon: DiffusionSolution) -> None:
     """Rationale: two sources give the sum of what each gives alone; power counts once."""
-    second = Source(Ball((-3.0, 5.0, 4.0), 1.5), 3.0)
+    second = Source(Sphere((-3.0, 5.0, 4.0), 1.5), 3.0)
     both = solve(nylon.mesh, [NYLON], [POINT, second])
     alone = solve(nylon.mesh, [NYLON], [second])
     points = nylon.mesh.snap(np.array([[14.95, 0, 0], [0, 14.95, 4], [-14.95, 0, 2], [3, 3, 15]]))
@@ -178,9 +178,9 @@ def test_linear_in_the_sources(nylon: Solution) -> None:
     assert both.solved.exited == pytest.approx(nylon.solved.exited + alone.solved.exited, rel=1e-9)
 
 
-def test_regions_of_the_same_optics_change_nothing(nylon: Solution) -> None:
+def test_regions_of_the_same_optics_change_nothing(nylon: DiffusionSolution) -> None:
     """Rationale: a label alone is no border; a darker ball takes light away."""
-    inside = nylon.mesh.inside(Ball((-4.0, 0.0, 0.0), 5))
+    inside = nylon.mesh.inside(Sphere((-4.0, 0.0, 0.0), 5))
     assert 0 < inside.sum() < len(inside)
     mesh = Tetrahedra(nylon.mesh.vertices, nylon.mesh.cells, inside, nylon.mesh.snap)
     same = solve(mesh, [NYLON, NYLON], [POINT])
@@ -230,7 +230,7 @@ def test_rod_nodes_are_uniform() -> None:
 
     Expected behaviour: for a skew axis too. Seen to fail with nodes uniform in radius instead of its square.
     """
-    rod = Rod((1.0, -2.0, 3.0), 6, 1.5, axis=(1.0, 2.0, 2.0))
+    rod = Cylinder((1.0, -2.0, 3.0), 6, 1.5, axis=(1.0, 2.0, 2.0))
     nodes = rod.nodes(1.0)
     assert nodes.shares.sum() == pytest.approx(1, abs=1e-14)
     assert nodes.shares.min() > 0
@@ -239,10 +239,10 @@ def test_rod_nodes_are_uniform() -> None:
     np.testing.assert_allclose(nodes.shares @ local**2, [1.5**2 / 4, 1.5**2 / 4, 3], rtol=1e-12)
     assert rod.contains(nodes.centres).all()
     assert rod.contains(rod.border() * (1 - 1e-9) + 1e-9 * np.array(rod.centre)).all()
-    assert np.ptp(Rod((0.0, 0.0, 0.0), 4).nodes(1).centres[:, :2]) == 0
+    assert np.ptp(Cylinder((0.0, 0.0, 0.0), 4).nodes(1).centres[:, :2]) == 0
 
 
-def test_surface_of_the_paper(nylon: Solution, tmp_path: Path) -> None:
+def test_surface_of_the_paper(nylon: DiffusionSolution, tmp_path: Path) -> None:
     """Rationale: what a camera gets: 40,000 vertices on the true cylinder, closed, with the finite elements' power.
 
     Expected behaviour: one scale factor, within 2e-4 of 1; the file below 4 MB.
@@ -268,7 +268,7 @@ def test_no_imprint_of_the_mesh(order: int) -> None:
     that, measured 0.6 %. Seen to fail with straight edges (order 2: 0.8 %).
     """
     solution = solve(
-        cylinder_tetrahedra(15, 30, 3 / (3 - order)), [NYLON], [Source(Ball((0.0, 0.0, 1.0)))], order=order
+        cylinder_tetrahedra(15, 30, 3 / (3 - order)), [NYLON], [Source(Sphere((0.0, 0.0, 1.0)))], order=order
     )
     phantom = solution.phantom(0.7)
     x, y, z = phantom.vertices.T
@@ -279,7 +279,7 @@ def test_no_imprint_of_the_mesh(order: int) -> None:
         assert np.ptp(values) / values.mean() < (0.01 if order == 1 else 0.002)
 
 
-def test_report(nylon: Solution) -> None:
+def test_report(nylon: DiffusionSolution) -> None:
     """The report's numbers fit each other."""
     report = nylon.report()
     assert report["nodes"] == 6951
@@ -291,7 +291,7 @@ def test_report(nylon: Solution) -> None:
     assert stages == ["assemble", "solve"]
 
 
-def test_locate_finds_the_cell(nylon: Solution) -> None:
+def test_locate_finds_the_cell(nylon: DiffusionSolution) -> None:
     """Rationale: points made inside known cells are found there; points outside are told apart."""
     mesh = nylon.mesh
     rng = np.random.default_rng(1)
@@ -318,10 +318,10 @@ def test_cylinder_mesh() -> None:
     ("sources", "message"),
     [
         ([], "there is no source"),
-        ([Source(Ball((16.0, 0.0, 0.0)))], "source 1: .* reaches out of the tissue"),
-        ([POINT, Source(Ball((13.0, 0.0, 0.0), 3))], "source 2: .* reaches out of the tissue"),
-        ([Source(Rod((0.0, 0.0, 12.0), 8, 1))], "reaches out of the tissue"),
-        ([Source(Ball((14.8, 0.0, 0.0)))], "too close to the border"),
+        ([Source(Sphere((16.0, 0.0, 0.0)))], "source 1: .* reaches out of the tissue"),
+        ([POINT, Source(Sphere((13.0, 0.0, 0.0), 3))], "source 2: .* reaches out of the tissue"),
+        ([Source(Cylinder((0.0, 0.0, 12.0), 8, 1))], "reaches out of the tissue"),
+        ([Source(Sphere((14.8, 0.0, 0.0)))], "too close to the border"),
     ],
 )
 def test_sources_refused(sources: list[Source], message: str) -> None:
@@ -337,7 +337,7 @@ def test_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_phantom_that_lets_no_light_out_is_refused() -> None:
     """Rationale: an exit power that is 0 in 64 bits was divided by."""
-    solution = solve(cylinder_tetrahedra(5, 10, 2.5), [Medium(1e3, 1)], [Source(Ball((0, 0, 0)))], order=1)
+    solution = solve(cylinder_tetrahedra(5, 10, 2.5), [Medium(1e3, 1)], [Source(Sphere((0, 0, 0)))], order=1)
     with pytest.raises(FluxError, match=r"the exit power is 0 W of 1 W, the phantom would be black\. Give smaller mua"):
         solution.phantom(2.5)
 
@@ -363,13 +363,13 @@ def test_arguments_refused() -> None:
         (Medium, (0.1, 0), "'musp' must be > 0"),
         (Medium, (0.1, 1e9), r"'musp' must be > 0 and at most 1e\+06, got 1e\+09"),
         (Medium, (1e300, 1), r"'mua' must be >= 0 and at most 1e\+06"),
-        (Source, (Ball((0.0, 0.0, 0.0)), 1e308), r"'power' must be > 0 and at most 1e\+30"),
+        (Source, (Sphere((0.0, 0.0, 0.0)), 1e308), r"'power' must be > 0 and at most 1e\+30"),
         (Medium, (0.1, 1, 0.9), "'n' must be >= 1"),
-        (Source, (Ball((0.0, 0.0, 0.0)), 0), "'power' must be > 0"),
-        (Ball, ((0.0, 0.0, float("nan")),), "three finite numbers"),
-        (Ball, ((0.0, 0.0, 0.0), -1), "'radius' must be >= 0"),
-        (Rod, ((0.0, 0.0, 0.0), 0), "'length' must be > 0"),
-        (Rod, ((0.0, 0.0, 0.0), 1, 1, (0.0, 0.0, 0.0)), "'axis' must not be"),
+        (Source, (Sphere((0.0, 0.0, 0.0)), 0), "'power' must be > 0"),
+        (Sphere, ((0.0, 0.0, float("nan")),), "three finite numbers"),
+        (Sphere, ((0.0, 0.0, 0.0), -1), "'radius' must be >= 0"),
+        (Cylinder, ((0.0, 0.0, 0.0), 0), "'length' must be > 0"),
+        (Cylinder, ((0.0, 0.0, 0.0), 1, 1, (0.0, 0.0, 0.0)), "'axis' must not be"),
     ):
         with pytest.raises(FluxError, match=message):
             kind(*numbers)

@@ -10,24 +10,24 @@ import pytest
 
 import mitsuba_fspt  # noqa: F401  (before Dr.Jit)
 from mitsuba_fspt.optics.media import Medium, Source
-from mitsuba_fspt.optics.shapes import Ball
+from mitsuba_fspt.optics.shapes import Sphere
 from mitsuba_fspt.runtime.errors import FluxError
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import solve
 from mitsuba_fspt.tissue.fluence_volume import Volume, voxel_box
-from mitsuba_fspt.tissue.solution import Solution
+from mitsuba_fspt.tissue.solution import DiffusionSolution
 
 pytest.importorskip("skfem")
 NYLON = Medium(0.0138, 0.91, 1.37)
 
 
 @pytest.fixture(scope="module")
-def nylon() -> Solution:
-    return solve(cylinder_tetrahedra(15, 30, 3), [NYLON], [Source(Ball((8.0, 0.0, 0.0)))])
+def nylon() -> DiffusionSolution:
+    return solve(cylinder_tetrahedra(15, 30, 3), [NYLON], [Source(Sphere((8.0, 0.0, 0.0)))])
 
 
 @pytest.fixture(scope="module")
-def volume(nylon: Solution) -> Volume:
+def volume(nylon: DiffusionSolution) -> Volume:
     return nylon.volume(0.6)
 
 
@@ -49,7 +49,7 @@ def test_file_layout(tmp_path: Path) -> None:
     assert np.frombuffer(content[48:], "<f4").tolist() == list(range(24))
 
 
-def test_voxels_hold_the_fluence(nylon: Solution, volume: Volume) -> None:
+def test_voxels_hold_the_fluence(nylon: DiffusionSolution, volume: Volume) -> None:
     """Rationale: every voxel whose middle is in the true cylinder has the fluence there, to float32."""
     z, y, x = np.meshgrid(*centres(volume), indexing="ij")
     inside = (np.hypot(x, y) < 15) & (np.abs(z) < 15)
@@ -60,7 +60,7 @@ def test_voxels_hold_the_fluence(nylon: Solution, volume: Volume) -> None:
     assert np.isfinite(volume.values).all()
 
 
-def test_continuation_outside(nylon: Solution, volume: Volume) -> None:
+def test_continuation_outside(nylon: DiffusionSolution, volume: Volume) -> None:
     """Rationale: beyond the border φ goes on as exp(-distance/(2AD)): the boundary condition's slope, positive.
 
     Seen to fail with the distance left out and with A for 2A.
@@ -77,7 +77,7 @@ def test_continuation_outside(nylon: Solution, volume: Volume) -> None:
     assert volume.values.min() > 0
 
 
-def test_mitsuba_reads_it(nylon: Solution, volume: Volume, tmp_path: Path) -> None:
+def test_mitsuba_reads_it(nylon: DiffusionSolution, volume: Volume, tmp_path: Path) -> None:
     """Rationale: Mitsuba's gridvolume gives the fluence back where it is asked, up to the border itself.
 
     Expected behaviour: trilinear interpolation on voxels of 0.6 mm is within 1 % rms; x, y and z are not exchanged
@@ -115,8 +115,8 @@ def test_box() -> None:
 
 @pytest.mark.parametrize(("voxel", "message"), [(0.0, "'voxel' must be > 0"), (1e-3, "Give larger ones")])
 def test_too_many_voxels_are_refused_before_the_border_is_cut(
-    nylon: Solution, monkeypatch: pytest.MonkeyPatch, voxel: float, message: str
+    nylon: DiffusionSolution, monkeypatch: pytest.MonkeyPatch, voxel: float, message: str
 ) -> None:
-    monkeypatch.setattr("mitsuba_fspt.tissue.solution.border_lattice", None)
+    monkeypatch.setattr("mitsuba_fspt.tissue.solution.refined_border", None)
     with pytest.raises(FluxError, match=message):
         nylon.volume(voxel)

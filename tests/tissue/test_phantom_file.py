@@ -13,17 +13,17 @@ from typer.testing import CliRunner
 
 from mitsuba_fspt.cli.flux import app
 from mitsuba_fspt.optics.media import Medium, Source
-from mitsuba_fspt.optics.shapes import Ball, Rod
+from mitsuba_fspt.optics.shapes import Cylinder, Sphere
 from mitsuba_fspt.phantom.phantom import Phantom
 from mitsuba_fspt.runtime.errors import BackendError, FluxError
 from mitsuba_fspt.tissue import phantom_file
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import solve
 from mitsuba_fspt.tissue.mesher import read_tetrahedra, tetrahedralize
-from mitsuba_fspt.tissue.phantom_file import Cylinder, PhantomFile, Region
+from mitsuba_fspt.tissue.phantom_file import CylinderGeometry, PhantomFile, Region
 
 pytest.importorskip("skfem")
-SCENES = Path(__file__).parent.parent / "scenes"
+SCENES = Path(__file__).parents[2] / "scenes"
 SMALL = """
 [geometry]
 shape = "cylinder"
@@ -58,10 +58,10 @@ def test_the_papers_phantoms() -> None:
     """Rationale: the files say what the paper says: R 15, H 30, a hole of 1 mm radius 8 mm off the axis."""
     for name, length in (("nylon_cylinder", 1.0), ("nylon_cylinder_6mm", 6.0)):
         phantom = PhantomFile.read(SCENES / f"{name}.toml")
-        assert phantom.geometry == Cylinder(15, 30)
+        assert phantom.geometry == CylinderGeometry(15, 30)
         assert phantom.medium == Medium(0.0138, 0.91, 1.37)
         ((source,), power) = phantom.sources, phantom.sources[0].power
-        assert isinstance(source.shape, Rod)
+        assert isinstance(source.shape, Cylinder)
         assert (source.shape.length, source.shape.radius, power) == (length, 1, 1)
         assert source.shape.centre[:2] == (8, 0)
         assert source.shape.centre[2] - length / 2 == -1.5
@@ -88,13 +88,13 @@ def test_everything_a_file_can_say(tmp_path: Path) -> None:
     assert phantom.medium == Medium(0.05, 1, 1.4)
     assert phantom.a == "haskell"
     assert phantom.sources == (
-        Source(Ball((1, 0, -1)), 2.5),
-        Source(Ball((0, 0.5, 1), 0.5), 1),
-        Source(Rod((0, 0, 0), 2, 0, (0, 1, 0)), 3),
+        Source(Sphere((1, 0, -1)), 2.5),
+        Source(Sphere((0, 0.5, 1), 0.5), 1),
+        Source(Cylinder((0, 0, 0), 2, 0, (0, 1, 0)), 3),
     )
     assert phantom.regions == (
-        Region(Ball((-2, 0, 0), 2), Medium(0.1, 2, 1.4)),
-        Region(Rod((0, 0, 3), 2, 9), Medium(0.2, 3, 1.5)),
+        Region(Sphere((-2, 0, 0), 2), Medium(0.1, 2, 1.4)),
+        Region(Cylinder((0, 0, 3), 2, 9), Medium(0.2, 3, 1.5)),
     )
     assert (phantom.edge, phantom.order, phantom.surface_edge, phantom.voxel) == (2, 2, 1, 1)
     mesh = phantom.mesh()
@@ -142,7 +142,7 @@ def test_tetrahedra_with_labels_from_a_file(tmp_path: Path) -> None:
     """Rationale: a labelled mesh in cm, written by meshio, is the same phantom as the shape it was labelled by."""
     meshio = pytest.importorskip("meshio")
     mesh = cylinder_tetrahedra(6, 8, 2)
-    inside = mesh.inside(Ball((-2, 0, 0), 2.5))
+    inside = mesh.inside(Sphere((-2, 0, 0), 2.5))
     labels = np.where(inside, 7, 3)
     meshio.write_points_cells(
         tmp_path / "tissue.vtu", mesh.vertices / 10, [("tetra", mesh.cells)], cell_data={"tissue": [labels]}
@@ -158,7 +158,7 @@ def test_tetrahedra_with_labels_from_a_file(tmp_path: Path) -> None:
         exited.append(solution.solved.exited)
     assert exited[1] == pytest.approx(exited[2], rel=1e-12)
     assert exited[1] < 0.99 * exited[0]
-    straight = solve(cylinder_tetrahedra(6, 8, 2), [Medium(0.05, 1)], [Source(Ball((1, 0, -1)), 2.5)], order=1)
+    straight = solve(cylinder_tetrahedra(6, 8, 2), [Medium(0.05, 1)], [Source(Sphere((1, 0, -1)), 2.5)], order=1)
     assert exited[0] == pytest.approx(straight.solved.exited, rel=0.02)
     with pytest.raises(FluxError, match=r"no field 'organ' .* Fields it has: 'tissue'"):
         read_tetrahedra(tmp_path / "tissue.vtu", 2, labels="organ")
@@ -188,7 +188,7 @@ def test_surface_through_the_mesher(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     pytest.importorskip("pytetwild")
     monkeypatch.chdir(tmp_path)
     ball = trimesh.creation.icosphere(5, 10.0)
-    solution = solve(tetrahedralize(ball.vertices, ball.faces, 3), [Medium(0.0138, 0.91)], [Source(Ball((0, 0, 0)))])
+    solution = solve(tetrahedralize(ball.vertices, ball.faces, 3), [Medium(0.0138, 0.91)], [Source(Sphere((0, 0, 0)))])
     assert not list(tmp_path.iterdir())
     assert solution.solved.exited == pytest.approx(0.47367, rel=1e-3)
     phantom = solution.phantom(0.7)
@@ -200,7 +200,7 @@ def test_surface_through_the_mesher(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_scikit_fem_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "skfem", None)
     with pytest.raises(BackendError, match=r"scikit-fem .* pip install 'mitsuba-fspt\[tissue\]'"):
-        solve(cylinder_tetrahedra(6, 8, 2), [Medium(0.05, 1)], [Source(Ball((1, 0, -1)))])
+        solve(cylinder_tetrahedra(6, 8, 2), [Medium(0.05, 1)], [Source(Sphere((1, 0, -1)))])
 
 
 def test_flux_solve(tmp_path: Path) -> None:

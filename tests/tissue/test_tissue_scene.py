@@ -12,7 +12,7 @@ import pytest
 import mitsuba_fspt as fspt
 from mitsuba_fspt.tissue.phantom_file import PhantomFile
 
-SCENES = Path(__file__).resolve().parent.parent / "scenes"
+SCENES = Path(__file__).resolve().parents[2] / "scenes"
 SCENE = SCENES / "nylon_cylinder_tissue.xml"
 DEFAULTS = {node.get("name"): node.get("value") for node in ET.parse(SCENE).getroot().iter("default")}
 REFERENCE = 7.51e-4  # W of 1 W
