@@ -17,6 +17,8 @@ from ..runtime.interrupt import ctrl_c_noted
 from .scene_rules import check_text
 from .scene_xml import SceneXml, read_xml
 
+COLOUR_FORMATS = ("rgb", "rgba", "xyz", "xyza")
+
 if TYPE_CHECKING:
     import mitsuba as mi
 
@@ -55,6 +57,7 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
             state.root.props["embree_use_robust_intersections"] = True
             state.root.props.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in texts.items())]))
             _name_children(state)
+            _set_film_formats(state)
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
     except (RuntimeError, ValueError) as error:
@@ -101,6 +104,17 @@ def _name_children(state: mi.parser.ParserState) -> None:
             names = itertools.chain([plain], (f"{plain}_{number}" for number in itertools.count(2)))
             node.props.set_id(next(name for name in names if name not in taken))
             taken.add(node.props.id())
+
+
+def _set_film_formats(state: mi.parser.ParserState) -> None:
+    """In monochrome variants store films as luminance, which Mitsuba does by itself with a warning for each."""
+    import mitsuba as mi
+
+    if not mi.is_monochromatic:
+        return
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Film and str(node.props.get("pixel_format", "rgb")).lower() in COLOUR_FORMATS:
+            node.props["pixel_format"] = "luminance"
 
 
 def _one_line(message: str) -> str:

@@ -53,6 +53,21 @@ def sheet(path, cells=2, half=3.0, value=lambda y, z: 1e-3 + 0 * y):
 # --- what load does ---
 
 
+def test_a_film_in_colour_loads_without_a_message(tmp_path, capfd):
+    """Mitsuba warns of every film that is not monochrome. Seen to fail with its format left alone."""
+    path = write_scene(tmp_path / "s.xml")
+    colour = path.read_text().replace('<string name="pixel_format" value="luminance"/>', "")
+    path.write_text(colour)
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Warn)
+    try:
+        fspt.load(path)
+    finally:
+        mi.set_log_level(level)
+    assert "pixel_format" not in colour
+    assert capfd.readouterr() == ("", "")
+
+
 def test_parameters_replace_the_defaults_of_the_file(tmp_path):
     path = write_scene(tmp_path / "s.xml")
     plain, wide = fspt.load(path), fspt.load(path, f_number=2.8, distance="170")
