@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..jit.mesh_buffers import triangles
+from ..jit.mesh_buffers import set_triangles, triangles
 from ..jit.robust_tracing import traced_robustly
 from ..runtime.plugin_types import is_surface
 
@@ -23,7 +23,7 @@ class Probe:
         if beside is None and mi.variant().startswith("cuda"):
             mi.Log(mi.LogLevel.Warn, APART)
         # The mesh itself, whose emitter holds the probe, must not be kept.
-        self.scene = traced_robustly([_twin(mesh)], beside)
+        self.scene = traced_robustly([_bare_copy(mesh)], beside)
 
     def at(self, mesh: mi.Shape, ps: mi.PositionSample3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """The full surface record at a position sample of the mesh."""
@@ -47,11 +47,7 @@ def probe_beside(scene: mi.Scene) -> None:
             emitter.trace_beside(scene)
 
 
-def _twin(mesh: mi.Shape) -> mi.Mesh:
+def _bare_copy(mesh: mi.Shape) -> mi.Mesh:
     """The triangles of a mesh and nothing else of it."""
     positions, faces = triangles(mesh)
-    copy = mi.Mesh("twin", dr.width(positions) // 3, dr.width(faces) // 3)
-    parameters = mi.traverse(copy)
-    parameters["vertex_positions"], parameters["faces"] = positions, faces
-    parameters.update()
-    return copy
+    return set_triangles(mi.Mesh("copy", dr.width(positions) // 3, dr.width(faces) // 3), positions, faces)

@@ -14,12 +14,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..jit.mesh_buffers import buffers, face_count
 from ..runtime.plugin_types import is_surface
 from .elements import elements_of
 
 
 @dataclass(frozen=True)
-class Faces:
+class FaceTable:
     """All faces of a scene's meshes.
 
     first : of each shape, by its number, at which face of all its own begin
@@ -33,7 +34,7 @@ class Faces:
     sources: tuple[Any, ...]
 
     @classmethod
-    def of(cls, meshes: Sequence[mi.Shape]) -> Faces | None:
+    def of(cls, meshes: Sequence[mi.Shape]) -> FaceTable | None:
         """The faces of these meshes; None unless all that glow do so by Lambert's law with a linear J_n."""
         first: dict[int, int] = {}
         tables, begin = [], 0
@@ -43,11 +44,11 @@ class Faces:
                 return None
             tables.append(_table(mesh, radiance))
             first[_number_of(mesh)] = begin
-            begin += mesh.face_count()
+            begin += face_count(mesh)
         starts = mi.UInt32([first.get(number, 0) for number in range(max(first, default=0) + 1)])
         table = dr.concat(tables)
         dr.eval(starts, table)
-        return cls(starts, table, tuple(_buffers(mesh) for mesh in meshes))
+        return cls(starts, table, tuple(buffers(mesh) for mesh in meshes))
 
     def radiance(self, pi: mi.PreliminaryIntersection3f, direction: mi.Vector3f) -> mi.Float:
         """Radiance [W/mm²/sr] where a ray with `direction` meets a face, towards its origin; 0 on the inward side."""
@@ -61,7 +62,7 @@ class Faces:
 
 
 def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
-    """What `Faces.of` follows from once a scene is checked; None where not all shapes are meshes."""
+    """What `FaceTable.of` follows from once a scene is checked; None where not all shapes are meshes."""
     if not all(shape.is_mesh() for shape in shapes):
         return None
     return [_edition(shape) for shape in shapes]
@@ -69,18 +70,13 @@ def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
 
 def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
     emitter = mesh.emitter()
-    places = (buffer.index for buffer in _buffers(mesh))
+    places = (buffer.index for buffer in buffers(mesh))
     return _number_of(mesh), *places, mark_of(emitter), getattr(emitter, "edition", 0)
 
 
 def mark_of(emitter: mi.Emitter | None) -> object:
     """What tells an emitter from others, to be kept in its stead."""
     return getattr(emitter, "mark", None) or dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]
-
-
-def _buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
-    # Copies, which share the data: what a mesh hands out keeps it alive.
-    return mi.Float(mesh.vertex_positions_buffer()), mi.UInt32(mesh.faces_buffer())
 
 
 def _number(shape: mi.ShapePtr) -> mi.UInt32:
@@ -92,15 +88,15 @@ def _number_of(shape: mi.Shape) -> int:
 
 
 def _radiance_at_corners(mesh: mi.Shape) -> tuple[mi.Float, ...] | None:
-    """Radiance [W/mm²/sr] at the three corners of every face, 0 where nothing glows; None as in `Faces.of`."""
+    """Radiance [W/mm²/sr] at the three corners of every face, 0 where nothing glows; None as in `FaceTable.of`."""
     emitter = mesh.emitter()
     if emitter is None:
-        return (dr.zeros(mi.Float, mesh.face_count()),) * 3
+        return (dr.zeros(mi.Float, face_count(mesh)),) * 3
     return emitter.radiance_at_corners() if is_surface(emitter) else None
 
 
 def _table(mesh: mi.Shape, radiance: tuple[mi.Float, ...]) -> mi.Float:
-    """Eight numbers for each face of a mesh, see `Faces`."""
+    """Eight numbers for each face of a mesh, see `FaceTable`."""
     elements = elements_of(mesh, minimum=1)
     si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
     # On a sliver a normal or J_n may be no number: it is dark.

@@ -1,4 +1,4 @@
-"""The law of the last flight: what leaves tissue is what scatters last, so the fluence inside tells its directions."""
+"""The law of the last flight: what leaves tissue has scattered for the last time inside, ∝ the fluence there."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit.loops import repeat
-from ..optics.media import Medium
-from ..runtime.errors import ExitanceError
-from .elements import elements_of
+from ...jit.loops import repeat
+from ...optics.media import Medium
+from ...runtime.errors import ExitanceError
+from ..elements import elements_of
+from . import ExitLaw, refractive_index, required, required_number
 
 NODES = 8  # along the line of sight
 RINGS, SPOKES = 8, 8  # of the hemisphere that is to carry J_n
 
 
-class LastFlight:
+class LastFlight(ExitLaw):
     r"""Light scattered for the last time on the refracted line of sight ω_i inside the tissue.
 
     L(r, ω) ∝ T/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds by Gauss–Laguerre, with a factor that makes the
@@ -39,6 +40,23 @@ class LastFlight:
         self._total: _Table | None = None
         self._values: mi.Float | None = None  # of the volume that is tabulated
 
+    @classmethod
+    def of(cls, props: mi.Properties) -> LastFlight:
+        """With the medium of `mua`, `musp` and `int_ior`, and the volume `fluence`."""
+        n = refractive_index(props)
+        mua, musp = (
+            required_number(props, name, "a float [1/mm]", example)
+            for name, example in (("mua", "0.01"), ("musp", "1"))
+        )
+        fluence = required(props, "fluence", "a volume, such as a gridvolume")
+        if not isinstance(fluence, mi.Volume):
+            raise ExitanceError(f"fspt_surface: 'fluence' must be a volume, got {fluence!r}. Give a gridvolume.")
+        return cls(Medium(mua, musp, n), fluence)
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        """The fluence."""
+        cb.put("fluence", self.fluence, mi.ParamFlags.NonDifferentiable)
+
     def prepare(self, shape: mi.Shape) -> None:
         """Tabulate what the hemisphere over each point of the surface carries; ExitanceError where Φ gives nothing."""
         inside, outside = shape.bbox(), self.fluence.bbox()
@@ -55,9 +73,11 @@ class LastFlight:
             )
 
     def renewed(self) -> bool:
+        """True where the volume has other values."""
         return self._values is not None and self._values.index != _values_of(self.fluence).index
 
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """The radiance towards `direction` over what the hemisphere carries [1/sr]."""
         return self._seen(si, direction, active) / self._total(si)
 
     def _seen(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
@@ -90,7 +110,7 @@ class LastFlight:
 
 
 class _Table:
-    """A function of the surface, known at the corners of its elements and interpolated between them."""
+    """A function of the surface, tabulated at the corners of its elements and interpolated between them."""
 
     def __init__(self, shape: mi.Shape, function: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
         self._elements = elements_of(shape, minimum=1 << 14)
