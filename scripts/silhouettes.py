@@ -53,7 +53,7 @@ def measure(name: str, f_number: float) -> list[tuple[str, float, list[float]]]:
     import drjit as dr
 
     from mitsuba_fspt.integral.draft import Draft
-    from mitsuba_fspt.integral.lines import View
+    from mitsuba_fspt.integral.eq9 import View
     from mitsuba_fspt.integral.nodes import apply_nodes, first_nodes
     from mitsuba_fspt.integral.quadrature import Quadrature
     from mitsuba_fspt.integral.transects import apply_transects, edges_of

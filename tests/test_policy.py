@@ -23,7 +23,7 @@ ARROWS = {
     "emission": {"runtime", "optics", "jit"},
     "integral": {"runtime", "optics", "jit", "emission"},
     "plugins": {"runtime", "optics", "jit", "emission", "integral"},
-    "rendering": {"runtime", "optics", "images", "jit", "emission", "integral"},
+    "rendering": {"runtime", "images", "jit", "emission", "integral"},
     "validation": {"runtime", "optics", "jit", "emission", "integral", "rendering"},
     "studies": {"runtime", "optics", "images", "jit", "emission", "integral", "rendering", "validation"},
     "cli": {"runtime", "images", "phantom", "tissue", "rendering", "studies", "validation"},

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
 from . import node_rules
-from .lines import View
+from .eq9 import View
 from .quadrature import Quadrature, Solution
 from .window import Window
 

@@ -9,8 +9,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.loops import repeat
-from .lines import TRANSECTS_TOGETHER, View
+from .eq9 import View
 from .node_rules import MOST_JUMPS, AlongTransect
+from .node_sums import TRANSECTS_TOGETHER
 from .transect import Transect
 
 MOST_STEPS = 2  # of jumps within a body: beside two the scan has too little left to tell a third from a slope
@@ -39,7 +40,7 @@ def integrate_transect(
 
     def look(s: mi.Float) -> mi.Point3f:
         position, pupil, _ = transect.at(s)
-        return mi.Point3f(*view.radiance_on_film(position, pupil, together)[1:])
+        return mi.Point3f(*view.integrand(position, pupil, together)[1:])
 
     found = _search(look, phase, along, outline, least)
     jumps, places = found.jumps, found.places()
@@ -61,7 +62,7 @@ def integrate_transect(
             share, slope = _towards_jumps((mi.Float(number) + phase) / mi.Float(nodes), at_start, at_end)
             s = low + (high - low) * share
             position, pupil, density = transect.at(s)
-            f, _, body, _ = view.radiance_on_film(position, pupil, together)
+            f, _, body, _ = view.integrand(position, pupil, together)
             return (sums.plus(slope * density, (s - middle) / half, f, body),)
 
         (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))

@@ -11,7 +11,7 @@ from ..jit.batches import batches
 from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
 from . import node_rules
 from .draft import Draft
-from .lines import NOTHING_SEEN, Sums, apply_rule
+from .node_sums import NOTHING_SEEN, Sums, apply_rule
 from .shortcuts import Finding
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def _one_will_do(draft: Draft) -> bool:
     lens, blur = draft.lens.optics, draft.window.blur
     curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
     will_do = curvature <= POINT * draft.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
-    lambert = all(getattr(emitter, "is_lambertian", bool)() for emitter in draft.view.scene.emitters())
+    lambert = all(getattr(emitter, "is_isotropic", bool)() for emitter in draft.view.scene.emitters())
     taken = will_do and lambert and draft.quadrature.takes("one line")
     why = f"cos⁴θ differs by {curvature:.1e} over the pupil, blur discs reach {blur:.2g} pixels"
     why += "" if lambert else ", the radiance depends on direction"

@@ -19,7 +19,8 @@ from ..jit.batches import batches
 from ..jit.pixel_grid import Grid
 from . import node_rules
 from .draft import Draft, open_share
-from .lines import View, apply_rule
+from .eq9 import View
+from .node_sums import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
 from .quadrature import Quadrature, Solution
 from .transects import integrate_by_transects

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..jit.pixel_grid import Grid
 from ..jit.spectra import scalar
+from .eq9 import eq9, etendue_from_surface
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow
 from .occlusion import hidden, hides_nothing
@@ -143,20 +144,19 @@ class _Refinement:
         # would make a round body noisy. What may jump within a piece, J_n and what hides it, comes from spots all over.
         middle, area = elements.place(index, mi.Point2f(*elements.middle), cut, part)
         spot, _ = elements.place(index, within, cut, part)
-        _, lens_point, weight, cos_theta = lens.arrival(middle.p, mi.warp.square_to_uniform_disk_concentric(aim))
+        _, lens_point, arrival, cos_theta = lens.arrival(middle.p, mi.warp.square_to_uniform_disk_concentric(aim))
         to_lens = dr.normalize(lens_point - middle.p)
         cos_s = dr.dot(middle.n, to_lens)
-        active = (cos_s > 0) & (weight > 0)
+        active = (cos_s > 0) & (arrival > 0)
         if self.hidden:
             active &= ~hidden(self.scene, spot.p, lens_point, active)
         spot.sh_frame.n = spot.n  # not the normal that a mesh is shaded with
         spot.initialize_sh_frame()
         spot.wi = spot.to_local(_turned_along(to_lens, middle.n, spot.n))
         radiance = dr.select(active, scalar(batch.glow.emitter.eval(spot, active)), 0)
-        # dΩ dS |cosθ_s| over A_vd A_pupil/u², that the film's value is a mean radiance whatever the lengths.
         virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
         cell = [_corner(i + x, j + y, m) for x, y in CORNERS]
-        etendue = dr.select(active, cos_s * weight * area * _area(cell) / (dr.pi * virtual_pixel), 0)
+        etendue = dr.select(active, etendue_from_surface(cos_s, area, arrival, _area(cell), virtual_pixel), 0)
 
         discs = {at: lens.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.window.corner))
@@ -173,7 +173,7 @@ class _Refinement:
         polygon = [dr.select(blurred, centre + radius * own, other) for own, other in zip(cell, images, strict=True)]
         for _, _, scale in discs.values():  # no image where a piece reaches through the lens plane
             active &= scale * discs[CORNERS[0]][2] > 0
-        lights = (mi.Float64(radiance) * mi.Float64(etendue), mi.Float64(etendue / dr.square(dr.square(cos_theta))))
+        lights = (eq9(mi.Float64(radiance), mi.Float64(etendue)), mi.Float64(etendue / dr.square(dr.square(cos_theta))))
         canvas.lay(lights, polygon, active)
         dr.eval(radiance, canvas.layers)
         return float(dr.max(radiance)[0])

@@ -1,17 +1,40 @@
-"""Buffers of Mitsuba's meshes."""
+"""Mitsuba's meshes: the one file that uses the names of their buffers, which Mitsuba 3.10 changes."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+POSITIONS, FACES = "vertex_positions", "faces"  # of `mi.traverse`
+
+
+def face_count(mesh: mi.Shape) -> int:
+    """Number of faces of a mesh."""
+    return mesh.face_count()
+
+
+def buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
+    """Vertex positions (3 V,) [mm] and face indices (3 F,) of a mesh.
+
+    Copies that share the data: the arrays that a mesh hands out keep it alive.
+    """
+    return mi.Float(mesh.vertex_positions_buffer()), mi.UInt32(mesh.faces_buffer())
+
 
 def triangles(shape: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
-    """Vertex positions and face indices of a mesh, flat as Mitsuba keeps them."""
-    buffers = mi.traverse(shape)
-    if "vertex_positions" in buffers:
-        # Copies, which share the data: what traverse hands out keeps the shape alive.
-        return mi.Float(buffers["vertex_positions"]), mi.UInt32(buffers["faces"])
-    # A rectangle is a mesh, too, of which only the place is told.
-    corners = mi.Transform4f(buffers["to_world"]) @ mi.Point3f([-1, 1, -1, 1], [-1, -1, 1, 1], 0)
+    """The same of a mesh or of a rectangle, which Mitsuba traces as a mesh without such buffers."""
+    parameters = mi.traverse(shape)
+    if POSITIONS in parameters:
+        return mi.Float(parameters[POSITIONS]), mi.UInt32(parameters[FACES])
+    corners = mi.Transform4f(parameters["to_world"]) @ mi.Point3f([-1, 1, -1, 1], [-1, -1, 1, 1], 0)
     return dr.ravel(corners), mi.UInt32(1, 2, 0, 1, 3, 2)
+
+
+def set_triangles(mesh: mi.Mesh, positions: Any, faces: Any) -> mi.Mesh:
+    """The mesh with these flat vertex positions [mm] and face indices."""
+    parameters = mi.traverse(mesh)
+    parameters[POSITIONS], parameters[FACES] = positions, faces
+    parameters.update()
+    return mesh

@@ -1,34 +1,25 @@
-"""The lens: lens law, diaphragm (Eq. 3), and the discs of the lens plane through which light may pass.
+"""The thin lens: lens law, diaphragm (Eq. 3), and the discs of the lens plane through which light may pass.
 
 Camera frame: lens plane z = 0, optical axis +z towards the object. Lengths in mm, all distances positive magnitudes
-from the lens plane. Pure Python floats in double precision; nothing here knows Mitsuba.
+from the lens plane. Pure Python floats in double precision; nothing here imports Mitsuba.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..runtime.errors import OpticsError
 from ..runtime.numbers import number
+from .discs import Disc
+from .models import LensModel, model_named, model_names
+from .models.diaphragm import Diaphragm
 
 LARGEST = 1e30  # of a lens's numbers and of their inverses: squares stay finite
-MODELS = ("diaphragm", "hrrt", "pinhole", "ripoll")
 FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
-BORDERS = ("lens_diameter", "diaphragm_distance", "numerical_aperture", "image_stop_diameter")
-NUMBERS = ("focal_length", "f_number", *FOCUS, *BORDERS)  # of `Lens.focused`
-EXAMPLES = dict(zip(NUMBERS, ("55", "8", "165", "0.5", "82.5", "20", "5", "0.5", "20"), strict=True))
-
-
-@dataclass(frozen=True)
-class Disc:
-    """Disc of the lens plane open to a virtual point at (x, y, u): centre `shift`·(x, y), radius `radius` [mm].
-
-    `shift` is 0 for a border that lies in the lens plane and 1 for a cone that moves along with the virtual point.
-    """
-
-    shift: float
-    radius: float
+BORDERS = ("lens_diameter", "diaphragm_distance", "image_stop_diameter")
+NUMBERS = ("focal_length", "f_number", *FOCUS, *BORDERS)  # of `Lens.focused`, whatever the model
+EXAMPLES = dict(zip(NUMBERS, ("55", "8", "165", "0.5", "82.5", "20", "5", "20"), strict=True))
 
 
 @dataclass(frozen=True)
@@ -43,9 +34,7 @@ class Lens:
     lens_diameter : the lens border [mm]; None leaves the diaphragm as the only border
     diaphragm_distance : from the lens plane to the diaphragm [mm]; > 0 behind the lens (detector side), < 0 in front
     image_stop_diameter : circular stop on the detector, centred on the optical axis [mm]; None leaves the film's border
-    model : 'diaphragm' (this paper), 'hrrt' (lens border only), 'pinhole' (one line of sight a point), 'ripoll'
-        (acceptance cone of `numerical_aperture` about the detector normal)
-    numerical_aperture : sine of the half angle of that cone, in (0, 1); only for 'ripoll'
+    model : which lines of sight pass, see `mitsuba_fspt.optics.models`
 
     Raises
     ------
@@ -57,9 +46,8 @@ class Lens:
     focus_distance: float
     lens_diameter: float | None = None
     diaphragm_distance: float = 0.0
-    model: str = "diaphragm"
-    numerical_aperture: float | None = None
     image_stop_diameter: float | None = None
+    model: LensModel = field(default_factory=Diaphragm)
 
     @classmethod
     def focused(
@@ -70,11 +58,14 @@ class Lens:
         focus_distance: float | None = None,
         magnification: float | None = None,
         image_distance: float | None = None,
-        **borders: object,
+        model: str = "diaphragm",
+        **numbers: object,
     ) -> Lens:
         """Lens focused by exactly one of u (`focus_distance`), t (`magnification`) or v (`image_distance`).
 
-        Lens law: 1/F = 1/u + 1/v, t = v/u. Raises OpticsError where none or several are given.
+        Lens law: 1/F = 1/u + 1/v, t = v/u. `model`: its name; `numbers`: borders of the lens and the model's own
+        parameters. Raises OpticsError where none or several set the focus, and for a number that belongs to no lens or
+        to another model.
         """
         focal_length = _require_positive("focal_length", focal_length, "mm, for example 55")
         focus = zip(FOCUS, (focus_distance, magnification, image_distance), strict=True)
@@ -97,7 +88,9 @@ class Lens:
             focus_distance = focal_length * value / (value - focal_length)
         else:
             focus_distance = value
-        return cls(focal_length, f_number, focus_distance, **borders)  # type: ignore[arg-type]
+        borders = {name: value for name, value in numbers.items() if name in BORDERS}
+        rest = {name: value for name, value in numbers.items() if name not in BORDERS and value is not None}
+        return cls(focal_length, f_number, focus_distance, **borders, model=_model(model, rest))  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         for name in ("focal_length", "f_number", "focus_distance", *BORDERS):
@@ -111,62 +104,16 @@ class Lens:
                 f"fspt_lens: 'focus_distance' must be > focal_length = {self.focal_length:g} mm for a real image, "
                 f"got {self.focus_distance:g}. Move the camera back or use a shorter lens."
             )
-        if self.model not in MODELS:
-            raise OpticsError(
-                f"fspt_lens: 'model' must be one of {', '.join(MODELS)}, got '{self.model}'. Give one of these."
-            )
         if not math.isfinite(self.diaphragm_distance):
             raise OpticsError(
                 f"fspt_lens: 'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm. Give mm, for "
                 "example 5."
             )
-        self._check_borders()
-
-    def _check_borders(self) -> None:
-        if self.model == "ripoll":
-            if self.numerical_aperture is None or not 0 < self.numerical_aperture < 1:
-                raise OpticsError(
-                    f"fspt_lens: model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}. "
-                    "Give for example 0.5."
-                )
-        elif self.numerical_aperture is not None:
-            raise OpticsError(
-                f"fspt_lens: 'numerical_aperture' = {self.numerical_aperture:g} belongs to model 'ripoll', this is "
-                f"'{self.model}'. Leave it out or set model to 'ripoll'."
-            )
-        if self.model == "hrrt" and self.lens_diameter is None:
-            raise OpticsError(
-                "fspt_lens: model 'hrrt' needs 'lens_diameter', the border that stops its light. Give mm, say 20."
-            )
         if self.image_stop_diameter is not None:
             _require_positive("image_stop_diameter", self.image_stop_diameter, "mm on the detector, for example 20")
         if self.lens_diameter is not None:
             _require_positive("lens_diameter", self.lens_diameter, "mm, for example 20")
-            # Float32 parameters pass through here: D = F/f_num computed twice may differ by its last bit.
-            if self.model == "diaphragm" and self.diaphragm_distance == 0:
-                if self.lens_diameter < self.diaphragm_diameter * (1 - 1e-6):
-                    raise OpticsError(
-                        f"fspt_lens: 'lens_diameter' = {self.lens_diameter:g} mm is smaller than the diaphragm "
-                        f"D = focal_length/f_number = {self.diaphragm_diameter:g} mm. Give a larger lens or "
-                        f"f_number >= {self.focal_length / self.lens_diameter:.4g}."
-                    )
-        if self.model == "diaphragm" and self.diaphragm_distance != 0:
-            if self.lens_diameter is None:
-                raise OpticsError(
-                    f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm needs 'lens_diameter', the "
-                    "second border a line of sight has to pass. Give mm, for example 20."
-                )
-            if self.diaphragm_distance >= self.image_distance:
-                raise OpticsError(
-                    f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be smaller than the image "
-                    f"distance {self.image_distance:g} mm: the diaphragm stands between lens and detector. Give less."
-                )
-            if -self.diaphragm_distance >= self.focus_distance:
-                raise OpticsError(
-                    f"fspt_lens: 'diaphragm_distance' = {self.diaphragm_distance:g} mm must be above -focus_distance = "
-                    f"{-self.focus_distance:g} mm: the diaphragm stands between lens and virtual detector plane. Give "
-                    "more."
-                )
+        self.model.check(self)
 
     @property
     def image_distance(self) -> float:
@@ -191,43 +138,38 @@ class Lens:
     @property
     def pupil_radius(self) -> float:
         """Radius [mm] over which lens points of lines of sight spread: the first disc's, of a pinhole 0."""
-        return 0.0 if self.model == "pinhole" else self.discs[0].radius
+        return self.model.pupil_radius(self)
 
     @property
     def discs(self) -> tuple[Disc, ...]:
-        """The one or two discs of the lens plane a line of sight has to pass; their overlap is the open pupil.
+        """The one or two discs of the lens plane a line of sight has to pass; their overlap is the open pupil."""
+        return self.model.discs(self)
 
-        Eq. 5's β, generalised: the first disc is the one to integrate over, a second one clips it.
-        """
-        u, radius = self.focus_distance, self.diaphragm_diameter / 2
-        if self.model == "ripoll" and self.numerical_aperture is not None:
-            return (Disc(1.0, u * math.tan(math.asin(self.numerical_aperture))),)
-        if self.model == "hrrt" and self.lens_diameter is not None:
-            return (Disc(0.0, self.lens_diameter / 2),)
-        if self.model == "pinhole" or self.diaphragm_distance == 0 or self.lens_diameter is None:
-            return (Disc(0.0, radius),)
-        pupil = self._entrance_pupil_disc(radius)
-        lens = Disc(0.0, self.lens_diameter / 2)
-        return (lens,) if pupil is None else (pupil, lens)
+    def numbers(self) -> dict[str, float | str]:
+        """The model's name, all numbers that are given or follow from the lens law, and D, by name [mm]."""
+        own = {name: getattr(self.model, name) for name in self.model.parameters()}
+        common = {name: getattr(self, name) for name in (*NUMBERS, "diaphragm_diameter")}
+        found = {"model": self.model.name} | common | own
+        return {name: value for name, value in found.items() if value is not None}
 
-    def _entrance_pupil_disc(self, radius: float) -> Disc | None:
-        """The diaphragm's image through the lens, projected from the virtual detector plane onto the lens plane.
 
-        A diaphragm at s behind the lens has its image at s F/(s - F), magnified F/(F - s), seen from the object
-        side; one in front is its own image. A virtual point at (x, u) sees a circle of radius R_p at depth z_p as
-        the disc of the lens plane with radius R_p u/(u - z_p) about -x z_p/(u - z_p).
-        """
-        s, focal, u = self.diaphragm_distance, self.focal_length, self.focus_distance
-        if s < 0:
-            depth, pupil_radius = -s, radius
-        elif s == focal:
-            # The image lies at infinity: the diaphragm stops directions, |slope| <= radius / F, a cone about the axis.
-            return Disc(1.0, u * radius / focal)
-        else:
-            depth, pupil_radius = s * focal / (s - focal), abs(radius * focal / (focal - s))
-        if depth == u:
-            return None  # the diaphragm lies on the detector: a field stop, not a pupil
-        return Disc(-depth / (u - depth), abs(pupil_radius * u / (u - depth)))
+def number_names() -> tuple[str, ...]:
+    """Names of all numbers that a lens of any model may have."""
+    return (*NUMBERS, *(name for model in model_names() for name in model_named(model).parameters()))
+
+
+def _model(name: str, own: dict[str, object]) -> LensModel:
+    """The model of a name with its own parameters; OpticsError for one that is not its own."""
+    kind = model_named(name)
+    for wrong in (parameter for parameter in own if parameter not in kind.parameters()):
+        home = next((other for other in model_names() if wrong in model_named(other).parameters()), None)
+        if home is None:
+            raise OpticsError(f"fspt_lens: no model has a number '{wrong}'. Leave it out or correct its name.")
+        raise OpticsError(
+            f"fspt_lens: '{wrong}' = {own[wrong]:g} belongs to model '{home}', this is '{name}'. Leave it out or set "
+            f"model to '{home}'."
+        )
+    return kind(**own)
 
 
 def configuration_factor(radius: float, distance: float, offset: float) -> float:

@@ -12,14 +12,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..emission.face_table import Faces, edition_of, mark_of
+from ..emission.face_table import FaceTable, edition_of, mark_of
 from ..integral import pupil_form, surface_form
-from ..integral.lines import View
+from ..integral.eq9 import View
 from ..integral.narrow import NarrowLight, narrow_light
 from ..integral.quadrature import Quadrature, Solution
 from ..integral.scene_checks import check_scene, check_surfaces_alone
 from ..integral.shortcuts import SHORTCUTS, Finding
 from ..integral.window import Window, glowing_boxes, window_of
+from ..jit.mesh_buffers import buffers
 from ..jit.pixel_grid import Grid
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
@@ -126,10 +127,10 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         boxes = glowing_boxes(scene)
         return self._window.recall((boxes, _view(lens), everywhere), lambda: window_of(boxes, lens, everywhere))
 
-    def _faces_of(self, scene: mi.Scene) -> Faces | None:
+    def _faces_of(self, scene: mi.Scene) -> FaceTable | None:
         shapes = scene.shapes()
         edition = edition_of(shapes)
-        return None if edition is None else self._faces.recall(edition, lambda: Faces.of(shapes))
+        return None if edition is None else self._faces.recall(edition, lambda: FaceTable.of(shapes))
 
     def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
         emitters = scene.emitters()
@@ -210,7 +211,7 @@ def _places(shapes: list[mi.Shape]) -> list[tuple[float, ...]]:
 def _place(shape: mi.Shape) -> tuple[float, ...]:
     box = (*shape.bbox().min, *shape.bbox().max)
     if shape.is_mesh():
-        return (shape.vertex_positions_buffer().index, *box)
+        return (buffers(shape)[0].index, *box)
     parameters = mi.traverse(shape)
     return (*box, *np.ravel(parameters["to_world"].matrix).tolist()) if "to_world" in parameters else box
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..integral.eq9 import etendue_from_pixel, pixel_etendue
 from ..integral.pupil import Pupil
 from ..jit.spectra import flat_share
-from ..optics.thin_lens import NUMBERS, Lens
+from ..optics.discs import defocus
+from ..optics.thin_lens import Lens, number_names
 from ..runtime.errors import OpticsError
 from .film import default_sampler, number, own_film
 
@@ -73,7 +73,7 @@ class FsptLens(mi.Sensor):
         own_film(props)
         default_sampler(props)
         super().__init__(props)
-        self._numbers = {n: number(props, n) for n in (*NUMBERS, "pixel_pitch") if n in props}
+        self._numbers = {n: number(props, n) for n in (*number_names(), "pixel_pitch") if n in props}
         missing = [name for name in REQUIRED if name not in self._numbers]
         if missing:
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
@@ -119,8 +119,7 @@ class FsptLens(mi.Sensor):
         self._pitch = dr.opaque(mi.Float, self.virtual_pitch)
         # Opaque: another film is the same kernel.
         self._middle = mi.Point2f(*(dr.opaque(mi.Float, 0.5 * int(n)) for n in self.film().size()))
-        # A_vd A_pupil/u² in double first: far away and stopped down, its factors leave the range of float32.
-        self.etendue = self.virtual_pitch**2 * math.pi * (self.optics.discs[0].radius / self.optics.focus_distance) ** 2
+        self.etendue = pixel_etendue(self.virtual_pitch, self.optics.discs[0].radius, self.optics.focus_distance)
         self._flat = dr.opaque(mi.Float, flat_share())
         self._etendue = dr.opaque(mi.Float, self.etendue * flat_share())
         self._solid_angle = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
@@ -140,25 +139,27 @@ class FsptLens(mi.Sensor):
 
     def line_of_sight(
         self, position: mi.Point2f, pupil: mi.Point2f, start: mi.Float | float = 0.0
-    ) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
-        """Ray from the pupil point through the virtual point, its weight cos⁴θ and its cosθ to the optical axis.
+    ) -> tuple[mi.Ray3f, mi.Float, mi.Bool]:
+        """Ray from the pupil point through the virtual point, its cosθ to the optical axis, and whether it passes.
 
         `position` [film pixels], `pupil` [unit disc], on the part that `open_pupil` leaves; the ray begins at depth
-        `start` < u [mm]. The weight is 0 beside the image-plane stop. The mean of weight × radiance over a pixel and
-        the pupil, times `etendue`, is the power on the pixel [W] (Eq. 9).
+        `start` < u [mm]. A line of sight beside the image-plane stop does not pass.
         """
         x = self.virtual_point(position)
         a = self._pupil.on_lens(x, pupil)
         towards = mi.Vector3f(x.x - a.x, x.y - a.y, self._u)
         cos_theta = self._u * dr.rcp(dr.norm(towards))
-        weight = dr.select(self._through_stop(x), dr.square(dr.square(cos_theta)), 0)
         share = start / self._u
         offset = self.m_to_world @ (mi.Vector3f(a.x, a.y, 0) + share * towards)
         # Far from the world's origin that point is rounded: from where it lies then, aim at the same virtual point.
         centre = mi.Point3f(self.m_to_world.translation())
         origin = centre + offset
         lost = offset - (origin - centre)
-        return mi.Ray3f(origin, dr.normalize(self.m_to_world @ towards * (1 - share) + lost)), weight, cos_theta
+        return (
+            mi.Ray3f(origin, dr.normalize(self.m_to_world @ towards * (1 - share) + lost)),
+            cos_theta,
+            self._through_stop(x),
+        )
 
     def open_pupil(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
         """Point of the part of the pupil that a second border (Eq. 5) leaves open at a film position; its share.
@@ -174,10 +175,10 @@ class FsptLens(mi.Sensor):
         a = shift·x + ρ, solved for the virtual point x of the line through r and ρ.
         """
         p = self._in_camera(point)
-        back = (self._u - p.z) / self._u
-        scale = (1 - (1 - self._pupil.shift) * back) * self._pitch
-        centre = self._middle - mi.Vector2f(p.x, p.y) / scale
-        return mi.Point2f(centre), self._pupil.radius * back / scale, scale
+        back, scale = defocus(p.z, self._u, self._pupil.shift)
+        side = scale * self._pitch
+        centre = self._middle - mi.Vector2f(p.x, p.y) / side
+        return mi.Point2f(centre), self._pupil.radius * back / side, side
 
     def arrival(self, point: mi.Point3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
         """Where light of a world point that heads for `pupil` [unit disc] arrives: film position [pixels], lens point.
@@ -194,8 +195,8 @@ class FsptLens(mi.Sensor):
         distance = dr.norm(lens_point - point)
         cos_theta = depth / distance
         # dA_a = (da/dρ)² dA_ρ: the pupil point moves along with x unless the disc is fixed in the lens plane.
-        back = (self._u - depth) / self._u
-        growth = 1 - shift * back / (1 - (1 - shift) * back)
+        back, scale = defocus(depth, self._u, shift)
+        growth = 1 - shift * back / scale
         weight = dr.square(growth * self._u / distance) * cos_theta
         passes = (depth > 0) & dr.isfinite(weight) & self._pupil.passes(x, a)
         return position, lens_point, dr.select(passes, weight, 0), cos_theta
@@ -215,8 +216,7 @@ class FsptLens(mi.Sensor):
         disc = self.optics.discs[0]
         numbers = (self.optics.focus_distance, disc.shift, self.optics.pupil_radius, self.virtual_pitch)
         u, shift, radius, pitch = (dr.opaque(mi.Float64, n) for n in numbers)
-        back = (u - depth) / u
-        scale = 1 - (1 - shift) * back
+        back, scale = defocus(depth, u, shift)
         blur = radius * back / (scale * pitch)
         return dr.select((scale > 0) & ~dr.isnan(blur), blur, dr.inf)
 
@@ -234,7 +234,7 @@ class FsptLens(mi.Sensor):
         p = np.where(lost, 0, points) @ self._to_camera[:3, :3].T + self._to_camera[:3, 3]
         p[..., 2:][lost] = -np.inf
         disc, u = self.optics.discs[0], self.optics.focus_distance
-        scale = 1 - (1 - disc.shift) * (u - p[..., 2:]) / u
+        _, scale = defocus(p[..., 2:], u, disc.shift)
         scale = np.where(scale > 0, scale, 1)  # there the radius is infinite
         centre = 0.5 * np.array(self.film().size(), np.float64) - p[..., :2] / (scale * self.virtual_pitch)
         blur = self.blur_radius(mi.Float64(p[..., 2].ravel())).numpy()
@@ -254,12 +254,12 @@ class FsptLens(mi.Sensor):
         film = self.film()
         position = sample2 * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
         pupil = mi.warp.square_to_uniform_disk_concentric(sample3)
-        ray, weight, _ = self.line_of_sight(position, pupil)
+        ray, cos_theta, passes = self.line_of_sight(position, pupil)
         x = self.virtual_point(position)
-        weight = dr.select(self._pupil.passes(x, self._pupil.on_lens(x, pupil)), weight, 0)
+        passes &= self._pupil.passes(x, self._pupil.on_lens(x, pupil))
         wavelengths, spectrum = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         ray.time, ray.wavelengths = time, wavelengths
-        return ray, spectrum * (weight * self._etendue)
+        return ray, spectrum * (etendue_from_pixel(cos_theta, passes) * self._etendue)
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True

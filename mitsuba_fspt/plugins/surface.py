@@ -8,8 +8,7 @@ import mitsuba as mi
 from ..emission import exitance
 from ..emission.elements import ElementDistribution, elements_of
 from ..emission.face_probe import Probe
-from ..emission.last_flight import LastFlight
-from ..emission.laws import Lambert, law_of
+from ..emission.laws import law_of
 from ..jit.recording import aside, dark_elsewhere, scene_is_checked
 from ..jit.spectra import sample_wavelengths
 from ..runtime.errors import ExitanceError
@@ -79,8 +78,7 @@ class FsptSurface(mi.Emitter):
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
         cb.put("exitance", self.exitance, mi.ParamFlags.Differentiable)
-        if isinstance(self.law, LastFlight):
-            cb.put("fluence", self.law.fluence, mi.ParamFlags.NonDifferentiable)
+        self.law.traverse(cb)
 
     def parameters_changed(self, keys: list[str]) -> None:
         super().parameters_changed(keys)
@@ -225,9 +223,9 @@ class FsptSurface(mi.Emitter):
             raise
         return True
 
-    def is_lambertian(self) -> bool:
+    def is_isotropic(self) -> bool:
         """True where the radiance is the same in all outward directions."""
-        return isinstance(self.law, Lambert)
+        return self.law.isotropic
 
     def is_uniform(self) -> bool:
         """True where J_n is one number."""
@@ -239,7 +237,7 @@ class FsptSurface(mi.Emitter):
 
     def radiance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
         """Radiance [W/mm²/sr] at the corners of every face of a mesh; None where it is not linear or not Lambert's."""
-        corners = exitance.at_corners(self._home(), self.exitance) if self.is_lambertian() else None
+        corners = exitance.at_corners(self._home(), self.exitance) if self.is_isotropic() else None
         if corners is None:
             return None
         profile = self.law.profile(dr.zeros(mi.SurfaceInteraction3f), mi.Vector3f(0, 0, 1), mi.Bool(True))

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..images.image import Image
 from ..integral.quadrature import Quadrature
 from ..integral.shortcuts import SHORTCUTS
-from ..optics.thin_lens import NUMBERS
 from ..runtime import backend
 from ..runtime.errors import SceneError
 from ..runtime.interrupt import ctrl_c_noted
@@ -237,9 +236,7 @@ def _refuse(settings: dict[str, object], method: str) -> None:
 
 def _lens_numbers(lens: mi.Sensor) -> dict[str, float | int | str]:
     optics = lens.optics
-    numbers = {name: getattr(optics, name) for name in ("model", *NUMBERS, "diaphragm_diameter")}
-    numbers["pixel_pitch"] = lens.pixel_pitch
-    return {name: value for name, value in numbers.items() if value is not None}
+    return optics.numbers() | {"pixel_pitch": lens.pixel_pitch}
 
 
 def _versions() -> dict[str, str]:

@@ -90,7 +90,7 @@ def _surfaces_and_pupil(scene: mi.Scene, lens: mi.Sensor) -> tuple[bool, str]:
     """Whether light can be followed from the surface to the pupil, and why not."""
     import mitsuba as mi
 
-    if lens.optics.model == "pinhole":
+    if lens.optics.model.name == "pinhole":
         return False, "a pinhole is no disc that light from the surface could meet"
     for emitter in scene.emitters():
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
@@ -145,7 +145,7 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
         {
             "type": "fspt_lens",
             **numbers,
-            "model": lens.optics.model,
+            "model": lens.optics.model.name,
             "to_world": mi.ScalarTransform4f(np.array(lens.world_transform().matrix, np.float64).reshape(4, 4)),
             "film": {"type": "hdrfilm", "pixel_format": "luminance", **dict(zip(names, sizes, strict=True))},
             "sampler": {"type": sampler},

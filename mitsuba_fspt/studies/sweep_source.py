@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from ..optics.thin_lens import NUMBERS, Lens
+from ..optics.thin_lens import Lens, number_names
 from ..rendering.scene_rules import REFERENCE, check_values, is_number
 from ..rendering.scene_xml import read_xml
 
@@ -40,7 +40,7 @@ class SceneSource:
         ours = []
         for node in self._lens:
             reference = REFERENCE.fullmatch(node.get("value", ""))
-            if reference and node.tag == "float" and node.get("name") in (*NUMBERS, "pixel_pitch"):
+            if reference and node.tag == "float" and node.get("name") in (*number_names(), "pixel_pitch"):
                 found[reference[1]] = (*found.get(reference[1], ()), node.get("name", ""))
                 ours.append(node)
         elsewhere = " ".join(text for node in self._nodes if node not in ours for text in node.attrib.values())
@@ -54,7 +54,7 @@ class SceneSource:
     def _check_lens(self) -> None:
         """Before the work, not after half of it; what the scene file does not say in so many words is left to it."""
         given = {node.get("name", ""): self._xml.fill_in(node.get("value", "")) for node in self._lens}
-        numbers = {name: text for name, text in given.items() if name in NUMBERS}
+        numbers = {name: text for name, text in given.items() if name in number_names()}
         plain = all(map(is_number, numbers.values())) and "include" not in {node.tag for node in self._lens}
         if plain and {"focal_length", "f_number"} <= set(numbers):
             model = given.get("model", "diaphragm")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..emission.elements import Elements, elements_of
+from ..integral.eq9 import eq9
 from ..integral.occlusion import hidden
 from ..integral.scene_checks import check_scene
 from ..jit.batches import batch_slices, numbered
@@ -101,5 +102,5 @@ def _add(
     # |r_vd - r| = |u - z|/cosθ_d; A_vd last, so that nothing leaves float32 on the way.
     defocus = dr.opaque(mi.Float, lens.optics.focus_distance) - distance * cos_d
     solid_angle = cos_d * dr.square(cos_d * dr.opaque(mi.Float, lens.virtual_pitch) / defocus)
-    added = mi.Float64(radiance * cos_s) * mi.Float64(area) * mi.Float64(solid_angle)
+    added = eq9(mi.Float64(radiance), mi.Float64(cos_s) * mi.Float64(area) * mi.Float64(solid_angle))
     dr.scatter_add(power, dr.select(lit, added, 0), number, lit)

@@ -62,7 +62,7 @@ def test_packets_of_lines_of_sight_meet_what_single_ones_meet(build, tmp_path, m
     """Seen to fail with packets of which one line of sight in sixteen is lost."""
     scene, found = build(tmp_path / "body.ply"), []
     for most in (-1.0, np.inf):
-        monkeypatch.setattr("mitsuba_fspt.integral.lines.NODES_TOGETHER", most)
+        monkeypatch.setattr("mitsuba_fspt.integral.node_sums.NODES_TOGETHER", most)
         monkeypatch.setattr("mitsuba_fspt.integral.jumps.TRANSECTS_TOGETHER", most)
         found.append(solved(scene))
     singly, together = found
@@ -133,14 +133,14 @@ def test_a_corner_nine_decades_dimmer_than_its_neighbour_keeps_its_light(tmp_pat
     import drjit as dr
     import mitsuba as mi
 
-    from mitsuba_fspt.emission.face_table import Faces
+    from mitsuba_fspt.emission.face_table import FaceTable
 
     corners, exitance = [[0, 0, 0], [0, 1, 0], [0, 0, 1]], np.array([1.0, 1e-9, 2e-9])
     path = write_ply(tmp_path / "face.ply", corners, [[0, 1, 2]], vertex=exitance)
     face = mi.load_dict({"type": "ply", "filename": str(path), "emitter": glow(attribute())})
     pi = dr.zeros(mi.PreliminaryIntersection3f, 3)
     pi.valid, pi.t, pi.prim_uv, pi.shape = True, 1.0, mi.Point2f([0, 1, 0], [0, 0, 1]), mi.ShapePtr(face)
-    found = Faces.of([face]).radiance(pi, mi.Vector3f(-1, 0, 0))
+    found = FaceTable.of([face]).radiance(pi, mi.Vector3f(-1, 0, 0))
     np.testing.assert_allclose(found.numpy(), exitance / np.pi, rtol=1e-6)
 
 

@@ -292,7 +292,7 @@ def test_fluence_updated_by_itself_is_followed():
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        ({"emission": "phong"}, "'emission' must be one of lambert, fresnel, last_flight, got 'phong'"),
+        ({"emission": "phong"}, "'emission' must be one of fresnel, lambert, last_flight, got 'phong'"),
         ({"emission": "fresnel"}, "emission 'fresnel' needs 'int_ior'"),
         ({"emission": "fresnel", "int_ior": 0.9}, "'int_ior' must be >= 1 and finite, got 0.9"),
         ({"emission": "fresnel", "int_ior": float("inf")}, "'int_ior' must be >= 1 and finite, got inf"),

@@ -8,7 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from mitsuba_fspt.optics.thin_lens import BORDERS, Disc, Lens, configuration_factor
+from mitsuba_fspt.optics.discs import Disc
+from mitsuba_fspt.optics.thin_lens import Lens, configuration_factor, number_names
 from mitsuba_fspt.runtime.errors import OpticsError
 
 FOCI = [{"focus_distance": 165.0}, {"magnification": 0.5}, {"image_distance": 82.5}]
@@ -50,7 +51,7 @@ def test_diaphragm_is_focal_length_over_f_number():
 )
 def test_every_model_has_one_disc(borders, disc):
     """D = 50/5 = 10 mm; without a diaphragm the lens border; sine 0.6 is tangent 0.75."""
-    (found,) = Lens(50.0, 5.0, 200.0, **borders).discs
+    (found,) = Lens.focused(50.0, 5.0, focus_distance=200.0, **borders).discs
     assert (found.shift, found.radius) == (disc.shift, pytest.approx(disc.radius, rel=1e-12))
 
 
@@ -86,7 +87,8 @@ def test_discs_of_a_diaphragm_off_the_lens_pass_what_a_traced_ray_passes(s):
 def test_diaphragm_in_the_rear_focal_plane_stops_directions():
     """|slope| ≤ (D/2)/F for every virtual point: Ripoll's cone."""
     telecentric = Lens(55.0, 5.5, 165.0, lens_diameter=40.0, diaphragm_distance=55.0).discs[0]
-    cone = Lens(55.0, 5.5, 165.0, model="ripoll", numerical_aperture=math.sin(math.atan(5 / 55))).discs[0]
+    sine = math.sin(math.atan(5 / 55))
+    cone = Lens.focused(55.0, 5.5, focus_distance=165.0, model="ripoll", numerical_aperture=sine).discs[0]
     assert telecentric.shift == cone.shift == 1
     assert telecentric.radius == pytest.approx(cone.radius, rel=1e-12)
 
@@ -157,11 +159,11 @@ def test_small_numbers_of_numpy_are_plain_numbers():
     assert Lens(np.int8(50), 8, np.int8(100)).image_distance == 100
 
 
-@pytest.mark.parametrize("name", ["focal_length", "f_number", "focus_distance", *BORDERS])
+@pytest.mark.parametrize("name", [name for name in number_names() if name not in ("magnification", "image_distance")])
 def test_what_is_no_number_is_refused_with_one_that_would_do(name):
     """Seen to fail: 20 for a numerical aperture, which is below 1."""
     good = {"focal_length": 55.0, "f_number": 8.0, "focus_distance": 165.0, "lens_diameter": 30.0}
     good |= {"model": "ripoll"} if name == "numerical_aperture" else {}
     with pytest.raises(OpticsError, match=f"'{name}' must be a number, got '8'") as caught:
-        Lens(**good | {name: "8"})
-    Lens(**good | {name: float(re.search(r"Give for example (.*)\.$", str(caught.value))[1])})
+        Lens.focused(**good | {name: "8"})
+    Lens.focused(**good | {name: float(re.search(r"Give for example (.*)\.$", str(caught.value))[1])})

@@ -1,0 +1,20 @@
+"""Lambert's law: the same radiance in all outward directions (Eq. 1)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import drjit as dr
+import mitsuba as mi
+
+from . import ExitLaw
+
+
+class Lambert(ExitLaw):
+    """L = J_n/π (Eq. 1): ∫ cosθ dΩ over the hemisphere is π."""
+
+    isotropic: ClassVar[bool] = True
+
+    def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """1/π [1/sr]."""
+        return mi.Float(dr.inv_pi)

@@ -1,0 +1,124 @@
+"""Eq. 9: the power P [W] that light of a surface with exitance J_n brings to a pixel.
+
+    P = 1/π ∫_S J_n α β |cosθ_s| |cosθ_d| / |r_vd − r|² dA_vd dS                  (Eq. 9, as the paper prints it)
+      = ∫_pixel ∫_pupil L(r, ω) · cos⁴θ/u² dA_a dA_vd                            (Eq. M.5, pupil form)
+      = ∫_S ∫_pupil L(r, ω) · cosθ_s cosθ/|r − a|² dA_a dS                       (Eq. M.9, surface form)
+
+Every form sums radiance times étendue over lines of sight, P = Σ L · dG, and each calls `eq9` for it. A line of sight
+runs from a point a of the pupil through a point r_vd of the virtual detector plane z = u to the first surface point r;
+L(r, ω) [W/mm²/sr] is the exit law's radiance there (Lambert: J_n/π), 0 where α or β is 0. The forms differ in how they
+choose the lines, and hence in the element of étendue dG [mm² sr] that each line stands for. docs/model.md derives them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..emission.face_table import FaceTable
+from ..jit.mesh_buffers import face_count
+from ..jit.spectra import at_one_wavelength, scalar
+from .shortcuts import Finding
+
+if TYPE_CHECKING:
+    from .window import Window
+
+
+def eq9(radiance: Any, etendue: Any) -> Any:
+    """Power [W] that lines of sight with this radiance [W/mm²/sr] and étendue [mm² sr] carry: L · dG (Eq. 9).
+
+    With an étendue relative to the pixel's own, `pixel_etendue`, the mean radiance on film [W/mm²/sr].
+    """
+    return etendue * radiance
+
+
+def pixel_etendue(side: float, pupil_radius: float, focus_distance: float) -> float:
+    """Étendue A_vd A_pupil/u² [mm² sr] of a virtual pixel of a `side` and a pupil at `focus_distance` u [mm] (Eq. M.6).
+
+    In double precision: far away and stopped down its factors leave the range of float32.
+    """
+    return side**2 * math.pi * (pupil_radius / focus_distance) ** 2
+
+
+def etendue_from_pixel(cos_theta: mi.Float, passes: mi.Bool, open_share: mi.Float | float = 1.0) -> mi.Float:
+    """Étendue of a line of sight of the pupil form over that of its pixel: cos⁴θ times the open share (Eq. M.5).
+
+    cos_theta : cosine of the line to the optical axis
+    passes : False where a stop holds the line back
+    open_share : share of the pupil that a second border leaves open to the virtual point
+    """
+    return open_share * dr.select(passes, dr.square(dr.square(cos_theta)), 0)
+
+
+def etendue_from_surface(
+    cos_s: mi.Float, area: mi.Float, arrival: mi.Float, cell: mi.Float, virtual_pixel: mi.Float
+) -> mi.Float:
+    """Étendue dS cosθ_s dΩ of a line of sight of the surface form over that of a pixel (Eq. M.9).
+
+    cos_s : cosine of the line to the normal of the surface element
+    area : of the element, dS [mm²]
+    arrival : solid angle of the pupil over A_pupil/u² (`FsptLens.arrival`)
+    cell : area of the part of the unit disc, all of which is the pupil, that the line stands for
+    virtual_pixel : area A_vd of a virtual pixel [mm²]
+    """
+    return cos_s * arrival * area * cell / (dr.pi * virtual_pixel)
+
+
+@dataclass(frozen=True)
+class View:
+    """What a lens sees of a scene along lines of sight, which begin at the depth `start` [mm], before all surfaces.
+
+    Mitsuba moves the limb of a small sphere far from where a ray begins by a share of the distance squared over its
+    radius; a late start avoids it. `detail`: triangles of the scene a pixel.
+    """
+
+    scene: mi.Scene
+    lens: mi.Sensor
+    start: mi.Float
+    faces: FaceTable | None
+    detail: float
+
+    @classmethod
+    def of(cls, scene: mi.Scene, lens: mi.Sensor, window: Window, faces: FaceTable | None = None) -> View:
+        """The view of a window's pixels through Mitsuba's surface records, or through the scene's face table."""
+        shapes = scene.shapes()
+        # In packets Embree misses some points of a disk.
+        meshes = all(shape.is_mesh() for shape in shapes)
+        triangles = sum(map(face_count, shapes)) if meshes else math.inf
+        start = dr.opaque(mi.Float, lens.clear_depth(scene.bbox()))
+        return cls(scene, lens, start, faces, triangles / math.prod(window.shape))
+
+    def integrand(
+        self, position: mi.Point2f, pupil: mi.Point2f, together: bool = False
+    ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+        """Integrand of Eq. 9 in the pupil form on one line of sight, and what the line met.
+
+        position : on the film [pixels]
+        pupil : on the unit disc; stands for as large a share of what is open of the pupil
+        together : trace the lines of neighbouring array entries as one packet
+
+        Returns the integrand [W/mm²/sr], whose mean over pixel and pupil, times the pixel's étendue, is P; the radiance
+        [W/mm²/sr]; the number of the shape met, 0 for none; its depth [mm].
+        """
+        pupil, open_share = self.lens.open_pupil(position, pupil)
+        ray, cos_theta, passes = self.lens.line_of_sight(position, pupil, self.start)
+        at_one_wavelength(ray)
+        pi = self.scene.ray_intersect_preliminary(ray, coherent=together, active=passes)
+        radiance = self.faces.radiance(pi, ray.d) if self.faces else self._by_record(pi, ray)
+        shape = mi.Float(dr.reinterpret_array(mi.UInt32, pi.shape))
+        integrand = eq9(radiance, etendue_from_pixel(cos_theta, passes, open_share))
+        return integrand, radiance, shape, self.start + pi.t * cos_theta
+
+    def finding(self) -> Finding:
+        """Whether lines of sight do without Mitsuba's surface records."""
+        why = "meshes alone, J_n linear on every face, the same radiance in all directions"
+        return Finding("record", self.faces is not None, why if self.faces else f"wanted: {why}")
+
+    def _by_record(self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Float:
+        """Exit law's radiance [W/mm²/sr] where a ray ends, on any shape and with any law."""
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        return scalar(si.emitter(self.scene).eval(si))

@@ -1,0 +1,75 @@
+"""Models of a lens: which lines of sight a lens lets through. One class a file, found by the file's name."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, ClassVar
+
+from ...runtime.by_name import class_named, names_in
+from ...runtime.errors import OpticsError
+from ...runtime.numbers import number
+
+if TYPE_CHECKING:
+    from ..discs import Disc
+    from ..thin_lens import Lens
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """What a lens of focal length F, f-number and focus lets through. Base of all models.
+
+    The fields of a subclass are its own parameters, numbers of `fspt_lens` that no other model has; None: not given.
+    `EXAMPLES` has a number, as text, for each of them. docs/extending.md shows a whole model.
+
+    Raises
+    ------
+    OpticsError : a parameter is no number.
+    """
+
+    EXAMPLES: ClassVar[dict[str, str]] = {}
+
+    def __post_init__(self) -> None:
+        for name in self.parameters():
+            if (value := getattr(self, name)) is not None:
+                checked = number(f"fspt_lens: '{name}'", value, OpticsError, self.EXAMPLES[name])
+                object.__setattr__(self, name, checked)
+
+    @property
+    def name(self) -> str:
+        """The name of the model in a scene file, that of its file."""
+        return type(self).__module__.rpartition(".")[2]
+
+    @classmethod
+    def parameters(cls) -> tuple[str, ...]:
+        """Names of the parameters that this model alone has."""
+        return tuple(field.name for field in fields(cls))
+
+    def check(self, lens: Lens) -> None:
+        """Raise OpticsError where the lens and this model's parameters do not fit together."""
+
+    def discs(self, lens: Lens) -> tuple[Disc, ...]:
+        """The one or two discs of the lens plane that a line of sight has to pass; their overlap is the open pupil.
+
+        Eq. 5's β, generalised: the first disc is the one to integrate over, a second one clips it.
+        """
+        raise NotImplementedError
+
+    def pupil_radius(self, lens: Lens) -> float:
+        """Radius [mm] over which the lens points of lines of sight spread: the first disc's."""
+        return self.discs(lens)[0].radius
+
+
+def model_names() -> tuple[str, ...]:
+    """Names of all models, in alphabetical order."""
+    return names_in(sys.modules[__name__])
+
+
+def model_named(name: str) -> type[LensModel]:
+    """The model's class. Raises OpticsError where there is none of this name."""
+    try:
+        return class_named(sys.modules[__name__], name)
+    except KeyError:
+        raise OpticsError(
+            f"fspt_lens: 'model' must be one of {', '.join(model_names())}, got '{name}'. Give one of these."
+        ) from None

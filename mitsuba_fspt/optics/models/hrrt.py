@@ -1,0 +1,28 @@
+"""The HRRT model: no diaphragm, the border of the lens stops the light (the paper's reference 16)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ...runtime.errors import OpticsError
+from ..discs import Disc
+from . import LensModel
+
+if TYPE_CHECKING:
+    from ..thin_lens import Lens
+
+
+@dataclass(frozen=True)
+class Hrrt(LensModel):
+    """Lines of sight pass the border of the lens, D = `lens_diameter`."""
+
+    def check(self, lens: Lens) -> None:
+        if lens.lens_diameter is None:
+            raise OpticsError(
+                "fspt_lens: model 'hrrt' needs 'lens_diameter', the border that stops its light. Give mm, say 20."
+            )
+
+    def discs(self, lens: Lens) -> tuple[Disc, ...]:
+        """The border of the lens, which `check` requires."""
+        return (Disc(0.0, (lens.lens_diameter or 0.0) / 2),)

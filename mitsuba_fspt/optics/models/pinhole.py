@@ -1,0 +1,24 @@
+"""The pinhole model: one line of sight through the middle of the lens (the paper's reference 15)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ..discs import Disc
+from . import LensModel
+
+if TYPE_CHECKING:
+    from ..thin_lens import Lens
+
+
+@dataclass(frozen=True)
+class Pinhole(LensModel):
+    """Every line of sight passes the middle of the lens; the étendue is that of the diaphragm D = F/f_num."""
+
+    def discs(self, lens: Lens) -> tuple[Disc, ...]:
+        return (Disc(0.0, lens.diaphragm_diameter / 2),)
+
+    def pupil_radius(self, lens: Lens) -> float:
+        """0: all lens points are one."""
+        return 0.0
