@@ -1,8 +1,8 @@
-"""Footprints: polygons of light on the film, shared out among the pixels they overlap, exactly.
+"""Footprints: polygons of light on the film, distributed exactly over the pixels that they overlap.
 
-An edge adds, within every pixel it crosses, the area to its right; running sums along the rows turn the edges of a
-polygon into its overlap with every pixel, however large or small it is. All sums are of whole numbers, so that they
-come out alike in whatever order threads add, and that nothing is left beside a polygon.
+Each edge adds the area to its right to every pixel that it crosses; cumulative sums along the rows turn the edges of a
+polygon into its overlap with every pixel, whatever its size. All sums are of integers: the result does not depend on
+the order in which threads add, and is exactly 0 outside a polygon.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DENSEST = 2.0**57  # quanta a pixel of an honest polygon at the most
 
 
 class Canvas:
-    """Film of `shape` (h, w) on which light of several kinds is laid, in whole multiples of each kind's quantum.
+    """Film of `shape` (h, w) that accumulates several quantities, each in integer multiples of its quantum.
 
     `centres` False: a pixel gets the light on its area; True: the density at its centre times that area. A pixel
     holds up to 2⁶² quanta, a polygon `DENSEST` quanta a pixel.
@@ -35,14 +35,14 @@ class Canvas:
         self._height, self._width = (dr.opaque(mi.Float64, side) for side in shape)
 
     def pictures(self) -> list[NDArray[np.float64]]:
-        """All light of each kind laid so far, shape (h, w)."""
+        """Each quantity accumulated so far, shape (h, w)."""
         steps = [mi.Int64(layer).numpy().reshape(self.shape) for layer in self.layers]
         return [np.cumsum(step, axis=1) * quantum for step, quantum in zip(steps, self.quanta, strict=True)]
 
     def lay(self, lights: Sequence[mi.Float64], polygon: Sequence[mi.Point2f], active: mi.Bool) -> None:
-        """Spread `lights` evenly over a polygon of four corners [pixels]; what lies beside the canvas is lost.
+        """Distribute `lights` evenly over a polygon of four corners [pixels]; the part beside the canvas is dropped.
 
-        A polygon that is not convex or too small for its light is folded over: a speck in its middle stands for it.
+        A polygon that is not convex, or too small for its light, is replaced by a small square about its middle.
         """
         lights = [light * scale for light, scale in zip(lights, self._scales, strict=True)]
         ring, active = _sound(polygon, lights), mi.Bool(active)

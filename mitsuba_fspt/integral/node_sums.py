@@ -1,4 +1,4 @@
-"""What the nodes of a rule see from a pixel: sums over lines of sight, each as one loop of one kernel."""
+"""Sums of the integrand over the nodes of a rule, as one loop of one kernel."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from ..jit.loops import repeat
 from . import node_rules
 from .eq9 import View
 
-# Triangles a pixel up to which neighbouring lines of sight meet the same ones and are the faster traced together:
-# nodes of pixels in a square, transects of one pixel.
+# Triangles a pixel up to which packets of neighbouring lines of sight are traced faster than single ones: packets of
+# the nodes of pixels in a square, and of the transects of one pixel.
 NODES_TOGETHER, TRANSECTS_TOGETHER = 4.0, 0.5
 
 
 @dataclass
 class Sums:
-    """What the nodes of a rule see from a pixel, or from each of many.
+    """Weighted sums over the nodes of a rule, for each pixel.
 
-    value, x, y : integrand of Eq. 9 [W/mm²/sr], and times the place on the pupil, weighted and summed
-    contrast : how far the integrand bends, see `rules.Rule`
-    coverage : share of the lines of sight that meet something
-    nearest, farthest : depths of what is met [mm]; inf and 0 where nothing is
+    value, x, y : Σ w f of the integrand f of Eq. 9 [W/mm²/sr]; Σ w f a_x and Σ w f a_y with the pupil point a
+    contrast : Σ c f, a measure of the integrand's curvature, see `node_rules.Rule`
+    coverage : share of the lines of sight that meet a surface
+    nearest, farthest : depths of the surface points met [mm]; inf and 0 where there is none
     """
 
     value: mi.Float
@@ -40,7 +40,7 @@ NOTHING_SEEN = (0, 0, 0, 0, 0, math.inf, 0)
 
 
 def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule) -> Sums:
-    """What one rule sees from every pixel."""
+    """Sums of one rule for every pixel."""
     table = [mi.Float(column) for column in (*rule.pupil.T, *rule.pixel.T, rule.weight, rule.contrast)]
     together = view.detail <= NODES_TOGETHER
 

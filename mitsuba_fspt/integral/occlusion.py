@@ -1,4 +1,4 @@
-"""What hides light on its way from the surface to the lens, and bodies that hide nothing of themselves."""
+"""Occlusion between surface and lens, and shapes that cannot occlude themselves."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import mitsuba as mi
 
 from ..emission.elements import elements_of
 
-GRAZING = 0.01  # rad above the surface; light that leaves it flatter is next to none
-LIFT = 1e-6  # of the body's size: what float32 needs to stand clear of the surface
-DIRECTIONS = 4  # looked along from each element
+GRAZING = 0.01  # rad above the surface; less light than this leaves it at flatter angles
+LIFT = 1e-6  # of the shape's size: distance from the surface that float32 resolves
+DIRECTIONS = 4  # rays from each element
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-# Where a ray begins on its way from the surface: so much of the largest coordinate and of the distance [mm/mm], some
-# hundred times what float32 can be wrong by.
+# Start of a ray that leaves the surface: these shares of the largest coordinate and of the distance [mm/mm], some
+# hundred times the rounding of float32.
 CLEAR, CLEAR_OF_DISTANCE = 2.0**-16, 2.0**-20
 
 
 def hidden(scene: mi.Scene, point: mi.Point3f, lens_point: mi.Point3f, active: mi.Bool) -> mi.Bool:
     """True where a surface lies between a surface point and a point of the lens.
 
-    The ray begins a little further on its way. Mitsuba's own would be lifted off along the normal, by 9e-5 of the
-    point's distance from the origin, and with them the borders of all shadows: by a hundredth of a pixel.
+    The ray starts a little further along its own direction. Mitsuba's `spawn_ray` would move the start along the normal
+    by 9e-5 of the point's distance from the origin, and with it the borders of shadows by a hundredth of a pixel.
     """
     way = mi.Vector3f(lens_point - point)
     distance = dr.norm(way)
@@ -34,9 +34,10 @@ def hidden(scene: mi.Scene, point: mi.Point3f, lens_point: mi.Point3f, active: m
 
 
 def hides_nothing(scene: mi.Scene) -> bool:
-    """True of one body alone that no grazing line from any of its elements meets again.
+    """True for a scene of one shape that no grazing ray from any of its elements meets again.
 
-    Not asked of the mesh edge by edge: a shallow dent in a fine mesh bends inwards by less than rounding at each.
+    A test of the mesh edge by edge would miss a shallow dent in a fine mesh, where each edge bends by less than
+    rounding.
     """
     shapes = scene.shapes()
     if len(shapes) != 1:

@@ -1,4 +1,4 @@
-"""The pupil in the lens plane: the disc that lines of sight start on, and what a second border leaves open of it."""
+"""The pupil in the lens plane: the disc on which lines of sight start, clipped by a second border."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ..optics.thin_lens import Lens
 
 
 class Pupil:
-    """The discs of a lens plane as kernel parameters; a point of the pupil is one of the unit disc.
+    """The discs of the lens plane as kernel parameters. Points of the pupil are given on the unit disc.
 
-    shift, radius : of the first disc, whose centre `shift`·x is seen from virtual point x [1, mm]; a pinhole's radius
-        is 0
+    shift, radius : of the first disc: its centre is at `shift`·x for virtual point x, its radius is in mm, 0 for a
+        pinhole
     """
 
     def __init__(self, optics: Lens) -> None:
@@ -21,7 +21,7 @@ class Pupil:
         self._borders = [tuple(dr.opaque(mi.Float, n) for n in (d.shift, d.radius)) for d in optics.discs[1:]]
 
     def on_lens(self, x: mi.Point2f, pupil: mi.Point2f) -> mi.Point2f:
-        """Point [mm] of the lens plane at which virtual point x sees a `pupil` point."""
+        """Point a = shift·x + radius·pupil [mm] of the lens plane, for virtual point x [mm]."""
         return self.shift * x + self.radius * pupil
 
     def passes(self, x: mi.Point2f, a: mi.Point2f) -> mi.Bool:
@@ -32,9 +32,9 @@ class Pupil:
         return passes
 
     def opened(self, x: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
-        """Pupil point that a second border leaves open to virtual point x, and the share of the pupil that is.
+        """Image of a pupil point in the part of the pupil that a second border leaves open, and the share of that part.
 
-        Even on the open part if `pupil` is on the disc, so that rules over the disc need not know of the border.
+        The map preserves area up to that share, so that any rule over the unit disc integrates over the open part.
         """
         share = mi.Float(1)
         for shift, radius in self._borders:
@@ -46,10 +46,10 @@ class Pupil:
 def onto_overlap(point: mi.Point2f, centre: mi.Vector2f, radius: mi.Float) -> tuple[mi.Point2f, mi.Float]:
     """Point of the overlap of the unit disc with the disc of `radius` about `centre`, for a `point` of the unit disc.
 
-    The map is continuous and preserves area but for the factor that comes back second, overlap over unit disc: no rule
-    over the disc has to know of a border. A chord at right angles to the line of centres goes to the chord with the
-    same share of area below it, a point of it to the point at the same share of its length. Below the height where the
-    circles meet the second disc bounds the overlap, above it the unit disc.
+    The map is continuous and preserves area up to the factor that comes back second, overlap over unit disc (Eq. M.13).
+    A chord at right angles to the line of centres goes to the chord with the same share of area below it, a point of it
+    to the point at the same share of its length. Below the height at which the circles meet the second disc bounds the
+    overlap, above it the unit disc does.
     """
     distance = dr.norm(centre)
     up = dr.select(distance > 0, centre / distance, mi.Vector2f(1, 0))

@@ -1,10 +1,10 @@
 """Eq. 9 in its pupil form: P = étendue · mean over pixel and pupil of cos⁴θ · L(first surface point on the line).
 
-A ladder of three rules. Four nodes over pupil and pixel serve every pixel, one where the pupil is as good as a point
-and blur stays in the pixel; where the picture bends, twelve; where the line of sight jumps (a silhouette, an occluder,
-an edge of J_n), transects: curves across the edge through pixel and pupil together. Along each the jumps are found by
-bisection and the pieces between them are integrated on their own, so that only what changes along the edge is left to
-sample.
+Three rules in turn. Every pixel takes four nodes over pupil and pixel, or one node where the pupil is nearly a point
+and the blur disc stays in the pixel; pixels on which the picture is curved take twelve; pixels on which the radiance
+jumps from line to line (a silhouette, an occluder, an edge of J_n) take transects: curves across the edge through pixel
+and pupil together. Along each transect the jumps are found by bisection and the pieces between them are integrated one
+by one, so that only the variation along the edge is left to sample. Each line of sight is `eq9.View.integrand`.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def solve(
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
-    Only pixels of the `window` are looked at, the others are dark. `light`: of surfaces as if in focus, see
-    `NarrowLight`. Where a partial solution is `known` no work is done, and what comes back is rough.
+    Only pixels of the `window` are computed, the others are dark. `light`: of surfaces as if in focus, see
+    `NarrowLight`. Pixels on which a partial solution is `known` are not refined.
     """
     draft = Draft(view, window, quadrature, known)
     rough = first_nodes(draft, light)

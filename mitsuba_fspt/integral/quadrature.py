@@ -1,4 +1,4 @@
-"""The accuracy asked for and the picture that comes out: plain data between the integrator and its callers."""
+"""Accuracy parameters of the deterministic integral, and the picture that it returns."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ..runtime.numbers import number, whole
 from .shortcuts import SHORTCUTS, Finding
 
 DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
-# That two rules agree says little about what both miss, and float32 tells lines of sight apart only so far: shares of
-# the tolerance and of the brightest pixel below which no error is said to be.
+# No error is stated below these shares of the tolerance and of the brightest pixel: two rules that agree may both miss
+# something, and float32 resolves lines of sight only so far.
 LEAST_CLAIM, FLOAT32_FLOOR = 0.05, 2e-7
 
 
 @dataclass(frozen=True)
 class Quadrature:
-    """All accuracy knobs of the deterministic integral, each with the error it bounds.
+    """All accuracy parameters of the deterministic integral, each with the error it bounds.
 
     rtol : absolute error of every pixel, relative to the brightest pixel; 0 < rtol < 1 (default 1e-3)
     domain : 'pupil' (lines of sight from the pixel) or 'surface' (power spread from surface elements)
@@ -55,7 +55,7 @@ class Quadrature:
 
     @property
     def least_error(self) -> float:
-        """Share of the brightest pixel below which no error is said to be."""
+        """Smallest error that is stated, over the brightest pixel."""
         return max(FLOAT32_FLOOR, LEAST_CLAIM * self.rtol)
 
     def takes(self, shortcut: str) -> bool:
@@ -67,9 +67,10 @@ class Quadrature:
 class Solution:
     """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
 
-    `rays` counts the lines of sight of all pixels together, in the EXR header `nodes`; `levels` tells humans what each
-    rung of the refinement did.
-    A partial solution is the whole picture only on the pixels `where`. `findings`: what was left out, and why.
+    rays : lines of sight of all pixels together, in the EXR header `nodes`
+    levels : what each step of the refinement did, as text
+    where : pixels on which a partial solution is complete
+    findings : which shortcuts were taken, and why
     """
 
     power: NDArray[np.float64]

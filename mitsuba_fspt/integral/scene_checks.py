@@ -1,5 +1,8 @@
-"""What a scene must be before anything is traced: float32 can tell its lengths and its light apart, something glows,
-J_n is sane, the camera stands outside, no surface lies in another."""
+"""Checks of a scene before it is traced.
+
+Float32 resolves its lengths and powers, something glows, J_n is sane, the camera is outside every closed surface, no
+surface lies in another one.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +18,18 @@ from ..jit.mesh_buffers import triangles
 from ..runtime.errors import ExitanceError, SceneError
 from ..runtime.plugin_types import is_lens, is_surface
 
-COARSEST = 0.1  # virtual pixels by which float32 may move a line of sight
-# W/mm² and W that leave room in float32 for the shares and the faint parts of a picture.
+COARSEST = 0.1  # virtual pixels: the largest displacement of a line of sight by float32
+# W/mm² and W: outside these ranges float32 cannot hold the sums and the faint parts of a picture.
 EXITANCES, FAINTEST = (1e-32, 1e32), 1e-36
-STRETCH = 1e-4  # by which float32 may make lengths and right angles differ
+STRETCH = 1e-4  # relative: the most that float32 may change lengths and right angles by
 MATRIX_ROUNDING = 1e-6  # of float32, in sums of products
-PROBES = 1 << 10  # surface points of a shape at which another one is looked for
-LIFT = 1e-6  # of the largest coordinate: what lies no further before a surface cannot be told from it
-PARALLEL = 0.999  # cosine of normals: bodies that poke into each other meet, too, but at an angle
+PROBES = 1 << 10  # surface points of a shape that are tested for a second surface
+LIFT = 1e-6  # of the largest coordinate: surfaces closer than this coincide in float32
+PARALLEL = 0.999  # cosine of the normals of coincident surfaces; shapes that intersect meet at an angle
 
 
 def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
-    """Raise SceneError or ExitanceError where the scene cannot give a picture; the message says how to mend it."""
+    """Raise SceneError or ExitanceError where the scene cannot give a picture; the message says how to fix it."""
     check_lens(sensor)
     check_rounding(sensor)
     if not scene.emitters():
@@ -56,7 +59,7 @@ def check_lens(sensor: mi.Sensor) -> None:
 
 
 def check_rounding(lens: mi.Sensor) -> None:
-    """Raise SceneError where float32 cannot tell the lines of sight of neighbouring pixels apart."""
+    """Raise SceneError where float32 moves lines of sight by more than a tenth of a pixel."""
     if lens.rounding <= COARSEST:
         return
     side = lens.virtual_pitch
@@ -68,7 +71,7 @@ def check_rounding(lens: mi.Sensor) -> None:
 
 
 def check_surfaces_alone(scene: mi.Scene) -> None:
-    """Raise SceneError where light comes from beyond all surfaces: the integral counts that of surfaces."""
+    """Raise SceneError for an environment emitter: the integral sums the light of surfaces alone."""
     for emitter in scene.emitters():
         if emitter.is_environment():
             raise SceneError(
@@ -78,7 +81,7 @@ def check_surfaces_alone(scene: mi.Scene) -> None:
 
 
 def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
-    """Raise ExitanceError where J_n or the power that comes of it leaves the range of float32."""
+    """Raise ExitanceError where J_n, or the power on a pixel that follows from it, leaves the range of float32."""
     brightest = emitter.brightest
     name = f"fspt_surface: 'exitance' of shape '{emitter.get_shape().id()}'"
     if not EXITANCES[0] <= brightest <= EXITANCES[1]:
@@ -95,7 +98,7 @@ def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
 
 
 def check_placement(shape: mi.Shape) -> None:
-    """Raise SceneError where a sphere, cylinder or disk is not traced where its parameters say."""
+    """Raise SceneError where Mitsuba would trace a sphere, cylinder or disk elsewhere than its `to_world` puts it."""
     kind = shape.class_name().lower()
     if kind not in ("sphere", "cylinder", "disk"):
         return
@@ -110,10 +113,10 @@ def check_placement(shape: mi.Shape) -> None:
     if kind == "disk":
         return
     lengths = np.linalg.norm(axes, axis=0)
-    alike = lengths[: 3 if kind == "sphere" else 2]  # a cylinder is as long as it likes
+    alike = lengths[: 3 if kind == "sphere" else 2]  # a cylinder may have any length
     cosines = axes.T @ axes / np.outer(lengths, lengths) - np.eye(3)
     if np.ptp(alike) > STRETCH * alike.max() or np.abs(cosines).max() > STRETCH:
-        # Mitsuba traces it round, its parameters are not.
+        # Mitsuba traces a round shape, its parameters describe another one.
         raise SceneError(
             f"scene: 'to_world' of {kind} '{shape.id()}' stretches or shears it, which it cannot follow. Give a "
             "rotation (about an axis of length 1), a translation and one scale, or a mesh."
@@ -121,12 +124,12 @@ def check_placement(shape: mi.Shape) -> None:
 
 
 def check_alone(scene: mi.Scene, emitter: mi.Emitter) -> None:
-    """Raise SceneError where a second surface lies in this one: which of them is seen would be chance."""
+    """Raise SceneError where a second surface coincides with this one: which of them a ray meets is undefined."""
     shape = emitter.get_shape()
     doubled = 0
     if shape.is_mesh():
         buffers = triangles(shape)
-        # Looked at once for as long as the mesh stays the same.
+        # Counted once for each state of the mesh.
         if [b.index for b in buffers] != [b.index for b in emitter.single_faces]:
             doubled = _doubled_faces(*buffers)
             emitter.single_faces = () if doubled else buffers

@@ -1,4 +1,4 @@
-"""What the integral leaves out because a scene does not need it: names, and what was found about a scene."""
+"""Shortcuts: work of the integral that a scene does not need, and whether it was left out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHORTCUTS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """Whether shortcut `name` was taken, and `why` or why not, in a few words with the numbers that decided."""
+    """Whether shortcut `name` was taken, and the reason `why`, with the numbers that decided."""
 
     name: str
     taken: bool

@@ -1,11 +1,11 @@
 """Eq. 9 in its surface form: P = ∫ L |cosθ_s| dS dΩ over the surface and over the pupil as a surface point sees it.
 
-The surface is cut into pieces, the pupil into M × M cells. What a piece sends through a cell is found along one line of
-sight and laid on the film where the image of the piece through the cell's middle lies: a polygon, shared out exactly
-among the pixels. Neighbours share the cells' middles, so that their images tile the film without gap or overlap, and
-all power lands, once. What makes the form stiff where pixels look for surface points, the blur disc that shrinks to
-nothing at z = u, is here only a small shift of images. Of a body smaller than its blur disc it is the other way round:
-there the cells, seen through the piece's middle, tile the disc.
+The surface is cut into pieces, the pupil into M × M cells. The power that a piece sends through a cell follows from one
+line of sight (`eq9`) and is laid on the image of the piece through the cell's middle: a polygon on the film,
+distributed exactly over the pixels. Neighbouring pieces share the cells' middles, so that their images tile the film
+without gap or overlap, and all power arrives, once. A blur disc that shrinks to nothing at z = u, which makes a sum
+over surface points stiff, only shifts images here. For a shape smaller than its blur disc the cells, imaged through the
+piece's middle, tile the disc instead.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from .window import Window
 # Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second
 # level both pieces and cells are refined, or what one of them does wrong would pass for converged.
 FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
-BLURRED = 0.5  # of the blur radius: a piece of a small body that is smaller is sent as one point
-DARK_LINES = 4096  # lines of sight a pixel before one is dark that no light has reached: two levels may pass it by
+BLURRED = 0.5  # of the blur radius: a smaller piece of a small shape is imaged as one point
+DARK_LINES = 4096  # lines of sight a pixel before a pixel without light counts as dark: two levels may miss it
 SAFETY = 3.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
-MEMORY = 0.4  # of what the level before was thought to leave may be left: two levels may agree by chance
+CARRIED = 0.4  # of the estimate of the level before that the next one keeps: two levels may agree by chance
 # No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
 # bits, and thousands of roundings on a pixel stay below 1e-9 of any but the faintest.
 HEADROOM, RESOLUTION, COVERAGE_QUANTUM = 2.0**4, 2.0**-56, 2.0**-50
@@ -52,9 +52,9 @@ def solve(
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
-    Only pixels of the `window` are looked at, the others are dark. With `where`, of its shape, only the pixels marked
-    there are the whole picture; 0 elsewhere. `least_peak`: mean radiance on film [W/mm²/sr] that the brightest pixel is
-    known to have at least.
+    Only pixels of the `window` are computed, the others are dark. With `where`, of its shape, the solution is complete
+    on the pixels marked there and 0 elsewhere. `least_peak`: lower bound of the brightest pixel's mean radiance on film
+    [W/mm²/sr].
 
     `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
     Coverage counts the lines of sight that meet a glowing surface, not those that meet a dark one. Raises SceneError
@@ -76,7 +76,7 @@ class _Refinement:
         self.levels: list[str] = []
 
     def run(self, where: NDArray[np.bool_] | None, least_peak: float) -> Solution:
-        # To look for what may hide is quicker for a few pixels than to make sure that nothing does.
+        # For a few pixels shadow rays are quicker than the test that makes them unnecessary.
         self.hidden = where is not None or not self._hides_nothing()
         shown = self.window.shown()
         mark = where = shown if where is None else where
@@ -89,7 +89,7 @@ class _Refinement:
             value, coverage = self._level(lines, mark)
             change = np.where(mark, np.abs(value - self.value), 0)
             recent, last = SAFETY * grid.array(grid.spread_max(grid.flat(change))), recent
-            estimate = recent if last is None else np.maximum(recent, MEMORY * last)
+            estimate = recent if last is None else np.maximum(recent, CARRIED * last)
             # All elements with light on a marked pixel were refined: only there is the new picture whole.
             self.error[mark], self.value[mark], self.coverage[mark] = estimate[mark], value[mark], coverage[mark]
             mark = self.error > self._tolerance(least_peak)
@@ -110,7 +110,7 @@ class _Refinement:
 
     def _findings(self) -> tuple[Finding, ...]:
         dark, count = (sum(getattr(glow, name) for glow in self.glows) for name in ("dark", "count"))
-        seen = "one surface may hide another" if self.hidden else "one convex body hides nothing of itself"
+        seen = "one surface may hide another" if self.hidden else "one convex shape hides nothing of itself"
         return (
             Finding("occlusion", not self.hidden, seen),
             Finding("dark", dark > 0, f"{dark} of {count} elements are dark"),
@@ -134,14 +134,14 @@ class _Refinement:
         return canvas.pictures()
 
     def _lay(self, canvas: Canvas, batch: Batch) -> float:
-        """Lay the light of a batch on the canvas, one line of sight a lane; the largest radiance it met."""
+        """Lay the light of a batch of lines of sight on the canvas; returns the largest radiance met [W/mm²/sr]."""
         elements, lens = batch.glow.elements, self.lens
         (index, cut, number), m = batch.lanes(), dr.opaque(mi.UInt32, batch.cells)
         part, i, j = number // (m * m), number % m, number // m % m
         within, aim = _strata(i, j, m, index * STRIDE + part)
 
-        # What is smooth comes from a piece's middle, by the midpoint rule: normals that differed from line to line
-        # would make a round body noisy. What may jump within a piece, J_n and what hides it, comes from spots all over.
+        # Smooth factors are taken at a piece's middle (midpoint rule): normals that differ from line to line would make
+        # a round shape noisy. J_n and occlusion, which may jump within a piece, are sampled all over it.
         middle, area = elements.place(index, mi.Point2f(*elements.middle), cut, part)
         spot, _ = elements.place(index, within, cut, part)
         _, lens_point, arrival, cos_theta = lens.arrival(middle.p, mi.warp.square_to_uniform_disk_concentric(aim))
@@ -162,9 +162,9 @@ class _Refinement:
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.window.corner))
         middle = _middle(i, j, m)
         images = [centre - origin + radius * middle for centre, radius, _ in discs.values()]
-        # The image of a piece through the cell's middle or, where that is smaller than a cell's or a body's own blur
-        # disc holds all of it, of the cell through the piece's middle: either way what lies side by side, on the
-        # surface or on the pupil, lies side by side on the film.
+        # The image of a piece through the cell's middle; or, where that is smaller than a cell's image or the blur disc
+        # covers the whole shape, of the cell through the piece's middle. Either way neighbours on the surface or on the
+        # pupil are neighbours on the film.
         share = 1 / len(elements.corners)
         centre = sum((discs[at][0] for at in elements.corners), mi.Point2f(0)) * share - origin
         radius = sum((discs[at][1] for at in elements.corners), mi.Float(0)) * share

@@ -1,4 +1,4 @@
-"""The effective virtual space (Eq. 4) on the film: the pixels whose lines of sight can meet the phantom at all."""
+"""The effective virtual space (Eq. 4) on the film: the pixels whose lines of sight can meet an emitting surface."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .node_rules import GAP
 
 Boxes = tuple[tuple[float, ...], ...]
 
-MOST_RIM = 16  # pixels: no further is looked beyond the crop window for a silhouette that four nodes may miss
+MOST_RIM = 16  # pixels: widest rim around the crop window that is searched for silhouettes
 
 
 @dataclass(frozen=True)
 class Window:
     """Rectangle of pixels: `top`, `left` of its first one from that of the crop window, `shape` (h, w); `full` (h, w).
 
-    It may reach a rim of pixels beyond the crop window, which are computed but not shown: their neighbours inside have
-    to know of a silhouette there. `blur`: the largest radius of a blur disc of what glows [pixels].
+    It may include a rim of pixels beyond the crop window, which are computed but not shown: a silhouette there affects
+    the estimates of their neighbours inside. `blur`: the largest radius of a blur disc of emitting surfaces [pixels].
     """
 
     top: int
@@ -42,7 +42,7 @@ class Window:
 
     @property
     def inner(self) -> tuple[slice, slice]:
-        """Rows and columns of the crop window in this one; what is left is the rim."""
+        """Rows and columns of the crop window in this one; the other pixels are the rim."""
         return self._common()[0]
 
     @property
@@ -91,7 +91,7 @@ class Window:
         return float(image[self.inner].max(initial=0.0) or image.max(initial=0.0))
 
     def _common(self) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-        """What both windows have, in this one and in the crop window."""
+        """Slices of the pixels that both windows share, in this one and in the crop window."""
         ends = [
             (max(start, 0), max(min(start + size, most), max(start, 0)))
             for start, size, most in zip((self.top, self.left), self.shape, self.full, strict=True)
@@ -101,15 +101,15 @@ class Window:
 
 
 def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -> Window:
-    """Window of the pixels with a line of sight into the bounding box of what glows; all if it surrounds the lens.
+    """Window of the pixels with a line of sight into the bounding box of emitting surfaces; all if it holds the lens.
 
-    Or all `everywhere`. Light of other emitters than `fspt_surface` can come from any surface of the scene.
+    `everywhere`: all pixels. Emitters other than `fspt_surface` count with the bounding box of the scene.
     """
     return window_of(glowing_boxes(scene), lens, everywhere)
 
 
 def glowing_boxes(scene: mi.Scene) -> Boxes:
-    """Corners of the bounding boxes of what glows, as numbers: xyz of the lowest and of the highest."""
+    """Bounding boxes of emitting surfaces, each as (x, y, z) of its lowest and of its highest corner [mm]."""
     emitters = scene.emitters()
     direct = all(is_surface(emitter) for emitter in emitters)
     boxes = [emitter.bbox() for emitter in emitters] if direct else [scene.bbox()]
