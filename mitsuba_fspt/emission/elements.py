@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -143,6 +144,8 @@ class ParameterElements(Elements):
         self._round = _ROUND.get(shape.class_name())
         if self._round:
             self._to_world = mi.Transform4f(mi.traverse(shape)["to_world"])
+            axes = np.array(self._to_world.matrix, np.float64).reshape(4, 4)[:3, :3]
+            self._scales = [dr.opaque(mi.Float, length) for length in np.linalg.norm(axes, axis=0)]
 
     def place(
         self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
@@ -173,16 +176,23 @@ class ParameterElements(Elements):
         """
         if not self._round:
             return self.shape.eval_parameterization(uv)
-        local, normal = self._round(uv)
+        local, normal = self._round.at(uv)
         p, n = self._to_world @ local, dr.normalize(self._to_world @ normal)
         pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(uv))
         pi.valid, pi.t, pi.prim_uv = True, 1.0, mi.Point2f(local.x, local.y)
-        return self.shape.compute_surface_interaction(mi.Ray3f(p + n, -n), pi, mi.RayFlags.All)
+        si = self.shape.compute_surface_interaction(mi.Ray3f(p + n, -n), pi, mi.RayFlags.All)
+        # Mitsuba derives these from the rounded point, which has few digits left on a small shape far off.
+        si.n = dr.select(dr.dot(si.n, n) < 0, -n, n)
+        si.sh_frame.n, si.uv = si.n, uv
+        return si
 
     def _cell(self, si: mi.SurfaceInteraction3f) -> mi.Point2u:
         return mi.Point2u(dr.clip(si.uv * self.side, 0, self.side - 1))
 
     def _area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """dA/d(sample) of a cell [mm²]: in closed form for round shapes, whose derivatives Mitsuba rounds likewise."""
+        if self._round:
+            return self._round.area(si.uv, *self._scales) / self.count
         return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / self.count
 
 
@@ -206,7 +216,22 @@ def _on_disk(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
     return mi.Point3f(uv.x * cos_phi, uv.x * sin_phi, 0), mi.Normal3f(0, 0, 1)
 
 
-_ROUND = {"Sphere": _on_sphere, "Cylinder": _on_cylinder, "Disk": _on_disk}
+@dataclass(frozen=True)
+class _Round:
+    """A round shape: point and normal `at` its parameters on the unit shape, and dA/(du dv) there.
+
+    `area` takes (u, v) and the lengths [mm] of the axes of `to_world`.
+    """
+
+    at: Callable[[mi.Point2f], tuple[mi.Point3f, mi.Normal3f]]
+    area: Callable[..., mi.Float]
+
+
+_ROUND = {
+    "Sphere": _Round(_on_sphere, lambda uv, a, b, c: 2 * dr.pi**2 * a * b * dr.sin(dr.pi * uv.y)),
+    "Cylinder": _Round(_on_cylinder, lambda uv, a, b, c: dr.two_pi * a * c),
+    "Disk": _Round(_on_disk, lambda uv, a, b, c: dr.two_pi * a * b * uv.x),
+}
 
 
 def _of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:

@@ -29,6 +29,7 @@ from ..runtime.errors import SceneError
 MEANINGLESS = ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "timeout")
 LEAST_DISPLACEMENT = 1e-3  # pixels; more only far from the world's origin
 NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
+UNCERTAINTY = 2.0  # factor to which that light is known
 
 
 class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
@@ -107,11 +108,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             solution = known.completed_by(pupil_form.solve(view, window, quadrature, narrow.in_focus, known))
         else:
             solution = pupil_form.solve(view, window, quadrature, narrow.in_focus)
-        if not cut.any():
-            return solution
-        # There lines of sight may miss what is narrow.
-        missed = window.expand(np.where(cut, narrow.on_pixels, 0)) * lens.etendue - solution.power
-        return replace(solution, error=np.maximum(solution.error, missed))
+        return replace(solution, error=np.maximum(solution.error, _missed(narrow, where, cut, window, lens, solution)))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or its robust twin where it loses rays; looked at once a scene."""
@@ -214,6 +211,19 @@ def _place(shape: mi.Shape) -> tuple[float, ...]:
         return (buffers(shape)[0].index, *box)
     parameters = mi.traverse(shape)
     return (*box, *np.ravel(parameters["to_world"].matrix).tolist()) if "to_world" in parameters else box
+
+
+def _missed(
+    narrow: NarrowLight, where: NDArray[np.bool_], cut: NDArray[np.bool_], window: Window, lens: mi.Sensor, of: Solution
+) -> NDArray[np.float64]:
+    """Narrow light that lines of sight may miss [W], shape (h, w): on pixels that did not take the surface form.
+
+    where : pixels of the window that took the surface form
+    cut : those that the image-plane stop cuts, which take lines of sight however bright they are
+    """
+    light = np.where(where, 0, UNCERTAINTY * narrow.on_pixels)
+    bright = window.expand(np.where(cut, light, 0)) * lens.etendue - of.power
+    return np.maximum(bright, window.expand(np.where(cut, 0, light)) * lens.etendue)
 
 
 def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
