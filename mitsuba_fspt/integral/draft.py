@@ -11,7 +11,8 @@ import mitsuba as mi
 from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
 from . import node_rules
 from .eq9 import View
-from .quadrature import Quadrature, Solution
+from .quadrature import Quadrature
+from .solution import Solution
 from .window import Window
 
 if TYPE_CHECKING:

@@ -22,7 +22,8 @@ from .draft import Draft, open_share
 from .eq9 import View
 from .node_sums import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
-from .quadrature import Quadrature, Solution
+from .quadrature import Quadrature
+from .solution import Solution
 from .transects import integrate_by_transects
 from .window import Window, visible_window
 

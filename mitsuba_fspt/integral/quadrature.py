@@ -1,16 +1,13 @@
-"""Accuracy parameters of the deterministic integral, and the picture that it returns."""
+"""Accuracy parameters of the deterministic integral."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
 
 from ..runtime.errors import SceneError
 from ..runtime.numbers import number, whole
-from .shortcuts import SHORTCUTS, Finding
+from .shortcuts import SHORTCUTS
 
 DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
 # No error is stated below these shares of the tolerance and of the brightest pixel: two rules that agree may both miss
@@ -61,35 +58,3 @@ class Quadrature:
     def takes(self, shortcut: str) -> bool:
         """True unless this one of `SHORTCUTS` is switched off."""
         return shortcut not in self.shortcuts_off
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
-
-    rays : lines of sight of all pixels together, in the EXR header `nodes`
-    levels : what each step of the refinement did, as text
-    where : pixels on which a partial solution is complete
-    findings : which shortcuts were taken, and why
-    """
-
-    power: NDArray[np.float64]
-    error: NDArray[np.float64]
-    coverage: NDArray[np.float64]
-    rays: int
-    levels: tuple[str, ...] = field(default=())
-    where: NDArray[np.bool_] = field(default_factory=lambda: np.ones((), bool))
-    findings: tuple[Finding, ...] = field(default=())
-
-    def completed_by(self, rest: Solution) -> Solution:
-        """This partial solution on its own pixels, `rest` elsewhere."""
-        planes = zip((self.power, self.error, self.coverage), (rest.power, rest.error, rest.coverage), strict=True)
-        power, error, coverage = (np.where(self.where, own, other) for own, other in planes)
-        return Solution(
-            power,
-            error,
-            coverage,
-            self.rays + rest.rays,
-            self.levels + rest.levels,
-            findings=self.findings + rest.findings,
-        )

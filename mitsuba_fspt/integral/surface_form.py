@@ -21,8 +21,9 @@ from .eq9 import eq9, etendue_from_surface
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow
 from .occlusion import hidden, hides_nothing
-from .quadrature import Quadrature, Solution
+from .quadrature import Quadrature
 from .shortcuts import Finding
+from .solution import Solution
 from .window import Window
 
 # Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second

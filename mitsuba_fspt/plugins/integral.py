@@ -16,9 +16,10 @@ from ..emission.face_table import FaceTable, edition_of, mark_of
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
 from ..integral.narrow import NarrowLight, narrow_light
-from ..integral.quadrature import Quadrature, Solution
+from ..integral.quadrature import Quadrature
 from ..integral.scene_checks import check_scene, check_surfaces_alone
 from ..integral.shortcuts import SHORTCUTS, Finding
+from ..integral.solution import Solution
 from ..integral.window import Window, glowing_boxes, window_of
 from ..jit.mesh_buffers import buffers
 from ..jit.pixel_grid import Grid

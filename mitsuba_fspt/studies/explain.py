@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     import mitsuba as mi
 
-    from ..integral.quadrature import Quadrature, Solution
+    from ..integral.quadrature import Quadrature
+    from ..integral.solution import Solution
 
 ROUNDS = 3  # a median of; once where a round takes longer than LONG [s]
 LONG = 5.0

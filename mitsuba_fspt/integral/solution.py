@@ -1,0 +1,42 @@
+"""The picture that the deterministic integral returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .shortcuts import Finding
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
+
+    rays : lines of sight of all pixels together, in the EXR header `nodes`
+    levels : what each step of the refinement did, as text
+    where : pixels on which a partial solution is complete
+    findings : which shortcuts were taken, and why
+    """
+
+    power: NDArray[np.float64]
+    error: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+    rays: int
+    levels: tuple[str, ...] = field(default=())
+    where: NDArray[np.bool_] = field(default_factory=lambda: np.ones((), bool))
+    findings: tuple[Finding, ...] = field(default=())
+
+    def completed_by(self, rest: Solution) -> Solution:
+        """This partial solution on its own pixels, `rest` elsewhere."""
+        planes = zip((self.power, self.error, self.coverage), (rest.power, rest.error, rest.coverage), strict=True)
+        power, error, coverage = (np.where(self.where, own, other) for own, other in planes)
+        return Solution(
+            power,
+            error,
+            coverage,
+            self.rays + rest.rays,
+            self.levels + rest.levels,
+            findings=self.findings + rest.findings,
+        )
