@@ -19,7 +19,7 @@ LEAST_CLAIM, FLOAT32_FLOOR = 0.05, 2e-7
 class Quadrature:
     """All accuracy parameters of the deterministic integral, each with the error it bounds.
 
-    rtol : absolute error of every pixel, relative to the brightest pixel; 0 < rtol < 1 (default 1e-3)
+    rtol : absolute error of every pixel, relative to the brightest pixel; 2e-7 <= rtol < 1 (default 1e-3)
     domain : 'pupil' (lines of sight from the pixel) or 'surface' (power spread from surface elements)
     pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
     max_nodes : lines of sight a pixel may take at most, four in any case (domain 'surface': on average, 256 in any
@@ -39,6 +39,11 @@ class Quadrature:
         object.__setattr__(self, "max_nodes", nodes)
         if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
             raise SceneError(f"fspt_integral: 'rtol' must be in (0, 1), got {self.rtol:g}. Give for example 1e-3.")
+        if self.rtol < FLOAT32_FLOOR:
+            raise SceneError(
+                f"fspt_integral: 'rtol' = {self.rtol:g} is below {FLOAT32_FLOOR:g}, the rounding of single precision. "
+                f"Give {FLOAT32_FLOOR:g} or more."
+            )
         if self.domain not in DOMAINS:
             raise SceneError(f"fspt_integral: 'domain' must be one of {', '.join(DOMAINS)}, got '{self.domain}'.")
         if self.pixel not in PIXELS:

@@ -28,6 +28,13 @@ class Solution:
     where: NDArray[np.bool_] = field(default_factory=lambda: np.ones((), bool))
     findings: tuple[Finding, ...] = field(default=())
 
+    def beyond(self, rtol: float) -> tuple[int, float]:
+        """Number of pixels whose error is above `rtol` times the brightest pixel; the largest error over that pixel."""
+        peak = self.power.max(initial=0.0)
+        if not peak > 0:
+            return 0, 0.0
+        return int(np.count_nonzero(self.error > rtol * peak)), float(self.error.max() / peak)
+
     def completed_by(self, rest: Solution) -> Solution:
         """This partial solution on its own pixels, `rest` elsewhere."""
         planes = zip((self.power, self.error, self.coverage), (rest.power, rest.error, rest.coverage), strict=True)

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples in flight
+DARK = (
+    "the picture is dark, no light reaches the lens. Check the lens's 'to_world', and that the faces' normals point "
+    "outwards"
+)
 Progress = Callable[[str, float], None]
 
 
@@ -62,9 +66,11 @@ def render(
     seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
     progress : called with what is being done and the share done
 
+    The metadata say in `warnings`, if anything, that `rtol` was not reached or that the picture is dark.
+
     Raises
     ------
-    SceneError, OpticsError, ExitanceError, BackendError : what is wrong and how to mend it.
+    SceneError, OpticsError, ExitanceError, BackendError : what is wrong and how to fix it.
     """
     scene = loaded(scene)
     backend.ensure_variant()
@@ -92,6 +98,8 @@ def render(
             *planes, how = _sample(scene, lens, integrator, spp, seed, tell)
         check_interrupt()
     how["wall_time"] = time.perf_counter() - start
+    if not planes[0].any():
+        how["warnings"] = DARK
     return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
 
 
@@ -107,6 +115,11 @@ def _integrate(
     how = {"method": "integral", **asdict(quadrature), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
     how["shortcuts_off"] = ", ".join(sorted(quadrature.shortcuts_off)) or "nothing"
     how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
+    pixels, largest = solution.beyond(quadrature.rtol)
+    if pixels:
+        how["warnings"] = (
+            f"rtol {quadrature.rtol:g} not reached on {pixels} pixels (largest error {largest:.1e} of the peak)"
+        )
     return solution.power, solution.error, solution.coverage, how
 
 
