@@ -1,6 +1,9 @@
-"""Small scenes for the tests that render, in the camera frame: lens in the origin, +z to the object, +x to the left.
+"""Small scenes for the tests: objects in the camera frame or around the world's origin, and scene files.
 
-All on one film of 40 × 32 pixels, whose size is compiled into the kernels: so the tests share them.
+`camera_scene` puts the lens into the origin: +z to the object, +x to the left. All its films are of 40 × 32 pixels,
+a size that is compiled into the kernels, so that the tests share them. `world_scene` has its objects around the origin
+and the `lens` on the +x axis. Importing this module sets a variant of Mitsuba unless one is set; the fixture `mono`
+sets llvm_ad_mono.
 """
 
 from __future__ import annotations
@@ -10,42 +13,23 @@ from pathlib import Path
 import numpy as np
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.runtime import backend
 
-SCENES = Path(__file__).parents[1] / "scenes"
-WIDTH, HEIGHT = 40, 32
-FOCAL, F_NUMBER, FOCUS, MAGNIFICATION = 55.0, 2.8, 165.0, 0.5
-RADIUS = FOCAL / F_NUMBER / 2  # of the pupil [mm]
-PITCH = 0.4  # mm
-SIDE = PITCH / MAGNIFICATION  # of a virtual pixel [mm]
+backend.ensure_variant()
 
+import mitsuba as mi  # noqa: E402
 
-def load(name, **parameters):
-    """A scene of scenes/ with its whole field on the small film."""
-    whole = {"width": WIDTH, "height": HEIGHT, "pixel_pitch": 256 * 0.108 / HEIGHT}
-    return fspt.load(SCENES / f"{name}.xml", **whole | parameters)
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
 
-def scene(*shapes, exitance=1.0, crop=None, lamp=None, **lens):
-    """Scene of shapes that glow with `exitance` [W/mm²], unless they bring their own 'glow', before the lens.
+def glow(exitance=1e-3):
+    """An emitter with this number or texture."""
+    return {"type": "fspt_surface", "exitance": exitance}
 
-    `lens`: parameters of fspt_lens, by default 55 mm f/2.8 at magnification 1/2. `crop`: x, y, width, height.
-    `lamp`: another emitter.
-    """
-    import mitsuba as mi
 
-    lens = {"focal_length": FOCAL, "f_number": F_NUMBER, "pixel_pitch": PITCH} | lens
-    if not {"magnification", "focus_distance", "image_distance"} & set(lens):
-        lens["magnification"] = MAGNIFICATION
-    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "luminance"}
-    if crop:
-        names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
-        film |= dict(zip(names, crop, strict=True))
-    glow = {"type": "fspt_surface", "exitance": exitance}
-    bodies = {f"shape_{k}": {"glow": dict(glow), **shape} for k, shape in enumerate(shapes)}
-    sensor = {"type": "fspt_lens", "film": film, **lens}
-    bodies |= {"lamp": lamp} if lamp else {}
-    whole = {"type": "scene", "embree_use_robust_intersections": True, "sensor": sensor, **bodies}
-    return mi.load_dict(whole, optimize=False)
+def attribute(name="vertex_exitance", **settings):
+    """The texture of a mesh attribute."""
+    return {"type": "mesh_attribute", "name": name, **settings}
 
 
 def even_disc(count):
@@ -55,19 +39,54 @@ def even_disc(count):
     return np.sqrt(number / count) * np.stack([np.cos(angle), np.sin(angle)])
 
 
+# --- in the camera frame ---
+
+WIDTH, HEIGHT = 40, 32
+FOCAL, F_NUMBER, FOCUS, MAGNIFICATION = 55.0, 2.8, 165.0, 0.5
+RADIUS = FOCAL / F_NUMBER / 2  # of the pupil [mm]
+PITCH = 0.4  # mm
+SIDE = PITCH / MAGNIFICATION  # of a virtual pixel [mm]
+
+
+def load_scene(name, **parameters):
+    """A scene of scenes/ with its whole field on the small film."""
+    whole = {"width": WIDTH, "height": HEIGHT, "pixel_pitch": 256 * 0.108 / HEIGHT}
+    return fspt.load(SCENES / f"{name}.xml", **whole | parameters)
+
+
+def camera_scene(*shapes, exitance=1.0, crop=None, lamp=None, **optics):
+    """Scene of shapes that glow with `exitance` [W/mm²], unless they bring their own 'emitter', before the lens.
+
+    `optics`: parameters of fspt_lens, by default 55 mm f/2.8 at magnification 1/2. `crop`: x, y, width, height.
+    `lamp`: another emitter.
+    """
+    optics = {"focal_length": FOCAL, "f_number": F_NUMBER, "pixel_pitch": PITCH} | optics
+    if not {"magnification", "focus_distance", "image_distance"} & set(optics):
+        optics["magnification"] = MAGNIFICATION
+    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "luminance"}
+    if crop:
+        names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+        film |= dict(zip(names, crop, strict=True))
+    objects = {f"shape_{k}": {"emitter": glow(exitance), **shape} for k, shape in enumerate(shapes)}
+    sensor = {"type": "fspt_lens", "film": film, **optics}
+    objects |= {"lamp": lamp} if lamp else {}
+    whole = {"type": "scene", "embree_use_robust_intersections": True, "sensor": sensor, **objects}
+    return mi.load_dict(whole, optimize=False)
+
+
 def disk(z, radius=100.0, x=0.0, y=0.0, tilt=0.0):
     """Disk that faces the lens, turned about the vertical by `tilt` degrees."""
-    import mitsuba as mi
-
     place = mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 1, 0], 180 + tilt).scale(radius)
     return {"type": "disk", "to_world": place}
 
 
 def sphere(z, radius, x=0.0, y=0.0):
+    """Sphere without an emitter of its own."""
     return {"type": "sphere", "center": [x, y, z], "radius": radius}
 
 
 def power(of, **accuracy):
+    """Picture of a scene by the integral, (h, w) [W]."""
     return fspt.render(of, method="integral", **accuracy).power
 
 
@@ -115,3 +134,90 @@ def collected(radius, centre, pupil=RADIUS):
     dx, d2 = px - x, (px - x) ** 2 + py**2 + z**2
     shine = np.maximum(dx * sine[:, None] - z * cosine[:, None], 0) * z / (np.pi * d2**2)
     return weight @ (shine @ part) * 2 * np.pi * radius**2
+
+
+# --- around the world's origin ---
+
+
+def write_ply(path, vertices, faces, *, vertex=None, face=None):
+    """Path of an ASCII PLY with one exitance a vertex or a face, which Mitsuba reads as `vertex_exitance`, …"""
+    header = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in "xyz"]
+    header += ["property float exitance_x"] if vertex is not None else []
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header += ["property float exitance_x"] if face is not None else []
+    rows = ["{:.9g} {:.9g} {:.9g}".format(*v) for v in vertices]
+    if vertex is not None:
+        rows = [f"{row} {value:.9g}" for row, value in zip(rows, vertex, strict=True)]
+    corners = [f"3 {a} {b} {c}" for a, b, c in faces]
+    if face is not None:
+        corners = [f"{row} {value:.9g}" for row, value in zip(corners, face, strict=True)]
+    path.write_text("\n".join([*header, "end_header", *rows, *corners, ""]))
+    return path
+
+
+def lens(size=16, pitch=0.8, distance=165.0, **settings):
+    """An f/8 lens on the +x axis that looks at the origin; `settings` replace or add parameters, None removes one."""
+    width, height = size if isinstance(size, tuple) else (size, size)
+    numbers = {
+        "type": "fspt_lens",
+        "focal_length": 55.0,
+        "f_number": 8.0,
+        "magnification": 0.5,
+        "pixel_pitch": pitch,
+        "to_world": mi.ScalarTransform4f().look_at([distance, 0, 0], [0, 0, 0], [0, 0, 1]),
+        "film": {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "luminance"},
+    }
+    return {name: value for name, value in (numbers | settings).items() if value is not None}
+
+
+def world_scene(*shapes, sensor=None, integrator=None, robust=True):
+    """A loaded scene of these shape dictionaries, `shape_0`, `shape_1`, …, before a lens."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "embree_use_robust_intersections": robust,
+            "integrator": integrator or {"type": "fspt_integral"},
+            "camera": sensor or lens(),
+            **{f"shape_{k}": shape for k, shape in enumerate(shapes)},
+        }
+    )
+
+
+def ball(exitance=1e-3, radius=5.0, center=(0.0, 0.0, 0.0)):
+    """A glowing sphere about the world's origin."""
+    return {"type": "sphere", "radius": radius, "center": list(center), "emitter": glow(exitance)}
+
+
+LENS_XML = """
+    <sensor type="fspt_lens">
+        <float name="focal_length" value="55"/>
+        <float name="f_number" value="$f_number"/>
+        <float name="magnification" value="0.5"/>
+        <float name="pixel_pitch" value="0.8"/>
+        <transform name="to_world"><lookat origin="$distance, 0, 0" target="0, 0, 0" up="0, 0, 1"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="8"/>
+            <integer name="height" value="6"/>
+            <string name="pixel_format" value="luminance"/>
+        </film>
+    </sensor>"""
+
+BALL_XML = """
+    <shape type="sphere">
+        <float name="radius" value="3"/>
+        <emitter type="fspt_surface"><float name="exitance" value="1e-3"/></emitter>
+    </shape>"""
+
+
+def write_scene(path, *, sensor=LENS_XML, shapes=BALL_XML, integrator='<integrator type="fspt_integral"/>', more=""):
+    """Path of a scene file with the parameters f_number and distance, of these parts."""
+    path.write_text(
+        f"""<scene version="3.0.0">
+    <default name="f_number" value="8"/>
+    <default name="distance" value="165"/>
+    {integrator}{sensor}{shapes}{more}
+</scene>
+"""
+    )
+    return path

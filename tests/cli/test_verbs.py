@@ -17,7 +17,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import typer
-from little_scenes import LENS_XML, SCENES, write_ply, write_scene
+from small_scenes import LENS_XML, SCENES, write_ply, write_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.cli import app
@@ -75,10 +75,10 @@ def test_render_with_a_picture_beside(run, tmp_path):
 
 def test_mitsubas_warnings_stay_out_of_the_output(run, tmp_path):
     """A film in colour draws one from Mitsuba, a scene that loses rays one from the integrator."""
-    import little_scenes
+    import small_scenes
 
     write_ply(tmp_path / "a.ply", [(0, -3, -3), (0, 3, -3), (0, 3, 3)], [(0, 1, 2)], vertex=[1, 1, 1])
-    sensor = little_scenes.LENS_XML.replace('value="luminance"', 'value="rgb"')
+    sensor = small_scenes.LENS_XML.replace('value="luminance"', 'value="rgb"')
     write_scene(tmp_path / "s.xml", sensor=sensor)
     for method in ("integral", "path"):
         code, out, err = run("render", "s.xml", "--method", method, *(["--spp", 4] if method == "path" else []))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from little_scenes import ball, lens, mi, scene_of
+from small_scenes import ball, lens, mi, world_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.emission.exitance import texels_of
@@ -34,7 +34,7 @@ def test_bright_texels_of_a_tiled_bitmap_keep_their_light(kind, tiles):
     slanted surface are taken for its limb (the cylinder, a third missing).
     """
     emitter = {"type": "fspt_surface", "exitance": one_bright_texel(32, tiles)}
-    scene = scene_of(SHAPES[kind] | {"emitter": emitter}, sensor=lens(size=(24, 20), pitch=0.6, f_number=4.0))
+    scene = world_scene(SHAPES[kind] | {"emitter": emitter}, sensor=lens(size=(24, 20), pitch=0.6, f_number=4.0))
     pupil, surface = (fspt.render(scene, domain=domain, rtol=1e-2, max_nodes=4000) for domain in ("pupil", "surface"))
     assert surface.power.sum() > 0
     assert pupil.power.sum() == pytest.approx(surface.power.sum(), rel=1e-2)
@@ -53,7 +53,7 @@ def test_who_sees_the_tip_of_a_small_checkerboard_gets_its_light():
     place = mi.ScalarTransform4f().translate([2.41, 3.0, 155.2]).rotate([0, 1, 0], 180).scale([1.35, 0.845, 1])
     rectangle = {"type": "rectangle", "to_world": place, "emitter": {"type": "fspt_surface", "exitance": bitmap}}
     optics = {"f_number": 2.75, "magnification": None, "focus_distance": 180.0, "to_world": None}
-    scene = scene_of(rectangle, sensor=lens(size=(12, 10), pitch=0.572, **optics))
+    scene = world_scene(rectangle, sensor=lens(size=(12, 10), pitch=0.572, **optics))
     camera = scene.sensors()[0]
     ax, ay = np.meshgrid(*2 * [(np.arange(500) + 0.5) / 250 - 1])
     ax, ay = (camera.optics.pupil_radius * a[ax**2 + ay**2 <= 1] for a in (ax, ay))
@@ -79,7 +79,7 @@ def test_texels_are_counted_as_often_as_they_lie_on_the_surface():
 def test_a_single_texel_of_four_million_is_not_refused():
     """Rationale: points all over the shape may miss it, and J_n passed for zero everywhere."""
     emitter = {"type": "fspt_surface", "exitance": one_bright_texel(1 << 11)}
-    scene = scene_of(SHAPES["disk"] | {"emitter": emitter}, sensor=lens(size=8))
+    scene = world_scene(SHAPES["disk"] | {"emitter": emitter}, sensor=lens(size=8))
     assert np.isfinite(fspt.render(scene, max_nodes=4).power).all()
 
 
@@ -98,7 +98,7 @@ RED_GREEN_BLUE = np.full((2, 4, 3), [3, 2, 1], np.float32)
 def test_bitmaps_that_are_no_watts_are_refused(pixels, raw, message):
     """Mitsuba makes luminance of the one and bends the values of the other: 128 of 255 would be 0.22 W/mm²."""
     with pytest.raises(RuntimeError, match=message):
-        scene_of(ball({"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": raw}))
+        world_scene(ball({"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": raw}))
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -106,6 +106,6 @@ def test_bitmaps_that_are_no_watts_are_refused(pixels, raw, message):
 def test_raw_bitmaps_in_grey_are_watts(value, channels):
     """Expected: those of a number; whole numbers are shares of the largest, 255."""
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 4, channels), value)), "raw": True}
-    power, uniform = (fspt.render(scene_of(ball(exitance))).power for exitance in (bitmap, 0.2))
+    power, uniform = (fspt.render(world_scene(ball(exitance))).power for exitance in (bitmap, 0.2))
     assert uniform.max() > 0
     np.testing.assert_allclose(power, uniform, rtol=1e-3, atol=1e-3 * uniform.max())

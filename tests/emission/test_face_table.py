@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from little_scenes import attribute, ball, glow, lens, scene_of, write_ply
+from small_scenes import attribute, ball, glow, lens, world_scene, write_ply
 
 from mitsuba_fspt.integral.quadrature import Quadrature
 from mitsuba_fspt.runtime.errors import ExitanceError
@@ -38,12 +38,12 @@ def wall():
 
 
 MESHES = {
-    "vertex": lambda path: scene_of(ply(path, per="vertex"), sensor=lens()),
-    "face": lambda path: scene_of(ply(path, per="face"), sensor=lens()),
-    "number": lambda path: scene_of(ply(path, exitance=2e-3), sensor=lens()),
-    "inside out": lambda path: scene_of(wall(), ply(path, per="vertex", flip_normals=True), sensor=lens()),
-    "rectangle": lambda path: scene_of(rectangle(), sensor=lens()),
-    "several": lambda path: scene_of(wall(), ply(path, per="face"), rectangle(), sensor=lens()),
+    "vertex": lambda path: world_scene(ply(path, per="vertex"), sensor=lens()),
+    "face": lambda path: world_scene(ply(path, per="face"), sensor=lens()),
+    "number": lambda path: world_scene(ply(path, exitance=2e-3), sensor=lens()),
+    "inside out": lambda path: world_scene(wall(), ply(path, per="vertex", flip_normals=True), sensor=lens()),
+    "rectangle": lambda path: world_scene(rectangle(), sensor=lens()),
+    "several": lambda path: world_scene(wall(), ply(path, per="face"), rectangle(), sensor=lens()),
 }
 
 
@@ -54,10 +54,13 @@ def solved(scene, *without, domain="pupil"):
 
 
 TUBE = {"type": "cylinder", "p0": [0, -6, -5], "p1": [0, 6, 5], "radius": 0.2, "emitter": glow()}
-BODIES = MESHES | {"ball": lambda _: scene_of(ball(), sensor=lens()), "tube": lambda _: scene_of(TUBE, sensor=lens())}
+OBJECTS = MESHES | {
+    "ball": lambda _: world_scene(ball(), sensor=lens()),
+    "tube": lambda _: world_scene(TUBE, sensor=lens()),
+}
 
 
-@pytest.mark.parametrize("build", BODIES.values(), ids=BODIES)
+@pytest.mark.parametrize("build", OBJECTS.values(), ids=OBJECTS)
 def test_packets_of_lines_of_sight_meet_what_single_ones_meet(build, tmp_path, monkeypatch):
     """Seen to fail with packets of which one line of sight in sixteen is lost."""
     scene, found = build(tmp_path / "body.ply"), []
@@ -93,11 +96,11 @@ def bitmap():
 
 
 OTHERS = {
-    "ball": lambda path: scene_of(ball()),
-    "bitmap": lambda path: scene_of({"type": "rectangle", "emitter": glow(bitmap())}),
-    "fresnel": lambda path: scene_of(rectangle() | {"emitter": glow() | {"emission": "fresnel", "int_ior": 1.37}}),
-    "area light": lambda path: scene_of(rectangle() | {"emitter": {"type": "area"}}),
-    "ball beside": lambda path: scene_of(rectangle(), ball()),
+    "ball": lambda path: world_scene(ball()),
+    "bitmap": lambda path: world_scene({"type": "rectangle", "emitter": glow(bitmap())}),
+    "fresnel": lambda path: world_scene(rectangle() | {"emitter": glow() | {"emission": "fresnel", "int_ior": 1.37}}),
+    "area light": lambda path: world_scene(rectangle() | {"emitter": {"type": "area"}}),
+    "ball beside": lambda path: world_scene(rectangle(), ball()),
 }
 
 
@@ -110,7 +113,7 @@ def test_the_table_follows_every_change(tmp_path):
     """Seen to fail with a table made once."""
     import mitsuba as mi
 
-    scene = scene_of(wall(), ply(tmp_path / "body.ply", per="vertex"), sensor=lens())
+    scene = world_scene(wall(), ply(tmp_path / "body.ply", per="vertex"), sensor=lens())
     parameters = mi.traverse(scene)
     for name, change in {
         "vertex_exitance": lambda values: values[::-1].copy(),
@@ -152,7 +155,7 @@ def test_the_table_follows_what_nobody_tells_of(tmp_path):
     body = trimesh.creation.icosphere(2, radius=5)
     write_ply(tmp_path / "body.ply", body.vertices, body.faces, vertex=np.full(len(body.vertices), 1e-3))
     shape = {"type": "ply", "filename": str(tmp_path / "body.ply"), "emitter": glow(texture)}
-    scene = scene_of(shape, sensor=lens())
+    scene = world_scene(shape, sensor=lens())
     before = solved(scene).power
     alone = mi.traverse(texture)
     alone["scale"] = 4.0
@@ -167,7 +170,7 @@ def test_the_table_follows_what_nobody_tells_of(tmp_path):
 @pytest.mark.parametrize("kind", ["vertex", "face"])
 def test_an_attribute_of_several_channels_is_refused(tmp_path, kind):
     """Fails where the first of its numbers are taken for one each."""
-    scene = scene_of(ply(tmp_path / "body.ply", per=kind), sensor=lens())
+    scene = world_scene(ply(tmp_path / "body.ply", per=kind), sensor=lens())
     (mesh,) = scene.shapes()
     count = mesh.vertex_count() if kind == "vertex" else mesh.face_count()
     mesh.remove_attribute(f"{kind}_exitance")
@@ -183,7 +186,7 @@ def test_a_zero_far_from_the_origin_is_not_taken_for_negative(tmp_path):
     write_ply(tmp_path / "far.ply", body.vertices + np.array([500, 0, 0]), body.faces, vertex=exitance)
     shape = {"type": "ply", "filename": str(tmp_path / "far.ply"), "emitter": glow(attribute())}
     far = lens(distance=665.0, magnification=None, focus_distance=165.0)
-    assert solved(scene_of(shape, sensor=far)).power.max() > 0
+    assert solved(world_scene(shape, sensor=far)).power.max() > 0
 
 
 def test_one_integrator_for_many_scenes(tmp_path):
@@ -193,7 +196,7 @@ def test_one_integrator_for_many_scenes(tmp_path):
     integrator = mi.load_dict({"type": "fspt_integral"})
 
     def sum_of(exitance):
-        scene = scene_of(ply(tmp_path / "body.ply", exitance=exitance), sensor=lens())
+        scene = world_scene(ply(tmp_path / "body.ply", exitance=exitance), sensor=lens())
         return integrator.solve(scene, scene.sensors()[0]).power.sum()
 
     sums = [sum_of(exitance) for exitance in (1e-3, 2e-3, 5e-3)]

@@ -12,10 +12,11 @@ from small_scenes import (
     HEIGHT,
     MAGNIFICATION,
     WIDTH,
+    camera_scene,
     disk,
     even_disc,
-    load,
-    scene,
+    glow,
+    load_scene,
     sphere,
     virtual_pixels,
 )
@@ -51,7 +52,7 @@ def part_of(name, view, f_number, part):
     """A scene of scenes/ that looks at a part of its film."""
     import mitsuba as mi
 
-    phantom = load(name, view=view, f_number=f_number)
+    phantom = load_scene(name, view=view, f_number=f_number)
     film = mi.traverse(phantom.sensors()[0].film())
     film["crop_offset"], film["crop_size"] = part[:2], part[2:]
     film.update()
@@ -81,7 +82,7 @@ def test_error_bounds_the_error_on_a_ball_of_five_pixels():
 
     Seen to fail (1.1e-3 of the brightest pixel off, 7e-4 stated) with transects that fill pixel and pupil less evenly.
     """
-    ball = scene(sphere(175.0, 5.0), f_number=8.0, pixel_pitch=0.9)
+    ball = camera_scene(sphere(175.0, 5.0), f_number=8.0, pixel_pitch=0.9)
     image, truth = fspt.render(ball), fspt.render(ball, rtol=3e-5)
     off = np.abs(image.power - truth.power)
     assert off.max() < RTOL * truth.power.max()
@@ -109,7 +110,7 @@ def test_balls_that_poke_into_each_other_are_no_second_surface():
     """One of the points at which a second surface is looked for lies on their common circle; seen to be refused."""
     front = sphere(172.24108170659895, 1.9883699847893401, 0.07712417676777661, 1.5394461159644504)
     back = sphere(172.75838990913695, 2.7974111028847615, 0.45245591722528644, -0.43217559420530804)
-    assert fspt.render(scene(back, front), rtol=0.1).power.any()
+    assert fspt.render(camera_scene(back, front), rtol=0.1).power.any()
 
 
 # --- work ---
@@ -118,7 +119,7 @@ def test_balls_that_poke_into_each_other_are_no_second_surface():
 def test_pixels_that_see_nothing_cost_nothing():
     """Expected: exactly 0, error 0, coverage 0, and not one line of sight more than the part around the body takes."""
     body = sphere(180.0, 3.0, 9.0, 6.0)
-    whole, part = fspt.render(scene(body)), fspt.render(scene(body, crop=(0, 0, 20, 16)))
+    whole, part = fspt.render(camera_scene(body)), fspt.render(camera_scene(body, crop=(0, 0, 20, 16)))
     dark = whole.coverage == 0
     assert dark.sum() > 0.9 * dark.size
     far_off = np.ones_like(dark)
@@ -135,7 +136,7 @@ def test_what_lies_beside_a_crop_window_is_not_refined():
     Seen to fail (a half) where all pixels that one blur disc reaches are refined.
     """
     body = sphere(240.0, 8.0, 1.0)
-    field, pixel = (scene(body, f_number=1.4, crop=crop) for crop in ((4, 4, 32, 24), (20, 10, 1, 1)))
+    field, pixel = (camera_scene(body, f_number=1.4, crop=crop) for crop in ((4, 4, 32, 24), (20, 10, 1, 1)))
     whole, part = fspt.render(field, rtol=1e-3), fspt.render(pixel, rtol=1e-3)
     np.testing.assert_allclose(part.power, whole.power[6:7, 16:17], rtol=2e-3)
     assert part.metadata["nodes"] < whole.metadata["nodes"] / 8
@@ -149,8 +150,8 @@ def test_tolerance_is_a_share_of_what_a_crop_window_shows(depth, domain):
     Seen to fail where what is computed around the window counts for the brightest pixel, too: 0.1 of that which is
     shown, 0.04 in the surface form.
     """
-    disc = disk(depth, 4.0, 6.0) | {"glow": {"type": "fspt_surface", "exitance": 10.0}}
-    part = scene(disc, sphere(FOCUS + 12, 4.0, -3.0), crop=(18, 0, WIDTH - 18, HEIGHT))
+    disc = disk(depth, 4.0, 6.0) | {"emitter": glow(10.0)}
+    part = camera_scene(disc, sphere(FOCUS + 12, 4.0, -3.0), crop=(18, 0, WIDTH - 18, HEIGHT))
     image = fspt.render(part, rtol=1e-2, domain=domain)
     assert image.error.max() <= 1e-2 * image.power.max()
 
@@ -161,20 +162,20 @@ def test_smooth_pixels_take_four_lines_of_sight(pixel):
 
     The unseen rim of two pixels around the film counts, too.
     """
-    picture = fspt.render(scene(disk(FOCUS), f_number=8.0), pixel=pixel)
+    picture = fspt.render(camera_scene(disk(FOCUS), f_number=8.0), pixel=pixel)
     assert picture.metadata["nodes"] == (4 + 12 / 16) * (WIDTH + 4) * (HEIGHT + 4)
     assert picture.coverage.min() == 1
 
 
 def test_more_accuracy_takes_more_lines_of_sight():
-    body = scene(sphere(180.0, 4.0), f_number=8.0)
+    body = camera_scene(sphere(180.0, 4.0), f_number=8.0)
     nodes = [fspt.render(body, rtol=rtol).metadata["nodes"] for rtol in (0.1, 1e-2, 1e-3)]
     assert 0 < nodes[0] < nodes[1] < nodes[2]
 
 
 def test_no_pixel_takes_more_lines_of_sight_than_max_nodes():
     """Expected: the limit kept, and the error says what that costs."""
-    body = scene(sphere(180.0, 4.0), f_number=8.0)
+    body = camera_scene(sphere(180.0, 4.0), f_number=8.0)
     few, many = (fspt.render(body, rtol=3e-4, max_nodes=n) for n in (1000, 1 << 16))
     assert few.metadata["nodes"] <= 1000 * WIDTH * HEIGHT
     off = np.abs(few.power - many.power)
@@ -195,7 +196,7 @@ def stripes(values, half, depth, angle=0.0):
     rows = mi.Bitmap(np.tile(values.astype(np.float32), (2, 1))[..., None])
     texture = {"type": "bitmap", "bitmap": rows, "raw": True, "wrap_mode": "clamp", "accel": False}
     place = mi.ScalarTransform4f().translate([0, 0, depth]).rotate([0, 0, 1], angle).rotate([0, 1, 0], 180).scale(half)
-    return {"type": "rectangle", "to_world": place, "glow": {"type": "fspt_surface", "exitance": texture}}
+    return {"type": "rectangle", "to_world": place, "emitter": glow(texture)}
 
 
 def ripples(depth, wave, angle):
@@ -234,7 +235,7 @@ def test_ripples_finer_than_the_blur_are_seen(angle, rtol):
     blur = radius * (FOCUS - depth) / FOCUS  # on the sheet
     wave, pitch = 4 / blur, 0.2
     x, y, width, height = crop = (12, 10, 12, 5)
-    sheet = scene(ripples(depth, wave, angle), pixel_pitch=pitch, crop=crop)
+    sheet = camera_scene(ripples(depth, wave, angle), pixel_pitch=pitch, crop=crop)
     image = fspt.render(sheet, rtol=rtol, pixel="centre")
     expected = rippled_power(depth, wave, angle, radius, pitch / MAGNIFICATION)[y : y + height, x : x + width]
     np.testing.assert_allclose(image.power, expected, atol=rtol * expected.max())
@@ -251,7 +252,7 @@ def test_kinks_finer_than_the_nodes_are_not_believed_smooth():
     place = (np.arange(texels) + 0.5) / texels
     values = 1 + 0.5 * np.sin(20 * np.pi * place)
     image = fspt.render(
-        scene(stripes(values, half, depth), f_number=4.0, pixel_pitch=0.8, crop=(0, row, WIDTH, 1)), rtol=RTOL
+        camera_scene(stripes(values, half, depth), f_number=4.0, pixel_pitch=0.8, crop=(0, row, WIDTH, 1)), rtol=RTOL
     )
     # By points even on pupil and pixel.
     side, number = 0.8 / MAGNIFICATION, np.arange(4096) + 0.5
@@ -280,11 +281,11 @@ def test_a_disk_between_single_lines_is_seen_beside_a_crop_window_too():
     """The same disks, a sheet 100 times as bright beside the window; seen to fail (0 W) where that counts, too."""
     depth, side = FOCAL * 11, 4.0
     small, bright = disk(depth, 0.5 * side, 6 * side, 4 * side), sheet(depth, 18 * side, 5.8 * side, 40 * side)
-    bright["glow"] = {"type": "fspt_surface", "exitance": 100.0}
+    bright["emitter"] = glow(100.0)
     row, column = HEIGHT // 2 - 4, WIDTH // 2 - 6
     crop = (column - 6, 0, WIDTH - column + 6, HEIGHT)
     wide = disk(depth, 5 * side, -8 * side, -5 * side)
-    of = scene(small, wide, bright, magnification=0.1, f_number=22, crop=crop)
+    of = camera_scene(small, wide, bright, magnification=0.1, f_number=22, crop=crop)
     image = fspt.render(of, rtol=1e-2)
     four = image.power[row - 1 : row + 1, 5:7] / of.sensors()[0].etendue * np.pi
     share = np.pi / 16 * (1 + side**2 * 52 / depth**2) ** -2
@@ -301,7 +302,7 @@ def test_a_disk_between_single_lines_of_sight_is_seen(width, tilt):
     magnification = 0.1
     depth, side = FOCAL * (1 + 1 / magnification), 0.4 / magnification
     small = disk(depth, width * side / 2, x=6 * side, y=4 * side, tilt=tilt)
-    of = scene(small, disk(depth, 5 * side, x=-8 * side, y=-5 * side), magnification=magnification, f_number=22)
+    of = camera_scene(small, disk(depth, 5 * side, x=-8 * side, y=-5 * side), magnification=magnification, f_number=22)
     image = fspt.render(of, rtol=1e-2)
     lens = of.sensors()[0]
     x, y = 6 * side, 4 * side

@@ -11,10 +11,11 @@ from small_scenes import (
     RADIUS,
     SIDE,
     WIDTH,
+    camera_scene,
     configuration_factor,
     disk,
+    glow,
     power,
-    scene,
     sphere,
 )
 
@@ -66,7 +67,7 @@ def test_uniform_disk_meets_the_closed_form_on_the_pixels_the_border_cuts(stop, 
     Expected: a tenth of what is asked for at each pixel and in all; the whole power is that of the circle in polar
     coordinates. A stop of 0.5 mm lies in four pixels. Seen to fail with the stop left out in 'surface'.
     """
-    image = fspt.render(scene(disk(SHARP, 200.0), image_stop_diameter=stop), rtol=1e-3, domain=domain)
+    image = fspt.render(camera_scene(disk(SHARP, 200.0), image_stop_diameter=stop), rtol=1e-3, domain=domain)
     expected = truth(stop)
     assert (image.power > 0).sum() == (expected > 0).sum()
     np.testing.assert_allclose(image.power, expected, atol=5e-4 * expected.max())
@@ -81,7 +82,7 @@ def test_the_error_bounds_the_error_and_more_work_lessens_it():
     expected = truth(STOP)
     worst = []
     for rtol in (1e-2, 1e-4):
-        image = fspt.render(scene(disk(BLURRED, 200.0), image_stop_diameter=STOP), rtol=rtol)
+        image = fspt.render(camera_scene(disk(BLURRED, 200.0), image_stop_diameter=STOP), rtol=rtol)
         difference = np.abs(image.power - expected)
         assert np.all(difference <= image.error + 1e-6 * expected.max())
         worst.append(difference.max() / expected.max())
@@ -95,12 +96,12 @@ def test_nothing_is_seen_or_computed_beside_the_stop():
     assert beside.sum() > 500
     assert inside.sum() > 400
     for options in ({}, {"domain": "surface"}, {"method": "path", "spp": 16}, {"method": "ptracer", "spp": 16}):
-        image = fspt.render(scene(disk(SHARP, 200.0), image_stop_diameter=STOP), **options)
+        image = fspt.render(camera_scene(disk(SHARP, 200.0), image_stop_diameter=STOP), **options)
         for plane in (image.power, image.error, image.coverage):
             assert np.all(plane[beside] == 0), options
         assert np.all(image.coverage[inside] > 0.9999), options
         assert image.power[inside].sum() > 0, options
-    four = fspt.render(scene(disk(SHARP, 200.0), image_stop_diameter=2.0), max_nodes=4)
+    four = fspt.render(camera_scene(disk(SHARP, 200.0), image_stop_diameter=2.0), max_nodes=4)
     assert four.metadata["nodes"] <= 4 * (2.0 / PITCH + 4) ** 2
 
 
@@ -109,7 +110,7 @@ def test_nothing_is_seen_or_computed_beside_the_stop():
 def test_monte_carlo_agrees_where_silhouettes_cross_the_border(method, borders):
     """A blurred ball beside the axis, partly behind the stop. Seen to fail with the stop left out of ptracer."""
     body = sphere(150.0, 6.0, 7.0, -3.0)
-    view = scene(body, image_stop_diameter=STOP, **borders)
+    view = camera_scene(body, image_stop_diameter=STOP, **borders)
     inside, beside = pixels(STOP)
     cut = ~inside & ~beside
     image = fspt.render(view)
@@ -119,21 +120,23 @@ def test_monte_carlo_agrees_where_silhouettes_cross_the_border(method, borders):
     z = (truth.power - image.power)[lit] / np.hypot(truth.error, image.error)[lit]
     assert np.abs(z).max() < 4.5
     assert image.power.sum() == pytest.approx(truth.power.sum(), rel=5e-3)
-    whole = power(scene(body, **borders))
+    whole = power(camera_scene(body, **borders))
     assert image.power.sum() < 0.95 * whole.sum()
 
 
 @pytest.mark.slow
 def test_both_domains_agree():
     body = sphere(158.0, 3.0, 8.5, -3.0)
-    pictures = [power(scene(body, image_stop_diameter=STOP), domain=d, rtol=5e-3) for d in ("pupil", "surface")]
+    pictures = [power(camera_scene(body, image_stop_diameter=STOP), domain=d, rtol=5e-3) for d in ("pupil", "surface")]
     np.testing.assert_allclose(pictures[0], pictures[1], atol=2e-3 * pictures[0].max())
     assert np.any(pictures[0] != pictures[1])
 
 
 def test_at_pixel_centres_the_stop_takes_whole_pixels():
     """`pixel = centre` is the value at the centre times the area, in the paper's way."""
-    free, stopped = (power(scene(disk(SHARP, 200.0), **s), pixel="centre") for s in ({}, {"image_stop_diameter": STOP}))
+    free, stopped = (
+        power(camera_scene(disk(SHARP, 200.0), **s), pixel="centre") for s in ({}, {"image_stop_diameter": STOP})
+    )
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     open_ = np.hypot(x, y) * PITCH < STOP / 2
     np.testing.assert_allclose(stopped, np.where(open_, free, 0), rtol=1e-5)
@@ -142,13 +145,15 @@ def test_at_pixel_centres_the_stop_takes_whole_pixels():
 def test_a_stop_wider_than_the_film_changes_no_bit():
     body = sphere(150.0, 6.0)
     for domain in ("pupil", "surface"):
-        free, wide = (power(scene(body, **s), domain=domain, rtol=3e-2) for s in ({}, {"image_stop_diameter": 100.0}))
+        free, wide = (
+            power(camera_scene(body, **s), domain=domain, rtol=3e-2) for s in ({}, {"image_stop_diameter": 100.0})
+        )
         np.testing.assert_array_equal(free, wide)
 
 
 def test_a_crop_window_is_stopped_like_the_film():
     crop = (2, 3, 12, 20)
-    whole, part = (power(scene(disk(SHARP, 200.0), image_stop_diameter=STOP, crop=c)) for c in (None, crop))
+    whole, part = (power(camera_scene(disk(SHARP, 200.0), image_stop_diameter=STOP, crop=c)) for c in (None, crop))
     np.testing.assert_allclose(part, whole[3:23, 2:14], atol=1e-3 * whole.max())
     assert (part == 0).any()
 
@@ -156,7 +161,7 @@ def test_a_crop_window_is_stopped_like_the_film():
 def test_the_stop_can_be_updated_and_stands_in_the_header():
     import mitsuba as mi
 
-    view = scene(disk(SHARP, 200.0), image_stop_diameter=STOP)
+    view = camera_scene(disk(SHARP, 200.0), image_stop_diameter=STOP)
     parameters = mi.traverse(view)
     parameters["sensor.image_stop_diameter"] = 4.0
     parameters.update()
@@ -179,7 +184,7 @@ def test_the_stop_is_as_much_larger_on_the_virtual_plane_as_the_pixels():
 def test_a_stop_below_a_pixel_is_refused():
     """The first lines of sight of a pixel would all miss it."""
     with pytest.raises(RuntimeError, match=r"image_stop_diameter.* = 0.3 mm is below a pixel. Give at least 0.4 mm"):
-        scene(disk(SHARP, 200.0), image_stop_diameter=0.3)
+        camera_scene(disk(SHARP, 200.0), image_stop_diameter=0.3)
 
 
 @pytest.mark.parametrize("domain", ["pupil", "surface"])
@@ -188,10 +193,10 @@ def test_narrow_light_on_a_pixel_that_the_stop_cuts_is_in_the_error(domain):
     the pixel was 0 with an error of 0, and another one the brightest.
     """
     place = np.array([5.6, 0.2]) * SIDE  # on a pixel that the border cuts, inside the stop
-    spot = {**disk(SHARP, 0.08 * SIDE, *place), "glow": {"type": "fspt_surface", "exitance": 1.0}}
-    wide = {**disk(SHARP, 1.2 * SIDE), "glow": {"type": "fspt_surface", "exitance": 1e-2}}
+    spot = {**disk(SHARP, 0.08 * SIDE, *place), "emitter": glow(1.0)}
+    wide = {**disk(SHARP, 1.2 * SIDE), "emitter": glow(1e-2)}
     stopped, free = (
-        fspt.render(scene(spot, wide, **stop), rtol=1e-2, domain=domain)
+        fspt.render(camera_scene(spot, wide, **stop), rtol=1e-2, domain=domain)
         for stop in ({"image_stop_diameter": 12.0 * PITCH}, {})
     )
     bright = free.power == free.power.max()

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from little_scenes import attribute, glow, lens, mi, scene_of, write_ply
+from small_scenes import attribute, glow, lens, mi, world_scene, write_ply
 
 import mitsuba_fspt as fspt
 
@@ -24,7 +24,7 @@ def seen_past(glowing, dark, f_number, dim):
     sensor = lens(
         size=(WIDTH, HEIGHT), pitch=0.55, f_number=f_number, magnification=None, focus_distance=FOCUS, to_world=None
     )
-    return scene_of(
+    return world_scene(
         disks[0] | {"emitter": glow(1.0)}, disks[1] | ({"emitter": glow(dim)} if dim else {}), sensor=sensor
     )
 
@@ -84,7 +84,7 @@ def test_few_lines_of_sight_know_what_they_miss(max_nodes):
     disk = {"type": "disk", "to_world": behind @ turned.scale(30)}
     plane = {"type": "rectangle", "to_world": before @ turned.scale([60, 20, 1])}
     optics = {"f_number": 2.0, "magnification": None, "focus_distance": FOCUS, "to_world": None}
-    scene = scene_of(disk | {"emitter": glow(1.0)}, plane, sensor=lens(size=(12, 24), pitch=0.22, **optics))
+    scene = world_scene(disk | {"emitter": glow(1.0)}, plane, sensor=lens(size=(12, 24), pitch=0.22, **optics))
     few, truth = fspt.render(scene, max_nodes=max_nodes), fspt.render(scene)
     assert (np.abs(few.power - truth.power) <= few.error + 2 * truth.error).all()
 
@@ -92,8 +92,8 @@ def test_few_lines_of_sight_know_what_they_miss(max_nodes):
 def test_narrow_light_before_a_dark_plate_that_hides_a_wide_body():
     """Disks of a sixth of a pixel; the plate stands aside first. Expected: their light alone, to 1e-2.
 
-    Seen to fail (a third of it lost, 0 W with an error of 0 on the brightest pixel) where bodies that nobody sees count
-    as what is around, and where what was found before the plate moved is kept.
+    Seen to fail (a third of it lost, 0 W with an error of 0 on the brightest pixel) where objects that nobody sees
+    count as what is around, and where what was found before the plate moved is kept.
     """
     optics = {"f_number": 4.0, "magnification": None, "focus_distance": FOCUS, "to_world": None}
     turned, at = mi.ScalarTransform4f().rotate([0, 1, 0], 180), mi.ScalarTransform4f().translate
@@ -102,7 +102,7 @@ def test_narrow_light_before_a_dark_plate_that_hides_a_wide_body():
     plate = {"type": "rectangle", "to_world": at([90, 0, 190]) @ turned.scale(40)}
     wide = {"type": "disk", "to_world": at([0, 0, 200]) @ turned.scale(6), "emitter": glow(1.0)}
     shapes = [plate, wide, *(disk | {"emitter": glow(1.0)} for disk in disks)]
-    scene = scene_of(*shapes, sensor=lens(size=(16, 12), pitch=0.22, **optics))
+    scene = world_scene(*shapes, sensor=lens(size=(16, 12), pitch=0.22, **optics))
     camera = scene.sensors()[0]
     light = 3 * camera.etendue * 0.08**2 / camera.virtual_pitch**2
     assert fspt.render(scene, rtol=1e-2).power.sum() > 10 * light
@@ -129,7 +129,7 @@ def test_what_a_dark_rod_leaves_of_a_pixel_is_looked_for_along_its_outline_too()
     window = {"width": 20, "height": 28, "crop_offset_x": 9, "crop_offset_y": 22, "crop_width": 6, "crop_height": 6}
     optics = {"focal_length": 50.0, "f_number": 4.3224, "magnification": 0.11282, "to_world": None}
     sensor = lens(pitch=0.36837, film={"type": "hdrfilm", "pixel_format": "luminance", **window}, **optics)
-    scene = scene_of(glowing | {"emitter": glow()}, dark, sensor=sensor)
+    scene = world_scene(glowing | {"emitter": glow()}, dark, sensor=sensor)
     pupil, surface = (fspt.render(scene, rtol=1e-2, domain=domain) for domain in ("pupil", "surface"))
     off = np.abs(pupil.power - surface.power)
     assert (off <= pupil.error + surface.error + 3e-3 * surface.power.max()).all()
@@ -164,7 +164,7 @@ def test_who_settled_by_chance_looks_again_when_a_neighbour_was_misled(tmp_path)
     window = {"width": 35, "height": 32, "crop_offset_x": 22, "crop_offset_y": 17, "crop_width": 5, "crop_height": 5}
     optics = {"focal_length": 55.0, "f_number": 1.2342, "magnification": 1.4662, "to_world": None}
     sensor = lens(pitch=0.28164, film={"type": "hdrfilm", "pixel_format": "luminance", **window}, **optics)
-    scene = scene_of(far, near, sensor=sensor)
+    scene = world_scene(far, near, sensor=sensor)
     pupil, surface = (fspt.render(scene, rtol=2e-2, domain=domain) for domain in ("pupil", "surface"))
     off = np.abs(pupil.power - surface.power)
     assert (off <= pupil.error + 0.1 * surface.power.max()).all()

@@ -18,14 +18,15 @@ from small_scenes import (
     RADIUS,
     SIDE,
     WIDTH,
+    camera_scene,
     collected,
     disk,
     even_disc,
     filled,
-    load,
+    glow,
+    load_scene,
     over_pixels,
     power,
-    scene,
     sphere,
     virtual_pixels,
 )
@@ -58,7 +59,7 @@ def test_uniform_disk_meets_the_closed_form(distance, pixel):
     Expected: 1e-5 of the power at every pixel of the whole field, f/2.8; over the area the mean of f by Gauss nodes.
     Seen to fail with cos⁴θ → cos³θ (3e-2), 1/π dropped, (p/t)² → p² (A_vd without 1/t²), u² → v².
     """
-    disk_scene = load("uniform_disk", distance=distance, f_number=2.8)
+    disk_scene = load_scene("uniform_disk", distance=distance, f_number=2.8)
     side = disk_scene.sensors()[0].pixel_pitch / MAGNIFICATION
     picture = power(disk_scene, rtol=1e-5, pixel=pixel)
     np.testing.assert_allclose(picture, filled(side, 1 if pixel == "centre" else 6), rtol=1e-5)
@@ -95,7 +96,7 @@ def test_uniform_sphere_meets_the_closed_form_where_the_cone_is_filled(centre):
     part = slice(y, y + height), slice(x, x + width)
     inside = inside[part]
     assert inside.mean() > 0.95
-    picture = power(scene(sphere(centre, 20.0, 2.0, -1.0), crop=crop), rtol=1e-5)
+    picture = power(camera_scene(sphere(centre, 20.0, 2.0, -1.0), crop=crop), rtol=1e-5)
     np.testing.assert_allclose(picture[inside], filled(nodes=6)[part][inside], rtol=1e-5)
 
 
@@ -107,7 +108,7 @@ def test_uniform_cylinder_meets_the_closed_form_where_the_cone_is_filled():
     assert inside[part].all()
     assert not inside.all()
     cylinder = {"type": "cylinder", "p0": [1.0, -90.0, 168.0], "p1": [1.0, 90.0, 168.0], "radius": 11.0}
-    picture = power(scene(cylinder, crop=crop), rtol=1e-5)
+    picture = power(camera_scene(cylinder, crop=crop), rtol=1e-5)
     np.testing.assert_allclose(picture, filled(nodes=6)[part], rtol=1e-5)
 
 
@@ -116,7 +117,7 @@ def test_light_falls_off_with_the_fourth_power_of_the_cosine():
 
     Seen to fail with cos⁴θ → cos³θ.
     """
-    picture = power(scene(disk(FOCUS), f_number=100.0), pixel="centre")
+    picture = power(camera_scene(disk(FOCUS), f_number=100.0), pixel="centre")
     falloff = cos4()
     assert falloff.min() < 0.98
     centre = picture[HEIGHT // 2, WIDTH // 2] / falloff[HEIGHT // 2, WIDTH // 2]
@@ -134,7 +135,7 @@ def test_all_power_through_the_pupil_arrives_whatever_the_focus(focus):
     Seen to fail with cos⁴θ → cos³θ (2e-3), 1/π dropped, A_vd without 1/t², and the 1/24 of the pixel's bend.
     """
     pitch = 0.8 * FOCAL / (focus - FOCAL)
-    picture = power(scene(sphere(180.0, 8.0), focus_distance=focus, pixel_pitch=pitch))
+    picture = power(camera_scene(sphere(180.0, 8.0), focus_distance=focus, pixel_pitch=pitch))
     assert picture[[0, -1]].max() == picture[:, [0, -1]].max() == 0  # the whole image is on the film
     assert picture.sum() == pytest.approx(collected(8.0, 180.0), rel=1e-4)
 
@@ -147,24 +148,24 @@ def test_one_full_stop_is_half_the_power():
 
     Seen to fail with D → D² in Eq. 3 and with the pupil area left out of the étendue.
     """
-    stops = [power(scene(disk(FOCUS), f_number=64 * np.sqrt(2) ** k), rtol=1e-6) for k in (0, 1, 2)]
+    stops = [power(camera_scene(disk(FOCUS), f_number=64 * np.sqrt(2) ** k), rtol=1e-6) for k in (0, 1, 2)]
     np.testing.assert_allclose(stops[0] / stops[1], 2, rtol=5e-6)
     np.testing.assert_allclose(stops[0] / stops[2], 4, rtol=1e-5)
 
 
 def test_power_is_linear_in_the_exitance():
     """Expected: the same bits if the exitance is a power of two, else float32 rounding and the places of jumps that it
-    moves, at exitances of bioluminescence; two bodies add where neither hides the other.
+    moves, at exitances of bioluminescence; two objects add where neither hides the other.
 
     Seen to fail with J_n^1.01 for J_n.
     """
     two = [sphere(180.0, 5.0, 7.0), sphere(150.0, 4.0, -7.0)]
-    bright = power(scene(*two, f_number=8.0), rtol=1e-2)
+    bright = power(camera_scene(*two, f_number=8.0), rtol=1e-2)
     for faint, rounding in ((2.0**-28, 1e-12), (3.7e-9, 2e-5)):
-        dim = power(scene(*two, f_number=8.0, exitance=faint), rtol=1e-2)
+        dim = power(camera_scene(*two, f_number=8.0, exitance=faint), rtol=1e-2)
         np.testing.assert_allclose(dim / faint, bright, atol=rounding * bright.max())
-    dark = [{**body, "glow": {"type": "fspt_surface", "exitance": 1e-12}} for body in two]
-    single = [power(scene(*pair, f_number=8.0), rtol=1e-2) for pair in ((two[0], dark[1]), (dark[0], two[1]))]
+    dark = [{**body, "emitter": glow(1e-12)} for body in two]
+    single = [power(camera_scene(*pair, f_number=8.0), rtol=1e-2) for pair in ((two[0], dark[1]), (dark[0], two[1]))]
     np.testing.assert_allclose(sum(single), bright, atol=2e-2 * bright.max())
     assert min(picture.max() for picture in single) > 0.5 * bright.max()
 
@@ -177,7 +178,8 @@ def test_power_scales_with_the_square_of_all_lengths(scale):
     """
     pictures = [
         power(
-            scene(sphere(180.0 * s, 8.0 * s, 3.0 * s, -2.0 * s), focal_length=FOCAL * s, pixel_pitch=0.5 * s), rtol=1e-2
+            camera_scene(sphere(180.0 * s, 8.0 * s, 3.0 * s, -2.0 * s), focal_length=FOCAL * s, pixel_pitch=0.5 * s),
+            rtol=1e-2,
         )
         for s in (1.0, scale)
     ]
@@ -191,7 +193,7 @@ def test_power_scales_with_the_square_of_all_lengths(scale):
 
 def test_pinhole_is_one_line_of_sight():
     """Rationale: P = J_n/π · πD²/4 · A_vd cos⁴θ/u² (Schulz), whatever D. Expected: float32 rounding."""
-    picture = power(scene(disk(FOCUS), model="pinhole"), pixel="centre")
+    picture = power(camera_scene(disk(FOCUS), model="pinhole"), pixel="centre")
     np.testing.assert_allclose(picture, RADIUS**2 * SIDE**2 * cos4() / FOCUS**2, rtol=2e-6)
 
 
@@ -201,19 +203,19 @@ def test_small_diaphragm_tends_to_the_pinhole():
     Seen to fail with the pupil area left out of the étendue of one of the two.
     """
     body = sphere(150.0, 6.0, 3.0, -2.0)
-    pinhole = power(scene(body, f_number=1e4, model="pinhole"), rtol=3e-3)
-    stopped = power(scene(body, f_number=1e4), rtol=3e-3)
+    pinhole = power(camera_scene(body, f_number=1e4, model="pinhole"), rtol=3e-3)
+    stopped = power(camera_scene(body, f_number=1e4), rtol=3e-3)
     assert (pinhole > 0).sum() > 100
     np.testing.assert_allclose(stopped, pinhole, atol=3e-3 * pinhole.max())
-    wide = power(scene(body, f_number=2.0), rtol=3e-2)
+    wide = power(camera_scene(body, f_number=2.0), rtol=3e-2)
     assert np.abs(wide / wide.max() - pinhole / pinhole.max()).max() > 0.1  # where the focus does matter
 
 
 def over_etendue(diameter, **lens):
     """Where a sphere covers part of another, their picture over a pixel's étendue: the mean of cos⁴θ L."""
     far, near = sphere(180.0, 8.0, -6.5), sphere(140.0, 2.0, 1.0, -0.5)
-    near["glow"] = {"type": "fspt_surface", "exitance": 2.0}
-    picture = power(scene(far, near, f_number=FOCAL / diameter, crop=(13, 10, 12, 13), **lens), rtol=1e-4)
+    near["emitter"] = glow(2.0)
+    picture = power(camera_scene(far, near, f_number=FOCAL / diameter, crop=(13, 10, 12, 13), **lens), rtol=1e-4)
     return picture / (SIDE**2 * np.pi * (diameter / 2) ** 2 / FOCUS**2)
 
 
@@ -254,8 +256,8 @@ def test_diaphragm_tends_to_hrrt_as_it_opens_to_the_lens_border():
 def test_hrrt_is_a_diaphragm_as_wide_as_the_lens(diameter):
     """Rationale: without a diaphragm the lens border stops the light. Expected: the same bits."""
     body = sphere(180.0, 8.0)
-    hrrt = power(scene(body, model="hrrt", lens_diameter=diameter, f_number=8.0), rtol=1e-2)
-    np.testing.assert_array_equal(hrrt, power(scene(body, f_number=FOCAL / diameter), rtol=1e-2))
+    hrrt = power(camera_scene(body, model="hrrt", lens_diameter=diameter, f_number=8.0), rtol=1e-2)
+    np.testing.assert_array_equal(hrrt, power(camera_scene(body, f_number=FOCAL / diameter), rtol=1e-2))
 
 
 @pytest.mark.parametrize("aperture", [0.05, 0.6])
@@ -264,7 +266,9 @@ def test_ripoll_s_detector_takes_the_same_cone_everywhere(aperture):
 
     Expected: to 1e-5. Seen to fail with tan for sin, and with u² → (u cosθ)².
     """
-    picture = power(scene(disk(FOCUS, 400.0), model="ripoll", numerical_aperture=aperture), rtol=1e-5, pixel="centre")
+    picture = power(
+        camera_scene(disk(FOCUS, 400.0), model="ripoll", numerical_aperture=aperture), rtol=1e-5, pixel="centre"
+    )
     np.testing.assert_allclose(picture, SIDE**2 * aperture**2, rtol=1e-5)
 
 
@@ -304,7 +308,7 @@ def test_diaphragm_off_the_lens_vignettes_like_two_circles(stop, lens, distance,
     borders = {"f_number": FOCAL / stop, "lens_diameter": lens, "diaphragm_distance": distance}
     side = pitch / MAGNIFICATION
     expected = side**2 / np.pi * over_pixels(partial(behind_two_circles, stop, lens, distance), side)
-    picture = power(scene(disk(FOCUS, 400.0), pixel_pitch=pitch, **borders), pixel="centre", rtol=1e-3)
+    picture = power(camera_scene(disk(FOCUS, 400.0), pixel_pitch=pitch, **borders), pixel="centre", rtol=1e-3)
     assert expected.min() < 0.8 * expected.max()
     np.testing.assert_allclose(picture, expected, atol=1e-4 * expected.max())
 
@@ -313,8 +317,8 @@ def test_diaphragm_in_the_rear_focal_plane_is_ripoll_s_detector():
     """Rationale: it stops directions, not places; |slope| ≤ (D/2)/F. Expected: the same picture, silhouettes too."""
     body = sphere(180.0, 8.0, 3.0)
     aperture = np.sin(np.arctan(1 / 16))  # D = F/8
-    cone = power(scene(body, model="ripoll", numerical_aperture=aperture), rtol=1e-2)
-    telecentric = power(scene(body, f_number=8.0, lens_diameter=200.0, diaphragm_distance=FOCAL), rtol=1e-2)
+    cone = power(camera_scene(body, model="ripoll", numerical_aperture=aperture), rtol=1e-2)
+    telecentric = power(camera_scene(body, f_number=8.0, lens_diameter=200.0, diaphragm_distance=FOCAL), rtol=1e-2)
     np.testing.assert_allclose(telecentric, cone, atol=1e-3 * cone.max())
 
 
@@ -335,8 +339,8 @@ def test_sharp_picture_is_the_object_times_the_magnification():
     Expected: area, centre and mean squared radius R²/2 + 1/6 (the pixel's own), to the cos⁴ falloff across it (1e-3)
     at f/22. Seen to fail with t → 1/t, t → 1 and with x → −x.
     """
-    picture = power(scene(disk(FOCUS, 4.0, 5.0, -3.0), f_number=22.0))
-    total, cx, cy, spread = moments(picture / power(scene(disk(FOCUS), f_number=22.0)))
+    picture = power(camera_scene(disk(FOCUS, 4.0, 5.0, -3.0), f_number=22.0))
+    total, cx, cy, spread = moments(picture / power(camera_scene(disk(FOCUS), f_number=22.0)))
     r = 4.0 * MAGNIFICATION / PITCH
     assert total == pytest.approx(np.pi * r**2, rel=1e-3)
     assert (cx, cy) == pytest.approx((WIDTH / 2 - 5.0 / SIDE, HEIGHT / 2 + 3.0 / SIDE), abs=5e-3)
@@ -351,7 +355,7 @@ def test_blur_disc_has_the_radius_of_similar_triangles(depth):
     2 (4/110)² = 2.6e-3.
     Seen to fail with the pupil radius doubled and with u − z → u + z.
     """
-    picture = power(scene(disk(depth, 4.0), f_number=4.0))
+    picture = power(camera_scene(disk(depth, 4.0), f_number=4.0))
     blur = FOCAL / 8 * abs(FOCUS - depth) / depth / SIDE
     image = 4.0 * FOCUS / depth / SIDE
     _, cx, cy, spread = moments(picture)
@@ -377,7 +381,7 @@ def test_body_smaller_than_its_blur_is_the_overlap_of_two_circles(depth):
     side = pitch / MAGNIFICATION
     expected = side**2 / (np.pi * FOCUS**2) * over_pixels(seen, side, 40)
     rows = slice(15, 17)
-    blurred = scene(disk(depth, radius), f_number=8.0, pixel_pitch=pitch, crop=(0, 15, WIDTH, 2))
+    blurred = camera_scene(disk(depth, radius), f_number=8.0, pixel_pitch=pitch, crop=(0, 15, WIDTH, 2))
     picture = power(blurred, rtol=3e-3)
     assert (expected[rows] == 0).any()
     np.testing.assert_allclose(picture, expected[rows], atol=3.3e-3 * expected.max())
@@ -390,7 +394,7 @@ def test_letter_l_is_upright_and_unmirrored(method):
     Expected: light on the middle of both bars, none in the open corner. Letter 16 × 24 mm, bars 6 mm, at t = 1/2:
     9.3 × 13.9 pixels about the middle of the film. Seen to fail with the sign of x or y turned in the lens.
     """
-    letter = load("l_shape")
+    letter = load_scene("l_shape")
     sampling = {} if method == "integral" else {"spp": 32, "seed": 1}
     picture = fspt.render(letter, method=method, **sampling).power
     pixels_per_mm = MAGNIFICATION / letter.sensors()[0].pixel_pitch
@@ -412,13 +416,13 @@ def test_crop_window_is_a_part_of_the_whole_picture(crop):
     """Expected: the accuracy asked for, by either of the two pictures."""
     body = sphere(180.0, 8.0, 3.0, -2.0)
     x, y, width, height = crop
-    whole = fspt.render(scene(body, pixel_pitch=0.5), rtol=3e-3)
-    part = fspt.render(scene(body, pixel_pitch=0.5, crop=crop), rtol=3e-3)
+    whole = fspt.render(camera_scene(body, pixel_pitch=0.5), rtol=3e-3)
+    part = fspt.render(camera_scene(body, pixel_pitch=0.5, crop=crop), rtol=3e-3)
     assert part.shape == (height, width)
     expected = whole.power[y : y + height, x : x + width]
     assert (expected == 0).any()
     assert (expected > 0).any()
     np.testing.assert_allclose(part.power, expected, atol=3e-3 * whole.power.max())
-    corner = fspt.render(scene(body, pixel_pitch=0.5, crop=(0, 0, 3, 2)))
+    corner = fspt.render(camera_scene(body, pixel_pitch=0.5, crop=(0, 0, 3, 2)))
     assert corner.shape == (2, 3)
     assert not corner.power.any()

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from little_scenes import mi
-from small_scenes import even_disc
+from small_scenes import even_disc, mi
 
 from mitsuba_fspt.integral.pupil import onto_overlap
 

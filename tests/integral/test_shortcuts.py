@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from little_scenes import SCENES, attribute, ball, glow, lens, scene_of, write_ply
+from small_scenes import SCENES, attribute, ball, glow, lens, world_scene, write_ply
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.cli import app
@@ -29,7 +29,7 @@ def mesh_of(body, path, vertex=None, face=None):
 
 def half_dark(path):
     body = trimesh.creation.icosphere(3, radius=5)
-    return scene_of(mesh_of(body, path, face=np.where(body.triangles_center[:, 2] > 0, 1e-3, 0)), sensor=lens(24))
+    return world_scene(mesh_of(body, path, face=np.where(body.triangles_center[:, 2] > 0, 1e-3, 0)), sensor=lens(24))
 
 
 def soft_spot(path):
@@ -38,15 +38,17 @@ def soft_spot(path):
     corner = np.arange(193 * 192).reshape(192, 193)[:, :-1].ravel()[:, None]
     faces = np.concatenate([corner + np.array(other) for other in ((0, 1, 194), (0, 194, 193))])
     sheet = trimesh.Trimesh(np.column_stack([0 * y, y, z]), faces, process=False)
-    return scene_of(mesh_of(sheet, path, vertex=np.exp(-(y**2 + z**2) / 12.8**2 / 2)), sensor=lens(24, f_number=100.0))
+    return world_scene(
+        mesh_of(sheet, path, vertex=np.exp(-(y**2 + z**2) / 12.8**2 / 2)), sensor=lens(24, f_number=100.0)
+    )
 
 
 CASES = {
-    "outside": (lambda path: scene_of(ball(), sensor=lens(40)), "pupil"),
+    "outside": (lambda path: world_scene(ball(), sensor=lens(40)), "pupil"),
     "one line": (soft_spot, "pupil"),
-    "smooth": (lambda path: scene_of(ball(radius=12.0), sensor=lens(24, f_number=2.8)), "pupil"),
+    "smooth": (lambda path: world_scene(ball(radius=12.0), sensor=lens(24, f_number=2.8)), "pupil"),
     "record": (half_dark, "pupil"),
-    "occlusion": (lambda path: scene_of(ball(), sensor=lens(24)), "surface"),
+    "occlusion": (lambda path: world_scene(ball(), sensor=lens(24)), "surface"),
     "dark": (half_dark, "surface"),
 }
 
@@ -83,25 +85,25 @@ def shell(path):
     body = trimesh.creation.icosphere(3, radius=5)
     body.update_faces(body.triangles_center[:, 0] < 0)
     body.invert()
-    return scene_of(mesh_of(body, path))
+    return world_scene(mesh_of(body, path))
 
 
 def dumbbell(path):
     """Two balls in one mesh, one behind the other: each is convex, both are not."""
     balls = [trimesh.creation.icosphere(3, radius=3).apply_translation([x, 1.5, 0]) for x in (-5, 5)]
-    return scene_of(mesh_of(trimesh.util.concatenate(balls), path))
+    return world_scene(mesh_of(trimesh.util.concatenate(balls), path))
 
 
 def torus(path):
-    return scene_of(mesh_of(trimesh.creation.torus(5, 2).apply_transform(_QUARTER_TURN), path))
+    return world_scene(mesh_of(trimesh.creation.torus(5, 2).apply_transform(_QUARTER_TURN), path))
 
 
 def two_balls(path):
-    return scene_of(ball(), ball(radius=2.0, center=(9, 0, 0)))
+    return world_scene(ball(), ball(radius=2.0, center=(9, 0, 0)))
 
 
 def inside_out(path):
-    return scene_of({"type": "sphere", "radius": 5.0, "flip_normals": True, "emitter": glow()})
+    return world_scene({"type": "sphere", "radius": 5.0, "flip_normals": True, "emitter": glow()})
 
 
 _QUARTER_TURN = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
@@ -113,26 +115,26 @@ def test_what_may_hide_is_looked_for(build, tmp_path):
 
 
 def test_a_wide_pupil_and_a_wide_blur_take_all_lines_of_sight():
-    assert not found(solved(scene_of(ball(), sensor=lens(24, f_number=2.8))), "one line")  # at 1e-2, f/8 takes one
-    assert not found(solved(scene_of(ball(), sensor=lens(24, f_number=100.0, pitch=0.005))), "one line")
+    assert not found(solved(world_scene(ball(), sensor=lens(24, f_number=2.8))), "one line")  # at 1e-2, f/8 takes one
+    assert not found(solved(world_scene(ball(), sensor=lens(24, f_number=100.0, pitch=0.005))), "one line")
 
 
 def dented(path):
     """A ball with a shallow dent around its waist, so fine a mesh that no edge tells."""
     body = trimesh.creation.uv_sphere(radius=5, count=[800, 60])
     body.vertices *= (1 - 0.1 * np.exp(-((body.vertices[:, 2] / 1.5) ** 2)))[:, None]
-    return scene_of(mesh_of(body, path))
+    return world_scene(mesh_of(body, path))
 
 
 def test_a_shallow_dent_in_a_fine_mesh_may_hide(tmp_path):
-    """`trimesh.is_convex` says that it is convex. Seen to fail with all bodies taken for convex."""
+    """`trimesh.is_convex` says that it is convex. Seen to fail with all objects taken for convex."""
     assert not found(solved(dented(tmp_path / "body.ply"), "surface", rtol=0.3), "occlusion")
 
 
 def test_radiance_that_depends_on_direction_takes_all_lines_of_sight():
     dull = ball()
     dull["emitter"] |= {"emission": "fresnel", "int_ior": 1.37}
-    assert not found(solved(scene_of(dull, sensor=lens(24, f_number=100.0))), "one line")
+    assert not found(solved(world_scene(dull, sensor=lens(24, f_number=100.0))), "one line")
 
 
 def test_what_is_thinner_than_a_pixel_and_between_two_rows_is_seen():
@@ -146,7 +148,7 @@ def test_what_is_thinner_than_a_pixel_and_between_two_rows_is_seen():
 
     place = mi.ScalarTransform4f().rotate([0, 0, 1], 20).scale([6, 6, 0.02])
     plate = {"type": "cube", "to_world": place, "emitter": glow()}
-    scene = scene_of(plate, sensor=lens(28, pitch=0.216))
+    scene = world_scene(plate, sensor=lens(28, pitch=0.216))
     by_light = fspt.render(scene, method="ptracer", spp=1024, seed=1)
     noise = np.sqrt((by_light.error**2).sum())
     assert noise < 0.05 * by_light.power.sum()
@@ -156,12 +158,12 @@ def test_what_is_thinner_than_a_pixel_and_between_two_rows_is_seen():
 
 
 def test_a_pinhole_takes_one_line_of_sight_a_pixel():
-    solution = solved(scene_of(ball(radius=30.0), sensor=lens(24, model="pinhole", pitch=0.2)))
+    solution = solved(world_scene(ball(radius=30.0), sensor=lens(24, model="pinhole", pitch=0.2)))
     assert solution.rays < 3 * solution.power.size  # with the rim and the probes; four a pixel would be 5.6
 
 
 def test_the_image_tells_what_was_left_out_and_what_was_not_allowed_to_be():
-    scene = scene_of(ball(), sensor=lens(40))
+    scene = world_scene(ball(), sensor=lens(40))
     image, without = fspt.render(scene, rtol=RTOL), fspt.render(scene, rtol=RTOL, shortcuts=False)
     assert SHORTCUTS["outside"] in image.metadata["left_out"]
     assert image.metadata["shortcuts_off"] == "nothing"
@@ -171,7 +173,7 @@ def test_the_image_tells_what_was_left_out_and_what_was_not_allowed_to_be():
 
 
 def test_a_scene_file_can_switch_them_off():
-    scene = scene_of(ball(), integrator={"type": "fspt_integral", "shortcuts": False})
+    scene = world_scene(ball(), integrator={"type": "fspt_integral", "shortcuts": False})
     assert scene.integrator().quadrature.shortcuts_off == frozenset(SHORTCUTS)
 
 
@@ -181,7 +183,7 @@ def test_an_unknown_shortcut_is_refused():
 
 
 def test_explain_measures_what_each_shortcut_saves():
-    rows = fspt.explain(scene_of(ball(), sensor=lens(40, f_number=2.8)), rtol=RTOL)
+    rows = fspt.explain(world_scene(ball(), sensor=lens(40, f_number=2.8)), rtol=RTOL)
     by_what = {row.what: row for row in rows}
     outside, one = by_what[SHORTCUTS["outside"]], by_what[SHORTCUTS["one line"]]
     assert outside.left_out
@@ -190,13 +192,13 @@ def test_explain_measures_what_each_shortcut_saves():
     assert one.lines_saved is None
     assert by_what["J_n look-ups"].left_out
     assert SHORTCUTS["occlusion"] not in by_what  # the surface form's own
-    other = fspt.explain(scene_of(ball()), rtol=RTOL, domain="surface")
+    other = fspt.explain(world_scene(ball()), rtol=RTOL, domain="surface")
     assert SHORTCUTS["occlusion"] in {row.what for row in other}
 
 
 def test_no_more_pixels_are_told_of_than_the_picture_has():
     """Where the phantom reaches beyond the picture so does what is looked at: pixels around know of silhouettes."""
-    solution = solved(scene_of(ball(radius=60.0), sensor=lens(8, f_number=2.8)))
+    solution = solved(world_scene(ball(radius=60.0), sensor=lens(8, f_number=2.8)))
     (outside,) = [finding for finding in solution.findings if finding.name == "outside"]
     assert (outside.taken, outside.why) == (False, "64 of 64 pixels can see what glows")
 

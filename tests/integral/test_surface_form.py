@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from little_scenes import glow, lens, scene_of, write_ply
 from small_scenes import (
     FOCUS,
     HEIGHT,
@@ -14,13 +13,17 @@ from small_scenes import (
     RADIUS,
     SIDE,
     WIDTH,
+    camera_scene,
     collected,
     disk,
     even_disc,
     filled,
-    load,
-    scene,
+    glow,
+    lens,
+    load_scene,
     sphere,
+    world_scene,
+    write_ply,
 )
 
 import mitsuba_fspt as fspt
@@ -52,7 +55,7 @@ def test_both_forms_are_one_integral(case):
     Seen to fail with the cosine at the surface dropped, and on the cylinder with blur discs of half the radius.
     """
     name, f_number = case
-    surface, pupil = both(load(name, f_number=f_number))
+    surface, pupil = both(load_scene(name, f_number=f_number))
     off, peak = np.abs(surface.power - pupil.power), pupil.power.max()
     assert off.max() < RTOL * peak
     assert np.mean(off <= surface.error + pupil.error) >= 0.99
@@ -62,7 +65,7 @@ def test_both_forms_are_one_integral(case):
 @pytest.mark.parametrize("tilt", [30, 60])
 def test_the_rim_of_a_disk_aslant_sends_light(tilt):
     """Expected: the accuracy asked for. Seen to fail (7e-2) with a third of the rim not found."""
-    surface, pupil = both(scene(disk(FOCUS, 6.0, 7.0, -3.0, tilt)), rtol=1e-2)
+    surface, pupil = both(camera_scene(disk(FOCUS, 6.0, 7.0, -3.0, tilt)), rtol=1e-2)
     np.testing.assert_allclose(surface.power, pupil.power, atol=1e-2 * pupil.power.max())
 
 
@@ -73,7 +76,7 @@ def test_a_mesh_sends_light_from_its_faces_however_smoothly_it_is_shaded(tmp_pat
     """
     body = trimesh.creation.icosphere(1, radius=8.0)
     path = write_ply(tmp_path / "ball.ply", body.vertices + np.array([0, 0, 180.0]), body.faces)
-    surface, pupil = both(scene({"type": "ply", "filename": str(path)}))
+    surface, pupil = both(camera_scene({"type": "ply", "filename": str(path)}))
     np.testing.assert_allclose(surface.power, pupil.power, atol=RTOL * pupil.power.max())
     np.testing.assert_allclose(surface.power.sum(), pupil.power.sum(), rtol=1e-3)
 
@@ -86,9 +89,9 @@ def test_a_shadows_border_lies_where_lines_of_sight_find_it():
     import mitsuba as mi
 
     far = 2000.0
-    ball = sphere(150.0, 4.0, far + 3) | {"glow": {"type": "fspt_surface", "exitance": 0.01}}
+    ball = sphere(150.0, 4.0, far + 3) | {"emitter": glow(0.01)}
     place = mi.ScalarTransform4f().translate([far, 0, 0])
-    surface, pupil = both(scene(disk(175.0, 9.0, far, tilt=30), ball, to_world=place))
+    surface, pupil = both(camera_scene(disk(175.0, 9.0, far, tilt=30), ball, to_world=place))
     np.testing.assert_allclose(surface.power, pupil.power, atol=RTOL * pupil.power.max())
     np.testing.assert_allclose(surface.power.sum(), pupil.power.sum(), rtol=1e-3)
 
@@ -100,7 +103,7 @@ def test_all_power_arrives_at_every_focus(focus):
     Seen to fail with the cosine at the surface dropped.
     """
     pitch = 0.8 * 55 / (focus - 55)
-    sharp = scene(sphere(180.0, 8.0), focus_distance=focus, pixel_pitch=pitch)
+    sharp = camera_scene(sphere(180.0, 8.0), focus_distance=focus, pixel_pitch=pitch)
     power = fspt.render(sharp, domain="surface", rtol=0.1).power
     assert power[[0, -1]].max() == power[:, [0, -1]].max() == 0
     assert power.sum() == pytest.approx(collected(8.0, 180.0), rel=2e-3)
@@ -112,12 +115,12 @@ def test_no_pixel_is_left_out_in_focus_nor_stopped_down(f_number):
 
     Expected: the closed form of the filled cone at every pixel, from two triangles and pixels far smaller.
     """
-    picture = fspt.render(scene(disk(FOCUS), f_number=f_number), domain="surface", rtol=RTOL)
+    picture = fspt.render(camera_scene(disk(FOCUS), f_number=f_number), domain="surface", rtol=RTOL)
     np.testing.assert_allclose(picture.power, filled(nodes=2, radius=55 / f_number / 2), rtol=2e-3)
 
 
 def test_same_bits_in_every_run():
-    body = scene(sphere(180.0, 8.0, 3.0), sphere(150.0, 3.0))
+    body = camera_scene(sphere(180.0, 8.0, 3.0), sphere(150.0, 3.0))
     first, second = (fspt.render(body, domain="surface", rtol=0.1) for _ in range(2))
     for plane in ("power", "error", "coverage"):
         np.testing.assert_array_equal(getattr(first, plane), getattr(second, plane))
@@ -134,19 +137,21 @@ def test_same_bits_in_every_run():
     ids=lambda lens: lens.get("model", "diaphragm off the lens"),
 )
 def test_every_model_of_the_lens(lens):
-    surface, pupil = both(scene(sphere(180.0, 8.0, 3.0, -2.0), **lens))
+    surface, pupil = both(camera_scene(sphere(180.0, 8.0, 3.0, -2.0), **lens))
     np.testing.assert_allclose(surface.power, pupil.power, atol=RTOL * pupil.power.max())
 
 
 def test_pixel_centres():
-    surface, pupil = both(scene(sphere(180.0, 8.0, 3.0, -2.0)), rtol=3e-2, pixel="centre", max_nodes=4096)
+    surface, pupil = both(camera_scene(sphere(180.0, 8.0, 3.0, -2.0)), rtol=3e-2, pixel="centre", max_nodes=4096)
     np.testing.assert_allclose(surface.power, pupil.power, atol=3e-2 * pupil.power.max())
 
 
 def test_crop_window_is_a_part_of_the_whole_picture():
     """Expected: the accuracy asked for, the brightest pixel of either picture in the part."""
     x, y, width, height = crop = (15, 9, 12, 10)
-    whole, part = (fspt.render(scene(sphere(180.0, 8.0), crop=c), domain="surface", rtol=RTOL) for c in (None, crop))
+    whole, part = (
+        fspt.render(camera_scene(sphere(180.0, 8.0), crop=c), domain="surface", rtol=RTOL) for c in (None, crop)
+    )
     inside = whole.power[y : y + height, x : x + width]
     np.testing.assert_allclose(part.power, inside, atol=RTOL * whole.power.max())
     assert part.coverage.shape == (height, width)
@@ -160,7 +165,7 @@ def test_a_spot_much_smaller_than_its_blur_keeps_its_power(domain):
     Expected: ∫ J_n f dS to 2e-3, spread evenly over the blur disc. Seen to fail, in the pupil, without that.
     """
     radius, depth = 0.025, 110.0
-    picture = fspt.render(scene(disk(depth, radius)), domain=domain, rtol=RTOL).power
+    picture = fspt.render(camera_scene(disk(depth, radius)), domain=domain, rtol=RTOL).power
     solid = RADIUS**2 / (RADIUS**2 + depth**2)  # of the flux density, from the spot to the pupil
     assert picture.sum() == pytest.approx(np.pi * radius**2 * solid, rel=2e-3)
     blur = RADIUS * abs(FOCUS - depth) / depth * MAGNIFICATION / PITCH  # pixels
@@ -185,7 +190,7 @@ def test_a_bar_thinner_than_a_pixel_or_than_its_blur_is_seen_all_along(bar):
     width, length, blur = bar
     depth = FOCUS * RADIUS / (RADIUS + blur * SIDE)
     size = np.array([length, width]) * SIDE * depth / FOCUS
-    picture = fspt.render(scene(rectangle(depth, *size, angle=27.0)), rtol=RTOL)
+    picture = fspt.render(camera_scene(rectangle(depth, *size, angle=27.0)), rtol=RTOL)
     expected = summed_points(depth, *size, angle=27.0, n=1 << (22 if blur > 4 else 20))
     off = np.abs(picture.power - expected) / expected.max()
     assert off.max() < RTOL
@@ -200,7 +205,7 @@ def test_light_that_only_grazes_the_pupil_is_seen():
     """
     depth, radius, off_axis = 180.0, 3.0, 1.0
     ends = {"p0": [off_axis, off_axis, depth], "p1": [off_axis, off_axis, depth + 1]}
-    picture = fspt.render(scene({"type": "cylinder", **ends, "radius": radius}), rtol=0.05)
+    picture = fspt.render(camera_scene({"type": "cylinder", **ends, "radius": radius}), rtol=0.05)
     turn = np.linspace(0, 2 * np.pi, 720, endpoint=False)[:, None]
     ax, ay = RADIUS * even_disc(20000)
     dx, dy = ax - off_axis - radius * np.cos(turn), ay - off_axis - radius * np.sin(turn)
@@ -218,7 +223,7 @@ def test_a_blur_disc_is_even_from_its_middle_to_its_rim(rtol, most):
     blur = 8.0
     depth = FOCUS * RADIUS / (RADIUS + blur * SIDE)
     side = 0.3 * SIDE * depth / FOCUS
-    picture = fspt.render(scene(rectangle(depth, side, side, angle=27.0)), domain="surface", rtol=rtol).power
+    picture = fspt.render(camera_scene(rectangle(depth, side, side, angle=27.0)), domain="surface", rtol=rtol).power
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     off_middle = np.hypot(x - WIDTH / 2, y - HEIGHT / 2)
     inside = off_middle < blur - 1.5
@@ -256,9 +261,9 @@ def test_a_spot_before_a_body_adds_its_power_where_it_is_blurred():
 
     Expected: pixel by pixel the sum of each alone, to the accuracy asked for.
     """
-    body, spot = disk(FOCUS, 8.0), {**disk(110.0, 0.02), "glow": {"type": "fspt_surface", "exitance": 3e4}}
-    both_shine = fspt.render(scene(body, spot), rtol=0.1)
-    alone = [fspt.render(scene(shape), rtol=3e-2).power for shape in (body, spot)]
+    body, spot = disk(FOCUS, 8.0), {**disk(110.0, 0.02), "emitter": glow(3e4)}
+    both_shine = fspt.render(camera_scene(body, spot), rtol=0.1)
+    alone = [fspt.render(camera_scene(shape), rtol=3e-2).power for shape in (body, spot)]
     assert alone[1].max() > 0.5 * alone[0].max()
     np.testing.assert_allclose(both_shine.power, sum(alone), atol=0.1 * both_shine.power.max())
     assert "lines a pixel" in both_shine.metadata["levels"]
@@ -267,15 +272,15 @@ def test_a_spot_before_a_body_adds_its_power_where_it_is_blurred():
 
 def test_a_light_without_a_surface_is_refused():
     lamp = {"type": "point", "position": [0.0, 0.0, 150.0], "intensity": 1.0}
-    lit = scene(sphere(180.0, 8.0), lamp=lamp)
+    lit = camera_scene(sphere(180.0, 8.0), lamp=lamp)
     with pytest.raises(SceneError, match="needs surfaces"):
         fspt.render(lit, domain="surface")
 
 
 @pytest.mark.parametrize("domain", ["surface", "pupil"])
 def test_light_from_beyond_all_surfaces_is_refused(domain):
-    """Rationale: pixels beside the bodies would not see it."""
-    sky = scene(sphere(180.0, 8.0), lamp={"type": "constant"})
+    """Rationale: pixels beside the objects would not see it."""
+    sky = camera_scene(sphere(180.0, 8.0), lamp={"type": "constant"})
     with pytest.raises(SceneError, match=r"shines from beyond all surfaces.* Leave it out, or render with method path"):
         fspt.render(sky, domain=domain)
 
@@ -287,7 +292,7 @@ def test_a_small_ball_far_out_of_focus():
     line to line, instead of those of a piece's middle.
     """
     depth, radius, x, y = 120.0, 0.4, 1.0, -2.0
-    picture = fspt.render(scene(sphere(depth, radius, x, y)), domain="surface", rtol=1e-3)
+    picture = fspt.render(camera_scene(sphere(depth, radius, x, y)), domain="surface", rtol=1e-3)
     rows, columns = np.nonzero(picture.power > 0)
     pick = slice(None, None, 6)
     expected = [
@@ -321,7 +326,7 @@ def test_a_thin_tube_far_away():
 
     place = mi.ScalarTransform4f().translate([-4, 0, FOCUS])
     tube = {"type": "cylinder", "p0": [0, -3, 0], "p1": [0, 3, 0], "radius": 0.2, "to_world": place}
-    of = scene(tube, f_number=8.0, pixel_pitch=0.2)
+    of = camera_scene(tube, f_number=8.0, pixel_pitch=0.2)
     surface, pupil = (fspt.render(of, domain=domain, rtol=1e-3).power for domain in ("surface", "pupil"))
     np.testing.assert_allclose(surface, pupil, atol=1e-3 * surface.max())
 
@@ -342,7 +347,7 @@ def test_no_pixel_is_dark_because_the_first_lines_of_sight_pass_it_by(tmp_path):
     border, pitch, u = 3.028, 0.70377, 180.0
     optics = {"f_number": 6.1255, "magnification": None, "focus_distance": u, "to_world": None}
     telecentric = {"diaphragm_distance": 55.0, "lens_diameter": border}
-    of = scene_of(mesh | {"emitter": glow(1.0)}, sensor=lens(size=(12, 10), pitch=pitch, **optics, **telecentric))
+    of = world_scene(mesh | {"emitter": glow(1.0)}, sensor=lens(size=(12, 10), pitch=pitch, **optics, **telecentric))
     side, radius = pitch * 125 / 55, border / 2
     squared = (1.5**2 + 0.5**2) * side**2
     z = u**2 + radius**2 + squared
@@ -366,8 +371,8 @@ def test_a_spot_on_a_wall_of_two_faces_adds_its_light(domain):
     disks = [{"type": "disk", "to_world": mi_turned(x, y, 179.99, 0.1 * pitch)} for x, y in spots]
     shapes = [wall | {"emitter": glow(1.0)}, *(disk | {"emitter": glow(3.0)} for disk in disks)]
     optics = {"f_number": 4.0, "magnification": None, "focus_distance": 180.0, "to_world": None}
-    of = scene_of(*shapes, sensor=lens(size=(12, 10), pitch=pitch * 55 / 125, **optics))
-    bare = scene_of(shapes[0], sensor=lens(size=(12, 10), pitch=pitch * 55 / 125, **optics))
+    of = world_scene(*shapes, sensor=lens(size=(12, 10), pitch=pitch * 55 / 125, **optics))
+    bare = world_scene(shapes[0], sensor=lens(size=(12, 10), pitch=pitch * 55 / 125, **optics))
     expected = fspt.render(bare, domain="pupil", rtol=1e-4).power.copy()
     for x, y in spots:
         expected[int(5 - y / pitch), int(6 - x / pitch)] *= 1 + 2 * np.pi * 0.1**2
@@ -393,7 +398,7 @@ def test_a_bright_vertex_of_small_faces_lies_where_it_is(tmp_path, domain):
     glowing = glow({"type": "mesh_attribute", "name": "vertex_exitance"})
     optics = {"f_number": 8.0, "magnification": None, "focus_distance": 180.0, "to_world": None}
     camera = lens(size=(12, 10), pitch=side * 55 / 125, **optics)
-    of = scene_of({"type": "ply", "filename": str(path), "face_normals": True, "emitter": glowing}, sensor=camera)
+    of = world_scene({"type": "ply", "filename": str(path), "face_normals": True, "emitter": glowing}, sensor=camera)
     image = fspt.render(of, domain=domain, rtol=1e-2)
     u, v = (c.ravel() for c in np.meshgrid(*2 * [(np.arange(2000) + 0.5) / 1000 - 1]))
     cone = (1 - np.maximum(np.maximum(np.abs(u), np.abs(v)), np.abs(u - v))).clip(0) * (steps / 1000 / side) ** 2

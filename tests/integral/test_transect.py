@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from little_scenes import glow, lens, mi, scene_of
+from small_scenes import glow, lens, mi, world_scene
 
 from mitsuba_fspt.integral import node_rules
 from mitsuba_fspt.integral.draft import Draft
@@ -126,7 +126,7 @@ def test_scatter_says_where_transects_kink_and_where_they_only_lean():
     import drjit as dr
 
     balls = [{"type": "sphere", "center": [x, y, 0], "radius": 4.0, "emitter": glow()} for x, y in ((12, -2), (-15, 2))]
-    scene = scene_of(*balls, sensor=lens(48, pitch=0.2, f_number=2.8))
+    scene = world_scene(*balls, sensor=lens(48, pitch=0.2, f_number=2.8))
     sensor = scene.sensors()[0]
     window = visible_window(scene, sensor)
     draft = Draft(View.of(scene, sensor, window), window, Quadrature(rtol=1e-4), None)
@@ -167,7 +167,7 @@ def test_eight_transects_know_the_share_of_a_straight_edge(shift, turn):
     width = 20.0
     corner = mi.ScalarTransform4f().translate([shift, 0, 0]).rotate([1, 0, 0], turn).rotate([0, 1, 0], 90)
     plane = corner.translate([0, width, 0]).scale(width)
-    scene = scene_of(
+    scene = world_scene(
         {"type": "rectangle", "to_world": plane, "emitter": glow()}, sensor=lens(24, pitch=0.02, f_number=20.0)
     )
     rays = [node_rules.along_transect(level, 1e-4).rays for level in (0, 1)]
@@ -198,7 +198,7 @@ def test_a_transect_is_split_where_it_enters_one_body_leaves_it_for_another_and_
         {"type": "sphere", "center": [x, y, 0], "radius": 2.0, "emitter": glow(j)}
         for x, y, j in ((10, -1, 2e-3), (-10, 1, 1e-3))
     ]
-    scene = scene_of(*balls, sensor=lens(8, pitch=4.0, f_number=2.8))
+    scene = world_scene(*balls, sensor=lens(8, pitch=4.0, f_number=2.8))
     sensor, points, number = scene.sensors()[0], 4000, 16
     view = View.of(scene, sensor, visible_window(scene, sensor))
     place = np.stack([np.linspace(0.3, 0.7, number), np.full(number, 0.5), np.linspace(0.4, 0.6, number)])

@@ -15,7 +15,7 @@ backend.ensure_variant()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-from little_scenes import ball, glow, lens, scene_of  # noqa: E402
+from small_scenes import ball, glow, lens, world_scene  # noqa: E402
 
 import mitsuba_fspt as fspt  # noqa: E402
 from mitsuba_fspt.runtime.errors import OpticsError  # noqa: E402
@@ -214,7 +214,7 @@ def test_a_crop_window_is_a_part_of_the_film():
 
 def pictures(settings, spp=4000):
     """Integral, path and ptracer of a ball, off the axis, and the Monte Carlo errors."""
-    scene = scene_of(ball(2e-3, center=(6, 1.5, -1)), sensor=lens(size=12, pitch=0.9, **settings))
+    scene = world_scene(ball(2e-3, center=(6, 1.5, -1)), sensor=lens(size=12, pitch=0.9, **settings))
     return [
         fspt.render(scene),
         *(fspt.render(scene, method=m, spp=spp, seed=3) for m in ("path", "ptracer")),
@@ -239,7 +239,7 @@ def test_a_crop_window_is_cut_out_of_the_picture(method):
     film = {"type": "hdrfilm", "width": 12, "height": 12, "pixel_format": "luminance"}
     images = []
     for window in ({}, crop):
-        scene = scene_of(ball(center=(0, 1.5, -1)), sensor=lens(pitch=0.9, film=film | window))
+        scene = world_scene(ball(center=(0, 1.5, -1)), sensor=lens(pitch=0.9, film=film | window))
         images.append(fspt.render(scene, method=method, **options))
     whole, part = images
     assert part.shape == (3, 5)
@@ -256,7 +256,9 @@ def test_a_crop_window_is_cut_out_of_the_picture(method):
 def test_films_of_a_row_a_column_or_one_pixel(method, size):
     """A sheet in the sharp plane that fills every line of sight: J_n A_vd sin²θ on each pixel near the axis."""
     place = mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale([15, 15, 1])
-    scene = scene_of({"type": "rectangle", "to_world": place, "emitter": glow(1e-3)}, sensor=lens(size=size, pitch=2.0))
+    scene = world_scene(
+        {"type": "rectangle", "to_world": place, "emitter": glow(1e-3)}, sensor=lens(size=size, pitch=2.0)
+    )
     options = {"rtol": 1e-2} if method == "integral" else {"spp": 20_000}
     image = fspt.render(scene, method=method, **options)
     assert image.shape == size[::-1]
@@ -281,7 +283,7 @@ CHANGES = {
 @pytest.mark.parametrize("name", CHANGES)
 def test_an_updated_parameter_changes_the_picture_as_in_a_fresh_scene(name):
     value = CHANGES[name]
-    scene, fresh = (scene_of(ball(), sensor=lens(size=12, pitch=1.0, **s)) for s in ({}, {name: value}))
+    scene, fresh = (world_scene(ball(), sensor=lens(size=12, pitch=1.0, **s)) for s in ({}, {name: value}))
     before = fspt.render(scene, max_nodes=4)
     parameters = mi.traverse(scene)
     parameters[f"camera.{name}"] = mi.Transform4f(value) if name == "to_world" else value
@@ -338,4 +340,4 @@ def test_to_string_tells_every_parameter():
         assert name in text
     assert "lens_diameter = 30" in text
     assert "diaphragm_distance = 5" in text
-    assert "exitance" in str(scene_of({"type": "sphere", "emitter": glow()}).emitters()[0])
+    assert "exitance" in str(world_scene({"type": "sphere", "emitter": glow()}).emitters()[0])

@@ -21,7 +21,7 @@ backend.ensure_variant()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-from little_scenes import attribute, ball, glow, scene_of, write_ply  # noqa: E402
+from small_scenes import attribute, ball, glow, world_scene, write_ply  # noqa: E402
 
 from mitsuba_fspt.emission.elements import UNIFORM_SHARE  # noqa: E402
 from mitsuba_fspt.runtime.errors import SceneError  # noqa: E402
@@ -58,7 +58,7 @@ class Case:
 def plastic(shape, exitance, scale=(1, 1, 1), **settings):
     """Scene of one shape at `PLACE`."""
     place = {"to_world": PLACE @ mi.ScalarTransform4f().scale(list(scale))}
-    return scene_of({"type": shape, **place, **settings, "emitter": glow(exitance)})
+    return world_scene({"type": shape, **place, **settings, "emitter": glow(exitance)})
 
 
 def pebble(per, value_of, folder):
@@ -371,7 +371,7 @@ def test_the_scene_samples_it_like_any_emitter(case):
 
 def test_exitance_far_above_one_passes_unscaled():
     """A reflectance would be refused or cut above 1."""
-    scene = scene_of({"type": "sphere", "radius": 3.0, "emitter": glow(4e7)})
+    scene = world_scene({"type": "sphere", "radius": 3.0, "emitter": glow(4e7)})
     si = scene.ray_intersect(mi.Ray3f([0, 0, 9], [0, 0, -1]))
     assert scene.emitters()[0].eval(si)[0].numpy() == pytest.approx(4e7 / np.pi, rel=1e-6)
 
@@ -379,7 +379,7 @@ def test_exitance_far_above_one_passes_unscaled():
 def test_a_scaled_attribute_is_scaled(tmp_path):
     path = write_ply(tmp_path / "a.ply", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)], vertex=[1, 1, 1])
     shape = {"type": "ply", "filename": str(path), "emitter": glow(attribute(scale=3.0))}
-    emitter = (scene := scene_of(shape)).emitters()[0]
+    emitter = (scene := world_scene(shape)).emitters()[0]
     _, weight = emitter.sample_ray(0.0, 0.5, mi.Point2f(0.3, 0.4), mi.Point2f(0.2, 0.1))
     assert weight[0].numpy() == pytest.approx(3 * 0.5, rel=1e-4)
     assert len(scene.shapes()) == 1
@@ -388,14 +388,14 @@ def test_a_scaled_attribute_is_scaled(tmp_path):
 def test_equal_emitters_stand_on_both_their_shapes():
     """`mi.load_dict` merges equal plugins; two shapes that glow alike must keep an emitter each."""
     shapes = [{"type": "sphere", "center": [0, 0, z], "emitter": glow(1e-3)} for z in (-2, 2)]
-    scene = scene_of(*shapes)
+    scene = world_scene(*shapes)
     assert [emitter.get_shape() is not None for emitter in scene.emitters()] == [True, True]
     assert {float(emitter.get_shape().bbox().min.z) for emitter in scene.emitters()} == {-3.0, 1.0}
 
 
 def test_the_power_is_differentiable_in_the_exitance():
     """d(power)/dJ_n = area, through the emitter's rays."""
-    scene = scene_of({"type": "rectangle", "emitter": glow(2e-3)})
+    scene = world_scene({"type": "rectangle", "emitter": glow(2e-3)})
     parameters = mi.traverse(scene)
     key = "shape_0.emitter.exitance.value"
     dr.enable_grad(parameters[key])
@@ -414,7 +414,9 @@ def test_slivers_on_which_no_place_is_found_are_no_harm(domain, tmp_path):
 
     def power(faces):
         mesh = {"type": "ply", "filename": str(write_ply(tmp_path / "sheet.ply", square, faces, vertex=[1e-3] * 7))}
-        scene = scene_of(mesh | {"emitter": glow(attribute())}, integrator={"type": "fspt_integral", "domain": domain})
+        scene = world_scene(
+            mesh | {"emitter": glow(attribute())}, integrator={"type": "fspt_integral", "domain": domain}
+        )
         return np.array(mi.render(scene))
 
     assert power([*faces, (4, 5, 6)]) == pytest.approx(power(faces), rel=1e-3, abs=0)
@@ -428,7 +430,7 @@ def test_a_rendered_scene_can_be_freed_and_keeps_its_names(integrator, tmp_path)
     gc.collect()
     kept = sum(type(thing).__name__ == "FsptSurface" for thing in gc.get_objects())
     depth = {} if integrator == "fspt_integral" else {"max_depth": 1}
-    scene = scene_of(
+    scene = world_scene(
         {"type": "ply", "filename": str(path), "emitter": glow(attribute())}, integrator={"type": integrator, **depth}
     )
     image = mi.render(scene, spp=4)
@@ -447,7 +449,7 @@ def test_an_integrator_of_its_own_keeps_no_emitter(tmp_path):
     gc.collect()
     kept = sum(type(thing).__name__ == "FsptSurface" for thing in gc.get_objects())
     for shape in ({"type": "ply", "filename": str(path), "emitter": glow(attribute())}, ball()):
-        scene = scene_of(shape)
+        scene = world_scene(shape)
         assert integrator.solve(scene, scene.sensors()[0]).power.max() > 0
         del scene
         gc.collect()
@@ -460,7 +462,7 @@ def test_round_shapes_that_are_stretched_are_refused(kind, scale):
     import mitsuba_fspt as fspt
 
     place = mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale(scale)
-    scene = scene_of({"type": kind, "to_world": place, "emitter": glow()})
+    scene = world_scene({"type": kind, "to_world": place, "emitter": glow()})
     with pytest.raises(SceneError, match=rf"'to_world' of {kind} .* stretches or shears it.* Give a rotation \(about"):
         fspt.render(scene)
 
@@ -471,7 +473,7 @@ def test_a_rotation_about_an_axis_not_of_length_1_is_refused(kind):
     import mitsuba_fspt as fspt
 
     place = mi.ScalarTransform4f().rotate([1, 0.5, 0], 40).scale(3)
-    scene = scene_of({"type": kind, "to_world": place, "emitter": glow()})
+    scene = world_scene({"type": kind, "to_world": place, "emitter": glow()})
     with pytest.raises(SceneError, match=r"Give (every rotation an axis|a rotation \(about an axis) of length 1"):
         fspt.render(scene)
 
@@ -480,14 +482,14 @@ def test_a_disk_may_be_an_ellipse():
     import mitsuba_fspt as fspt
 
     place = mi.ScalarTransform4f().rotate([0.48, 0.64, 0.6], 30).rotate([0, 1, 0], 90).scale([1e-2, 10, 1])
-    assert fspt.render(scene_of({"type": "disk", "to_world": place, "emitter": glow()})).power.max() > 0
+    assert fspt.render(world_scene({"type": "disk", "to_world": place, "emitter": glow()})).power.max() > 0
 
 
 def test_a_cylinder_may_be_as_long_as_it_likes():
     import mitsuba_fspt as fspt
 
     place = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 30).scale([1, 1, 9])
-    assert fspt.render(scene_of({"type": "cylinder", "to_world": place, "emitter": glow()})).power.max() > 0
+    assert fspt.render(world_scene({"type": "cylinder", "to_world": place, "emitter": glow()})).power.max() > 0
 
 
 @pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk", "rectangle", "cube"])
@@ -519,7 +521,7 @@ def test_elements_of_turned_shapes_lie_where_their_parameters_say(kind, angle):
     from mitsuba_fspt.emission.elements import ParameterElements
 
     shape = {"type": kind, "to_world": mi.ScalarTransform4f().rotate([0, 0, 1], angle).scale(5), "emitter": glow()}
-    scene = scene_of(shape)
+    scene = world_scene(shape)
     elements = ParameterElements(scene.shapes()[0], 10_000)
     number = np.arange(elements.count)
     si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(0.3, 0.6))

@@ -38,9 +38,9 @@ import mitsuba_fspt as fspt
 import mitsuba as mi
 import numpy as np
 def pictures():
-    from little_scenes import attribute, ball, glow, lens, scene_of
+    from small_scenes import attribute, ball, glow, lens, world_scene
     mesh = {"type": "ply", "filename": sys.argv[1], "face_normals": True, "emitter": glow(attribute())}
-    scene = scene_of(mesh, ball(700.0, radius=1.5, center=(9, 1, 1)), sensor=lens(size=8, pitch=1.0))
+    scene = world_scene(mesh, ball(700.0, radius=1.5, center=(9, 1, 1)), sensor=lens(size=8, pitch=1.0))
     integral = fspt.render(scene)
     plain = np.array(mi.render(scene)).mean(-1)
     tracers = [fspt.render(scene, method=method, spp=256) for method in ("path", "ptracer")]
@@ -78,7 +78,7 @@ def pictures(tmp_path_factory):
     """What `all_pictures` says in every run: power by integral and plain mi.render, power and error by path and by
     ptracer, the variant.
     """
-    from little_scenes import write_ply
+    from small_scenes import write_ply
 
     vertices = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
     path = tmp_path_factory.mktemp("variants") / "sheet.ply"
@@ -110,9 +110,9 @@ def test_path_has_the_watts_of_the_integral_at_all_wavelengths():
 import mitsuba_fspt as fspt
 import mitsuba as mi
 mi.set_variant("llvm_ad_spectral")
-from little_scenes import glow, lens, scene_of
+from small_scenes import glow, lens, world_scene
 turned = mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale(60)
-scene = scene_of({"type": "disk", "to_world": turned, "emitter": glow()}, sensor=lens(size=16, pitch=0.2))
+scene = world_scene({"type": "disk", "to_world": turned, "emitter": glow()}, sensor=lens(size=16, pitch=0.2))
 path, integral = (fspt.render(scene, method=method) for method in ("path", "integral"))
 print(json.dumps(path.power.sum() / integral.power.sum() - 1))
 """

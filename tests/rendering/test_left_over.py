@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from little_scenes import BALL_XML, LENS_XML, write_scene
+from small_scenes import BALL_XML, LENS_XML, write_scene
 
 FAILING = {
     "a shape": {"shapes": BALL_XML.replace("<emitter", '<float name="colour" value="1"/><emitter')},

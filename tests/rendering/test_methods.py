@@ -14,7 +14,21 @@ import pytest
 import trimesh
 from reference_cases import rms
 from scipy.stats import t as student
-from small_scenes import F_NUMBER, FOCAL, FOCUS, HEIGHT, PITCH, WIDTH, disk, load, power, scene, sphere
+from small_scenes import (
+    F_NUMBER,
+    FOCAL,
+    FOCUS,
+    HEIGHT,
+    PITCH,
+    WIDTH,
+    attribute,
+    camera_scene,
+    disk,
+    glow,
+    load_scene,
+    power,
+    sphere,
+)
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.validation.reference import Camera, pupil_form
@@ -35,8 +49,8 @@ MODELS = {
 def phantom(name):
     """The scene made anew: kernels hold a branch for each emitter alive, and are not shared where those differ."""
     if name in MODELS:
-        return scene(sphere(180.0, 8.0, 3.0, -2.0), **MODELS[name])
-    return load(name, f_number=2.8)
+        return camera_scene(sphere(180.0, 8.0, 3.0, -2.0), **MODELS[name])
+    return load_scene(name, f_number=2.8)
 
 
 @cache
@@ -153,10 +167,10 @@ def test_integral_agrees_with_the_reference_where_one_body_hides_another():
     the near sphere, out of focus, covers the edge of the far one. Seen to fail with the near sphere left out, cos⁴θ →
     cos³θ, 1/π dropped.
     """
-    bodies = [(sphere(180.0, 8.0, -6.5), 1.0), (sphere(140.0, 2.0, 1.0, -0.5), 2.0)]
-    shapes = [{**body, "glow": {"type": "fspt_surface", "exitance": glow}} for body, glow in bodies]
-    picture = power(scene(*shapes, crop=MIDDLE), rtol=1e-3)
-    balls = [Sphere(body["center"], body["radius"]) for body, _ in bodies]
+    objects = [(sphere(180.0, 8.0, -6.5), 1.0), (sphere(140.0, 2.0, 1.0, -0.5), 2.0)]
+    shapes = [{**shape, "emitter": glow(exitance)} for shape, exitance in objects]
+    picture = power(camera_scene(*shapes, crop=MIDDLE), rtol=1e-3)
+    balls = [Sphere(shape["center"], shape["radius"]) for shape, _ in objects]
     truth, error = pupil_form(
         camera(*MIDDLE[2:]), balls, lambda p, i: np.full(len(p), (1.0, 2.0)[i]), 1 << 14, "lattice"
     )
@@ -173,13 +187,12 @@ def test_integral_agrees_with_the_reference_on_a_mesh_with_exitance_at_its_verti
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=4.0)
     mesh.apply_translation([0.3, -0.2, 172.0])
     x, y, z = mesh.vertices.T
-    glow = 1 + 0.6 * np.sin(0.8 * x + 1.1 * y) * np.cos(0.5 * z)
-    mesh.vertex_attributes["exitance_x"] = glow.astype(np.float32)
+    exitance = 1 + 0.6 * np.sin(0.8 * x + 1.1 * y) * np.cos(0.5 * z)
+    mesh.vertex_attributes["exitance_x"] = exitance.astype(np.float32)
     mesh.export(tmp_path / "ball.ply")
-    emitter = {"type": "fspt_surface", "exitance": {"type": "mesh_attribute", "name": "vertex_exitance"}}
-    ball = {"type": "ply", "filename": str(tmp_path / "ball.ply"), "face_normals": True, "glow": emitter}
-    picture = power(scene(ball, crop=MIDDLE), rtol=1e-3)
-    body = TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), glow[mesh.faces])
+    ball = {"type": "ply", "filename": str(tmp_path / "ball.ply"), "face_normals": True, "emitter": glow(attribute())}
+    picture = power(camera_scene(ball, crop=MIDDLE), rtol=1e-3)
+    body = TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), exitance[mesh.faces])
     truth, error = mesh_truth(camera(*MIDDLE[2:]), body, levels=((512, 3),))
     assert error.max() < 1.5e-3 * truth.max()
     np.testing.assert_allclose(picture, truth, atol=1e-3 * truth.max() + 3 * error.max())
@@ -190,7 +203,9 @@ def test_integral_agrees_with_path_where_the_lens_border_cuts_the_pupil():
 
     Expected: the accuracy asked for, beside the noise. Seen to fail, by 3.5e-2, with nodes that pass the border by.
     """
-    vignetted = scene(disk(FOCUS, 200.0), f_number=5.6, lens_diameter=22.0, diaphragm_distance=20.0, pixel_pitch=1.0)
+    vignetted = camera_scene(
+        disk(FOCUS, 200.0), f_number=5.6, lens_diameter=22.0, diaphragm_distance=20.0, pixel_pitch=1.0
+    )
     picture = power(vignetted, rtol=5e-3)
     path = fspt.render(vignetted, method="path", spp=1024, seed=1)
     assert picture.min() < 0.8 * picture.max()

@@ -10,7 +10,7 @@ from mitsuba_fspt.runtime import backend
 backend.ensure_variant()
 
 import mitsuba as mi  # noqa: E402
-from little_scenes import ball, lens, scene_of, write_scene  # noqa: E402
+from small_scenes import ball, lens, world_scene, write_scene  # noqa: E402
 
 import mitsuba_fspt as fspt  # noqa: E402
 from mitsuba_fspt.rendering.monte_carlo import standard_error  # noqa: E402
@@ -106,7 +106,7 @@ def test_the_standard_error_of_monte_carlo_is_its_scatter(scene, method):
 @pytest.mark.parametrize("method", ["path", "ptracer"])
 def test_what_no_sample_met_has_the_error_of_a_single_one(method):
     """Expected: the light that few samples miss on the pixels of the rim is within some errors. Fails with none (0)."""
-    scene = scene_of(ball(radius=3.0), sensor=lens(size=48, pixel_pitch=0.1, f_number=2.8))
+    scene = world_scene(ball(radius=3.0), sensor=lens(size=48, pixel_pitch=0.1, f_number=2.8))
     exact = fspt.render(scene, rtol=1e-3).power
     missed, error = [], []
     for seed in range(4):
@@ -124,7 +124,7 @@ def test_what_no_sample_missed_beside_a_border_has_the_error_of_a_single_miss():
 
     Fails for one in twelve of these pixels, by 26 errors, with their scatter alone.
     """
-    scene = scene_of(ball(radius=3.0), sensor=lens(size=48, pixel_pitch=0.1, f_number=2.8))
+    scene = world_scene(ball(radius=3.0), sensor=lens(size=48, pixel_pitch=0.1, f_number=2.8))
     exact = fspt.render(scene, rtol=1e-3)
     rim = (exact.coverage > 0.9) & (exact.coverage < 0.999)
     off, error = [], []
@@ -168,7 +168,9 @@ def test_a_scene_without_integrator_takes_the_integral():
 
 
 def test_the_scenes_own_monte_carlo_is_taken():
-    scene = scene_of(ball(), integrator={"type": "path", "max_depth": 1}, sensor=lens(sampler={"type": "independent"}))
+    scene = world_scene(
+        ball(), integrator={"type": "path", "max_depth": 1}, sensor=lens(sampler={"type": "independent"})
+    )
     image = fspt.render(scene, spp=4)
     assert image.metadata["method"] == "path"
     assert "Independent" in image.metadata["sampler"]
@@ -188,7 +190,7 @@ def test_progress_is_told(scene, options):
 
 def test_exitance_scales_the_picture_and_nothing_clips():
     """Twelve decades."""
-    sums = [fspt.render(scene_of(ball(j)), max_nodes=4).power.sum() / j for j in (1e-6, 1.0, 1e6)]
+    sums = [fspt.render(world_scene(ball(j)), max_nodes=4).power.sum() / j for j in (1e-6, 1.0, 1e6)]
     np.testing.assert_allclose(sums, sums[0], rtol=1e-5)
 
 

@@ -11,7 +11,7 @@ backend.ensure_variant()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-from little_scenes import (  # noqa: E402
+from small_scenes import (  # noqa: E402
     BALL_XML,
     LENS_XML,
     SCENES,
@@ -19,7 +19,7 @@ from little_scenes import (  # noqa: E402
     ball,
     glow,
     lens,
-    scene_of,
+    world_scene,
     write_ply,
     write_scene,
 )
@@ -200,7 +200,7 @@ def test_plain_mitsuba_renders_monte_carlo_in_the_same_unit(tmp_path, method):
 
 def test_a_scene_from_a_dictionary_is_the_scene_of_the_file(tmp_path):
     path = write_scene(tmp_path / "s.xml")
-    scene = scene_of(ball(radius=3.0), sensor=lens(size=(8, 6)))
+    scene = world_scene(ball(radius=3.0), sensor=lens(size=(8, 6)))
     same_power(fspt.render(scene).power, fspt.render(path).power)
 
 
@@ -246,7 +246,7 @@ def test_textures_nest_in_a_scene_file(tmp_path):
 
 
 def test_updating_a_number_scales_the_picture():
-    scene = scene_of(ball(1e-3))
+    scene = world_scene(ball(1e-3))
     before = fspt.render(scene, max_nodes=4).power
     parameters = mi.traverse(scene)
     parameters["shape_0.emitter.exitance.value"] = 3e-3
@@ -259,7 +259,7 @@ def graded(tmp_path):
     """A scene of one sheet whose J_n rises along y, and its parameters."""
     path = sheet(tmp_path / "sheet.ply", value=lambda y, z: 1e-3 * (5 + y))
     shape = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute())}
-    scene = scene_of(shape, sensor=lens(size=8))
+    scene = world_scene(shape, sensor=lens(size=8))
     return scene, mi.traverse(scene)
 
 
@@ -295,7 +295,7 @@ def test_updating_to_values_that_cannot_be_is_refused_at_every_render(graded, va
 
 
 def test_a_moved_shape_is_seen_where_it_went():
-    scene = scene_of(ball(radius=2.0), sensor=lens(size=9))
+    scene = world_scene(ball(radius=2.0), sensor=lens(size=9))
     parameters = mi.traverse(scene)
     parameters["shape_0.to_world"] = mi.Transform4f().translate([0, 4, 0]).scale(2)
     parameters.update()

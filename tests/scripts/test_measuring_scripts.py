@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from little_scenes import write_scene
+from small_scenes import write_scene
 
 pytestmark = pytest.mark.usefixtures("mono")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))

@@ -14,8 +14,7 @@ import time
 import numpy as np
 import pytest
 import small_scenes
-from little_scenes import write_scene
-from small_scenes import FOCUS, HEIGHT, RADIUS, SIDE, WIDTH
+from small_scenes import FOCUS, HEIGHT, RADIUS, SIDE, WIDTH, write_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.cli import app
@@ -151,7 +150,7 @@ def test_every_method_comes_nearer_with_its_knob(tmp_path):
 
     A ball behind the sharp plane, as blurred as the sum over points needs it.
     """
-    scene = small_scenes.scene(small_scenes.sphere(220.0, 6.0), exitance=1e-3)
+    scene = small_scenes.camera_scene(small_scenes.sphere(220.0, 6.0), exitance=1e-3)
     told = fspt.converge(scene, rounds=1, budget=100.0)
     assert told.methods == ALL
     assert told.skipped == {}
@@ -181,7 +180,7 @@ def test_every_method_comes_nearer_with_its_knob(tmp_path):
 
 @pytest.mark.usefixtures("mono", "short")
 def test_a_dark_picture_is_refused():
-    scene = small_scenes.scene(small_scenes.sphere(200.0, 10.0, x=400.0))
+    scene = small_scenes.camera_scene(small_scenes.sphere(200.0, 10.0, x=400.0))
     with pytest.raises(SceneError, match="dark"):
         fspt.converge(scene)
 
@@ -190,13 +189,13 @@ def test_a_dark_picture_is_refused():
 def test_methods_that_do_not_apply_are_left_out_with_the_reason():
     import mitsuba as mi
 
-    pinhole = small_scenes.scene(small_scenes.sphere(200.0, 10.0), model="pinhole")
+    pinhole = small_scenes.camera_scene(small_scenes.sphere(200.0, 10.0), model="pinhole")
     offered, skipped = converge_methods.methods(pinhole, pinhole.sensors()[0])
     assert {method.name for method in offered} | set(skipped) == set(ALL)
     assert set(skipped) == {"integral, surface form", "sum over points", "ptracer"}
     assert all("pinhole" in reason for reason in skipped.values())
     lamp = mi.load_dict({"type": "constant"})
-    sky = small_scenes.scene(small_scenes.sphere(200.0, 10.0), lamp=lamp)
+    sky = small_scenes.camera_scene(small_scenes.sphere(200.0, 10.0), lamp=lamp)
     assert "no surface" in converge_methods.methods(sky, sky.sensors()[0])[1]["ptracer"]
 
 
@@ -206,7 +205,7 @@ def test_lens_with_another_sampler_is_the_same_lens():
     import mitsuba as mi
 
     borders = {"lens_diameter": 30.0, "diaphragm_distance": 20.0}
-    lens = small_scenes.scene(small_scenes.disk(FOCUS), crop=(3, 5, 20, 10), **borders).sensors()[0]
+    lens = small_scenes.camera_scene(small_scenes.disk(FOCUS), crop=(3, 5, 20, 10), **borders).sensors()[0]
     twin = converge_methods.lens_with(lens, "stratified")
     assert twin.sampler().class_name() == "StratifiedSampler"
     assert [int(n) for n in (*twin.film().crop_size(), *twin.film().crop_offset())] == [20, 10, 3, 5]
@@ -220,7 +219,7 @@ def test_raw_rays_are_as_many_as_asked_for():
     """On the pixels that can see what glows alone: rays beside it cost next to nothing."""
     from mitsuba_fspt.integral.window import visible_window
 
-    scene = small_scenes.scene(small_scenes.sphere(200.0, 4.0))
+    scene = small_scenes.camera_scene(small_scenes.sphere(200.0, 4.0))
     lens = scene.sensors()[0]
     once = 4 * math.prod(visible_window(scene, lens).shape)
     assert 0 < once < 2 * WIDTH * HEIGHT
@@ -238,7 +237,7 @@ def test_reference_is_as_near_to_the_closed_form_as_it_says():
 
     The statement is no empty one: below 1e-5 of the peak.
     """
-    scene = small_scenes.scene(small_scenes.disk(FOCUS))
+    scene = small_scenes.camera_scene(small_scenes.disk(FOCUS))
     made = converge_reference.own_reference(scene, scene.sensors()[0], 1.0)
     truth = SIDE**2 * small_scenes.over_pixels(
         lambda x, y: small_scenes.configuration_factor(RADIUS, FOCUS, np.hypot(x, y)), nodes=4

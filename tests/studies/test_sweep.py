@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from little_scenes import BALL_XML, LENS_XML, write_ply, write_scene
+from small_scenes import BALL_XML, LENS_XML, write_ply, write_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.images import picture

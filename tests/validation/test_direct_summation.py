@@ -22,7 +22,7 @@ def patch(z, x=0.0, y=0.0, turn=180.0):
 def summed(*shapes, minimum=20000, **lens):
     from mitsuba_fspt.validation import direct_summation
 
-    scene = small_scenes.scene(*shapes, **lens)
+    scene = small_scenes.camera_scene(*shapes, **lens)
     power, pairs = direct_summation.solve(scene, scene.sensors()[0], minimum)
     assert pairs >= (power > 0).sum()
     return power
@@ -41,7 +41,7 @@ def test_sum_over_points_carries_what_enters_the_diaphragm(depth):
 def test_sum_over_points_comes_to_the_integral_far_from_the_sharp_plane():
     """Expected: a blur disc of 8 pixels' radius gathers its edge by whole pixels: 2 % of the peak on any."""
     body = small_scenes.sphere(400.0, 20.0, x=3.0)
-    truth = small_scenes.power(small_scenes.scene(body), rtol=1e-3)
+    truth = small_scenes.power(small_scenes.camera_scene(body), rtol=1e-3)
     assert np.abs(summed(body, minimum=1 << 18) - truth).max() < 0.02 * truth.max()
 
 
