@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -16,8 +11,6 @@ import typer
 from ..runtime.backend import quiet_mitsuba
 from .options import Parameters, SceneFile, definitions, require_writable
 from .terminal import progress_bar
-
-CACHE = "DRJIT_CACHE_DIR"
 
 
 def converge(
@@ -39,16 +32,15 @@ def converge(
     and the times to an error. Takes about rounds x 20 x budget and two minutes.
     """
     from ..images.picture import require_matplotlib
-    from ..studies.converge_sheet import png_file, write_csv
-    from ..studies.converge_table import render_text
+    from ..studies.converge import converge, empty_kernel_cache
+    from ..studies.convergence_report import png_file, write_csv
 
     figure, sheet = (output / f"{scene.stem}_converge{suffix}" for suffix in (".png", ".csv"))
     require_writable(figure, ".png")
     require_writable(sheet, ".csv")
     require_matplotlib()
-    with progress_bar() as progress, _empty_kernel_cache() as kernels:
+    with progress_bar() as progress, empty_kernel_cache() as kernels:
         from ..rendering.scene import load
-        from ..studies.converge import converge
 
         quiet_mitsuba()
         loaded = load(scene, **definitions(define))
@@ -58,21 +50,5 @@ def converge(
     if as_json:
         typer.echo(json.dumps(found.to_dict(), allow_nan=False))
         return
-    typer.echo(render_text(found))
+    typer.echo(found.render_text())
     typer.echo(f"\n{sheet}: every setting; {figure}: the same to look at")
-
-
-@contextmanager
-def _empty_kernel_cache() -> Iterator[Path | None]:
-    """A folder of our own for Dr.Jit's kernels, so that cold is cold; None where Dr.Jit has chosen one already."""
-    if "drjit" in sys.modules:
-        yield None
-        return
-    before = os.environ.get(CACHE)
-    with tempfile.TemporaryDirectory(prefix="fspt-kernels-", ignore_cleanup_errors=True) as folder:
-        os.environ[CACHE] = folder
-        try:
-            yield Path(folder)
-        finally:
-            os.environ.pop(CACHE)
-            os.environ.update({CACHE: before} if before is not None else {})

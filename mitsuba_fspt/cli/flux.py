@@ -7,7 +7,7 @@ import time
 from contextlib import nullcontext
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -15,6 +15,10 @@ from rich.console import Console
 from ..runtime.atomic_files import atomic_path, require_apart
 from ..runtime.errors import FluxError
 from .options import require_writable
+
+if TYPE_CHECKING:
+    from ..phantom.phantom import Phantom
+    from ..tissue.fluence_volume import Volume
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -69,7 +73,7 @@ def import_(
     from ..phantom.flux_import import import_flux
 
     require_writable(output, ".ply", FluxError)
-    # What lies beside a mesh (node, elem, param, ...) never ends in .ply.
+    # Other files that belong to a mesh (node, elem, param, ...) never end in .ply.
     require_apart(output, [mesh, values] if values else [mesh], error=FluxError)
     phantom = import_flux(
         mesh,
@@ -84,8 +88,7 @@ def import_(
         flip=flip,
     )
     phantom.write(output)
-    report = phantom.report() | {"output": str(output)}
-    typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
+    _print_report(phantom.report() | {"output": str(output)}, as_json)
 
 
 @app.command()
@@ -108,29 +111,43 @@ def solve(
     require_writable(output, ".ply", FluxError)
     if volume:
         require_writable(volume, ".vol", FluxError)
-    told = PhantomFile.read(description)
-    require_apart(output, [description, *told.files], error=FluxError)
-    if volume:
-        require_apart(volume, [description, *told.files, output], "--volume", FluxError)
+    tissue = PhantomFile.read(description)
+    _require_apart(output, volume, [description, *tissue.files])
     with Console(stderr=True).status("mesh") as status:
-        solution = told.solve(status.update)
+        solution = tissue.solve(status.update)
         status.update("surface")
-        phantom = solution.phantom(told.surface_edge)
+        phantom = solution.phantom(tissue.surface_edge)
         report = phantom.report() | solution.report()
-        if volume is not None:
+        grid = None
+        if volume:
             status.update("volume")
-            grid = solution.volume(told.voxel)
+            grid = solution.volume(tissue.voxel)
             report |= {"volume": str(volume)} | grid.report()
-    with atomic_path(volume, FluxError) if volume else nullcontext() as beside:  # both files or none
-        if beside:
-            grid.write(beside)
+    _write(phantom, output, grid, volume)
+    _print_report(report | {"seconds": time.perf_counter() - start, "output": str(output)}, as_json)
+
+
+def _require_apart(output: Path, volume: Path | None, inputs: list[Path]) -> None:
+    """Raise FluxError where an output file would overwrite an input file, or the volume the phantom."""
+    require_apart(output, inputs, error=FluxError)
+    if volume:
+        require_apart(volume, [*inputs, output], "--volume", FluxError)
+
+
+def _write(phantom: Phantom, output: Path, grid: Volume | None, volume: Path | None) -> None:
+    """Write the phantom and, if given, the fluence on a grid to the file `volume`: both files or none."""
+    with atomic_path(volume, FluxError) if volume else nullcontext() as temporary:
+        if grid and temporary:
+            grid.write(temporary)
         phantom.write(output)
-    report |= {"seconds": time.perf_counter() - start, "output": str(output)}
-    typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
 
 
-def table(report: dict[str, object]) -> str:
-    """The report as lines of name, value and unit."""
+def _print_report(report: dict[str, object], as_json: bool) -> None:
+    typer.echo(json.dumps(report, allow_nan=False) if as_json else report_text(report))
+
+
+def report_text(report: dict[str, object]) -> str:
+    """The report as text, a line of name, value and unit for each entry."""
     units = {"area": "mm^2", "removed_percent": "% of the power", "seconds": "s"}
     units |= dict.fromkeys(("power", "removed_power", "source_power", "absorbed_power", "exit_power"), "W")
     units |= {"min": str(report["unit"]), "max": str(report["unit"])}

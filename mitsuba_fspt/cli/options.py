@@ -1,4 +1,4 @@
-"""Arguments that several verbs of the command line have, and what is made of them before the work begins."""
+"""Options that several verbs of the command line share, and checks of them before the work begins."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom",
 
 
 def definitions(define: list[str] | None) -> dict[str, str]:
-    """Values by name of the options -D NAME=VALUE; SceneError for one that is none, or for a name given twice."""
+    """Values by name from the options -D NAME=VALUE; SceneError for text of another form or a name given twice."""
     pairs: dict[str, str] = {}
     for text in define or ():
         if "=" not in text.strip("="):
@@ -38,9 +38,17 @@ def definitions(define: list[str] | None) -> dict[str, str]:
 
 
 def require_writable(path: Path, suffix: str | None = None, error: type[FsptError] = ImageError) -> None:
-    """Refuse, as an `error`, an output that cannot be written before the work, not after it; None: any suffix."""
+    """Raise `error` for an output file that cannot be written, or that has another suffix (None: any suffix)."""
     if suffix and path.suffix.lower() != suffix:
         raise error(f"output file '{path}' must end in {suffix}. Give a name such as {NAMES[suffix]}{suffix}.")
     require_place(path, error)
     if not os.access(path.parent, os.W_OK):
         raise error(f"output file '{path}': the folder '{path.parent}' is not writable. Write elsewhere with -o.")
+
+
+def require_picture(path: Path) -> None:
+    """Raise ImageError for a PNG file that cannot be written, BackendError where matplotlib is missing."""
+    from ..images.picture import require_matplotlib
+
+    require_writable(path, ".png")
+    require_matplotlib()

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..runtime.backend import quiet_mitsuba
-from ..runtime.errors import BackendError, FsptError, SceneError
+from ..runtime.errors import BackendError, SceneError
 from .options import Method, Rtol, SceneFile, Seed, Spp
-from .terminal import progress_bar
+from .terminal import Interrupted, progress_bar
 
-
-class Interrupted(FsptError):
-    """Ctrl-C where what is done stays: the message says how to go on."""
+if TYPE_CHECKING:
+    from ..studies.sweep import SweepRow
 
 
 def sweep(
@@ -46,32 +47,30 @@ def sweep(
 
     folder = output or Path(f"{scene.stem}_sweep")
     values = _values(define)
-    try:
+    with _resumable(folder):
         with progress_bar() as progress:
             quiet_mitsuba()
-            rows = sweep(
-                scene,
-                values,
-                folder,
-                method=method,
-                rtol=rtol,
-                spp=spp,
-                seed=seed,
-                jobs=jobs,
-                scheduler=scheduler,
-                progress=progress,
-            )
+            settings = {"method": method, "rtol": rtol, "spp": spp, "seed": seed, "jobs": jobs, "scheduler": scheduler}
+            rows = sweep(scene, values, folder, progress=progress, **settings)  # type: ignore[arg-type]
         total = sum(row.wall_time for row in rows)
         typer.echo(f"{folder / INDEX}: {len(rows)} points, {total:.3g} s of rendering")
         _write_sheet(rows, folder / "contact_sheet.png")
+
+
+@contextmanager
+def _resumable(folder: Path) -> Iterator[None]:
+    """Ctrl-C in the block raises `Interrupted`, which says that the same command continues the sweep."""
+    try:
+        yield
     except KeyboardInterrupt as cause:
         raise Interrupted(
             f"interrupted; finished images stay in {folder}, the same command goes on from there."
         ) from cause
 
 
-def _write_sheet(rows: list, path: Path) -> None:
-    from ..studies.contact_sheet import write_contact_sheet
+def _write_sheet(rows: list[SweepRow], path: Path) -> None:
+    """Write the contact sheet; where that cannot be drawn, say so on stderr."""
+    from ..studies.sweep import write_contact_sheet
 
     try:
         write_contact_sheet(rows, path)
@@ -81,6 +80,7 @@ def _write_sheet(rows: list, path: Path) -> None:
 
 
 def _values(define: list[str] | None) -> dict[str, list[str]]:
+    """Lists of values by name from the options -D NAME=V1,V2,...; SceneError as of `definitions`."""
     values: dict[str, list[str]] = {}
     for text in define or ():
         name, equals, several = text.partition("=")

@@ -35,11 +35,11 @@ class ZTest:
     Attributes
     ----------
     max_z : the largest |z|
-    chi2 : mean of z², about 1 where the errors are true
+    chi2 : mean of z², about 1 where the errors are right
     p_value : probability that `pixels` independent normal z reach `max_z`, p = 1 − (1 − p_1)^pixels with
-        p_1 = erfc(max_z/√2) of one pixel (Šidák's correction); a small one says that the images differ
-    pixels : how many pixels have an error to be judged by
-    unjudged : how many pixels differ though both errors are 0; they are not part of the test
+        p_1 = erfc(max_z/√2) of one pixel (Šidák's correction); small where the images differ
+    pixels : number of pixels with an error above 0, which are those that the test uses
+    unjudged : number of pixels that differ though both errors are 0; the test does not use them
     """
 
     max_z: float
@@ -51,7 +51,7 @@ class ZTest:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What `compare` finds.
+    """The result of `compare`.
 
     Attributes
     ----------
@@ -72,8 +72,27 @@ class Comparison:
     profiles: tuple[Profile, ...] = field(repr=False)
     z_test: ZTest | None
 
+    def render_text(self) -> str:
+        """The numbers as text, one a line with its meaning; without the profiles."""
+        ratio = "none       the standard's powers add up to 0"
+        if self.ratio is not None:
+            ratio = f"{self.ratio:.6f}   of the total powers"
+        lines = [
+            f"ME     {self.me:.3e}   mean error, each image over its own maximum",
+            f"CF     {self.cf:.7f}   correlation factor",
+            f"max    {self.max_error:.3e}   largest error over the standard's peak",
+            f"RMS    {self.rms:.3e}   over the standard's peak",
+            f"ratio  {ratio}",
+        ]
+        if self.z_test:
+            z = self.z_test
+            lines.append(
+                f"chi2   {z.chi2:.3f}   per pixel; largest |z| {z.max_z:.2f} of {z.pixels} pixels, p {z.p_value:.2g}"
+            )
+        return "\n".join(lines)
+
     def to_dict(self) -> dict[str, Any]:
-        """The same as numbers, text, lists and dicts only, as JSON takes them."""
+        """The same as plain data for JSON."""
         numbers = {name: getattr(self, name) for name in ("me", "cf", "max_error", "rms", "ratio")}
         profiles = [
             {
@@ -102,14 +121,14 @@ def compare(
     rows, columns : numbers of the rows and columns to take profiles of, in 0 … h − 1 and 0 … w − 1, one alone or
         several; where neither is given, those through the standard's brightest pixel
 
-    The z-test counts `error` as a standard deviation and the two as independent; a deterministic method's is
-    a bound and makes the test milder. A Monte Carlo pixel that few samples have lit knows its error badly and
-    makes it too strict: give such images samples enough.
+    The z-test takes `error` as a standard deviation and the two errors as independent. The error of a deterministic
+    method is a bound and makes the test milder. The error of a Monte Carlo pixel that few samples have lit is itself
+    uncertain and makes the test too strict: give such images more samples.
 
     Raises
     ------
-    ImageError : one is no `Image`, shapes differ, an image has no positive power or is constant (ME or CF then have no
-        meaning), a row or column does not exist.
+    ImageError : one is no `Image`, shapes differ, an image has no positive power or is constant (ME or CF are then not
+        defined), a row or column does not exist.
     """
     _check(calculated, standard)
     p_cal, p_std = (image.power.astype(np.float64) for image in (calculated, standard))
@@ -196,5 +215,5 @@ def _z_test(difference: NDArray[np.float64], *errors: NDArray[np.floating] | Non
 
 
 def _size(image: Image) -> str:
-    """Width × height, as all messages tell it; arrays have the shape (h, w)."""
+    """Width × height as text for messages; arrays have the shape (h, w)."""
     return " × ".join(map(str, image.shape[::-1]))

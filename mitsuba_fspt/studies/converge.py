@@ -1,12 +1,18 @@
-"""Error against run time: every method over its own accuracy knob, timed in rounds that go through all settings."""
+"""Error against run time: the reference picture, and every method timed over its own accuracy parameter (its knob).
+
+The timed rounds go through all settings by turns, so that a slow moment of the machine slows all methods alike.
+"""
 
 from __future__ import annotations
 
 import math
 import os
 import platform
+import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +20,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..images.image import read
+from ..integral.quadrature import Quadrature
 from ..rendering import render
 from ..rendering.scene import loaded
 from ..runtime import backend
-from ..runtime.errors import FsptError, SceneError
+from ..runtime.errors import FsptError, ImageError, SceneError
 from ..runtime.numbers import number, whole
-from .converge_methods import Method, Shot, methods, raw_rate
-from .converge_reference import Reference, own_reference, read_reference
+from .converge_methods import Method, Picture, methods, raw_rate
 from .convergence import Convergence, Measurement
 
 if TYPE_CHECKING:
@@ -29,11 +36,16 @@ if TYPE_CHECKING:
     from ..rendering.render import Progress
 
 BUDGET, ROUNDS = 2.0, 5
-REFERENCE_TIME = 15.0  # times the budget
-PATIENCE = 4.0  # times the budget: what a coarsest setting may take
-BURST = 0.1  # s
-WHOLE_CONE = 1 - 1e-4  # of the lines of sight: a sum of float32 weights
+REFERENCE_TIME = 15.0  # times the budget: run time of the reference picture
+PATIENCE = 4.0  # times the budget: longest time of a method's coarsest setting
+BURST = 0.1  # s: least time of a setting's runs in one round
+WHOLE_CONE = 1 - 1e-4  # of a pixel's lines of sight; less than 1, as float32 weights are summed
 MIB = 1 << 20
+CACHE_VARIABLE = "DRJIT_CACHE_DIR"  # environment variable that names Dr.Jit's folder of compiled kernels
+# The first rtol of the reference is always taken, a finer one if the expected time is within REFERENCE_TIME.
+REFERENCE_RTOL = {"pupil": (1e-4, 1e-5, 1e-6), "surface": (1e-2, 1e-3, 1e-4, 1e-5)}
+GROWTH = 8.0  # expected ratio of the times of one of these and the one before
+COARSER = 10.0  # times the reference's rtol: the finest setting of the same form whose error is measured
 
 Plane = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -53,14 +65,14 @@ def converge(
 
         found = fspt.converge("scenes/two_spheres.xml", budget=0.5)
         found.order("integral"), found.time_to("path, multijitter", 1e-3)
+        print(found.render_text())
 
-    Every setting runs once cold, once more for its memory, once untimed before the first round, and in each round for a
-    tenth of a second, at least once, the rounds forwards and backwards through all settings by turns: a slow moment of
-    the machine meets them all, and medians count. `converge_sheet` writes the CSV file and the figure,
-    `converge_table` the table.
+    Every setting runs once cold, once more for its memory, once untimed before the first round, and in each round for
+    0.1 s, at least once. The rounds go through all settings alternately forwards and backwards, so that a slow moment
+    of the machine slows all of them; medians count. `convergence_report` writes the CSV file and the figure.
 
-    Cold is the first run of a setting: tracing, compiling, and what an integrator finds out once about a scene. Kernels
-    that Dr.Jit has, in memory or on disk, are not compiled again, unless `kernels` lets it forget them.
+    The cold run is the first run of a setting: recording, compilation, and what an integrator computes once a scene.
+    Kernels that Dr.Jit has in memory or on disk are not compiled again, unless `kernels` allows to delete them.
 
     Parameters
     ----------
@@ -70,12 +82,12 @@ def converge(
     budget : longest time of one picture [s], > 0; finer settings are left out. About rounds × 20 × budget in all,
         and some seconds a setting for its first runs.
     reference : EXR file with error.Y, or NPZ file with arrays power and error [W]; None makes one, see `own_reference`
-    kernels : DRJIT_CACHE_DIR of this process, if all kernels may be forgotten before every cold run; else None
+    kernels : DRJIT_CACHE_DIR of this process, if all kernels may be deleted before every cold run; else None
     progress : called with what is being done and the share done
 
     Raises
     ------
-    SceneError, OpticsError, ExitanceError, ImageError, BackendError : what is wrong and how to mend it.
+    SceneError, OpticsError, ExitanceError, ImageError, BackendError : what is wrong and how to fix it.
     """
     sensor = whole("converge: 'sensor'", sensor, SceneError, "0")
     rounds = whole("converge: 'rounds'", rounds, SceneError, str(ROUNDS))
@@ -85,92 +97,248 @@ def converge(
     scene = loaded(scene)
     backend.ensure_variant()
     lens = render.sensor_of(scene, sensor)
-    tell = progress or (lambda what, share: None)
-    known = _reference(scene, lens, reference, budget, tell)
+    report = progress or (lambda what, share: None)
+    measured_from = _reference(scene, lens, reference, budget, report)
     full = render.render(scene, method="integral", sensor=sensor, rtol=1e-3).coverage > WHOLE_CONE
-    bench = Bench(Judge(known, full), Path(kernels) if kernels is not None else None, budget)
-    skipped = bench.try_all(*methods(scene, lens, known.least_rtol), tell)
-    rate = bench.run_rounds(rounds, [raw_rate(scene, lens, together) for together in (False, True)], tell)
-    return _convergence(scene, bench, rounds, rate, skipped)
+    benchmark = Benchmark(measured_from, full, Path(kernels) if kernels is not None else None, budget)
+    skipped = benchmark.try_all(*methods(scene, lens, measured_from.least_rtol), report)
+    rate = benchmark.run_rounds(rounds, [raw_rate(scene, lens, together) for together in (False, True)], report)
+    return _convergence(scene, benchmark, rounds, rate, skipped)
 
 
-def _reference(
-    scene: mi.Scene, lens: mi.Sensor, path: str | os.PathLike[str] | None, budget: float, tell: Progress
-) -> Reference:
-    """What errors are counted from: the file's picture, or one of our own."""
-    width, height = (int(n) for n in _film(scene, lens).crop_size())
-    known = read_reference(path, (height, width)) if path is not None else None
-    tell("reference", 0.0)
-    return known or own_reference(scene, lens, REFERENCE_TIME * budget)
+@contextmanager
+def empty_kernel_cache() -> Iterator[Path | None]:
+    """An empty folder for Dr.Jit's kernels, deleted at the end; None if Dr.Jit is imported and has its folder.
+
+    For the parameter `kernels` of `converge`: in a fresh folder the cold runs compile everything.
+    """
+    if "drjit" in sys.modules:
+        yield None
+        return
+    before = os.environ.get(CACHE_VARIABLE)
+    with tempfile.TemporaryDirectory(prefix="fspt-kernels-", ignore_cleanup_errors=True) as folder:
+        os.environ[CACHE_VARIABLE] = folder
+        try:
+            yield Path(folder)
+        finally:
+            os.environ.pop(CACHE_VARIABLE)
+            os.environ.update({CACHE_VARIABLE: before} if before is not None else {})
 
 
-def _convergence(scene: mi.Scene, bench: Bench, rounds: int, rate: float, skipped: dict[str, str]) -> Convergence:
-    """What was measured, as plain data."""
+def _convergence(
+    scene: mi.Scene, benchmark: Benchmark, rounds: int, rate: float, skipped: dict[str, str]
+) -> Convergence:
+    """All that was measured, as plain data."""
     import mitsuba as mi
 
-    known = bench.judge.reference
-    height, width = known.power.shape
+    reference = benchmark.reference
+    height, width = reference.power.shape
     return Convergence(
         scene=scene.id(),
         machine=f"{os.cpu_count()} cores, {platform.machine()}, {mi.variant()}; {rounds} rounds",
         shape=(height, width),
-        reference=known.name,
-        check=known.check,
-        stated=known.rms,
-        stated_largest=known.largest,
-        full=int(bench.judge.full.sum()),
+        reference=reference.name,
+        check=reference.check,
+        stated=reference.rms,
+        stated_largest=reference.largest,
+        full=int(benchmark.full.sum()),
         raw_rate=rate,
-        rows=tuple(trial.row() for trial in bench.trials),
+        rows=tuple(setting.row() for setting in benchmark.settings),
         skipped=skipped,
     )
 
 
-class Judge:
-    """Errors of a picture over the reference's brightest pixel: mean square, that of the marked pixels, largest."""
+# ---------------------------------------------------------------------- the reference picture
 
-    def __init__(self, reference: Reference, full: Mask) -> None:
-        self.reference, self.full = reference, full
 
-    def __call__(self, power: Plane) -> tuple[float, float, float]:
-        error = (power - self.reference.power) / self.reference.peak
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The picture that errors are measured from.
+
+    power, error : power and its stated absolute error, shape (h, w) [W]
+    name : file or method that it is from
+    check : result of the comparison with an independent picture, '' without one
+    least_rtol : finest rtol of the integral's pupil form whose error can be measured; the reference is of that form,
+        and finer pictures share its error
+    """
+
+    power: Plane
+    error: Plane
+    name: str
+    check: str = ""
+    least_rtol: float = 0.0
+
+    @property
+    def peak(self) -> float:
+        """Power on the brightest pixel [W], to which all errors are relative."""
+        return float(self.power.max())
+
+    @property
+    def rms(self) -> float:
+        """Stated RMS error, relative to the brightest pixel."""
+        return float(np.sqrt(np.mean(self.error**2)) / self.peak)
+
+    @property
+    def largest(self) -> float:
+        """Largest stated error of a pixel, relative to the brightest pixel."""
+        return float(self.error.max() / self.peak)
+
+    def errors_of(self, power: Plane, full: Mask) -> tuple[float, float, float]:
+        """Errors of a picture, shape (h, w) [W], relative to the brightest pixel.
+
+        Their mean square over all pixels, that over the pixels of `full` (NaN without any), and the largest one.
+        """
+        error = (power - self.power) / self.peak
         square = np.square(error)
-        full = float(np.mean(square[self.full])) if self.full.any() else np.nan
-        return float(np.mean(square)), full, float(np.abs(error).max())
+        square_full = float(np.mean(square[full])) if full.any() else np.nan
+        return float(np.mean(square)), square_full, float(np.abs(error).max())
+
+
+def _reference(
+    scene: mi.Scene, lens: mi.Sensor, path: str | os.PathLike[str] | None, budget: float, report: Progress
+) -> Reference:
+    """The reference: the file's picture, or our own where no file is given."""
+    width, height = (int(n) for n in _film(scene, lens).crop_size())
+    from_file = read_reference(path, (height, width)) if path is not None else None
+    report("reference", 0.0)
+    return from_file or own_reference(scene, lens, REFERENCE_TIME * budget)
+
+
+def _film(scene: mi.Scene, lens: mi.Sensor) -> mi.Film:
+    """The film of the lens; raises as `check_scene` does."""
+    from ..integral.scene_checks import check_scene
+
+    check_scene(scene, lens)
+    return lens.film()
+
+
+def read_reference(path: str | os.PathLike[str], shape: tuple[int, int]) -> Reference:
+    """Reference from an EXR file with channels Y and error.Y, or an NPZ file with arrays power and error [W].
+
+    Raises
+    ------
+    ImageError : no such file, not such a file, no error in it, another size than `shape` (h, w), or a dark picture.
+    """
+    path = Path(path)
+    if path.suffix == ".npz":
+        power, error = _arrays(path)
+    else:
+        image = read(path)
+        power, error = image.power, image.error
+    if error is None:
+        raise ImageError(f"reference '{path}' has no channel 'error.Y'. Give a picture that states its own error.")
+    for plane in (power, error):
+        if plane.shape != shape:
+            sizes = " and ".join(f"{w} x {h}" for h, w in (plane.shape[:2], shape))
+            raise ImageError(f"reference '{path}' and the scene's film differ: {sizes} pixels. Give one of its size.")
+    if not (np.isfinite(power).all() and np.isfinite(error).all() and error.min() >= 0 and power.max() > 0):
+        raise ImageError(
+            f"reference '{path}': power and error must be finite, error >= 0, one pixel bright. Make it anew."
+        )
+    return Reference(power.astype(np.float64), error.astype(np.float64), str(path))
+
+
+def _arrays(path: Path) -> tuple[Plane, Plane]:
+    """Power and error, shape (h, w) [W], of an NPZ file."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            power, error = np.asarray(stored["power"]), np.asarray(stored["error"])
+    except OSError as cause:
+        raise ImageError(f"reference '{path}' cannot be read: {cause.strerror or cause}. Check the name.") from cause
+    except Exception as cause:  # whatever a damaged archive makes NumPy and zipfile raise
+        raise ImageError(f"reference '{path}' is no NPZ file. Give arrays 'power', 'error' [W].") from cause
+    if power.ndim != 2 or {power.dtype.kind, error.dtype.kind} - set("fiu"):
+        raise ImageError(f"reference '{path}': 'power' and 'error' must be numbers of shape (h, w), in W.")
+    return power, error
+
+
+def own_reference(scene: mi.Scene, lens: mi.Sensor, seconds: float) -> Reference:
+    """The integral's pupil form at the finest rtol that takes about `seconds`, checked by the surface form.
+
+    The surface form is another algorithm on the same rays. The stated error of a pixel is the larger one of the pupil
+    form's own estimate and of the difference between the forms beyond the surface form's estimate.
+
+    Raises
+    ------
+    SceneError : the picture is dark.
+    """
+    fine, rtol = _finest(scene, lens, "pupil", seconds)
+    if not fine.power.max() > 0:
+        raise SceneError("converge: the picture is dark, no error can be told relative to its peak. Turn the camera.")
+    name = f"fspt_integral, pupil form, rtol {rtol:g}"
+    try:
+        other, other_rtol = _finest(scene, lens, "surface", seconds)
+    except FsptError as refusal:
+        return Reference(fine.power, fine.error, name, f"not checked by the surface form: {refusal}", COARSER * rtol)
+    apart = np.abs(other.power - fine.power)
+    unexplained = np.maximum(apart - other.error, 0)
+    peak = fine.power.max()
+    rms, largest = np.sqrt(np.mean(apart**2)) / peak, apart.max() / peak
+    own = np.sqrt(np.mean(other.error**2)) / peak
+    check = (
+        f"surface form, rtol {other_rtol:g}: RMS difference {rms:.1e}, largest {largest:.1e}; it states {own:.1e} RMS, "
+        f"which leaves {np.sqrt(np.mean(unexplained**2)) / peak:.1e} unexplained"
+    )
+    return Reference(fine.power, np.maximum(fine.error, unexplained), name, check, COARSER * rtol)
+
+
+def _finest(scene: mi.Scene, lens: mi.Sensor, domain: str, seconds: float) -> tuple:
+    """The finest solution of a form that takes about `seconds`, and its rtol."""
+    import mitsuba as mi
+
+    integrator = mi.load_dict({"type": "fspt_integral"})
+    ladder = REFERENCE_RTOL[domain]
+    for rtol in ladder:
+        start = time.perf_counter()
+        solution = integrator.solve(scene, lens, Quadrature(rtol=rtol, domain=domain))
+        if rtol == ladder[-1] or (time.perf_counter() - start) * GROWTH > seconds:
+            break
+    return solution, rtol
+
+
+# ---------------------------------------------------------------------- the measurements
 
 
 @dataclass
-class Trial:
-    """One method at one setting: how to run it, and what the runs gave."""
+class TimedSetting:
+    """One method at one setting: a function that runs it, and the results of its runs.
+
+    cold : time of the first run [s]; memory : peak of Dr.Jit's arrays [MiB]; picture : of the last run
+    seconds : median run time of each round [s]; errors : of each round, see `Reference.errors_of`
+    """
 
     method: Method
-    run: Callable[[], Shot]
+    run: Callable[[], Picture]
     cold: float
     memory: float
-    shot: Shot
+    picture: Picture
     seconds: list[float] = field(default_factory=list)
     errors: list[tuple[float, float, float]] = field(default_factory=list)
 
-    def run_timed(self, judge: Judge) -> None:
-        """One round: again and again for `BURST`, lest what ran before decides how warm a short one is; its median."""
-        if not self.seconds:  # its kernels were forgotten for the sake of others' cold runs
+    def run_timed(self, reference: Reference, full: Mask) -> None:
+        """One round: repeated runs for `BURST` seconds, of which the median time counts.
+
+        A single run of a short setting would depend on the caches that the setting before left behind.
+        """
+        if not self.seconds:  # its kernels were deleted before the cold runs of the settings after it
             self.run()
         times: list[float] = []
         while sum(times) < BURST:
-            seconds, self.shot = _seconds(self.run)
+            seconds, self.picture = _seconds(self.run)
             times.append(seconds)
         self.seconds.append(float(np.median(times)))
-        self.errors.append(judge(self.shot.power))
+        self.errors.append(reference.errors_of(self.picture.power, full))
 
     def row(self) -> Measurement:
-        """Monte Carlo's errors differ from seed to seed: the root of the mean square over the rounds."""
+        """The measurement; its RMS error is averaged over the rounds, as Monte Carlo's differs from seed to seed."""
         square, full, _ = np.mean(self.errors, axis=0)
         return Measurement(
             method=self.method.name,
             knob=self.method.knob,
-            value=self.shot.knob,
+            value=self.picture.knob,
             cold=self.cold,
             seconds=tuple(self.seconds),
-            rays=self.shot.rays,
+            rays=self.picture.rays,
             rms=float(np.sqrt(square)),
             rms_full=float(np.sqrt(full)),
             largest=float(np.median([largest for *_, largest in self.errors])),
@@ -178,65 +346,71 @@ class Trial:
         )
 
 
-class Bench:
-    """The settings that are worth timing, found by their first runs."""
+class Benchmark:
+    """The settings that are timed: of each method, from coarse to fine, those that take at most `budget` seconds."""
 
-    def __init__(self, judge: Judge, kernels: Path | None, budget: float) -> None:
-        self.judge, self.kernels, self.budget = judge, kernels, budget
-        self.trials: list[Trial] = []
+    def __init__(self, reference: Reference, full: Mask, kernels: Path | None, budget: float) -> None:
+        """`full`: mask, shape (h, w), of the pixels whose whole cone sees the phantom; `kernels` as of `converge`."""
+        self.reference, self.full = reference, full
+        self.kernels, self.budget = kernels, budget
+        self.settings: list[TimedSetting] = []
 
-    def try_all(self, offered: list[Method], skipped: dict[str, str], tell: Progress) -> dict[str, str]:
-        """First runs of all methods; returns what is left out, those `skipped` already among it, and why.
+    def try_all(self, offered: list[Method], skipped: dict[str, str], report: Progress) -> dict[str, str]:
+        """Run all methods for the first time; returns `skipped` with the settings that take too long, and the reasons.
 
-        SceneError where nothing is left to time.
+        Raises
+        ------
+        SceneError : no setting is left to time.
         """
         left_out = dict(skipped)
         for k, method in enumerate(offered):
-            tell(f"first runs: {method.name}", 0.1 + 0.4 * k / len(offered))
+            report(f"first runs: {method.name}", 0.1 + 0.4 * k / len(offered))
             try:
                 left_out |= self.try_ladder(method)
             except FsptError as refusal:
                 left_out[method.name] = str(refusal)
-        if left_out and not self.trials:
+        if left_out and not self.settings:
             name, why = next(iter(left_out.items()))
             raise SceneError(
                 f"converge: nothing to time; {name}: {why}, 'budget' is {self.budget:g} s. Give a longer one."
             )
         return left_out
 
-    def run_rounds(self, rounds: int, raws: list[Callable[[], int]], tell: Progress) -> float:
+    def run_rounds(self, rounds: int, raws: list[Callable[[], int]], report: Progress) -> float:
         """The timed rounds; returns the rays per second of the faster of the `raws`, see `raw_rate`."""
         rays = [raw() for raw in raws]
         seconds: list[list[float]] = [[] for _ in raws]
         for k in range(rounds):
             for own, raw in zip(seconds, raws, strict=True):
                 own.append(_seconds(raw)[0])
-            for trial in self.trials[:: -1 if k % 2 else 1]:
-                tell(f"round {k + 1}: {trial.method.name}", 0.5 + 0.5 * k / rounds)
-                trial.run_timed(self.judge)
+            for setting in self.settings[:: -1 if k % 2 else 1]:
+                report(f"round {k + 1}: {setting.method.name}", 0.5 + 0.5 * k / rounds)
+                setting.run_timed(self.reference, self.full)
         return max(count / float(np.median(own)) for count, own in zip(rays, seconds, strict=True))
 
     def try_ladder(self, method: Method) -> dict[str, str]:
-        """Run a method's settings from coarse to fine until one takes longer than the budget; the first one stays.
+        """Run a method's settings from coarse to fine until one takes longer than the budget; the first is always kept.
 
-        Returns which ones are left out for that, and why.
+        Returns the settings that are left out for that, with the reason; raises SceneError if the first one takes
+        longer than PATIENCE × the budget.
         """
         for k, value in enumerate(method.ladder):
-            self._forget_kernels()
+            self._delete_kernels()
             run = method.prepare(value)
             cold, _ = _seconds(run)
-            seconds, memory, shot = _with_memory(run)
+            seconds, memory, picture = _with_memory(run)
             if seconds > self.budget:
-                seconds = min(seconds, _seconds(run)[0])  # a slow moment of the machine does not end a ladder
+                seconds = min(seconds, _seconds(run)[0])  # a second run, in case the machine was slow for a moment
             if seconds > self.budget and (k > 0 or seconds > PATIENCE * self.budget):
                 if k == 0:
                     raise SceneError(f"its coarsest setting takes {seconds:.3g} s")
                 from_here = f"{method.name}, {method.knob} {value:g} and finer"
                 return {from_here: f"{seconds:.3g} s a picture, more than the budget of {self.budget:g} s"}
-            self.trials.append(Trial(method, run, cold, memory, shot))
+            self.settings.append(TimedSetting(method, run, cold, memory, picture))
         return {}
 
-    def _forget_kernels(self) -> None:
+    def _delete_kernels(self) -> None:
+        """Delete Dr.Jit's compiled kernels in memory and on disk, where the caller allows it."""
         if self.kernels is None:
             return
         import drjit as dr
@@ -247,8 +421,8 @@ class Bench:
             path.unlink(missing_ok=True)
 
 
-def _with_memory(run: Callable[[], Shot]) -> tuple[float, float, Shot]:
-    """Seconds, peak of Dr.Jit's arrays beside what lived before [MiB], and the picture."""
+def _with_memory(run: Callable[[], Picture]) -> tuple[float, float, Picture]:
+    """Run time [s], peak of Dr.Jit's arrays above what was allocated before the run [MiB], and the picture."""
     import drjit as dr
     import mitsuba as mi
 
@@ -257,19 +431,12 @@ def _with_memory(run: Callable[[], Shot]) -> tuple[float, float, Shot]:
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     before = dr.detail.malloc_watermark(device)
-    seconds, shot = _seconds(run)
-    return seconds, (dr.detail.malloc_watermark(device) - before) / MIB, shot
+    seconds, picture = _seconds(run)
+    return seconds, (dr.detail.malloc_watermark(device) - before) / MIB, picture
 
 
 def _seconds(run: Callable[[], Any]) -> tuple[float, Any]:
+    """Run time [s] and the result of a function."""
     start = time.perf_counter()
     result = run()
     return time.perf_counter() - start, result
-
-
-def _film(scene: mi.Scene, lens: mi.Sensor) -> mi.Film:
-    """The film of a scene that was checked."""
-    from ..integral.scene_checks import check_scene
-
-    check_scene(scene, lens)
-    return lens.film()

@@ -1,4 +1,7 @@
-"""All ways to one picture, each over its own knob: the integral in both forms, the paper's sum and Monte Carlo."""
+"""The methods that `converge` compares: the integral in both forms, the paper's sum over points, and Monte Carlo.
+
+Each has one accuracy parameter, its knob: rtol, number of points, or samples a pixel.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +23,19 @@ if TYPE_CHECKING:
 SAMPLERS = ("multijitter", "independent", "stratified", "orthogonal", "ldsampler")
 RTOL = (1.0, 0.5, 0.2, 0.05, 0.03, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
 RTOL_SURFACE = (0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)
-# Samples a pixel, sides of the squares; those of an orthogonal array are primes.
+# Square roots of the samples a pixel; primes for the orthogonal array.
 SIDES = (2, 4, 6, 8, 10, 12, 16, 23, 32, 45, 64, 91, 128)
 PRIMES = (2, 5, 11, 17, 23, 31, 47, 67, 89, 127)
 POWERS_OF_TWO = (2, 4, 8, 16, 32, 64, 128)
 PASS_SAMPLES = 1 << 26  # Monte Carlo samples in one pass: 1024 a pixel of 256 x 256
-POINTS, MOST_POINTS = 1 << 10, 1 << 26  # of the paper's sum
+POINTS, MOST_POINTS = 1 << 10, 1 << 26  # least and largest number of points of the paper's sum
 
 Plane = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One picture: power, shape (h, w) [W]; the rays it took; the knob as it came out, where that is rounded."""
+class Picture:
+    """Power, shape (h, w) [W]; number of rays; the knob's value, which may be rounded from the one asked for."""
 
     power: Plane
     rays: int
@@ -41,19 +44,22 @@ class Shot:
 
 @dataclass(frozen=True)
 class Method:
-    """A way to a picture: `ladder`, the settings of its `knob` from coarse to fine; `prepare` makes one ready to run.
+    """A method: `ladder`, the values of its `knob` from coarse to fine; `prepare(value)` returns a function to run.
 
-    What a method finds out once about a scene it finds out in the first run of what `prepare` returns.
+    What a method computes once a scene it computes in the first run of that function, not in `prepare`.
     """
 
     name: str
     knob: str
     ladder: tuple[float, ...]
-    prepare: Callable[[float], Callable[[], Shot]]
+    prepare: Callable[[float], Callable[[], Picture]]
 
 
 def methods(scene: mi.Scene, lens: mi.Sensor, least_rtol: float = 0.0) -> tuple[list[Method], dict[str, str]]:
-    """All methods that apply to a scene, and why others do not; `least_rtol`: of the integral's pupil form."""
+    """The methods that apply to a scene, and the reason for each that does not.
+
+    `least_rtol`: finest rtol of the integral's pupil form.
+    """
     found = [integral(scene, lens, "pupil", tuple(rtol for rtol in RTOL if rtol >= least_rtol))]
     skipped = {}
     surfaces, reason = _surfaces_and_pupil(scene, lens)
@@ -67,19 +73,19 @@ def methods(scene: mi.Scene, lens: mi.Sensor, least_rtol: float = 0.0) -> tuple[
 
 
 def integral(scene: mi.Scene, lens: mi.Sensor, domain: str, ladder: tuple[float, ...]) -> Method:
-    """The deterministic integral over rtol, over the area of the pixels whatever the scene's own integrator does.
+    """The deterministic integral over the pixels' area, with rtol as its knob; the scene's integrator is not used.
 
-    At rtol = 1 four lines of sight a pixel, whatever comes out.
+    rtol = 1 means four lines of sight a pixel, without a check of the error.
     """
     import mitsuba as mi
 
-    def prepare(rtol: float) -> Callable[[], Shot]:
+    def prepare(rtol: float) -> Callable[[], Picture]:
         accuracy = {"rtol": rtol} if rtol < 1 else {"rtol": 0.5, "max_nodes": 4}
         integrator = mi.load_dict({"type": "fspt_integral", "domain": domain, **accuracy})
 
-        def run() -> Shot:
+        def run() -> Picture:
             solution = integrator.solve(scene, lens)
-            return Shot(solution.power, solution.rays, rtol)
+            return Picture(solution.power, solution.rays, rtol)
 
         return run
 
@@ -87,7 +93,7 @@ def integral(scene: mi.Scene, lens: mi.Sensor, domain: str, ladder: tuple[float,
 
 
 def _surfaces_and_pupil(scene: mi.Scene, lens: mi.Sensor) -> tuple[bool, str]:
-    """Whether light can be followed from the surface to the pupil, and why not."""
+    """Whether light can be traced from the surfaces to the pupil, and if not, why."""
     import mitsuba as mi
 
     if lens.optics.model.name == "pinhole":
@@ -99,16 +105,17 @@ def _surfaces_and_pupil(scene: mi.Scene, lens: mi.Sensor) -> tuple[bool, str]:
 
 
 def _point_sum(scene: mi.Scene, lens: mi.Sensor) -> Method:
+    """The paper's sum over surface points."""
     from ..validation import direct_summation
 
-    # The first one has the faces of a mesh as they are; settings that come to the same number are one.
+    # At a minimum of 1 the faces of a mesh are not divided. Minima that give the same number of points are one setting.
     minima = (1, *itertools.takewhile(lambda n: n <= MOST_POINTS, (POINTS * 4**k for k in itertools.count())))
     counts = {direct_summation.points_of(scene, minimum): minimum for minimum in reversed(minima)}
 
-    def prepare(points: float) -> Callable[[], Shot]:
-        def run() -> Shot:
+    def prepare(points: float) -> Callable[[], Picture]:
+        def run() -> Picture:
             power, pairs = direct_summation.solve(scene, lens, counts[int(points)])
-            return Shot(power, pairs, points)
+            return Picture(power, pairs, points)
 
         return run
 
@@ -117,15 +124,15 @@ def _point_sum(scene: mi.Scene, lens: mi.Sensor) -> Method:
 
 
 def _path(scene: mi.Scene, lens: mi.Sensor, sampler: str) -> Method:
-    """Mitsuba's `path` of depth 1 from a twin of the lens that has the sampler; the twin is no part of the scene."""
+    """Mitsuba's `path` of depth 1 from a copy of the lens with this sampler; the copy is not in the scene."""
     sides = {"multijitter": SIDES, "orthogonal": PRIMES}.get(sampler, POWERS_OF_TWO)
-    twin = lens_with(lens, sampler)
-    return Method(PATH + sampler, "spp", _squares(sides), _monte_carlo("path", scene, twin))
+    return Method(PATH + sampler, "spp", _squares(sides), _monte_carlo("path", scene, lens_with(lens, sampler)))
 
 
 def _ptracer(scene: mi.Scene, lens: mi.Sensor) -> Method:
-    twin = lens_with(lens, "independent")
-    return Method(PTRACER, "spp", _squares(POWERS_OF_TWO), _monte_carlo("ptracer", scene, twin))
+    """Mitsuba's particle tracer."""
+    own_lens = lens_with(lens, "independent")
+    return Method(PTRACER, "spp", _squares(POWERS_OF_TWO), _monte_carlo("ptracer", scene, own_lens))
 
 
 def _squares(sides: tuple[int, ...]) -> tuple[float, ...]:
@@ -133,7 +140,7 @@ def _squares(sides: tuple[int, ...]) -> tuple[float, ...]:
 
 
 def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
-    """The same `fspt_lens` and film with another sampler."""
+    """A copy of an `fspt_lens` and its film with another sampler."""
     import mitsuba as mi
 
     own = dict(mi.traverse(lens))
@@ -153,22 +160,22 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
     )
 
 
-def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], Shot]]:
-    """Settings over the samples a pixel, in as few passes as memory allows; every run has another seed."""
+def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], Picture]]:
+    """A `prepare` function over the samples a pixel, in as few passes as memory allows; every run has another seed."""
     from ..emission.face_probe import probe_beside
 
     probe_beside(scene)
     integrator, seed = tracer(kind), itertools.count(1)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
 
-    def prepare(spp: float) -> Callable[[], Shot]:
+    def prepare(spp: float) -> Callable[[], Picture]:
         count = math.ceil(spp * pixels / PASS_SAMPLES)
 
-        def run() -> Shot:
+        def run() -> Picture:
             total, samples = np.zeros(()), 0
             for power, taken in passes(scene, lens, integrator, itertools.islice(seed, count), math.ceil(spp / count)):
                 total, samples = total + power, samples + taken
-            return Shot(total / count, samples * pixels, samples)
+            return Picture(total / count, samples * pixels, samples)
 
         return run
 
@@ -176,12 +183,12 @@ def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float
 
 
 def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 << 20) -> Callable[[], int]:
-    """A run of nothing but Embree or OptiX: rays in memory to hits in memory; it returns their number.
+    """A function that only traces rays, from rays in memory to hits in memory, and returns their number.
 
-    Lines of sight like the integral's: four nodes on every pixel that can see what glows, turned about the pupil's
-    middle until there are `least` rays; those of neighbouring pixels lie side by side, and are traced `together`, in
-    packets, or each on its own. Rays beside it, which cost far less, are none of them: a method whose rays are many
-    such may get more than this out of Embree.
+    The rays are lines of sight like the integral's: four nodes on every pixel that can see a glowing surface, rotated
+    about the pupil's centre until there are `least` rays. Rays of neighbouring pixels are neighbours in memory;
+    `together`: Embree traces them in packets, else one by one. Pixels that cannot see a glowing surface have no rays
+    here. Such rays cost far less, so that a method with many of them may trace more rays per second than this function.
     """
     import drjit as dr
     import mitsuba as mi

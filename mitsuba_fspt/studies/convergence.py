@@ -1,4 +1,4 @@
-"""What `converge` finds: errors and times of every setting, and what follows from them. Pure NumPy."""
+"""The result of `converge`: errors and times of every setting, what follows from them, and their text tables."""
 
 from __future__ import annotations
 
@@ -10,25 +10,30 @@ from typing import Any
 
 import numpy as np
 
-# Names of the methods. Monte Carlo from the camera is one with every sampler; `PEER` has Mitsuba's best.
+# Names of the methods. Monte Carlo from the camera has one for every sampler; `PEER` is the one with the best sampler.
 INTEGRAL, SURFACE_FORM, DIRECT_SUM, PTRACER = "integral", "integral, surface form", "sum over points", "ptracer"
 PATH = "path, "
 PEER = PATH + "multijitter"
-FLOOR = 3.0  # times the reference's stated error: errors below it say little about a method
-LEAST_CORRELATION = 0.7  # of the logarithms of work and error, for a power law to say something
-TARGETS = (1e-3, 1e-4, 1e-5)  # RMS errors over the brightest pixel
+FLOOR = 3.0  # times the reference's stated error: smaller errors are not used to fit an order
+LEAST_CORRELATION = 0.7  # of the logarithms of work and error; no order is fitted where it is less
+TARGETS = (1e-3, 1e-4, 1e-5)  # RMS errors relative to the brightest pixel
+# Pixels ('full': those whose whole cone sees the phantom) and RMS errors at which the integral is compared with `path`.
+PAIRS = (("all", 1e-3), ("all", 1e-4), ("all", 3e-5), ("all", 1e-5), ("full", 1e-4), ("full", 3e-5), ("full", 1e-5))
+NONE = "–"  # in the table, for a number that does not exist
 
 
 @dataclass(frozen=True)
 class Measurement:
     """One method at one setting of its `knob`. Errors are relative to the reference's brightest pixel.
 
-    cold : first run [s], with the compiling and what is found out once about a scene
-    seconds : median of the runs of each round [s]
-    rays : lines of sight; for the sum over points, pairs of a point and a pixel
+    cold : time of the first run [s], with the compilation and with what an integrator computes once a scene
+    seconds : median run time of each round [s]
+    rays : number of lines of sight; for the sum over points, number of pairs of a point and a pixel
     rms, rms_full : RMS error over all pixels and over those whose whole cone sees the phantom (NaN: there are none)
-    largest : largest error of a pixel; of Monte Carlo the median over the runs, whose squares `rms` averages
-    memory : peak of the arrays that Dr.Jit held for it [MiB], beside the scene; NumPy's and Embree's are not counted
+    largest : largest error of a pixel; for Monte Carlo the median of it over the rounds, while `rms` is the root of
+        the mean square over the rounds
+    memory : peak of Dr.Jit's arrays during a run [MiB], without those of the scene; NumPy's and Embree's memory is not
+        counted
     """
 
     method: str
@@ -44,7 +49,7 @@ class Measurement:
 
     @property
     def median(self) -> float:
-        """Median time, warm [s]."""
+        """Median warm run time [s]."""
         return float(np.median(self.seconds))
 
     @property
@@ -57,14 +62,14 @@ class Measurement:
 class Convergence:
     """Error against run time of all methods on one scene.
 
-    scene : its name and parameters; machine : what it was measured on; shape : (h, w)
-    reference, check : what errors are counted from, and what an independent picture said of it
-    stated, stated_largest : its own RMS and largest error over its brightest pixel
+    scene : its name and parameters; machine : the machine and the variant; shape : (h, w)
+    reference, check : names of the reference picture and of the picture that it was checked against, with the result
+    stated, stated_largest : RMS and largest error that the reference states of itself, relative to its brightest pixel
     full : number of pixels whose whole cone sees the phantom
-    raw_rate : rays per second of Embree or OptiX alone, on pixels that can see what glows; in packets or one by one,
-        whichever is faster
+    raw_rate : rays per second of Embree or OptiX alone, on pixels that can see a glowing surface; traced in packets or
+        one by one, whichever is faster
     rows : method by method, from coarse to fine
-    skipped : methods that do not apply and settings that take too long, and why
+    skipped : methods that do not apply and settings that take too long, with the reason
     """
 
     scene: str
@@ -81,7 +86,7 @@ class Convergence:
 
     @property
     def methods(self) -> list[str]:
-        """Names in the order of the rows."""
+        """Names of the methods in the order of the rows."""
         return list(dict.fromkeys(row.method for row in self.rows))
 
     def of(self, method: str) -> list[Measurement]:
@@ -94,9 +99,9 @@ class Convergence:
         return fitted_order([row.rays for row in rows], [row.rms for row in rows])
 
     def time_to(self, method: str, target: float, full: bool = False, run: int | None = None) -> float | None:
-        """Least time [s] to an RMS error, by the medians or in one run of the rounds.
+        """Least time [s] in which a method reaches an RMS error, by the median times or by those of one round.
 
-        None where no setting gets there, or where the target is below what the reference says of its own error.
+        None where no setting reaches it, or where the target is smaller than the error the reference states of itself.
         """
         rows = self.of(method)
         errors = [row.rms_full if full else row.rms for row in rows]
@@ -104,9 +109,9 @@ class Convergence:
         return time_to(times, errors, target) if target >= self.stated else None
 
     def ratio(self, method: str, peer: str, target: float, full: bool = False) -> tuple[float, float, float] | None:
-        """How many times longer a peer takes to an error: median, least and largest over the rounds.
+        """Time of `peer` over time of `method` to an RMS error: median, least and largest over the rounds.
 
-        Times are paired round by round, so that a slow moment of the machine meets both.
+        The two times of a ratio are of the same round, in which a slow machine slows both.
         """
         ratios = []
         for run in range(len(self.rows[0].seconds)):
@@ -117,17 +122,29 @@ class Convergence:
         return float(np.median(ratios)), min(ratios), max(ratios)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data for JSON, with the order and the times to TARGETS of every method."""
-        told = asdict(self)
-        for row, plain in zip(self.rows, told["rows"], strict=True):
-            plain |= {"median": row.median, "rate": row.rate, "share_of_raw": row.rate / self.raw_rate}
-            plain["rms_full"] = None if math.isnan(row.rms_full) else row.rms_full
-        told["methods"] = {
+        """All fields as plain data for JSON, with the order and the times to TARGETS of every method."""
+        plain = asdict(self)
+        for row, fields in zip(self.rows, plain["rows"], strict=True):
+            fields |= {"median": row.median, "rate": row.rate, "share_of_raw": row.rate / self.raw_rate}
+            fields["rms_full"] = None if math.isnan(row.rms_full) else row.rms_full
+        plain["methods"] = {
             method: {"order": self.order(method)}
             | {f"time_to_{target:g}": self.time_to(method, target) for target in TARGETS}
             for method in self.methods
         }
-        return told
+        return plain
+
+    def render_text(self) -> str:
+        """Scene, machine and reference in a line each, then two Markdown tables: all methods; integral and `path`."""
+        h, w = self.shape
+        lines = [
+            f"{self.scene}: {w} x {h} pixels, {self.full} of them see the phantom with their whole cone ('full')",
+            f"{self.machine}; tracing alone: {self.raw_rate / 1e6:.3g} million rays a second that can meet it ('raw')",
+            f"reference: {self.reference}, stated error {self.stated:.1e} RMS, {self.stated_largest:.1e} at the most",
+        ]
+        lines += [f"checked by: {self.check}"] if self.check else []
+        lines += [f"skipped: {method}: {reason}" for method, reason in self.skipped.items()]
+        return "\n".join([*lines, "", _table(_method_rows(self)), "", _table(_ratio_rows(self))])
 
 
 def fitted_order(work: Sequence[float], errors: Sequence[float]) -> float | None:
@@ -146,9 +163,10 @@ def fitted_order(work: Sequence[float], errors: Sequence[float]) -> float | None
 
 
 def time_to(times: Sequence[float], errors: Sequence[float], target: float) -> float | None:
-    """Least time in which an error is reached; None where none of the settings reaches it.
+    """Least time in which an error is reached; None where no setting reaches it.
 
-    Between a setting that does not and the next one in time that does, the power law through both is followed.
+    Between a setting that does not reach it and the next slower one that does, the time is interpolated by the power
+    law through both.
     """
     points = sorted((t, e) for t, e in zip(times, errors, strict=True) if not math.isnan(e))
     reached = [t for t, e in points if e <= target]
@@ -157,3 +175,63 @@ def time_to(times: Sequence[float], errors: Sequence[float], target: float) -> f
             share = math.log(e0 / target) / math.log(e0 / e1) if e1 > 0 else 1.0
             reached.append(t0 * (t1 / t0) ** share)
     return min(reached, default=None)
+
+
+# ---------------------------------------------------------------------- the text tables
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table with columns of equal width; the first row is the head."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["| " + " | ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)) + " |" for row in rows]
+    return "\n".join([lines[0], "|" + "|".join("-" * (w + 2) for w in widths) + "|", *lines[1:]])
+
+
+def _method_rows(found: Convergence) -> list[list[str]]:
+    """A row a method: the rates of its finest setting, its largest memory, its coarsest setting's first run."""
+    head = ["method", "order", *(f"to {target:g}" for target in TARGETS), "cold start", "Mrays/s", "of raw", "Dr.Jit"]
+    rows = [head]
+    for method in found.methods:
+        of = found.of(method)
+        order, fine = found.order(method), of[-1]
+        rows.append(
+            [
+                method,
+                NONE if order is None else f"{order:.2f}",
+                *(_time(found.time_to(method, target)) for target in TARGETS),
+                _time(of[0].cold),
+                f"{fine.rate / 1e6:.3g}" if fine.rays else NONE,
+                f"{fine.rate / found.raw_rate:.0%}" if fine.rays else NONE,
+                f"{max(row.memory for row in of):.2g} MiB",
+            ]
+        )
+    return rows
+
+
+def _ratio_rows(found: Convergence) -> list[list[str]]:
+    """A row an error: times of the integral and of `PEER`, their ratio, and the fastest of `path`'s other samplers."""
+    rows = [["pixels", "RMS error", INTEGRAL, PEER, "ratio (over the rounds)", "best other sampler"]]
+    others = [method for method in found.methods if method.startswith(PATH) and method != PEER]
+    for pixels, target in PAIRS:
+        full = pixels == "full"
+        if (full and found.full == 0) or target < found.stated:
+            continue
+        ratio = found.ratio(INTEGRAL, PEER, target, full)
+        times = {method: found.time_to(method, target, full) for method in others}
+        best = min(((t, method.removeprefix(PATH)) for method, t in times.items() if t is not None), default=None)
+        rows.append(
+            [
+                pixels,
+                f"{target:g}",
+                *(_time(found.time_to(method, target, full)) for method in (INTEGRAL, PEER)),
+                NONE if ratio is None else "{:.2g} ({:.2g} to {:.2g})".format(*ratio),
+                NONE if best is None else f"{best[1]}, {_time(best[0])}",
+            ]
+        )
+    return rows
+
+
+def _time(seconds: float | None) -> str:
+    if seconds is None:
+        return NONE
+    return f"{seconds:.3g} s" if seconds >= 1 else f"{seconds * 1e3:.3g} ms"

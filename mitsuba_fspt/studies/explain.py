@@ -1,4 +1,4 @@
-"""What `fspt explain` tells: what the integral of a scene leaves out, why, and what that is seen to save."""
+"""The shortcuts of a scene's integral: which ones are taken, why, and what share of its work they save."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
     from ..integral.quadrature import Quadrature
     from ..integral.solution import Solution
 
-ROUNDS = 3  # a median of; once where a round takes longer than LONG [s]
+ROUNDS = 3  # timed pairs of runs, of which the median counts; only one where a run takes longer than LONG [s]
 LONG = 5.0
 WHAT_WIDTH = 1 + max(len(what) for what in SHORTCUTS.values())
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """One line of the table.
+    """One row of the table: something that the integral may leave out.
 
-    what : is left out or not (`left_out`), and `why`
-    lines_saved, time_saved : shares in [0, 1] of the lines of sight and of the time it would take without the shortcut,
-        measured; None where it is not taken or nothing to switch off
+    what : name; `left_out`: True if it is left out of this scene; `why` : the reason
+    lines_saved, time_saved : measured saving, as a share of the lines of sight and of the time without the shortcut, at
+        most 1; None where it is not taken or cannot be switched off
     """
 
     what: str
@@ -66,9 +66,10 @@ def explain(
     rtol: float | None = None,
     domain: str | None = None,
 ) -> list[Explanation]:
-    """What the integral leaves out of a scene: every shortcut that is taken is switched off once to see what it saves.
+    """One row for everything that the integral may leave out of a scene.
 
-    Parameters as of `render`, and so are the errors raised.
+    Each shortcut that is taken is switched off, to measure the lines of sight and the time that it saves. Parameters
+    and errors are those of `render`.
     """
     scene = loaded(scene)
     variant = backend.ensure_variant()
@@ -93,7 +94,10 @@ def explain(
 def _saved(
     solve: Callable[[Quadrature], tuple[Solution, float]], quadrature: Quadrature, without: Quadrature
 ) -> tuple[float, float]:
-    """Shares of the lines of sight and of the time that a shortcut saves, by rounds in pairs after a first one."""
+    """Shares of the lines of sight and of the time that a shortcut saves, from pairs of runs with and without it.
+
+    A first run without it compiles the kernels; its time does not count.
+    """
     long, seconds = solve(without)
     rounds = ROUNDS if seconds < LONG else 1
     pairs = [(solve(quadrature), solve(without)) for _ in range(rounds)]
@@ -106,7 +110,7 @@ def _row(finding: Finding, lines: float | None, seconds: float | None) -> Explan
 
 
 def _never_done(scene: mi.Scene, variant: str) -> list[Explanation]:
-    """What costs nothing because it is never begun."""
+    """Rows for work that is never begun where it is not needed, and so has no cost to measure."""
     loaded = [one.module for one in EXTRAS if one.module in sys.modules]
     uniform = [is_surface(emitter) and emitter.is_uniform() for emitter in scene.emitters()]
     return [

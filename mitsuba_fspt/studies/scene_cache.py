@@ -1,4 +1,4 @@
-"""The cache of a sweep: a phantom that stays while only the lens before it changes."""
+"""The scene cache of a sweep: the last loaded scene is used again where only numbers of its lens differ."""
 
 from __future__ import annotations
 
@@ -18,10 +18,14 @@ if TYPE_CHECKING:
 
 
 class SceneCache:
-    """Renders points one at a time and keeps the last scene; bits as from a scene loaded anew."""
+    """Renders the points of a sweep one at a time and keeps the last scene.
+
+    The images are the same, to the last bit, as from a scene that is loaded for each point. `loads` counts the scenes
+    that were loaded.
+    """
 
     def __init__(self, *, threads: int | None = None, quiet: bool = False) -> None:
-        """`threads` for Dr.Jit (None leaves them as they are); `quiet` for a process that only renders."""
+        """`threads`: number of Dr.Jit's threads (None leaves it unchanged); `quiet`: no warnings of Mitsuba."""
         self._threads, self._quiet = threads, quiet
         self._scene: mi.Scene | None = None
         self._geometry = ""
@@ -29,36 +33,41 @@ class SceneCache:
         self.loads = 0
 
     def image(self, point: SweepPoint) -> Image:
-        """Image of a point, `fingerprint` in its metadata; raises as `load` and `render` do, the point named first."""
+        """Image of a point, with `fingerprint` in its metadata.
+
+        Raises what `load` and `render` raise; the message begins with the values of the point's parameters.
+        """
         try:
             with self._one_at_a_time:
                 image = render(self._set_up(point), **point.settings)  # type: ignore[arg-type]
         except FsptError as error:
             raise type(error)(f"{point.label}: {error}") from error
-        told = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint}
-        return replace(image, metadata=image.metadata | told)
+        origin = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint}
+        return replace(image, metadata=image.metadata | origin)
 
     def image_or_error(self, point: SweepPoint) -> Image | FsptError:
-        """`image`, or what it raises: the other points can be rendered all the same."""
+        """`image`, or the FsptError that it raises, so that a sweep can go on with the other points."""
         try:
             return self.image(point)
         except FsptError as error:
             return error
 
     def _set_up(self, point: SweepPoint) -> mi.Scene:
+        """The scene of a point, loaded or with its lens changed."""
         scene = self._scene if self._geometry == point.geometry else None
-        self._scene = None  # should the set-up fail, nothing half changed is kept
+        self._scene = None  # if the set-up fails, no half changed scene is kept
         if scene is not None:
             _set_lens(scene, point)
         else:
             if self.loads == 0:
-                self._settle()
+                self._set_up_mitsuba()
             scene = load(point.path, **point.parameters)
             self.loads += 1
         self._scene, self._geometry = scene, point.geometry
         return scene
 
-    def _settle(self) -> None:
+    def _set_up_mitsuba(self) -> None:
+        """Set a variant, the log level and the number of threads; once, before the first scene."""
         ensure_variant()
         import drjit as dr
         import mitsuba as mi
@@ -70,6 +79,7 @@ class SceneCache:
 
 
 def _set_lens(scene: mi.Scene, point: SweepPoint) -> None:
+    """Set the numbers of the scene's lens to those of the point."""
     import mitsuba as mi
 
     numbers = mi.traverse(scene.sensors()[0])

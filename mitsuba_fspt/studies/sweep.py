@@ -1,10 +1,10 @@
-"""Sweeps: one image for every combination of values over a scene, an index of them, and no point rendered twice."""
+"""Sweeps: one image of a scene for every combination of parameter values, an index of them, and a contact sheet."""
 
 from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..images import picture
 from ..images.image import Image, read
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import FsptError, ImageError, SceneError
@@ -23,20 +24,24 @@ if TYPE_CHECKING:
     from ..rendering.render import Progress
 
 INDEX = "index.csv"
-NAMED = 5  # points that failed, beside the first of them
+MAX_NAMED = 5  # failed points that an error message names, beside the first of them
 Images = Generator[tuple[SweepPoint, Image | FsptError], None, None]
 COLUMNS = ("file", "power", "peak", "largest_error", "wall_time")
+# The contact sheet.
+MAX_COLUMNS = 8  # images in a row, where not several parameters vary
+GAP = 0.04  # between images, relative to the larger side of an image
+CAPTION = 0.1  # height of the text above an image, relative likewise
 
 
 @dataclass(frozen=True)
 class SweepRow:
-    """One point of a sweep, as the index tells it.
+    """One point of a sweep, one row of its index.
 
     parameters : name and value, as text
-    file : its image
-    power, peak : sum of all pixels and brightest pixel [W]
-    largest_error : of a pixel [W]; None where the image has no error
-    wall_time : of the rendering [s]
+    file : path of its image
+    power, peak : power on all pixels and on the brightest one [W]
+    largest_error : largest error of a pixel [W]; None where the image has no error
+    wall_time : time of the rendering [s]
     """
 
     parameters: dict[str, str]
@@ -64,18 +69,19 @@ def sweep(
 
         fspt.sweep("scenes/nylon_cylinder.xml", {"f_number": [2.8, 5.6], "view": [0, 90]}, "nylon")
 
-    Writes an EXR for each into `folder`, and `index.csv`. Points that are there already, from the same scene, data,
-    values, settings and version, are not rendered again; so an interrupted sweep goes on where it was. The scene is
-    loaded once for all points that differ only in numbers of the lens. The bits do not depend on `jobs` or `scheduler`
-    (but for `ptracer`, whose sums take the order of the threads). `sweep_sheet.write_contact_sheet` draws the rows.
+    Writes an EXR file for each row into `folder`, and `index.csv`. An image that is there already and was made from the
+    same scene, data, values, settings and versions is not rendered again, so that a second call continues an
+    interrupted sweep. The scene is loaded once for all points that differ only in numbers of the lens. The pixels do
+    not depend on `jobs` or `scheduler`, to the last bit, except with `ptracer`, whose sums depend on the order of the
+    threads. `write_contact_sheet` draws the rows.
 
     Parameters
     ----------
     scene : name of a scene file
-    parameters : values for `<default>` parameters of the scene, in a list or one alone
-    folder : where the images go; made if its parent exists
+    parameters : values for `<default>` parameters of the scene: a list of values or one value for each name
+    folder : folder of the images; created if its parent exists
     method, rtol, spp, seed : as in `render`
-    jobs : processes, >= 1; None renders in this one (with scheduler 'local': as many as the machine has cores). Each
+    jobs : number of processes, >= 1; None renders in this one (with scheduler 'local': one process a core). Each
         imports the script that calls: keep the call behind `if __name__ == "__main__":`
     scheduler : address of a dask.distributed scheduler, for example 'tcp://10.0.0.1:8786', or 'local' to start one
         on this machine; needs the extra `cluster`. Workers must find the scene under the same path.
@@ -83,10 +89,10 @@ def sweep(
 
     Raises
     ------
-    SceneError, OpticsError, ExitanceError : a parameter, value or setting that cannot be used; where only the
-        rendering showed it, the message names the point, and comes when the others are done.
+    SceneError, OpticsError, ExitanceError : a parameter, value or setting that cannot be used. An error of the
+        rendering is raised after the other points are done, and names the point.
     ImageError : the folder cannot be written.
-    BackendError : no such scheduler, dask is missing, a worker died thrice at one point, no LLVM.
+    BackendError : no such scheduler, dask is missing, one point ended its worker process three times, no LLVM.
     """
     folder = Path(folder)
     jobs = None if jobs is None else whole("sweep: 'jobs'", jobs, SceneError, "2")
@@ -98,7 +104,7 @@ def sweep(
 
 
 def _settings(method: str | None, rtol: float | None, spp: int | None, seed: int | None) -> dict[str, Setting]:
-    """What every point is rendered with; SceneError for what is no number."""
+    """The settings common to all points; SceneError for a value that is no number."""
     return {
         "method": method,
         "rtol": None if rtol is None else number("sweep: 'rtol'", rtol, SceneError, "1e-3"),
@@ -110,29 +116,29 @@ def _settings(method: str | None, rtol: float | None, spp: int | None, seed: int
 def _completed(
     wanted: list[SweepPoint], folder: Path, jobs: int | None, scheduler: str | None, progress: Progress | None
 ) -> list[SweepRow]:
-    """Rows of all points, rendered where their image is not there yet; the index tells those that are."""
+    """Rows of all points; renders those whose image is missing, and writes the index, after an interrupt too."""
     rows = {point.file: row for point in wanted if (row := _finished(point, folder)) is not None}
     missing = _by_geometry(point for point in wanted if point.file not in rows)
     failed: dict[str, FsptError] = {}
 
-    def tell() -> None:
+    def report() -> None:
         if progress:
             done = len(rows) + len(failed)
             progress(f"{done} of {len(wanted)} points", done / len(wanted))
 
-    tell()
+    report()
     try:
         with closing(_images(missing, jobs, scheduler)) as images:
             for point, image in images:
                 if isinstance(image, FsptError):
                     failed[point.label] = image
-                    tell()
+                    report()
                     continue
                 folder.mkdir(exist_ok=True)
-                with ctrl_c_held():  # no image without its row in the index
+                with ctrl_c_held():  # so that every image has its row in the index
                     image.write(folder / point.file)
                     rows[point.file] = _row(point, folder, image)
-                tell()
+                report()
     finally:
         if rows:
             with ctrl_c_held():
@@ -149,20 +155,20 @@ def _require_all(wanted: list[SweepPoint], failed: Mapping[str, FsptError]) -> N
     error, others = failed[labels[0]], labels[1:]
     if not others:
         raise error
-    named = ", ".join(others[:NAMED]) + (" and more" if others[NAMED:] else "")
+    named = ", ".join(others[:MAX_NAMED]) + (" and more" if others[MAX_NAMED:] else "")
     raise type(error)(f"{error} {len(labels)} of {len(wanted)} points failed; the others: {named}.") from error
 
 
 def _images(missing: list[SweepPoint], jobs: int | None, scheduler: str | None) -> Images:
-    """Points and their images, or why there is none, as they come: from here, other processes or a cluster."""
+    """Points with their images or errors in the order they are finished, by this process, others or a cluster."""
     if not missing:
         return
     if scheduler is not None:
-        from .sweep_cluster import images_of_cluster
+        from .sweep_workers import images_of_cluster
 
         yield from images_of_cluster(missing, scheduler, jobs)
     elif jobs is not None and jobs > 1:
-        from .sweep_pool import images_of_processes
+        from .sweep_workers import images_of_processes
 
         yield from images_of_processes(missing, jobs)
     else:
@@ -174,7 +180,7 @@ def _images(missing: list[SweepPoint], jobs: int | None, scheduler: str | None) 
 
 
 def _by_geometry(missing: Iterable[SweepPoint]) -> list[SweepPoint]:
-    """The points with those together that one load of the scene serves."""
+    """The points, those that can use the same loaded scene one after the other."""
     groups: dict[str, list[SweepPoint]] = {}
     for point in missing:
         groups.setdefault(point.geometry, []).append(point)
@@ -182,7 +188,7 @@ def _by_geometry(missing: Iterable[SweepPoint]) -> list[SweepPoint]:
 
 
 def _finished(point: SweepPoint, folder: Path) -> SweepRow | None:
-    """The row of an image that is there, whole, and made from all that would make it now."""
+    """The row of a point whose image exists, is readable and has the same fingerprint; else None."""
     if not os.path.isfile(folder / point.file):
         return None
     try:
@@ -193,7 +199,7 @@ def _finished(point: SweepPoint, folder: Path) -> SweepRow | None:
 
 
 def _row(point: SweepPoint, folder: Path, image: Image) -> SweepRow:
-    # As the file has it, in float32: a row says the same when it is made anew from the file.
+    """The row of an image, from its float32 values, which are those in the file."""
     power = image.power.astype(np.float32)
     error = None if image.error is None else float(image.error.astype(np.float32).max())
     total, peak = float(power.sum(dtype=np.float64)), float(power.max())
@@ -223,17 +229,65 @@ def _check_names(wanted: list[SweepPoint]) -> None:
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be written before the work, not after it."""
+    """Raise ImageError for a folder that cannot be created or written, before anything is rendered."""
     if os.path.exists(folder) and not folder.is_dir():
         raise ImageError(f"sweep: the folder '{folder}' is a file. Give another name with -o.")
-    standing = folder if os.path.isdir(folder) else folder.parent
-    if not os.path.isdir(standing):
-        raise ImageError(f"sweep: '{folder}': the folder '{standing}' does not exist. Make it, or write elsewhere.")
-    if not os.access(standing, os.W_OK):
-        raise ImageError(f"sweep: the folder '{standing}' is not writable. Write elsewhere with -o.")
+    existing = folder if os.path.isdir(folder) else folder.parent
+    if not os.path.isdir(existing):
+        raise ImageError(f"sweep: '{folder}': the folder '{existing}' does not exist. Make it, or write elsewhere.")
+    if not os.access(existing, os.W_OK):
+        raise ImageError(f"sweep: the folder '{existing}' is not writable. Write elsewhere with -o.")
     try:
         os.stat(folder)
     except FileNotFoundError:
         pass
     except OSError as cause:  # a name too long
         raise ImageError(f"sweep: the folder '{folder}' cannot be made: {cause.strerror}. Give -o a name.") from cause
+
+
+# ---------------------------------------------------------------------- the contact sheet
+
+
+def write_contact_sheet(rows: Sequence[SweepRow], path: str | os.PathLike[str]) -> None:
+    """Write the images of a sweep side by side to a PNG file, with one colour bar for all [W/pixel].
+
+    Above each image are its values of the parameters that vary. Where several parameters vary, there is a column for
+    every value of the last one. An image smaller than the others is in the upper left corner of its cell.
+
+    Raises
+    ------
+    ImageError : no rows, an image that cannot be read, the suffix is not .png or the file cannot be written.
+    BackendError : matplotlib is not installed.
+    """
+    file = picture.require_png(path)
+    picture.require_matplotlib()
+    if not rows:
+        raise ImageError("contact sheet: a sweep without points. Give the rows that sweep returned.")
+    powers = [read(row.file).power for row in rows]
+    scale, unit = picture.scale_and_unit(np.array([power.max() for power in powers]))
+    height, width = (max(power.shape[side] for power in powers) for side in (0, 1))
+    varied, same = _parameters(rows)
+    columns = len(varied[-1][1]) if len(varied) > 1 else min(len(rows), MAX_COLUMNS)
+    lines = -(-len(rows) // columns)
+    gap, caption = (int(np.ceil(share * max(height, width))) for share in (GAP, CAPTION))
+    sheet = np.full((lines * (height + caption), columns * (width + gap) - gap), np.nan, np.float32)
+    figure = picture.empty_figure(width=1.5 + 1.8 * columns, height=0.5 + 1.8 * sheet.shape[0] / (width + gap))
+    axes = figure.add_subplot()
+    for place, (row, power) in enumerate(zip(rows, powers, strict=True)):
+        line, column = divmod(place, columns)
+        top, left = line * (height + caption) + caption, column * (width + gap)
+        sheet[top : top + power.shape[0], left : left + power.shape[1]] = power / scale
+        label = "  ".join(f"{name}={row.parameters[name]}" for name, _ in varied)
+        axes.text(left, top - 0.2 * caption, label, fontsize="x-small", va="bottom")
+    shown = axes.imshow(sheet, cmap=picture.COLOURS, vmin=0, vmax=float(np.nanmax(sheet)) or 1.0, interpolation="none")
+    axes.axis("off")
+    axes.set_title("  ".join(f"{name}={value}" for name, (value,) in same), fontsize="small")
+    figure.colorbar(shown, ax=axes, label=f"power [{unit}]", shrink=min(1.0, 3 / lines), aspect=20)
+    picture.save_figure(figure, file)
+
+
+def _parameters(rows: Sequence[SweepRow]) -> tuple[list, list]:
+    """Names and values of the parameters with several values, and those of the parameters with one value."""
+    values = {name: list(dict.fromkeys(row.parameters[name] for row in rows)) for name in rows[0].parameters}
+    varied = [(name, of) for name, of in values.items() if len(of) > 1]
+    return varied, [(name, of) for name, of in values.items() if len(of) == 1]

@@ -1,4 +1,7 @@
-"""The points of a sweep: the values of each, the name of its image and the fingerprint of all that it depends on."""
+"""The points of a sweep: parameter values, name of the image, and a fingerprint of all that the image depends on.
+
+`SceneSource` reads two things from the scene's XML: the files that it names, and which parameters only set the lens.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +15,28 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from ..optics.thin_lens import Lens, number_names
 from ..rendering.scene import check_parameters, parameter_text
+from ..rendering.scene_rules import REFERENCE, check_values, is_number
+from ..rendering.scene_xml import read_xml
 from ..runtime.errors import SceneError
-from .sweep_source import SceneSource
 
 Setting = str | int | float | None
-LONGEST = 60  # characters of a value in a file name
-MOST_BYTES = 250  # of a file name before its suffix: all file systems in use hold 255
+MAX_CHARACTERS = 60  # of a value in a file name
+MAX_BYTES = 250  # of a file name without its suffix; file systems allow 255 with it
 
 
 @dataclass(frozen=True)
 class SweepPoint:
-    """One image of a sweep and all that makes it; plain data that travels to other processes.
+    """One image of a sweep and all that it is made from; plain data that can be sent to other processes.
 
     scene : the scene file as given
-    path : the same from the root, for a process that works in another folder
+    path : its absolute path, for a process that works in another folder
     parameters : name and value, as in the scene's `<default>`
-    lens : names of the lens numbers that a parameter sets, for parameters that do nothing else
+    lens : names of the lens numbers that a parameter sets, for parameters that set nothing else
     settings : method, rtol, spp, seed as `render` takes them
-    geometry : fingerprint of the scene without its lens; equal where one load serves both points
-    fingerprint : of the scene's files, the parameters, the settings and the versions
+    geometry : hash of the scene without its lens; points of equal `geometry` can use the same loaded scene
+    fingerprint : hash of the scene's files, the parameters, the settings and the versions
     """
 
     scene: str
@@ -52,16 +57,16 @@ class SweepPoint:
         """Name of the image, 'nylon_cylinder_f_number=2.8_view=90.exr'."""
         values = (f"{name}={_in_a_name(value)}" for name, value in self.parameters.items())
         name = "_".join([self.path.stem, *values])
-        return (name if len(os.fsencode(name)) <= MOST_BYTES else _shortened(name)) + ".exr"
+        return (name if len(os.fsencode(name)) <= MAX_BYTES else _shortened(name)) + ".exr"
 
 
 def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Setting]) -> list[SweepPoint]:
-    """All combinations of the values over a scene, the last parameter changing fastest.
+    """One point for every combination of the values, the last parameter changing fastest.
 
     Raises
     ------
-    SceneError : no parameters, one that the scene has not or without values, a value twice or that is no number
-        where the scene wants one, a scene that cannot be read.
+    SceneError : no parameters, a parameter that the scene does not have or that has no values, a value given twice, a
+        value that is no number where the scene needs one, a scene that cannot be read.
     OpticsError : a lens that cannot exist.
     """
     texts = {name: _texts(name, given) for name, given in values.items()}
@@ -75,21 +80,22 @@ def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Set
 def _point(
     scene: Path, parameters: dict[str, str], digests: dict[Path, str], settings: dict[str, Setting]
 ) -> SweepPoint:
+    """The point of these parameters, checked; `digests` as of `SceneSource`."""
     check_parameters(scene, parameters)
     source = SceneSource(scene, parameters, digests)
     source.check()
-    lens = source.lens_parameters()
-    moving = {name: lens[name] for name in parameters if name in lens}
-    standing = {name: value for name, value in parameters.items() if name not in moving}
+    all_lens = source.lens_parameters()
+    lens = {name: all_lens[name] for name in parameters if name in all_lens}
+    others = {name: value for name, value in parameters.items() if name not in lens}
     versions = [version(name) for name in ("mitsuba-fspt", "mitsuba")]
-    geometry = _hash(versions, source.digests(), standing)
-    fingerprint = _hash(geometry, {name: parameters[name] for name in moving}, settings)
+    geometry = _hash(versions, source.digests(), others)
+    fingerprint = _hash(geometry, {name: parameters[name] for name in lens}, settings)
     path = source.path
-    return SweepPoint(str(path), path.absolute(), parameters, moving, settings, geometry, fingerprint)
+    return SweepPoint(str(path), path.absolute(), parameters, lens, settings, geometry, fingerprint)
 
 
 def _texts(name: str, given: object) -> list[str]:
-    """Values of a parameter as the scene file would spell them; one alone need not be in a list."""
+    """Values of a parameter as text in a scene file; `given` is a list of them or one value."""
     several = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and getattr(given, "ndim", 1) > 0
     values = list(given) if several else [given]  # type: ignore[call-overload]
     texts = [parameter_text(value).strip() for value in values]
@@ -102,14 +108,14 @@ def _texts(name: str, given: object) -> list[str]:
 
 
 def _in_a_name(value: str) -> str:
-    """`value`, or where a file name cannot hold it, what it can and a hash that keeps values apart."""
-    plain = re.sub(r"[^\w.+-]", "-", value)[:LONGEST]
+    """`value` for a file name; characters that it cannot hold are replaced, and a hash keeps such values distinct."""
+    plain = re.sub(r"[^\w.+-]", "-", value)[:MAX_CHARACTERS]
     return plain if plain == value else f"{plain}-{_short_hash(value)}"
 
 
 def _shortened(name: str) -> str:
-    """The beginning of a name that is too long, and a hash that keeps points apart."""
-    beginning = os.fsencode(name)[: MOST_BYTES - 9].decode(errors="ignore")
+    """The beginning of a name that is too long, and a hash that keeps the names of points distinct."""
+    beginning = os.fsencode(name)[: MAX_BYTES - 9].decode(errors="ignore")
     return f"{beginning}-{_short_hash(name)}"
 
 
@@ -119,3 +125,78 @@ def _short_hash(text: str) -> str:
 
 def _hash(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+
+
+class SceneSource:
+    """The XML of a scene file and of the files that it includes, read once with these values of its parameters.
+
+    path : the scene file
+    parameters : values by name, as text
+    digests : SHA-256 by file; new ones are added, so that sources that share this dictionary read a file once
+
+    Raises
+    ------
+    SceneError : the file or one that it includes cannot be read or is not valid XML.
+    """
+
+    def __init__(
+        self, path: Path, parameters: Mapping[str, str] | None = None, digests: dict[Path, str] | None = None
+    ) -> None:
+        self.path = path
+        self._parameters = parameters or {}
+        self._xml = read_xml(path, self._parameters)
+        self._nodes = self._xml.nodes
+        sensors = [node for node in self._nodes if node.tag == "sensor"]
+        # The elements inside <sensor type="fspt_lens">; none where there is another sensor, too.
+        self._lens = list(sensors[0]) if [node.get("type") for node in sensors] == ["fspt_lens"] else []
+        self._digests = {} if digests is None else digests
+
+    def lens_parameters(self) -> dict[str, tuple[str, ...]]:
+        """Names of the lens numbers that a parameter sets, for the parameters that set nothing else in the scene."""
+        found: dict[str, tuple[str, ...]] = {}
+        lens_nodes = []
+        for node in self._lens:
+            reference = REFERENCE.fullmatch(node.get("value", ""))
+            if reference and node.tag == "float" and node.get("name") in (*number_names(), "pixel_pitch"):
+                found[reference[1]] = (*found.get(reference[1], ()), node.get("name", ""))
+                lens_nodes.append(node)
+        elsewhere = " ".join(text for node in self._nodes if node not in lens_nodes for text in node.attrib.values())
+        return {name: numbers for name, numbers in found.items() if f"${name}" not in elsewhere}
+
+    def check(self) -> None:
+        """Raise SceneError for a value that is no number where one is needed, OpticsError for an impossible lens."""
+        check_values(self.path, self._xml)
+        self._check_lens()
+
+    def _check_lens(self) -> None:
+        """Raise OpticsError for a lens that cannot exist, before any point is rendered.
+
+        Numbers that the XML does not give as plain text are checked later, when the scene is loaded.
+        """
+        given = {node.get("name", ""): self._xml.fill_in(node.get("value", "")) for node in self._lens}
+        numbers = {name: text for name, text in given.items() if name in number_names()}
+        plain = all(map(is_number, numbers.values())) and "include" not in {node.tag for node in self._lens}
+        if plain and {"focal_length", "f_number"} <= set(numbers):
+            model = given.get("model", "diaphragm")
+            Lens.focused(model=model, **{name: float(text) for name, text in numbers.items()})  # type: ignore[arg-type]
+
+    def digests(self) -> list[tuple[str, str]]:
+        """Name and SHA-256 of the scene file, of what it includes and of every file that its attributes name.
+
+        Names are relative to the scene's folder, so that a scene copied with its data has the same digests.
+        """
+        return sorted({(os.path.relpath(file, self.path.parent), self._digest(file)) for file in self._xml.sources()})
+
+    def _digest(self, file: Path) -> str:
+        if file not in self._digests:
+            self._digests[file] = _sha256(file)
+        return self._digests[file]
+
+
+def _sha256(file: Path) -> str:
+    """SHA-256 of a file, as hexadecimal digits."""
+    digest = hashlib.sha256()
+    with file.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

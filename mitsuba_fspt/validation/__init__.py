@@ -1,1 +1,1 @@
-"""Independent truths: the integral in float64 NumPy, stiff cases, and the paper's own sum over surface points."""
+"""Independent references: the integral in float64 NumPy, stiff cases, and the paper's own sum over surface points."""

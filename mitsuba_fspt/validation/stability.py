@@ -1,4 +1,4 @@
-"""What `fspt stability` tells: stiff and extreme cases, each right to its tolerance or refused, and what it reached."""
+"""The runner of `fspt stability`: a case is a stiff or extreme scene, its result an error or a refusal."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Case:
     """One row of the table.
 
     name : what is stiff or extreme
-    why : where the truth comes from
-    run : returns the worst relative error against it, >= 0 (no unit); a picture that is not finite gives NaN
-    tolerance : what that error may be, > 0; None where float32 cannot be right and a refusal is
-    slow : left out unless everything is asked for
+    why : the truth that the picture is compared with
+    run : function that returns the largest relative error, >= 0 (no unit); NaN for a picture that is not finite
+    tolerance : largest error allowed, > 0; None where float32 cannot be right, so that a refusal is expected
+    slow : True for a case that runs on request only
     """
 
     name: str
@@ -32,7 +32,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Result:
-    """What a case came to: its `error`, or the message of its `refusal`, and how long it took [s]."""
+    """Result of a case: its `error`, or the message of its `refusal`, and its run time [s]."""
 
     case: Case
     error: float | None
@@ -41,7 +41,7 @@ class Result:
 
     @property
     def ok(self) -> bool:
-        """True if the case was right to its tolerance, or refused where that is what is right. NaN is never right."""
+        """True if the error is within the tolerance, or if the case was refused as expected. NaN is never right."""
         if self.case.tolerance is None or self.error is None:
             return self.case.tolerance is None and self.refusal is not None
         return 0 <= self.error <= self.case.tolerance
@@ -55,7 +55,7 @@ class Result:
         return f"{row}  {self.refusal}" if self.refusal else row
 
     def to_dict(self) -> dict[str, str | float | bool | None]:
-        """The row as plain data for JSON; an error that is not finite is null, like one that was not reached."""
+        """The row as plain data for JSON; the error is None where it is not finite and where the case was refused."""
         error = self.error if self.error is not None and math.isfinite(self.error) else None
         return {
             "case": self.case.name,
@@ -69,7 +69,7 @@ class Result:
 
 
 def check(case: Case) -> Result:
-    """Run a case. Errors of this package are its refusal; any other exception is a fault of the code and comes out."""
+    """Run a case. An FsptError is its refusal; any other exception is a fault of the code and is raised."""
     start = time.perf_counter()
     error, refusal = None, None
     try:

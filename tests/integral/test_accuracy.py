@@ -22,7 +22,7 @@ from small_scenes import (
 )
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.validation import stiff_cases_scenes as far_away
+from mitsuba_fspt.validation import stiff_scenes as far_away
 
 pytestmark = pytest.mark.usefixtures("mono")
 

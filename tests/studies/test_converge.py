@@ -19,10 +19,9 @@ from small_scenes import FOCUS, HEIGHT, RADIUS, SIDE, WIDTH, write_scene
 import mitsuba_fspt as fspt
 from mitsuba_fspt.cli import app
 from mitsuba_fspt.runtime.errors import ImageError, SceneError
-from mitsuba_fspt.studies import converge, converge_methods, converge_reference
-from mitsuba_fspt.studies.converge_sheet import COLUMNS, png_file, write_csv
-from mitsuba_fspt.studies.converge_table import render_text
+from mitsuba_fspt.studies import converge, converge_methods
 from mitsuba_fspt.studies.convergence import Convergence, Measurement, fitted_order, time_to
+from mitsuba_fspt.studies.convergence_report import COLUMNS, png_file, write_csv
 
 ALL = ["integral", "integral, surface form", "sum over points"]
 ALL += [f"path, {sampler}" for sampler in converge_methods.SAMPLERS] + ["ptracer"]
@@ -63,17 +62,17 @@ def test_what_takes_longer_than_the_budget_is_left_out_and_says_so():
     def prepare(value):
         def run():
             time.sleep(0.05 * value)
-            return converge_methods.Shot(np.ones((1, 1)), 1, value)
+            return converge_methods.Picture(np.ones((1, 1)), 1, value)
 
         return run
 
     slow = converge_methods.Method("slow", "n", (1.0, 2.0, 6.0, 12.0), prepare)
-    bench = converge.Bench(None, None, budget=0.2)
-    (setting,) = (told := bench.try_ladder(slow))
-    assert setting == "slow, n 6 and finer"
-    assert "more than the budget of 0.2 s" in told[setting]
-    assert [trial.shot.knob for trial in bench.trials] == [1.0, 2.0]
-    assert converge.Bench(None, None, budget=10.0).try_ladder(slow) == {}
+    benchmark = converge.Benchmark(None, None, None, budget=0.2)
+    (left_out,) = (told := benchmark.try_ladder(slow))
+    assert left_out == "slow, n 6 and finer"
+    assert "more than the budget of 0.2 s" in told[left_out]
+    assert [setting.picture.knob for setting in benchmark.settings] == [1.0, 2.0]
+    assert converge.Benchmark(None, None, None, budget=10.0).try_ladder(slow) == {}
 
 
 def test_errors_near_the_references_own_have_no_say_in_the_order():
@@ -112,7 +111,7 @@ def test_ratio_is_paired_so_that_a_slow_round_does_not_decide():
 
 def test_text_and_json_hold_what_was_found():
     told = found(row(rays=100, rms=1e-2), row(rays=10000, rms=1e-4, seconds=(0.05, 0.05)), stated=3e-5)
-    text = render_text(told)
+    text = told.render_text()
     assert "skipped: b: no surface" in text
     assert [cell.strip() for cell in text.splitlines()[8].split("|")[1:6]] == ["a", "1.00", "50 ms", "50 ms", "–"]
     plain = json.loads(json.dumps(told.to_dict(), allow_nan=False))
@@ -141,7 +140,7 @@ def short(monkeypatch):
         monkeypatch.setattr(converge_methods, name, (2, 16))
     monkeypatch.setattr(converge_methods, "PRIMES", (2, 17))
     monkeypatch.setattr(converge_methods, "MOST_POINTS", 1 << 16)
-    monkeypatch.setattr(converge_reference, "RTOL", {"pupil": (1e-4,), "surface": (0.1,)})
+    monkeypatch.setattr(converge, "REFERENCE_RTOL", {"pupil": (1e-4,), "surface": (0.1,)})
 
 
 @pytest.mark.usefixtures("mono", "short")
@@ -206,11 +205,11 @@ def test_lens_with_another_sampler_is_the_same_lens():
 
     borders = {"lens_diameter": 30.0, "diaphragm_distance": 20.0}
     lens = small_scenes.camera_scene(small_scenes.disk(FOCUS), crop=(3, 5, 20, 10), **borders).sensors()[0]
-    twin = converge_methods.lens_with(lens, "stratified")
-    assert twin.sampler().class_name() == "StratifiedSampler"
-    assert [int(n) for n in (*twin.film().crop_size(), *twin.film().crop_offset())] == [20, 10, 3, 5]
+    copy = converge_methods.lens_with(lens, "stratified")
+    assert copy.sampler().class_name() == "StratifiedSampler"
+    assert [int(n) for n in (*copy.film().crop_size(), *copy.film().crop_offset())] == [20, 10, 3, 5]
     place, pupil = mi.Point2f([4.0, 12.5], [6.0, 14.0]), mi.Point2f([0.1, -0.9], [0.2, 0.1])
-    for one, other in zip(lens.line_of_sight(place, pupil), twin.line_of_sight(place, pupil), strict=True):
+    for one, other in zip(lens.line_of_sight(place, pupil), copy.line_of_sight(place, pupil), strict=True):
         np.testing.assert_array_equal(np.array(getattr(one, "d", one)), np.array(getattr(other, "d", other)))
 
 
@@ -238,7 +237,7 @@ def test_reference_is_as_near_to_the_closed_form_as_it_says():
     The statement is no empty one: below 1e-5 of the peak.
     """
     scene = small_scenes.camera_scene(small_scenes.disk(FOCUS))
-    made = converge_reference.own_reference(scene, scene.sensors()[0], 1.0)
+    made = converge.own_reference(scene, scene.sensors()[0], 1.0)
     truth = SIDE**2 * small_scenes.over_pixels(
         lambda x, y: small_scenes.configuration_factor(RADIUS, FOCUS, np.hypot(x, y)), nodes=4
     )
@@ -256,8 +255,8 @@ def test_reference_states_what_its_check_cannot_explain(monkeypatch):
             power, error = power + np.diag([0.01, 0]), error * 0
         return fspt.Image(power, error), 1e-4
 
-    monkeypatch.setattr(converge_reference, "_finest", finest)
-    made = converge_reference.own_reference(None, None, 1.0)
+    monkeypatch.setattr(converge, "_finest", finest)
+    made = converge.own_reference(None, None, 1.0)
     np.testing.assert_allclose(made.error, np.diag([0.009, 0]), atol=1e-12)
 
 
@@ -266,7 +265,7 @@ def test_reference_from_a_file(tmp_path):
     np.savez(tmp_path / "r.npz", power=power, error=error)
     fspt.Image(power, error).write(tmp_path / "r.exr")
     for name in ("r.npz", "r.exr"):
-        read = converge_reference.read_reference(tmp_path / name, (1, 2))
+        read = converge.read_reference(tmp_path / name, (1, 2))
         assert (read.peak, read.largest) == pytest.approx((4.0, 0.01))
         assert read.rms == pytest.approx(0.01 / math.sqrt(2))
 
@@ -287,7 +286,7 @@ def test_bad_reference_is_refused(tmp_path, case):
     elif case in arrays:
         np.savez(path, **arrays[case])
     with pytest.raises(ImageError, match=r"r\.npz"):
-        converge_reference.read_reference(path, (1, 2))
+        converge.read_reference(path, (1, 2))
 
 
 # --- the verb ---

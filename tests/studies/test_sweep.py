@@ -22,9 +22,9 @@ from small_scenes import BALL_XML, LENS_XML, write_ply, write_scene
 import mitsuba_fspt as fspt
 from mitsuba_fspt.images import picture
 from mitsuba_fspt.runtime.errors import BackendError, ImageError, SceneError
-from mitsuba_fspt.studies import scene_cache, sweep, sweep_pool
-from mitsuba_fspt.studies.contact_sheet import write_contact_sheet
-from mitsuba_fspt.studies.sweep_source import SceneSource
+from mitsuba_fspt.studies import scene_cache, sweep, sweep_workers
+from mitsuba_fspt.studies.sweep import write_contact_sheet
+from mitsuba_fspt.studies.sweep_point import SceneSource
 
 F_NUMBERS, DISTANCES = ("2.8", "8"), ("165", "175")
 VALUES = {"f_number": F_NUMBERS, "distance": DISTANCES}
@@ -279,7 +279,7 @@ def test_a_parameter_of_a_file_that_another_parameter_names(tmp_path):
 
 def test_two_processes_one_of_them_killed(scene, tmp_path, monkeypatch, serial):
     started, killed = [], []
-    start = sweep_pool._Worker.__init__
+    start = sweep_workers._Worker.__init__
 
     def counting(self, threads):
         start(self, threads)
@@ -291,7 +291,7 @@ def test_two_processes_one_of_them_killed(scene, tmp_path, monkeypatch, serial):
             os.kill(child.pid, signal.SIGKILL)
             killed.append(child.pid)
 
-    monkeypatch.setattr(sweep_pool._Worker, "__init__", counting)
+    monkeypatch.setattr(sweep_workers._Worker, "__init__", counting)
     rows = fspt.sweep(scene, VALUES, "o", jobs=2, progress=kill_one)
     assert len(killed) == 1
     assert len(started) == 3  # one in place of the dead, none more
@@ -301,7 +301,7 @@ def test_two_processes_one_of_them_killed(scene, tmp_path, monkeypatch, serial):
 
 
 def test_a_point_that_kills_every_process_is_named(scene, monkeypatch):
-    monkeypatch.setattr(sweep_pool, "_work", operator.is_)  # ends at once
+    monkeypatch.setattr(sweep_workers, "_work", operator.is_)  # ends at once
     with pytest.raises(BackendError, match=r"3 worker processes died at f_number=8\. Give it more memory"):
         fspt.sweep(scene, {"f_number": [8]}, "o", jobs=2)
 
@@ -376,9 +376,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, arguments, mess
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
 def test_a_scheduler_that_does_not_answer(run, tmp_path, monkeypatch, address):
     pytest.importorskip("distributed")
-    from mitsuba_fspt.studies import sweep_cluster
-
-    monkeypatch.setattr(sweep_cluster, "PATIENCE", 0.5)
+    monkeypatch.setattr(sweep_workers, "SCHEDULER_TIMEOUT", 0.5)
     code, out, err = run("sweep", "s.xml", *DEFINE, "--scheduler", address)
     assert (code, out) == (2, "")
     assert err == (

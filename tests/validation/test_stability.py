@@ -9,7 +9,7 @@ import pytest
 
 from mitsuba_fspt.cli import app
 from mitsuba_fspt.runtime.errors import SceneError
-from mitsuba_fspt.validation import stiff_cases, stiff_cases_scenes
+from mitsuba_fspt.validation import stiff_cases, stiff_scenes
 from mitsuba_fspt.validation.stability import NAME_WIDTH, Case, check
 
 CASES = [case for case in stiff_cases.cases() if not case.slow]
@@ -27,7 +27,7 @@ def test_a_lens_that_stretches_or_mirrors_is_refused(mono, stretch):
     """Rationale: 5e-4 in length is 1e-3 in power; a mirrored picture is a wrong one."""
     place = mono.ScalarTransform4f().rotate([0.6, 0, 0.8], 50).scale(list(stretch))
     with pytest.raises(RuntimeError, match="'to_world' scales lengths or mirrors"):
-        stiff_cases_scenes.scene(stiff_cases_scenes.ball(), at=place)
+        stiff_scenes.scene(stiff_scenes.ball(), at=place)
 
 
 def test_names_tell_the_rows_apart_and_fit_their_column():

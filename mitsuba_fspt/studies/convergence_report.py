@@ -1,4 +1,4 @@
-"""What `converge` leaves behind: a CSV file with every setting, a figure of errors over time."""
+"""The files of a convergence study: a CSV file with every setting, a figure of error over run time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ COLUMNS = (
     "drjit_mib",
 )
 GREY, MARKERS = "0.55", "sD^vP"
-# The methods the figure is about; what is not here is one of several of its kind, thin and grey.
+# The methods that the figure compares. All others, the further samplers of `path`, are thin and grey.
 STYLES: dict[str, dict[str, Any]] = {
     INTEGRAL: {"color": "#0b5fa5", "marker": "o", "linewidth": 2.4, "markersize": 5.5, "zorder": 6},
     SURFACE_FORM: {"color": "#35a6c8", "marker": "o", "linewidth": 1.6, "markersize": 4.5, "zorder": 5},
@@ -44,9 +44,9 @@ STYLES: dict[str, dict[str, Any]] = {
 
 
 def write_csv(found: Convergence, path: str | os.PathLike[str]) -> None:
-    """Write one row a setting; first the reference with the error it states of itself, and the raw rate of rays.
+    """Write a CSV file: the reference with its stated errors, the raw rate of rays, then one row a setting.
 
-    Times in s, errors over the brightest pixel. Raises ImageError where the file cannot be written.
+    Times in s, errors relative to the brightest pixel. Raises ImageError where the file cannot be written.
     """
     with atomic_path(path, ImageError) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         rows = csv.DictWriter(file, COLUMNS, restval="")
@@ -58,6 +58,7 @@ def write_csv(found: Convergence, path: str | os.PathLike[str]) -> None:
 
 
 def _line(row: Measurement, raw_rate: float) -> dict[str, str | int]:
+    """The columns of one setting; `raw_rate` in rays per second."""
     values: tuple[str | int, ...] = (
         row.method,
         row.knob,
@@ -75,11 +76,11 @@ def _line(row: Measurement, raw_rate: float) -> dict[str, str | int]:
 
 
 def png_file(found: Convergence, path: str | os.PathLike[str]) -> AbstractContextManager[None]:
-    """A picture of error over warm time, drawn before a block and in its place when the block ends well.
+    """A PNG file of error over warm run time; drawn before the `with` block, renamed to `path` after it succeeded.
 
-    RMS of all pixels, RMS of those whose whole cone sees the phantom, largest.
-    Dotted: the error the reference states of itself; what lies below it is drawn hollow, on the lower edge at the
-    least.
+    Three panels: RMS error of all pixels, RMS error of those whose whole cone sees the phantom, largest error. The
+    dotted line is the error that the reference states of itself; points below it are hollow, and points below the
+    axes stand on their lower edge.
 
     Raises
     ------
@@ -110,6 +111,7 @@ def png_file(found: Convergence, path: str | os.PathLike[str]) -> AbstractContex
 
 
 def _draw(axes: Axes, found: Convergence, errors: list[float], stated: float, bottom: float) -> None:
+    """One panel: `errors` of all rows over their times; none lower than `bottom`, hollow below `stated`."""
     others = [method for method in found.methods if method not in STYLES]
     for method in found.methods:
         thin = {"color": GREY, "marker": MARKERS[others.index(method) % len(MARKERS)]} if method in others else {}
@@ -129,6 +131,7 @@ def _draw(axes: Axes, found: Convergence, errors: list[float], stated: float, bo
 
 
 def _draw_stated(axes: Axes, stated: float) -> None:
+    """The dotted line at the reference's own error."""
     axes.axhline(stated, color="0.3", linestyle=":", linewidth=1.2)
     axes.annotate(
         "the reference's own error",

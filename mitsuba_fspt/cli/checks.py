@@ -1,0 +1,65 @@
+"""`fspt doctor`, `fspt stability` and `fspt explain`: checks of the installation, of the accuracy and of a scene."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from ..runtime.backend import quiet_mitsuba
+from .options import Domain, Parameters, Rtol, SceneFile, definitions
+from .terminal import progress_bar
+
+
+def doctor() -> None:
+    """Print versions, the chosen LLVM and why, devices, and a timed first kernel."""
+    from ..runtime.doctor import diagnose
+
+    diagnosis = diagnose()
+    typer.echo(diagnosis.render_text())
+    raise typer.Exit(0 if diagnosis.usable else 2)
+
+
+def stability(
+    everything: Annotated[bool, typer.Option("--all", help="Also the row of 3 million triangles.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
+) -> None:
+    """Try stiff and extreme cases against the truth: each must be right to its tolerance, or refused."""
+    from ..validation.stability import check
+    from ..validation.stiff_cases import cases
+
+    quiet_mitsuba()
+    results = []
+    for case in cases():
+        if everything or not case.slow:
+            results.append(check(case))
+            if not as_json:
+                typer.echo(results[-1].render_text())
+    held = sum(result.ok for result in results)
+    if as_json:
+        typer.echo(json.dumps([result.to_dict() for result in results]))
+    else:
+        typer.echo(f"{held} of {len(results)} hold, {sum(result.seconds for result in results):.0f} s")
+    raise typer.Exit(0 if held == len(results) else 1)
+
+
+def explain(
+    scene: SceneFile,
+    define: Parameters = None,
+    rtol: Rtol = None,
+    domain: Domain = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
+) -> None:
+    """Tell what the integral leaves out of a scene, why, and what that saves: 'render --no-shortcuts' goes without."""
+    with progress_bar():
+        from ..rendering.scene import load
+        from ..studies.explain import HEADER, explain
+
+        quiet_mitsuba()
+        rows = explain(load(scene, **definitions(define)), rtol=rtol, domain=domain)
+    if as_json:
+        typer.echo(json.dumps([row.to_dict() for row in rows]))
+        return
+    for line in (HEADER, *(row.render_text() for row in rows)):
+        typer.echo(line)
