@@ -72,11 +72,10 @@ def _write(image: Image, output: Path, picture: Path | None) -> None:
 
 
 def _print_summary(image: Image, output: Path, picture: Path | None) -> None:
-    """Print the files, the total power and the brightest pixel; on stderr that the picture is dark."""
+    """Print the files, the total power and the brightest pixel; on stderr what the metadata warn of."""
     power, peak = image.power.sum(), image.power.max()
     typer.echo(f"{output}: total {power:.6g} W, brightest pixel {peak:.6g} W, {image.metadata['wall_time']:.3g} s")
     if picture:
         typer.echo(f"{picture}: the same to look at")
-    if peak == 0:
-        hint = "Check the lens's 'to_world', and that the faces' normals point outwards"
-        typer.echo(f"fspt: {output}: the picture is dark, no light reaches the lens. {hint}.", err=True)
+    if "warnings" in image.metadata:
+        typer.echo(f"fspt: {output}: {image.metadata['warnings']}.", err=True)

@@ -78,10 +78,9 @@ def render(
     lens = sensor_of(scene, sensor)
     integrator = integrator_of(scene, method)
     accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
-    sampling = {"spp": spp, "seed": seed}
     deterministic = is_integral(integrator)
-    refused = sampling if deterministic else accuracy | {"shortcuts": None if shortcuts else False}
-    _refuse(refused, "integral" if deterministic else "Monte Carlo")
+    other = {"spp": spp, "seed": seed} if deterministic else accuracy | {"shortcuts": None if shortcuts else False}
+    _refuse(other, "integral" if deterministic else "Monte Carlo")
     accuracy["shortcuts_off"] = None if shortcuts else frozenset(SHORTCUTS)
     start = time.perf_counter()
     with ctrl_c_noted() as check_interrupt:
@@ -97,9 +96,7 @@ def render(
             spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
             *planes, how = _sample(scene, lens, integrator, spp, seed, tell)
         check_interrupt()
-    how["wall_time"] = time.perf_counter() - start
-    if not planes[0].any():
-        how["warnings"] = DARK
+    how |= {"wall_time": time.perf_counter() - start} | ({} if planes[0].any() else {"warnings": DARK})
     return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
 
 

@@ -99,6 +99,8 @@ def mesh(vertices: ArrayLike, faces: ArrayLike, exitance: float | Plane = 1.0) -
     def shape_at(pose: mi.ScalarTransform4f) -> mi.Mesh:
         import mitsuba as mi
 
+        from ..jit.mesh_buffers import set_triangles
+
         matrix = np.array(pose.matrix, np.float64)
         texture: Any = exitance
         kind = "vertex" if np.size(exitance) == len(vertices) else "face"
@@ -109,11 +111,8 @@ def mesh(vertices: ArrayLike, faces: ArrayLike, exitance: float | Plane = 1.0) -
         built = mi.Mesh("mesh", len(vertices), len(faces), props=props)
         if np.ndim(exitance):
             built.add_attribute(f"{kind}_exitance", 1, np.asarray(exitance, np.float32))
-        buffers = mi.traverse(built)
-        buffers["vertex_positions"] = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32).ravel()
-        buffers["faces"] = faces.ravel()
-        buffers.update()
-        return built
+        positions = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+        return set_triangles(built, positions.ravel(), faces.ravel())
 
     return shape_at
 
