@@ -43,7 +43,7 @@ class FaceTable:
             if radiance is None:
                 return None
             tables.append(_table(mesh, radiance))
-            first[_number_of(mesh)] = begin
+            first[shape_number(mesh)] = begin
             begin += face_count(mesh)
         starts = mi.UInt32([first.get(number, 0) for number in range(max(first, default=0) + 1)])
         table = dr.concat(tables)
@@ -71,7 +71,7 @@ def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
 def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
     emitter = mesh.emitter()
     places = (buffer.index for buffer in buffers(mesh))
-    return _number_of(mesh), *places, mark_of(emitter), getattr(emitter, "edition", 0)
+    return shape_number(mesh), *places, mark_of(emitter), getattr(emitter, "edition", 0)
 
 
 def mark_of(emitter: mi.Emitter | None) -> object:
@@ -83,7 +83,8 @@ def _number(shape: mi.ShapePtr) -> mi.UInt32:
     return dr.reinterpret_array(mi.UInt32, shape)
 
 
-def _number_of(shape: mi.Shape) -> int:
+def shape_number(shape: mi.Shape) -> int:
+    """Number of a shape among all that live, as it stands in intersection records."""
     return int(_number(mi.ShapePtr(shape))[0])
 
 

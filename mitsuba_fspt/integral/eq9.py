@@ -18,10 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from ..emission.face_table import FaceTable
+from ..emission.face_table import FaceTable, shape_number
 from ..jit.mesh_buffers import face_count
 from ..jit.spectra import at_one_wavelength, scalar
+from ..runtime.plugin_types import is_surface
 from .shortcuts import Finding
 
 if TYPE_CHECKING:
@@ -73,7 +75,10 @@ class View:
     """What a lens sees of a scene along lines of sight, which begin at the depth `start` [mm], before all surfaces.
 
     Mitsuba moves the limb of a small sphere far from where a ray begins by a share of the distance squared over its
-    radius; a late start avoids it. `detail`: triangles of the scene a pixel.
+    radius; a late start avoids it.
+
+    detail : triangles of the scene a pixel
+    emitting : 1 at the number of each shape with an `fspt_surface`, 0 elsewhere; None where all shapes have one
     """
 
     scene: mi.Scene
@@ -81,6 +86,7 @@ class View:
     start: mi.Float
     faces: FaceTable | None
     detail: float
+    emitting: mi.Float | None
 
     @classmethod
     def of(cls, scene: mi.Scene, lens: mi.Sensor, window: Window, faces: FaceTable | None = None) -> View:
@@ -90,7 +96,7 @@ class View:
         meshes = all(shape.is_mesh() for shape in shapes)
         triangles = sum(map(face_count, shapes)) if meshes else math.inf
         start = dr.opaque(mi.Float, lens.clear_depth(scene.bbox()))
-        return cls(scene, lens, start, faces, triangles / math.prod(window.shape))
+        return cls(scene, lens, start, faces, triangles / math.prod(window.shape), _emitting(shapes))
 
     def integrand(
         self, position: mi.Point2f, pupil: mi.Point2f, together: bool = False
@@ -113,6 +119,13 @@ class View:
         integrand = eq9(radiance, etendue_from_pixel(cos_theta, passes, open_share))
         return integrand, radiance, shape, self.start + pi.t * cos_theta
 
+    def covers(self, shape: mi.Float) -> mi.Bool:
+        """True where the number of a shape that `integrand` returned is that of one with an `fspt_surface`."""
+        met = shape > 0
+        if self.emitting is None:
+            return met
+        return met & (dr.gather(mi.Float, self.emitting, mi.UInt32(shape), met) > 0)
+
     def finding(self) -> Finding:
         """Whether lines of sight do without Mitsuba's surface records."""
         why = "meshes alone, J_n linear on every face, the same radiance in all directions"
@@ -122,3 +135,13 @@ class View:
         """Exit law's radiance [W/mm²/sr] where a ray ends, on any shape and with any law."""
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         return scalar(si.emitter(self.scene).eval(si))
+
+
+def _emitting(shapes: list[mi.Shape]) -> mi.Float | None:
+    """The table `View.emitting` of these shapes."""
+    if all(is_surface(shape.emitter()) for shape in shapes):
+        return None
+    numbers = [shape_number(shape) for shape in shapes]
+    table = np.zeros(max(numbers) + 1, np.float32)
+    table[numbers] = [is_surface(shape.emitter()) for shape in shapes]
+    return mi.Float(table)

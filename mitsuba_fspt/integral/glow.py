@@ -20,7 +20,7 @@ from .window import Window
 
 CELLS = 2.5  # balances the cells of the pupil with the size of the pieces, whatever the blur
 PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
-CURVED = 32.0  # over rtol: elements of a round shape; below a pixel none is cut, and their midpoints err by 1/count
+CURVED = 24.0  # over rtol: elements of a round shape; below a pixel none is cut, and their midpoints err by 1/count
 BULGE = 0.1  # how far a curved element may reach beyond its corners, in units of their distance
 MISPLACED = 1 / 8  # of a step in J_n along a row of elements, times their side squared, they misplace
 UNBOUNDED = 4.0  # side [pixels] counted for an element that reaches through the lens plane and has no image

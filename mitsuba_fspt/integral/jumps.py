@@ -63,7 +63,7 @@ def integrate_transect(
             s = low + (high - low) * share
             position, pupil, density = transect.at(s)
             f, _, body, _ = view.integrand(position, pupil, together)
-            return (sums.plus(slope * density, (s - middle) / half, f, body),)
+            return (sums.plus(slope * density, (s - middle) / half, f, view.covers(body)),)
 
         (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))
         until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
@@ -216,12 +216,12 @@ class _Sums:
     f: mi.Vector2f
     coverage: mi.Float
 
-    def plus(self, weight: mi.Float, z: mi.Float, f: mi.Float, body: mi.Float) -> _Sums:
+    def plus(self, weight: mi.Float, z: mi.Float, f: mi.Float, covered: mi.Bool) -> _Sums:
         """The sums with one more node."""
         return _Sums(
             self.one + weight * mi.Vector3f(1, z, z * z),
             self.f + weight * f * mi.Vector2f(1, z),
-            self.coverage + dr.select(body > 0, weight, 0),
+            self.coverage + dr.select(covered, weight, 0),
         )
 
     def corrected(self, exact: mi.Vector2f) -> tuple[mi.Float, mi.Float]:

@@ -23,8 +23,8 @@ class Sums:
 
     value, x, y : Σ w f of the integrand f of Eq. 9 [W/mm²/sr]; Σ w f a_x and Σ w f a_y with the pupil point a
     contrast : Σ c f, a measure of the integrand's curvature, see `node_rules.Rule`
-    coverage : share of the lines of sight that meet a surface
-    nearest, farthest : depths of the surface points met [mm]; inf and 0 where there is none
+    coverage : share of the lines of sight that meet a shape with an `fspt_surface`
+    nearest, farthest : depths of the surface points met, dark ones too [mm]; inf and 0 where there is none
     """
 
     value: mi.Float
@@ -53,7 +53,7 @@ def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule) -> Sums:
             contrast=sums.contrast + null * f,
             x=sums.x + weight * f * ax,
             y=sums.y + weight * f * ay,
-            coverage=sums.coverage + dr.select(hit, weight, 0),
+            coverage=sums.coverage + dr.select(view.covers(body), weight, 0),
             nearest=dr.select(hit, dr.minimum(sums.nearest, depth), sums.nearest),
             farthest=dr.select(hit, dr.maximum(sums.farthest, depth), sums.farthest),
         )
