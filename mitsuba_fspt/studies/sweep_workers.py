@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..images.image import Image
 from ..runtime.errors import BackendError, FsptError
@@ -27,6 +27,14 @@ if TYPE_CHECKING:
 
 TRIES = 3  # processes that one point may end before it counts as failed
 SCHEDULER_TIMEOUT = 10  # s, for a scheduler to answer, and for its first worker to be there
+# Options of a cluster on this machine. Its scheduler opens an HTTP port even without a dashboard: with port 0 any free
+# one, by default 8787, with a warning on stderr where another cluster has that.
+LOCAL_CLUSTER: dict[str, Any] = {
+    "threads_per_worker": 1,
+    "memory_limit": 0,
+    "dashboard_address": "127.0.0.1:0",
+    "scheduler_kwargs": {"dashboard": False},
+}
 
 
 def share_of_cores(jobs: int) -> int:
@@ -209,9 +217,8 @@ def _local(jobs: int) -> Iterator[tuple[Client, int | None]]:
     """A client of a new cluster on this machine, and the number of threads for each of its `jobs` workers."""
     from distributed import Client, LocalCluster
 
-    options = {"n_workers": jobs, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": None}
     with ctrl_c_blocked():
-        cluster = LocalCluster(**options, silence_logs=logging.CRITICAL)
+        cluster = LocalCluster(n_workers=jobs, **LOCAL_CLUSTER, silence_logs=logging.CRITICAL)
     with cluster, Client(cluster) as client:
         yield client, share_of_cores(jobs)
 
