@@ -1,1 +1,1 @@
-"""What leaves a surface: J_n on its elements and the exit laws that share it out over directions."""
+"""Emission of a surface: J_n on its elements, and exit laws that distribute it over directions."""

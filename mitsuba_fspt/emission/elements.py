@@ -1,10 +1,11 @@
-"""Elements of an emitting surface: small patches with known area and power, to sample from and to integrate over.
+"""Elements of an emitting surface: small patches of known area and power, for sampling and for integration.
 
-A mesh is cut into its faces, each into k² equal triangles where it has few; any other shape into a grid of its
-surface parameters (u, v). Elements know where they lie on the surface and which one holds a given surface point.
+The elements of a mesh are its faces, each divided into k² equal triangles if the mesh has few; those of any other
+shape are the cells of a grid in its surface parameters (u, v). Elements map samples to surface points and find the
+element that contains a surface point.
 
 Shapes and textures are called directly here, never through Dr.Jit pointers: elements may be built while a kernel is
-being recorded, and a pointer of the recording would find its way into what is evaluated aside.
+being recorded, and a pointer of the recording would enter the expressions that are evaluated aside.
 """
 
 from __future__ import annotations
@@ -20,25 +21,25 @@ import numpy as np
 from ..jit.mesh_buffers import triangles
 
 MIN_ELEMENTS = 1 << 16
-# Share of the samples that goes everywhere alike, so that light smaller than an element is never excluded.
+# Share of the samples with uniform density, so that light on an area smaller than an element is never excluded.
 UNIFORM_SHARE = 1e-3
 
 
 def elements_of(shape: mi.Shape, minimum: int = MIN_ELEMENTS) -> Elements:
-    """The elements of `shape`, at least `minimum` of them."""
+    """Elements of `shape`, at least `minimum` of them."""
     return MeshElements(shape, minimum) if shape.is_mesh() else ParameterElements(shape, minimum)
 
 
 class Elements:
-    """Patches of one shape: `count` of them, element `index` placed by a point of the unit square."""
+    """`count` elements of one shape; `place` maps a point of the unit square to a point of an element."""
 
     count: int
-    corners: tuple[tuple[int, int], ...]  # the samples at which `place` puts an element's corners
-    middle: tuple[float, float]  # and its middle
+    corners: tuple[tuple[int, int], ...]  # samples that `place` maps to an element's corners
+    middle: tuple[float, float]  # sample that `place` maps to its centre
 
     def __init__(self, shape: mi.Shape) -> None:
-        # A pointer array does not keep what it points at. Emitters keep elements and shapes their emitter: elements
-        # that kept the shape would close a circle through C++, which nobody ever frees.
+        # A pointer array holds no reference. Emitters hold elements, and shapes their emitter: a reference from the
+        # elements to the shape would close a cycle through C++, which is never freed.
         self._shape = mi.ShapePtr(shape)
 
     @property
@@ -48,22 +49,22 @@ class Elements:
     def place(
         self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        """Surface point of element `index` at `sample` of [0, 1]², and dA/d(sample) there [mm²].
+        """Surface interaction on element `index` at `sample` in [0, 1]², and dA/d(sample) there [mm²].
 
-        With `cut` > 1 that of the element's part number `part` of cut².
+        With `cut` > 1 the same for part number `part`, from 0, of the element's cut² parts.
         """
         raise NotImplementedError
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
-        """Element that holds `si`, and dA/d(sample) of `place` there [mm²]."""
+        """Index of the element that contains `si`, and dA/d(sample) of `place` there [mm²]."""
         raise NotImplementedError
 
     def weigh(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, tuple[mi.Float, ...]]:
-        """Element that holds `si`, and the weights by which values at its corners are interpolated there."""
+        """Index of the element that contains `si`, and the weights that interpolate values at its corners to `si`."""
         raise NotImplementedError
 
     def areas(self) -> mi.Float:
-        """Area of each element [mm²], the mean of dA over a few points."""
+        """Area of each element, shape (count,) [mm²]: the mean of dA/d(sample) over five points."""
         index = dr.arange(mi.UInt32, self.count)
         total = dr.zeros(mi.Float, self.count)
         for point in _FIVE_POINTS:
@@ -75,10 +76,10 @@ _FIVE_POINTS = ((0.5, 0.5), (0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))
 
 
 class MeshElements(Elements):
-    """Faces of a triangle mesh, each cut into k² congruent triangles."""
+    """Faces of a triangle mesh, each divided into k² congruent triangles."""
 
     corners = ((0, 0), (1, 0), (0, 1))
-    middle = (5 / 9, 1 / 2)  # which `place` puts at the centroid
+    middle = (5 / 9, 1 / 2)  # `place` maps it to the centroid
 
     def __init__(self, shape: mi.Shape, minimum: int) -> None:
         super().__init__(shape)
@@ -105,7 +106,7 @@ class MeshElements(Elements):
         return index, (1 - b.x - b.y, b.x, b.y)
 
     def _part(self, face: mi.UInt32, b: mi.Point2f) -> tuple[mi.UInt32, mi.Point2f]:
-        """The part of a face at its coordinates (b1, b2), and the coordinates in that part."""
+        """Element of a face at its barycentric coordinates (b1, b2), and the coordinates in that element."""
         k = self.k
         x, y = k * (b.x + b.y), k * b.y
         row, half = dr.clip(dr.floor(x), 0, k - 1), dr.floor(y)
@@ -116,6 +117,7 @@ class MeshElements(Elements):
         return face * (k * k) + mi.UInt32(row * row + column), within
 
     def _interaction(self, face: mi.UInt32, uv: mi.Point2f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        """Surface interaction at the barycentric coordinates `uv` of a face, and the area of its elements [mm²]."""
         p0, e1, e2 = self._corners(face)
         pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(face))
         pi.valid, pi.t, pi.prim_index, pi.prim_uv = True, 1.0, face, uv
@@ -123,11 +125,13 @@ class MeshElements(Elements):
         return si, self._area(e1, e2)
 
     def _corners(self, face: mi.UInt32) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
+        """First corner of a face, and its edges to the second and third corner [mm]."""
         f = dr.gather(mi.Point3u, self._faces, face)
         p0, p1, p2 = (dr.gather(mi.Point3f, self._positions, f[n]) for n in range(3))
         return p0, mi.Vector3f(p1 - p0), mi.Vector3f(p2 - p0)
 
     def _area(self, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Float:
+        """Area of an element of the face with these edges [mm²]."""
         return dr.norm(dr.cross(e1, e2)) / (2 * self.k**2)
 
 
@@ -141,8 +145,8 @@ class ParameterElements(Elements):
         super().__init__(shape)
         self.side = math.ceil(math.sqrt(minimum))
         self.count = self.side**2
-        self._round = _ROUND.get(shape.class_name())
-        if self._round:
+        self._unit_shape = _UNIT_SHAPES.get(shape.class_name())
+        if self._unit_shape:
             self._to_world = mi.Transform4f(mi.traverse(shape)["to_world"])
             axes = np.array(self._to_world.matrix, np.float64).reshape(4, 4)[:3, :3]
             self._scales = [dr.opaque(mi.Float, length) for length in np.linalg.norm(axes, axis=0)]
@@ -153,7 +157,7 @@ class ParameterElements(Elements):
         cell = mi.Point2f(mi.Point2u(index % self.side, index // self.side))
         number, cut = mi.UInt32(part), mi.UInt32(cut)
         within = (mi.Point2f(mi.Point2u(number % cut, number // cut)) + sample) / mi.Float(cut)
-        # A hair inside: what still looks for its points misses some at the very ends of its parameters.
+        # Slightly inside: shapes that search for their own points miss some at the ends of their parameters.
         uv = dr.clip((cell + within) / self.side, 2.0**-21, 1 - 2.0**-21)
         si = self.at(uv)
         return si, self._area(si) / dr.square(mi.Float(cut))
@@ -169,14 +173,15 @@ class ParameterElements(Elements):
         return cell.x + cell.y * self.side, weights
 
     def at(self, uv: mi.Point2f) -> mi.SurfaceInteraction3f:
-        """The surface record at (u, v) of [0, 1]².
+        """Surface interaction at (u, v) in [0, 1]².
 
-        Mitsuba's spheres, cylinders and disks look for their own points along a ray. Turned by 90° the first two look
-        past some of them, along the normal that they would have unturned; a tilted disk misses a third of its rim.
+        Mitsuba's spheres, cylinders and disks search for their own points along a ray. If rotated by 90°, the first
+        two miss some of them, since the ray follows the normal of the unrotated shape; a tilted disk misses a third of
+        its rim.
         """
-        if not self._round:
+        if not self._unit_shape:
             return self.shape.eval_parameterization(uv)
-        local, normal = self._round.at(uv)
+        local, normal = self._unit_shape.at(uv)
         p, n = self._to_world @ local, dr.normalize(self._to_world @ normal)
         pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(uv))
         pi.valid, pi.t, pi.prim_uv = True, 1.0, mi.Point2f(local.x, local.y)
@@ -187,12 +192,13 @@ class ParameterElements(Elements):
         return si
 
     def _cell(self, si: mi.SurfaceInteraction3f) -> mi.Point2u:
+        """Column and row of the cell that contains `si`."""
         return mi.Point2u(dr.clip(si.uv * self.side, 0, self.side - 1))
 
     def _area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
-        """dA/d(sample) of a cell [mm²]: in closed form for round shapes, whose derivatives Mitsuba rounds likewise."""
-        if self._round:
-            return self._round.area(si.uv, *self._scales) / self.count
+        """dA/d(sample) of the cell at `si` [mm²]: in closed form for round shapes, whose derivatives Mitsuba rounds."""
+        if self._unit_shape:
+            return self._unit_shape.area(si.uv, *self._scales) / self.count
         return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / self.count
 
 
@@ -217,8 +223,8 @@ def _on_disk(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:
 
 
 @dataclass(frozen=True)
-class _Round:
-    """A round shape: point and normal `at` its parameters on the unit shape, and dA/(du dv) there.
+class _UnitShape:
+    """A round shape of unit size: point and normal `at` its parameters (u, v), and dA/(du dv) once it is scaled.
 
     `area` takes (u, v) and the lengths [mm] of the axes of `to_world`.
     """
@@ -227,17 +233,17 @@ class _Round:
     area: Callable[..., mi.Float]
 
 
-_ROUND = {
-    "Sphere": _Round(_on_sphere, lambda uv, a, b, c: 2 * dr.pi**2 * a * b * dr.sin(dr.pi * uv.y)),
-    "Cylinder": _Round(_on_cylinder, lambda uv, a, b, c: dr.two_pi * a * c),
-    "Disk": _Round(_on_disk, lambda uv, a, b, c: dr.two_pi * a * b * uv.x),
+_UNIT_SHAPES = {
+    "Sphere": _UnitShape(_on_sphere, lambda uv, a, b, c: 2 * dr.pi**2 * a * b * dr.sin(dr.pi * uv.y)),
+    "Cylinder": _UnitShape(_on_cylinder, lambda uv, a, b, c: dr.two_pi * a * c),
+    "Disk": _UnitShape(_on_disk, lambda uv, a, b, c: dr.two_pi * a * b * uv.x),
 }
 
 
 def _of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:
-    """Coordinates (b1, b2) in a triangle of the point `b` of one of its k² parts.
+    """Barycentric coordinates (b1, b2) in a triangle of the point `b` of number `part` of its k² parts.
 
-    Part r² + c lies in row r of k rows; odd c are the triangles that stand upside down.
+    Part r² + c lies in row r of k rows; triangles with odd c are inverted.
     """
     row = mi.UInt32(dr.sqrt(mi.Float(part) + 0.5))
     column = part - row * row
@@ -248,14 +254,14 @@ def _of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:
 
 
 def _barycentric(d: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Point2f:
-    """Coordinates (b1, b2) of d = b1 e1 + b2 e2 in the plane of the two edges."""
+    """Barycentric coordinates (b1, b2) with d = b1 e1 + b2 e2 in the plane of the two edges."""
     n = dr.cross(e1, e2)
     scale = dr.rcp(dr.squared_norm(n))
     return mi.Point2f(dr.dot(dr.cross(d, e2), n) * scale, dr.dot(dr.cross(e1, d), n) * scale)
 
 
 class ElementDistribution:
-    """Surface points with a density ∝ the exitance of their element [1/mm²]."""
+    """Distribution of surface points whose density [1/mm²] is ∝ the mean exitance of their element."""
 
     def __init__(self, elements: Elements, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
         self.elements = elements
@@ -265,15 +271,15 @@ class ElementDistribution:
             si, area = elements.place(index, mi.Point2f(*point))
             power += area * dr.maximum(exitance(si), 0)
         share = power + (UNIFORM_SHARE * dr.mean(power) / dr.mean(elements.areas())) * elements.areas()
-        # A row of elements, then one of the row: the 24 bits of one random number cannot tell 10⁵ elements apart
-        # evenly (1% of the power of each goes astray), those of two can.
+        # First a row of elements, then an element of the row: the 24 bits of one random number do not resolve 10⁵
+        # elements evenly (the power of each is off by 1 %), those of two do.
         self._side = math.ceil(math.sqrt(elements.count))
         table = np.zeros(self._side**2, np.float32)
         table[: elements.count] = share.numpy()
         self._choice = mi.DiscreteDistribution2D(table.reshape(self._side, self._side))
 
     def sample(self, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        """Surface point drawn with two uniform numbers, and its density [1/mm²]."""
+        """Surface interaction drawn with two uniform numbers, and its density [1/mm²]."""
         cell, chance, within = self._choice.sample(sample, active)
         si, area = self.elements.place(cell.x + cell.y * self._side, within)
         return si, dr.select(area > 0, chance / area, 0)

@@ -1,4 +1,4 @@
-"""J_n on the surface: the texture a scene gives for it, its values on one shape, and what they must be."""
+"""J_n on the surface: the texture of the scene file, its values on one shape, and the checks of both."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from ..jit.spectra import at_one_wavelength, scalar
 from ..runtime.errors import ExitanceError
 from .elements import elements_of
 
-SLIVER = 1e-6  # of the mean area: on a smaller face single precision may find no place to interpolate at
+SLIVER = 1e-6  # of the mean area: on a smaller face the interpolation in single precision may fail
 NEGATIVE_ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
-FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # of a shape's elements that are looked at, of the texels that tell how many
-# How the names of Mitsuba's classes begin that hold a colour, or a value for each wavelength.
+FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # least number of elements checked on a shape, and most texels that raise it
+# Beginnings of the names of Mitsuba's classes for a colour, and for a value at each wavelength.
 COLOURS, SPECTRA = ("SRGB", "D65"), ("Regular", "Irregular", "BlackBody")
 CORNERS_AND_CENTRE = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
 
 
 def texture_of(props: mi.Properties) -> mi.Texture:
-    """J_n as a texture; a number is the same at all wavelengths, where Mitsuba would make it white light.
+    """J_n [W/mm²] as a texture; a number becomes equal at all wavelengths, where Mitsuba would make white light.
 
-    ExitanceError for a colour or a spectrum, whose watts would depend on the variant, for a bitmap that is none of
-    W/mm² and for what is no number.
+    Raises
+    ------
+    ExitanceError : the value is a colour or a spectrum, whose watts would depend on the variant, a bitmap that does
+        not hold W/mm², or no number.
     """
     value = props["exitance"]
     if isinstance(value, bool):
@@ -54,8 +56,10 @@ def texture_of(props: mi.Properties) -> mi.Texture:
 
 @dataclass(frozen=True, eq=False)
 class ExitanceState:
-    """Where J_n comes from: the values of the mesh attribute or of the bitmap that `texture` reads, None where it reads
-    none, and its plain numbers, `value` or `scale`.
+    """Data behind J_n, for the detection of changes.
+
+    attribute, bitmap : values of the mesh attribute or of the bitmap that the texture reads; None if it reads none
+    numbers : plain numbers of the texture, `value` or `scale`
     """
 
     attribute: mi.Float | None
@@ -64,7 +68,7 @@ class ExitanceState:
 
     @classmethod
     def of(cls, shape: mi.Shape, texture: mi.Texture) -> ExitanceState:
-        """As it is now; a mesh that lacks the attribute has none."""
+        """Present data of a texture on a shape; `attribute` is None on a mesh that lacks it."""
         name, parameters = _attribute_name(texture), mi.traverse(texture)
         on_mesh = {} if name is None else mi.traverse(shape)
         numbers = (n for key in ("value", "scale") if key in parameters for n in np.ravel(parameters[key]))
@@ -75,14 +79,16 @@ class ExitanceState:
         )
 
     def state(self) -> tuple[object, ...]:
-        """What tells it from any other for as long as it is kept."""
+        """Key of the data, different from that of any other data for as long as this object exists."""
         return *(values if values is None else values.index for values in (self.attribute, self.bitmap)), *self.numbers
 
 
 def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
-    """J_n [W/mm²] on one shape as a function that calls no pointer; ExitanceError where an attribute is missing.
+    """J_n [W/mm²] on one shape, as a function of the surface interaction that calls no Dr.Jit pointer.
 
-    A mesh attribute the shape does not have would render black without a word.
+    Raises
+    ------
+    ExitanceError : the shape lacks the mesh attribute, which would silently render black, or it has several channels.
     """
     name = _attribute_name(texture)
     if name is None:
@@ -99,7 +105,7 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
             f"'{plain}_x', or bring the values in with 'fspt flux import'."
         )
     values = ExitanceState.of(shape, texture).attribute
-    if values is not None and dr.width(values) != _places(shape, name):
+    if values is not None and dr.width(values) != _attribute_size(shape, name):
         raise ExitanceError(
             f"fspt_surface: mesh attribute '{name}' of shape '{shape.id()}' has several numbers for each "
             f"{name.partition('_')[0]}, J_n is one. Give an attribute of one channel."
@@ -109,14 +115,14 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
 
 
 def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float, mi.Float] | None:
-    """J_n [W/mm²] at the three corners of every face, between which it is linear; None where it is something else."""
+    """J_n [W/mm²] at the three corners of every face, each of shape (F,), if it is linear between them; else None."""
     faces = triangles(mesh)[1]
     count = dr.width(faces) // 3
     if is_uniform(texture):
         everywhere = function_on(mesh, texture)(dr.zeros(mi.SurfaceInteraction3f)) + dr.zeros(mi.Float, count)
         return everywhere, everywhere, everywhere
     name, values = _attribute_name(texture), ExitanceState.of(mesh, texture).attribute
-    if name is None or values is None or dr.width(values) != _places(mesh, name):
+    if name is None or values is None or dr.width(values) != _attribute_size(mesh, name):
         return None
     values = values * float(mi.traverse(texture)["scale"])
     if name.startswith("face"):
@@ -126,7 +132,7 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
 
 
 def _check_bitmap(texture: mi.Texture) -> None:
-    """ExitanceError if `texture` is a bitmap in colour, or of whole numbers that Mitsuba takes for sRGB."""
+    """Raise ExitanceError for a bitmap in colour, or of whole numbers that Mitsuba decodes as sRGB."""
     values = mi.traverse(texture)
     if "data" not in values:
         return
@@ -137,7 +143,7 @@ def _check_bitmap(texture: mi.Texture) -> None:
             f"fspt_surface: 'exitance' is a bitmap of {channels} channels that differ, J_n is one number. Give one of "
             "one channel, as a float EXR."
         )
-    if not dr.is_float_v(values["data"]) and "raw = 0" in str(texture):  # which nothing but its description tells
+    if not dr.is_float_v(values["data"]) and "raw = 0" in str(texture):  # only its description states it
         raise ExitanceError(
             f"fspt_surface: 'exitance' is a picture of {width} × {height} whole numbers, which are decoded as sRGB. "
             'Give W/mm² as a float EXR, or add <boolean name="raw" value="true"/> for shares of the largest number.'
@@ -145,12 +151,12 @@ def _check_bitmap(texture: mi.Texture) -> None:
 
 
 def is_uniform(texture: mi.Texture) -> bool:
-    """True where J_n is one number."""
+    """True if J_n is one number."""
     return texture.class_name() == "UniformSpectrum"
 
 
 def texels_of(texture: mi.Texture) -> int:
-    """How many pixels of the bitmap that is J_n lie on the unit square of (u, v), up to `MOST_TEXELS`; 1 if none is."""
+    """Number of texels of the bitmap of J_n on the unit square of (u, v), at most `MOST_TEXELS`; 1 without a bitmap."""
     values = mi.traverse(texture)
     if "data" not in values:
         return 1
@@ -159,17 +165,23 @@ def texels_of(texture: mi.Texture) -> int:
 
 
 def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
-    """Largest J_n [W/mm²] of all corners and centres; ExitanceError if one is negative or not finite, or all are 0."""
+    """Largest J_n [W/mm²] of the corners and centres of a shape's elements.
+
+    Raises
+    ------
+    ExitanceError : a value is negative or not finite, all are 0, or the shape has no area or vertices that are not
+        finite.
+    """
     if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):
-        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has vertices that are not finite. Mend its mesh.")
+        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has vertices that are not finite. Fix its mesh.")
     values, areas = _values_and_areas(shape, texture)
     values, areas = values[areas > 0], areas[areas > 0]  # a face without area emits nothing
     name = f"fspt_surface: 'exitance' of shape '{shape.id()}'"
     if not values.size:
-        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has no area to glow. Mend its mesh.")
+        raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has no area to glow. Fix its mesh.")
     finite = np.isfinite(values)
     if not finite[areas > SLIVER * areas.mean()].all():
-        raise ExitanceError(f"{name} has NaN or infinite values. Mend the data before rendering.")
+        raise ExitanceError(f"{name} has NaN or infinite values. Fix the data before rendering.")
     values = values[finite]
     if values.min() < -NEGATIVE_ROUNDING * values.max(initial=0):
         raise ExitanceError(
@@ -178,7 +190,7 @@ def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
         )
     brightest = float(values.max())
     texels = ExitanceState.of(shape, texture).bitmap
-    if brightest == 0 and texels is not None:  # points all over the shape may miss the only bright one
+    if brightest == 0 and texels is not None:  # the checked points may miss the only bright texel
         brightest = float(dr.max(texels)[0])
     if brightest <= 0:
         raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
@@ -186,11 +198,14 @@ def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
 
 
 def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """J_n [W/mm²] all over a shape and the areas that it counts for; at corners as it was given where it is linear."""
+    """J_n [W/mm²] at points all over a shape, and the area of the element of each [mm²].
+
+    Where J_n is linear on faces, the points are their corners, with J_n as given.
+    """
     corners = at_corners(shape, texture) if shape.is_mesh() else None
     elements = elements_of(shape, minimum=1 if corners else max(FEWEST, texels_of(texture)))
     if corners:
-        # Interpolation far from the world's origin would make a zero negative.
+        # Interpolation far from the world's origin could turn a zero negative.
         area = elements.areas()
         everywhere = [(value, area) for value in corners]
     else:
@@ -202,13 +217,13 @@ def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.
     return values, areas
 
 
-def _places(mesh: mi.Shape, attribute: str) -> int:
-    """How many vertices or faces of a mesh an attribute of this name is for."""
+def _attribute_size(mesh: mi.Shape, attribute: str) -> int:
+    """Number of vertices or faces of a mesh, the elements of an attribute with this name."""
     positions, faces = triangles(mesh)
     return dr.width(faces if attribute.startswith("face") else positions) // 3
 
 
 def _attribute_name(texture: mi.Texture) -> str | None:
-    """The mesh attribute a texture reads, which only its description tells."""
+    """Name of the mesh attribute that a texture reads, which only its description states; None for other textures."""
     found = re.match(r'MeshAttribute\[\s*name = "([^"]*)"', str(texture))
     return found[1] if found else None

@@ -1,4 +1,4 @@
-"""The face of a mesh that a sampled position lies on: a position sample does not say, a short ray finds it."""
+"""Face of a mesh at a sampled position, found by a short ray, since a position sample does not contain it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..jit.mesh_buffers import set_triangles, triangles
 from ..jit.robust_tracing import traced_robustly
 from ..runtime.plugin_types import is_surface
 
-REACH = 1e-4  # of the largest coordinate: how far before the surface the ray starts, and how far behind it ends
+REACH = 1e-4  # of the largest coordinate: distance from the surface at which the ray starts, and at which it ends
 APART = (
     "fspt_surface: on CUDA a kernel that traces rays in the scene cannot look for faces of a mesh beside it, and loses "
     "light. Load the scene with mitsuba_fspt.load, or render it with mitsuba_fspt.render."
@@ -17,16 +17,16 @@ APART = (
 
 
 class Probe:
-    """Looks for faces of a mesh; on CUDA in kernels that trace rays in a scene only if it was set up `beside` that."""
+    """Search for the faces of a mesh; on CUDA, kernels that trace rays in a scene need one built `beside` the scene."""
 
     def __init__(self, mesh: mi.Shape, beside: mi.Scene | None = None) -> None:
         if beside is None and mi.variant().startswith("cuda"):
             mi.Log(mi.LogLevel.Warn, APART)
-        # The mesh itself, whose emitter holds the probe, must not be kept.
+        # A copy: the emitter of the mesh holds the probe, so that a reference to the mesh itself would be a cycle.
         self.scene = traced_robustly([_bare_copy(mesh)], beside)
 
     def at(self, mesh: mi.Shape, ps: mi.PositionSample3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        """The full surface record at a position sample of the mesh."""
+        """Surface interaction at a position sample of the mesh."""
         reach = REACH * (dr.max(dr.abs(ps.p)) + 1e-3)
         ray = mi.Ray3f(ps.p + reach * ps.n, -ps.n)
         ray.maxt = 2 * reach
@@ -39,7 +39,7 @@ class Probe:
 
 
 def probe_beside(scene: mi.Scene) -> None:
-    """Let light leave meshes of a scene in the kernels that trace rays in it; needed on CUDA alone."""
+    """Set up the probes of a scene's meshes for kernels that trace rays in the scene; needed on CUDA only."""
     if not mi.variant().startswith("cuda"):
         return
     for emitter in scene.emitters():
@@ -48,6 +48,6 @@ def probe_beside(scene: mi.Scene) -> None:
 
 
 def _bare_copy(mesh: mi.Shape) -> mi.Mesh:
-    """The triangles of a mesh and nothing else of it."""
+    """Mesh with the triangles of `mesh` and nothing else."""
     positions, faces = triangles(mesh)
     return set_triangles(mi.Mesh("copy", dr.width(positions) // 3, dr.width(faces) // 3), positions, faces)

@@ -1,8 +1,8 @@
-"""Scenes of meshes as one table of their faces, read where a line of sight ends.
+"""Table of all faces of a scene of meshes, read where a line of sight ends.
 
-Mitsuba's surface record gathers the corners of the face, looks for the place between them anew and asks shape, emitter
-and texture through pointers. Where J_n is linear on every face and the radiance alike in all outward directions, its
-values at three corners and the normal are all there is to know, and they lie in half a cache line.
+Mitsuba's surface interaction gathers the corners of the face, computes the point between them again and calls shape,
+emitter and texture through pointers. If J_n is linear on every face and the radiance equal in all outward directions,
+its values at three corners and the normal suffice, and they fill half a cache line.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from .elements import elements_of
 class FaceTable:
     """All faces of a scene's meshes.
 
-    first : of each shape, by its number, at which face of all its own begin
-    table : eight numbers a face: the least radiance at its corners, how much more it is at each of them [W/mm²/sr],
-        its normal, 0
-    sources : the meshes' buffers, kept lest others take their numbers in `edition_of`
+    first : index in the table of the first face of each shape, by the shape's number
+    table : eight numbers per face: the least radiance at its corners, the excess over it at each corner [W/mm²/sr],
+        the normal, 0
+    sources : buffers of the meshes, kept so that no other buffers get their indices, which `edition_of` compares
     """
 
     first: mi.UInt32
@@ -35,7 +35,7 @@ class FaceTable:
 
     @classmethod
     def of(cls, meshes: Sequence[mi.Shape]) -> FaceTable | None:
-        """The faces of these meshes; None unless all that glow do so by Lambert's law with a linear J_n."""
+        """Table of the faces of these meshes; None unless all that emit follow Lambert's law with a linear J_n."""
         first: dict[int, int] = {}
         tables, begin = [], 0
         for mesh in meshes:
@@ -51,7 +51,7 @@ class FaceTable:
         return cls(starts, table, tuple(buffers(mesh) for mesh in meshes))
 
     def radiance(self, pi: mi.PreliminaryIntersection3f, direction: mi.Vector3f) -> mi.Float:
-        """Radiance [W/mm²/sr] where a ray with `direction` meets a face, towards its origin; 0 on the inward side."""
+        """Radiance [W/mm²/sr] towards the origin of a ray with `direction` that meets a face; 0 on the inward side."""
         met = pi.is_valid()
         face = dr.gather(mi.UInt32, self.first, _number(pi.shape), met) + pi.prim_index
         least, normal = (dr.gather(mi.Vector4f, self.table, 2 * face + half, met) for half in (0, 1))
@@ -62,24 +62,26 @@ class FaceTable:
 
 
 def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
-    """What `FaceTable.of` follows from once a scene is checked; None where not all shapes are meshes."""
+    """Key of the data that `FaceTable.of` depends on, for a checked scene; None unless all shapes are meshes."""
     if not all(shape.is_mesh() for shape in shapes):
         return None
     return [_edition(shape) for shape in shapes]
 
 
 def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
+    """Key of one mesh: shape, indices of its buffers, emitter and edition of J_n."""
     emitter = mesh.emitter()
-    places = (buffer.index for buffer in buffers(mesh))
-    return shape_number(mesh), *places, mark_of(emitter), getattr(emitter, "edition", 0)
+    indices = (buffer.index for buffer in buffers(mesh))
+    return shape_number(mesh), *indices, mark_of(emitter), getattr(emitter, "edition", 0)
 
 
 def mark_of(emitter: mi.Emitter | None) -> object:
-    """What tells an emitter from others, to be kept in its stead."""
+    """Key that identifies an emitter and is stored in place of it."""
     return getattr(emitter, "mark", None) or dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]
 
 
 def _number(shape: mi.ShapePtr) -> mi.UInt32:
+    """Dr.Jit's number of each shape."""
     return dr.reinterpret_array(mi.UInt32, shape)
 
 
@@ -89,7 +91,7 @@ def shape_number(shape: mi.Shape) -> int:
 
 
 def _radiance_at_corners(mesh: mi.Shape) -> tuple[mi.Float, ...] | None:
-    """Radiance [W/mm²/sr] at the three corners of every face, 0 where nothing glows; None as in `FaceTable.of`."""
+    """Radiance [W/mm²/sr] at the three corners of every face, 0 without an emitter; None as in `FaceTable.of`."""
     emitter = mesh.emitter()
     if emitter is None:
         return (dr.zeros(mi.Float, face_count(mesh)),) * 3
@@ -100,9 +102,10 @@ def _table(mesh: mi.Shape, radiance: tuple[mi.Float, ...]) -> mi.Float:
     """Eight numbers for each face of a mesh, see `FaceTable`."""
     elements = elements_of(mesh, minimum=1)
     si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
-    # On a sliver a normal or J_n may be no number: it is dark.
+    # On a sliver the normal or J_n may be NaN: the face is dark.
     sound = dr.all(dr.isfinite(si.n)) & dr.all(dr.isfinite(mi.Vector3f(*radiance)))
-    # From the least one on: where all are alike so is all between, and a dim one beside a bright one is not lost.
+    # Excess over the least corner: equal corners give an equal radiance between them, and a dim corner beside a bright
+    # one keeps its digits.
     least = dr.minimum(dr.minimum(radiance[0], radiance[1]), radiance[2])
     columns = [least, *(corner - least for corner in radiance), si.n.x, si.n.y, si.n.z, mi.Float(0)]
     table = dr.empty(mi.Float, 8 * elements.count)

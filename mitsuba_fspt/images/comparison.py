@@ -1,4 +1,4 @@
-"""How far a calculated image is from a standard: the paper's ME and CF, absolute errors and a z-test."""
+"""Comparison of a calculated image with a standard: the paper's ME and CF, absolute errors and a z-test."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from .image import Image
 class Profile:
     """Power along one row or column of both images.
 
-    `line` is 'row' or 'column', `index` its number from the top or the left, from 0 on; `calculated` and
-    `standard` are arrays of shape (w,) or (h,) [W].
+    line : 'row' or 'column'
+    index : its number, from 0 at the top or left
+    calculated, standard : arrays, shape (w,) or (h,) [W]
     """
 
     line: str
@@ -30,16 +31,17 @@ class Profile:
 
 @dataclass(frozen=True)
 class ZTest:
-    """Differences in units of their standard deviation, z = (P_cal − P_std) / √(error_cal² + error_std²).
+    """Test of the differences in units of their standard deviation, z = (P_cal − P_std) / √(error_cal² + error_std²).
 
     Attributes
     ----------
     max_z : the largest |z|
-    chi2 : mean of z², about 1 where the errors are right
-    p_value : probability that `pixels` independent normal z reach `max_z`, p = 1 − (1 − p_1)^pixels with
-        p_1 = erfc(max_z/√2) of one pixel (Šidák's correction); small where the images differ
-    pixels : number of pixels with an error above 0, which are those that the test uses
-    unjudged : number of pixels that differ though both errors are 0; the test does not use them
+    chi2 : mean of z², about 1 if the errors are right
+    p_value : probability that the largest of `pixels` independent normal |z| is at least `max_z`,
+        p = 1 − (1 − p_1)^pixels with p_1 = erfc(max_z/√2) of one pixel (Šidák's correction); a small value means that
+        the images differ
+    pixels : number of pixels with an error above 0, which are tested
+    unjudged : number of pixels that differ although both errors are 0; they are not tested
     """
 
     max_z: float
@@ -51,7 +53,7 @@ class ZTest:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The result of `compare`.
+    """Result of `compare`.
 
     Attributes
     ----------
@@ -59,9 +61,9 @@ class Comparison:
     cf : correlation factor, Pearson's, with sums over N − 1 (paper, section 3), in [−1, 1]
     max_error : max|P_cal − P_std| / max P_std, absolute powers: only the standard's peak scales both
     rms : √(Σ(P_cal − P_std)² / N) / max P_std, likewise absolute
-    ratio : Σ P_cal / Σ P_std of the absolute powers; None where the standard's add up to 0
+    ratio : Σ P_cal / Σ P_std of the absolute powers; None if it is not finite, as for Σ P_std = 0
     profiles : power along rows and columns
-    z_test : differences against their errors; None where no image has an error above 0
+    z_test : test of the differences against their errors; None if no image has an error above 0
     """
 
     me: float
@@ -92,7 +94,7 @@ class Comparison:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as plain data for JSON."""
+        """Comparison as numbers, text, lists and dicts, ready for JSON."""
         numbers = {name: getattr(self, name) for name in ("me", "cf", "max_error", "rms", "ratio")}
         profiles = [
             {
@@ -113,22 +115,22 @@ def compare(
     rows: ArrayLike | None = None,
     columns: ArrayLike | None = None,
 ) -> Comparison:
-    """Distance of a calculated image from a standard of the same shape (h, w).
+    """Deviation of a calculated image from a standard of the same shape (h, w).
 
     Parameters
     ----------
     calculated, standard : power [W], for example the integral and a Monte Carlo image
-    rows, columns : numbers of the rows and columns to take profiles of, in 0 … h − 1 and 0 … w − 1, one alone or
-        several; where neither is given, those through the standard's brightest pixel
+    rows, columns : indices of the profiles, one or several, in 0 … h − 1 and 0 … w − 1; if neither is given, the row
+        and column through the standard's brightest pixel
 
-    The z-test takes `error` as a standard deviation and the two errors as independent. The error of a deterministic
-    method is a bound and makes the test milder. The error of a Monte Carlo pixel that few samples have lit is itself
-    uncertain and makes the test too strict: give such images more samples.
+    The z-test takes `error` as a standard deviation and both errors as independent. The error of a deterministic
+    method is a bound and makes the test milder. The standard error of a Monte Carlo pixel that few samples have lit
+    is uncertain and makes the test too strict: give such images enough samples.
 
     Raises
     ------
-    ImageError : one is no `Image`, shapes differ, an image has no positive power or is constant (ME or CF are then not
-        defined), a row or column does not exist.
+    ImageError : an argument is no `Image`, the shapes differ, an image has no positive power or is constant (ME or CF
+        is then undefined), or a row or column does not exist.
     """
     _check(calculated, standard)
     p_cal, p_std = (image.power.astype(np.float64) for image in (calculated, standard))
@@ -207,7 +209,7 @@ def _z_test(difference: NDArray[np.float64], *errors: NDArray[np.floating] | Non
     return ZTest(
         max_z=max_z,
         chi2=float(np.square(z).mean()),
-        # log1p and expm1 keep a p_one far below 1e-16 alive, which 1 − (1 − p_one)^pixels would round to 0.
+        # log1p and expm1 keep a p_one far below 1e-16, which 1 − (1 − p_one)^pixels would round to 0.
         p_value=abs(math.expm1(pixels * math.log1p(-p_one))) if p_one < 1 else 1.0,
         pixels=pixels,
         unjudged=int(np.count_nonzero(difference[~judged])),
@@ -215,5 +217,5 @@ def _z_test(difference: NDArray[np.float64], *errors: NDArray[np.floating] | Non
 
 
 def _size(image: Image) -> str:
-    """Width × height as text for messages; arrays have the shape (h, w)."""
+    """Width × height, the order of all messages; arrays have the shape (h, w)."""
     return " × ".join(map(str, image.shape[::-1]))

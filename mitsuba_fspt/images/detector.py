@@ -1,10 +1,10 @@
-"""The CCD behind the lens, in the terms of EMVA 1288: from power on a pixel to electrons and counts.
+"""CCD behind the lens, in the terms of EMVA 1288: from power on a pixel to electrons and counts.
 
     photons    μ_p = P t λ / (h c)
     electrons  μ_e = η μ_p + I_dark t,  summed over the pixels of a bin,  σ_e² = μ_e + σ_read²
     counts     y   = bias + round(electrons / gain)
 
-The charge of a bin is Poisson distributed about μ_e (shot noise), its read-out adds a normal one, σ_read.
+The charge of a bin is Poisson distributed with mean μ_e (shot noise); its read-out adds normal noise, σ_read.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from ..runtime.numbers import number, whole
 from .exr import Metadata, write_exr
 from .image import Image
 
-# A detector's numbers, each with one to give. What an exposure's metadata call them: `pixel_pitch` there is that of the
-# pixels read out.
+# Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
+# `pixel_pitch` is that of the pixels read out.
 EXAMPLES = {
     "quantum_efficiency": "0.85",
     "dark_current": "1e-3",
@@ -49,10 +49,10 @@ class Exposure:
 
     Attributes
     ----------
-    electrons : float32 array, shape (h, w) [e-], before the conversion to counts; where there is hardly any
-        light, read noise can make them negative
+    electrons : float32 array, shape (h, w) [e-], before the conversion to counts; at low light, read noise can make
+        them negative
     counts : uint16 array, shape (h, w) [DN]
-    metadata : those of the image and the detector's numbers; `quantity` is electrons, `unit` e-
+    metadata : those of the image and the detector's parameters; `quantity` is electrons, `unit` e-
     """
 
     electrons: NDArray[np.float32]
@@ -62,7 +62,7 @@ class Exposure:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the electrons to an EXR file: channel `Y`, the metadata under `fspt:`.
 
-        Raises ImageError where the suffix is not .exr or the file cannot be written.
+        Raises ImageError if the suffix is not .exr or the file cannot be written.
         """
         write_exr(path, {"Y": self.electrons}, self.metadata)
 
@@ -79,7 +79,10 @@ class Exposure:
 
     @contextmanager
     def counts_file(self, path: str | os.PathLike[str]) -> Iterator[None]:
-        """The file of `write_counts`, written before a block, in its place when the block ends well. Raises as that."""
+        """Context manager that writes the file of `write_counts` before its block and renames it to `path` after it.
+
+        An exception in the block leaves `path` unchanged. Raises as `write_counts`.
+        """
         path = Path(path)
         if path.suffix.lower() not in (".png", ".tif", ".tiff"):
             raise ImageError(f"counts file '{path}': counts are written as PNG or TIFF. Give a .png or .tif.")
@@ -104,7 +107,7 @@ class Exposure:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Mean [e-] and variance [e-²] of an exposure's pixels, arrays of shape (h, w), without the full well."""
+    """Mean [e-] and variance [e-²] of the electrons of each pixel read out, shape (h, w), ignoring the full well."""
 
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
@@ -112,24 +115,24 @@ class Expectation:
 
 @dataclass(frozen=True)
 class Detector:
-    """A CCD by the numbers of EMVA 1288, the same for all its pixels.
+    """CCD described by the parameters of EMVA 1288, which are the same for all its pixels.
 
     Parameters
     ----------
     quantum_efficiency : η, electrons per photon, in (0, 1]
     dark_current : [e-/px/s], >= 0
     read_noise : σ_read [e-] of one read-out, >= 0
-    full_well : [e-], > 0; what a read-out pixel, binned or not, delivers at most
+    full_well : [e-], in (0, 1e15]; the most electrons that a read-out pixel, binned or not, delivers
     gain : [e-/DN], > 0; 1/K in EMVA 1288
     bias : [DN], >= 0
-    bits : of the converter, 1 … 16; counts end at 2^bits − 1
-    pixel_pitch : [mm] of the pixel that `dark_current` belongs to. An image whose metadata have another
-        `pixel_pitch` gets dark current by area; None: it belongs to the image's pixels, whatever their pitch
-    name : goes into the files
+    bits : of the converter, 1 … 16; the largest count is 2^bits − 1
+    pixel_pitch : [mm], > 0, of the pixel to which `dark_current` refers; for an image with another `pixel_pitch` in
+        its metadata the dark current is scaled by area. None: it refers to the image's pixels, whatever their pitch
+    name : label in the files
 
     Raises
     ------
-    DetectorError : a number outside its range.
+    DetectorError : a parameter is no number or outside its range.
     """
 
     quantum_efficiency: float
@@ -144,7 +147,7 @@ class Detector:
 
     @classmethod
     def typical_ccd(cls) -> Detector:
-        """A cooled back-illuminated 2048² CCD of 13.5 µm pixels: typical, not a data sheet."""
+        """Cooled back-illuminated 2048² CCD with 13.5 µm pixels; typical values, not those of a data sheet."""
         return cls(
             quantum_efficiency=0.85,
             dark_current=1e-3,
@@ -175,11 +178,11 @@ class Detector:
             _require("pixel_pitch", self.pixel_pitch, self.pixel_pitch > 0, "> 0 mm, for example 0.0135")
 
     def expected(self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1) -> Expectation:
-        """Mean and variance of the electrons that `expose` draws, before the full well cuts them.
+        """Mean and variance of the electrons that `expose` draws, before the full well limits them.
 
         Parameters and errors as for `expose`.
         """
-        exposure_time, wavelength_nm = _light(exposure_time, wavelength_nm)
+        exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
         if (darkest := image.power.min()) < 0:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
         energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
@@ -193,7 +196,7 @@ class Detector:
     def expose(
         self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
     ) -> Exposure:
-        """One exposure of the detector to an image; the same seed gives the same bits.
+        """One exposure of the detector to an image; the same seed gives bit-identical results.
 
         Parameters
         ----------
@@ -205,20 +208,20 @@ class Detector:
 
         Raises
         ------
-        DetectorError : a number outside its range, or a binning that does not divide the image.
+        DetectorError : a parameter is outside its range, or the binning does not divide the image.
         """
-        exposure_time, wavelength_nm = _light(exposure_time, wavelength_nm)
+        exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
         seed, binning = _whole("seed", seed), _whole("binning", binning)
         _require(
             "seed", seed, 0 <= seed <= 1 << 53, ">= 0 and at most 2^53, for example 1"
         )  # an EXR holds no larger one
         rng = np.random.default_rng(seed)
         mean = self.expected(image, exposure_time, wavelength_nm, binning=binning).mean
-        # Means this far above the full well end there for certain; NumPy draws none beyond 9e18.
+        # A mean this far above the full well saturates with certainty; NumPy draws no Poisson number beyond 9e18.
         charge = rng.poisson(np.minimum(mean, 2 * self.full_well + 1e6))
         electrons = np.minimum(charge + rng.normal(0.0, self.read_noise, mean.shape), self.full_well)
         full = electrons >= self.full_well
-        electrons = electrons.astype(np.float32)  # what the EXR holds is what is counted
+        electrons = electrons.astype(np.float32)  # the counts follow from the values that the EXR holds
         top = 2**self.bits - 1
         counts = np.clip(np.rint(self.bias + electrons / np.float64(self.gain)), 0, top)
         metadata = image.metadata | {
@@ -231,7 +234,7 @@ class Detector:
             "detector_seed": seed,
             "saturated_pixels": int(np.sum(full | (counts >= top))),
         }
-        metadata |= {told: getattr(self, name) for name, told in RECORDED.items() if getattr(self, name) is not None}
+        metadata |= {key: getattr(self, name) for name, key in RECORDED.items() if getattr(self, name) is not None}
         if "pixel_pitch" in image.metadata:
             metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
         return Exposure(electrons, counts.astype(np.uint16), metadata)
@@ -249,8 +252,8 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
     return blocks.sum(axis=(1, 3))
 
 
-def _light(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
-    """Both as plain numbers, in bounds that keep dark pixels dark: 0 W times infinitely many photons is no number."""
+def _time_and_wavelength(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
+    """Both as floats, within bounds that keep photons per watt finite: 0 W times infinity is NaN, not dark."""
     time = number("detector: 'exposure_time'", exposure_time, DetectorError, "60")
     wavelength = number("detector: 'wavelength_nm'", wavelength_nm, DetectorError, "650")
     _require("exposure_time", time, 0 <= time <= 1e12, "in 0 … 1e12 s, for example 60")
@@ -263,5 +266,6 @@ def _whole(name: str, value: int) -> int:
 
 
 def _require(name: str, value: float, holds: bool, rule: str) -> None:
+    """Raise DetectorError unless `value` is finite and the `rule` holds."""
     if not (holds and math.isfinite(value)):
         raise DetectorError(f"detector: '{name}' must be finite and {rule}, got {value}.")

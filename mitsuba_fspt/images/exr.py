@@ -1,4 +1,4 @@
-"""OpenEXR files: 32-bit float channels by name, and header attributes under `fspt:` for everything else."""
+"""OpenEXR files: 32-bit float channels by name, and metadata as header attributes under `fspt:`."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from ..runtime.errors import ImageError
 Metadata = dict[str, str | int | float]
 
 PREFIX = "fspt:"
-STREAM_BUFFER = 1 << 16  # bytes, more than any C++ library holds back
-_mute = Lock()  # the process has one standard output and one standard error: who mutes them is alone
+STREAM_BUFFER = 1 << 16  # bytes, more than any C++ library buffers
+_mute = Lock()  # the process has one standard output and one standard error: one thread at a time mutes them
 
 
 def write_exr(
     path: str | os.PathLike[str], channels: Mapping[str, NDArray], metadata: Mapping[str, str | int | float]
 ) -> None:
-    """Write `channels`, all of one shape (h, w), and `metadata` to an EXR file: whole or not at all.
+    """Write `channels`, all of one shape (h, w), and `metadata` to an EXR file, completely or not at all.
 
-    Channels become 32-bit floats (zip compression, row 0 at the top); what float32 cannot hold is refused,
-    what is too small for it becomes 0. The metadata key `f_number` becomes the attribute `fspt:f_number`:
-    text a `string`, integers an `int`, floats a `double` (EXR's `float` has 32 bits). An integer beyond
-    32 bits becomes a `double` of the same value.
+    Channels become 32-bit floats (zip compression, row 0 at the top); a value beyond float32 is refused, one too
+    small for it becomes 0. The metadata key `f_number` becomes the attribute `fspt:f_number`: text a `string`, an
+    integer an `int`, a float a `double` (EXR's `float` has 32 bits). An integer beyond 32 bits becomes a `double` of
+    the same value.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def write_exr(
         try:
             OpenEXR.File(header, pixels).write(str(temporary))
             if os.path.getsize(temporary) < STREAM_BUFFER:
-                # All of it waited in the stream's buffer, whose failing flush at the close nobody reports.
+                # Such a file stays in the stream's buffer until the close, which reports no failure: read it back.
                 OpenEXR.File(str(temporary))
         except (RuntimeError, ValueError) as cause:
             reason = _one_line(cause).replace(str(temporary), str(path)).rstrip(".")
@@ -56,9 +56,9 @@ def write_exr(
 
 
 def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], Metadata]:
-    """Channels by name, each of shape (h, w) and the type it has in the file, and the metadata under `fspt:`.
+    """Channels by name, each of shape (h, w) and the type stored in the file, and the metadata under `fspt:`.
 
-    Of several parts the first one counts. Attributes under `fspt:` that are no text or number are left out.
+    Of several parts the first is read. Attributes under `fspt:` that are neither text nor number are left out.
 
     Raises
     ------
@@ -81,14 +81,14 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], Metadata
     for key, value in header.items():
         if key.startswith(PREFIX):
             if isinstance(value, np.ndarray) and value.shape == (1,):
-                value = float(value[0])  # OpenEXR hands out a double as an array of one
+                value = float(value[0])  # OpenEXR returns a double as an array of one
             if isinstance(value, (str, int, float)):
                 metadata[key.removeprefix(PREFIX)] = value
     return channels, metadata
 
 
 def _attribute(key: str, value: object) -> str | int | NDArray[np.float64]:
-    """`value` as OpenEXR takes it."""
+    """`value` in a type that OpenEXR stores; ImageError for any other value."""
     if isinstance(value, str):
         return value
     if isinstance(value, Integral):
@@ -106,6 +106,7 @@ def _attribute(key: str, value: object) -> str | int | NDArray[np.float64]:
 
 
 def _float32(name: str, values: NDArray) -> NDArray[np.float32]:
+    """`values` as contiguous float32; ImageError if one is not finite or too large."""
     limit = float(np.finfo(np.float32).max)
     unfit = ~(np.abs(values) <= limit)  # true for NaN too
     if unfit.any():
@@ -123,10 +124,10 @@ def _one_line(cause: BaseException) -> str:
 
 @contextmanager
 def _muted() -> Iterator[None]:
-    """Nothing of what OpenEXR prints about a damaged file, which it reports by raising as well.
+    """Context manager that discards OpenEXR's output about a damaged file, for which it raises an exception as well.
 
-    Its Python part prints to `sys.stdout`; its C part writes past `sys.stderr`, so that for a moment the
-    whole process has no standard error. One thread at a time: two would keep each other's muted streams.
+    Its Python part prints to `sys.stdout`; its C part bypasses `sys.stderr`, so that the whole process has no
+    standard error during the block. One thread at a time: two would restore each other's muted streams.
     """
     with _mute, redirect_stdout(StringIO()):
         try:

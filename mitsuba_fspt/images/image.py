@@ -1,4 +1,4 @@
-"""The picture of a camera: power in W on every pixel, how sure it is, and how it was made."""
+"""Image of a camera: power [W] on every pixel, its error and coverage, and metadata."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ class Image:
 
     Parameters
     ----------
-    power : array, shape (h, w) [W], the power on each pixel
-    error : array, shape (h, w) [W], its estimated absolute error (Monte Carlo: the standard error), or None
-    coverage : array, shape (h, w), share in [0, 1] of a pixel's lines of sight that meet the phantom, or None
-    metadata : text and numbers that say how the image was made; `quantity` and `unit` are added
+    power : array, shape (h, w) [W], power on each pixel
+    error : array, shape (h, w) [W], estimated absolute error of the power (Monte Carlo: standard error), or None
+    coverage : array, shape (h, w), unweighted share in [0, 1] of a pixel's lines of sight that reach a shape with
+        `fspt_surface`, or None
+    metadata : text and numbers that record the origin of the image; `quantity` and `unit` are added
 
-    The arrays are held as read-only views, at least 32-bit floats.
+    The arrays are stored as read-only views with at least 32-bit floats.
 
     Raises
     ------
     ImageError : an array is not of shape (h, w), the shapes differ, a value is NaN or infinite, or the
-        metadata say that the values are no power.
+        metadata name another quantity or unit than power in W.
     """
 
     power: NDArray[np.floating]
@@ -57,18 +58,18 @@ class Image:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(h, w)."""
+        """Height and width (h, w) [pixels]."""
         return self.power.shape
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y` (float32), metadata under `fspt:`.
 
-        The file is whole or not there. Single pixels may vanish below float32's 1e-38; an image whose
-        brightest pixel does is refused.
+        The file is written completely or not at all. Pixels below float32's 1e-38 may become 0; an image whose
+        brightest pixel lies below that is refused.
 
         Raises
         ------
-        ImageError : the suffix is not .exr, a value does not fit into float32 or the file cannot be written.
+        ImageError : the suffix is not .exr, a value does not fit into float32, or the file cannot be written.
         """
         peak = np.abs(self.power).max()
         if 0 < peak < np.finfo(np.float32).tiny:
@@ -81,14 +82,14 @@ class Image:
 
 
 def read(path: str | os.PathLike[str]) -> Image:
-    """Image from an EXR file, one of ours or any with a channel `Y`, whose values then count as W on a pixel.
+    """Image of an EXR file with a channel `Y`, whose values count as power [W] on a pixel.
 
-    `error` and `coverage` are None where the file has no channel `error.Y`, `coverage.Y`.
+    `error` and `coverage` are None if the file has no channel `error.Y`, `coverage.Y`.
 
     Raises
     ------
-    ImageError : no such file, not an EXR file, a damaged one, no channel `Y`, values that are not finite or
-        no power.
+    ImageError : the file does not exist, is no EXR file or damaged, has no channel `Y`, or holds values that are
+        not finite or, by its metadata, no power.
     """
     channels, metadata = read_exr(path)
     if "Y" not in channels:
@@ -103,7 +104,7 @@ def read(path: str | os.PathLike[str]) -> Image:
 
 
 def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:
-    """`values` as a read-only array of at least 32-bit floats; refuses what is no image."""
+    """`values` as a read-only array (h, w) of at least 32-bit floats; ImageError if shape, type or a value is wrong."""
     array = np.asarray(values)
     if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ImageError(

@@ -1,4 +1,4 @@
-"""Images to look at: PNG files with a calibrated colour bar and a scale in mm on the sharp plane."""
+"""PNG pictures of images, with a calibrated colour bar and axes in mm on the sharp plane."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ DIFFERENCES = "RdBu_r"  # white where the images agree
 
 
 def write_png(image: Image, path: str | os.PathLike[str]) -> None:
-    """Write a picture of `image` [W/pixel] to a PNG file, method and lens above it.
+    """Write a picture of `image` [W/pixel] to a PNG file, with method and lens as its title.
 
-    Axes are in mm from the middle, on the sharp plane where the metadata hold `pixel_pitch` and
-    `magnification`, on the detector where they hold the pitch alone; else they count rows and columns.
+    Axes are in mm from the centre: on the sharp plane if the metadata hold `pixel_pitch` and `magnification`, on the
+    detector if they hold the pitch alone. Without a pitch they count rows and columns.
 
     Raises
     ------
@@ -41,7 +41,10 @@ def write_png(image: Image, path: str | os.PathLike[str]) -> None:
 
 
 def png_file(image: Image, path: str | os.PathLike[str]) -> AbstractContextManager[None]:
-    """The file of `write_png`, drawn before a block and in its place when the block ends well. Raises as that."""
+    """Context manager that writes the file of `write_png` before its block and renames it to `path` after it.
+
+    An exception in the block leaves `path` unchanged. Raises as `write_png`.
+    """
     path = require_png(path)
     figure = empty_figure(width=6.0, height=0.7 + 4.4 * _aspect(image))
     axes = figure.add_subplot()
@@ -52,10 +55,10 @@ def png_file(image: Image, path: str | os.PathLike[str]) -> AbstractContextManag
 
 
 def write_comparison_png(calculated: Image, standard: Image, path: str | os.PathLike[str]) -> None:
-    """Write both images on one scale, their difference and a profile to a PNG file, ME and CF above them.
+    """Write both images on one scale, their difference and a profile to a PNG file, with ME and CF as its title.
 
-    The profile runs along the row through the standard's brightest pixel; bands show ± `error` where known.
-    Raises as `write_png` and `compare` do.
+    The profile runs along the row through the standard's brightest pixel; bands show ± `error` where it is given.
+    Raises as `write_png` and `compare`.
     """
     path = require_png(path)
     comparison = compare(calculated, standard)
@@ -70,8 +73,8 @@ def write_comparison_png(calculated: Image, standard: Image, path: str | os.Path
     row = comparison.profiles[0].index
     for image, name, colour in ((standard, "standard", "C7"), (calculated, "calculated", "C3")):
         _draw_profile(bottom_right, image, row, scale, name, colour)
-    (left, right, _, _), place = _extent(standard)
-    bottom_right.set(xlabel=place, xlim=(left, right), ylabel=f"power [{unit}]", ylim=(0, None))
+    (left, right, _, _), axis_label = _extent(standard)
+    bottom_right.set(xlabel=axis_label, xlim=(left, right), ylabel=f"power [{unit}]", ylim=(0, None))
     bottom_right.set_title(f"row {row}", fontsize="medium")
     bottom_right.set_box_aspect(_aspect(standard))
     bottom_right.legend(frameon=False)
@@ -84,7 +87,7 @@ def write_comparison_png(calculated: Image, standard: Image, path: str | os.Path
 
 
 def caption(image: Image) -> str:
-    """Method and lens of an image in one line, as far as its metadata know them; may be empty."""
+    """Method and lens of an image in one line, from those keys that its metadata hold; may be empty."""
     forms = (
         ("method", "{}"),
         ("focal_length", "F = {:g} mm"),
@@ -103,11 +106,11 @@ def draw_picture(
     limits: tuple[float, float],
     colours: str = COLOURS,
 ) -> None:
-    """`values` as a picture in the frame of `image`, with a colour bar of the same height."""
-    extent, place = _extent(image)
+    """Draw `values` (h, w) within `limits` in the frame of `image`, with a colour bar of that height and a `label`."""
+    extent, axis_label = _extent(image)
     low, high = limits
     shown = axes.imshow(values, cmap=colours, vmin=low, vmax=high or 1.0, extent=extent)
-    axes.set(xlabel=place, ylabel=place)
+    axes.set(xlabel=axis_label, ylabel=axis_label)
     bar = axes.inset_axes((1.03, 0.0, 0.05, 1.0))
     bar.figure.colorbar(shown, cax=bar, label=label)
 
@@ -132,7 +135,7 @@ def _draw_profile(axes: Axes, image: Image, row: int, scale: float, name: str, c
 
 
 def _extent(image: Image) -> tuple[tuple[float, float, float, float], str]:
-    """(left, right, bottom, top) of the picture and the axis label that says in what unit, on which plane."""
+    """(left, right, bottom, top) of the picture [mm or pixels], and the axis label with unit and plane."""
     height, width = image.shape
     pitch, magnification = (image.metadata.get(key) for key in ("pixel_pitch", "magnification"))
     if not pitch:
@@ -143,18 +146,19 @@ def _extent(image: Image) -> tuple[tuple[float, float, float, float], str]:
 
 
 def _aspect(image: Image) -> float:
-    """Height over width, within what a figure can show."""
+    """Height over width, limited to [0.5, 2] for the figure."""
     return min(2.0, max(0.5, image.shape[0] / image.shape[1]))
 
 
 def scale_and_unit(values: NDArray) -> tuple[float, str]:
-    """Power of 1000 that brings the largest of `values` [W] to 1 … 1000, and the unit with that factor."""
+    """Power of 1000 that scales the largest of `values` [W] to 1 … 1000, and the unit with that factor."""
     peak = float(np.abs(values).max())
     exponent = 3 * math.floor(math.log10(peak) / 3) if peak > 0 else 0
     return 10.0**exponent, "W/pixel" if exponent == 0 else rf"$10^{{{exponent}}}$ W/pixel"
 
 
 def require_png(path: str | os.PathLike[str]) -> Path:
+    """`path` as a Path; ImageError if its suffix is not .png."""
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ImageError(f"picture file '{path}': pictures are written as PNG. Give a name that ends in .png.")
@@ -162,7 +166,7 @@ def require_png(path: str | os.PathLike[str]) -> Path:
 
 
 def require_matplotlib() -> None:
-    """Raise BackendError where matplotlib is missing."""
+    """Raise BackendError if matplotlib is missing."""
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError as cause:
@@ -170,7 +174,7 @@ def require_matplotlib() -> None:
 
 
 def empty_figure(width: float, height: float) -> Figure:
-    """An empty figure [inches], free of pyplot's windows and global state."""
+    """Empty figure of `width` × `height` inches, without pyplot's windows and global state."""
     require_matplotlib()
     from matplotlib.figure import Figure
 
@@ -179,12 +183,13 @@ def empty_figure(width: float, height: float) -> Figure:
 
 @contextmanager
 def figure_file(figure: Figure, path: Path) -> Iterator[None]:
-    """The PNG file of a figure, drawn before a block and in its place when the block ends well."""
+    """Context manager that writes the PNG file of a figure before its block and renames it to `path` after it."""
     with atomic_path(path, ImageError) as temporary:
         figure.savefig(temporary, dpi=150)
         yield
 
 
 def save_figure(figure: Figure, path: Path) -> None:
+    """Write the PNG file of a figure."""
     with figure_file(figure, path):
         pass

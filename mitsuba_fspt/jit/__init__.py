@@ -1,1 +1,1 @@
-"""Helpers of Dr.Jit code that know nothing of cameras: pixel grids, batches, loops, spectra, recording, meshes."""
+"""Dr.Jit helpers without camera physics: pixel grids, batches, loops, spectra, recording, meshes."""

@@ -1,4 +1,4 @@
-"""Batches: work cut into kernels wide enough to pay and small enough to bound the memory."""
+"""Batches: work divided into kernels that are large enough to be efficient and small enough to bound the memory."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-BATCH = 1 << 22  # lines of sight in one kernel: bounds the memory, whatever the size of the picture
+BATCH = 1 << 22  # most lines of sight in one kernel, which bounds the memory for pictures of any size
 
 
 def batches(index: mi.UInt32, lines_each: int = 1) -> list[mi.UInt32]:
-    """The listed numbers in batches of at most `BATCH` lines of sight, where each number takes `lines_each`."""
+    """The numbers in `index`, in batches of at most `BATCH` lines of sight, `lines_each` per number."""
     size, count = max(1, BATCH // lines_each), dr.width(index)
     if count <= size:
         return [index] if count else []
@@ -25,9 +25,9 @@ def batches(index: mi.UInt32, lines_each: int = 1) -> list[mi.UInt32]:
 
 
 def batch_slices(lines: NDArray[np.int64]) -> Iterator[slice]:
-    """Slices of consecutive items that take at most `BATCH` lines of sight together; at least one item a slice.
+    """Slices of consecutive items with at most `BATCH` lines of sight together, or of a single item with more.
 
-    `lines`, shape (n,): lines of sight that each item takes.
+    `lines`, shape (n,): number of lines of sight of each item.
     """
     ends = np.cumsum(lines)
     first = 0
@@ -39,6 +39,6 @@ def batch_slices(lines: NDArray[np.int64]) -> Iterator[slice]:
 
 
 def numbered(lines: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Item of each line of sight and its number within that item, both of shape (Σ lines,); item k has `lines[k]`."""
+    """Item of each line of sight, and its number in that item, both of shape (Σ lines,); item k has `lines[k]`."""
     item = np.repeat(np.arange(len(lines)), lines)
     return item, np.arange(len(item)) - np.repeat(np.cumsum(lines) - lines, lines)

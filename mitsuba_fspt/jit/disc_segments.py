@@ -1,4 +1,4 @@
-"""Segments of the unit disc: the share of it that lies below a chord, and its integrals."""
+"""Segments of the unit disc: the share of its area below a chord, the inverse of that, and its integrals."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from numpy.polynomial import Chebyshev
 from numpy.typing import NDArray
 
 NEWTON_STEPS = 8
-DEGREE = 9  # reaches 2e-8
+DEGREE = 9  # of the polynomial for the inverse, with an error of 2e-8
 
 
 def segment(y: mi.Float) -> mi.Float:
-    """F(y), the share of the disc on which a coordinate is less than y."""
+    """F(y), the share of the disc's area on which a coordinate is less than y; 0 for y <= -1, 1 for y >= 1."""
     y = dr.clip(y, -1, 1)
     return 0.5 + (y * dr.sqrt(1 - y * y) + dr.asin(y)) / dr.pi
 
 
 def segment_height(share: mi.Float) -> mi.Float:
-    """y of F(y) = share. The angle δ = 2 acos y of the smaller segment has δ - sin δ = 2π times its share; with the
-    cube root of that for a variable y is smooth up to the disc's rim.
+    """Height y with F(y) = share, for a share in [0, 1].
+
+    The angle δ = 2 acos |y| of the smaller segment satisfies δ - sin δ = 2π times its share. As a function of
+    (δ - sin δ)^(2/3), |y| is smooth up to the disc's rim and is evaluated as a polynomial.
     """
     smaller = 2 * dr.pi * dr.minimum(share, 1 - share)
     z = dr.square(dr.cbrt(smaller)) / (0.5 * LARGEST) - 1
@@ -33,9 +35,9 @@ def segment_height(share: mi.Float) -> mi.Float:
 
 
 def _height(square: NDArray[np.float64]) -> NDArray[np.float64]:
-    """cos(δ/2) of (δ - sin δ)^(2/3)."""
+    """cos(δ/2) as a function of `square` = (δ - sin δ)^(2/3)."""
     wanted = square**1.5
-    angle = np.cbrt(6 * wanted)  # the root, nearly
+    angle = np.cbrt(6 * wanted)  # first approximation of δ
     for _ in range(NEWTON_STEPS):
         angle -= (angle - np.sin(angle) - wanted) / (1 - np.cos(angle))
     return np.cos(angle / 2)
@@ -46,14 +48,14 @@ _HEIGHT = np.polynomial.chebyshev.cheb2poly(Chebyshev.interpolate(_height, DEGRE
 
 
 def segment_integral(y: mi.Float64) -> mi.Float64:
-    """∫ F from -1 to y."""
+    """Integral of F from -1 to y; 0 for y < -1."""
     z = dr.clip(y, -1, 1)
     rest = dr.sqrt(1 - z * z)
     return z * segment(z) + 2 / (3 * dr.pi) * rest**3 + dr.maximum(y - 1, 0)
 
 
 def segment_double_integral(y: mi.Float64) -> mi.Float64:
-    """∫∫ F from -1 to y."""
+    """Integral of `segment_integral` from -1 to y; 0 for y < -1."""
     z = dr.clip(y, -1, 1)
     rest = dr.sqrt(1 - z * z)
     arc = dr.asin(z) * (4 * z * z + 1) / 8 + z * rest * (2 * z * z + 13) / 24

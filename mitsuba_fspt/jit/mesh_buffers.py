@@ -1,4 +1,4 @@
-"""Mitsuba's meshes: the one file that uses the names of their buffers, which Mitsuba 3.10 changes."""
+"""Buffers of Mitsuba's meshes; the only file that uses their names, which Mitsuba 3.10 changes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ def face_count(mesh: mi.Shape) -> int:
 def buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
     """Vertex positions (3 V,) [mm] and face indices (3 F,) of a mesh.
 
-    Copies that share the data: the arrays that a mesh hands out keep it alive.
+    Copies that share the data: the arrays that a mesh returns would keep it alive.
     """
     return mi.Float(mesh.vertex_positions_buffer()), mi.UInt32(mesh.faces_buffer())
 
 
 def triangles(shape: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
-    """The same of a mesh or of a rectangle, which Mitsuba traces as a mesh without such buffers."""
+    """Vertex positions (3 V,) [mm] and face indices (3 F,) of a mesh or of a rectangle.
+
+    Mitsuba traces a rectangle as a mesh, but without such buffers.
+    """
     parameters = mi.traverse(shape)
     if POSITIONS in parameters:
         return mi.Float(parameters[POSITIONS]), mi.UInt32(parameters[FACES])
@@ -33,7 +36,7 @@ def triangles(shape: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
 
 
 def set_triangles(mesh: mi.Mesh, positions: Any, faces: Any) -> mi.Mesh:
-    """The mesh with these flat vertex positions [mm] and face indices."""
+    """`mesh` itself, updated to these vertex positions (3 V,) [mm] and face indices (3 F,)."""
     parameters = mi.traverse(mesh)
     parameters[POSITIONS], parameters[FACES] = positions, faces
     parameters.update()

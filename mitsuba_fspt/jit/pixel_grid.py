@@ -1,4 +1,4 @@
-"""Neighbourhoods on the pixel grid as kernels: which pixels lie near marked ones, and which way an image changes."""
+"""Operations on the neighbourhoods of pixels as kernels: dilation, maxima, sums and gradients."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    PixelArray = mi.Float64  # of h · w lanes, row by row; masks likewise
+    PixelArray = mi.Float64  # h · w entries, row by row; masks likewise
     Mask = mi.Bool
 
-COVERAGE_ROUNDING = 1e-4  # of a share of coverage: a sum of float32 weights
+COVERAGE_ROUNDING = 1e-4  # rounding error of a coverage, which is a sum of float32 weights
 AROUND = [(dx, dy) for dx, dy in itertools.product((-1, 0, 1), repeat=2) if (dx, dy) != (0, 0)]
-BLOCK = 4  # side of the squares of pixels that are looked at together, each of which holds one of the lattice
+BLOCK = 4  # side of the squares of pixels that are processed together; each holds one pixel of the lattice of probes
 
 
 class Grid:
-    """The pixels of a picture of `shape` (h, w), at least one; an image on it is one array of h · w lanes, row by row.
+    """Pixels of a picture of `shape` (h, w), at least one; an image on it is one array of h · w entries, row by row.
 
-    Sizes and radii reach kernels as data: pictures of all shapes share them.
+    Sizes and radii reach kernels as data, so that pictures of all shapes share the kernels.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
@@ -33,7 +33,7 @@ class Grid:
         self._height, self._width = (dr.opaque(mi.Int, side) for side in shape)
         self.y = mi.Int(self.number) // self._width
         self.x = mi.Int(self.number) - self.y * self._width
-        # Numbers of the neighbours, which are asked for again and again.
+        # Numbers of the neighbours, computed once for repeated use.
         self._around = {(dx, dy): self._index(self.x + dx, self.y + dy) for dx, dy in AROUND}
         self._by_squares = self._in_bands()
         dr.eval(self.number, self.x, self.y, self._around, self._by_squares)
@@ -42,26 +42,26 @@ class Grid:
         return math.prod(self.shape)
 
     def pixels(self, mask: Mask | None = None) -> mi.UInt32:
-        """Numbers of all pixels or of the marked ones, squares of sixteen together."""
+        """Numbers of all pixels or of the marked ones, in an order that keeps squares of sixteen together."""
         if mask is None:
             return self._by_squares
         return dr.gather(mi.UInt32, self._by_squares, dr.compress(dr.gather(mi.Bool, mask, self._by_squares)))
 
     def _in_bands(self) -> mi.UInt32:
-        """Numbers of the pixels band by band, `BLOCK` rows each, and in a band column by column."""
+        """Numbers of all pixels, sorted by bands of `BLOCK` rows and by columns within a band."""
         number, full = mi.Int(self.number), BLOCK * self._width
         band = number // full
-        # At least 1: kernels run on a little beyond the last pixel, and nothing may be divided by zero there.
-        place, rows = number - band * full, dr.clip(self._height - BLOCK * band, 1, BLOCK)
-        column = place // rows
-        return mi.UInt32((BLOCK * band + place - column * rows) * self._width + column)
+        # At least 1: kernels run a little beyond the last pixel and must not divide by zero there.
+        position, rows = number - band * full, dr.clip(self._height - BLOCK * band, 1, BLOCK)
+        column = position // rows
+        return mi.UInt32((BLOCK * band + position - column * rows) * self._width + column)
 
     def full(self, kind: type, value: Any) -> Any:
-        """An image that has the same value everywhere."""
+        """Image with the same value on every pixel."""
         return dr.full(kind, value, len(self))
 
     def flat(self, array: NDArray[Any]) -> Any:
-        """PixelArray or mask from an array (h, w)."""
+        """Image or mask from an array (h, w)."""
         flat = np.ascontiguousarray(array).ravel()
         return mi.Bool(flat) if flat.dtype == bool else mi.Float64(flat)
 
@@ -72,31 +72,32 @@ class Grid:
     # ------------------------------------------------------------------ neighbours
 
     def at(self, image: Any, x: mi.Int, y: mi.Int) -> Any:
-        """Values of an image at pixels (x, y); beside the grid that of the nearest one on it."""
+        """Values of an image at pixels (x, y); outside the grid that of the nearest pixel."""
         return dr.gather(type(image), image, self._index(x, y))
 
     def _index(self, x: mi.Int, y: mi.Int) -> mi.UInt32:
+        """Numbers of the pixels (x, y), clamped to the grid."""
         return mi.UInt32(dr.clip(y, 0, self._height - 1) * self._width + dr.clip(x, 0, self._width - 1))
 
     def _neighbours(self, image: Any, step: int = 1) -> dict[tuple[int, int], Any]:
-        """Values `step` pixels away along (dx, dy), all eight."""
+        """Values of the eight pixels `step` pixels away, by direction (dx, dy)."""
         if step == 1:
             return {way: dr.gather(type(image), image, index) for way, index in self._around.items()}
         k = dr.opaque(mi.Int, step)
         return {(dx, dy): self.at(image, self.x + dx * k, self.y + dy * k) for dx, dy in AROUND}
 
     def spread_max(self, image: Any, radius: int = 1) -> Any:
-        """Largest value within `radius` pixels (square) of each."""
+        """Largest value within `radius` pixels (square) of each pixel."""
         return self.spread_all((image,), radius)[0]
 
     def spread_all(self, images: tuple, radius: int = 1) -> tuple:
-        """`spread_max` of several images in one."""
+        """`spread_max` of several images in the same kernels."""
         reach, most = 0, min(radius, max(self.shape) - 1)
         while reach < most:
-            step = min(2 * reach + 1, most - reach)  # no gap opens
+            step = min(2 * reach + 1, most - reach)  # a larger step would leave gaps
             dr.eval(images)  # together: gathers would evaluate each one alone
             images = tuple(reduce(_larger, self._neighbours(image, step).values(), image) for image in images)
-            dr.eval(images)  # all need this one kernel, which every larger one around it would compile anew
+            dr.eval(images)  # one kernel for all radii; as part of a larger kernel it would be compiled anew
             reach += step
         return images
 
@@ -105,7 +106,7 @@ class Grid:
         return self.spread_max(mask, radius)
 
     def grow(self, mask: Mask, reach: mi.Int, most: int) -> Mask:
-        """True within `reach` ≤ `most` pixels (square) of a marked pixel, each with its own; at least 1."""
+        """True within `reach` <= `most` pixels (square) of a marked pixel; each has its own `reach`, at least 1."""
         left = dr.select(mask, dr.maximum(reach, 1), -1)
         covered, step = 0, 1
         while covered < max(most, 1):
@@ -115,7 +116,10 @@ class Grid:
         return left >= 0
 
     def _reached(self, left: mi.Int, step: int) -> mi.Int:
-        """The most that is `left` of reaches from two steps around; of steps 1, 2, 4 … every way is the shortest."""
+        """Largest reach that is `left` over at each pixel from pixels up to two steps away.
+
+        Steps 1, 2, 4 … in turn connect any two pixels by a shortest path.
+        """
         k = dr.opaque(mi.Int, step)
         dr.eval(left)
 
@@ -129,7 +133,7 @@ class Grid:
         return most
 
     def box_sum(self, image: PixelArray, radius: int) -> PixelArray:
-        """Sum over the (2 radius + 1)² pixels around each, fewer at the border; cost independent of the radius."""
+        """Sum over the (2 radius + 1)² pixels around each one, fewer at the border; cost independent of the radius."""
         reach = dr.opaque(mi.Int, radius)
         rows = _sliding_sum(image, self.y * self._width, self.x, self._width, reach)
         number = mi.Int(self.number)
@@ -138,7 +142,7 @@ class Grid:
         return _sliding_sum(turned, self.x * self._height, self.y, self._height, reach)
 
     def mean_where(self, image: PixelArray, mask: Mask, radius: int) -> PixelArray:
-        """Mean of the marked pixels among the (2 radius + 1)² around each; 0 where there is none."""
+        """Mean over the marked pixels among the (2 radius + 1)² around each pixel; 0 if there is none."""
         sums = dr.select(mask, image, 0), dr.select(mask, mi.Float64(1), 0)
         for dx, dy in ((1, 0), (0, 1)):
             dr.eval(sums)
@@ -150,7 +154,7 @@ class Grid:
         return mean
 
     def _beside(self, images: tuple[PixelArray, ...], dx: int, dy: int) -> list[PixelArray]:
-        """Values (dx, dy) pixels away, 0 beside the grid."""
+        """Values (dx, dy) pixels away, 0 outside the grid."""
         x, y = self.x + dx, self.y + dy
         here = (x >= 0) & (x < self._width) & (y >= 0) & (y < self._height)
         index = self._index(x, y)
@@ -159,21 +163,21 @@ class Grid:
     # ------------------------------------------------------------------ one pixel of sixteen
 
     def probes(self) -> Mask:
-        """True on one pixel of sixteen, in every row and column at other places than in the next (rank-1 lattice)."""
+        """True on one pixel of sixteen, the rank-1 lattice x = 5 y mod 16, which differs from row to row."""
         return ((self.x - 5 * self.y) & (BLOCK * BLOCK - 1)) == 0
 
     def spread_over_probes(self, image: PixelArray) -> PixelArray:
-        """Largest value on the lattice in the 3 × 3 blocks of 4 × 4 pixels around each pixel's block."""
+        """Largest value on the lattice of `probes` in the 3 × 3 blocks of 4 × 4 pixels around each pixel's block."""
         dr.eval(image)
         near = []
         for dx, dy in [(0, 0), *AROUND]:
             x = dr.clip(self.x // BLOCK + dx, 0, (self._width - 1) // BLOCK)
             y = dr.clip(self.y // BLOCK + dy, 0, (self._height - 1) // BLOCK)
-            k = (x - y) & (BLOCK - 1)  # where on its diagonal the lattice meets the block
+            k = (x - y) & (BLOCK - 1)  # position of the lattice pixel on the diagonal of the block
             near.append(self.at(image, BLOCK * x + k, BLOCK * y + k))
         return reduce(dr.maximum, near)
 
-    # ------------------------------------------------------------------ how an image changes
+    # ------------------------------------------------------------------ differences
 
     def gradient(self, image: PixelArray) -> tuple[PixelArray, PixelArray]:
         """Central differences along x and y, one-sided at the border; 0 along an axis of a single pixel."""
@@ -183,14 +187,17 @@ class Grid:
         return along_x * dr.select(at_border[0], 1.0, 0.5), along_y * dr.select(at_border[1], 1.0, 0.5)
 
     def second_differences(self, image: PixelArray) -> tuple[PixelArray, PixelArray]:
-        """P(k - 1) - 2 P(k) + P(k + 1) along x and y; the outermost take their neighbours', 0 on less than three."""
+        """P(k - 1) - 2 P(k) + P(k + 1) along x and y; border pixels take their neighbour's value.
+
+        0 along an axis of fewer than three pixels.
+        """
         x, y = dr.clip(self.x, 1, self._width - 2), dr.clip(self.y, 1, self._height - 2)
         along_x = self.at(image, x - 1, self.y) - 2 * self.at(image, x, self.y) + self.at(image, x + 1, self.y)
         along_y = self.at(image, self.x, y - 1) - 2 * self.at(image, self.x, y) + self.at(image, self.x, y + 1)
         return dr.select(self._width > 2, along_x, 0), dr.select(self._height > 2, along_y, 0)
 
     def principal_angle(self, x: PixelArray, y: PixelArray, radius: int) -> PixelArray:
-        """Angle of the axis along which the vectors (x, y) of a neighbourhood mostly point (structure tensor)."""
+        """Angle [rad] of the principal axis of the vectors (x, y) within `radius` pixels (structure tensor)."""
         products = x * y, x * x - y * y
         dr.eval(products)
         cross, along = (self.box_sum(product, radius) for product in products)
@@ -199,7 +206,7 @@ class Grid:
     # ------------------------------------------------------------------ silhouettes
 
     def outline(self, coverage: PixelArray) -> Mask:
-        """True within a pixel of both a hit and a miss, where lines of sight may pass a silhouette."""
+        """True within a pixel of both covered and uncovered lines of sight, which may pass a silhouette there."""
         near = self._neighbours(coverage).values()
         most, least = reduce(dr.maximum, near, coverage), reduce(dr.minimum, near, coverage)
         outline = (most > COVERAGE_ROUNDING) & (least < 1 - COVERAGE_ROUNDING)
@@ -208,18 +215,19 @@ class Grid:
 
 
 def _larger(a: Any, b: Any) -> Any:
+    """Larger value of two images; of masks True where either is."""
     return a | b if dr.is_mask_v(a) else dr.maximum(a, b)
 
 
 def parted(coverage: PixelArray) -> Mask:
-    """True where some lines of sight of a pixel hit and some miss."""
+    """True where some lines of sight of a pixel are covered and some are not."""
     return (coverage > COVERAGE_ROUNDING) & (coverage < 1 - COVERAGE_ROUNDING)
 
 
-def _sliding_sum(image: PixelArray, start: mi.Int, place: mi.Int, length: mi.Int, reach: mi.Int) -> PixelArray:
-    """Sums within `reach` of a `place` along lines of pixels that are stored from `start` on and have a `length`."""
+def _sliding_sum(image: PixelArray, start: mi.Int, position: mi.Int, length: mi.Int, reach: mi.Int) -> PixelArray:
+    """Sums within `reach` of a `position` on a line of `length` pixels, which is stored from index `start` on."""
     total = dr.cumsum(image)
-    last = start + dr.minimum(place + reach, length - 1)
-    before = start + dr.maximum(place - reach, 0) - 1
+    last = start + dr.minimum(position + reach, length - 1)
+    before = start + dr.maximum(position - reach, 0) - 1
     upto = dr.gather(mi.Float64, total, mi.UInt32(dr.maximum(before, 0)), before >= 0)
     return dr.gather(mi.Float64, total, mi.UInt32(last)) - upto

@@ -1,6 +1,6 @@
-"""What may not happen while a kernel is recorded: virtual calls record one function of every living plugin.
+"""Recording of kernels: a virtual call records one function of every existing plugin, also of unused scenes.
 
-Also of those in scenes nobody needs any more.
+So plugins must not be deleted during a recording, and unsound surfaces of other scenes must not fail in it.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _checked = ContextVar("scene_is_checked", default=False)
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """Record kernels of a scene that was checked: nothing is collected, and a bad surface elsewhere is dark.
+    """Context manager for kernels of a checked scene: no garbage collection, unsound surfaces of other scenes are dark.
 
-    Did a plugin disappear between two calls in the same kernel, they would differ, and Dr.Jit would define one function
-    twice and abort the process.
+    If a plugin were deleted between two calls in one kernel, the calls would differ, and Dr.Jit would define one
+    function twice and abort the process.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -38,10 +38,10 @@ def recording() -> Iterator[None]:
 
 
 def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
-    """`build(shape)` evaluated now, even while this thread records a kernel; its gradients are not tracked.
+    """Result of `build(shape)`, evaluated at once even while this thread records a kernel; without gradients.
 
-    Light tracers first meet the emitter in the middle of a recording, when nothing can be evaluated. Dr.Jit records
-    by thread, so a thread of its own is free to.
+    Light tracers first call the emitter in the middle of a recording, when its thread cannot evaluate arrays. Dr.Jit
+    records per thread, so that another thread can.
     """
 
     def run() -> Any:
@@ -50,13 +50,14 @@ def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
 
     with ThreadPoolExecutor(1) as pool:
         built = pool.submit(run).result()
-    # What this thread records from now on comes after what that one left unevaluated: on CUDA the handle of a scene.
+    # A new scope puts later operations of this thread after those that the other left unevaluated: on CUDA the handle
+    # of a scene.
     dr.detail.new_scope(dr.backend_v(mi.Float))
     return built
 
 
 def dark_elsewhere(*kinds: str) -> Callable[[Callable], Callable]:
-    """Decorator of an emitter's method: zeros of these kinds where its surface is another scene's and unsound."""
+    """Decorator of an emitter's method: zeros of the types `kinds` if the surface is unsound, in another scene."""
 
     def decorate(method: Callable) -> Callable:
         @wraps(method)
@@ -72,5 +73,5 @@ def dark_elsewhere(*kinds: str) -> Callable[[Callable], Callable]:
 
 
 def scene_is_checked() -> bool:
-    """True while kernels of a scene are recorded whose own surfaces are known to be sound."""
+    """True while kernels are recorded for a scene whose own surfaces have been checked."""
     return _checked.get()

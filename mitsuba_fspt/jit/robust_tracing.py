@@ -1,7 +1,7 @@
-"""Scenes whose ray tracing loses rays at mesh edges, and their cure.
+"""Detection of scenes whose ray tracing loses rays at mesh edges, and robust copies of them.
 
-Embree without its robust mode misses some rays that meet an edge or a vertex exactly. A scene cannot be asked which
-mode it was built in, so the loss itself is looked for.
+Embree without its robust mode misses some rays that meet an edge or a vertex exactly. A scene does not report the mode
+it was built in, so test rays detect the loss itself.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import mitsuba as mi
 
 from .mesh_buffers import triangles
 
-PROBES = 4096
-STEP = 1e-4  # of the distance, from a probed point to its four neighbours in the test
-STEPS = (3242174889, 2447445414)  # of the R₂ sequence, in units of 2⁻³²: even over edges and places on them
+PROBES = 4096  # points on the edges of each mesh
+STEP = 1e-4  # distance from a probed point to its four neighbours in the test, over the distance from the lens
+STEPS = (3242174889, 2447445414)  # of the R₂ sequence, in units of 2⁻³²: uniform over edges and positions on them
 
 
 def robust_scene(scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
-    """`scene` itself, or, where it is seen to lose rays, the same shapes traced robustly (and a warning logged)."""
+    """`scene` itself, or, if it loses rays, a scene of the same shapes in Embree's robust mode, with a warning."""
     lost = lost_rays(scene, lens)
     if not lost:
         return scene
     robust = traced_robustly(scene.shapes())
-    if lost_rays(robust, lens) >= lost:  # as of a scene that is robust: a few are lost in any case
+    if lost_rays(robust, lens) >= lost:  # `scene` was robust: a few rays are lost in any case
         return scene
     mi.Log(
         mi.LogLevel.Warn,
@@ -35,9 +35,9 @@ def robust_scene(scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
 
 
 def traced_robustly(shapes: Sequence[mi.Shape], beside: mi.Scene | None = None) -> mi.Scene:
-    """A scene of these shapes in Embree's robust mode; `mi.load_dict` would give the shapes other names.
+    """Scene of these shapes in Embree's robust mode; `mi.load_dict` would give the shapes other names.
 
-    On CUDA a kernel can trace rays in two scenes only where one of them was set up `beside` the other.
+    On CUDA a kernel can trace rays in two scenes only if one of them was built `beside` the other.
     """
     props = mi.Properties("scene")
     props["embree_use_robust_intersections"] = True
@@ -49,13 +49,14 @@ def traced_robustly(shapes: Sequence[mi.Shape], beside: mi.Scene | None = None) 
 
 
 def lost_rays(scene: mi.Scene, lens: mi.Sensor) -> int:
-    """How many rays from the lens to points on edges meet nothing although four rays around each meet something."""
+    """Number of rays from the lens to points on edges that meet no shape although four rays around each meet one."""
     if not mi.variant().startswith("llvm"):
         return 0
     return sum(_lost_rays(scene, lens, shape) for shape in scene.shapes() if shape.is_mesh())
 
 
 def _lost_rays(scene: mi.Scene, lens: mi.Sensor, mesh: mi.Shape) -> int:
+    """Number of rays lost at the edges of one mesh."""
     target, origin = _points_on_edges(mesh), lens.world_transform() @ mi.Point3f(0, 0, 0)
     d = mi.Vector3f(target - origin)
     frame = mi.Frame3f(dr.normalize(d))
@@ -67,18 +68,18 @@ def _lost_rays(scene: mi.Scene, lens: mi.Sensor, mesh: mi.Shape) -> int:
     around = mi.Bool(True)
     for side in (frame.s, -frame.s, frame.t, -frame.t):
         around &= meets(side * (STEP * dr.norm(d)))
-    # Packets have a code of their own, which loses others.
+    # Embree traces packets of rays by other code, which loses other rays.
     return sum(int(dr.count(around & ~meets(mi.Vector3f(0), together))[0]) for together in (False, True))
 
 
 def _points_on_edges(mesh: mi.Shape) -> mi.Point3f:
-    """`PROBES` points on edges all over a mesh, several on each where its faces are fewer."""
+    """`PROBES` points on edges all over a mesh, several per face if it has fewer faces."""
     positions, faces = triangles(mesh)
     count = max(1, dr.width(faces) // 3)
     number = dr.arange(mi.UInt32, PROBES)
     face = number * max(1, count // PROBES) % count
-    edge, place = (mi.Float(number * step) * 2.0**-32 for step in STEPS)
+    edge, position = (mi.Float(number * step) * 2.0**-32 for step in STEPS)
     start = mi.UInt32(3 * edge)
     ends = [dr.gather(mi.UInt32, faces, 3 * face + corner % 3) for corner in (start, start + 1)]
     a, b = (dr.gather(mi.Point3f, positions, end) for end in ends)
-    return mi.Point3f(dr.lerp(a, b, place))
+    return mi.Point3f(dr.lerp(a, b, position))

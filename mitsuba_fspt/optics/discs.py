@@ -25,8 +25,8 @@ def defocus(depth: Any, focus_distance: Any, shift: Any) -> tuple[Any, Any]:
 
         x = r/scale - ρ · ((u - z)/u)/scale,   scale = 1 - (1 - shift)(u - z)/u        (Eq. M.7 of docs/model.md),
 
-    so that the blur disc of r has its centre at r/scale and the radius R·|u - z|/u/scale, R the disc's own. A `scale`
-    <= 0 is that of a point that no line of sight can meet. Floats, NumPy arrays or Dr.Jit arrays; no unit.
+    so that the blur disc of r has its centre at r/scale and the radius R·|u - z|/u/scale, R the disc's own. A point
+    with `scale` <= 0 counts as one without a bounded blur disc. Floats, NumPy arrays or Dr.Jit arrays; no unit.
     """
     back = (focus_distance - depth) / focus_distance
     return back, 1 - (1 - shift) * back

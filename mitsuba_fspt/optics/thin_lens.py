@@ -166,7 +166,7 @@ def _model(name: str, own: dict[str, object]) -> LensModel:
         if home is None:
             raise OpticsError(f"fspt_lens: no model has a number '{wrong}'. Leave it out or correct its name.")
         raise OpticsError(
-            f"fspt_lens: '{wrong}' = {own[wrong]:g} belongs to model '{home}', this is '{name}'. Leave it out or set "
+            f"fspt_lens: '{wrong}' = {own[wrong]} belongs to model '{home}', this is '{name}'. Leave it out or set "
             f"model to '{home}'."
         )
     return kind(**own)

@@ -1,1 +1,1 @@
-"""Surfaces with a surface flux density J_n, and the files of other programs that they come from."""
+"""Triangle surfaces with a surface flux density J_n, and readers for the files of other programs."""

@@ -1,4 +1,4 @@
-"""Surface flux density J_n from the results of other codes: read, converted to W/mm², checked."""
+"""Import of the surface flux density J_n from results of other codes: reading, conversion to W/mm², checks."""
 
 from __future__ import annotations
 
@@ -31,31 +31,30 @@ def import_flux(
     clip: bool = False,
     flip: bool = False,
 ) -> Phantom:
-    """Phantom from a mesh and values on it, as other codes write them.
+    """Phantom from a mesh and the values on it in the files or arrays of another code.
 
     Parameters
     ----------
-    mesh : a file, or arrays (points (V, 3), cells). Cells are triangles (F, 3) or tetrahedra (T, 4), whose
-        boundary becomes the surface; from 0, or from 1 with format 'mmc' or 'nirfast'.
-    values : one value for each vertex, triangle, tetrahedron or boundary face: a file or an array. None:
-        `mesh` has them.
-    field : which array, property or column holds them; of a table its name or its number from 1
-    per : 'vertex' or 'face', what the values stand on; needed where their number or name leaves that open
+    mesh : file, or arrays (points (V, 3), cells). Cells are triangles (F, 3) or tetrahedra (T, 4), whose
+        boundary becomes the surface; indices count from 0, or from 1 with format 'mmc' or 'nirfast'.
+    values : file or array with one value for each vertex, triangle, tetrahedron or boundary face. None: the values
+        are in `mesh`.
+    field : name of the array, property or column of the values; a column also by its number from 1
+    per : 'vertex' or 'face', the elements that carry the values; needed if their number and name leave that open
     format : 'auto' (by the file's name) or one of `formats.FORMATS`
-    length_unit : 'mm', 'cm' or 'm', of the mesh **and** of its values: W per square of it. MMC's values are
-        the power of a face, whatever the unit.
-    a : the values are fluence, J_n = phi/(2A): A by 'robin', 'haskell' (see `boundary`), or the number
-        itself. None: they are J_n; NIRFAST's are fluence always, and A is its own 'robin' then.
-    n : refractive index of the tissue for A; None: what the file says, else 1.37
+    length_unit : 'mm', 'cm' or 'm', unit of the mesh **and** of its values: W per square of it. MMC's values are
+        power per face, whatever the unit.
+    a : the values are fluence, J_n = phi/(2A), with A by 'robin', 'haskell' (see `optics.boundary`) or as a number.
+        None: they are J_n, except NIRFAST's, which are always fluence, with A by 'robin' as in NIRFAST
+    n : refractive index of the tissue for A; None: that of the file, else 1.37
     clip : set negative values to 0 and record their power
-    flip : turn all faces over
+    flip : reverse the orientation of all faces
 
     Raises
     ------
-    FluxError : unreadable or contradictory input; a closed surface that shows inward; faces that contradict
-        each other.
-    ExitanceError : values that are NaN or infinite, negative without `clip`, or zero everywhere; J_n beyond
-        single precision.
+    FluxError : the input is unreadable or contradictory, the faces of a closed surface point inward, or their
+        orientations are inconsistent.
+    ExitanceError : values are NaN or infinite, negative without `clip`, or 0 everywhere; J_n beyond single precision.
     BackendError : the format needs an optional package.
     """
     scale = millimetres(length_unit, "flux import")
@@ -68,7 +67,7 @@ def import_flux(
     found = replace(found, vertices=found.vertices * scale, faces=found.faces[:, ::-1] if flip else found.faces)
     require_finite(found.values, found.per)
     source = raw.source if values is not None else f"{raw.source} '{found.name}'"
-    with np.errstate(over="ignore"):  # inf is refused next
+    with np.errstate(over="ignore"):  # require_single refuses inf
         exitance, provenance = _exitance(raw, found, scale, a, n)
     require_single(exitance)
     provenance = {"source": source, **provenance}
@@ -81,7 +80,7 @@ def import_flux(
 def _exitance(
     raw: RawMesh, found: SurfaceValues, scale: float, a: str | float | None, n: float | None
 ) -> tuple[NDArray[np.float64], dict[str, str]]:
-    """J_n [W/mm²] of the values as they stand in the file, and how it came about."""
+    """J_n [W/mm²] from the values in the file's unit, and the provenance of the conversion."""
     if a is None and raw.quantity == "fluence":
         a = "robin"
     if n is not None and a not in ("robin", "haskell"):
@@ -96,14 +95,14 @@ def _exitance(
     values = found.values / scale**2
     if a is None:
         return values, {}
-    factor, told = _boundary_factor(a, n, found, raw.source)
-    return values / (2 * factor), {"boundary_factor": told}
+    factor, description = _boundary_factor(a, n, found, raw.source)
+    return values / (2 * factor), {"boundary_factor": description}
 
 
 def _boundary_factor(
     a: str | float, n: float | None, found: SurfaceValues, source: str
 ) -> tuple[float | NDArray[np.float64], str]:
-    """A, one for all or one for each value, and what to record of it."""
+    """A, one for all values or one for each, and its description for the provenance."""
     if n is None and found.index is not None and a in ("robin", "haskell"):
         index = found.index if found.per == "vertex" else found.index[found.faces].mean(axis=1)
         if np.isnan(index).any():
@@ -112,14 +111,14 @@ def _boundary_factor(
         index = np.array([TISSUE_INDEX if n is None else n])
     indices, where = np.unique(index, return_inverse=True)
     factors = np.array([boundary_a(a, float(value)) for value in indices])
-    told = " to ".join(f"{f:.6g}" for f in np.unique(factors[[0, -1]]))
+    description = " to ".join(f"{f:.6g}" for f in np.unique(factors[[0, -1]]))
     if a in ("robin", "haskell"):
-        told += f" ({a}, n = {' to '.join(f'{i:.6g}' for i in np.unique(indices[[0, -1]]))})"
-    return (float(factors[0]) if len(factors) == 1 else factors[where.ravel()]), told
+        description += f" ({a}, n = {' to '.join(f'{i:.6g}' for i in np.unique(indices[[0, -1]]))})"
+    return (float(factors[0]) if len(factors) == 1 else factors[where.ravel()]), description
 
 
 def _require_outward(phantom: Phantom, flip: bool) -> None:
-    """Refuse faces that contradict each other, and a closed surface that shows inward: dark parts."""
+    """Raise FluxError for inconsistent orientations and for a closed surface with inward faces: they would be dark."""
     shape = phantom.closure
     if shape.twisted:
         raise FluxError(
@@ -129,8 +128,8 @@ def _require_outward(phantom: Phantom, flip: bool) -> None:
     if shape.inside_out:
         turned = closure(phantom.vertices, phantom.faces[:, ::-1])
         if turned.outward:
-            mend = "Leave out" if flip else "Give"
-            raise FluxError(f"mesh: the closed surface is inside out, its light would stay inside. {mend} --flip.")
+            fix = "Leave out" if flip else "Give"
+            raise FluxError(f"mesh: the closed surface is inside out, its light would stay inside. {fix} --flip.")
         raise FluxError(
             f"mesh: {shape.inside_out} of its {shape.pieces} closed pieces are inside out. Turn those over in the mesh."
         )
@@ -139,7 +138,7 @@ def _require_outward(phantom: Phantom, flip: bool) -> None:
 def _without_negatives(
     found: SurfaceValues, exitance: NDArray[np.float64], clip: bool
 ) -> tuple[NDArray[np.float64], int, float]:
-    """J_n >= 0, the number of values that were negative, and their power [W]."""
+    """J_n [W/mm²] >= 0, the number of values that were negative, and the magnitude of their power [W]."""
     negative = exitance < 0
     count = int(np.count_nonzero(negative))
     if count == 0:

@@ -1,8 +1,8 @@
-"""The phantom: a triangle surface in mm that gives off light, its exitance J_n in W/mm² on vertices or faces.
+"""Phantom: an emitting triangle surface [mm] with its exitance J_n [W/mm²] on vertices or faces.
 
 phantom = Phantom(vertices, faces, exitance, "vertex", {"source": "my own code"})
 phantom.power
-phantom.write("mouse.ply")  # what fspt_surface reads as mesh_attribute vertex_exitance
+phantom.write("mouse.ply")  # fspt_surface reads it as mesh_attribute vertex_exitance
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from .formats.ply import read_ply, write_ply
 from .surface_mesh import Closure, Indices, Points, closure, face_areas
 
 UNIT = "W/mm^2"
-# What the renderer's 32-bit numbers hold.
+# Range of the renderer's 32-bit numbers.
 LEAST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
-# Words of the report and the PLY's comments that no provenance may overwrite.
+# Keys of the report and of the PLY's comments that no provenance may overwrite.
 RESERVED = {
     *("area", "power", "min", "max", "zeros", "negatives", "removed_power", "removed_percent", "quantity"),
     *("unit", "length_unit", "watertight", "outward", "per", "vertices", "faces"),
@@ -32,19 +32,22 @@ RESERVED = {
 
 @dataclass(frozen=True, eq=False)
 class Phantom:
-    """Triangle surface with exitance, ready for a camera.
+    """Triangle surface with exitance, ready for a scene.
 
-    vertices : (V, 3) [mm]
-    faces : (F, 3), numbers of vertices from 0, anticlockwise seen from outside
-    exitance : J_n, (V,) or (F,) as `per` says, finite, >= 0, not all 0 [W/mm²]; linear between vertices
+    Parameters
+    ----------
+    vertices : array, shape (V, 3) [mm]
+    faces : array, shape (F, 3), indices of vertices from 0, counterclockwise seen from outside
+    exitance : array, shape (V,) or (F,) as set by `per` [W/mm²], J_n, finite, >= 0, not all 0; linear between vertices
     per : 'vertex' or 'face'
-    provenance : where the values come from, single words to texts, for the report and the PLY's comments
-    negatives, removed_power : how many values were negative and became 0, and their power, >= 0 [W]
+    provenance : origin of the values, texts by single-word keys, for the report and the PLY's comments
+    negatives, removed_power : number of values that were negative and became 0, and their power [W], >= 0
 
     Raises
     ------
-    ExitanceError : exitance that is not finite, is negative, or zero everywhere.
-    FluxError : arrays whose shapes do not fit each other, or a surface without area.
+    ExitanceError : exitance is not finite, is negative, is 0 everywhere, or lies beyond single precision.
+    FluxError : the arrays do not fit each other, a key of the provenance is taken, or the surface has no area or
+        vertices beyond single precision.
     """
 
     vertices: Points
@@ -78,7 +81,7 @@ class Phantom:
         if (far := np.abs(self.vertices[self.faces]).max()) > LARGEST:
             raise FluxError(f"phantom: a vertex lies at {far:.3g} mm, the renderer holds {LARGEST:.2g}. Scale it.")
         if not self.area > 0:
-            raise FluxError(f"phantom: the surface has no area ({self.area:g} mm^2). Mend its vertices.")
+            raise FluxError(f"phantom: the surface has no area ({self.area:g} mm^2). Fix its vertices.")
         if not self.power > 0:
             raise ExitanceError("exitance: zero everywhere, the phantom would be black. Check the field's name.")
 
@@ -89,20 +92,20 @@ class Phantom:
 
     @cached_property
     def power(self) -> float:
-        """Σ J_n A [W]; on a face the mean of its corners where J_n stands on vertices."""
+        """Power Σ J_n A [W] over the faces; J_n per vertex counts with the mean of a face's corners."""
         return float(shares(self.vertices, self.faces, self.per) @ self.exitance)
 
     @cached_property
     def closure(self) -> Closure:
-        """Whether the surface is closed and outward."""
+        """Closure and orientation of the surface."""
         return closure(self.vertices, self.faces)
 
     def report(self) -> dict[str, object]:
-        """What to look at before use: numbers, truth values and texts, ready for JSON.
+        """Properties to check before use: numbers, booleans and texts by name, ready for JSON.
 
-        area [mm²], power [W], min and max [W/mm²], zeros and negatives (how many values; negative ones have
+        area [mm²], power [W], min and max [W/mm²], zeros and negatives (numbers of values; negative ones have
         become zeros), watertight, outward (None: open, undecided), unit, removed_power [W], per, vertices,
-        faces, and the provenance. `removed_percent` is relative to the power that stays.
+        faces, and the provenance. `removed_percent` is relative to the remaining power.
         """
         return {
             "area": self.area,
@@ -123,10 +126,10 @@ class Phantom:
         }
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write a binary PLY, whole or not at all, with the exitance where Mitsuba's `ply` plugin finds it.
+        """Write a binary PLY, completely or not at all, with the exitance as a property for Mitsuba's `ply` plugin.
 
         The property `exitance_x` becomes the mesh attribute `vertex_exitance` or `face_exitance`. Numbers are
-        doubles. Comments tell quantity, units, power and provenance.
+        doubles. Comments state quantity, units, power and provenance.
 
         Raises
         ------
@@ -145,12 +148,13 @@ class Phantom:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Phantom:
-        """The phantom that `write` wrote, its numbers bit by bit.
+        """Phantom from a PLY written by `write`, with bit-identical numbers.
 
         Raises
         ------
         FluxError : the file cannot be read, or its comments name other units.
-        ExitanceError : it has no property `exitance_x`; `import_flux` reads others.
+        ExitanceError : the file has no property `exitance_x`, or one on vertices and one on faces; `import_flux` reads
+            other properties.
         """
         raw, comments = read_ply(Path(path))
         exitance = {f.on: f.values for f in raw.fields if f.name == "exitance_x"}
@@ -177,9 +181,10 @@ class Phantom:
 
 
 def shares(vertices: Points, faces: Indices, per: str) -> NDArray[np.float64]:
-    """Area [mm²] that each value stands for, (V,) or (F,): Σ shares · J_n is the power.
+    """Area by which each value counts, shape (V,) or (F,) [mm²]: Σ shares · J_n is the power.
 
-    A face for its own area, a vertex for a third of each of its faces': the exact integral of linear J_n.
+    A face counts with its own area, a vertex with a third of the area of each of its faces: the exact integral of a
+    linear J_n.
     """
     areas = face_areas(vertices, faces)
     if per == "face":
@@ -188,7 +193,7 @@ def shares(vertices: Points, faces: Indices, per: str) -> NDArray[np.float64]:
 
 
 def require_finite(exitance: NDArray[np.float64], per: str) -> None:
-    """Raise ExitanceError where a value is NaN or infinite, with the first one's number."""
+    """Raise ExitanceError if a value is NaN or infinite; the message gives the index of the first."""
     finite = np.isfinite(exitance)
     if not finite.all():
         raise ExitanceError(
@@ -198,7 +203,7 @@ def require_finite(exitance: NDArray[np.float64], per: str) -> None:
 
 
 def require_single(exitance: NDArray[np.float64]) -> None:
-    """Raise ExitanceError where the renderer's single precision would make inf of a value, or 0 of all of them."""
+    """Raise ExitanceError if the renderer's single precision would turn a value into inf, or all values into 0."""
     largest = float(np.abs(exitance).max(initial=0.0))
     if largest > LARGEST or 0 < largest < LEAST:
         raise ExitanceError(

@@ -1,7 +1,7 @@
-"""Triangle surfaces in space: areas, the boundary of tetrahedra, and whether a surface is closed and outward.
+"""Geometry of triangle surfaces: areas, the boundary of tetrahedra, closure and orientation.
 
 Pure NumPy on `points` of shape (V, 3), `faces` of shape (F, 3) and `tetrahedra` of shape (T, 4), indices from
-0. The outward side of a face is the one from which its corners run anticlockwise.
+0. The outward side of a face is the one from which its corners run counterclockwise.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from ..runtime.errors import FluxError
 Points = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# Local faces of a tetrahedron in the order of MMC and of iso2mesh's rowmajor `faceneighbors`, each with the
-# corner opposite to it.
+# Local faces of a tetrahedron in the order of MMC and of iso2mesh's rowmajor `faceneighbors`, and the corner opposite
+# to each.
 TETRAHEDRON_FACES = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
 TETRAHEDRON_OPPOSITE = np.array([3, 2, 1, 0])
 
 
 def face_normals(points: Points, faces: Indices) -> Points:
-    """Vector area of each face, shape (F, 3): outward, its length the area [unit of `points`, squared]."""
+    """Vector area of each face, shape (F, 3) [length unit of `points`, squared]: outward normal times area."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a) / 2
 
@@ -34,10 +34,11 @@ def face_areas(points: Points, faces: Indices) -> NDArray[np.float64]:
 
 
 def boundary(points: Points, tetrahedra: Indices) -> tuple[Indices, Indices]:
-    """Faces (F, 3) that belong to one tetrahedron only, outward, and that tetrahedron's number (F,).
+    """Boundary faces (F, 3) of the tetrahedra, outward, and the index of the tetrahedron of each (F,).
 
-    They come tetrahedron by tetrahedron, within one in the order (1,2,3) (1,2,4) (1,3,4) (2,3,4). The corner
-    opposite to a face tells which side is outward; the order of a tetrahedron's own corners has no say in it.
+    A boundary face belongs to one tetrahedron only. Faces are sorted by tetrahedron, within one in the order (1,2,3)
+    (1,2,4) (1,3,4) (2,3,4). The corner opposite to a face defines its outward side; the order of a tetrahedron's
+    corners has no effect.
 
     Raises
     ------
@@ -61,9 +62,9 @@ def boundary(points: Points, tetrahedra: Indices) -> tuple[Indices, Indices]:
 
 
 def merge(points: Points, faces: Indices) -> tuple[Points, Indices]:
-    """The same faces, in the same order, on points that are all different; none are merged that differ.
+    """Points without duplicates (P, 3), and the same faces in the same order on them (F, 3).
 
-    A format without shared corners (STL) repeats a corner for each of its faces.
+    Only equal points are merged. A format without shared corners (STL) repeats a corner for each of its faces.
     """
     order = np.lexsort(points.T)
     ordered = points[order]
@@ -75,7 +76,7 @@ def merge(points: Points, faces: Indices) -> tuple[Points, Indices]:
 
 
 def compact(points: Points, faces: Indices) -> tuple[Points, Indices, Indices]:
-    """Only the points that the faces use, in order: (points, renumbered faces, numbers of those points)."""
+    """Points that the faces use, in order, the renumbered faces, and the old indices of those points."""
     used = np.zeros(len(points), dtype=bool)
     used[faces.ravel()] = True
     kept = np.flatnonzero(used)
@@ -85,13 +86,13 @@ def compact(points: Points, faces: Indices) -> tuple[Points, Indices, Indices]:
 
 @dataclass(frozen=True)
 class Closure:
-    """How a surface closes.
+    """Closure and orientation of a surface.
 
     watertight : every edge has a face on either side
-    twisted : number of edges that both their faces walk in the same direction; 0 on a surface with two sides
-    inside_out : number of closed pieces that are inside out; None unless watertight and not twisted. A piece
-        that shows towards its own middle is right where it is the wall of a cavity in another piece.
-    pieces : number of connected pieces; 0 where `inside_out` is None
+    twisted : number of edges that both their faces traverse in the same direction; 0 if orientations are consistent
+    inside_out : number of connected pieces whose faces point to the wrong side; None unless watertight and not
+        twisted. Faces that point to the interior of their piece are right if the piece bounds a cavity in another one.
+    pieces : number of connected pieces; 0 if `inside_out` is None
     """
 
     watertight: bool
@@ -101,23 +102,23 @@ class Closure:
 
     @property
     def outward(self) -> bool | None:
-        """Whether every face shows outward; None where an open surface leaves that undecided."""
+        """True if every face points outward; None if the surface is open, which leaves that undecided."""
         if self.twisted:
             return False
         return None if self.inside_out is None else self.inside_out == 0
 
 
 def closure(points: Points, faces: Indices) -> Closure:
-    """Whether the surface is closed and shows outward; corners at the same place count as one."""
+    """Closure and orientation of a surface; corners at equal positions count as one."""
     points, faces = merge(points, faces)
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    faces = faces[distinct]  # a face that is a line or a point bounds nothing
+    faces = faces[distinct]  # a face that is a line or a point bounds no volume
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     _, edge, count = np.unique(low * len(points) + high, return_inverse=True, return_counts=True)
     forward = np.bincount(edge.ravel(), weights=start < end, minlength=len(count))
     watertight = bool(len(count)) and bool((count % 2 == 0).all())
-    # As many faces walk an edge one way as the other; the one face at a rim has no partner.
+    # An edge needs as many faces in one direction as in the other; a face at a rim has no partner.
     twisted = int(np.count_nonzero(np.abs(2 * forward - count) > count % 2))
     if not watertight or twisted:
         return Closure(watertight, twisted, None, 0)
@@ -126,22 +127,22 @@ def closure(points: Points, faces: Indices) -> Closure:
 
 
 def _inside_out(points: Points, faces: Indices) -> tuple[int, int]:
-    """Number of pieces of a closed surface that are inside out, and of all pieces."""
+    """Number of pieces of a closed surface whose faces point to the wrong side, and number of all pieces."""
     label = _pieces(len(points), faces)[faces[:, 0]]
     _, first, piece = np.unique(label, return_index=True, return_inverse=True)
     corners, normals = points[faces], face_normals(points, faces)
-    # About a corner of the piece: far from the origin the volume would cancel.
+    # Relative to a corner of the piece: far from the origin the volume would cancel.
     heights = corners[:, 0] - corners[first, 0][piece]
     volumes = np.bincount(piece, weights=np.einsum("ij,ij->i", normals, heights)) / 3
     areas = np.bincount(piece, weights=np.linalg.norm(normals, axis=1))
-    # A sheet with a face on either side has no volume, only rounding, and is right as it is.
-    hollow = np.flatnonzero(volumes < -1e-9 * areas**1.5)  # few: cavities and mistakes
+    # A sheet with a face on either side has no volume, only rounding error, and counts as right.
+    hollow = np.flatnonzero(volumes < -1e-9 * areas**1.5)  # few: cavities and inverted pieces
     if len(hollow) == 0:
         return 0, len(first)
     lowest, highest = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     wrong = 0
     for number in hollow:
-        # A point of no particular place on the piece: the line upwards meets no edge of an aligned mesh.
+        # A generic point of the piece: the line upwards from it meets no edge of an axis-aligned mesh.
         point = np.array([0.5377, 0.2719, 0.1904]) @ corners[first[number]]
         near = ((lowest <= point[:2]) & (highest >= point[:2])).all(axis=1) & (piece != number)
         wrong += _crossings_above(point, corners[near]) <= 0
@@ -149,7 +150,7 @@ def _inside_out(points: Points, faces: Indices) -> tuple[int, int]:
 
 
 def _crossings_above(point: Points, corners: NDArray[np.float64]) -> int:
-    """Faces met on the way up from `point`, outward ones minus inward ones: 1 inside a body, 0 outside."""
+    """Number of faces above `point` along +z, outward ones minus inward ones: 1 inside an object, 0 outside."""
     x, y, z = np.moveaxis(corners - point, 2, 0)
     side = x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)  # twice the area of (origin, corner, next)
     up, down = (side > 0).all(axis=1), (side < 0).all(axis=1)
@@ -158,12 +159,12 @@ def _crossings_above(point: Points, corners: NDArray[np.float64]) -> int:
 
 
 def _pieces(count: int, faces: Indices) -> Indices:
-    """For each of `count` points the smallest number of a point that the faces connect it with."""
+    """Smallest index of a point that faces connect with each of `count` points, shape (count,)."""
     label = np.arange(count)
     while True:
         before = label.copy()
         lowest = label[faces].min(axis=1).repeat(3)
-        np.minimum.at(label, before[faces.ravel()], lowest)  # hook whole trees, not single points
+        np.minimum.at(label, before[faces.ravel()], lowest)  # attach whole trees, not single points
         np.minimum.at(label, faces.ravel(), lowest)
         label = label[label]
         if np.array_equal(label, before):
@@ -171,7 +172,7 @@ def _pieces(count: int, faces: Indices) -> Indices:
 
 
 def _multiplicity(triples: Indices, count: int) -> Indices:
-    """How often each row of `triples` (sorted in the row, numbers below `count`) occurs among all rows."""
+    """Number of occurrences of each row of `triples` (N, 3) among all rows; rows are sorted, entries below `count`."""
     pair = triples[:, 0] * count + triples[:, 1]
     if count > 2**21:  # three such numbers no longer fit in 63 bits: number the pairs first
         _, pair = np.unique(pair, return_inverse=True)

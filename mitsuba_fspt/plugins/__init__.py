@@ -1,4 +1,4 @@
-"""The three plugins, registered with whichever JIT variant of Mitsuba is active. One plugin a file."""
+"""The three plugins, registered with the active JIT variant of Mitsuba; one plugin per file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _registered: set[str] = set()
 
 
 def register() -> None:
-    """Register `fspt_surface`, `fspt_lens` and `fspt_integral` with the active variant; a no-op the second time.
+    """Register `fspt_surface`, `fspt_lens` and `fspt_integral` with the active variant, once per variant.
 
-    The classes derive from the active variant's base classes, so their modules run once for every variant.
-    Scalar variants get only a refusal: Python plugins crawl there, and mesh attribute emitters crash.
+    The classes derive from the active variant's base classes, so their modules are executed once for every variant.
+    Scalar variants get plugins that refuse: Python plugins are very slow there, and mesh attribute emitters crash.
     """
     variant = mi.variant()
     if variant is None or variant in _registered:
@@ -38,8 +38,8 @@ def register() -> None:
 def _refuse_in(variant: str) -> None:
     """Register plugins that refuse a scalar variant.
 
-    Whatever the active variant, `mi.load_dict` asks scalar_rgb what kind of plugin a name is. Left without an answer
-    it takes equal emitters of two shapes for copies of one, which then cannot stand on both.
+    In every variant `mi.load_dict` queries scalar_rgb for the kind of a plugin's name. Without an answer it takes equal
+    emitters of two shapes for copies of one, which cannot belong to both.
     """
     if variant in _registered:
         return

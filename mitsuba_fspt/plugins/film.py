@@ -1,4 +1,4 @@
-"""What `fspt_lens` is given: numbers, sampler, and a film whose pixels each gather one float32 number alone."""
+"""Inputs of `fspt_lens`: its numbers, a sampler, and a film whose pixels each store one independent float32 number."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ..runtime.errors import OpticsError
 
 
 def own_film(props: mi.Properties) -> None:
-    """Replace the film of the scene file by one of its size that stores power: monochrome, float32, box filter."""
+    """Replace the film in `props` by one of equal size and crop that stores power: monochrome, float32, box filter."""
     size, crop_offset, crop_size = (256, 256), (0, 0), None
     for name, child in props.objects():
         if isinstance(child, mi.Film):
@@ -26,7 +26,7 @@ def own_film(props: mi.Properties) -> None:
 
 
 def default_sampler(props: mi.Properties) -> None:
-    """The best stock sampler for one bounce, where the scene file names none."""
+    """Add the best stock sampler for one bounce to `props` if the scene file names none."""
     if not any(isinstance(child, mi.Sampler) for _, child in props.objects()):
         sampler = mi.Properties("multijitter")
         sampler["sample_count"] = 64
@@ -34,15 +34,15 @@ def default_sampler(props: mi.Properties) -> None:
 
 
 def _make(props: mi.Properties) -> mi.Object:
-    """A plugin made without `mi.load_dict`, which sets the process's file resolver aside for a moment.
+    """Plugin object created without `mi.load_dict`, which replaces the process's file resolver for a moment.
 
-    Scenes load on several threads, and one that looks for a file in that moment reads freed memory.
+    Scenes load on several threads, and a thread that searches for a file in that moment reads freed memory.
     """
     return mi.PluginManager.instance().create_object(props)
 
 
 def number(props: mi.Properties, name: str) -> mi.Float64:
-    """A parameter of the lens, in double precision; OpticsError where it is no number."""
+    """Value of a lens parameter in double precision; OpticsError if it is no number."""
     value = props[name]
     try:
         if not isinstance(value, bool):

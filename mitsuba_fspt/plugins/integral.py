@@ -28,8 +28,8 @@ from ..jit.robust_tracing import robust_scene
 from ..runtime.errors import SceneError
 
 MEANINGLESS = ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "timeout")
-LEAST_DISPLACEMENT = 1e-3  # pixels; more only far from the world's origin
-NARROW = 0.1  # pixels with more than so many times rtol of light in narrow spots are left to the surface form
+LEAST_DISPLACEMENT = 1e-3  # pixels; larger ones occur only far from the world's origin
+NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
 UNCERTAINTY = 2.0  # factor to which that light is known
 
 
@@ -44,22 +44,23 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
      * - rtol
        - |float|
-       - Error asked for on every pixel, relative to the brightest pixel (Default: 1e-3).
+       - Requested error of every pixel, relative to the brightest pixel (Default: 1e-3).
      * - domain
        - |string|
        - pupil: lines of sight from every pixel (Default). surface: the power of every surface element is spread
-         over the pixels its blur disc covers. Two ways of writing Eq. 9. Light from bodies and spots thinner than
+         over the pixels its blur disc covers. Both are forms of Eq. 9. Light from objects and spots thinner than
          half a pixel or half their blur disc, which lines of sight from the pixels would miss, is spread in any case.
      * - pixel
        - |string|
        - area: integrate over the pixel (Default). centre: the value at its centre times its area, as in the paper.
      * - max_nodes
        - |int|
-       - Lines of sight a pixel may take at most (Default: 200000), four in any case; domain surface: on average, and
-         256 in any case.
+       - Most lines of sight per pixel (Default: 200000), four in any case; domain surface: on average, and 256 in any
+         case.
      * - shortcuts
        - |bool|
-       - Leave out what the scene does not need (Default: true). Without, the same power comes out, later.
+       - Omit computations that the scene does not need (Default: true). false gives the same power, within the
+         requested error, in more time.
 
     Needs an `fspt_lens`. Deterministic: the same bits every run; sampler, samples per pixel and seed are not used.
     """
@@ -68,14 +69,16 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         _refuse_meaningless(props)
         super().__init__(props)
         self.quadrature = _quadrature_of(props)
-        # What was found out about the last scene; the scene itself, whose child this is, must not be kept.
-        self._sound: list[object] = []
+        # Results about the last scene; a reference to the scene, whose child this integrator is, would be a cycle.
+        self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
         self._window, self._narrow, self._faces = CachedValue(), CachedValue(), CachedValue()
 
     def solve(self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None) -> Solution:
-        """Power, error and coverage of the sensor's crop window, with another `quadrature` than the integrator's own.
+        """Power, error and coverage of the sensor's crop window, by `quadrature` or the integrator's own.
 
-        Raises SceneError or ExitanceError as in `check_scene`, or where something else than surfaces shines.
+        Raises
+        ------
+        SceneError, ExitanceError : as in `check_scene`, or the scene has an environment emitter.
         """
         quadrature = quadrature or self.quadrature
         check_scene(scene, sensor)
@@ -85,16 +88,16 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
             solution = self._solve_in(window, traced, sensor, quadrature)
         error = solution.error
-        if sensor.rounding >= LEAST_DISPLACEMENT and 0 not in window.shape:  # by less lines of sight move at random
-            error = error + window.expand(_moved(window.cut(solution.power), sensor.rounding))
+        if sensor.rounding >= LEAST_DISPLACEMENT and 0 not in window.shape:  # smaller displacements are random
+            error = error + window.expand(_displacement_error(window.cut(solution.power), sensor.rounding))
         return replace(solution, error=error, findings=(_outside(window), *solution.findings))
 
     def _solve_in(self, window: Window, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
-        """The form of Eq. 9 asked for; pixels with light of narrow spots take the surface form in any case."""
+        """Solution by the requested form of Eq. 9; pixels with light of narrow spots always take the surface form."""
         if 0 in window.shape:
             return Solution(*np.zeros((3, *window.full)), rays=0)
         view = View.of(scene, lens, window, self._faces_of(scene) if quadrature.takes("record") else None)
-        # Light from the surface knows no border on the film: pixels that the image-plane stop cuts take lines of sight.
+        # The surface form ignores the border of the image-plane stop: pixels that it cuts take lines of sight.
         inside, cut = window.field_stop(lens)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
@@ -112,28 +115,31 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         return replace(solution, error=np.maximum(solution.error, _missed(narrow, where, cut, window, lens, solution)))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
-        """`scene`, or its robust twin where it loses rays; looked at once a scene."""
+        """`scene`, or a robust copy if it loses rays; a scene without loss is tested once."""
         marks = [mark_of(emitter) for emitter in scene.emitters()]
-        if marks != self._sound:
+        if marks != self._lossless:
             robust = robust_scene(scene, lens)
             if robust is not scene:
                 return robust
-            self._sound = marks
+            self._lossless = marks
         return scene
 
     def _visible_window(self, scene: mi.Scene, lens: mi.Sensor, everywhere: bool) -> Window:
+        """Window of the pixels that can see an emitter, or of all `everywhere`; cached."""
         boxes = glowing_boxes(scene)
         return self._window.recall((boxes, _view(lens), everywhere), lambda: window_of(boxes, lens, everywhere))
 
     def _faces_of(self, scene: mi.Scene) -> FaceTable | None:
+        """Table of the scene's faces, None if `FaceTable.of` gives none; cached."""
         shapes = scene.shapes()
         edition = edition_of(shapes)
         return None if edition is None else self._faces.recall(edition, lambda: FaceTable.of(shapes))
 
     def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
+        """Light of objects and spots that lines of sight may miss; cached."""
         emitters = scene.emitters()
         editions = [(mark_of(emitter), getattr(emitter, "edition", 0)) for emitter in emitters]
-        state = (editions, glowing_boxes(scene), _places(scene.shapes()), _view(lens), window)
+        state = (editions, glowing_boxes(scene), _poses(scene.shapes()), _view(lens), window)
         return self._narrow.recall(state, lambda: narrow_light(scene, lens, window))
 
     def render(
@@ -156,7 +162,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
 
 def _refuse_meaningless(props: mi.Properties) -> None:
-    """What Mitsuba's base classes take from every integrator, and would do nothing here."""
+    """Raise SceneError for a parameter that Mitsuba's base classes accept and that would have no effect here."""
     for name in MEANINGLESS:
         if name in props:
             raise SceneError(
@@ -166,6 +172,7 @@ def _refuse_meaningless(props: mi.Properties) -> None:
 
 
 def _quadrature_of(props: mi.Properties) -> Quadrature:
+    """Quadrature from the integrator's parameters; SceneError if one is wrong."""
     defaults = Quadrature()
     shortcuts = props.get("shortcuts", True)
     if not isinstance(shortcuts, bool):
@@ -180,14 +187,14 @@ def _quadrature_of(props: mi.Properties) -> Quadrature:
 
 
 class CachedValue:
-    """The last thing found out, for as long as the `state` that it follows from is the same."""
+    """Cache of one result, valid as long as the `state` that it depends on is unchanged."""
 
     def __init__(self) -> None:
         self._state: object = None
         self._found: Any = None
 
     def recall(self, state: object, find: Callable[[], Any]) -> Any:
-        """What `find` gave for this state."""
+        """Result of `find` for this state, computed if the state has changed."""
         if state != self._state:
             self._found = find()
             self._state = state
@@ -195,18 +202,19 @@ class CachedValue:
 
 
 def _view(lens: mi.Sensor) -> tuple[object, ...]:
-    """All of a lens and its film that a picture depends on."""
+    """All parameters of a lens and its film that a picture depends on."""
     film = lens.film()
     sizes = (int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
     return (lens.optics, lens.pixel_pitch, lens.placement, *sizes)
 
 
-def _places(shapes: list[mi.Shape]) -> list[tuple[float, ...]]:
-    """Where the bodies are that may hide one another; nothing of one alone."""
-    return [_place(shape) for shape in shapes] if len(shapes) > 1 else []
+def _poses(shapes: list[mi.Shape]) -> list[tuple[float, ...]]:
+    """Poses of shapes, which may hide one another; empty for a single shape."""
+    return [_pose(shape) for shape in shapes] if len(shapes) > 1 else []
 
 
-def _place(shape: mi.Shape) -> tuple[float, ...]:
+def _pose(shape: mi.Shape) -> tuple[float, ...]:
+    """Bounding box of a shape, with the index of its vertex buffer or the matrix of its `to_world`."""
     box = (*shape.bbox().min, *shape.bbox().max)
     if shape.is_mesh():
         return (buffers(shape)[0].index, *box)
@@ -227,14 +235,15 @@ def _missed(
     return np.maximum(bright, window.expand(np.where(cut, 0, light)) * lens.etendue)
 
 
-def _moved(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
-    """What lines of sight that float32 moves by `rounding` [pixels] may change."""
+def _displacement_error(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
+    """Change of the power [W], shape (h, w), if float32 displaces lines of sight by `rounding` [pixels]."""
     grid = Grid(power.shape)
     x, y = grid.gradient(grid.flat(power))
     return rounding * grid.array(grid.spread_max(dr.sqrt(x * x + y * y)))
 
 
 def _outside(window: Window) -> Finding:
+    """Finding about the pixels outside the visible window."""
     inside, pixels = window.count, math.prod(window.full)
     return Finding("outside", inside < pixels, f"{inside} of {pixels} pixels can see what glows")
 

@@ -1,4 +1,4 @@
-"""`fspt_lens`: the camera of the paper, a thin lens with a diaphragm, whose film holds power in W on the pixel."""
+"""`fspt_lens`: the paper's camera, a thin lens with a diaphragm, whose film stores the power [W] on each pixel."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ..runtime.errors import OpticsError
 from .film import default_sampler, number, own_film
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
-STRETCH = 1e-5  # by which float32 may make a rotation's matrix differ from one
-CLEAR, MOST_CLEAR = 0.999, 0.9  # of the depth of what is nearest, and of u, that lines of sight leave out
-EPSILON = 2.0**-23  # float32's rounding of a length, relative to the largest one it comes from
+STRETCH = 1e-5  # deviation of a rotation's matrix from orthonormality that float32 may cause
+CLEAR, MOST_CLEAR = 0.999, 0.9  # of the nearest depth of the scene, and of u: lines of sight skip so much
+EPSILON = 2.0**-23  # float32's rounding error of a length, relative to the largest length it is computed from
 
 
 class FsptLens(mi.Sensor):
@@ -57,16 +57,16 @@ class FsptLens(mi.Sensor):
        - Sine of the half angle of that cone, in (0, 1); only with model ripoll.
      * - image_stop_diameter
        - |float| [mm]
-       - Optional circular stop on the detector, centred on the optical axis: light beside it reaches no pixel, a pixel
-         that its border cuts gets what falls on the part inside. Updatable.
+       - Optional circular stop on the detector, centred on the optical axis: light outside it reaches no pixel, a pixel
+         that its border cuts receives the light on the part inside. Updatable.
      * - to_world
        - |transform|
        - Rotation and translation. Puts the lens centre at the origin looking along +z. Updatable.
 
-    The sensor weighs a line of sight from lens point a to virtual point r_vd with A_vd A_pupil cos⁴θ/u², so that
-    the mean of weight × radiance over a pixel is the power on it [W] (pupil form of Eq. 9). A power on a pixel is one
-    float32 number gathered by that pixel alone, so the film becomes a monochrome float32 film with a box filter
-    whatever the scene file says; its size and crop window are kept.
+    The sensor weights a line of sight from lens point a to virtual point r_vd by A_vd A_pupil cos⁴θ/u², so that
+    the mean of weight × radiance over a pixel is the power on it [W] (pupil form of Eq. 9). A pixel stores its power as
+    one float32 number that no other pixel contributes to, so any film of the scene file is replaced by a monochrome
+    float32 film with a box filter; size and crop window are kept.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -92,11 +92,11 @@ class FsptLens(mi.Sensor):
         try:
             self._update()
         except OpticsError as error:
-            self.fault = error  # lines of sight follow the numbers before
+            self.fault = error  # the numbers before the update stay in use
             raise
 
     def _update(self) -> None:
-        """Check the numbers and derive what the kernels read; opaque, so that a new value compiles nothing."""
+        """Check the numbers and derive the kernels' inputs, opaque so that a new value needs no compilation."""
         numbers = {name: float(value[0]) for name, value in self._numbers.items()}
         pitch = numbers.pop("pixel_pitch")
         if not 0 < pitch < float("inf"):
@@ -114,19 +114,19 @@ class FsptLens(mi.Sensor):
         self.pixel_pitch = pitch
         self.virtual_pitch = pitch / self.optics.magnification
         self._pupil = Pupil(self.optics)
-        self._seen = dr.opaque(mi.Float, self.optics.seen_field)
+        self._stop_radius = dr.opaque(mi.Float, self.optics.seen_field)
         self._u = dr.opaque(mi.Float, self.optics.focus_distance)
         self._pitch = dr.opaque(mi.Float, self.virtual_pitch)
-        # Opaque: another film is the same kernel.
+        # Opaque: films of all sizes share the kernels.
         self._middle = mi.Point2f(*(dr.opaque(mi.Float, 0.5 * int(n)) for n in self.film().size()))
         self.etendue = pixel_etendue(self.virtual_pitch, self.optics.discs[0].radius, self.optics.focus_distance)
         self._flat = dr.opaque(mi.Float, flat_share())
         self._etendue = dr.opaque(mi.Float, self.etendue * flat_share())
         self._solid_angle = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
         dr.make_opaque(self.m_to_world)
-        # How far float32 may move a line of sight on the virtual detector plane [virtual pixels].
-        place = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
-        self.rounding = EPSILON * (place + self.optics.focus_distance) / self.virtual_pitch
+        # Largest displacement of a line of sight by float32 on the virtual detector plane [virtual pixels].
+        farthest = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
+        self.rounding = EPSILON * (farthest + self.optics.focus_distance) / self.virtual_pitch
 
     # ------------------------------------------------------------------ lines of sight
 
@@ -140,10 +140,10 @@ class FsptLens(mi.Sensor):
     def line_of_sight(
         self, position: mi.Point2f, pupil: mi.Point2f, start: mi.Float | float = 0.0
     ) -> tuple[mi.Ray3f, mi.Float, mi.Bool]:
-        """Ray from the pupil point through the virtual point, its cosθ to the optical axis, and whether it passes.
+        """Ray from the pupil point through the virtual point, its cosθ to the optical axis, and True if it passes.
 
-        `position` [film pixels], `pupil` [unit disc], on the part that `open_pupil` leaves; the ray begins at depth
-        `start` < u [mm]. A line of sight beside the image-plane stop does not pass.
+        `position` [film pixels]; `pupil` [unit disc], on the part that `open_pupil` leaves; `start` < u [mm], the depth
+        at which the ray begins. A line of sight outside the image-plane stop does not pass.
         """
         x = self.virtual_point(position)
         a = self._pupil.on_lens(x, pupil)
@@ -151,7 +151,7 @@ class FsptLens(mi.Sensor):
         cos_theta = self._u * dr.rcp(dr.norm(towards))
         share = start / self._u
         offset = self.m_to_world @ (mi.Vector3f(a.x, a.y, 0) + share * towards)
-        # Far from the world's origin that point is rounded: from where it lies then, aim at the same virtual point.
+        # Far from the world's origin the start point is rounded: the ray aims from there at the same virtual point.
         centre = mi.Point3f(self.m_to_world.translation())
         origin = centre + offset
         lost = offset - (origin - centre)
@@ -162,16 +162,17 @@ class FsptLens(mi.Sensor):
         )
 
     def open_pupil(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
-        """Point of the part of the pupil that a second border (Eq. 5) leaves open at a film position; its share.
+        """Point of the part of the pupil that a second border (Eq. 5) leaves open at a film position, and its share.
 
-        Even on it if `pupil` is on the unit disc, so that rules over the disc need not know of the border.
+        Its density on that part is uniform if that of `pupil` is on the unit disc, so that rules over the disc apply
+        with and without the border.
         """
         return self._pupil.opened(self.virtual_point(position), pupil)
 
     def blur_disc(self, point: mi.Point3f) -> tuple[mi.Point2f, mi.Float, mi.Float]:
         """Blur disc of a world point: centre and signed radius [film pixels]; side of a pixel at its depth [mm].
 
-        Its light that heads for `pupil` [unit disc] arrives at centre + radius · pupil: r = x + (a − x)(u − z)/u with
+        Light of the point towards `pupil` [unit disc] arrives at centre + radius · pupil: r = x + (a − x)(u − z)/u with
         a = shift·x + ρ, solved for the virtual point x of the line through r and ρ.
         """
         p = self._in_camera(point)
@@ -181,10 +182,11 @@ class FsptLens(mi.Sensor):
         return mi.Point2f(centre), self._pupil.radius * back / side, side
 
     def arrival(self, point: mi.Point3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
-        """Where light of a world point that heads for `pupil` [unit disc] arrives: film position [pixels], lens point.
+        """Arrival of the light of a world point towards `pupil` [unit disc], four values.
 
-        Third (da/dρ)² cosθ u²/d², by which A_pupil/u² turns into the solid angle of the pupil [sr], 0 where no light
-        passes the lens (an image-plane stop has no say); fourth cosθ of the line of sight to the optical axis.
+        Film position [pixels]; lens point in world coordinates [mm]; weight (da/dρ)² cosθ u²/d², by which A_pupil/u²
+        becomes the solid angle of the pupil [sr], 0 where no light passes the lens (an image-plane stop has no effect
+        on it); cosθ of the line of sight to the optical axis.
         """
         centre, radius, _ = self.blur_disc(point)
         position, shift = centre + radius * pupil, self._pupil.shift
@@ -194,7 +196,7 @@ class FsptLens(mi.Sensor):
         depth = self._in_camera(point).z
         distance = dr.norm(lens_point - point)
         cos_theta = depth / distance
-        # dA_a = (da/dρ)² dA_ρ: the pupil point moves along with x unless the disc is fixed in the lens plane.
+        # dA_a = (da/dρ)² dA_ρ: the pupil point shifts along with x unless the disc is fixed in the lens plane.
         back, scale = defocus(depth, self._u, shift)
         growth = 1 - shift * back / scale
         weight = dr.square(growth * self._u / distance) * cos_theta
@@ -202,14 +204,14 @@ class FsptLens(mi.Sensor):
         return position, lens_point, dr.select(passes, weight, 0), cos_theta
 
     def _in_camera(self, point: mi.Point3f) -> mi.Vector3f:
-        """A world point in the camera frame; the difference first, which is exact where the world is far off."""
+        """World point in the camera frame [mm]; the difference is taken first, exact far from the world's origin."""
         return self.m_to_world.inverse() @ mi.Vector3f(point - mi.Point3f(self.m_to_world.translation()))
 
     def _through_stop(self, x: mi.Point2f) -> mi.Bool:
-        """True where the image of virtual point x lies inside the image-plane stop."""
-        return dr.squared_norm(x) <= dr.square(self._seen)
+        """True if the image of virtual point x lies inside the image-plane stop."""
+        return dr.squared_norm(x) <= dr.square(self._stop_radius)
 
-    # ------------------------------------------------------------------ what the film can see, in double precision
+    # ------------------------------------------------------------------ the visible space, in double precision
 
     def blur_radius(self, depth: mi.Float64) -> mi.Float64:
         """Radius [pixels] of the blur disc of a point at `depth` z [mm], < 0 beyond the sharp plane; inf at z <= 0."""
@@ -221,21 +223,21 @@ class FsptLens(mi.Sensor):
         return dr.select((scale > 0) & ~dr.isnan(blur), blur, dr.inf)
 
     def clear_depth(self, box: mi.ScalarBoundingBox3f) -> float:
-        """Depth [mm] from 0 to most of u before which nothing of a box lies; 0 where the lens stands in it."""
+        """Depth [mm], in 0 … 0.9 u, before which no part of a box lies; 0 if the box reaches the lens plane."""
         ends = np.array([box.min, box.max], np.float64)
         axis, offset = self._to_camera[2, :3], self._to_camera[2, 3]
         nearest = float((ends * axis).min(axis=0).sum() + offset)
         return min(max(CLEAR * nearest, 0.0), MOST_CLEAR * self.optics.focus_distance)
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; inf: nothing bounds it."""
-        # A turned sphere does not find a few of its own points: they may be anywhere, z = -inf.
+        """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; radius inf: unbounded."""
+        # A rotated sphere gives no finite position for a few of its points: z = -inf makes their discs unbounded.
         lost = ~np.isfinite(points).all(axis=-1, keepdims=True)
         p = np.where(lost, 0, points) @ self._to_camera[:3, :3].T + self._to_camera[:3, 3]
         p[..., 2:][lost] = -np.inf
         disc, u = self.optics.discs[0], self.optics.focus_distance
         _, scale = defocus(p[..., 2:], u, disc.shift)
-        scale = np.where(scale > 0, scale, 1)  # there the radius is infinite
+        scale = np.where(scale > 0, scale, 1)  # elsewhere the radius is infinite
         centre = 0.5 * np.array(self.film().size(), np.float64) - p[..., :2] / (scale * self.virtual_pitch)
         blur = self.blur_radius(mi.Float64(p[..., 2].ravel())).numpy()
         return centre, np.abs(blur).reshape(p[..., 2:].shape)
@@ -250,7 +252,11 @@ class FsptLens(mi.Sensor):
         sample3: mi.Point2f,
         active: mi.Bool = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Line of sight through a uniform point of the crop window and a uniform point of the pupil."""
+        """Line of sight through a uniform point of the crop window and a uniform point of the pupil, and its weight.
+
+        The weight is the étendue of a pixel times cos⁴θ [mm² sr], 0 where no light passes; spectral variants multiply
+        it by the weight of the wavelengths.
+        """
         film = self.film()
         position = sample2 * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
         pupil = mi.warp.square_to_uniform_disk_concentric(sample3)
@@ -264,9 +270,9 @@ class FsptLens(mi.Sensor):
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        """Direction from `it` to a uniform point of the pupil, with the film position its light arrives at.
+        """Direction from `it` to a uniform point of the pupil, with the film position at which its light arrives.
 
-        The weight is A_pupil cosθ/d² over the number of crop pixels, by which light tracers multiply again.
+        The weight is A_pupil cosθ/d² [sr] over the number of crop pixels, by which light tracers multiply again.
         """
         film = self.film()
         pupil = mi.warp.square_to_uniform_disk_concentric(sample)
@@ -285,7 +291,7 @@ class FsptLens(mi.Sensor):
         return ds, mi.Spectrum(dr.select(inside, self._flat * solid_angle / (size.x * size.y), 0))
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
-        """Density [1/sr] that `sample_direction` wrote into `ds`; of other records it knows nothing."""
+        """Density [1/sr] that `sample_direction` has written into `ds`; other records are not supported."""
         return dr.select(active, ds.pdf, 0)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:

@@ -1,4 +1,4 @@
-"""`fspt_surface`: the phantom's surface as an emitter with the surface flux density J_n [W/mm²]."""
+"""`fspt_surface`: emitter on the phantom's surface with the surface flux density J_n [W/mm²]."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class FsptSurface(mi.Emitter):
     r"""
     .. _emitter-fspt_surface:
 
-    Glowing surface (:monosp:`fspt_surface`)
-    ----------------------------------------
+    Emitting surface (:monosp:`fspt_surface`)
+    -----------------------------------------
 
     .. pluginparameters::
 
@@ -38,7 +38,7 @@ class FsptSurface(mi.Emitter):
        - Absorption µa >= 0 and reduced scattering µs' > 0; only with last_flight.
      * - fluence
        - |volume|
-       - Fluence Φ > 0 in the tissue, in any unit, a gridvolume that holds the shape; only with last_flight. Updatable.
+       - Fluence Φ > 0 in the tissue, in any unit, a gridvolume around the shape; only with last_flight. Updatable.
 
     The radiance is 0 on the inward side, the side away from the geometric normal; on the outward side, with µ the
     cosine to the normal, ∫ L µ dΩ = J_n and
@@ -47,10 +47,10 @@ class FsptSurface(mi.Emitter):
     - fresnel: L = J_n/(4π) · (2A + 3µ_i) · T(µ)/n², the diffusion approximation's radiance refracted at a smooth
       border; µ_i = √(1 − (1 − µ²)/n²), T the unpolarised Fresnel transmittance, A of Haskell et al. (1994). At
       n = 1.37 it is 1.11 × J_n/π face-on and falls to 0 at the limb;
-    - last_flight: L = C · T(µ)/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds. What leaves is what scatters
-      last, on the refracted line of sight ω_i; it sees the slope of the fluence along the surface and its bend above a
-      shallow source, which the other laws do not. C(r) is such that the hemisphere carries J_n(r). The volume is what
-      'fspt flux solve --volume' writes; turn it along with the shape.
+    - last_flight: L = C · T(µ)/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds. The light was scattered for the
+      last time on the refracted line of sight ω_i. The law includes the slope of the fluence along the surface and its
+      curvature above a shallow source, which the other laws neglect. C(r) makes ∫ L µ dΩ = J_n(r). 'fspt flux solve
+      --volume' writes the volume; it must be rotated along with the shape.
 
     Positions are sampled ∝ J_n, directions ∝ µ.
     """
@@ -67,11 +67,11 @@ class FsptSurface(mi.Emitter):
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
         self._positions: ElementDistribution | None = None
         self._probe: Probe | None = None
-        self._source: exitance.ExitanceState | None = None  # known after `check`
-        self.single_faces: tuple[mi.Float, ...] = ()  # of the mesh that is known to hold no face twice
-        self.brightest = 0.0  # largest J_n [W/mm²], known after `check`
-        # For those who remember something about it: what tells it from all others, and counts the changes of J_n. Who
-        # kept it instead, and not its shape, would leave Dr.Jit an emitter to record whose shape is gone.
+        self._source: exitance.ExitanceState | None = None  # data of J_n at the last `check`
+        self.single_faces: tuple[mi.Float, ...] = ()  # buffers of the mesh for which no face was found twice
+        self.brightest = 0.0  # largest J_n [W/mm²], set by `check`
+        # For caches: `mark` identifies this emitter, `edition` counts the changes of J_n. A cache that held the emitter
+        # itself, but not its shape, would leave Dr.Jit an emitter to record whose shape is deleted.
         self.mark, self.edition = object(), 0
         self._shape: mi.ShapePtr | None = None
 
@@ -87,6 +87,7 @@ class FsptSurface(mi.Emitter):
         self._forget_exitance()
 
     def _forget_exitance(self) -> None:
+        """Discard all results that depend on J_n."""
         self._positions = self._source = None
         self.edition += 1
 
@@ -97,13 +98,13 @@ class FsptSurface(mi.Emitter):
         return mi.depolarizer(self._radiance(si, si.to_world(si.wi), active))
 
     def _radiance(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Radiance [W/mm²/sr] towards a unit vector of the world, 0 on the inward side."""
+        """Radiance [W/mm²/sr] towards a unit vector in world coordinates, 0 on the inward side."""
         if not self.sound():
             return mi.UnpolarizedSpectrum(0)
         outward = active & (dr.dot(si.n, direction) > 0)
         radiance = self.exitance.eval(si, outward) * self.law.profile(si, direction, outward)
-        # On a sliver, where single precision finds no place to interpolate at, J_n is not a number.
-        # `select` makes a plain array of it, of which Mitsuba's depolarizer would take the first wavelength alone.
+        # On a sliver, where interpolation in single precision fails, J_n is NaN.
+        # `select` returns a plain array, of which Mitsuba's depolarizer would take the first wavelength only.
         return mi.UnpolarizedSpectrum(dr.select(outward & dr.isfinite(radiance), radiance, 0))
 
     # ------------------------------------------------------------------ sampling
@@ -120,6 +121,7 @@ class FsptSurface(mi.Emitter):
 
     @dark_elsewhere("Float")
     def pdf_position(self, ps: mi.PositionSample3f, active: mi.Bool = True) -> mi.Float:
+        """Density of `sample_position` [1/mm²]."""
         return self._distribution().pdf(self._surface_at(ps, active), active)
 
     @dark_elsewhere("Ray3f", "Spectrum")
@@ -131,7 +133,7 @@ class FsptSurface(mi.Emitter):
         sample3: mi.Point2f,
         active: mi.Bool = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Ray from a point ∝ J_n in a direction ∝ cosθ; its weight is the power it stands for [W]."""
+        """Ray from a point with density ∝ J_n in a direction with density ∝ cosθ; the weight is its power [W]."""
         si, pdf = self._distribution().sample(sample2, active)
         si.wavelengths, weight = sample_wavelengths(sample1)
         direction = mi.Frame3f(si.n).to_world(mi.warp.square_to_cosine_hemisphere(sample3))
@@ -144,7 +146,7 @@ class FsptSurface(mi.Emitter):
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        """Direction from `it` to a surface point ∝ J_n; the weight is radiance over its density [1/sr]."""
+        """Direction from `it` to a surface point with density ∝ J_n; the weight is radiance over density [1/sr]."""
         si, pdf = self._distribution().sample(sample, active)
         ds = mi.DirectionSample3f(mi.PositionSample3f(si))
         ds.n, ds.time, ds.emitter, ds.delta = si.n, it.time, mi.EmitterPtr(self), False
@@ -158,6 +160,7 @@ class FsptSurface(mi.Emitter):
 
     @dark_elsewhere("Float")
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
+        """Density of `sample_direction` [1/sr]."""
         pdf = self._distribution().pdf(self._surface_at(ds, active), active)
         return dr.select(active, _solid_angle(pdf, ds), 0)
 
@@ -172,9 +175,9 @@ class FsptSurface(mi.Emitter):
     def sample_wavelengths(
         self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
     ) -> tuple[mi.Wavelength, mi.Spectrum]:
-        """Wavelengths, and the radiance at `si` over their density; light tracers learn the radiance here.
+        """Wavelengths, and the radiance at `si` over their density; light tracers obtain the radiance here.
 
-        `si.wi` is a direction of the world: Mitsuba's `ptracer`, the one caller, sets it so, without `to_local`.
+        `si.wi` is in world coordinates: Mitsuba's `ptracer`, the only caller, sets it without `to_local`.
         """
         ps = mi.PositionSample3f(si)
         ps.n = si.n
@@ -185,8 +188,8 @@ class FsptSurface(mi.Emitter):
 
     # ------------------------------------------------------------------ the surface itself
 
-    def _home(self) -> mi.Shape:
-        """The shape; ExitanceError where it is gone with its scene, for Dr.Jit records every emitter that is left."""
+    def _own_shape(self) -> mi.Shape:
+        """Shape of the emitter; ExitanceError if it was deleted with its scene: Dr.Jit records every existing one."""
         if self._shape is None:
             self._shape = mi.ShapePtr(self.get_shape())
         if self._shape[0] is None:
@@ -194,26 +197,27 @@ class FsptSurface(mi.Emitter):
         return self._shape[0]
 
     def check(self) -> None:
-        """Raise ExitanceError where J_n or the law of emission does not fit the shape; once a change."""
-        source = exitance.ExitanceState.of(self._home(), self.exitance)
-        # Mitsuba does not tell an emitter of new values on its mesh, nor of what is updated by itself.
+        """Raise ExitanceError if J_n or the exit law does not fit the shape; repeated only after a change."""
+        source = exitance.ExitanceState.of(self._own_shape(), self.exitance)
+        # Mitsuba does not notify an emitter of new values on its mesh, nor of objects that are updated separately.
         if self._source and (self._source.state() != source.state() or self.law.renewed()):
             self._forget_exitance()
         if self._source:
             return
 
-        def look(shape: mi.Shape) -> float:
+        def checked(shape: mi.Shape) -> float:
             brightest = exitance.check_values(shape, self.exitance)
             self.law.prepare(shape)
             return brightest
 
-        self.brightest = aside(look, self._home())
+        self.brightest = aside(checked, self._own_shape())
         self._source = source
 
     def sound(self) -> bool:
-        """True after `check`; False where it fails in a recording for another scene, which must not care."""
+        """True if `check` succeeds; False if it fails during a recording for another scene, which must not fail."""
         if scene_is_checked() and (self._source or self._shape is None):
-            # Never looked at, it is none of that scene; where loading failed, its shape is gone and must not be asked.
+            # Without an earlier check it belongs to another scene. If loading failed, its shape is deleted and must not
+            # be accessed.
             return self._source is not None
         try:
             self.check()
@@ -224,37 +228,38 @@ class FsptSurface(mi.Emitter):
         return True
 
     def is_isotropic(self) -> bool:
-        """True where the radiance is the same in all outward directions."""
+        """True if the radiance is equal in all outward directions."""
         return self.law.isotropic
 
     def is_uniform(self) -> bool:
-        """True where J_n is one number."""
+        """True if J_n is one number."""
         return exitance.is_uniform(self.exitance)
 
     def is_linear(self) -> bool:
-        """True where J_n is linear on every face of a mesh: an attribute of it."""
-        return bool(self._source) and self._source.attribute is not None and self._home().is_mesh()
+        """True if J_n is a mesh attribute, and so linear on every face."""
+        return bool(self._source) and self._source.attribute is not None and self._own_shape().is_mesh()
 
     def radiance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
-        """Radiance [W/mm²/sr] at the corners of every face of a mesh; None where it is not linear or not Lambert's."""
-        corners = exitance.at_corners(self._home(), self.exitance) if self.is_isotropic() else None
+        """Radiance [W/mm²/sr] at the corners of every face of a mesh; None if it is not linear or not Lambert's."""
+        corners = exitance.at_corners(self._own_shape(), self.exitance) if self.is_isotropic() else None
         if corners is None:
             return None
         profile = self.law.profile(dr.zeros(mi.SurfaceInteraction3f), mi.Vector3f(0, 0, 1), mi.Bool(True))
         return tuple(profile * value for value in corners)
 
     def _distribution(self) -> ElementDistribution:
+        """Distribution of positions ∝ J_n, built on first use."""
         self.check()
         if self._positions is None:
             self._positions = aside(
                 lambda shape: ElementDistribution(elements_of(shape), exitance.function_on(shape, self.exitance)),
-                self._home(),
+                self._own_shape(),
             )
         return self._positions
 
     def _surface_at(self, ps: mi.PositionSample3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        """The full surface record at a position sample, which lacks the face it lies on."""
-        shape = self._home()
+        """Surface interaction at a position sample, which does not contain its face."""
+        shape = self._own_shape()
         if not shape.is_mesh():
             return self._distribution().elements.at(ps.uv)
         if self._probe is None:
@@ -262,28 +267,29 @@ class FsptSurface(mi.Emitter):
         return self._probe.at(shape, ps, active)
 
     def trace_beside(self, scene: mi.Scene) -> None:
-        """Find faces in the kernels that trace rays in `scene`, see `Probe`.
+        """Set up the search for faces for kernels that trace rays in `scene`, see `Probe`.
 
-        Each time anew: faces may have been looked for beside another scene since.
+        Repeated on every call, since the probe may have been built beside another scene in between.
         """
-        if self._home().is_mesh():
+        if self._own_shape().is_mesh():
             with dr.suspend_grad():
-                self._probe = Probe(self._home(), scene)
+                self._probe = Probe(self._own_shape(), scene)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
-        return self._home().bbox()
+        return self._own_shape().bbox()
 
     def to_string(self) -> str:
         return f"FsptSurface[\n  exitance = {self.exitance},\n  emission = {self.law}\n]"
 
 
 def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
-    """Density per solid angle [1/sr] from density per area [1/mm²]; 0 from behind."""
+    """Density per solid angle [1/sr] from density per area [1/mm²]; 0 on the inward side."""
     cos_theta = -dr.dot(ds.d, ds.n)
     return dr.select(cos_theta > 0, pdf * dr.square(ds.dist) / cos_theta, 0)
 
 
 def _rcp(pdf: mi.Float) -> mi.Float:
+    """1/pdf; 0 for pdf = 0."""
     return dr.select(pdf > 0, dr.rcp(pdf), 0)
 
 

@@ -1,4 +1,4 @@
-"""Mitsuba's Monte Carlo of a scene: independent passes, and what scatters between them."""
+"""Mitsuba's Monte Carlo of a scene: independent passes, and the standard error from their scatter."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import mitsuba as mi
 
-ALIKE = 3.0  # by less than this factor do the errors of neighbours differ that see the same
-FEW = 20  # events on a pixel; fewer say too little of their variance
+ALIKE = 3.0  # the errors of neighbouring pixels with the same view differ by less than this factor
+FEW = 20  # events on a pixel, below which its own passes estimate the variance badly
 Plane = NDArray[np.float64]
 
 
 def tracer(method: str) -> mi.Integrator:
-    """Mitsuba's `path` or `ptracer`, one ray a sample."""
+    """Mitsuba's integrator `path` or `ptracer` with one ray per sample."""
     import mitsuba as mi
 
-    # Depth 1 is the light that leaves the surface straight into the lens, all there is in free space.
+    # Depth 1 is light that goes from the surface straight into the lens, which is all light in free space.
     return mi.load_dict({"type": method, "max_depth": 1})
 
 
 def passes(
     scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, seeds: Iterable[int], spp: int
 ) -> Iterator[tuple[Plane, int]]:
-    """Power [W], shape (h, w), and samples a pixel of one pass for each seed."""
+    """Power [W], shape (h, w), and samples per pixel of one pass for each seed."""
     import drjit as dr
 
     from ..jit.recording import recording
@@ -39,15 +39,16 @@ def passes(
 
 
 def standard_error(mean: Plane, mean_square: Plane, count: int, samples: int) -> Plane:
-    """Standard error s [W], shape (h, w), of the `mean` ⟨P⟩ of `count` passes with so many `samples` a pixel in all.
+    """Standard error s [W], shape (h, w), of the `mean` ⟨P⟩ of `count` passes with `samples` per pixel in all.
 
-    s² = (⟨P²⟩ - ⟨P⟩²)/(count - 1) where the passes tell. Where light comes in events that bring w each, s² = w ⟨P⟩, so
-    that ⟨P⟩²/s² of them were counted. Three cases in which a pixel's own passes tell too little:
+    `mean` [W] and `mean_square` ⟨P²⟩ [W²] have the shape (h, w). s² = (⟨P²⟩ - ⟨P⟩²)/(count - 1) where the passes
+    determine it. If light arrives in events of power w each, s² = w ⟨P⟩, and ⟨P⟩²/s² is the number of events. In three
+    cases a pixel's own passes do not determine s:
 
-    (a) events are `FEW`: s² is its mean over such pixels in the 3 × 3 around, those without events left out;
-    (b) no event: besides, s is at least the largest w there;
-    (c) all passes alike, but a neighbour's s above `ALIKE` times this one: some sample may have missed what next to it
-        some missed, and s is at least ⟨P⟩/samples, if not the neighbour's.
+    (a) at most `FEW` events: s² is its mean over such pixels in the 3 × 3 neighbourhood, those without events left out;
+    (b) no event: in addition s is at least the largest w in the neighbourhood;
+    (c) passes that agree, but a neighbour's s above `ALIKE` times this one: some samples there miss the light, so that
+        a sample here could miss it too, and s is at least the smaller of ⟨P⟩/samples and the neighbour's s.
     """
     from ..jit.pixel_grid import Grid
 

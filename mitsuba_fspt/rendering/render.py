@@ -1,4 +1,4 @@
-"""Pictures of a scene: by the deterministic integral, or by Mitsuba's own Monte Carlo with its standard error."""
+"""Images of a scene by the deterministic integral, or by Mitsuba's Monte Carlo with its standard error."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
-SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples in flight
+SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples of one pass
 DARK = (
     "the picture is dark, no light reaches the lens. Check the lens's 'to_world', and that the faces' normals point "
     "outwards"
@@ -60,17 +60,17 @@ def render(
     method : 'integral' (Eq. 9, deterministic), 'path' or 'ptracer' (Monte Carlo); None takes the scene's own
     sensor : number of the sensor, an `fspt_lens`
     rtol, domain, pixel, max_nodes : accuracy of the integral, see `Quadrature`; None takes the scene's own
-    shortcuts : False to leave out nothing of the integral, see `SHORTCUTS`; True takes the scene's own
-    spp : Monte Carlo samples a pixel, >= 2 (default 256); their error is the standard error of independent passes,
-        and where no sample met light, but one could have, about what a single one brings
+    shortcuts : False takes no shortcut of the integral, see `SHORTCUTS`; True takes the scene's own setting
+    spp : Monte Carlo samples per pixel, >= 2 (default 256); the error is the standard error of independent passes, and
+        on a pixel where no sample met light, but one could have, about the power of a single sample
     seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
-    progress : called with what is being done and the share done
+    progress : function called with the name of the stage and the share done, 0 … 1
 
     The metadata say in `warnings`, if anything, that `rtol` was not reached or that the picture is dark.
 
     Raises
     ------
-    SceneError, OpticsError, ExitanceError, BackendError : what is wrong and how to fix it.
+    SceneError, OpticsError, ExitanceError, BackendError : the message names the fault and its fix.
     """
     scene = loaded(scene)
     backend.ensure_variant()
@@ -85,16 +85,16 @@ def render(
     start = time.perf_counter()
     with ctrl_c_noted() as check_interrupt:
 
-        def tell(what: str, share: float) -> None:
+        def report(stage: str, share: float) -> None:
             check_interrupt()
             if progress:
-                progress(what, share)
+                progress(stage, share)
 
         if deterministic:
-            *planes, how = _integrate(scene, lens, integrator, accuracy, tell)
+            *planes, how = _integrate(scene, lens, integrator, accuracy, report)
         else:
             spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
-            *planes, how = _sample(scene, lens, integrator, spp, seed, tell)
+            *planes, how = _sample(scene, lens, integrator, spp, seed, report)
         check_interrupt()
     how |= {"wall_time": time.perf_counter() - start} | ({} if planes[0].any() else {"warnings": DARK})
     return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
@@ -103,7 +103,7 @@ def render(
 def _integrate(
     scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress
 ) -> tuple:
-    """Power, error and coverage by the deterministic integral, and metadata."""
+    """Power, error [W] and coverage, shape (h, w), by the deterministic integral, and metadata."""
     own = asdict(integrator.quadrature)
     wanted = own | {name: value for name, value in accuracy.items() if value is not None}
     progress("integrating", 0.0)
@@ -128,7 +128,7 @@ def _sample(
     seed: int,
     progress: Progress,
 ) -> tuple:
-    """Mean and standard error of independent Monte Carlo passes, summed in double precision, coverage, and metadata."""
+    """Mean and standard error [W] of Monte Carlo passes and coverage, shape (h, w), in double precision; metadata."""
     from ..emission.face_probe import probe_beside
     from ..integral.pupil_form import coverage
     from ..integral.scene_checks import check_scene
@@ -145,7 +145,7 @@ def _sample(
     pixels = math.prod(int(n) for n in lens.film().crop_size())
     count = max(min(PASSES, spp), math.ceil(spp * pixels / SAMPLES_IN_FLIGHT))
     lens.sampler().set_sample_count(math.ceil(spp / count))
-    each = lens.sampler().sample_count()  # some samplers take more: told once, not in every pass
+    each = lens.sampler().sample_count()  # some samplers round up, with a warning: here once, not in every pass
     seeds = (int(np.random.SeedSequence((seed, k)).generate_state(1)[0]) for k in range(count))
     total = squares = 0.0
     samples = 0
@@ -169,7 +169,7 @@ def _sample(
 
 
 def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
-    """True on pixels with lines of sight to where something glows (Eq. 4) that no image-plane stop holds back."""
+    """True, shape (h, w), on pixels with lines of sight to an emitter (Eq. 4) that no image-plane stop blocks."""
     from ..integral.window import visible_window
 
     window = visible_window(scene, lens)
@@ -178,7 +178,7 @@ def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
 
 
 def sensor_of(scene: mi.Scene, number: int) -> mi.Sensor:
-    """Sensor `number` of a scene; SceneError where there is none, or what is given is no scene of this variant."""
+    """Sensor `number` of a scene; SceneError if it does not exist, or `scene` is no scene of the active variant."""
     _check_kind(scene)
     sensors = scene.sensors()
     if not 0 <= number < len(sensors):
@@ -188,6 +188,7 @@ def sensor_of(scene: mi.Scene, number: int) -> mi.Sensor:
 
 
 def _check_kind(scene: object) -> None:
+    """Raise SceneError unless `scene` is a scene of the active variant."""
     import mitsuba as mi
 
     if isinstance(scene, mi.Scene):
@@ -204,12 +205,17 @@ def _check_kind(scene: object) -> None:
 
 
 def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
-    """The integrator of a method, see `METHODS`, the scene's own where it is that; SceneError where there is none."""
+    """Integrator of a method of `METHODS`; of None or 'integral' the scene's own, if it fits.
+
+    Raises
+    ------
+    SceneError : there is no such method, or the scene's own integrator gives no power.
+    """
     import mitsuba as mi
 
     own = scene.integrator()
     if method is None and own is not None:
-        # What else they give beside or instead of light is no power.
+        # Depth and further output channels (AOVs) are no power.
         if own.class_name() == "DepthIntegrator" or own.aov_names():
             raise SceneError(
                 f"scene: integrator {own.class_name()} gives no power. Give the scene an 'fspt_integral' or 'path', or "
@@ -225,11 +231,11 @@ def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
 
 
 def _require_light(scene: mi.Scene, integrator: mi.Integrator) -> None:
-    """Light of a surface goes straight to the lens: a Monte Carlo without that would be dark all over."""
+    """Raise SceneError if a Monte Carlo leaves out light that goes straight to the lens: its image would be dark."""
     if not any(type(emitter).__name__ == "FsptSurface" for emitter in scene.emitters()):
         return
     hidden = "'hide_emitters' = true" if getattr(integrator, "hide_emitters", False) else None
-    if hidden is None and re.search(r"\bmax_depth = 0\b", str(integrator)):  # told by its description alone
+    if hidden is None and re.search(r"\bmax_depth = 0\b", str(integrator)):  # only its description states it
         hidden = "'max_depth' = 0"
     if hidden:
         raise SceneError(
@@ -239,6 +245,7 @@ def _require_light(scene: mi.Scene, integrator: mi.Integrator) -> None:
 
 
 def _refuse(settings: dict[str, object], method: str) -> None:
+    """Raise SceneError for a given setting that has no meaning for the method."""
     for name, value in settings.items():
         if value is not None:
             raise SceneError(f"render: '{name}' = {value} has no meaning for {method}. Leave it out or set 'method'.")

@@ -1,4 +1,4 @@
-"""Scene files: XML with `<default>` parameters in, a Mitsuba scene out."""
+"""Loading of scene files: from XML with `<default>` parameters to a Mitsuba scene."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
     """Mitsuba scene of an XML file; keywords replace the file's `<default>` values.
 
-    Sets a variant where none is set (see `backend.ensure_variant`), and turns Embree's robust mode on. The scene's
+    Sets a variant if none is active (see `backend.ensure_variant`), and turns Embree's robust mode on. The scene's
     `id()` is the file and its parameters, for example 'scenes/nylon_cylinder.xml f_number=8'.
 
     Raises
     ------
-    SceneError : the file cannot be read, is no valid scene, has no such parameter, or none that takes such a value;
-        one line with the cause.
+    SceneError : the file cannot be read, is no valid scene, has no such parameter, or a value does not fit its
+        parameter; one line with the cause.
     """
     path = Path(path)
     backend.ensure_variant()
@@ -70,31 +70,33 @@ def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
 
 
 def loaded(scene: mi.Scene | str | os.PathLike[str]) -> mi.Scene:
-    """A scene itself, or that of the file so named."""
+    """`scene` itself, or the scene loaded from the file of that name."""
     return load(scene) if isinstance(scene, (str, os.PathLike)) else scene
 
 
 def _xml_of(path: Path, parameters: Mapping[str, object]) -> SceneXml:
+    """XML of the scene file with these values of its parameters."""
     return read_xml(path, {name: parameter_text(value) for name, value in parameters.items()})
 
 
 def check_parameters(path: Path, parameters: Mapping[str, object]) -> None:
-    """Raise SceneError for a name that is no `<default>` of the file or of what it includes with these values."""
+    """Raise SceneError for a name that is no `<default>` of the file or of the files it includes with these values."""
     known = _xml_of(path, parameters).defaults
     for name in parameters:
         if name not in known:
             names = ", ".join(known) or "none"
             raise SceneError(f"{path}: the scene has no parameter '{name}'. Its <default> parameters: {names}.")
-        if name in ("config", "filename"):  # what Mitsuba calls the arguments of its parser
+        if name in ("config", "filename"):  # names of arguments of Mitsuba's parser
             raise SceneError(f"{path}: Mitsuba cannot set a parameter '{name}'. Give the <default> another name.")
 
 
 def parameter_text(value: object) -> str:
+    """Text of a parameter's value for Mitsuba's parser."""
     return str(value).lower() if isinstance(value, (bool, np.bool_)) else str(value)
 
 
 def _name_children(state: mi.parser.ParserState) -> None:
-    """Give sensors and shapes without an id one, 'fspt_lens', 'sphere', 'sphere_2', for errors and `mi.traverse`."""
+    """Give sensors and shapes without an id one, 'fspt_lens', 'sphere', 'sphere_2', for messages and `mi.traverse`."""
     import mitsuba as mi
 
     taken = {node.props.id() for node in state.nodes}
@@ -107,7 +109,7 @@ def _name_children(state: mi.parser.ParserState) -> None:
 
 
 def _set_film_formats(state: mi.parser.ParserState) -> None:
-    """In monochrome variants store films as luminance, which Mitsuba does by itself with a warning for each."""
+    """Store films as luminance in monochrome variants; Mitsuba does the same, but with a warning for each film."""
     import mitsuba as mi
 
     if not mi.is_monochromatic:
@@ -118,13 +120,13 @@ def _set_film_formats(state: mi.parser.ParserState) -> None:
 
 
 def _one_line(message: str) -> str:
-    """The place and the cause out of Mitsuba's message, without its source lines and Python's traceback."""
+    """Position and cause from Mitsuba's message, without its source lines and Python's traceback."""
     lines = [re.sub(r"\[[\w.]+:\d+\] ", "", line).strip() for line in message.splitlines()]
     text = " ".join(filter(None, lines))
     found = re.match(
         r"(?:At|Error while loading|While loading|Parsing of XML file) (.*?\(line \d+, col \d+\)):? (.*)", text
     )
-    place, cause = (found[1] + ": ", found[2]) if found else ("", text)
+    position, cause = (found[1] + ": ", found[2]) if found else ("", text)
     ours = [line for line in lines if re.match(r"(\w+\.)*\w*(Error|Exception): ", line)]
     unknown = re.match(r'Found \d+ unreferenced .* plugin of type "(\w+)": ', cause)
     broken = re.match(r'failed to instantiate (\w+) plugin of type "(\w+)": (.*)', cause)
@@ -134,8 +136,8 @@ def _one_line(message: str) -> str:
         names = re.findall(r'- \w+ "(\w+)"', cause)
         named = [name for name in names if not name.startswith("_arg_")]
         cause = f"'{unknown[1]}' has no parameter {', '.join(named)}. Correct its name or leave it out."
-        if not named:  # Mitsuba's own names for what has none
+        if not named:  # only properties without a name, to which Mitsuba gives its own
             cause = f"'{unknown[1]}' has no use for what stands in it without a name. Name it, or leave it out."
     elif broken:
         cause = f"cannot load the {broken[1]} '{broken[2]}': {broken[3].rstrip('.!')}. Check its file and parameters."
-    return place + cause
+    return position + cause

@@ -1,4 +1,4 @@
-"""What the XML of a scene must be before Mitsuba reads it, which would say less of the matter, nothing, or crash."""
+"""Rules for the XML of a scene, checked before Mitsuba reads it, which would report less, report nothing, or crash."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from .scene_xml import SceneXml
 
 REFERENCE = re.compile(r"\$(\w+)")
 NO_PROPERTIES = ("default", "alias", "include", "path", "resource")
-LISTS = {  # attributes that hold numbers, one or several, by element
+LISTS = {  # attributes that hold one or several numbers, by element
     **dict.fromkeys(("point", "vector", "translate", "scale", "rotate", "matrix"), ("value",)),
     "lookat": ("origin", "target", "up"),
 }
-NEEDED = {"bitmap": ("filename", "data", "bitmap"), "volume": ("volume",)}  # or these textures crash the process
+NEEDED = {"bitmap": ("filename", "data", "bitmap"), "volume": ("volume",)}  # without one, the texture crashes Mitsuba
 
 
 def check_text(path: Path, scene: SceneXml) -> None:
-    """Raise SceneError for what the text of a scene cannot be, see `check_values` and below; one line."""
+    """Raise SceneError, of one line, if the XML of a scene breaks one of the rules of this file."""
     check_values(path, scene)
     for node in scene.nodes:
-        _check_twins(path, node)
+        _check_duplicates(path, node)
         _check_source(path, node, scene)
-        _check_homes(path, node)
+        _check_parents(path, node)
         if node.get("type") == "fspt_surface":
             _check_colours(path, node, scene)
 
 
 def check_values(path: Path, scene: SceneXml) -> None:
-    """Raise SceneError for a given value that is no number, whole number or boolean where one is due.
+    """Raise SceneError if a given value is no number, whole number or boolean where one is required.
 
-    Mitsuba would tell the line it ends up in, and not the parameter's name.
+    Mitsuba would report the line that uses the value, not the parameter's name.
     """
     for node in scene.nodes:
         for attribute, text in node.attrib.items():
@@ -44,7 +44,7 @@ def check_values(path: Path, scene: SceneXml) -> None:
 
 
 def is_number(text: str) -> bool:
-    """True for a finite number as Mitsuba spells it."""
+    """True for a finite number in Mitsuba's notation."""
     try:
         return math.isfinite(float(text)) and text.isascii() and "_" not in text
     except ValueError:
@@ -52,6 +52,7 @@ def is_number(text: str) -> bool:
 
 
 def _check_value(path: Path, name: str, text: str, tag: str, attribute: str) -> None:
+    """Raise SceneError if the text of parameter `name` does not fit the attribute of the element `tag`."""
     due = None
     if (tag, attribute) == ("integer", "value"):
         due = None if re.fullmatch(r"\s*-?[0-9]+\s*", text) else "a whole number"
@@ -65,8 +66,8 @@ def _check_value(path: Path, name: str, text: str, tag: str, attribute: str) -> 
         raise SceneError(f"{path}: parameter '{name}' must be {due}, got '{text}'. Correct this value.")
 
 
-def _check_twins(path: Path, node: ElementTree.Element) -> None:
-    """Of two with one name Mitsuba cannot parse the second, or takes one of them without a word."""
+def _check_duplicates(path: Path, node: ElementTree.Element) -> None:
+    """Raise SceneError for two properties of one name: Mitsuba cannot parse the second, or ignores one silently."""
     names = [child.get("name") for child in node if child.tag not in NO_PROPERTIES and child.get("name")]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
@@ -75,21 +76,25 @@ def _check_twins(path: Path, node: ElementTree.Element) -> None:
 
 
 def _check_source(path: Path, node: ElementTree.Element, scene: SceneXml) -> None:
+    """Raise SceneError for a texture without its data."""
     kind = scene.fill_in(node.get("type", ""))
     needed = NEEDED.get(kind, ()) if node.tag == "texture" else ()
     if needed and not any(child.get("name") in needed for child in node):
         raise SceneError(f"{path}: a texture '{kind}' has no '{needed[0]}'. Give it one.")
 
 
-def _check_homes(path: Path, node: ElementTree.Element) -> None:
-    """A glow without a shape the integral passes over, and Monte Carlo fails on; one with an id may be referred to."""
+def _check_parents(path: Path, node: ElementTree.Element) -> None:
+    """Raise SceneError for an fspt_surface outside a shape: the integral would ignore it, Monte Carlo would fail.
+
+    An fspt_surface with an id is accepted, since a shape may refer to it.
+    """
     for child in node if node.tag != "shape" else ():
         if child.get("type") == "fspt_surface" and not child.get("id"):
             raise SceneError(f"{path}: an fspt_surface stands in <{node.tag}>. Put it into the <shape> that glows.")
 
 
 def _check_colours(path: Path, emitter: ElementTree.Element, scene: SceneXml) -> None:
-    """J_n as a colour or a spectrum, of which monochrome variants make its luminance without a word."""
+    """Raise SceneError for J_n as a colour or a spectrum, which monochrome variants silently turn into luminance."""
     for child in emitter:
         colour = child.tag == "rgb" or child.get("type") == "d65"
         spectrum = child.tag == "spectrum" and ":" in scene.fill_in(child.get("value", ""))

@@ -1,4 +1,4 @@
-"""The XML of a scene as Mitsuba's parser goes through it: `<default>` values, `$name` in texts, included files."""
+"""XML of a scene, read like Mitsuba's parser: `<default>` values, `$name` in texts, included files."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ..runtime.errors import SceneError
 
 @dataclass(frozen=True)
 class SceneXml:
-    """What a scene file says together with all it includes, in the order of the text.
+    """Content of a scene file and of all files that it includes, in the order of the text.
 
     given : values for `<default>` parameters, as text
-    files : the scene file and those it includes
+    files : the scene file and its includes
     nodes : their elements
     defaults : names and values of their `<default>` parameters; the first of a name counts
-    folders : where files are looked for, after the folder of the file that names them and before the current one
+    folders : folders searched for a file, after the folder of the file that names it and before the current folder
     """
 
     given: Mapping[str, str]
@@ -30,33 +30,34 @@ class SceneXml:
     folders: list[Path] = field(default_factory=list)
 
     def fill_in(self, text: str) -> str:
-        """`text` with values in place of `$name`, the longest name first; what has no value stays."""
+        """`text` with values in place of `$name`, the longest name first; a name without value is kept."""
         values = {**self.defaults, **self.given}
         names = sorted(filter(None, values), key=len, reverse=True)
         pattern = "|".join(re.escape(f"${name}") for name in names)
         return re.sub(pattern, lambda found: values[found[0][1:]], text) if names else text
 
-    def places(self, name: str, folder: Path) -> list[Path]:
-        """Files that a name in a file of this folder may stand for, the likeliest first; none where there is none."""
-        tried = [place / name for place in (folder, *self.folders)]
+    def candidates(self, name: str, folder: Path) -> list[Path]:
+        """Existing files that `name` in a file of this folder may refer to, the likeliest first."""
+        tried = [home / name for home in (folder, *self.folders)]
         there = [file for file in dict.fromkeys(tried) if os.path.isfile(file)]
         return there or [Path(name)] * os.path.isfile(name)
 
     def sources(self) -> set[Path]:
-        """The scene file, what it includes and every file that an attribute may name."""
+        """The scene file, its includes, and every existing file that an attribute may refer to."""
         names = {self.fill_in(text) for node in self.nodes for text in node.attrib.values()}
         folders = {file.parent for file in self.files}
-        return set(self.files).union(*(self.places(name, folder) for name in names for folder in folders))
+        return set(self.files).union(*(self.candidates(name, folder) for name in names for folder in folders))
 
 
 def read_xml(path: Path, given: Mapping[str, str]) -> SceneXml:
-    """What a scene file says with these values for its parameters; SceneError where it cannot be read."""
+    """Content of a scene file with the values `given` for its parameters; SceneError if it cannot be read."""
     scene = SceneXml(given, folders=[path.parent])
     _read(path, scene, ())
     return scene
 
 
 def _read(path: Path, scene: SceneXml, outer: tuple[Path, ...]) -> None:
+    """Add the content of a file to `scene`; `outer`: the chain of files whose includes lead to it."""
     if os.path.realpath(path) in map(os.path.realpath, outer):
         raise SceneError(f"{outer[0]}: {path} includes itself. Take that <include> out.")
     if path in scene.files:  # a second time
@@ -69,11 +70,12 @@ def _read(path: Path, scene: SceneXml, outer: tuple[Path, ...]) -> None:
         elif node.tag == "path":
             scene.folders.append(path.parent / scene.fill_in(node.get("value", "")))
         elif node.tag == "include":
-            for inner in scene.places(scene.fill_in(node.get("filename", "")), path.parent)[:1]:
+            for inner in scene.candidates(scene.fill_in(node.get("filename", "")), path.parent)[:1]:
                 _read(inner, scene, (*outer, path))
 
 
 def _root(path: Path) -> ElementTree.Element:
+    """Root element of an XML file; SceneError if it cannot be read."""
     try:
         return ElementTree.parse(path).getroot()
     except OSError as error:
@@ -81,4 +83,4 @@ def _root(path: Path) -> ElementTree.Element:
     except LookupError as error:
         raise SceneError(f"{path}: {error}. Save the scene file as UTF-8, and say so in its first line.") from error
     except ElementTree.ParseError as error:
-        raise SceneError(f"{path}: not valid XML: {error}. Mend that line.") from error
+        raise SceneError(f"{path}: not valid XML: {error}. Fix that line.") from error

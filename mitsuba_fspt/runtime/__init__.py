@@ -1,1 +1,1 @@
-"""What the process needs before any physics: errors, numbers, files, interrupts, Dr.Jit's backend and its LLVM."""
+"""Services without physics: errors, numbers, files, interrupts, Dr.Jit's backend and its LLVM library."""

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: written beside their final place, then renamed."""
+"""Atomic writing of files: a temporary file beside the final path is written completely, then renamed."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from .errors import FsptError
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError) -> Iterator[Path]:
-    """Path of an empty temporary file beside `path`; it takes the place of `path` when the block ends well.
+    """Context manager that yields the path of an empty temporary file, renamed to `path` after the block.
 
-    The temporary name keeps the suffix of `path`, for libraries that choose the format by it. If the block
-    raises anything (an error, a full disk, Ctrl-C), the temporary file is removed and what stood at `path`
-    stays as it was. An OSError comes out as `error`, everything else as it is.
+    The temporary file lies beside `path` and keeps its suffix, for libraries that choose the format by it. If the
+    block raises anything (an error, a full disk, Ctrl-C), the temporary file is removed and `path` is unchanged. An
+    OSError is raised again as `error`, any other exception as it is.
 
         with atomic_path("phantom.ply", FluxError) as temporary:
             mesh.export(temporary)
@@ -28,7 +28,7 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
     """
     path = Path(path)
     require_place(path, error)
-    # A long stem is cut, so that the temporary name is not refused where the final one is allowed.
+    # A long stem is cut, so that the temporary name is allowed wherever the final one is.
     temporary = path.with_name(f".{path.stem[:40]}-{secrets.token_hex(4)}{path.suffix}")
     try:
         temporary.touch(exist_ok=False)
@@ -43,7 +43,7 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
 
 
 def require_place(path: Path, error: type[FsptError] = FsptError) -> None:
-    """Raise `error` where no file can stand at `path`, for what stands there, for want of a folder or for its name."""
+    """Raise `error` if no file can be written at `path`: a folder, no folder above, a bad name, write protection."""
     if os.path.isdir(path):
         raise error(f"output file '{path}' is a folder. Give the name of a file in it.")
     if os.path.isfile(path.parent):
@@ -61,7 +61,7 @@ def require_place(path: Path, error: type[FsptError] = FsptError) -> None:
 
 
 def require_apart(output: Path, inputs: Iterable[Path], option: str = "-o", error: type[FsptError] = FsptError) -> None:
-    """Raise `error` where the output that `option` names would take the place of one of the `inputs`."""
+    """Raise `error` if the `output` file, named by the command line's `option`, is the same file as an input."""
     for other in inputs:
         same = os.path.realpath(output) == os.path.realpath(other)
         if same or (os.path.exists(output) and os.path.exists(other) and os.path.samefile(output, other)):

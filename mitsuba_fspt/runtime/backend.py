@@ -1,11 +1,11 @@
-"""Dr.Jit's backend: a working LLVM before Dr.Jit loads, our plugins in every variant, the variant to take.
+"""Set-up of Dr.Jit's backend: a working LLVM library, our plugins in every variant, the choice of a variant.
 
-Importing this package must load neither Dr.Jit nor Mitsuba, yet act when somebody else does, in either order.
-So `prepare` puts a watcher before Python's import finders. It finds no module itself; two names make it act:
+Importing this package loads neither Dr.Jit nor Mitsuba, but must act when they are imported, before or after it.
+So `prepare` puts an `ImportWatch` before Python's import finders. It finds no module itself and acts on two names:
 
-- `drjit`, the moment before Dr.Jit binds libLLVM for good: one that works is chosen and handed over;
+- `drjit`, just before Dr.Jit binds libLLVM for the life of the process: a working library is selected and passed on;
 - `mitsuba.<variant>`, which `mi.set_variant` imports at its first use: a broken LLVM is refused while the old
-  variant still stands, and the callback is added that registers our plugins after every switch.
+  variant is still active, and the callback is added that registers our plugins after every switch.
 """
 
 import ctypes
@@ -35,10 +35,10 @@ INSTALL = (
 
 
 class ImportWatch:
-    """The watcher.
+    """Import finder that acts on `drjit` and `mitsuba.<variant>`, see the module's docstring.
 
-    selection : what Dr.Jit was told to load; None until then, or if Dr.Jit came first
-    register : called after each switch of the variant
+    selection : LLVM library passed to Dr.Jit; None before that, or if Dr.Jit was imported first
+    register : function called after each switch of the variant
     """
 
     selection: libllvm.Selection | None = None
@@ -47,7 +47,7 @@ class ImportWatch:
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> "ModuleSpec | None":
-        """Always None: the finders behind this one find the module."""
+        """None in all cases: the finders behind this one find the module."""
         if name == "drjit":
             self.before_drjit()
         elif name.startswith(("mitsuba.llvm_", "mitsuba.cuda_", "mitsuba.scalar_")):
@@ -56,7 +56,7 @@ class ImportWatch:
         return None
 
     def before_drjit(self) -> None:
-        """Name a missing libatomic, which Dr.Jit would not, then set DRJIT_LIBLLVM_PATH."""
+        """Set DRJIT_LIBLLVM_PATH; BackendError if libatomic is missing, which Dr.Jit would not name."""
         if sys.platform == "linux" and not _loads("libatomic.so.1"):
             raise BackendError(
                 "Dr.Jit needs the system library libatomic.so.1, which is missing. Install it: "
@@ -73,11 +73,15 @@ _watch = ImportWatch()
 
 
 def prepare(register: Callable[[], None]) -> None:
-    """Arrange all of this; called when the package is imported. Calling it again changes `register` alone.
+    """Install the import watch; called when the package is imported. A second call replaces `register` alone.
 
-    `register` is called after each switch of the variant, to register the plugins.
+    Parameters
+    ----------
+    register : function that registers the plugins, called after each switch of the variant
 
-    Raises BackendError if an LLVM variant is active on an LLVM that would abort the process.
+    Raises
+    ------
+    BackendError : an LLVM variant is active on an LLVM library that would abort the process.
     """
     _watch.register = register
     if _watch not in sys.meta_path:
@@ -90,21 +94,26 @@ def prepare(register: Callable[[], None]) -> None:
 
 
 def _on_variant(_old: str | None, new: str) -> None:
-    """Mitsuba calls this after each switch; what it raises comes out of `mi.set_variant`."""
+    """Mitsuba's callback after each switch of the variant; its exceptions propagate out of `mi.set_variant`."""
     require_working_llvm(new)
     _watch.register()
 
 
 def selection() -> libllvm.Selection | None:
-    """What Dr.Jit was told to load, and why; None if it is not imported yet, or was before mitsuba_fspt."""
+    """LLVM library passed to Dr.Jit, with the reason; None before Dr.Jit is imported, or if it was imported first."""
     return _watch.selection
 
 
 def choose_variant(kind: str = "mono") -> str:
-    """`cuda_ad_<kind>` where there is a CUDA device that works, else `llvm_ad_<kind>`.
+    """Name of the variant to use: `cuda_ad_<kind>` if a CUDA device works, else `llvm_ad_<kind>`.
 
-    `kind`: mono (one wavelength), rgb, spectral, mono_polarized or spectral_polarized.
-    Raises BackendError if neither works, with what to install; or if Mitsuba has no such kind.
+    Parameters
+    ----------
+    kind : mono (one wavelength), rgb, spectral, mono_polarized or spectral_polarized
+
+    Raises
+    ------
+    BackendError : neither backend works (the message names the packages to install), or Mitsuba has no such kind.
     """
     import mitsuba
 
@@ -122,9 +131,11 @@ def choose_variant(kind: str = "mono") -> str:
 
 @ctrl_c_held()
 def ensure_variant() -> str:
-    """The active variant; where there is none, `choose_variant()` is set first.
+    """Name of the active variant; if none is active, `choose_variant()` is set first.
 
-    Raises BackendError if the active one is scalar, if its LLVM does not work, or if no backend works.
+    Raises
+    ------
+    BackendError : the active variant is scalar, its LLVM does not work, or no backend works.
     """
     import mitsuba
 
@@ -142,7 +153,7 @@ def ensure_variant() -> str:
 
 
 def quiet_mitsuba() -> None:
-    """A variant, and none of Mitsuba's warnings: they would break the one line that the command line promises."""
+    """Set a variant and silence Mitsuba's warnings, which would break the one-line messages of the command line."""
     ensure_variant()
     import mitsuba
 
@@ -150,14 +161,14 @@ def quiet_mitsuba() -> None:
 
 
 def require_working_llvm(variant: str) -> None:
-    """Raise BackendError if `variant` is one of LLVM's and Dr.Jit is bound to an LLVM that does not work."""
+    """Raise BackendError if `variant` is an LLVM variant and Dr.Jit is bound to an LLVM that does not work."""
     problem = llvm_problem() if variant.startswith("llvm_") else None
     if problem:
         raise BackendError(f"{variant}: {problem}")
 
 
 def llvm_problem() -> str | None:
-    """Why the LLVM that Dr.Jit is bound to cannot be used, and the mend; None if it can."""
+    """Reason why the LLVM that Dr.Jit is bound to cannot be used, with the fix; None if it can be used."""
     import drjit
 
     bound = drjit.detail.llvm_version()
@@ -166,20 +177,20 @@ def llvm_problem() -> str | None:
     loaded = f"LLVM {'.'.join(map(str, bound))}" if bound[0] > 0 else "no LLVM"
     rule = f"Dr.Jit has bound {loaded} and needs {libllvm.MIN_MAJOR} or newer"
     chosen = _watch.selection or libllvm.select()
-    reasons = "; ".join(f"{loser.path}: {loser.reason}" for loser in chosen.rejected)
+    reasons = "; ".join(f"{library.path}: {library.reason}" for library in chosen.rejected)
     if chosen.path is None:
         return f"{rule}; {chosen.why}{f' ({reasons})' if reasons else ''}. {INSTALL}"
     if chosen.version is None:
         other = libllvm.select({})
-        mend = f"Unset it: {other.path} works." if other.path else f"Unset it. {INSTALL}"
-        return f"{rule}; {libllvm.ENVIRONMENT_NAME} is set to {reasons}. {mend}"
+        fix = f"Unset it: {other.path} works." if other.path else f"Unset it. {INSTALL}"
+        return f"{rule}; {libllvm.ENVIRONMENT_NAME} is set to {reasons}. {fix}"
     if _watch.selection is None:
         return f"{rule}; it was imported before mitsuba_fspt. Import mitsuba_fspt first: {chosen.path} works."
     return f"{rule}; it refused {chosen.path} ({chosen.why}). {INSTALL}"
 
 
 def cuda_problem() -> str | None:
-    """Why CUDA cannot be used; None if it can."""
+    """Reason why CUDA cannot be used; None if it can be used."""
     import drjit
 
     if not drjit.has_backend(drjit.JitBackend.CUDA):
@@ -191,6 +202,7 @@ def cuda_problem() -> str | None:
 
 
 def _loads(library: str) -> bool:
+    """True if the dynamic loader finds and loads the library."""
     try:
         ctypes.CDLL(library)
     except OSError:

@@ -1,4 +1,4 @@
-"""Classes found by name: a folder with one class a file, where a new file is a new name and nothing else is edited."""
+"""Classes found by name in a package with one class per file; a new file adds a name without any other edit."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from types import ModuleType
 
 
 def names_in(folder: ModuleType) -> tuple[str, ...]:
-    """Names of the files of a package, in alphabetical order."""
+    """Names of the modules in the package `folder`, in alphabetical order."""
     return tuple(sorted(module.name for module in pkgutil.iter_modules(folder.__path__)))
 
 
 def class_named(folder: ModuleType, name: str) -> type:
-    """The class of the file `name`, which has the same name in capitals: `LastFlight` of last_flight.py.
+    """Class of the module `name` in the package `folder`, named like the module: `LastFlight` in last_flight.py.
 
     Raises
     ------
-    KeyError : the package has no such file.
+    KeyError : the package has no such module.
     """
     if name not in names_in(folder):
         raise KeyError(name)

@@ -1,7 +1,7 @@
-"""What `fspt doctor` tells: versions, which LLVM and why, CUDA devices, a timed first kernel, what is absent.
+"""Report of `fspt doctor`: versions, LLVM library with reason, CUDA devices, timed kernels, missing packages.
 
-Every backend is tried in a process of its own on an empty kernel cache: a driver or an LLVM that aborts the
-process becomes a line of the report, and the first kernel is a cold one.
+Every backend is tried in a process of its own with an empty kernel cache: a driver or an LLVM that aborts the
+process becomes a line of the report, and the time of the first kernel includes its compilation.
 """
 
 import ctypes
@@ -29,12 +29,12 @@ CORE = ("mitsuba-fspt", "mitsuba", "drjit", "numpy", "trimesh", "OpenEXR", "type
 VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
 
 _TRIAL = "import json, sys; from mitsuba_fspt.runtime import doctor; print(json.dumps(doctor.try_variant(sys.argv[1])))"
-_TRIAL_TIMEOUT = 300.0  # s; a driver that hangs
+_TRIAL_TIMEOUT = 300.0  # s; limit for a driver that hangs
 
 
 @dataclass(frozen=True)
 class ReportLine:
-    """One line of the report; `ok` is False where something is missing or does not work."""
+    """One line of the report; `ok` is False if a component is missing or does not work."""
 
     section: str
     name: str
@@ -44,13 +44,13 @@ class ReportLine:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole report; `usable` if at least one backend computed the right result."""
+    """Complete report; `usable` is True if at least one backend computed the right result."""
 
     rows: tuple[ReportLine, ...]
     usable: bool
 
     def render_text(self) -> str:
-        """The report as plain text, a section after the other, `!` before the rows that are not ok."""
+        """Report as plain text, section by section, with `!` before the rows that are not ok."""
         width = max(len(row.name) for row in self.rows)
         lines: list[str] = []
         section = ""
@@ -64,7 +64,7 @@ class Diagnosis:
 
 
 def diagnose() -> Diagnosis:
-    """Look at everything; takes a second or two for each backend. Raises nothing for what is missing."""
+    """Diagnosis of this installation; takes a second or two per backend. A missing component raises nothing."""
     devices = cuda_devices()
     trials = {name: run_trial(name) for name in VARIANTS if devices or not name.startswith("cuda")}
     rows = [*_versions(), *_llvm(), *_cuda(devices), *_backends(trials), *_optional(), *_cache()]
@@ -72,11 +72,15 @@ def diagnose() -> Diagnosis:
 
 
 def try_variant(variant: str) -> dict[str, float]:
-    """Seconds a computation takes in this process, by step: `import`, `variant`, `scene`, `first`, `second`.
+    """Time [s] of each step of a computation in this process: `import`, `variant`, `scene`, `first`, `second`.
 
-    The kernel sends a grid of parallel rays, 4 wide, at a unit sphere and counts the hits, so that the ray
-    tracer is tried too (Embree for LLVM, OptiX for CUDA). Raises BackendError if the variant does not work,
-    or if the share of rays that hit is not pi/16, the sphere's shadow on the grid, within 1 %.
+    The kernel traces parallel rays from a square of side 4 towards a unit sphere and counts those that meet it, so
+    that the ray tracer is tested too (Embree for LLVM, OptiX for CUDA). `first` and `second` are its first two runs.
+
+    Raises
+    ------
+    BackendError : the variant does not work, or the share of rays that meet the sphere differs by more than 1 % from
+        pi/16, the ratio of the sphere's cross-section to the square.
     """
     times = [time.perf_counter()]
     import drjit
@@ -89,10 +93,10 @@ def try_variant(variant: str) -> dict[str, float]:
     times.append(time.perf_counter())
     for _ in range(2):
         x, y = drjit.meshgrid(*2 * [drjit.linspace(mitsuba.Float, -2, 2, 512)])
-        origin = mitsuba.Point3f(x, y, drjit.minimum(x, -5))  # a float minimum: what LLVM 15 and 16 abort at
-        hits = scene.ray_test(mitsuba.Ray3f(origin, mitsuba.Vector3f(0, 0, 1))).numpy()
+        origin = mitsuba.Point3f(x, y, drjit.minimum(x, -5))  # a float minimum, at which LLVM 15 and 16 abort
+        met = scene.ray_test(mitsuba.Ray3f(origin, mitsuba.Vector3f(0, 0, 1))).numpy()
         times.append(time.perf_counter())
-    share = float(hits.mean())
+    share = float(met.mean())
     if not math.isclose(share, math.pi / 16, rel_tol=0.01):
         raise BackendError(f"{variant}: computes {share:.6g} where {math.pi / 16:.6g} is right")
     names = ("import", "variant", "scene", "first", "second")
@@ -100,7 +104,7 @@ def try_variant(variant: str) -> dict[str, float]:
 
 
 def run_trial(variant: str) -> dict[str, float] | str:
-    """`try_variant` in a fresh process without cached kernels; where it fails, the reason in one line."""
+    """Result of `try_variant` in a new process without cached kernels; if it fails, the reason in one line."""
     package_home = str(Path(__file__).resolve().parents[2])
     search = os.pathsep.join(filter(None, [package_home, os.environ.get("PYTHONPATH")]))
     with tempfile.TemporaryDirectory() as cache:
@@ -127,7 +131,7 @@ def run_trial(variant: str) -> dict[str, float] | str:
 
 
 def cuda_devices() -> list[str]:
-    """Names of the CUDA devices the NVIDIA driver knows; empty without driver or device."""
+    """Names of the CUDA devices that the NVIDIA driver lists; empty without driver or device."""
     name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
     try:
         cuda = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or name)
@@ -172,8 +176,8 @@ def _llvm() -> Iterator[ReportLine]:
     yield ReportLine("LLVM", "version", version, ok=usable)
     yield ReportLine("LLVM", "library", chosen.path or "none", ok=usable)
     yield ReportLine("LLVM", "why", chosen.why, ok=usable)
-    for loser in chosen.rejected:
-        yield ReportLine("LLVM", "rejected", f"{loser.path}: {loser.reason}")
+    for library in chosen.rejected:
+        yield ReportLine("LLVM", "rejected", f"{library.path}: {library.reason}")
 
 
 def _cuda(devices: list[str]) -> Iterator[ReportLine]:
@@ -196,13 +200,13 @@ def _backends(trials: dict[str, dict[str, float] | str]) -> Iterator[ReportLine]
 
 
 def _optional() -> Iterator[ReportLine]:
-    for one in EXTRAS:
-        missing = f"not installed: pip install 'mitsuba-fspt[{one.extra}]'"
-        yield ReportLine("extras", one.distribution, _version(one.distribution) or missing)
+    for package in EXTRAS:
+        missing = f"not installed: pip install 'mitsuba-fspt[{package.extra}]'"
+        yield ReportLine("extras", package.distribution, _version(package.distribution) or missing)
 
 
 def _cache() -> Iterator[ReportLine]:
-    """Where Dr.Jit keeps compiled kernels between runs."""
+    """Folder and size of Dr.Jit's cache of compiled kernels."""
     default = Path(tempfile.gettempdir(), "drjit") if sys.platform == "win32" else Path("~/.drjit").expanduser()
     folder = Path(os.environ.get("DRJIT_CACHE_DIR") or default)
     try:

@@ -1,8 +1,8 @@
-"""The package's errors: each message names the thing, the value, the rule and the mend, in one line."""
+"""Exceptions of the package; each message states the object, the value, the rule and the fix in one line."""
 
 
 class FsptError(ValueError):
-    """Base of everything this package raises on purpose; the command line turns it into one line and exit code 2."""
+    """Base class of the package's exceptions; the command line prints the message as one line and exits with code 2."""
 
 
 class OpticsError(FsptError):
@@ -30,4 +30,4 @@ class BackendError(FsptError, ImportError):
 
 
 class DetectorError(FsptError):
-    """A detector that cannot exist, or an exposure it cannot make."""
+    """A detector parameter, or a parameter of an exposure, outside its range."""

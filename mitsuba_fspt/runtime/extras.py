@@ -1,4 +1,4 @@
-"""Optional packages: what each is called, and the extra of this one that brings it."""
+"""Optional packages, and the extra of mitsuba-fspt that installs each."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Extra:
-    """A `distribution` that pip installs, the `module` that Python imports, the `extra` in mitsuba-fspt[…]."""
+    """Optional package: `distribution` for pip, `module` for import, `extra` in pip install 'mitsuba-fspt[extra]'."""
 
     distribution: str
     module: str

@@ -1,5 +1,5 @@
-"""Ctrl-C while the renderer calls back: what is raised in a plugin's method or a recorded loop can be lost or turned
-into another exception on its way through C++. SIGTERM is treated alike where the process has made it raise, too.
+"""Ctrl-C during a render: an exception raised in a plugin's method or in a recorded loop can be lost, or turned into
+another exception, on its way through C++. SIGTERM is handled alike if the process has made it raise.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from .errors import FsptError
 
 @contextmanager
 def ctrl_c_noted() -> Iterator[Callable[[], None]]:
-    """A function that raises KeyboardInterrupt if Ctrl-C was pressed before; the usual exception comes, too.
+    """Context manager that yields a function, which raises KeyboardInterrupt if Ctrl-C was pressed in the block.
 
-    What else but our own errors comes after Ctrl-C becomes KeyboardInterrupt; what Python could only tell of, as it
-    came in a destructor, is not told. Nothing is done where there are no `_handlers`.
+    The usual handler runs as well. After Ctrl-C, an exception that leaves the block becomes KeyboardInterrupt unless
+    it is an FsptError, and exceptions in destructors, which Python can only print, are not printed. The block runs
+    unchanged if `_handlers` is empty.
     """
     pressed = False
 
-    def note(number: int, frame: FrameType | None) -> None:
+    def record(number: int, frame: FrameType | None) -> None:
         nonlocal pressed
         pressed = True
         before[number](number, frame)
 
-    def tell(lost: sys.UnraisableHookArgs) -> None:
+    def report_unraisable(lost: sys.UnraisableHookArgs) -> None:
         if not pressed:
-            told_before(lost)
+            hook_before(lost)
 
     def check() -> None:
         if pressed:
@@ -40,10 +41,10 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     if not before:
         yield check
         return
-    told_before = sys.unraisablehook
+    hook_before = sys.unraisablehook
     for number in before:
-        signal.signal(number, note)
-    sys.unraisablehook = tell
+        signal.signal(number, record)
+    sys.unraisablehook = report_unraisable
     try:
         yield check
     except FsptError:
@@ -55,14 +56,15 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        sys.unraisablehook = told_before
+        sys.unraisablehook = hook_before
 
 
 @contextmanager
 def ctrl_c_held() -> Iterator[None]:
-    """Ctrl-C waits for the end of the block: what is written in C++ and not made to be interrupted may end the process.
+    """Context manager that delays Ctrl-C to the end of the block.
 
-    Nothing is done where there are no `_handlers`.
+    An interrupt inside C++ code that is not prepared for it may end the process. The block runs unchanged if
+    `_handlers` is empty.
     """
     before = _handlers()
     pressed: list[tuple[int, FrameType | None]] = []
@@ -79,14 +81,14 @@ def ctrl_c_held() -> Iterator[None]:
 
 
 def terminated_as_by_ctrl_c() -> None:
-    """From here on SIGTERM raises KeyboardInterrupt, so that nothing is left behind: files, folders, processes."""
+    """Make SIGTERM raise KeyboardInterrupt from now on, so that files, folders and processes are cleaned up."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _handlers() -> dict[int, Callable[[int, FrameType | None], object]]:
-    """What Ctrl-C and SIGTERM call; without those that are ignored or end the process at once.
+    """Python handlers of SIGINT and SIGTERM by signal number; an ignored signal or a default action has none.
 
-    None in other threads than the main one, which alone hears of them.
+    Empty outside the main thread, the only one in which Python handles signals.
     """
     if threading.current_thread() is not threading.main_thread():
         return {}

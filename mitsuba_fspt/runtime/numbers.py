@@ -1,4 +1,4 @@
-"""Numbers as callers give them, NumPy's and arrays without axes among them, as Python's own, which do not overflow."""
+"""Checks of numeric arguments. NumPy scalars and arrays without axes become Python numbers, which do not overflow."""
 
 from __future__ import annotations
 
@@ -13,10 +13,22 @@ from .errors import FsptError
 
 
 def number(thing: str, value: object, error: type[FsptError], example: str) -> float:
-    """`value` as a float, infinite where it is beyond all floats; `error` for what is no real number, True too."""
+    """`value` as a float; ±inf if it is beyond the range of floats.
+
+    Parameters
+    ----------
+    thing : name of the argument in the message
+    value : real number, NumPy scalar, Decimal or array without axes; bool is refused
+    error : class of the exception
+    example : valid value for the message
+
+    Raises
+    ------
+    error : `value` is no real number.
+    """
     value = _without_axes(value)
     if isinstance(value, bool) or not isinstance(value, (Real, Decimal)):
-        raise error(f"{thing} must be a number, got {_told(value)}. Give for example {example}.")
+        raise error(f"{thing} must be a number, got {_shown(value)}. Give for example {example}.")
     try:
         return float(value)
     except OverflowError:
@@ -24,19 +36,26 @@ def number(thing: str, value: object, error: type[FsptError], example: str) -> f
 
 
 def whole(thing: str, value: object, error: type[FsptError], example: str) -> int:
-    """`value` as an int; raises `error` for what is no whole number, True too."""
+    """`value` as an int; parameters as for `number`.
+
+    Raises
+    ------
+    error : `value` is no whole number; bool is refused too.
+    """
     value = _without_axes(value)
     with suppress(OverflowError, ValueError):  # infinite, not a number
         if isinstance(value, (Real, Decimal)) and not isinstance(value, bool):
             found = int(value)  # type: ignore[arg-type]  # likewise
             if found == value:
                 return found
-    raise error(f"{thing} must be a whole number, got {_told(value)}. Give for example {example}.")
+    raise error(f"{thing} must be a whole number, got {_shown(value)}. Give for example {example}.")
 
 
 def _without_axes(value: object) -> object:
+    """The element of an array without axes; any other value unchanged."""
     return value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
 
 
-def _told(value: object) -> str:
+def _shown(value: object) -> str:
+    """`value` as text on one line."""
     return " ".join((str(value) if isinstance(value, Real) else repr(value)).split())

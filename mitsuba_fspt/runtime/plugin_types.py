@@ -1,22 +1,22 @@
-"""Which of Mitsuba's objects are this package's own plugins.
+"""Tests of whether a Mitsuba object is one of this package's plugins.
 
-Told by the names of their classes: every variant has classes of its own, and to import one for `isinstance` would
-register it with whatever variant is set.
+They compare class names: every variant has classes of its own, and importing one for `isinstance` would register it
+with the active variant.
 """
 
 from __future__ import annotations
 
 
 def is_surface(emitter: object) -> bool:
-    """True of an `fspt_surface`."""
+    """True if `emitter` is an `fspt_surface`."""
     return type(emitter).__name__ == "FsptSurface"
 
 
 def is_lens(sensor: object) -> bool:
-    """True of an `fspt_lens`."""
+    """True if `sensor` is an `fspt_lens`."""
     return type(sensor).__name__ == "FsptLens"
 
 
 def is_integral(integrator: object) -> bool:
-    """True of an `fspt_integral`."""
+    """True if `integrator` is an `fspt_integral`."""
     return type(integrator).__name__ == "FsptIntegral"

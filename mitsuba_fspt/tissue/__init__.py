@@ -1,1 +1,1 @@
-"""Light inside the tissue: the diffusion equation by finite elements, from a source to J_n on the surface."""
+"""Light in tissue: the diffusion equation by finite elements, from sources to J_n on the surface."""

@@ -1,10 +1,10 @@
-"""Light in tissue: the diffusion equation by finite elements.
+"""Diffusion equation of light in tissue, solved by finite elements.
 
     -∇·(D ∇φ) + µa φ = q inside,   φ + 2 A D ∂φ/∂n = 0 on the border,   D = 1/(3 (µa + µs')).
 
-φ is split in φ_f + w. φ_f is the field of the sources in endless tissue with the optics found at the source:
-known exactly, its singularity and its power included. The finite elements carry the smooth rest w alone, so
-that both orders of element reach their full rate and the mesh need not know where the sources are.
+φ is split into φ_f + w. φ_f is the field of the sources in infinite tissue with the optics found at the source, in
+closed form, including its singularity and its power. The finite elements solve for the smooth rest w only, so that
+both orders of element converge at their full rate and the mesh is independent of the sources' positions.
 
     mesh = cylinder_tetrahedra(radius=15, height=30, edge=1.5)
     solution = solve(mesh, [Medium(0.0138, 0.91, 1.37)], [Source(Sphere((8, 0, 0)))])
@@ -41,11 +41,12 @@ def solve(
     order: int = 2,
     progress: Progress | None = None,
 ) -> DiffusionSolution:
-    """DiffusionSolution of the diffusion equation on a mesh, with its power balance.
+    """Solution of the diffusion equation on a mesh, with its power balance.
 
     Parameters
     ----------
-    mesh : the tissue; `media[label]` fills its region `label`
+    mesh : tetrahedra of the tissue; `media[label]` fills its region `label`
+    media : absorption, reduced scattering and refractive index of each region
     sources : at least one; their shapes must lie inside the mesh
     a : boundary factor: 'robin', 'haskell' (from each region's n) or a number
     order : 1 or 2, of the tetrahedra
@@ -53,11 +54,11 @@ def solve(
 
     Raises
     ------
-    FluxError : no source, one outside the mesh or too close to its border, a region without medium, another
+    FluxError : no source, a source outside the mesh or too close to its border, a region without medium, another
         order, or no convergence.
     BackendError : scikit-fem or SciPy is missing.
     """
-    tell = progress or (lambda stage: None)
+    report = progress or (lambda stage: None)
     if order not in (1, 2):
         raise FluxError(f"solve: 'order' must be 1 or 2, got {order}.")
     if mesh.region.min() < 0 or mesh.region.max() >= len(media):
@@ -66,10 +67,10 @@ def solve(
             f"to {len(media) - 1}. Give one a region."
         )
     factors = [boundary_a(a, medium.n) for medium in media]
-    tell("assemble")
+    report("assemble")
     system = System(mesh, order, [m.diffusion for m in media], [m.mua for m in media], factors)
     fields = _free_fields(mesh, media, sources)
-    tell("solve")
+    report("solve")
     solved = system.solve(fields)
     power = math.fsum(source.power for source in sources)
     solution = DiffusionSolution(mesh, system.basis, tuple(media), tuple(factors), fields, power, solved)
@@ -82,7 +83,7 @@ def solve(
 
 
 def _free_fields(mesh: Tetrahedra, media: Sequence[Medium], sources: Sequence[Source]) -> tuple[FreeField, ...]:
-    """One field for each region with light in it; a shape across several counts node by node."""
+    """Free field of the sources in each region; each node of a source counts to the region that contains it."""
     if not sources:
         raise FluxError("solve: there is no source. Give at least one.")
     parts = []

@@ -1,12 +1,12 @@
-"""The finite elements of the diffusion equation: matrix, load, solution and power balance, by scikit-fem.
+"""Finite elements of the diffusion equation: matrix, load, solution and power balance, by scikit-fem.
 
-With D_f, µ_f the optics of the free field φ_f of the sources, the rest w = φ - φ_f obeys for every test
+With D_f, µ_f the optics of the free field φ_f of the sources, the rest w = φ - φ_f satisfies for every test
 function v
 
     ∫ (D ∇w·∇v + µa w v) dV + ∮ w v/(2A) dS
         = -∮ (φ_f/(2A) + D_f ∂φ_f/∂n) v dS - ∫ [(D - D_f) ∇φ_f·∇v + (µa - µ_f) φ_f v] dV,
 
-where the last integral runs over the regions with other optics than the source's.
+where the last integral runs over the regions whose optics differ from the source's.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from .tetrahedra import Tetrahedra
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Relative residual of the linear system. Far from the sources φ is nine decades below its peak; this leaves
-# it digits.
+# Relative residual of the linear system. Far from the sources φ is nine decades below its peak and keeps some digits.
 TOLERANCE = 1e-13
 MOST_ITERATIONS = 5000
-# Of the quadrature on the border, where φ_f is no polynomial: what makes shallow sources lose power (see `balance`).
+# Degree of the quadrature on the border, where φ_f is no polynomial; its error is the power that shallow sources lose
+# (see `balance`).
 BORDER_DEGREE = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The rest w at the nodes [W/mm²], the powers absorbed inside and leaving through the border [W]."""
+    """Rest w at the nodes [W/mm²], power absorbed inside and power leaving through the border [W]."""
 
     rest: Array
     absorbed: float
@@ -44,10 +44,10 @@ class Solved:
 
 
 class System:
-    """The discrete problem on one mesh: `basis` of the cells, `border` basis of the boundary facets.
+    """Discrete problem on one mesh: `basis` of the cells, `border` basis of the boundary facets.
 
-    `diffusion` [mm], `mua` [1/mm] and `factors` A hold one number a region; `order` is 1 or 2. Elements of
-    order 2 have a curved border where the mesh knows it.
+    `diffusion` [mm], `mua` [1/mm] and `factors` A hold one number per region; `order` is 1 or 2. Elements of
+    order 2 have a curved border if the mesh has a `snap`.
 
     Raises
     ------
@@ -67,13 +67,13 @@ class System:
         grid = _grid(skfem, mesh, order)
         self.basis = skfem.Basis(grid, self.element, intorder=2 * order)
         self.border = _border_basis(skfem, grid, self.element)
-        # One row a cell or facet, to broadcast over its quadrature points.
+        # One row per cell or facet, to broadcast over its quadrature points.
         self.diffusion = np.asarray(diffusion)[mesh.region][:, None]
         self.mua = np.asarray(mua)[mesh.region][:, None]
         self.factor = np.asarray(factors)[mesh.region[grid.f2t[0, self.border.find]]][:, None]
 
     def solve(self, fields: Sequence[FreeField]) -> Solved:
-        """The rest of φ beside the free fields of the sources, and where their power goes.
+        """Rest w of φ beside the free fields of the sources, with the absorbed and the exit power.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class System:
         changed = (self.diffusion != field.diffusion) | (self.mua != field.mua)
         other = np.flatnonzero(changed[:, 0])
         load, power = np.zeros(self.basis.N), 0.0
-        # ∇φ_f is steep beside a source: a rule of many small tetrahedra there.
+        # ∇φ_f is steep near a source: cells there take a rule of many small tetrahedra.
         near = self._near(other, field.centres)
         skfem = import_skfem()
         degree = 2 * self.element.maxdeg
@@ -130,7 +130,7 @@ class System:
         return load, power
 
     def _near(self, cells: Index, centres: Array) -> NDArray[np.bool_]:
-        """Which of the cells have a centre within two radii of their middle."""
+        """True for each of the cells with one of the `centres` within two cell radii of its centroid."""
         from scipy.spatial import cKDTree
 
         corners = self.basis.mesh.p[:, self.basis.mesh.t[:, cells]]
@@ -139,10 +139,10 @@ class System:
         return np.asarray(cKDTree(centres).query(middle.T)[0] < 2 * size)
 
     def _conjugate_gradients(self, load: Array) -> tuple[Array, int]:
-        """DiffusionSolution of the linear system and the number of iterations, with a Jacobi preconditioner.
+        """Solution of the linear system, shape (N,), with a Jacobi preconditioner, and the number of iterations.
 
-        SciPy's own takes dot products by threaded BLAS, whose threads wait for each other on a busy machine:
-        five times the time.
+        SciPy's conjugate gradients take dot products by threaded BLAS, whose threads wait for each other on a busy
+        machine: five times the time.
         """
         matrix = self._matrix()
         jacobi = 1 / matrix.diagonal()
@@ -165,6 +165,7 @@ class System:
         )
 
     def _matrix(self) -> Any:
+        """Sparse matrix of the left side of the module's equation."""
         skfem = import_skfem()
         volume = skfem.BilinearForm(lambda u, v, w: self.diffusion * (u.grad * v.grad).sum(axis=0) + self.mua * u * v)
         surface = skfem.BilinearForm(lambda u, v, w: u * v / (2 * self.factor))
@@ -172,7 +173,7 @@ class System:
 
     @staticmethod
     def _integrate(basis: Any, value: Array, gradient: Array | None = None) -> Array:
-        """∫ (value · v + gradient · ∇v) of every test function v, both given at the quadrature points."""
+        """∫ (value · v + gradient · ∇v) for every test function v; `value` and `gradient` at the quadrature points."""
         skfem = import_skfem()
         if gradient is None:
             form = skfem.LinearForm(lambda v, w: value * v)
@@ -202,14 +203,14 @@ def import_skfem() -> Any:
 
 
 def _split_rule(degree: int) -> tuple[Array, Array]:
-    """Points (3, Q) and weights (Q,) of the reference tetrahedron cut into 64, each with a rule of the degree."""
+    """Points (3, Q) and weights (Q,) on the reference tetrahedron, cut into 64 with a rule of `degree` in each."""
     skfem = import_skfem()
     parts = skfem.Basis(skfem.MeshTet1.init_refdom().refined(2), skfem.ElementTetP1(), intorder=degree)
     return np.asarray(parts.global_coordinates()).reshape(3, -1), parts.dx.ravel()
 
 
 def _grid(skfem: Any, mesh: Tetrahedra, order: int) -> Any:
-    """The mesh for scikit-fem; for order 2 with the midpoints of its edges on the true border, if curved."""
+    """Mesh of scikit-fem; for order 2 and a curved border, with the midpoints of border edges on the true border."""
     straight = skfem.MeshTet1(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.cells.T))
     if order == 1 or mesh.snap is None:
         return straight
@@ -217,7 +218,7 @@ def _grid(skfem: Any, mesh: Tetrahedra, order: int) -> Any:
     middle = curved.dofs.edge_dofs[0, np.unique(curved.f2e[:, curved.boundary_facets()])]
     before = curved.doflocs[:, middle]
     curved.doflocs[:, middle] = mesh.snap(before.T).T
-    # A flat cell can turn over, or nearly; all its edges stay straight.
+    # A flat cell can be inverted, or nearly; all its edges stay straight.
     points = skfem.ElementTetP2.doflocs.T
     bent = skfem.MappingIsoparametric(curved, skfem.ElementTetP2()).detDF(points)
     turned = (bent / straight.mapping().detDF(points)).min(axis=1) < 0.5
@@ -227,9 +228,10 @@ def _grid(skfem: Any, mesh: Tetrahedra, order: int) -> Any:
 
 
 def _border_basis(skfem: Any, grid: Any, element: Any) -> Any:
-    """The basis of the boundary facets, with their points' places in the cells known exactly.
+    """Basis of the boundary facets, with exact local coordinates of their quadrature points in the cells.
 
-    scikit-fem finds those of curved cells by Newton steps, which flat cells and round-off far from the origin stop.
+    scikit-fem computes those of curved cells by Newton's method, which fails for flat cells and, by round-off, far
+    from the origin.
     """
     if grid.affine:
         return skfem.FacetBasis(grid, element, intorder=BORDER_DEGREE)
@@ -237,10 +239,10 @@ def _border_basis(skfem: Any, grid: Any, element: Any) -> Any:
     facets = grid.boundary_facets()
     mapping = grid.mapping()
 
-    def places(_: Array, tind: Index) -> Array:
+    def local_coordinates(_: Array, tind: Index) -> Array:
         corners = np.argmax(grid.t[:, None, tind] == grid.facets[:, facets], axis=0)
         reference = skfem.refdom.RefTet.p[:, corners]
         return np.einsum("dkf,kq->dfq", reference, np.stack([1 - points[0] - points[1], *points]))
 
-    mapping.invF = places
+    mapping.invF = local_coordinates
     return skfem.FacetBasis(grid, element, mapping, quadrature=(points, weights), facets=facets)

@@ -1,4 +1,4 @@
-"""Fluence in the tissue on a regular grid, as a file that Mitsuba's `gridvolume` reads."""
+"""Fluence in tissue on a regular grid, and its file for Mitsuba's `gridvolume`."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ MOST_VOXELS = 512**3
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Values in the middle of voxels, shape (Z, Y, X); `low` and `high`: corners (x, y, z) of their box [mm].
+    """Values at the centres of voxels, shape (Z, Y, X); `low` and `high`: corners (x, y, z) of their box [mm].
 
-    In a scene: a `gridvolume` of the file with `use_grid_bbox`, or with a `to_world` that takes the unit cube
-    to the box, translate(low) · scale(high - low).
+    In a scene: a `gridvolume` of the file with `use_grid_bbox`, or with a `to_world` that maps the unit cube to the
+    box, translate(low) · scale(high - low).
     """
 
     values: NDArray[np.float32]
@@ -29,7 +29,7 @@ class Volume:
     high: Array
 
     def report(self) -> dict[str, object]:
-        """Size and place, ready for JSON: `volume_voxels` (x, y, z), `volume_low` and `volume_high` [mm]."""
+        """Size and position, ready for JSON: `volume_voxels` (x, y, z), `volume_low` and `volume_high` [mm]."""
         return {
             "volume_voxels": list(self.values.shape[::-1]),
             "volume_low": self.low.tolist(),
@@ -41,7 +41,7 @@ class Volume:
 
         Raises
         ------
-        FluxError : the file cannot be written; nothing is left behind.
+        FluxError : the file cannot be written; no partial file remains.
         """
         layers, rows, columns = self.values.shape
         header = struct.pack("<3sB5i6f", b"VOL", 3, 1, columns, rows, layers, 1, *self.low, *self.high)
@@ -50,13 +50,13 @@ class Volume:
 
 
 def voxel_box(low: Array, high: Array, voxel: float) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """Box of whole voxels about the box from `low` to `high` (x, y, z) [mm], one voxel wider on every side.
+    """Box of whole voxels around the box from `low` to `high` (x, y, z) [mm], wider by a voxel or more on every side.
 
-    Returns its corners and the coordinates of the voxel centres along x, y and z [mm].
+    Returns its two corners and the coordinates of the voxel centres along x, y and z [mm].
 
     Raises
     ------
-    FluxError : the voxel's edge [mm] is not positive, or there would be more than 512³ of them.
+    FluxError : the voxel's edge [mm] is not positive, or there would be more than 512³ voxels.
     """
     if not (np.isfinite(voxel) and voxel > 0):
         raise FluxError(f"volume: 'voxel' must be > 0 and finite, got {voxel:g}. Give mm.")

@@ -1,4 +1,4 @@
-"""Fluence of uniform spheres of light in endless homogeneous tissue: the exactly known part of the solution.
+"""Fluence of uniform spherical sources in infinite homogeneous tissue: the closed-form part of the solution.
 
 -D ∇²φ + µa φ = q has φ = P/(4πDr) · exp(−kr) around a point of power P, k = √(µa/D). Outside a uniform ball
 of radius a the same holds with P · 3 i₁(ka)/(ka) in place of P (mean value property), i₁ the modified
@@ -15,18 +15,20 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Below this decay [1/mm] the factor exp(-kr) is 1 over any phantom; it stands for tissue without absorption,
-# where the closed form of the ball is 0/0.
+# Below this decay [1/mm] the factor exp(-kr) is 1 over any phantom. It replaces k = 0 of tissue without absorption, for
+# which the closed form of the ball is 0/0.
 SMALLEST_DECAY = 1e-7
 PAIRS_AT_ONCE = 500_000
 
 
 @dataclass(frozen=True, eq=False)
 class FreeField:
-    """Field of K spheres of light in endless tissue.
+    """Field of K spherical sources in infinite tissue.
 
-    `centres` (K, 3) [mm], `radii` (K,) [mm] (0: a point), `powers` (K,) [W], `diffusion` D [mm], `mua`
-    [1/mm].
+    centres : array, shape (K, 3) [mm]
+    radii : array, shape (K,) [mm], 0 for a point source
+    powers : array, shape (K,) [W]
+    diffusion, mua : D [mm] and µa [1/mm]
     """
 
     centres: Array
@@ -37,13 +39,13 @@ class FreeField:
 
     @property
     def decay(self) -> float:
-        """k = √(µa/D) [1/mm]."""
+        """Decay k = √(µa/D) [1/mm], at least `SMALLEST_DECAY`."""
         return max(float(np.sqrt(self.mua / self.diffusion)), SMALLEST_DECAY)
 
     def fluence(self, points: Array, core: float = 0.0) -> Array:
         """φ [W/mm²] at `points` (N, 3) [mm], shape (N,).
 
-        Closer than `core` [mm] to a centre φ stays constant; at a point source, with core 0, it is infinite.
+        Closer than `core` [mm] to a centre φ is constant; with core 0 it is infinite at a point source.
         """
         fluence = np.empty(len(points))
         for part, distance in self._distances(points):
@@ -53,7 +55,7 @@ class FreeField:
     def with_gradient(self, points: Array) -> tuple[Array, Array, Array]:
         """φ [W/mm²], shape (N,), ∇φ [W/mm³] and Σ P r/(4πr³) [W/mm²], shape (N, 3), at `points` (N, 3) [mm].
 
-        The last one is what -D ∇φ would be outside the spheres if nothing were absorbed.
+        The last one equals -D ∇φ outside the spheres in tissue without absorption.
         """
         fluence, gradient = np.empty(len(points)), np.empty((len(points), 3))
         outflow = np.empty_like(gradient)
@@ -65,7 +67,7 @@ class FreeField:
         return fluence, gradient, outflow
 
     def _distances(self, points: Array) -> Iterator[tuple[slice, Array]]:
-        """Blocks of points with their distances from the centres (n, K) [mm]."""
+        """Slices of the points, each with the distances (n, K) [mm] of its points from the centres."""
         from scipy.spatial.distance import cdist
 
         step = max(1, PAIRS_AT_ONCE // len(self.centres))
@@ -74,11 +76,11 @@ class FreeField:
             yield part, cdist(points[part], self.centres)
 
     def _along(self, points: Array, weights: Array) -> Array:
-        """Σ weight · (point - centre) over the spheres, (N, 3), of weights (N, K)."""
+        """Σ weight · (point - centre) over the spheres, shape (N, 3), for weights (N, K)."""
         return points * weights.sum(axis=1, keepdims=True) - weights @ self.centres
 
     def _fluence_of_balls(self, r: Array) -> Array:
-        """φ of each ball at the distances r (N, K) from its centre."""
+        """φ [W/mm²] of each ball at the distances r (N, K) [mm] from its centre."""
         from scipy.special import spherical_in
 
         k, x = self.decay, self.decay * self.radii
@@ -87,13 +89,13 @@ class FreeField:
             value = self.powers * inflation / (4 * np.pi * self.diffusion) * np.exp(-k * r) / r
         inside, a, density = self._inside(r)
         if len(a):
-            # 1 − (1 + ka) exp(−ka) i₀(kr) as two terms which are both small where ka and kr are.
-            bend = (1 + k * a) * np.exp(-k * a) * _bend(k * r[inside])
-            value[inside] = density / (self.diffusion * k**2) * (_one_minus(k * a) - bend)
+            # 1 − (1 + ka) exp(−ka) i₀(kr) as two terms that are both small for small ka and kr.
+            second = (1 + k * a) * np.exp(-k * a) * _i0_minus_one(k * r[inside])
+            value[inside] = density / (self.diffusion * k**2) * (_one_minus(k * a) - second)
         return value
 
     def _slope_of_balls(self, r: Array, fluence: Array) -> Array:
-        """(dφ/dr)/r of each ball at the distances r (N, K), where its φ is `fluence`."""
+        """(dφ/dr)/r [W/mm⁴] of each ball at the distances r (N, K) [mm], where its φ is `fluence`."""
         k = self.decay
         slope = -fluence * (k + 1 / r) / r
         inside, a, density = self._inside(r)
@@ -102,7 +104,7 @@ class FreeField:
         return slope
 
     def _inside(self, r: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Which distances end inside the ball, and there the ball's radius [mm] and power density [W/mm³]."""
+        """Mask (N, K) of the distances inside the ball, and for those the ball's radius [mm] and density [W/mm³]."""
         inside = r < self.radii
         ball = np.nonzero(inside)[1]
         return inside, self.radii[ball], self.powers[ball] / (4 / 3 * np.pi * self.radii[ball] ** 3)
@@ -113,7 +115,7 @@ def _one_minus(x: Array) -> Array:
     return np.where(x < 1e-2, x**2 * (1 / 2 - x / 3 + x**2 / 8 - x**3 / 30), 1 - (1 + x) * np.exp(-x))
 
 
-def _bend(y: Array) -> Array:
+def _i0_minus_one(y: Array) -> Array:
     """i₀(y) − 1 = sinh(y)/y − 1, accurate for small y."""
     return np.where(y < 1e-2, y**2 / 6 * (1 + y**2 / 20), np.sinh(y) / np.where(y > 0, y, 1) - 1)
 

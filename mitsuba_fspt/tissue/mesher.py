@@ -1,4 +1,4 @@
-"""Tetrahedra from files: a tetrahedral mesh as it is, or a closed surface through the mesher fTetWild."""
+"""Tetrahedra from files: a tetrahedral mesh as stored, or a closed surface filled by the mesher fTetWild."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from ..runtime.errors import BackendError, FluxError
 from .border_surface import nearest_points
 from .tetrahedra import Tetrahedra, require_few
 
-ENVELOPE = 20  # an edge over this: how far the mesher may leave the surface, to which its border is brought back
-ROUNDS = 5  # of putting back vertices whose move has crushed a cell
-CRUSHED = 0.3  # of a cell's volume, or turned over: less must not be left of it
+ENVELOPE = 20  # edge over the distance by which the mesher may leave the surface, onto which its border is moved after
+ROUNDS = 5  # of restoring vertices whose move has crushed a cell
+CRUSHED = 0.3  # least ratio of a cell's signed volumes after and before the move
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -29,10 +29,10 @@ Index = NDArray[np.int64]
 def read_tetrahedra(
     path: str | os.PathLike[str], edge: float, length_unit: str = "mm", labels: str | None = None
 ) -> Tetrahedra:
-    """Tetrahedra of a file, or those that fill its closed surface with edges of about `edge` [mm].
+    """Tetrahedra of a file; if it holds a closed surface, tetrahedra with edges of about `edge` [mm] that fill it.
 
-    `labels` names the file's field of whole numbers, one a tetrahedron, which become the mesh's regions as
-    they are. Any format of `fspt flux import` will do.
+    `labels` : name of the file's field of whole numbers, one per tetrahedron, used unchanged as the mesh's regions.
+    Any format of `fspt flux import` can be read.
 
     Raises
     ------
@@ -65,11 +65,11 @@ def read_tetrahedra(
 def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
     """Tetrahedra with edges of about `edge` [mm] in a closed surface, `vertices` (V, 3) [mm], `faces` (F, 3).
 
-    By fTetWild; the border's vertices lie on the surface. The mesh differs a little from run to run.
+    Meshed by fTetWild; the border's vertices are moved onto the surface. The mesh differs a little from run to run.
 
     Raises
     ------
-    FluxError : the surface is open, nothing comes out, or there would be more than 5 million tetrahedra.
+    FluxError : the surface is open, the edge is out of range, or there are no or more than 5 million tetrahedra.
     BackendError : pytetwild is not installed.
     """
     if not closure(vertices, faces).watertight:
@@ -89,8 +89,8 @@ def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
             f"geometry: the mesh edge must be > 0 and at most the size {diagonal:.3g} mm, got {edge:g}. Give mm."
         )
     volume = abs(float(np.linalg.det(vertices[faces]).sum())) / 6
-    require_few(6 * math.sqrt(2) * volume, edge)  # regular ones
-    with _in_temporary_folder():  # the mesher leaves a file where it runs
+    require_few(6 * math.sqrt(2) * volume, edge)  # regular tetrahedra
+    with _in_temporary_folder():  # the mesher leaves a file in the current folder
         points, cells = pytetwild.tetrahedralize(
             np.ascontiguousarray(vertices, dtype=np.float64),
             np.ascontiguousarray(faces, dtype=np.int32),
@@ -104,6 +104,7 @@ def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
 
 @contextmanager
 def _in_temporary_folder() -> Iterator[None]:
+    """Context manager that makes a temporary folder the current one."""
     here = os.getcwd()
     with TemporaryDirectory() as folder:
         os.chdir(folder)
@@ -114,8 +115,8 @@ def _in_temporary_folder() -> Iterator[None]:
 
 
 def _on_surface(mesh: Tetrahedra, vertices: Array, faces: Index) -> Tetrahedra:
-    """The mesh with the vertices of its border on the surface it fills; `snap` brings other points there."""
-    # Triangles of one size, so that the nearest one is among the few with the nearest centroids.
+    """Mesh with its border vertices moved onto the surface; `snap` of the result moves other points there."""
+    # Triangles of similar size, so that the nearest one is among the few with the nearest centroids.
     fine, parts = subdivide_to_size(vertices, faces, mesh.edge / 2, max_iter=20)
     surface = fine[parts]
 
@@ -126,7 +127,7 @@ def _on_surface(mesh: Tetrahedra, vertices: Array, faces: Index) -> Tetrahedra:
     moved = mesh.vertices.copy()
     moved[border] = snap(moved[border])
     for _ in range(ROUNDS):
-        # A flat cell can turn over; its vertices stay where they were.
+        # A flat cell can be inverted; its vertices return to their old positions.
         crushed = _determinants(moved, mesh.cells) / _determinants(mesh.vertices, mesh.cells) < CRUSHED
         kept = np.unique(mesh.cells[crushed])
         moved[kept] = mesh.vertices[kept]

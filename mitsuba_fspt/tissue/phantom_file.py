@@ -1,4 +1,4 @@
-"""The description of a phantom in TOML, lengths in mm, powers in W.
+"""Description of a phantom in TOML, lengths in mm, powers in W.
 
 [geometry]
 shape = "cylinder"       # about the z axis, centred at the origin
@@ -68,26 +68,26 @@ class CylinderGeometry:
     height: float
 
     def mesh(self, edge: float) -> Tetrahedra:
-        """Its tetrahedra with edges of about `edge` [mm]."""
+        """Tetrahedra of the cylinder with edges of about `edge` [mm]."""
         return cylinder_tetrahedra(self.radius, self.height, edge)
 
 
 @dataclass(frozen=True)
 class MeshGeometry:
-    """Tetrahedra or a closed surface in a file, in `length_unit`; `labels`: the field that labels its cells."""
+    """Tetrahedra or a closed surface in a file, in `length_unit`; `labels`: name of the field that labels its cells."""
 
     path: Path
     length_unit: str = "mm"
     labels: str | None = None
 
     def mesh(self, edge: float) -> Tetrahedra:
-        """Its tetrahedra, or those with edges of about `edge` [mm] that fill it."""
+        """Tetrahedra of the file, or tetrahedra with edges of about `edge` [mm] that fill its surface."""
         return read_tetrahedra(self.path, edge, self.length_unit, self.labels)
 
 
 @dataclass(frozen=True)
 class Region:
-    """A part of the tissue with a `medium` of its own: a shape, or a label of the mesh file."""
+    """Part of the tissue with its own `medium`; `where`: a shape, or a label of the mesh file."""
 
     where: Shape | int
     medium: Medium
@@ -95,10 +95,10 @@ class Region:
 
 @dataclass(frozen=True)
 class PhantomFile:
-    """A phantom to be solved: what the TOML file says. `medium` is that of all tissue outside the `regions`.
+    """Content of a TOML file that describes a phantom. `medium` fills all tissue outside the `regions`.
 
-    `edge` of the tetrahedra, `surface_edge` of the surface's triangles and `voxel` [mm]; `order` 1 or 2; `a`
-    the boundary factor's name or value.
+    `edge` of the tetrahedra, `surface_edge` of the surface's triangles and `voxel` [mm]; `order` 1 or 2 of the finite
+    elements; `a` name or value of the boundary factor.
     """
 
     geometry: CylinderGeometry | MeshGeometry
@@ -113,12 +113,11 @@ class PhantomFile:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> PhantomFile:
-        """The description in a TOML file. A file it names is looked for beside it.
+        """Description in a TOML file; a relative path in it starts at the file's folder.
 
         Raises
         ------
-        FluxError : the file cannot be read, a key is missing, unknown or of a wrong kind, a number out of
-        range.
+        FluxError : the file cannot be read, a key is missing, unknown or of a wrong type, or a number is out of range.
         """
         path = Path(path)
         file = Table.load(path)
@@ -143,16 +142,15 @@ class PhantomFile:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that it reads besides itself."""
+        """Files that are read in addition to the TOML file."""
         return (self.geometry.path,) if isinstance(self.geometry, MeshGeometry) else ()
 
     def mesh(self) -> Tetrahedra:
-        """The tetrahedra with the number of their region, 1, 2, …, 0 for the rest; of several the last.
+        """Tetrahedra with the number of their region: 1, 2, … for `regions`, where the last one counts, else 0.
 
         Raises
         ------
-        FluxError, BackendError : see cylinder_tetrahedra and read_tetrahedra; or a label that no tetrahedron
-        has.
+        FluxError, BackendError : as in cylinder_tetrahedra and read_tetrahedra; or no tetrahedron is in a region.
         """
         mesh = self.geometry.mesh(self.edge)
         labels, region = mesh.region, np.zeros(len(mesh.cells), dtype=np.int64)
@@ -167,18 +165,18 @@ class PhantomFile:
         return replace(mesh, region=region)
 
     def solve(self, progress: Progress | None = None) -> DiffusionSolution:
-        """Mesh the phantom and solve it; see `tissue.solve`."""
-        import_skfem()  # before the mesher's minutes
+        """Solution for the phantom on its mesh; see `diffusion.solve`."""
+        import_skfem()  # a missing package is reported before the mesher's minutes
         if progress:
             progress("mesh")
         mesh = self.mesh()
-        mesh.cuts(self.surface_edge)  # refuses what cannot be, before the solver's minutes
+        mesh.cuts(self.surface_edge)  # an impossible edge is refused before the solver's minutes
         media = (self.medium, *(part.medium for part in self.regions))
         return solve(mesh, media, self.sources, a=self.a, order=self.order, progress=progress)
 
 
 def _geometry(table: Table, folder: Path) -> CylinderGeometry | MeshGeometry:
-    """The geometry of the table [geometry]."""
+    """Geometry of the table [geometry]."""
     if "file" in table.left:
         result: CylinderGeometry | MeshGeometry = MeshGeometry(
             folder / table.text("file"), table.text("length_unit", "mm"), table.optional_text("labels")
@@ -191,11 +189,12 @@ def _geometry(table: Table, folder: Path) -> CylinderGeometry | MeshGeometry:
 
 
 def _medium(table: Table, n: float) -> Medium:
+    """Medium of the keys mua, musp and n, with `n` as the default."""
     return Medium(table.number("mua"), table.number("musp"), table.number("n", n))
 
 
 def _region(table: Table, n: float) -> Region:
-    """A table of [[regions]]; its refractive index is that of [optical] unless it names one."""
+    """Region of a table of [[regions]]; its refractive index is that of [optical] unless it names one."""
     where = table.whole("label") if "label" in table.left else _shape(table, ("sphere", "cylinder"))
     result = Region(where, _medium(table, n))
     table.done()
@@ -203,13 +202,14 @@ def _region(table: Table, n: float) -> Region:
 
 
 def _source(table: Table) -> Source:
-    """A table of [[sources]]."""
+    """Source of a table of [[sources]]."""
     result = Source(_shape(table, ("point", "sphere", "cylinder")), table.number("power", 1.0))
     table.done()
     return result
 
 
 def _shape(table: Table, choices: tuple[str, ...]) -> Shape:
+    """Shape of a table, one of the `choices`; a point is a sphere of radius 0."""
     shape = table.choice("shape", choices)
     centre = table.vector("centre")
     if shape == "point":

@@ -1,4 +1,4 @@
-"""A solved phantom: fluence and exitance at any point, the border as a phantom, the fluence as a volume."""
+"""Solution for a phantom: fluence and exitance at any point, the border as a phantom, the fluence as a volume."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from .tetrahedra import OUTSIDE, Tetrahedra, depth
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Share of the exit power that values below 0, an error of the mesh, may take away before it is refused.
+# Largest share of the exit power that values below 0, an error of the mesh, may remove.
 LARGEST_REMOVED = 1e-4
-# Of the search in curved cells; each one divides the error by about 8 radii of curvature over an edge.
+# Iterations of the search in curved cells; each one divides the error by about 8 radii of curvature over an edge.
 CURVED_STEPS = 6
-NEARBY = 0.5  # barycentric coordinates beyond a cell: further off curved cells are as good as straight ones
+NEARBY = 0.5  # barycentric distance from a cell, beyond which its straight form is accurate enough
 
 
 @dataclass(frozen=True, eq=False)
 class DiffusionSolution:
-    """φ = free fields of the sources + the rest `solved.rest` on the finite element `basis` of `mesh`.
+    """Solution φ = free `fields` of the sources + the rest `solved.rest` on the finite element `basis` of `mesh`.
 
-    `media` and boundary `factors` A: one a region of the mesh; `source_power` [W].
+    `media` and boundary `factors` A: one per region of the mesh; `source_power` [W].
     """
 
     mesh: Tetrahedra
@@ -45,7 +45,7 @@ class DiffusionSolution:
 
     @property
     def balance(self) -> float:
-        """(absorbed + exit power)/source power - 1, no unit: what quadrature on the border misses of the sources."""
+        """(absorbed + exit power)/source power - 1, no unit: error of the quadrature of the sources on the border."""
         return (self.solved.absorbed + self.solved.exited) / self.source_power - 1
 
     def report(self) -> dict[str, float | int]:
@@ -69,8 +69,8 @@ class DiffusionSolution:
     def fluence_at(self, points: Array, core: float = 0.0) -> Array:
         """φ [W/mm²] at `points` (N, 3) [mm] in the tissue, shape (N,).
 
-        Just outside, the rest w is that of the nearest point of a nearby cell. Closer than `core` [mm] to a
-        point source φ stays constant; with core 0 it is infinite there.
+        Just outside, the rest w is that of a nearby point of the border. Closer than `core` [mm] to a point source φ
+        is constant; with core 0 it is infinite there.
         """
         cells, local = self._locate(points)
         return self._fluence(points, cells, local, core)
@@ -82,15 +82,15 @@ class DiffusionSolution:
         return self._fluence(points, cells, local, 0.0) / (2 * factor)
 
     def phantom(self, edge: float) -> Phantom:
-        """The border with J_n on its vertices, the edges of its triangles about `edge` [mm] > 0 or shorter.
+        """Border as a phantom with J_n on its vertices; triangle edges are about `edge` [mm] > 0 or shorter.
 
-        One factor, near 1, makes the sum over triangles of area times mean value the finite elements' exit
-        power; the provenance has it as `scale`. Values below 0 become 0 and are counted.
+        All values are multiplied by one factor near 1, so that the sum over triangles of area times mean value is the
+        finite elements' exit power; the provenance gives it as `scale`. Values below 0 become 0 and are counted.
 
         Raises
         ------
-        FluxError : the edge is not positive or far too short, no light leaves, or the values below 0 matter: the
-            mesh is too coarse.
+        FluxError : the edge is not positive or far too short, no light leaves, or the values below 0 remove too much
+            power: the mesh is too coarse.
         """
         if not self.solved.exited > 0:
             raise FluxError(
@@ -119,16 +119,16 @@ class DiffusionSolution:
         return Phantom(vertices, faces, clipped * scale, "vertex", provenance, negatives, removed)
 
     def volume(self, voxel: float) -> Volume:
-        """φ [W/mm²] in the middle of cubes of edge `voxel` [mm], in a box one of them wider than the tissue.
+        """φ [W/mm²] at the centres of cubes of edge `voxel` [mm], in a box wider than the tissue by a cube or more.
 
-        Outside, φ goes on from the nearest point of the border as exp(-distance/(2AD)), the slope of the
+        Outside, φ is continued from the nearest point of the border as exp(-distance/(2AD)), the slope of the
         boundary condition, so that trilinear interpolation up to the surface meets no jump.
 
         Raises
         ------
-        FluxError : the voxel's edge is not positive, or there would be too many of them.
+        FluxError : the voxel's edge is not positive, or there would be too many voxels.
         """
-        # Too many voxels are refused before the border is cut as fine.
+        # Too many voxels are refused before the border is refined to the same edge.
         voxel_box(self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0), voxel)
         border, faces = self._border(voxel)
         low, high, axes = voxel_box(border.min(axis=0), border.max(axis=0), voxel)
@@ -137,14 +137,14 @@ class DiffusionSolution:
         cells, local = self._curved(points, *self.mesh.locate(points))
         inside = depth(local) > -OUTSIDE
         fluence = np.empty(len(points))
-        # 1/r has over a cube about its middle the mean 1/(0.42 edge): a point source keeps its voxel finite.
+        # The mean of 1/r over a cube about its centre is 1/(0.42 edge): a point source leaves its voxel finite.
         fluence[inside] = self._fluence(points[inside], cells[inside], local[inside], 0.42 * voxel)
         nearest = self._snap(nearest_points(points[~inside], border[faces]))
         fluence[~inside] = self._continued(points[~inside], nearest)
         return Volume(fluence.reshape(x.shape).astype(np.float32), low, high)
 
     def _continued(self, points: Array, nearest: Array) -> Array:
-        """φ at `points` outside, from the nearest points of the border."""
+        """φ [W/mm²] at `points` outside the tissue, from the `nearest` points of the border."""
         cells, local = self._locate(nearest)
         region = self.mesh.region[cells]
         length = np.array([2 * a * m.diffusion for a, m in zip(self.factors, self.media, strict=True)])[region]
@@ -152,32 +152,33 @@ class DiffusionSolution:
         return self._fluence(nearest, cells, local, 0.0) * np.exp(-distance / length)
 
     def _border(self, edge: float) -> tuple[Array, Index]:
-        """The border as vertices and faces with edges of about `edge` [mm] or less, on the true surface."""
+        """Vertices and faces of the border, with edges of about `edge` [mm] or less, on the true surface."""
         vertices, faces = refined_border(self.basis.mesh, self.mesh.cuts(edge))
         return self._snap(vertices), faces
 
     def _snap(self, points: Array) -> Array:
-        """Points near the border on the true one, where the mesh knows it."""
+        """Points near the border, moved onto the true border if the mesh has a `snap`."""
         return points if self.mesh.snap is None else self.mesh.snap(points)
 
     def _fluence(self, points: Array, cells: Index, local: Array, core: float) -> Array:
+        """φ [W/mm²] at `points` with known cells and local coordinates; `core` as in `fluence_at`."""
         dofs = self.basis.element_dofs[:, cells]
         rest = sum(self.solved.rest[dof] * shape for dof, shape in zip(dofs, self._shapes(local), strict=True))
         return np.asarray(rest + sum(field.fluence(points, core) for field in self.fields))
 
     def _shapes(self, local: Array) -> list[Array]:
-        """The basis functions of a cell at local coordinates (N, 3)."""
+        """Basis functions of a cell at local coordinates (N, 3), each of shape (N,)."""
         return [self.basis.elem.lbasis(local.T, i)[0] for i in range(self.basis.Nbfun)]
 
     def _locate(self, points: Array) -> tuple[Index, Array]:
-        """Cells and local coordinates of points, held inside the cell."""
+        """Cells and local coordinates of points, the coordinates clamped to the cell."""
         cells, local = self._curved(points, *self.mesh.locate(points))
         rest = np.maximum(1 - local.sum(axis=1, keepdims=True), 0)
         local = np.maximum(local, 0)
         return cells, local / (local.sum(axis=1, keepdims=True) + rest)
 
     def _curved(self, points: Array, cells: Index, local: Array) -> tuple[Index, Array]:
-        """Cells and local coordinates in the curved mesh, from those in the straight one."""
+        """Cells and local coordinates of points in the curved mesh, from those in the straight mesh."""
         near = np.flatnonzero(depth(local) > -NEARBY)
         if self.basis.mesh.affine or len(near) == 0:
             return cells, local
@@ -186,7 +187,7 @@ class DiffusionSolution:
         near = near[converged]
         local[near] = there[converged]
         for _ in range(CURVED_STEPS):
-            # A facet that ends in a curved edge is curved too: the point can be in the next cell.
+            # A facet with a curved edge is curved too: the point can be in the next cell.
             behind = self.mesh.behind(cells[near], local[near])
             near, behind = near[behind >= 0], behind[behind >= 0]
             there = self._curved_local(points[near], behind)
@@ -196,7 +197,7 @@ class DiffusionSolution:
         return cells, local
 
     def _curved_local(self, points: Array, cells: Index) -> Array:
-        """Local coordinates of points in curved cells, which differ from straight ones by little: a fixed point."""
+        """Local coordinates of points in curved cells, by fixed-point iteration from those in the straight cells."""
         nodes = self.basis.mesh.doflocs[:, self.basis.element_dofs[:, cells]].swapaxes(0, 1)
         local = self.mesh.local(points, cells)
         for _ in range(CURVED_STEPS):

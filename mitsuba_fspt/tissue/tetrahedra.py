@@ -1,4 +1,4 @@
-"""A tetrahedral mesh of tissue: its regions, and which cell a point is in."""
+"""Tetrahedral mesh of tissue: its regions, and the search for the cell that contains a point."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ..runtime.errors import FluxError
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-STARTS = 4  # of the search for a point's cell
-MOST_STEPS = 200
+STARTS = 4  # start cells of the search for a point's cell
+MOST_STEPS = 200  # of the search from one start cell
 ROUND_OFF = 1e-9  # of a barycentric coordinate
-OUTSIDE = 1e-6  # likewise: a point no further beyond the border counts as inside
-# More take tens of gigabytes: tetrahedra in the solver, triangles of the surface.
+OUTSIDE = 1e-6  # a point counts as inside up to this barycentric distance beyond the border
+# More would take tens of gigabytes: tetrahedra in the solver, triangles of the surface.
 MOST_CELLS = 5_000_000
 MOST_FACES = 10_000_000
 
@@ -29,13 +29,16 @@ MOST_FACES = 10_000_000
 class Tetrahedra:
     """Tetrahedral mesh.
 
-    `vertices` (V, 3) [mm]; `cells` (T, 4), indices of vertices in either orientation; `region` (T,), the
-    label of each cell, all 0 where left out; `snap` brings points (N, 3) near the border onto the true,
-    curved one.
+    Parameters
+    ----------
+    vertices : array, shape (V, 3) [mm]
+    cells : array, shape (T, 4), indices of vertices in either orientation
+    region : array, shape (T,), label of each cell; all 0 if left out
+    snap : function that moves points (N, 3) [mm] near the border onto the true, curved border; None: it is straight
 
     Raises
     ------
-    FluxError : an array has another shape, a vertex is not finite, an index out of range, or a cell is flat.
+    FluxError : an array has another shape, a vertex is not finite, an index is out of range, or a cell is flat.
     """
 
     vertices: Array
@@ -46,9 +49,7 @@ class Tetrahedra:
     def __post_init__(self) -> None:
         vertices, cells = np.asarray(self.vertices, dtype=np.float64), np.asarray(self.cells, dtype=np.int64)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
-            raise FluxError(
-                f"tetrahedra: vertices must be finite, shape (V, 3), got shape {vertices.shape}. Mend them."
-            )
+            raise FluxError(f"tetrahedra: vertices must be finite, shape (V, 3), got shape {vertices.shape}. Fix them.")
         if cells.ndim != 2 or cells.shape[1] != 4 or len(cells) == 0:
             raise FluxError(
                 f"tetrahedra: cells must have shape (T, 4), T > 0, got {cells.shape}. Give four corners each."
@@ -73,7 +74,7 @@ class Tetrahedra:
             )
 
     def cuts(self, edge: float) -> int:
-        """Into how many parts the border's edges are to be cut for triangles with edges of about `edge` [mm].
+        """Number of parts, >= 1, of each border edge for triangles with edges of about `edge` [mm].
 
         Raises
         ------
@@ -92,13 +93,13 @@ class Tetrahedra:
 
     @property
     def edges(self) -> Array:
-        """The three edge vectors of each cell from its first vertex, as columns; (T, 3, 3) [mm]."""
+        """Edge vectors of each cell from its first vertex, as columns, shape (T, 3, 3) [mm]."""
         corners = self.vertices[self.cells]
         return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
 
     @property
     def volumes(self) -> Array:
-        """Volume of each cell, (T,) [mm³]."""
+        """Volume of each cell, shape (T,) [mm³]."""
         return np.asarray(np.abs(np.linalg.det(self.edges)) / 6)
 
     @property
@@ -107,15 +108,14 @@ class Tetrahedra:
         return float((6 * np.sqrt(2) * self.volumes.mean()) ** (1 / 3))
 
     def inside(self, shape: Shape) -> NDArray[np.bool_]:
-        """Whether the centroid of each cell lies in the shape; (T,)."""
+        """True for each cell whose centroid lies in the shape, shape (T,)."""
         return shape.contains(self.vertices[self.cells].mean(axis=1))
 
     def locate(self, points: Array) -> tuple[Index, Array]:
-        """The cell each of `points` (N, 3) [mm] is in; outside, one close to it.
+        """Cell that contains each of `points` (N, 3) [mm], or a cell close to a point outside the mesh.
 
-        Returns the cells (N,) and the points' local coordinates (N, 3): the barycentric coordinates of the
-        cell's second to fourth vertex; they and their complement to 1 are >= 0 (see `depth`) where the point
-        is inside.
+        Returns the cells (N,) and the points' local coordinates (N, 3), the barycentric coordinates of the cell's
+        second to fourth vertex. If the point is inside, they and their complement to 1 are >= 0 (see `depth`).
         """
         from scipy.spatial import cKDTree
 
@@ -123,7 +123,7 @@ class Tetrahedra:
         starts = tree.query(points, k=min(STARTS, len(self.cells)))[1].reshape(len(points), -1)
         cells, local = self._walk(points, starts[:, 0])
         for start in starts.T[1:]:
-            # Stuck at the border: outside, or on the other side of a cleft. Another start tells which.
+            # The walk ended at the border: the point is outside, or beyond a gap in the mesh. Try another start.
             lost = np.flatnonzero(depth(local) < -ROUND_OFF)
             other, there = self._walk(points[lost], start[lost])
             better = depth(there) > depth(local[lost])
@@ -131,7 +131,10 @@ class Tetrahedra:
         return cells, local
 
     def _walk(self, points: Array, start: Index) -> tuple[Index, Array]:
-        """From cell to cell, each time through the facet that the point is farthest behind."""
+        """Cells (N,) and local coordinates (N, 3) after a walk from `start`.
+
+        Each step crosses the facet that the point lies farthest behind, up to the point's cell or the border.
+        """
         cells, local = start.copy(), np.empty((len(points), 3))
         moving = np.arange(len(points))
         for _ in range(MOST_STEPS):
@@ -142,7 +145,7 @@ class Tetrahedra:
             if len(moving) == 0:
                 break
         else:
-            local[moving] = -np.inf  # going round in circles
+            local[moving] = -np.inf  # the walk is cyclic
         return cells, local
 
     def local(self, points: Array, cells: Index) -> Array:
@@ -150,7 +153,7 @@ class Tetrahedra:
         return np.einsum("nij,nj->ni", self.inverse[cells], points - self.vertices[self.cells[cells, 0]])
 
     def behind(self, cells: Index, local: Array) -> Index:
-        """The next cell towards each point with these local coordinates, (N,); -1 in its own cell and at the border."""
+        """Next cell towards each point with these local coordinates, (N,); -1 in its own cell and at the border."""
         weights = np.column_stack([1 - local.sum(axis=1), local])
         weights[self.neighbours[cells] < 0] = 0
         through = np.argmin(weights, axis=1)
@@ -159,12 +162,12 @@ class Tetrahedra:
 
     @cached_property
     def inverse(self) -> Array:
-        """Inverse of each cell's edge matrix, (T, 3, 3) [1/mm]."""
+        """Inverse of each cell's edge matrix, shape (T, 3, 3) [1/mm]."""
         return np.asarray(np.linalg.inv(self.edges))
 
     @cached_property
     def neighbours(self) -> Index:
-        """The cell behind the facet opposite to each vertex of each cell, (T, 4); -1 at the border."""
+        """Cell behind the facet opposite to each vertex of each cell, shape (T, 4); -1 at the border."""
         facets = np.sort(self.cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
         order = np.lexsort(facets.T)
         pair = np.flatnonzero((facets[order[1:]] == facets[order[:-1]]).all(axis=1))
@@ -174,9 +177,9 @@ class Tetrahedra:
 
 
 def require_few(at_one: float, edge: float) -> None:
-    """Raise FluxError where a mesh with edges of `edge` [mm] would have more than `MOST_CELLS` tetrahedra.
+    """Raise FluxError if a mesh with edges of `edge` [mm] would have more than `MOST_CELLS` tetrahedra.
 
-    `at_one` : how many it would have with edges of 1 mm
+    `at_one` : their number with edges of 1 mm
     """
     cells = at_one / edge / edge / edge
     if cells > MOST_CELLS:

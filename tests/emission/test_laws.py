@@ -294,8 +294,8 @@ def test_fluence_updated_by_itself_is_followed():
     [
         ({"emission": "phong"}, "'emission' must be one of fresnel, lambert, last_flight, got 'phong'"),
         ({"emission": "fresnel"}, "emission 'fresnel' needs 'int_ior'"),
-        ({"emission": "fresnel", "int_ior": 0.9}, "'int_ior' must be >= 1 and finite, got 0.9"),
-        ({"emission": "fresnel", "int_ior": float("inf")}, "'int_ior' must be >= 1 and finite, got inf"),
+        ({"emission": "fresnel", "int_ior": 0.9}, "'int_ior' must be >= 1 and at most 100, got 0.9"),
+        ({"emission": "fresnel", "int_ior": float("inf")}, "'int_ior' must be >= 1 and at most 100, got inf"),
         ({"emission": "last_flight", "int_ior": 1.37, "mua": 0.1, "musp": 1.0}, "needs 'fluence'.*as a volume"),
         ({"emission": "last_flight", "int_ior": 1.37, "mua": 0.1}, "needs 'musp'"),
         (

@@ -182,7 +182,7 @@ def test_bad_arrays(mesh, values, options, message):
     [
         ("v.csv", "a,b\n1,2\n3,4\n", r"which of its 2 columns.*'a', 'b'"),
         ("v.csv", "1,2\n3,x\n", r"not a table of numbers.*'x'"),
-        ("v.csv", "1,2\n3,x\n", r"not a table of numbers.*\. Mend that line\."),
+        ("v.csv", "1,2\n3,x\n", r"not a table of numbers.*\. Fix that line\."),
         ("v.csv", "1\n\n", r"1 values fit nothing"),
         ("v.csv", "# nothing\n", r"holds no values"),
         ("v.csv", "", r"holds no values"),

@@ -1,6 +1,6 @@
-"""Exit laws: how the exit radiance L(r, ω) of a point shares its exitance J_n out over the outward hemisphere.
+"""Exit laws: the exit radiance L(r, ω) of a point, which distributes its exitance J_n over the outward hemisphere.
 
-One class a file, found by the file's name. docs/extending.md shows a whole law.
+One class per file, found by the file's name. docs/extending.md shows a complete law.
 """
 
 from __future__ import annotations
@@ -16,37 +16,37 @@ from ...runtime.numbers import number
 
 
 class ExitLaw:
-    """Base of all exit laws. A law's `profile` is L/J_n [1/sr], with ∫ L cosθ dΩ = J_n over the outward hemisphere.
+    """Base class of the exit laws. `profile` is L/J_n [1/sr], with ∫ L cosθ dΩ = J_n over the outward hemisphere.
 
-    isotropic : the radiance is the same in all outward directions, so that J_n alone tells it
+    isotropic : the radiance is equal in all outward directions, so that J_n alone determines it
     """
 
     isotropic: ClassVar[bool] = False
 
     @classmethod
     def of(cls, props: mi.Properties) -> ExitLaw:
-        """The law with its own parameters, read from those of an `fspt_surface`; ExitanceError where one is wrong."""
+        """Law with its own parameters, read from those of an `fspt_surface`; ExitanceError if one is wrong."""
         return cls()
 
     @property
     def name(self) -> str:
-        """The law's name in a scene file, that of its file."""
+        """Name of the law in a scene file, equal to that of its Python file."""
         return type(self).__module__.rpartition(".")[2]
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
-        """Show `mi.traverse` what of the law can be updated."""
+        """Expose the updatable parameters of the law to `mi.traverse`."""
 
     def prepare(self, shape: mi.Shape) -> None:
-        """Look at the surface once before the first `profile`; ExitanceError where the law does not fit it."""
+        """Precompute on the surface, once before the first `profile`; ExitanceError if the law does not fit it."""
 
     def renewed(self) -> bool:
-        """True where what the law follows has changed since `prepare`, so that it is to be called again."""
+        """True if data that the law depends on have changed since `prepare`, which must then be called again."""
         return False
 
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """L/J_n [1/sr] at the surface point `si` towards the outward unit vector `direction` of the world.
+        """L/J_n [1/sr] at the surface point `si` towards the outward unit vector `direction` in world coordinates.
 
-        The side that the direction is on is not checked.
+        The method does not check that the direction is outward.
         """
         raise NotImplementedError
 
@@ -60,7 +60,7 @@ def law_names() -> tuple[str, ...]:
 
 
 def law_of(props: mi.Properties) -> ExitLaw:
-    """The law that the `emission` of an `fspt_surface` names, with its parameters.
+    """Law that the parameter `emission` of an `fspt_surface` names, with its own parameters.
 
     Raises
     ------
@@ -77,17 +77,17 @@ def law_of(props: mi.Properties) -> ExitLaw:
 
 
 def required(props: mi.Properties, name: str, kind: str) -> Any:
-    """The parameter `name`, without which the law in `props` cannot be; ExitanceError where it is missing."""
+    """Value of the parameter `name`; ExitanceError, which asks for a `kind` of value, if it is missing."""
     if name not in props:
         raise ExitanceError(f"fspt_surface: emission '{props['emission']}' needs '{name}'. Give it as {kind}.")
     return props[name]
 
 
 def required_number(props: mi.Properties, name: str, kind: str, example: str) -> float:
-    """The same of a number."""
+    """Value of the parameter `name` as a float; ExitanceError if it is missing or no number."""
     return number(f"fspt_surface: '{name}'", required(props, name, kind), ExitanceError, example)
 
 
 def refractive_index(props: mi.Properties) -> float:
-    """The parameter `int_ior`: index n of the tissue relative to outside."""
+    """Value of the parameter `int_ior`: refractive index n of the tissue relative to outside."""
     return required_number(props, "int_ior", "a float", "1.37")

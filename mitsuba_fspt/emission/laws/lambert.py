@@ -1,4 +1,4 @@
-"""Lambert's law: the same radiance in all outward directions (Eq. 1)."""
+"""Lambert's law: equal radiance in all outward directions (Eq. 1)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from . import ExitLaw
 
 
 class Lambert(ExitLaw):
-    """L = J_n/π (Eq. 1): ∫ cosθ dΩ over the hemisphere is π."""
+    """Radiance L = J_n/π in all outward directions (Eq. 1), since ∫ cosθ dΩ over the hemisphere is π."""
 
     isotropic: ClassVar[bool] = True
 

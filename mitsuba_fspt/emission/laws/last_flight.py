@@ -1,4 +1,4 @@
-"""The law of the last flight: what leaves tissue has scattered for the last time inside, ∝ the fluence there."""
+"""Last-flight law: light that leaves tissue was scattered for the last time inside, at a rate ∝ the fluence there."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from ...runtime.errors import ExitanceError
 from ..elements import elements_of
 from . import ExitLaw, refractive_index, required, required_number
 
-NODES = 8  # along the line of sight
-RINGS, SPOKES = 8, 8  # of the hemisphere that is to carry J_n
+NODES = 8  # of the quadrature along the line of sight
+RINGS, SPOKES = 8, 8  # of the quadrature over the hemisphere, which normalises the law to J_n
 
 
 class LastFlight(ExitLaw):
-    r"""Light scattered for the last time on the refracted line of sight ω_i inside the tissue.
+    r"""Radiance of light scattered for the last time on the refracted line of sight ω_i inside the tissue.
 
-    L(r, ω) ∝ T/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds by Gauss–Laguerre, with a factor that makes the
-    hemisphere carry J_n at every point r. Φ, the `fluence`, is a volume of the world; only its course matters, not
-    its unit. Scattering counts as isotropic. Beyond the border Φ goes on as the volume does.
+    L(r, ω) ∝ T/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds by Gauss–Laguerre, with a factor that makes
+    ∫ L µ dΩ = J_n at every point r. Φ, the `fluence`, is a volume in world coordinates; only its relative values
+    matter, not its unit. Scattering is taken as isotropic. Beyond the border Φ is that of the volume.
 
     Raises
     ------
@@ -37,12 +37,12 @@ class LastFlight(ExitLaw):
         self._flight = mi.Float(flight / (medium.mua + medium.musp))
         self._weight = mi.Float(weight)
         self._hemisphere = _hemisphere()
-        self._total: _Table | None = None
-        self._values: mi.Float | None = None  # of the volume that is tabulated
+        self._total: _Table | None = None  # ∫ of `_relative_radiance` times µ over the hemisphere
+        self._values: mi.Float | None = None  # grid values of the volume at the time of `prepare`
 
     @classmethod
     def of(cls, props: mi.Properties) -> LastFlight:
-        """With the medium of `mua`, `musp` and `int_ior`, and the volume `fluence`."""
+        """Law with the medium of `mua`, `musp` and `int_ior`, and the volume `fluence`."""
         n = refractive_index(props)
         mua, musp = (
             required_number(props, name, "a float [1/mm]", example)
@@ -54,18 +54,23 @@ class LastFlight(ExitLaw):
         return cls(Medium(mua, musp, n), fluence)
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
-        """The fluence."""
+        """Expose the volume `fluence`."""
         cb.put("fluence", self.fluence, mi.ParamFlags.NonDifferentiable)
 
     def prepare(self, shape: mi.Shape) -> None:
-        """Tabulate what the hemisphere over each point of the surface carries; ExitanceError where Φ gives nothing."""
+        """Tabulate the hemisphere integral of the relative radiance on the surface.
+
+        Raises
+        ------
+        ExitanceError : the volume does not contain the shape, or Φ gives an integral <= 0 or not finite.
+        """
         inside, outside = shape.bbox(), self.fluence.bbox()
         if not (outside.contains(inside.min) and outside.contains(inside.max)):
             raise ExitanceError(
                 f"fspt_surface: the volume 'fluence', {_extent(outside)}, does not hold shape '{shape.id()}', "
                 f"{_extent(inside)}. Set its 'use_grid_bbox' or 'to_world'."
             )
-        self._total, self._values = _Table(shape, self._carried), _values_of(self.fluence)
+        self._total, self._values = _Table(shape, self._hemisphere_integral), _values_of(self.fluence)
         if not self._total.positive():
             raise ExitanceError(
                 f"fspt_surface: the volume 'fluence' has values <= 0 or not finite under shape '{shape.id()}'. Write "
@@ -73,15 +78,15 @@ class LastFlight(ExitLaw):
             )
 
     def renewed(self) -> bool:
-        """True where the volume has other values."""
+        """True if the volume has other values than in `prepare`."""
         return self._values is not None and self._values.index != _values_of(self.fluence).index
 
     def profile(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """The radiance towards `direction` over what the hemisphere carries [1/sr]."""
-        return self._seen(si, direction, active) / self._total(si)
+        """Relative radiance towards `direction` over its hemisphere integral [1/sr]."""
+        return self._relative_radiance(si, direction, active) / self._total(si)
 
-    def _seen(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """T · Σ wₖ Φ(r − sₖ ω_i): the radiance towards an outward unit vector, up to a factor."""
+    def _relative_radiance(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """T · Σ wₖ Φ(r − sₖ ω_i): radiance towards an outward unit vector, up to a factor."""
         mu = dr.dot(si.n, direction)
         reflectance, cos_inner, _, _ = mi.fresnel(mu, self._n)
         inside = (direction - mu * si.n) / self._n + dr.abs(cos_inner) * si.n
@@ -94,13 +99,14 @@ class LastFlight(ExitLaw):
         (total,) = repeat(NODES, node, mi.Float(0))
         return (1 - reflectance) * total
 
-    def _carried(self, si: mi.SurfaceInteraction3f) -> mi.Float:
-        """∫ of `_seen` times µ over the hemisphere."""
+    def _hemisphere_integral(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """∫ of `_relative_radiance` times µ over the outward hemisphere."""
         frame = mi.Frame3f(si.n)
 
         def add(k: mi.UInt32, total: mi.Float) -> tuple[mi.Float]:
             x, y, z, weight = (dr.gather(mi.Float, column, k) for column in self._hemisphere)
-            return (total + weight * self._seen(si, frame.to_world(mi.Vector3f(x, y, z)), mi.Bool(True)),)
+            direction = frame.to_world(mi.Vector3f(x, y, z))
+            return (total + weight * self._relative_radiance(si, direction, mi.Bool(True)),)
 
         return repeat(RINGS * SPOKES, add, mi.Float(0))[0]
 
@@ -110,16 +116,17 @@ class LastFlight(ExitLaw):
 
 
 class _Table:
-    """A function of the surface, tabulated at the corners of its elements and interpolated between them."""
+    """Function on a surface, tabulated at the corners of its elements and interpolated between them."""
 
     def __init__(self, shape: mi.Shape, function: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
         self._elements = elements_of(shape, minimum=1 << 14)
         index = dr.arange(mi.UInt32, self._elements.count)
-        places = (self._elements.place(index, mi.Point2f(*corner))[0] for corner in self._elements.corners)
-        self._values = [function(si) for si in places]
+        corners = (self._elements.place(index, mi.Point2f(*corner))[0] for corner in self._elements.corners)
+        self._values = [function(si) for si in corners]
         dr.eval(self._values)
 
     def positive(self) -> bool:
+        """True if all values are > 0 and finite."""
         return all(dr.all((value > 0) & dr.isfinite(value)) for value in self._values)
 
     def __call__(self, si: mi.SurfaceInteraction3f) -> mi.Float:
@@ -128,7 +135,7 @@ class _Table:
 
 
 def _values_of(volume: mi.Volume) -> mi.Float:
-    """The numbers that a volume updated by itself changes; none where it holds no grid."""
+    """Grid values of a volume, which an update of the volume changes; empty if it has no grid."""
     parameters = mi.traverse(volume)
     return mi.Float(parameters["data"].array) if "data" in parameters else mi.Float()
 
@@ -136,7 +143,8 @@ def _values_of(volume: mi.Volume) -> mi.Float:
 def _hemisphere() -> tuple[mi.Float, ...]:
     """Unit vectors (x, y, z) about +z and weights such that Σ w f is ∫ f µ dΩ.
 
-    Rings at µ = x², x the Gauss nodes: transmittance is steep at grazing exit. Each is turned against the next.
+    Rings at µ = x² with Gauss nodes x, since the transmittance is steep at grazing exit. Each ring is rotated relative
+    to the next.
     """
     x, weight = np.polynomial.legendre.leggauss(RINGS)
     x, weight = (x + 1) / 2, weight / 2
@@ -148,5 +156,6 @@ def _hemisphere() -> tuple[mi.Float, ...]:
 
 
 def _extent(box: mi.BoundingBox3f) -> str:
+    """Corners of a box as text for messages."""
     low, high = ([float(c) for c in corner] for corner in (box.min, box.max))
     return "from ({:g}, {:g}, {:g}) to ({:g}, {:g}, {:g}) mm".format(*low, *high)

@@ -1,4 +1,4 @@
-"""Meshes with values from other codes: which reader takes which file, and what comes out of all of them."""
+"""Readers of meshes with values from other codes, chosen by format; each returns a `RawMesh`."""
 
 from __future__ import annotations
 
@@ -47,18 +47,18 @@ __all__ = [
 
 
 def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, format: str) -> RawMesh:
-    """The mesh of a file or of arrays (points, cells), with `values` as its only field where they are given.
+    """Mesh of a file or of arrays (points, cells); `values`, if given, become its only field.
 
     Raises
     ------
-    FluxError : an unknown format, or what the format's reader refuses.
+    FluxError : the format is unknown, or its reader refuses the input.
     """
     if format not in FORMATS:
         raise FluxError(f"flux import: 'format' must be one of {', '.join(FORMATS)}, got '{format}'.")
     if isinstance(mesh, tuple):
         return _from_arrays(mesh, values, field, format)
     path = Path(mesh)
-    if not os.path.exists(path) and format != "nirfast":  # its name may come without a suffix
+    if not os.path.exists(path) and format != "nirfast":  # a NIRFAST name may lack the suffix
         raise FluxError(f"mesh '{path}' does not exist. Check the name.")
     if format == "auto":
         format = _detect(path)
@@ -71,7 +71,7 @@ def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, form
 
 
 def _detect(path: Path) -> str:
-    """The format of a file by its name."""
+    """Format of a file, from its name."""
     suffix = path.suffix.lower()
     if suffix == ".dat" and path.name.startswith(("node_", "elem_")):
         return "mmc"
@@ -83,7 +83,7 @@ def _detect(path: Path) -> str:
 
 
 def _from_arrays(mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field: str | None, format: str) -> RawMesh:
-    """Points and cells in memory; those of MMC and NIRFAST count from 1, all others from 0."""
+    """Mesh of points and cells in memory; cells of MMC and NIRFAST count from 1, all others from 0."""
     points, cells = np.asarray(mesh[0], np.float64), np.asarray(mesh[1])
     if values is None:
         raise FluxError("flux import: a mesh in memory needs 'values'. Give one for each vertex or face.")
@@ -99,7 +99,7 @@ def _from_arrays(mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field
 
 
 def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh:
-    """The mesh with these values in place of its own fields."""
+    """Mesh with `values` in place of its own fields."""
     if isinstance(values, (str, os.PathLike)):
         name, array = Path(values).name, read_values(Path(values), field)
     else:

@@ -1,4 +1,4 @@
-"""Gmsh: whose values are whose. They come with the tags of their nodes or elements, which meshio passes over."""
+"""Order of the values in Gmsh files: each value carries the tag of its node or element, which meshio ignores."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from ...runtime.errors import FluxError
 
 Tags = NDArray[np.int64]
-# Gmsh's number of a kind of element: how many nodes it has. Other kinds are refused before.
+# Number of nodes by Gmsh's type of element. Other types are refused before.
 NODES = {1: 2, 2: 3, 4: 4, 8: 3, 9: 6, 11: 10, 15: 1}
 OWNERS = {"NodeData": "Nodes", "ElementData": "Elements"}
 
 
 def put_in_order(mesh: Any, path: Path) -> None:
-    """Move the values in meshio's `mesh` of the file to the nodes and elements whose tags they have.
+    """Move the values in meshio's `mesh` of the file to the nodes and elements with the same tags.
 
     Raises
     ------
-    FluxError : a name has values twice (time steps), or tags that are not those of the mesh.
+    FluxError : a name has values twice (time steps), or tags other than those of the mesh.
     """
     owners, data = _read_tags(path)
     starts = np.cumsum([len(block.data) for block in mesh.cells])[:-1]
@@ -34,11 +34,11 @@ def put_in_order(mesh: Any, path: Path) -> None:
             mesh.cell_data[name] = np.split(np.concatenate(mesh.cell_data[name])[rows], starts)
 
 
-def _rows(tags: Tags, owners: Tags, what: str) -> Tags:
-    """For each owner the row of its value."""
+def _rows(tags: Tags, owners: Tags, subject: str) -> Tags:
+    """Row of the value of each owner (node or element); FluxError, about `subject`, if the tags differ."""
     order, rank = np.argsort(tags), np.argsort(np.argsort(owners))
     if not np.array_equal(tags[order], np.sort(owners)):
-        raise FluxError(f"{what} have other tags than the mesh. Save both anew with one value for each.")
+        raise FluxError(f"{subject} have other tags than the mesh. Save both anew with one value for each.")
     return order[rank]
 
 
@@ -68,7 +68,7 @@ def _read_tags(path: Path) -> tuple[dict[str, Tags], dict[tuple[str, str], Tags]
 
 
 def _sections(file: BinaryIO) -> Iterator[str]:
-    """Names of the sections; after each the rest of it is passed over."""
+    """Names of the sections of a file; the rest of each is skipped before the next."""
     for line in iter(file.readline, b""):
         if line.startswith(b"$"):
             yield (name := line[1:].decode("ascii", "replace").strip())
@@ -77,17 +77,19 @@ def _sections(file: BinaryIO) -> Iterator[str]:
 
 
 class _Reader:
-    """Tags in the sections of a file, text or `binary`, of format 2 (`old`) or 4.1; `size`: of its long integers."""
+    """Reader of the tags in a file, text or `binary`, of format 2 (`old`) or 4.1; `size`: type of its long integers."""
 
     def __init__(self, file: BinaryIO, binary: bool, size: str, old: bool) -> None:
         self.file, self.binary, self.size, self.old = file, binary, size, old
 
     def nodes(self) -> Tags:
+        """Tags of the nodes."""
         if not self.old:
             return self._blocks(lambda kind, count: self._tags_then_points(count))
         return self._column("i4", 3, int(self.file.readline()))
 
     def elements(self) -> Tags:
+        """Tags of the elements."""
         if not self.old:
             return self._blocks(lambda kind, count: self._table(self.size, 1 + NODES[kind], count))
         count = int(self.file.readline())
@@ -101,16 +103,16 @@ class _Reader:
         return np.concatenate(blocks)
 
     def data(self) -> tuple[str, Tags]:
-        """Name and tags of the values of a section."""
-        texts, _, whole = self._lines(), self._lines(), self._lines()  # in between real numbers: the time
+        """Name and tags of a section of values."""
+        texts, _, whole = self._lines(), self._lines(), self._lines()  # the second list is the time
         return texts[0].strip().replace('"', ""), self._column("i4", int(whole[1]), int(whole[2]))
 
     def _lines(self) -> list[str]:
-        """As many lines as the first one says."""
+        """Lines of a list, whose first line is their number."""
         return [self.file.readline().decode() for _ in range(int(self.file.readline()))]
 
     def _blocks(self, read: Callable[[int, int], Tags]) -> Tags:
-        """The blocks of a section of format 4.1; `read` has the kind and number of what a block holds."""
+        """Tags of all blocks of a section of format 4.1; `read` takes the kind and number of a block's entries."""
         blocks = []
         for _ in range(int(self._numbers(self.size, 4)[0])):
             kind = int(self._numbers("i4", 3)[2])
@@ -118,16 +120,17 @@ class _Reader:
         return np.concatenate(blocks)
 
     def _tags_then_points(self, count: int) -> Tags:
+        """Tags of a block of nodes, whose coordinates follow them."""
         tags = self._numbers(self.size, count)
         self._numbers("f8", 3 * count)
         return tags.astype(np.int64)
 
     def _table(self, kind: str, columns: int, count: int) -> Tags:
-        """The first column of a table of whole numbers."""
+        """First column of a table of whole numbers."""
         return self._numbers(kind, columns * count).reshape(count, columns)[:, 0].astype(np.int64)
 
     def _column(self, kind: str, values: int, count: int) -> Tags:
-        """The tags before `values` real numbers each."""
+        """Tags of `count` rows, each of a tag and `values` real numbers."""
         if not self.binary:
             return self._numbers("f8", count * (1 + values)).reshape(count, -1)[:, 0].astype(np.int64)
         return np.fromfile(self.file, [("tag", kind), ("values", "f8", (values,))], count)["tag"].astype(np.int64)

@@ -1,4 +1,4 @@
-"""Meshes with point and cell data by meshio: VTU, legacy VTK, Gmsh, XDMF, MEDIT, Abaqus (extra `mesh`)."""
+"""Reader of meshio's formats with point and cell data: VTU, legacy VTK, Gmsh, XDMF, MEDIT, Abaqus (extra `mesh`)."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ FORMATS = {
     ".mesh": "medit",
     ".inp": "abaqus",
 }
-# Cells and their number of corner nodes; the other nodes of second-order cells are passed over.
+# Types of cells and their number of corner nodes; the other nodes of second-order cells are ignored.
 TRIANGLES = {"triangle": 3, "triangle6": 3, "triangle7": 3}
 TETRAHEDRA = {"tetra": 4, "tetra10": 4}
 IGNORED = ("vertex", "line", "line3")
-LABELS = "gmsh:"  # meshio's names for what Gmsh numbers parts by
+LABELS = "gmsh:"  # prefix of meshio's names for Gmsh's part numbers
 
 
 def read_meshio(path: Path) -> RawMesh:
-    """Tetrahedra of the file, or else its triangles, with its scalar point and cell data.
+    """Tetrahedra of the file, or its triangles if it has none, with its scalar point and cell data.
 
-    Cell data of a file with both kinds is passed over; `source` says so.
+    Cell data of a file with both kinds is ignored; `source` states so.
 
     Raises
     ------
-    FluxError : the file cannot be read, or holds other cells than these.
+    FluxError : the file cannot be read, or holds other cells.
     BackendError : meshio is not installed, or h5py for an XDMF or MEDIT file with HDF5 data.
     """
     mesh = _load(path)
@@ -57,7 +57,7 @@ def read_meshio(path: Path) -> RawMesh:
     fields = [Field(name, values, "vertex") for name, values in mesh.point_data.items()]
     source = path.name
     if kinds & set(TRIANGLES) and kinds & set(TETRAHEDRA):
-        # Which of the two carry the values? A guess could take the wrong ones.
+        # Either kind may carry the values; a guess could be wrong.
         source += " (its cell data passed over: both on triangles and on tetrahedra)"
     else:
         for name, data in mesh.cell_data.items():
@@ -67,12 +67,12 @@ def read_meshio(path: Path) -> RawMesh:
 
 
 def _has_values(mesh: Any) -> bool:
-    """Whether there is more than labels."""
+    """True if the mesh has data besides labels."""
     return not all(name.startswith(LABELS) for name in (*mesh.point_data, *mesh.cell_data))
 
 
 def _require_one_piece(path: Path) -> None:
-    """Refuse a VTU of several pieces: meshio takes the cells of the last one alone."""
+    """Raise FluxError for a VTU of several pieces, of which meshio keeps the cells of the last only."""
     pieces = len(re.findall(rb"<Piece[\s>/]", path.read_bytes()))
     if pieces > 1:
         raise FluxError(
@@ -81,7 +81,7 @@ def _require_one_piece(path: Path) -> None:
 
 
 def _load(path: Path):
-    """meshio's mesh; what meshio prints or exits with becomes an error."""
+    """meshio's mesh of a file; a failure or exit of meshio, with its printed text, becomes a FluxError."""
     try:
         import meshio
     except ImportError as cause:
@@ -89,9 +89,9 @@ def _load(path: Path):
             f"flux import: meshio, which reads '{path.name}', is not installed. pip install 'mitsuba-fspt[mesh]'."
         ) from cause
     require_file(path)
-    said = StringIO()
+    printed = StringIO()
     try:
-        with redirect_stdout(said), redirect_stderr(said):
+        with redirect_stdout(printed), redirect_stderr(printed):
             return meshio.read(path, file_format=FORMATS.get(path.suffix.lower()))
     except ImportError as cause:
         raise BackendError(
@@ -99,5 +99,5 @@ def _load(path: Path):
             f"pip install {cause.name or 'h5py'}."
         ) from cause
     except (Exception, SystemExit) as cause:  # a damaged file makes meshio's readers raise anything, or exit
-        reason = " ".join(said.getvalue().split()) or one_line(cause)
+        reason = " ".join(printed.getvalue().split()) or one_line(cause)
         raise FluxError(f"'{path}' cannot be read by meshio: {reason[:200].rstrip('.')}. Save it anew.") from cause

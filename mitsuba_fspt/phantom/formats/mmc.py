@@ -1,7 +1,7 @@
-"""MMC and pmmc: the energy that leaves through each boundary face of a tetrahedral mesh (`dref`).
+"""Reader of MMC and pmmc: the energy that leaves through each boundary face of a tetrahedral mesh (`dref`).
 
-Files of the command line tool: `node_ID.dat` and `elem_ID.dat`, a header line and then `i x y z` and
-`i a b c d region`, numbered from 1; `SESSION_dref.dat`, lines `face value`, one time gate after the other.
+Files of the command line tool: `node_ID.dat` and `elem_ID.dat` have a header line and then lines `i x y z` and
+`i a b c d region`, numbered from 1; `SESSION_dref.dat` has lines `face value`, one time gate after the other.
 Values are energy through the face divided by the energy launched: W per W of the source, not per area.
 """
 
@@ -25,8 +25,7 @@ def read_mmc(mesh: Path, values: Path | None) -> RawMesh:
 
     Raises
     ------
-    FluxError : a file is missing or not in MMC's layout; values that are not text, not normalised, or of
-        another mesh.
+    FluxError : a file is missing or not in MMC's layout; the values are not text, not normalised, or of another mesh.
     """
     kind, _, session = mesh.stem.partition("_")
     if kind not in ("node", "elem") or not session:
@@ -40,7 +39,7 @@ def read_mmc(mesh: Path, values: Path | None) -> RawMesh:
             f"MMC: node and elem files must have 4 and 6 columns after their first line, '{mesh}' has "
             f"{nodes.shape[1]} and {elements.shape[1]}. Linear tetrahedra are read only."
         )
-    # MMC leaves the elements as they are where it finds these files beside them.
+    # MMC does not reorder the elements if it finds these files beside them.
     kept = any(mesh.with_name(f"{part}_{session}.dat").exists() for part in ("facenb", "velem"))
     tetrahedra = elements[:, 1:5].astype(np.int64)
     return mmc_mesh(nodes[:, 1:], tetrahedra, _read_dref(values), f"MMC {values.name}", turn=not kept)
@@ -49,9 +48,14 @@ def read_mmc(mesh: Path, values: Path | None) -> RawMesh:
 def mmc_mesh(nodes: Points, elements: Indices, dref: NDArray, source: str, turn: bool = True) -> RawMesh:
     """Mesh with dref on its boundary faces.
 
-    `nodes` (V, 3) and `elements` (T, 4 or more), from 1; `dref` (F,), (F, gates) or (gates · F,), summed over
-    the gates. Before MMC numbers the faces it exchanges the last two nodes of each element whose
-    (2−1)·(3−1)×(4−1) is positive; `turn` False says that it did not.
+    Parameters
+    ----------
+    nodes : array, shape (V, 3)
+    elements : array, shape (T, 4 or more), node numbers from 1
+    dref : array, shape (F,), (F, gates) or (gates · F,); summed over the gates
+    source : origin of the values, for messages and provenance
+    turn : before MMC numbers the faces, it exchanges the last two nodes of each element whose (2−1)·(3−1)×(4−1) is
+        positive; False if it did not
     """
     tetrahedra = elements[:, :4].astype(np.int64) - 1
     RawMesh(nodes, tetrahedra, source)  # checks the numbers of the nodes
@@ -76,7 +80,7 @@ def mmc_mesh(nodes: Points, elements: Indices, dref: NDArray, source: str, turn:
 
 
 def _read_dref(path: Path) -> NDArray[np.float64]:
-    """The second column of a `_dref.dat`, its first one checked."""
+    """Second column of a `_dref.dat`, shape (N,); FluxError unless the first one numbers the faces."""
     if path.suffix.lower() not in TEXT:
         raise FluxError(
             f"MMC: '{path}' is not a text _dref.dat. In its binary and JNIfTI files MMC appears to store the "

@@ -1,8 +1,8 @@
-"""NIRFAST: text files of one stem, without headers; fluence at the nodes of a tetrahedral mesh.
+"""Reader of NIRFAST: text files with a common stem, without headers; fluence at the nodes of a tetrahedral mesh.
 
-`.node`: `boundary x y z` (boundary 1 or 0; no number of the node, unlike TetGen's `.node`), `.elem`: four
-node numbers from 1, `.param` (if there): a line with its kind, then a line a node, `mua kappa n` of kinds stnd
-and blt, `mua kappa n mua kappa mua eta tau` of kind fluor; kind spec has no n. Lengths in mm.
+`.node`: `boundary x y z` (boundary 1 or 0; no number of the node, unlike TetGen's `.node`); `.elem`: four
+node numbers from 1; `.param` (optional): a line with its kind, then a line per node, `mua kappa n` for kinds stnd
+and blt, `mua kappa n mua kappa mua eta tau` for kind fluor; kind spec has no n. Lengths in mm.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ def read_nirfast(mesh: Path) -> RawMesh:
 
 
 def nirfast_mesh(nodes: Points, elements: Indices, source: str, index: NDArray[np.float64] | None = None) -> RawMesh:
-    """Mesh of `nodes` (V, 3), `elements` (T, 4) from 1, and index at the nodes; its values are fluence."""
+    """Mesh of `nodes` (V, 3), `elements` (T, 4) from 1 and refractive `index` (V,); its values are fluence."""
     return RawMesh(nodes, elements - 1, source, quantity="fluence", index=index)
 
 
 def _index(path: Path, nodes: int) -> NDArray[np.float64] | None:
-    """The refractive index at the nodes from a `.param`, NaN where its kind tells none; None without a file."""
+    """Refractive index at the nodes from a `.param`, shape (V,), NaN if its kind has none; None without a file."""
     if not os.path.exists(path):
         return None
     with path.open(errors="replace") as file:

@@ -1,4 +1,4 @@
-"""PLY: read with its scalar properties and comments, written as Mitsuba reads it."""
+"""PLY files: read with scalar properties and comments, written in the layout that Mitsuba reads."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ..surface_mesh import Indices, Points
 from .raw import Field, RawMesh, scalars
 from .surface_files import load_triangles
 
-# Properties that are geometry or colour.
+# Properties of geometry and colour.
 NOT_VALUES = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
 TEXTURE = {"s", "t", "u", "v"}
 
 
 def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
-    """A PLY's triangles with their scalar properties, in the file's order, and its comments by first word.
+    """Triangles of a PLY with their scalar properties, in the file's order, and its comments by first word.
 
     Raises
     ------
@@ -31,10 +31,10 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
     mesh = load_triangles(path, "ply", fix_texture=False, skip_materials=True)
     elements = mesh.metadata.get("_ply_raw", {})
     for element, count in (("vertex", len(mesh.vertices)), ("face", len(mesh.faces))):
-        told = elements.get(element, {}).get("length", 0)
-        if count < told:  # polygons may be more triangles
+        declared = elements.get(element, {}).get("length", 0)
+        if count < declared:  # more is right: a polygon gives several triangles
             raise FluxError(
-                f"'{path}' ends early: its header tells of {told} {element} lines, there are {count}. Mend it."
+                f"'{path}' ends early: its header tells of {declared} {element} lines, there are {count}. Fix it."
             )
     _require_corners(elements.get("face", {}).get("data", {}), path)
     fields = []
@@ -42,7 +42,7 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
         data = elements.get(element, {}).get("data", {})
         names = (data.dtype.names or ()) if isinstance(data, np.ndarray) else data
         values = {name: np.asarray(data[name]) for name in names if name not in NOT_VALUES}
-        # trimesh splits polygons of more than three corners: then values on faces no longer fit.
+        # trimesh splits polygons of more than three corners; values on faces then do not fit.
         fitting = len(mesh.vertices if on == "vertex" else mesh.faces)
         fields += [Field(name, v, on, name in TEXTURE) for name, v in values.items() if len(v) == fitting]
     points, cells = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
@@ -50,7 +50,7 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
 
 
 def _require_corners(faces: Any, path: Path) -> None:
-    """Refuse faces that trimesh drops or misreads; of their lines it keeps an array (binary) or columns (text)."""
+    """Raise FluxError for `faces`, trimesh's array (binary) or columns (text) of lines, that it drops or misreads."""
     binary = isinstance(faces, np.ndarray)
     names = (faces.dtype.names or ()) if binary else faces
     for name in {"vertex_indices", "vertex_index"} & set(names):
@@ -64,6 +64,7 @@ def _require_corners(faces: Any, path: Path) -> None:
 
 
 def _comments(path: Path) -> dict[str, str]:
+    """Comments of the header by their first word."""
     comments = {}
     with path.open("rb") as file:
         for line in file:
@@ -86,12 +87,12 @@ def write_ply(
 ) -> None:
     """Write triangles with scalar properties on each 'vertex' or 'face' (`per`) as a binary PLY of doubles.
 
-    Mitsuba makes mesh attributes of properties that end in an underscore and a letter or digit: `exitance_x`
-    becomes `vertex_exitance` or `face_exitance`; a plain `exitance` it passes over.
+    Mitsuba reads a property whose name ends in an underscore and a letter or digit as a mesh attribute: `exitance_x`
+    becomes `vertex_exitance` or `face_exitance`. It ignores a plain `exitance`.
 
     Raises
     ------
-    FluxError : the suffix is not .ply, or the file cannot be written; nothing is left behind then.
+    FluxError : the suffix is not .ply, or the file cannot be written; no partial file remains.
     """
     if path.suffix.lower() != ".ply":
         raise FluxError(f"output file '{path}' must end in .ply. Give a name such as phantom.ply.")

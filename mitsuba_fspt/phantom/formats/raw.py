@@ -1,4 +1,4 @@
-"""What a file holds before it is a phantom: points, cells, fields; and the choice of one field."""
+"""Contents of a mesh file before conversion to a phantom: points, cells, fields; and the choice of one field."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ...runtime.errors import FluxError
 from ..surface_mesh import Indices, Points, boundary, compact
 from .table import pick, quoted
 
-LABELS = "medit:"  # numbers of the parts of a mesh: good for media, never values
+LABELS = "medit:"  # prefix of the part numbers of a mesh, which label media and are never values
 
 
 @dataclass(frozen=True)
 class Field:
-    """Named values of shape (N,), one on each 'vertex', 'cell' (triangle or tetrahedron) or boundary 'face'.
+    """Named values of shape (N,), one `on` each 'vertex', 'cell' (triangle or tetrahedron) or boundary 'face'.
 
-    `on` None leaves it to the number of values. `by_name`: never chosen but by its name.
+    If `on` is None, the number of values decides. With `by_name` the field is chosen by its name only.
     """
 
     name: str
@@ -29,7 +29,7 @@ class Field:
 
 
 def scalars(fields: Iterable[Field]) -> tuple[Field, ...]:
-    """Those of the fields that hold one real number each, as shape (N,)."""
+    """The fields with one real number per element, as shape (N,)."""
     return tuple(
         replace(f, values=f.values.ravel())
         for f in fields
@@ -39,12 +39,12 @@ def scalars(fields: Iterable[Field]) -> tuple[Field, ...]:
 
 @dataclass(frozen=True)
 class RawMesh:
-    """Points (V, 3), cells (C, 3) triangles or (C, 4) tetrahedra that count from 0, and the file's fields.
+    """Points (V, 3), cells (C, 3) triangles or (C, 4) tetrahedra with indices from 0, and the file's fields.
 
-    quantity : what the values are: 'exitance' and 'fluence' [W per square of the file's length unit], or
-        'power', W of each face
-    point_order : False where the file has no vertices of its own, so that values cannot be in their order
-    index : the refractive index at the points (V,), where the file knows it; NaN where it should and does not
+    quantity : of the values: 'exitance' or 'fluence' [W per square of the file's length unit], or 'power' [W] of each
+        face
+    point_order : False if the file has no vertices of its own, so that values cannot be in their order
+    index : refractive index at the points (V,), NaN if the file's kind of parameters lacks it; None without parameters
     """
 
     points: Points
@@ -74,14 +74,14 @@ class RawMesh:
                 f"are {len(points)}. Is the mesh complete, does it count from 0 or from 1?"
             )
         if not np.isfinite(points).all() and not np.isfinite(points[cells]).all():
-            raise FluxError(f"{self.source}: vertices of cells must be finite, some are NaN or inf. Mend the mesh.")
+            raise FluxError(f"{self.source}: vertices of cells must be finite, some are NaN or inf. Fix the mesh.")
 
 
 @dataclass(frozen=True)
 class SurfaceValues:
     """Values on a triangle surface, per 'vertex' (V,) or per 'face' (F,), in the file's units.
 
-    index : the refractive index at its vertices (V,), where the file knows it
+    index : refractive index at its vertices (V,), as in `RawMesh`
     """
 
     vertices: Points
@@ -93,20 +93,20 @@ class SurfaceValues:
 
 
 def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceValues:
-    """The surface of `mesh` (of tetrahedra their boundary, outward) with the chosen field on it.
+    """Surface of `mesh` (of tetrahedra their boundary, outward) with the chosen field on it.
 
-    `name` chooses the field, `per` ('vertex' or 'face') where name or number leave it open.
+    `name` chooses the field; `per` ('vertex' or 'face') decides if the name or the number of values is ambiguous.
 
     Raises
     ------
-    FluxError : no or several fields fit, or the number of values fits nothing.
+    FluxError : no field or several fields fit, or the number of values fits neither vertices, faces nor tetrahedra.
     """
     if mesh.cells.shape[1] == 4:
         faces, owner = boundary(mesh.points, mesh.cells)
     else:
         faces, owner = mesh.cells, np.arange(len(mesh.cells))
     chosen = _choose(mesh, name, per)
-    on = chosen.on or _place(chosen, mesh, len(faces), per)
+    on = chosen.on or _carrier(chosen, mesh, len(faces), per)
     vertices, faces, kept = compact(mesh.points, faces)
     if on == "vertex":
         if not mesh.point_order:
@@ -123,7 +123,7 @@ def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceV
 
 
 def _choose(mesh: RawMesh, name: str | None, per: str | None) -> Field:
-    """The one field of that name; without a name the only one of real numbers: whole ones label something."""
+    """Field of that name; without a name the only field of real numbers, since whole numbers are labels."""
     fields = [f for f in mesh.fields if not f.name.startswith(LABELS)]
     fitting = [f for f in fields if per is None or f.on is None or (f.on == "vertex") == (per == "vertex")]
     if fields and not fitting:
@@ -148,29 +148,29 @@ def _choose(mesh: RawMesh, name: str | None, per: str | None) -> Field:
     return same[0]
 
 
-def _place(chosen: Field, mesh: RawMesh, faces: int, per: str | None) -> str:
-    """Where values stand, by their number: 'vertex', 'face' or 'cell'."""
+def _carrier(chosen: Field, mesh: RawMesh, faces: int, per: str | None) -> str:
+    """Kind of element that carries the values, by their number: 'vertex', 'face' or 'cell'."""
     counts = {"vertex": len(mesh.points), "face": faces, "cell": len(mesh.cells)}
     if mesh.cells.shape[1] == 3:
         del counts["cell"]
     count = len(chosen.values)
-    places = [
-        place
-        for place, there_are in counts.items()
-        if there_are == count and (per is None or (place == "vertex") == (per == "vertex"))
+    carriers = [
+        carrier
+        for carrier, number in counts.items()
+        if number == count and (per is None or (carrier == "vertex") == (per == "vertex"))
     ]
-    if len(places) == 1:
-        return places[0]
-    if per == "face" and places:  # as many tetrahedra as boundary faces
+    if len(carriers) == 1:
+        return carriers[0]
+    if per == "face" and carriers:  # as many tetrahedra as boundary faces
         return "face"
     names = {
         "vertex": "vertices",
         "face": "faces" if len(counts) == 2 else "boundary faces",
         "cell": "tetrahedra",
     }
-    listed = ", ".join(f"{there_are} {names[place]}" for place, there_are in counts.items())
-    if places:
-        raise FluxError(f"{chosen.name}: {count} values fit {' and '.join(names[p] for p in places)}. Give --per.")
+    listed = ", ".join(f"{number} {names[carrier]}" for carrier, number in counts.items())
+    if carriers:
+        raise FluxError(f"{chosen.name}: {count} values fit {' and '.join(names[c] for c in carriers)}. Give --per.")
     asked = f" (asked for per {per})" if per else ""
     raise FluxError(
         f"{chosen.name}: {count} values fit nothing{asked}, {mesh.source} has {listed}. Give one value for each."

@@ -1,4 +1,4 @@
-"""Surface meshes: `.npz`, OBJ, OFF, and what trimesh loads (STL, GLB, ...), with the fields they carry."""
+"""Readers of surface meshes with their fields: `.npz`, OBJ, OFF, and the formats of trimesh (STL, GLB, ...)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from .table import one_line, read_npz, require_file
 if TYPE_CHECKING:
     import trimesh
 
-# What trimesh reads by itself; other kinds it would pass on to meshio.
+# Formats that trimesh reads itself; it would pass any other on to meshio.
 KINDS = ("stl", "off", "glb", "gltf", "3mf", "dae", "zae", "3dxml", "xaml", "ctm", "step", "stp")
 
 
 def read_arrays(path: Path) -> RawMesh:
-    """A `.npz` with `vertices` (V, 3), `faces` (F, 3) or `tetrahedra` (T, 4) from 0, and fields of any name.
+    """Mesh of a `.npz` with `vertices` (V, 3), `faces` (F, 3) or `tetrahedra` (T, 4) from 0, and fields of any name.
 
-    `vertices_mm` goes for `vertices`, and so on: the words may have a suffix.
+    `nodes` counts as `vertices`, and the names may have a suffix, as in `vertices_mm`.
     """
     arrays = read_npz(path)
     points = _named(arrays, ("vertices", "nodes"), path)
@@ -39,7 +39,7 @@ def read_arrays(path: Path) -> RawMesh:
 
 
 def _named(arrays: dict[str, NDArray], words: tuple[str, ...], path: Path) -> NDArray:
-    """The one array of two axes whose name is a word or starts with it and an underscore."""
+    """The one array of two axes whose name is one of `words`, or starts with one and an underscore."""
     fitting = [n for n, a in arrays.items() if a.ndim == 2 and any(n == w or n.startswith(f"{w}_") for w in words)]
     if len(fitting) != 1:
         listed = ", ".join(f"'{name}' {array.shape}" for name, array in arrays.items())
@@ -48,10 +48,9 @@ def _named(arrays: dict[str, NDArray], words: tuple[str, ...], path: Path) -> ND
 
 
 def read_obj(path: Path) -> RawMesh:
-    """Vertices and triangles of an OBJ in the order of its lines, which values beside it count on.
+    """Vertices and triangles of an OBJ in the order of its lines, on which a separate file of values relies.
 
-    Normals, texture coordinates and materials are passed over: loaders that make use of them split and sort
-    the vertices.
+    Normals, texture coordinates and materials are ignored: loaders that use them split and sort the vertices.
     """
     try:
         text = path.read_bytes()
@@ -67,25 +66,25 @@ def read_obj(path: Path) -> RawMesh:
     except ValueError as cause:  # not a number, or faces with different numbers of corners
         raise FluxError(f"'{path}' is not an OBJ of triangles: {one_line(cause)}. Triangulate it first.") from cause
     if cells.shape[1] != 3 or cells.min() < 1:
-        what = f"{cells.shape[1]} corners a face" if cells.shape[1] != 3 else "relative vertex numbers"
-        raise FluxError(f"'{path}' has {what}. Save it with triangles and vertices numbered from 1.")
+        fault = f"{cells.shape[1]} corners a face" if cells.shape[1] != 3 else "relative vertex numbers"
+        raise FluxError(f"'{path}' has {fault}. Save it with triangles and vertices numbered from 1.")
     return RawMesh(points, cells - 1, path.name)
 
 
 def read_off(path: Path) -> RawMesh:
-    """Vertices and triangles of an OFF in its order; one with more in it (colours, polygons) as trimesh loads it."""
+    """Vertices and triangles of an OFF file in its order; trimesh loads a file with more (colours, polygons)."""
     return _plain_off(path) or read_trimesh(path)
 
 
 def _plain_off(path: Path) -> RawMesh | None:
-    """An OFF that holds nothing but points and triangles, which trimesh reads line by line, many times slower."""
+    """Mesh of an OFF file that holds only points and triangles, else None; trimesh reads such a file far slower."""
     try:
         text = re.sub(rb"#[^\r\n]*", b"", path.read_bytes()).lstrip()
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # what NumPy gives where a word is no number
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy's warning at a word that is no number
             numbers = np.fromstring(text[3:], sep=" ")
     except (DeprecationWarning, ValueError):
         return None
@@ -101,13 +100,13 @@ def _plain_off(path: Path) -> RawMesh | None:
 
 
 def read_trimesh(path: Path) -> RawMesh:
-    """A mesh that trimesh loads, unchanged in order, with its scalar fields on vertices and faces.
+    """Mesh loaded by trimesh, unchanged in order, with its scalar fields on vertices and faces.
 
-    The corners of an STL are merged where they are equal; its faces keep their order.
+    Equal corners of an STL are merged; its faces keep their order.
 
     Raises
     ------
-    FluxError : trimesh does not know the format or cannot read the file, or finds no triangles in it.
+    FluxError : trimesh does not support the format, cannot read the file, or finds no triangles in it.
     BackendError : the format needs a package that is not installed.
     """
     kind = path.suffix.lower().lstrip(".")
@@ -125,14 +124,14 @@ def read_trimesh(path: Path) -> RawMesh:
 
 
 def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
-    """trimesh's mesh of a file, its vertices and faces as they are.
+    """trimesh's mesh of a file, its vertices and faces unprocessed.
 
     Raises
     ------
     FluxError : the file cannot be read, or has no faces.
     BackendError : its format needs a package that is not installed.
     """
-    import trimesh  # takes longer to load than most meshes
+    import trimesh  # deferred: takes longer to load than most meshes
 
     require_file(path)
     try:
@@ -153,7 +152,7 @@ def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
 
 
 def _fields(mesh: trimesh.Trimesh) -> tuple[Field, ...]:
-    """Scalar attributes on the vertices and faces."""
+    """Scalar attributes on vertices and faces."""
     on_vertices = [Field(name, np.asarray(v), "vertex") for name, v in mesh.vertex_attributes.items()]
     on_faces = [Field(name, np.asarray(v), "cell") for name, v in mesh.face_attributes.items()]
     return scalars(on_vertices + on_faces)

@@ -1,4 +1,4 @@
-"""Files of bare values, one per vertex or per face: text (CSV, TSV, spaces), NumPy and MATLAB arrays."""
+"""Readers of files with values only, one per vertex or face: text (CSV, TSV, spaces), NumPy and MATLAB arrays."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ...runtime.errors import BackendError, FluxError
 
 
 def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
-    """The values of a file as shape (N,), in its order.
+    """Values of a file in its order, shape (N,).
 
-    `field` chooses where there are several: a column by its name in the header line or by its number from 1,
-    an array of an `.npz` or a variable of a `.mat` by its name. Text may have comments (#), a header line,
-    and commas, semicolons, tabs or spaces between its columns.
+    `field` chooses one of several: a column by its name in the header line or by its number from 1, an array of an
+    `.npz` or a variable of a `.mat` by its name. Text may have comments (#), a header line, and commas, semicolons,
+    tabs or spaces between its columns.
 
     Raises
     ------
@@ -45,11 +45,11 @@ def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
 
 
 def pick(candidates: dict[str, NDArray], field: str | None, where: str) -> str:
-    """The name asked for; without one, `exitance`, or the only candidate.
+    """Name of the chosen field: `field` if given, else `exitance`, else the only candidate.
 
     Raises
     ------
-    FluxError : no such name, none at all, or several; the message lists them.
+    FluxError : the name does not exist, there is no candidate, or several; the message lists them.
     """
     if field is not None:
         if field not in candidates:
@@ -59,13 +59,13 @@ def pick(candidates: dict[str, NDArray], field: str | None, where: str) -> str:
         if name in candidates:
             return name
     if len(candidates) != 1:
-        mend = "Choose one by --field NAME." if candidates else "Give the values by --values FILE."
-        raise FluxError(f"{where}: which field holds the values? Fields it has: {quoted(candidates)}. {mend}")
+        fix = "Choose one by --field NAME." if candidates else "Give the values by --values FILE."
+        raise FluxError(f"{where}: which field holds the values? Fields it has: {quoted(candidates)}. {fix}")
     return next(iter(candidates))
 
 
 def quoted(names: Iterable[str]) -> str:
-    """The names in quotes."""
+    """The names in quotes, separated by commas; 'none' if there are none."""
     return ", ".join(f"'{name}'" for name in names) or "none"
 
 
@@ -74,7 +74,8 @@ def column(array: NDArray, names: list[str], field: str | None, where: str) -> N
 
     Raises
     ------
-    FluxError : not real numbers, more than two axes, several columns and no `field`, or no such column.
+    FluxError : the array does not hold real numbers or has more than two axes, `field` is missing for several columns,
+        or names no column.
     """
     if array.dtype.kind not in "fiu":
         kind = "complex numbers" if array.dtype.kind == "c" else f"of type {array.dtype}"
@@ -102,7 +103,7 @@ def column(array: NDArray, names: list[str], field: str | None, where: str) -> N
 
 
 def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], list[str]]:
-    """A text table: numbers of shape (rows, columns), and the names in its header line, if it has one.
+    """Numbers of a text table, shape (rows, columns), and the names in its header line; [] without one.
 
     Raises
     ------
@@ -115,12 +116,12 @@ def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], li
     try:
         table = np.loadtxt(StringIO(text), delimiter=delimiter, skiprows=skip, ndmin=2)
     except ValueError as cause:
-        raise FluxError(f"'{path}' is not a table of numbers: {one_line(cause)}. Mend that line.") from cause
+        raise FluxError(f"'{path}' is not a table of numbers: {one_line(cause)}. Fix that line.") from cause
     return table, names if len(names) == table.shape[1] else []
 
 
 def _text(path: Path) -> str:
-    """What stands in a text file, read once: a pipe holds it only once."""
+    """Content of a text file, read only once, since a pipe can be read only once."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as cause:
@@ -133,7 +134,10 @@ def _text(path: Path) -> str:
 
 
 def _layout(text: str, skip_lines: int) -> tuple[list[str], str | None, int | None]:
-    """Column names ([]: no header), delimiter (None: blanks), number of lines above the first numbers (None: none)."""
+    """Column names ([] without header), delimiter (None: blanks), number of lines before the numbers (None: none).
+
+    `skip_lines` : number of lines at the top to ignore
+    """
     header = ""
     for number, line in enumerate(map(str.strip, StringIO(text))):
         if number < skip_lines or not line:
@@ -149,7 +153,7 @@ def _layout(text: str, skip_lines: int) -> tuple[list[str], str | None, int | No
 
 
 def _is_numeric(line: str) -> bool:
-    """Whether a line holds numbers (or nothing) between its delimiters."""
+    """True if a line holds only numbers (or nothing) between its delimiters."""
     try:
         _ = [float(token) for token in re.split(r"[,;\t]|\s+", line) if token.strip()]
     except ValueError:
@@ -158,11 +162,11 @@ def _is_numeric(line: str) -> bool:
 
 
 def read_npz(path: Path) -> dict[str, NDArray]:
-    """The arrays of an `.npz` file by name.
+    """Arrays of an `.npz` file by name.
 
     Raises
     ------
-    FluxError : the file cannot be read or is none.
+    FluxError : the file cannot be read or is no `.npz`.
     """
     loaded = _load_numpy(path)
     if isinstance(loaded, np.ndarray):
@@ -171,7 +175,7 @@ def read_npz(path: Path) -> dict[str, NDArray]:
 
 
 def _load_numpy(path: Path) -> NDArray | dict[str, NDArray]:
-    """The array of a `.npy` or those of a `.npz`, whichever the file is."""
+    """Array of a `.npy` file, or arrays by name of a `.npz`; the content decides, not the suffix."""
     try:
         with path.open("rb") as file:
             loaded = np.load(file, allow_pickle=False)
@@ -185,7 +189,7 @@ def _load_numpy(path: Path) -> NDArray | dict[str, NDArray]:
 
 
 def _read_mat(path: Path) -> dict[str, NDArray]:
-    """Numeric variables of a MATLAB file; the member phi of a struct data is called data.phi."""
+    """Variables of a MATLAB file by name; the member phi of a struct data is named data.phi."""
     try:
         from scipy.io import loadmat
         from scipy.io.matlab import MatReadError
@@ -212,12 +216,12 @@ def _read_mat(path: Path) -> dict[str, NDArray]:
 
 
 def require_file(path: Path) -> None:
-    """Raise FluxError where there is no file, but nothing or a folder."""
+    """Raise FluxError if `path` is no file."""
     if not os.path.isfile(path):
-        what = "it is a folder" if os.path.isdir(path) else "there is no such file"
-        raise FluxError(f"'{path}' cannot be read: {what}. Check the name.")
+        reason = "it is a folder" if os.path.isdir(path) else "there is no such file"
+        raise FluxError(f"'{path}' cannot be read: {reason}. Check the name.")
 
 
 def one_line(cause: BaseException) -> str:
-    """The cause's own text on one line, without its full stop."""
+    """Text of an exception, or the name of its class, on one line without full stop."""
     return " ".join(str(cause).split()).rstrip(".") or type(cause).__name__
