@@ -6,12 +6,12 @@ Units: mm, W; a picture holds W on each pixel per W of source.
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import markdown_tables
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,11 +82,12 @@ def _values(table: Table) -> Iterator[tuple[str, str, str, str]]:
 
 
 def fill(path: Path, tables: Sequence[Table]) -> None:
-    """Put each table into a Markdown file, between the lines <!-- NAME --> and <!-- /NAME -->."""
+    """Put each table that a Markdown file marks into the file, see `markdown_tables`."""
     text = path.read_text(encoding="utf-8")
+    marked = markdown_tables.names(text)
     for table in tables:
-        marks = rf"(<!-- {table.name} -->\n).*?(<!-- /{table.name} -->)"
-        text = re.sub(marks, lambda found, new=table: f"{found[1]}\n{new.markdown()}\n\n{found[2]}", text, flags=re.S)
+        if table.name in marked:
+            text = markdown_tables.replace(text, table.name, table.markdown())
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -1,20 +1,24 @@
 """Error against run time of every method on the nylon cylinder: the README's table and figure.
 
     python scripts/work_precision.py [-o docs] [--truth out/nylon_cylinder_truth.npz] [--rounds 5] [--budget 2]
+                                     [--readme README.md]
 
 f/2.8, focused on the phantom's front, magnification 0.5, 256 x 256 pixels. `fspt converge` measures, writes
 nylon_cylinder_converge.csv and .png and prints the ratios. It counts errors from the float64 reference's picture,
 arrays power and error [W], the error being the one that the reference states of itself; this shares no code with the
-plugins, takes minutes, and is made once.
+plugins, takes minutes, and is made once. With --readme the last table is written into that file, too.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import os
 import sys
 from pathlib import Path
 
+import markdown_tables
 import numpy as np
 
 from mitsuba_fspt.cli.app import run
@@ -32,6 +36,7 @@ def main() -> None:
     parser.add_argument("--truth", type=Path, default=ROOT / "out" / "nylon_cylinder_truth.npz", metavar="FILE.npz")
     parser.add_argument("--rounds", default="5")
     parser.add_argument("--budget", default="2")
+    parser.add_argument("--readme", type=Path, metavar="FILE.md", help="write the table between its markers there")
     arguments = parser.parse_args()
     if not arguments.truth.exists():
         write_truth(arguments.truth)
@@ -39,7 +44,13 @@ def main() -> None:
     scene = [os.path.relpath(ROOT / "scenes" / "nylon_cylinder.xml"), "-D", "f_number=2.8"]
     counted_from = ["--reference", os.path.relpath(arguments.truth)]
     how = ["--rounds", arguments.rounds, "--budget", arguments.budget, "-o", str(arguments.output)]
-    sys.exit(run(["converge", *scene, *counted_from, *how]))
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        code = run(["converge", *scene, *counted_from, *how])
+    print(printed.getvalue(), end="")
+    if code == 0 and arguments.readme:
+        markdown_tables.write(arguments.readme, "work_precision", markdown_tables.last_table(printed.getvalue()))
+    sys.exit(code)
 
 
 def write_truth(path: Path) -> None:

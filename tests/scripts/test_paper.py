@@ -96,11 +96,12 @@ def test_binning_sums_and_keeps_the_scale():
 def test_tables_fill_their_places_in_a_text(tmp_path):
     table = Table("one", {"view": "", "ME": ".3f"}, [("left", 0.12345), ("back", None)])
     text = tmp_path / "text.md"
-    text.write_text("before\n<!-- one -->\nold\n<!-- /one -->\nafter\n", encoding="utf-8")
+    text.write_text("before\n<!-- table: one -->\nold\n<!-- /table -->\nafter\n", encoding="utf-8")
     for _ in range(2):
-        paper_common.fill(text, [table])
+        paper_common.fill(text, [table, Table("other", {"view": ""}, [])])
     filled = (
-        "before\n<!-- one -->\n\n| view | ME |\n|---|---|\n| left | 0.123 |\n| back | – |\n\n<!-- /one -->\nafter\n"
+        "before\n<!-- table: one -->\n\n| view | ME |\n|---|---|\n| left | 0.123 |\n| back | – |\n\n<!-- /table -->\n"
+        "after\n"
     )
     assert text.read_text(encoding="utf-8") == filled
     paper_common.write_csv([table], tmp_path / "values.csv")

@@ -1,0 +1,73 @@
+"""What README.md, CONTRIBUTING.md and docs name exists: files, links, scripts, rooms and words of the code."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from test_policy import ARROWS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+SOURCES = "\n".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "mitsuba_fspt").rglob("*.py")))
+
+
+def text_of(page):
+    """A page without its blocks of code."""
+    return re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+
+
+def cells(page, heading, column):
+    """Cells of one column of the table under a heading, the head left out."""
+    section = text_of(page).split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ")]
+    return [re.split(r"(?<!\\)\|", row)[column].strip() for row in rows[1:]]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_files_exist(page):
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", text_of(page)):
+        assert (page.parent / target).exists(), target
+    for name in re.findall(r"`((?:mitsuba_fspt|scripts|tests|docs|scenes)/[\w./*]+)`", text_of(page)):
+        assert list(ROOT.glob(name.rstrip("/").replace("NAME", "*"))), name
+
+
+def test_places_in_the_code_exist():
+    """The last table of docs/model.md: files below the package, and the names in them."""
+    rows = zip(*(cells(ROOT / "docs" / "model.md", "Where it stands in the code", k) for k in (2, 3)), strict=True)
+    for files, names in rows:
+        text = ""
+        for name in re.findall(r"`([\w/.]+)`", files):
+            path = ROOT / "mitsuba_fspt" / name
+            assert path.exists(), name
+            text += path.read_text(encoding="utf-8") if path.is_file() else " ".join(p.name for p in path.iterdir())
+        for name in re.findall(r"`([\w.]+)`", names):
+            assert name in text or name.rpartition(".")[2] in text, name
+
+
+@pytest.mark.parametrize(
+    ("heading", "column"),
+    [
+        ("Radiometry", 4),
+        ("Emission and tissue", 4),
+        ("Camera", 4),
+        ("Numerical scheme", 2),
+        ("Output and statistics", 4),
+    ],
+)
+def test_words_of_the_glossary_are_those_of_the_code(heading, column):
+    for cell in cells(ROOT / "docs" / "glossary.md", heading, column):
+        for word in re.findall(r"`([^`]+)`", cell):
+            if "/" in word:
+                assert (ROOT / "mitsuba_fspt" / word).exists(), word
+                continue
+            for part in re.findall(r"\w+", word):
+                assert re.search(rf"\b{part}\b", SOURCES), word
+
+
+def test_contributing_lists_the_rooms_and_their_arrows():
+    page = ROOT / "CONTRIBUTING.md"
+    rooms = [cell.strip("`") for cell in cells(page, "Layout", 1)]
+    arrows = [set(re.findall(r"`(\w+)`", cell)) for cell in cells(page, "Layout", 3)]
+    assert dict(zip(rooms, arrows, strict=True)) == ARROWS
