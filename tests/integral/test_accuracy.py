@@ -1,4 +1,8 @@
-"""What is promised of the integral: the accuracy asked for at every pixel, an honest error, work where it is needed."""
+"""What is promised of the integral: the accuracy asked for at every pixel, an honest error, work where it is needed.
+
+The truth is computed in float64 NumPy without any code of the integral: by rows for spheres, by a depth buffer for
+meshes. Both state their own standard error, a tenth of the accuracy asked for in most cases, a third at worst.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from row_reference import Sphere, truth
 from small_scenes import (
     FOCAL,
     FOCUS,
     HEIGHT,
     MAGNIFICATION,
+    PITCH,
+    SCENES,
     WIDTH,
     camera_scene,
     disk,
@@ -23,11 +30,12 @@ from small_scenes import (
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.validation import stiff_scenes as far_away
+from mitsuba_fspt.validation.reference import Camera, look_at
+from mitsuba_fspt.validation.reference_mesh import TriangleMesh, load_ply, mesh_truth
 
 pytestmark = pytest.mark.usefixtures("mono")
 
 RTOL = 1e-3
-FINER = {"rtol": RTOL / 100}
 # Parts of the film (x, y, width, height): a corner, the brightest spot, edges, a sphere's edge behind another sphere.
 CASES = [
     ("nylon_cylinder", 0, 2.8, (16, 12, 8, 7)),
@@ -43,9 +51,51 @@ CASES = [
 
 @cache
 def pictures(name, view, f_number, part):
-    """Picture at RTOL, and one of a hundredth of that."""
-    phantom = part_of(name, view, f_number, part)
-    return fspt.render(phantom, rtol=RTOL), fspt.render(phantom, **FINER)
+    """Picture at RTOL; power on its pixels and the standard error of that [W], by the reference."""
+    return fspt.render(part_of(name, view, f_number, part), rtol=RTOL), *reference(name, view, f_number, part)
+
+
+def reference(name, view, f_number, part):
+    """Power on a part of the film and its standard error [W], from the scene's description alone."""
+    place = look_at([175 if name == "two_spheres" else 180, 0, 0], [0, 0, 0], [0, 0, 1])
+    camera = Camera(FOCAL, f_number, FOCUS, 256 * 0.108 / HEIGHT, WIDTH, HEIGHT, place)
+    cosine, sine = np.cos(np.radians(view)), np.sin(np.radians(view))
+    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    if name == "nylon_cylinder":
+        mesh = load_ply(SCENES / "nylon_cylinder.ply")
+        x, y, width, height = part
+        region = np.zeros((HEIGHT, WIDTH), bool)
+        region[y : y + height, x : x + width] = True
+        mesh = TriangleMesh(mesh.vertices @ turn.T, mesh.faces, mesh.exitance)
+        planes = mesh_truth(camera, mesh, levels=((32, 8), (512, 16)), tolerance=1e-4, region=region, replicas=4)
+        return [plane[region].reshape(height, width) for plane in planes]
+    if name == "two_spheres":
+        near, far = camera.from_world(np.array([[45.0, 7.0, 4.0], [0.0, 0.0, 0.0]]))
+        return truth(camera, Sphere(near, 5.0, 3e-3), Sphere(far, 10.0, 1e-3), nodes=1 << 15, part=part)
+    painted = Sphere((0.0, 0.0, 180.0), 15.0, lambda points: painted_exitance(camera.in_world(points) @ turn))
+    few, many = {"nodes": 1 << 11, "along": 16}, {"nodes": 1 << 13, "along": 8}
+    return truth(camera, painted, part=part, **(few if view == 0 else many))
+
+
+@cache
+def texels():
+    """Of the textured sphere, north pole in row 0, longitude 0 in column 0, (h, w) [W/mm²]."""
+    import mitsuba as mi
+
+    return np.array(mi.Bitmap(str(SCENES / "textured_sphere.exr")), np.float64).reshape(256, 512)
+
+
+def painted_exitance(points):
+    """J_n of the textured sphere at points (…, 3) of its own frame: linear between the texels' middles."""
+    x, y, z = np.moveaxis(points / np.linalg.norm(points, axis=-1, keepdims=True), -1, 0)
+    height, width = texels().shape
+    column = np.arctan2(y, x) / (2 * np.pi) % 1 * width - 0.5
+    row = np.arccos(z) / np.pi * height - 0.5
+    i, j = np.floor(row).astype(int), np.floor(column).astype(int)
+    up, across = row - i, column - j
+    corners = [texels()[(i + k) % height, (j + m) % width] for k in (0, 1) for m in (0, 1)]
+    upper, lower = (a + (b - a) * across for a, b in (corners[:2], corners[2:]))
+    return upper + (lower - upper) * up
 
 
 def part_of(name, view, f_number, part):
@@ -63,43 +113,72 @@ def part_of(name, view, f_number, part):
 def test_every_pixel_is_as_accurate_as_asked(case):
     """Rationale: rtol bounds the error of every pixel relative to the brightest one.
 
-    Expected: against rtol/100, no pixel off by more than rtol. Seen to fail with the bisection of jumps left out.
+    Expected: no pixel differs from the reference by more than rtol. Seen to fail with cos⁴θ → cos³θ (all cases) and
+    with one bisection of each jump (where silhouettes are in focus).
     """
-    image, truth = pictures(*case)
+    image, expected, error = pictures(*case)
     assert image.shape == case[3][:1:-1]
-    assert (truth.power > 0).sum() > 15
-    assert np.abs(image.power - truth.power).max() < RTOL * truth.power.max()
+    assert (expected > 0).sum() > 15
+    assert error.max() < 0.3 * RTOL * expected.max()
+    assert np.abs(image.power - expected).max() < RTOL * expected.max()
 
 
 def test_error_bounds_the_error():
-    """Rationale: `error` is the estimated absolute error of each pixel. Expected: a bound for 99 pixels of 100."""
-    bounded = [np.abs(image.power - truth.power) <= image.error for image, truth in (pictures(*case) for case in CASES)]
+    """Rationale: `error` is the estimated absolute error of each pixel.
+
+    Expected: a bound for 99 pixels of 100, beside the standard error of the reference. Seen to fail with cos⁴θ → cos³θ
+    (48 of 100) and with a tenth of the error stated (83 of 100).
+    """
+    bounded = [
+        np.abs(image.power - expected) <= image.error + error
+        for image, expected, error in (pictures(*case) for case in CASES)
+    ]
     assert np.concatenate(bounded, axis=None).mean() >= 0.99
 
 
 def test_error_bounds_the_error_on_a_ball_of_five_pixels():
     """A limb curved within every pixel, and a tenth of a pixel out of focus. Expected: a bound, pixel by pixel.
 
-    Seen to fail (1.1e-3 of the brightest pixel off, 7e-4 stated) with transects that fill pixel and pupil less evenly.
+    Seen to fail with transects that fill pixel and pupil less evenly (1.1e-3 of the brightest pixel off, 7e-4 stated),
+    with one bisection of each jump (2.6e-3 off) and with a tenth of the error stated.
     """
-    ball = camera_scene(sphere(175.0, 5.0), f_number=8.0, pixel_pitch=0.9)
-    image, truth = fspt.render(ball), fspt.render(ball, rtol=3e-5)
-    off = np.abs(image.power - truth.power)
-    assert off.max() < RTOL * truth.power.max()
-    assert (off <= image.error + truth.error).all()
+    image = fspt.render(camera_scene(sphere(175.0, 5.0), f_number=8.0, pixel_pitch=0.9))
+    expected, error = on_axis(175.0, 5.0, 8.0, 0.9)
+    off = np.abs(image.power - expected)
+    assert error.max() < 0.1 * RTOL * expected.max()
+    assert off.max() < RTOL * expected.max()
+    assert (off <= image.error + error).all()
+
+
+def on_axis(depth, radius, f_number, pitch, side=12):
+    """Power of a sphere on the axis and its standard error [W] by the reference; all of it is on the middle pixels."""
+    planes = np.zeros((2, HEIGHT, WIDTH))
+    x, y = (WIDTH - side) // 2, (HEIGHT - side) // 2
+    camera = Camera(FOCAL, f_number, FOCUS, pitch, WIDTH, HEIGHT)
+    part = truth(camera, Sphere((0, 0, depth), radius), nodes=1 << 14, part=(x, y, side, side))
+    assert not np.any([part[0][[0, -1]], part[0][:, [0, -1]].T])
+    planes[:, y : y + side, x : x + side] = part
+    return planes
 
 
 def test_error_knows_what_float32_makes_of_far_places():
-    """The same scene 10⁵ mm away and turned. Seen to fail with the rounding of lines of sight left out of the error."""
+    """Rationale: float32 moves lines of sight of a scene that is turned and 10⁵ mm away from the world's origin.
+
+    Expected: larger errors than at the origin, and bounds for 99 pixels of 100. Seen to fail with the rounding of lines
+    of sight left out of the error (89 of 100) and with cos⁴θ → cos³θ.
+    """
     here, there = (fspt.render(far_away.scene(far_away.ball(), at=far_away.moved(*at)())) for at in ((0,), (1e5, 50)))
-    off = np.abs(there.power - here.power)
-    assert off.max() > here.error.max()
-    assert (off <= there.error + here.error).mean() >= 0.99
+    camera = Camera(FOCAL, far_away.F_NUMBER, FOCUS, PITCH, far_away.WIDTH, far_away.HEIGHT)
+    expected, error = truth(camera, Sphere((1.5, -1.0, 168.0), 6.0))
+    off = np.abs(there.power - expected)
+    assert error.max() < here.error.max()
+    assert off.max() > here.error.max() + error.max()
+    assert (off <= there.error + error).mean() >= 0.99
 
 
 def test_same_bits_in_every_run():
     """Expected: power, error and coverage, of the same scene and of one loaded anew."""
-    image, _ = pictures(*CASES[0])
+    image, *_ = pictures(*CASES[0])
     phantom = part_of(*CASES[0])
     for again in (fspt.render(phantom, rtol=RTOL), fspt.render(phantom, rtol=RTOL)):
         for plane in ("power", "error", "coverage"):
@@ -174,12 +253,14 @@ def test_more_accuracy_takes_more_lines_of_sight():
 
 
 def test_no_pixel_takes_more_lines_of_sight_than_max_nodes():
-    """Expected: the limit kept, and the error says what that costs."""
+    """Expected: the limit is kept, and the error says what that costs. Seen to fail with cos⁴θ → cos³θ."""
     body = camera_scene(sphere(180.0, 4.0), f_number=8.0)
-    few, many = (fspt.render(body, rtol=3e-4, max_nodes=n) for n in (1000, 1 << 16))
+    few = fspt.render(body, rtol=3e-4, max_nodes=1000)
     assert few.metadata["nodes"] <= 1000 * WIDTH * HEIGHT
-    off = np.abs(few.power - many.power)
-    assert off.max() > 3e-4 * many.power.max()
+    expected, error = on_axis(180.0, 4.0, 8.0, PITCH)
+    off = np.abs(few.power - expected)
+    assert error.max() < 1e-4 * expected.max()
+    assert off.max() > 3e-4 * expected.max()
     assert few.error.max() > off.max()
     assert np.mean(off <= few.error) >= 0.99
 
