@@ -34,26 +34,24 @@ class Quadrature:
     shortcuts_off: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rtol", number("fspt_integral: 'rtol'", self.rtol, SceneError, "1e-3"))
-        nodes = whole("fspt_integral: 'max_nodes'", self.max_nodes, SceneError, "200000")
+        object.__setattr__(self, "rtol", number("'rtol'", self.rtol, SceneError, "1e-3"))
+        nodes = whole("'max_nodes'", self.max_nodes, SceneError, "200000")
         object.__setattr__(self, "max_nodes", nodes)
         if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
-            raise SceneError(f"fspt_integral: 'rtol' must be in (0, 1), got {self.rtol:g}. Give for example 1e-3.")
+            raise SceneError(f"'rtol' must be in (0, 1), got {self.rtol:g}. Give for example 1e-3.")
         if self.rtol < FLOAT32_FLOOR:
             raise SceneError(
-                f"fspt_integral: 'rtol' = {self.rtol:g} is below {FLOAT32_FLOOR:g}, the rounding of single precision. "
+                f"'rtol' = {self.rtol:g} is below {FLOAT32_FLOOR:g}, the rounding of single precision. "
                 f"Give {FLOAT32_FLOOR:g} or more."
             )
         if self.domain not in DOMAINS:
-            raise SceneError(f"fspt_integral: 'domain' must be one of {', '.join(DOMAINS)}, got '{self.domain}'.")
+            raise SceneError(f"'domain' must be one of {', '.join(DOMAINS)}, got '{self.domain}'.")
         if self.pixel not in PIXELS:
-            raise SceneError(f"fspt_integral: 'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
+            raise SceneError(f"'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
         if self.max_nodes < 1:
-            raise SceneError(f"fspt_integral: 'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 200000.")
+            raise SceneError(f"'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 200000.")
         if unknown := set(self.shortcuts_off) - set(SHORTCUTS):
-            raise SceneError(
-                f"fspt_integral: 'shortcuts_off' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}."
-            )
+            raise SceneError(f"'shortcuts_off' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}.")
 
     @property
     def least_error(self) -> float:

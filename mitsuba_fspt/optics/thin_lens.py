@@ -72,7 +72,7 @@ class Lens:
         given = {name: value for name, value in focus if value is not None}
         if len(given) != 1:
             raise OpticsError(
-                f"fspt_lens: exactly one of {', '.join(map(repr, FOCUS))} sets the focus, got "
+                f"exactly one of {', '.join(map(repr, FOCUS))} sets the focus, got "
                 f"{' and '.join(map(repr, given)) or 'none'}. Give one, for example magnification = 0.5."
             )
         ((name, value),) = given.items()
@@ -82,7 +82,7 @@ class Lens:
         elif name == "image_distance":
             if value <= focal_length:
                 raise OpticsError(
-                    f"fspt_lens: 'image_distance' must be > focal_length = {focal_length:g} mm for a real image, "
+                    f"'image_distance' must be > focal_length = {focal_length:g} mm for a real image, "
                     f"got {value:g}. Give a larger one, or 'magnification'."
                 )
             focus_distance = focal_length * value / (value - focal_length)
@@ -95,19 +95,18 @@ class Lens:
     def __post_init__(self) -> None:
         for name in ("focal_length", "f_number", "focus_distance", *BORDERS):
             if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, number(f"fspt_lens: '{name}'", value, OpticsError, EXAMPLES[name]))
+                object.__setattr__(self, name, number(f"'{name}'", value, OpticsError, EXAMPLES[name]))
         _require_positive("focal_length", self.focal_length, "mm, for example 55")
         _require_positive("f_number", self.f_number, "f_number = F/D, for example 8")
         _require_positive("focus_distance", self.focus_distance, "mm, for example 165")
         if self.focus_distance <= self.focal_length:
             raise OpticsError(
-                f"fspt_lens: 'focus_distance' must be > focal_length = {self.focal_length:g} mm for a real image, "
+                f"'focus_distance' must be > focal_length = {self.focal_length:g} mm for a real image, "
                 f"got {self.focus_distance:g}. Move the camera back or use a shorter lens."
             )
         if not math.isfinite(self.diaphragm_distance):
             raise OpticsError(
-                f"fspt_lens: 'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm. Give mm, for "
-                "example 5."
+                f"'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm. Give mm, for example 5."
             )
         if self.image_stop_diameter is not None:
             _require_positive("image_stop_diameter", self.image_stop_diameter, "mm on the detector, for example 20")
@@ -164,9 +163,9 @@ def _model(name: str, own: dict[str, object]) -> LensModel:
     for wrong in (parameter for parameter in own if parameter not in kind.parameters()):
         home = next((other for other in model_names() if wrong in model_named(other).parameters()), None)
         if home is None:
-            raise OpticsError(f"fspt_lens: no model has a number '{wrong}'. Leave it out or correct its name.")
+            raise OpticsError(f"no model has a number '{wrong}'. Leave it out or correct its name.")
         raise OpticsError(
-            f"fspt_lens: '{wrong}' = {own[wrong]} belongs to model '{home}', this is '{name}'. Leave it out or set "
+            f"'{wrong}' = {own[wrong]} belongs to model '{home}', this is '{name}'. Leave it out or set "
             f"model to '{home}'."
         )
     return kind(**own)
@@ -185,9 +184,9 @@ def configuration_factor(radius: float, distance: float, offset: float) -> float
 
 def _require_positive(name: str, value: float, example: str) -> float:
     """`value` as a plain number; OpticsError where it is none, not positive or beyond `LARGEST`."""
-    value = number(f"fspt_lens: '{name}'", value, OpticsError, EXAMPLES[name])
+    value = number(f"'{name}'", value, OpticsError, EXAMPLES[name])
     if not (math.isfinite(value) and value > 0):
-        raise OpticsError(f"fspt_lens: '{name}' must be > 0 and finite, got {value:g}. Give {example}.")
+        raise OpticsError(f"'{name}' must be > 0 and finite, got {value:g}. Give {example}.")
     if not 1 / LARGEST <= value <= LARGEST:
-        raise OpticsError(f"fspt_lens: '{name}' must be in 1/{LARGEST:g} … {LARGEST:g}, got {value:g}. Give {example}.")
+        raise OpticsError(f"'{name}' must be in 1/{LARGEST:g} … {LARGEST:g}, got {value:g}. Give {example}.")
     return value

@@ -25,7 +25,7 @@ from ..jit.mesh_buffers import buffers
 from ..jit.pixel_grid import Grid
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
-from ..runtime.errors import SceneError
+from ..runtime.errors import SceneError, named
 
 MEANINGLESS = ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "timeout")
 LEAST_DISPLACEMENT = 1e-3  # pixels; larger ones occur only far from the world's origin
@@ -177,13 +177,14 @@ def _quadrature_of(props: mi.Properties) -> Quadrature:
     shortcuts = props.get("shortcuts", True)
     if not isinstance(shortcuts, bool):
         raise SceneError(f"fspt_integral: 'shortcuts' must be true or false, got {shortcuts!r}. Give it as a boolean.")
-    return Quadrature(
-        rtol=props.get("rtol", defaults.rtol),
-        domain=str(props.get("domain", defaults.domain)),
-        pixel=str(props.get("pixel", defaults.pixel)),
-        max_nodes=props.get("max_nodes", defaults.max_nodes),
-        shortcuts_off=frozenset() if shortcuts else frozenset(SHORTCUTS),
-    )
+    with named("fspt_integral"):
+        return Quadrature(
+            rtol=props.get("rtol", defaults.rtol),
+            domain=str(props.get("domain", defaults.domain)),
+            pixel=str(props.get("pixel", defaults.pixel)),
+            max_nodes=props.get("max_nodes", defaults.max_nodes),
+            shortcuts_off=frozenset() if shortcuts else frozenset(SHORTCUTS),
+        )
 
 
 class CachedValue:

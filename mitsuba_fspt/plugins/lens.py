@@ -12,7 +12,7 @@ from ..integral.pupil import Pupil
 from ..jit.spectra import flat_share
 from ..optics.discs import defocus
 from ..optics.thin_lens import Lens, number_names
-from ..runtime.errors import OpticsError
+from ..runtime.errors import OpticsError, named
 from .film import default_sampler, number, own_film
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
@@ -106,7 +106,8 @@ class FsptLens(mi.Sensor):
         axes = matrix[:3, :3]
         if not np.allclose(axes @ axes.T, np.eye(3), atol=STRETCH) or np.linalg.det(axes) < 0:
             raise OpticsError("fspt_lens: 'to_world' scales lengths or mirrors. Give a rotation and a translation.")
-        self.optics = Lens.focused(model=self._model, **numbers)
+        with named("fspt_lens"):
+            self.optics = Lens.focused(model=self._model, **numbers)
         if (stop := numbers.get("image_stop_diameter", pitch)) < pitch:
             raise OpticsError(
                 f"fspt_lens: 'image_stop_diameter' = {stop:g} mm is below a pixel. Give at least {pitch:g} mm."

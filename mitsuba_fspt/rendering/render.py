@@ -18,7 +18,7 @@ from ..images.image import Image
 from ..integral.quadrature import Quadrature
 from ..integral.shortcuts import SHORTCUTS
 from ..runtime import backend
-from ..runtime.errors import SceneError
+from ..runtime.errors import SceneError, named
 from ..runtime.interrupt import ctrl_c_noted
 from ..runtime.numbers import whole
 from ..runtime.plugin_types import is_integral
@@ -107,7 +107,8 @@ def _integrate(
     own = asdict(integrator.quadrature)
     wanted = own | {name: value for name, value in accuracy.items() if value is not None}
     progress("integrating", 0.0)
-    quadrature = Quadrature(**wanted)
+    with named("fspt_integral"):
+        quadrature = Quadrature(**wanted)
     solution = integrator.solve(scene, lens, quadrature)
     how = {"method": "integral", **asdict(quadrature), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
     how["shortcuts_off"] = ", ".join(sorted(quadrature.shortcuts_off)) or "nothing"

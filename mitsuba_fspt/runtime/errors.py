@@ -1,5 +1,8 @@
 """Exceptions of the package; each message states the object, the value, the rule and the fix in one line."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class FsptError(ValueError):
     """Base class of the package's exceptions; the command line prints the message as one line and exits with code 2."""
@@ -31,3 +34,12 @@ class BackendError(FsptError, ImportError):
 
 class DetectorError(FsptError):
     """A detector parameter, or a parameter of an exposure, outside its range."""
+
+
+@contextmanager
+def named(thing: str) -> Iterator[None]:
+    """Context manager: puts `thing: ` before the message of an FsptError that its block raises."""
+    try:
+        yield
+    except FsptError as error:
+        raise type(error)(f"{thing}: {error}") from error

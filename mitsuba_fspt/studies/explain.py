@@ -14,6 +14,7 @@ from ..integral.shortcuts import SHORTCUTS, Finding
 from ..rendering.render import integrator_of, sensor_of
 from ..rendering.scene import loaded
 from ..runtime import backend
+from ..runtime.errors import named
 from ..runtime.extras import EXTRAS
 from ..runtime.plugin_types import is_surface
 
@@ -75,7 +76,8 @@ def explain(
     variant = backend.ensure_variant()
     lens, integrator = sensor_of(scene, sensor), integrator_of(scene, "integral")
     wanted = {name: value for name, value in (("rtol", rtol), ("domain", domain)) if value is not None}
-    quadrature = replace(integrator.quadrature, **wanted)
+    with named("fspt_integral"):
+        quadrature = replace(integrator.quadrature, **wanted)
 
     def solve(quadrature: Quadrature) -> tuple[Solution, float]:
         start = time.perf_counter()

@@ -19,7 +19,7 @@ from ..optics.thin_lens import Lens, number_names
 from ..rendering.scene import check_parameters, parameter_text
 from ..rendering.scene_rules import REFERENCE, check_values, is_number
 from ..rendering.scene_xml import read_xml
-from ..runtime.errors import SceneError
+from ..runtime.errors import SceneError, named
 
 Setting = str | int | float | None
 MAX_CHARACTERS = 60  # of a value in a file name
@@ -178,7 +178,8 @@ class SceneSource:
         plain = all(map(is_number, numbers.values())) and "include" not in {node.tag for node in self._lens}
         if plain and {"focal_length", "f_number"} <= set(numbers):
             model = given.get("model", "diaphragm")
-            Lens.focused(model=model, **{name: float(text) for name, text in numbers.items()})  # type: ignore[arg-type]
+            with named("fspt_lens"):
+                Lens.focused(model=model, **{name: float(text) for name, text in numbers.items()})  # type: ignore[arg-type]
 
     def digests(self) -> list[tuple[str, str]]:
         """Name and SHA-256 of the scene file, of what it includes and of every file that its attributes name.

@@ -172,7 +172,7 @@ def test_the_stop_can_be_updated_and_stands_in_the_header():
 
 @pytest.mark.parametrize("diameter", [0.0, -3.0, np.inf, np.nan])
 def test_a_stop_that_cannot_be_is_refused(diameter):
-    with pytest.raises(OpticsError, match=r"fspt_lens: 'image_stop_diameter' must be > 0 and finite, got .*example 20"):
+    with pytest.raises(OpticsError, match=r"'image_stop_diameter' must be > 0 and finite, got .*example 20"):
         Lens(55.0, 8.0, 165.0, image_stop_diameter=diameter)
 
 

@@ -121,7 +121,7 @@ def test_diaphragm_in_the_rear_focal_plane_stops_directions():
 )
 def test_lens_that_cannot_be_is_refused_by_name(arguments, name):
     good = {"focal_length": 55.0, "f_number": 2.8, "focus_distance": 165.0}
-    with pytest.raises(OpticsError, match=f"fspt_lens.*{name}") as caught:
+    with pytest.raises(OpticsError, match=name) as caught:
         Lens.focused(**good | arguments)
     assert "\n" not in str(caught.value)
 

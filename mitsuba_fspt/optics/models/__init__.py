@@ -32,7 +32,7 @@ class LensModel:
     def __post_init__(self) -> None:
         for name in self.parameters():
             if (value := getattr(self, name)) is not None:
-                checked = number(f"fspt_lens: '{name}'", value, OpticsError, self.EXAMPLES[name])
+                checked = number(f"'{name}'", value, OpticsError, self.EXAMPLES[name])
                 object.__setattr__(self, name, checked)
 
     @property
@@ -71,5 +71,5 @@ def model_named(name: str) -> type[LensModel]:
         return class_named(sys.modules[__name__], name)
     except KeyError:
         raise OpticsError(
-            f"fspt_lens: 'model' must be one of {', '.join(model_names())}, got '{name}'. Give one of these."
+            f"'model' must be one of {', '.join(model_names())}, got '{name}'. Give one of these."
         ) from None

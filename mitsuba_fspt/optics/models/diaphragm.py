@@ -24,7 +24,7 @@ class Diaphragm(LensModel):
             self._check_distance(lens)
         elif lens.lens_diameter is not None and lens.lens_diameter < lens.diaphragm_diameter * (1 - ROUNDING):
             raise OpticsError(
-                f"fspt_lens: 'lens_diameter' = {lens.lens_diameter:g} mm is smaller than the diaphragm "
+                f"'lens_diameter' = {lens.lens_diameter:g} mm is smaller than the diaphragm "
                 f"D = focal_length/f_number = {lens.diaphragm_diameter:g} mm. Give a larger lens or "
                 f"f_number >= {lens.focal_length / lens.lens_diameter:.4g}."
             )
@@ -33,17 +33,17 @@ class Diaphragm(LensModel):
         distance = lens.diaphragm_distance
         if lens.lens_diameter is None:
             raise OpticsError(
-                f"fspt_lens: 'diaphragm_distance' = {distance:g} mm needs 'lens_diameter', the "
+                f"'diaphragm_distance' = {distance:g} mm needs 'lens_diameter', the "
                 "second border a line of sight has to pass. Give mm, for example 20."
             )
         if distance >= lens.image_distance:
             raise OpticsError(
-                f"fspt_lens: 'diaphragm_distance' = {distance:g} mm must be smaller than the image "
+                f"'diaphragm_distance' = {distance:g} mm must be smaller than the image "
                 f"distance {lens.image_distance:g} mm: the diaphragm stands between lens and detector. Give less."
             )
         if -distance >= lens.focus_distance:
             raise OpticsError(
-                f"fspt_lens: 'diaphragm_distance' = {distance:g} mm must be above -focus_distance = "
+                f"'diaphragm_distance' = {distance:g} mm must be above -focus_distance = "
                 f"{-lens.focus_distance:g} mm: the diaphragm stands between lens and virtual detector plane. Give "
                 "more."
             )

@@ -19,9 +19,7 @@ class Hrrt(LensModel):
 
     def check(self, lens: Lens) -> None:
         if lens.lens_diameter is None:
-            raise OpticsError(
-                "fspt_lens: model 'hrrt' needs 'lens_diameter', the border that stops its light. Give mm, say 20."
-            )
+            raise OpticsError("model 'hrrt' needs 'lens_diameter', the border that stops its light. Give mm, say 20.")
 
     def discs(self, lens: Lens) -> tuple[Disc, ...]:
         """The border of the lens, which `check` requires."""

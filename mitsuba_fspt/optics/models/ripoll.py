@@ -27,7 +27,7 @@ class Ripoll(LensModel):
     def check(self, lens: Lens) -> None:
         if self.numerical_aperture is None or not 0 < self.numerical_aperture < 1:
             raise OpticsError(
-                f"fspt_lens: model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}. "
+                f"model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}. "
                 "Give for example 0.5."
             )
 
