@@ -1,4 +1,4 @@
-"""`fspt compare` and `fspt expose`: two images against each other, and the detector's response to one."""
+"""`fspt plot`, `fspt compare` and `fspt expose`: pictures of images, two against each other, a detector's response."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 
 from ..runtime.atomic_files import require_apart
 from ..runtime.errors import ImageError
-from .options import SourcePower
+from .options import SourcePower, require_picture
 
 
 def compare(
@@ -32,6 +32,48 @@ def compare(
 
         write_comparison_png(*images, png)
     typer.echo(json.dumps(result.to_dict()) if as_json else result.render_text())
+
+
+def plot(
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE.exr...", help="Images, a panel each.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Picture to write, .png; IMAGE.png, or plot.png for several.")
+    ] = None,
+    log: Annotated[bool, typer.Option("--log", help="Logarithmic colour scale.")] = False,
+    limits: Annotated[
+        str | None, typer.Option("--range", metavar="A,B", help="Ends of the colour scale [W/pixel].")
+    ] = None,
+    per_panel: Annotated[bool, typer.Option("--per-panel", help="A colour scale for each image.")] = False,
+    outline: Annotated[bool, typer.Option("--outline", help="Draw the outline of the phantom.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+) -> None:
+    """Draw images with colour bar, axes in mm and total power; the scale is logarithmic where peaks differ a lot."""
+    from ..images.image import read
+    from ..images.picture import draw_panels, save_figure
+
+    output = output or Path(f"{images[0].stem}.png" if len(images) == 1 else "plot.png")
+    require_picture(output)
+    require_apart(output, images, error=ImageError)
+    pictures = [read(path) for path in images]
+    ends = _range(limits) if limits is not None else None
+    names = [path.stem for path in images]
+    figure = draw_panels(pictures, names, log=log, limits=ends, per_panel=per_panel, outline=outline)
+    save_figure(figure, output)
+    if as_json:
+        totals = [float(image.power.sum(dtype="float64")) for image in pictures]
+        typer.echo(json.dumps({"output": str(output), "images": [*map(str, images)], "total_power": totals}))
+    elif not quiet:
+        typer.echo(f"{output}: {len(images)} {'image' if len(images) == 1 else 'images'}")
+
+
+def _range(text: str) -> tuple[float, float]:
+    """Two numbers from the text A,B; ImageError for another text."""
+    try:
+        low, high = map(float, text.split(","))
+    except ValueError as cause:
+        raise ImageError(f"--range {text}: must be two numbers A,B in W/pixel, for example --range 0,1e-9.") from cause
+    return low, high
 
 
 def expose(

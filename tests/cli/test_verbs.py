@@ -179,6 +179,34 @@ def test_expose_writes_electrons_and_counts(run, two_images, tmp_path):
     assert header("e.exr")["fspt:quantity"] == "electrons"
 
 
+def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
+    code, out, err = run("plot", "a.exr")
+    assert (code, out, err) == (0, "a.png: 1 image\n", "")
+    code, out, err = run("plot", *two_images, "--range", "1e-12,1e-7", "--json")
+    assert (code, err) == (0, "")
+    powers = [fspt.read(name).power.sum(dtype=float) for name in two_images]
+    assert json.loads(out) == {"output": "plot.png", "images": [*two_images], "total_power": pytest.approx(powers)}
+    assert run("plot", *two_images, "--log", "--per-panel", "-o", "b.png", "--quiet") == (0, "", "")
+    assert set(os.listdir(tmp_path)) == {*two_images, "a.png", "b.png", "plot.png"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--range", "1"), "--range 1: must be two numbers A,B in W/pixel, for example --range 0,1e-9."),
+        (("--range", "2,1"), "picture: the range must be A < B in W/pixel, got 2,1. Give 0,1e-9."),
+        (("--outline",), "picture: an image without coverage has no outline. Leave it out, or give one that"),
+        (("-o", "a.jpg"), "output file 'a.jpg' must end in .png. Give a name such as picture.png."),
+        (("none.exr",), "image file 'none.exr' does not exist. Give the path of an EXR file."),
+    ],
+)
+def test_plots_that_cannot_be_drawn(run, two_images, tmp_path, options, message):
+    code, out, err = run("plot", "a.exr", *options)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"fspt: {message}")
+    assert set(os.listdir(tmp_path)) == set(two_images)
+
+
 EXPOSE = ("expose", "a.exr", "-o", "e.exr", "--exposure-time", "1", "--wavelength-nm", "600")
 
 
@@ -344,9 +372,9 @@ def test_version_and_help(run):
     assert re.fullmatch(r"mitsuba-fspt \d+\.\d+\.\d+\S*\n", out)
     code, out, err = run("--help")
     assert (code, err) == (0, "")
-    for verb in ("render", "compare", "expose", "doctor", "flux", "converge"):
+    for verb in ("render", "plot", "compare", "expose", "doctor", "flux", "converge"):
         assert verb in out
-    for verb in ("render", "compare", "expose", "doctor", "flux", "converge"):
+    for verb in ("render", "plot", "compare", "expose", "doctor", "flux", "converge"):
         code, out, err = run(verb, "--help")
         assert (code, err) == (0, "")
         assert "Usage: fspt " + verb in out
