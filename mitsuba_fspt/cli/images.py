@@ -1,16 +1,18 @@
-"""`fspt compare` and `fspt expose`: two images against each other, and the detector's response to one."""
+"""`fspt plot`, `fspt compare` and `fspt expose`: pictures of images, two against each other, a detector's response."""
 
 from __future__ import annotations
 
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ..runtime.atomic_files import require_apart
 from ..runtime.errors import ImageError
+from .options import SourcePower, require_picture
 
 
 def compare(
@@ -32,22 +34,91 @@ def compare(
     typer.echo(json.dumps(result.to_dict()) if as_json else result.render_text())
 
 
+def plot(
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE.exr...", help="Images, a panel each.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Picture to write, .png; IMAGE.png, or plot.png for several.")
+    ] = None,
+    log: Annotated[bool, typer.Option("--log", help="Logarithmic colour scale.")] = False,
+    limits: Annotated[
+        str | None, typer.Option("--range", metavar="A,B", help="Ends of the colour scale [W/pixel].")
+    ] = None,
+    per_panel: Annotated[bool, typer.Option("--per-panel", help="A colour scale for each image.")] = False,
+    outline: Annotated[bool, typer.Option("--outline", help="Draw the outline of the phantom.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+) -> None:
+    """Draw images with colour bar, axes in mm and total power; the scale is logarithmic where peaks differ a lot."""
+    from ..images.image import read
+    from ..images.picture import draw_panels, save_figure
+
+    output = output or Path(f"{images[0].stem}.png" if len(images) == 1 else "plot.png")
+    require_picture(output)
+    require_apart(output, images, error=ImageError)
+    pictures = [read(path) for path in images]
+    ends = _range(limits) if limits is not None else None
+    names = [path.stem for path in images]
+    figure = draw_panels(pictures, names, log=log, limits=ends, per_panel=per_panel, outline=outline)
+    save_figure(figure, output)
+    if as_json:
+        totals = [float(image.power.sum(dtype="float64")) for image in pictures]
+        typer.echo(json.dumps({"output": str(output), "images": [*map(str, images)], "total_power": totals}))
+    elif not quiet:
+        typer.echo(f"{output}: {len(images)} {'image' if len(images) == 1 else 'images'}")
+
+
+def _range(text: str) -> tuple[float, float]:
+    """Two numbers from the text A,B; ImageError for another text."""
+    try:
+        low, high = map(float, text.split(","))
+    except ValueError as cause:
+        raise ImageError(f"--range {text}: must be two numbers A,B in W/pixel, for example --range 0,1e-9.") from cause
+    return low, high
+
+
 def expose(
     image: Annotated[Path, typer.Argument(metavar="IMAGE.exr", help="Power image, as 'fspt render' writes it.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Electrons to write, .exr.")],
     exposure_time: Annotated[float, typer.Option(help="Exposure time [s].")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
+    source_power: SourcePower = None,
     binning: Annotated[int, typer.Option(help="Pixels per side binned before read-out.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     counts: Annotated[Path | None, typer.Option(help="Also write the counts [DN], 16-bit .png or .tif.")] = None,
+    detector: Annotated[
+        Path | None,
+        typer.Option(metavar="CAMERA.toml", help="Camera with a table [detector]; a typical cooled CCD if left out."),
+    ] = None,
+    quantum_efficiency: Annotated[float | None, typer.Option(help="Electrons per photon, in (0, 1].")] = None,
+    dark_current: Annotated[float | None, typer.Option(help="[e-/px/s], of a pixel of --pixel-pitch.")] = None,
+    read_noise: Annotated[float | None, typer.Option(help="Of one read-out [e-].")] = None,
+    full_well: Annotated[float | None, typer.Option(help="Of a read-out pixel, binned or not [e-].")] = None,
+    gain: Annotated[float | None, typer.Option(help="[e-/DN]; 1/K in EMVA 1288.")] = None,
+    bias: Annotated[float | None, typer.Option(help="[DN].")] = None,
+    bits: Annotated[int | None, typer.Option(help="Of the converter, 1 to 16.")] = None,
+    pixel_pitch: Annotated[float | None, typer.Option(help="Of the detector's own pixels [mm].")] = None,
 ) -> None:
-    """Expose a typical cooled CCD (not a data sheet) to an image: electrons, and counts if asked."""
+    """Expose a CCD to an image: electrons, and counts if asked.
+
+    The CCD is that of CAMERA.toml, or a typical cooled one (not a data sheet);
+    options replace its numbers.
+    """
     from ..images.detector import Detector
     from ..images.image import read
 
     require_apart(output, [image], error=ImageError)
-    exposure = Detector.typical_ccd().expose(
-        read(image), exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, seed=seed
+    numbers: dict[str, Any] = {
+        "quantum_efficiency": quantum_efficiency,
+        "dark_current": dark_current,
+        "read_noise": read_noise,
+    }
+    numbers |= {"full_well": full_well, "gain": gain, "bias": bias, "bits": bits, "pixel_pitch": pixel_pitch}
+    camera = Detector.from_toml(detector) if detector else Detector.typical_ccd()
+    camera = replace(camera, **{name: value for name, value in numbers.items() if value is not None})
+    power = read(image)
+    power = power if source_power is None else power.scaled(source_power)
+    exposure = camera.expose(
+        power, exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, seed=seed
     )
     with exposure.counts_file(counts) if counts else nullcontext():  # both files or none
         exposure.write(output)

@@ -21,6 +21,9 @@ Rtol = Annotated[float | None, typer.Option(help="Error of the integral relative
 Domain = Annotated[str | None, typer.Option(help="pupil or surface; the scene's own if left out.")]
 Spp = Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
+SourcePower = Annotated[
+    float | None, typer.Option(metavar="W", help="Power of the light source [W], for a scene that is per 1 W of it.")
+]
 NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
 
 

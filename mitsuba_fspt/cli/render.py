@@ -19,6 +19,7 @@ from .options import (
     Rtol,
     SceneFile,
     Seed,
+    SourcePower,
     Spp,
     definitions,
     require_picture,
@@ -38,6 +39,7 @@ def render(
     domain: Domain = None,
     spp: Spp = None,
     seed: Seed = None,
+    source_power: SourcePower = None,
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
@@ -50,6 +52,10 @@ def render(
         require_picture(picture)
     for written in (output, picture) if picture else (output,):
         require_apart(written, read_xml(scene, parameters).sources(), error=ImageError)
+    if source_power is not None:
+        from ..images.image import required_source_power
+
+        required_source_power(source_power)
     with progress_bar() as progress:
         from ..rendering.render import render
         from ..rendering.scene import load
@@ -59,6 +65,7 @@ def render(
         image = render(
             loaded, method=method, rtol=rtol, domain=domain, shortcuts=shortcuts, spp=spp, seed=seed, progress=progress
         )
+    image = image if source_power is None else image.scaled(source_power)
     _write(image, output, picture)
     _print_summary(image, output, picture)
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..runtime.errors import ImageError
 from ..runtime.numbers import whole
 from .image import Image
+from .z_test import ZTest, error_bound, z_test
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,28 +30,6 @@ class Profile:
     standard: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class ZTest:
-    """Test of the differences in units of their standard deviation, z = (P_cal − P_std) / √(error_cal² + error_std²).
-
-    Attributes
-    ----------
-    max_z : the largest |z|
-    chi2 : mean of z², about 1 if the errors are right
-    p_value : probability that the largest of `pixels` independent normal |z| is at least `max_z`,
-        p = 1 − (1 − p_1)^pixels with p_1 = erfc(max_z/√2) of one pixel (Šidák's correction); a small value means that
-        the images differ
-    pixels : number of pixels with an error above 0, which are tested
-    unjudged : number of pixels that differ although both errors are 0; they are not tested
-    """
-
-    max_z: float
-    chi2: float
-    p_value: float
-    pixels: int
-    unjudged: int
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Result of `compare`.
@@ -63,7 +42,9 @@ class Comparison:
     rms : √(Σ(P_cal − P_std)² / N) / max P_std, likewise absolute
     ratio : Σ P_cal / Σ P_std of the absolute powers; None if it is not finite, as for Σ P_std = 0
     profiles : power along rows and columns
-    z_test : test of the differences against their errors; None if no image has an error above 0
+    z_test : test of the differences against their errors; None if no image has a standard error above 0
+    beyond : where no image has a standard error, number of pixels that differ by more than the integrals' errors
+        together; None if there are none of these either
     """
 
     me: float
@@ -73,6 +54,7 @@ class Comparison:
     ratio: float | None
     profiles: tuple[Profile, ...] = field(repr=False)
     z_test: ZTest | None
+    beyond: int | None = None
 
     def render_text(self) -> str:
         """The numbers as text, one a line with its meaning; without the profiles."""
@@ -87,10 +69,9 @@ class Comparison:
             f"ratio  {ratio}",
         ]
         if self.z_test:
-            z = self.z_test
-            lines.append(
-                f"chi2   {z.chi2:.3f}   per pixel; largest |z| {z.max_z:.2f} of {z.pixels} pixels, p {z.p_value:.2g}"
-            )
+            lines.append(self.z_test.render_text())
+        elif self.beyond is not None:
+            lines.append(f"beyond {self.beyond}   pixels that differ by more than both integrals' errors together")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
@@ -105,7 +86,8 @@ class Comparison:
             }
             for profile in self.profiles
         ]
-        return numbers | {"z_test": self.z_test and asdict(self.z_test), "profiles": profiles}
+        tests = {"z_test": self.z_test and asdict(self.z_test), "beyond": self.beyond}
+        return numbers | tests | {"profiles": profiles}
 
 
 def compare(
@@ -123,9 +105,8 @@ def compare(
     rows, columns : indices of the profiles, one or several, in 0 … h − 1 and 0 … w − 1; if neither is given, the row
         and column through the standard's brightest pixel
 
-    The z-test takes `error` as a standard deviation and both errors as independent. The error of a deterministic
-    method is a bound and makes the test milder. The standard error of a Monte Carlo pixel that few samples have lit
-    is uncertain and makes the test too strict: give such images enough samples.
+    The z-test takes the errors of both images as independent. That of the integral is a bound, that of Monte Carlo a
+    standard error from few passes, any other a known standard deviation: see `ZTest`.
 
     Raises
     ------
@@ -140,6 +121,7 @@ def compare(
     if rows is None and columns is None:
         row, column = np.unravel_index(p_std.argmax(), p_std.shape)
         rows, columns = [int(row)], [int(column)]
+    test = z_test(calculated, standard)
     return Comparison(
         me=float(np.abs(normalised_cal - normalised_std).mean()),
         cf=float(np.corrcoef(normalised_cal.ravel(), normalised_std.ravel())[0, 1]),
@@ -147,7 +129,8 @@ def compare(
         rms=float(np.sqrt(np.square(difference / peak).mean())),
         ratio=_ratio(float(p_cal.sum()), float(p_std.sum())),
         profiles=_profiles(p_cal, p_std, () if rows is None else rows, () if columns is None else columns),
-        z_test=_z_test(difference, calculated.error, standard.error),
+        z_test=test,
+        beyond=None if test else _beyond(difference, calculated, standard),
     )
 
 
@@ -176,6 +159,11 @@ def _check(calculated: Image, standard: Image) -> None:
             )
 
 
+def _beyond(difference: NDArray[np.float64], calculated: Image, standard: Image) -> int | None:
+    bound = error_bound(calculated, standard)
+    return int(np.count_nonzero(difference > bound)) if bound.any() else None
+
+
 def _ratio(calculated: float, standard: float) -> float | None:
     ratio = calculated / standard if standard else math.inf
     return ratio if math.isfinite(ratio) else None
@@ -192,28 +180,6 @@ def _profiles(
                 raise ImageError(f"compare: {line} {index} does not exist. Give one in 0 … {len(std) - 1}.")
             profiles.append(Profile(line, index, cal[index], std[index]))
     return tuple(profiles)
-
-
-def _z_test(difference: NDArray[np.float64], *errors: NDArray[np.floating] | None) -> ZTest | None:
-    deviation = np.zeros_like(difference)
-    for error in errors:
-        if error is not None:
-            deviation = np.hypot(deviation, error)
-    judged = deviation > 0
-    pixels = int(judged.sum())
-    if pixels == 0:
-        return None
-    z = difference[judged] / deviation[judged]
-    max_z = float(z.max())
-    p_one = math.erfc(max_z / math.sqrt(2))
-    return ZTest(
-        max_z=max_z,
-        chi2=float(np.square(z).mean()),
-        # log1p and expm1 keep a p_one far below 1e-16, which 1 − (1 − p_one)^pixels would round to 0.
-        p_value=abs(math.expm1(pixels * math.log1p(-p_one))) if p_one < 1 else 1.0,
-        pixels=pixels,
-        unjudged=int(np.count_nonzero(difference[~judged])),
-    )
 
 
 def _size(image: Image) -> str:

@@ -14,7 +14,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import number, whole
+from ..runtime.toml_file import read_toml
 from .exr import Metadata, write_exr
 from .image import Image
 
@@ -38,6 +39,7 @@ EXAMPLES = {
     "bits": "16",
     "pixel_pitch": "0.0135",
 }
+TABLES = ("detector", "lens")  # of a camera's TOML file; the lens is for other readers
 RECORDED = {name: name for name in EXAMPLES} | {"pixel_pitch": "detector_pixel_pitch"}
 
 PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
@@ -159,6 +161,51 @@ class Detector:
             pixel_pitch=0.0135,
             name="typical, not a data sheet",
         )
+
+    @classmethod
+    def from_toml(cls, path: str | os.PathLike[str]) -> Detector:
+        """Detector of a camera's TOML file: its table [detector], whose keys are the parameters of the class.
+
+        Only `pixel_pitch` and `name` may be left out. A table [lens] in the same file is not read.
+
+            [detector]
+            name = "iKon-M 934, serial 1234"
+            quantum_efficiency = 0.9   # electrons per photon
+            dark_current = 1e-3        # e-/px/s
+            read_noise = 3.5           # e-
+            full_well = 1e5            # e-
+            gain = 1.6                 # e-/DN
+            bias = 500                 # DN
+            bits = 16
+            pixel_pitch = 0.013        # mm, of the pixel of the dark current
+
+        Raises
+        ------
+        DetectorError : the file cannot be read, has no table [detector], a key is unknown or missing, or a value is of
+            the wrong type or outside its range.
+        """
+        content = read_toml(path, DetectorError)
+        table = content.get("detector")
+        if not isinstance(table, dict):
+            raise DetectorError(f"'{path}': the table [detector] is missing. Give it, with {', '.join(EXAMPLES)}.")
+        if unknown := [key for key in content if key not in TABLES]:
+            raise DetectorError(
+                f"'{path}': '{unknown[0]}' means nothing here. Put it into [detector], or leave it out."
+            )
+        known = {field.name: field.default for field in fields(cls)}
+        if unknown := [key for key in table if key not in known]:
+            raise DetectorError(f"'{path}' [detector]: '{unknown[0]}' means nothing here. Give {', '.join(known)}.")
+        if missing := [key for key, default in known.items() if default is MISSING and key not in table]:
+            key = missing[0]
+            raise DetectorError(f"'{path}' [detector]: '{key}' is missing. Give for example {key} = {EXAMPLES[key]}.")
+        if not isinstance(table.get("name", ""), str):
+            raise DetectorError(
+                f"'{path}' [detector]: 'name' must be a text in quotes, got {table['name']}. Give for example \"CCD\"."
+            )
+        try:
+            return cls(**table)
+        except DetectorError as cause:
+            raise DetectorError(f"'{path}' [detector]: {str(cause).removeprefix('detector: ')}") from cause
 
     def __post_init__(self) -> None:
         for name, example in EXAMPLES.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..runtime.errors import ImageError
+from ..runtime.numbers import number
 from .exr import Metadata, read_exr, write_exr
 
 
@@ -61,6 +63,25 @@ class Image:
         """Height and width (h, w) [pixels]."""
         return self.power.shape
 
+    def scaled(self, source_power: float) -> Image:
+        """Image of the same scene with a light source of `source_power` [W], where this one is per 1 W of source.
+
+        Power and error are multiplied by it; coverage stays. The metadata record it as `source_power`.
+
+        Raises
+        ------
+        ImageError : `source_power` is not finite and > 0, or the metadata hold a `source_power` already.
+        """
+        watt = required_source_power(source_power)
+        if "source_power" in self.metadata:
+            raise ImageError(
+                f"image: 'source_power' is {self.metadata['source_power']:g} W already, got {watt:g} W. "
+                "Leave it out, or render the image without it."
+            )
+        error = None if self.error is None else self.error.astype(np.float64) * watt
+        metadata = self.metadata | {"source_power": watt}
+        return Image(self.power.astype(np.float64) * watt, error, self.coverage, metadata)
+
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y` (float32), metadata under `fspt:`.
 
@@ -101,6 +122,14 @@ def read(path: str | os.PathLike[str]) -> Image:
         return Image(channels["Y"], channels.get("error.Y"), channels.get("coverage.Y"), metadata)
     except ImageError as cause:
         raise ImageError(f"image file '{path}': {cause}") from cause
+
+
+def required_source_power(watt: float) -> float:
+    """Power of a light source [W] as a float; ImageError unless it is finite and > 0."""
+    found = number("image: 'source_power'", watt, ImageError, "1e-9")
+    if not 0 < found < math.inf:
+        raise ImageError(f"image: 'source_power' must be finite and > 0 W, got {found:g}. Give for example 1e-9.")
+    return found
 
 
 def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:

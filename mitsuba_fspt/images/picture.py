@@ -1,21 +1,26 @@
-"""PNG pictures of images, with a calibrated colour bar and axes in mm on the sharp plane."""
+"""PNG pictures of images, with a calibrated colour bar and axes in mm on the virtual detector plane."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+import re
+import textwrap
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, ImageError
-from .comparison import compare
+from .colour_scale import ColourScale
+from .colour_scale import scale_and_unit as scale_and_unit
+from .comparison import Comparison, Profile, compare
 from .image import Image
+from .z_test import differences, error_bound
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,13 +28,15 @@ if TYPE_CHECKING:
 
 COLOURS = "inferno"  # perceptually uniform, black where there is no light
 DIFFERENCES = "RdBu_r"  # white where the images agree
+OUTLINE = "deepskyblue"  # a colour that the map of powers does not have
+COLUMNS = 4  # panels in a row
 
 
 def write_png(image: Image, path: str | os.PathLike[str]) -> None:
-    """Write a picture of `image` [W/pixel] to a PNG file, with method and lens as its title.
+    """Write a picture of `image` [W/pixel] to a PNG file, with view, total power, method and lens as its title.
 
-    Axes are in mm from the centre: on the sharp plane if the metadata hold `pixel_pitch` and `magnification`, on the
-    detector if they hold the pitch alone. Without a pitch they count rows and columns.
+    Axes are in mm from the centre: on the virtual detector plane if the metadata hold `pixel_pitch` and
+    `magnification`, on the detector if they hold the pitch alone. Without a pitch they count rows and columns.
 
     Raises
     ------
@@ -46,38 +53,28 @@ def png_file(image: Image, path: str | os.PathLike[str]) -> AbstractContextManag
     An exception in the block leaves `path` unchanged. Raises as `write_png`.
     """
     path = require_png(path)
-    figure = empty_figure(width=6.0, height=0.7 + 4.4 * _aspect(image))
-    axes = figure.add_subplot()
-    scale, unit = scale_and_unit(image.power)
-    draw_picture(axes, image.power / scale, image, f"power [{unit}]", (0.0, float(image.power.max() / scale)))
-    axes.set_title(caption(image))
-    return figure_file(figure, path)
+    return figure_file(draw_panels([image]), path)
 
 
 def write_comparison_png(calculated: Image, standard: Image, path: str | os.PathLike[str]) -> None:
-    """Write both images on one scale, their difference and a profile to a PNG file, with ME and CF as its title.
+    """Write both images on one scale, their difference and two profiles to a PNG file, with ME and CF as its title.
 
-    The profile runs along the row through the standard's brightest pixel; bands show ± `error` where it is given.
-    Raises as `write_png` and `compare`.
+    The difference is drawn in W and in standard errors, beyond the error bound of the integral. The profiles run along
+    the row and the column through the standard's brightest pixel; bands show ± `error` where it is given. Raises as
+    `write_png` and `compare`.
     """
     path = require_png(path)
     comparison = compare(calculated, standard)
-    figure = empty_figure(width=10.0, height=1.8 + 6.8 * _aspect(standard))
-    (top_left, top_right), (bottom_left, bottom_right) = figure.subplots(2, 2)
-    scale, unit = scale_and_unit(np.maximum(calculated.power, standard.power))
-    high = max(calculated.power.max(), standard.power.max()) / scale
-    for axes, image, name in ((top_left, calculated, "calculated"), (top_right, standard, "standard")):
-        draw_picture(axes, image.power / scale, image, f"power [{unit}]", (0.0, high))
-        axes.set_title(f"{name}\n{caption(image)}".strip(), fontsize="medium")
-    _show_difference(bottom_left, calculated, standard)
-    row = comparison.profiles[0].index
-    for image, name, colour in ((standard, "standard", "C7"), (calculated, "calculated", "C3")):
-        _draw_profile(bottom_right, image, row, scale, name, colour)
-    (left, right, _, _), axis_label = _extent(standard)
-    bottom_right.set(xlabel=axis_label, xlim=(left, right), ylabel=f"power [{unit}]", ylim=(0, None))
-    bottom_right.set_title(f"row {row}", fontsize="medium")
-    bottom_right.set_box_aspect(_aspect(standard))
-    bottom_right.legend(frameon=False)
+    figure = empty_figure(width=15.0, height=1.8 + 7.2 * _aspect(standard))
+    (first, second, row), (difference, deviation, column) = figure.subplots(2, 3)
+    scale = ColourScale.over([np.maximum(calculated.power, standard.power)])
+    for axes, image, name in ((first, calculated, "calculated"), (second, standard, "standard")):
+        draw_image(axes, image, scale)
+        axes.set_title(f"{name}, {title(image)}\n{caption(image)}".strip(), fontsize="medium")
+    _show_difference(difference, calculated, standard)
+    _show_deviation(deviation, calculated, standard, comparison)
+    for axes, profile in zip((row, column), comparison.profiles, strict=True):
+        _show_profile(axes, profile, calculated, standard, scale)
     ratio = "none" if comparison.ratio is None else f"{comparison.ratio:.5g}"
     figure.suptitle(
         f"ME {comparison.me:.3g},  CF {comparison.cf:.5g},  ratio of powers {ratio},  "
@@ -93,9 +90,114 @@ def caption(image: Image) -> str:
         ("focal_length", "F = {:g} mm"),
         ("f_number", "f/{:g}"),
         ("magnification", "magnification {:.4g}"),
+        ("source_power", "source {:.3g} W"),
     )
     known = image.metadata
     return ",  ".join(form.format(known[key]) for key, form in forms if key in known)
+
+
+def title(image: Image, name: str = "") -> str:
+    """Name, view and total power of an image in one line; the view is that of the scene's parameters, if any."""
+    view = re.search(r"(?:^|\s)view=(\S+)", str(image.metadata.get("scene", "")))
+    parts = [name] if name else []
+    parts += [f"view {view[1]}°"] if view else []
+    return ", ".join([*parts, f"total {image.power.sum(dtype=np.float64):.4g} W"])
+
+
+def draw_panels(
+    images: Sequence[Image],
+    names: Sequence[str] = (),
+    *,
+    log: bool = False,
+    limits: tuple[float, float] | None = None,
+    per_panel: bool = False,
+    outline: bool = False,
+) -> Figure:
+    """Figure with a panel for each image, up to `COLUMNS` in a row.
+
+    Parameters
+    ----------
+    images : power [W]; their titles state the view and the total power
+    names : of the images, for the titles; none if left out
+    log, limits : of the colour scale, limits in W/pixel; see `ColourScale.over`
+    per_panel : a colour scale for each image; False: one for all
+    outline : draw the outline of the phantom, where the coverage is 1/2
+
+    Raises
+    ------
+    ImageError : limits that are no range or given with `per_panel`, or an outline of an image without coverage.
+    BackendError : matplotlib is not installed.
+    """
+    if per_panel and limits is not None:
+        raise ImageError("picture: one range for all panels and a scale for each exclude each other. Leave one out.")
+    scales = [ColourScale.over([image.power], log=log) for image in images]
+    if not per_panel:
+        scales = [ColourScale.over([image.power for image in images], log=log, limits=limits)] * len(images)
+    columns = min(len(images), COLUMNS)
+    rows = -(-len(images) // columns)
+    width = 6.0 if columns == 1 else 1.0 + (4.2 if per_panel else 3.4) * columns
+    height = 4.4 if columns == 1 else 3.0
+    figure = empty_figure(width, 1.0 + rows * (0.5 + height * max(map(_aspect, images))))
+    grid = figure.subplots(rows, columns, squeeze=False)
+    common = len(images) > 1 and len(set(map(caption, images))) == 1
+    own_bar = per_panel or len(images) == 1
+    for place, axes in enumerate(grid.flat):
+        if place >= len(images):
+            axes.axis("off")
+            continue
+        image, name = images[place], names[place] if names else ""
+        draw_image(axes, image, scales[place], outline=outline, bar=own_bar)
+        lines = [*textwrap.wrap(title(image, name), 44)] + ([] if common else [caption(image)])
+        axes.set_title("\n".join(filter(None, lines)), fontsize="medium" if columns == 1 else "small")
+        axes.label_outer()
+    figure.suptitle(caption(images[0]) if common else "", fontsize="medium")
+    if not own_bar:
+        shown = grid.flat[0].get_images()[0]
+        figure.colorbar(
+            shown,
+            ax=grid,
+            label=scales[0].label,
+            shrink=0.9 if rows == 1 else min(1.0, 2 / rows),
+            aspect=25,
+            extend=_extend(images, scales[0]),
+        )
+    return figure
+
+
+def draw_image(axes: Axes, image: Image, scale: ColourScale, *, outline: bool = False, bar: bool = True) -> None:
+    """Draw the power of `image` on a colour scale, with its colour bar if `bar`, and the `outline` of the phantom."""
+    extent, axis_label = _extent(image)
+    shown = axes.imshow(scale.values(image.power), cmap=COLOURS, norm=scale.norm(), extent=extent)
+    axes.set(xlabel=axis_label, ylabel=axis_label)
+    if bar:
+        side = axes.inset_axes((1.03, 0.0, 0.05, 1.0))
+        side.figure.colorbar(shown, cax=side, label=scale.label, extend=_extend([image], scale))
+    if outline:
+        draw_outline(axes, image)
+
+
+def draw_outline(axes: Axes, image: Image) -> None:
+    """Draw the contour where half of a pixel's lines of sight meet the phantom; ImageError without coverage."""
+    if image.coverage is None:
+        raise ImageError(
+            "picture: an image without coverage has no outline. Leave it out, or give one that 'fspt render' wrote."
+        )
+    if image.coverage.min() < 0.5 < image.coverage.max() and min(image.shape) > 1:
+        x, y = _centres(image)
+        axes.contour(x, y, image.coverage, levels=[0.5], colors=OUTLINE, linewidths=1.0)
+
+
+def draw_scale_bar(axes: Axes, left: float, bottom: float, width: float, side: float) -> None:
+    """Draw a scale bar of a round length, about a quarter of `width` pixels, into a picture in pixels.
+
+    left, bottom : [pixels] of the picture's corner;  side : of a pixel on the virtual detector plane [mm]
+    """
+    wanted = 0.3 * width * side
+    decade = 10.0 ** math.floor(math.log10(wanted))
+    length = max(decade * step for step in (1, 2, 5) if decade * step <= wanted)
+    start, at = left + 0.06 * width, bottom - 0.06 * width
+    axes.plot([start, start + length / side], [at, at], color="white", linewidth=2, solid_capstyle="butt")
+    axes.text(start, at - 0.02 * width, f"{length:g} mm", color="white", fontsize="x-small", va="bottom")
 
 
 def draw_picture(
@@ -123,38 +225,81 @@ def _show_difference(axes: Axes, calculated: Image, standard: Image) -> None:
     axes.set_title("calculated − standard", fontsize="medium")
 
 
-def _draw_profile(axes: Axes, image: Image, row: int, scale: float, name: str, colour: str) -> None:
-    (left, right, _, _), _ = _extent(image)
-    width = image.shape[1]
-    x = left + (np.arange(width) + 0.5) * (right - left) / width
-    power = image.power[row] / scale
-    axes.plot(x, power, color=colour, label=name, linewidth=1.2)
-    if image.error is not None:
-        error = image.error[row] / scale
-        axes.fill_between(x, power - error, power + error, color=colour, alpha=0.3, linewidth=0)
+def _show_deviation(axes: Axes, calculated: Image, standard: Image, comparison: Comparison) -> None:
+    """Draw the difference in standard errors, white where it is not tested; one line in its place without them."""
+    test = comparison.z_test
+    if test is None:
+        axes.axis("off")
+        axes.text(0.5, 0.5, "no image has a standard error", ha="center", transform=axes.transAxes)
+        return
+    z = np.nan_to_num(differences(calculated, standard))
+    reach = max(test.max_z, 1.0)
+    draw_picture(axes, z, standard, "difference / standard error", (-reach, reach), DIFFERENCES)
+    bound = " beyond the integral's error" if error_bound(calculated, standard).any() else ""
+    chi2 = "none" if test.chi2 is None else f"{test.chi2:.3g}"
+    axes.set_title(f"difference{bound} in standard errors\nchi2 {chi2},  p {test.p_value:.2g}", fontsize="medium")
+
+
+def _show_profile(axes: Axes, profile: Profile, calculated: Image, standard: Image, scale: ColourScale) -> None:
+    """Draw the power along a row or column of both images, the calculated one as a thin line on a wide one."""
+    row = profile.line == "row"
+    x = _centres(standard)[0 if row else 1]
+    pairs = (
+        (standard, profile.standard, "standard", "0.65", 4.0),
+        (calculated, profile.calculated, "calculated", "C3", 1.2),
+    )
+    for image, power, name, colour, width in pairs:
+        axes.plot(x, power / scale.factor, color=colour, label=name, linewidth=width)
+        if image.error is not None:
+            error = (image.error[profile.index] if row else image.error[:, profile.index]) / scale.factor
+            low, high = power / scale.factor - error, power / scale.factor + error
+            axes.fill_between(x, low, high, color=colour, alpha=0.3, linewidth=0)
+    left, right, bottom, top = _extent(standard)[0]
+    axes.set(xlabel=_extent(standard)[1], xlim=(left, right) if row else sorted((bottom, top)))
+    axes.set(ylabel=scale.label, ylim=(0, None))
+    axes.set_title(
+        f"{profile.line} {profile.index}, " + ("left to right" if row else "vertical position"), fontsize="medium"
+    )
+    axes.set_box_aspect(_aspect(standard))
+    axes.legend(frameon=False)
+
+
+def _extend(images: Sequence[Image], scale: ColourScale) -> Literal["neither", "min", "max", "both"]:
+    """Ends of the colour bar beyond which there is light."""
+    below = any(bool(np.any((image.power > 0) & (image.power < scale.low))) for image in images)
+    above = any(float(image.power.max()) > scale.high for image in images)
+    return "both" if below and above else "min" if below else "max" if above else "neither"
 
 
 def _extent(image: Image) -> tuple[tuple[float, float, float, float], str]:
     """(left, right, bottom, top) of the picture [mm or pixels], and the axis label with unit and plane."""
     height, width = image.shape
-    pitch, magnification = (image.metadata.get(key) for key in ("pixel_pitch", "magnification"))
-    if not pitch:
+    side = virtual_pitch(image)
+    if not side:
         return (-0.5, width - 0.5, height - 0.5, -0.5), "pixel"
-    side = float(pitch) / float(magnification or 1.0)
     x, y = side * width / 2, side * height / 2
-    return (-x, x, -y, y), "mm on the sharp plane" if magnification else "mm on the detector"
+    plane = "virtual detector plane" if image.metadata.get("magnification") else "detector"
+    return (-x, x, -y, y), f"mm on the {plane}"
+
+
+def virtual_pitch(image: Image) -> float | None:
+    """Side of a pixel [mm] on the virtual detector plane, on the detector without a magnification; None if unknown."""
+    pitch, magnification = (image.metadata.get(key) for key in ("pixel_pitch", "magnification"))
+    return float(pitch) / float(magnification or 1.0) if pitch else None
+
+
+def _centres(image: Image) -> tuple[NDArray, NDArray]:
+    """Positions of the columns, shape (w,), and of the rows, shape (h,), in the unit of `_extent`."""
+    (left, right, bottom, top), _ = _extent(image)
+    height, width = image.shape
+    x = left + (np.arange(width) + 0.5) * (right - left) / width
+    y = top + (np.arange(height) + 0.5) * (bottom - top) / height
+    return x, y
 
 
 def _aspect(image: Image) -> float:
     """Height over width, limited to [0.5, 2] for the figure."""
     return min(2.0, max(0.5, image.shape[0] / image.shape[1]))
-
-
-def scale_and_unit(values: NDArray) -> tuple[float, str]:
-    """Power of 1000 that scales the largest of `values` [W] to 1 … 1000, and the unit with that factor."""
-    peak = float(np.abs(values).max())
-    exponent = 3 * math.floor(math.log10(peak) / 3) if peak > 0 else 0
-    return 10.0**exponent, "W/pixel" if exponent == 0 else rf"$10^{{{exponent}}}$ W/pixel"
 
 
 def require_png(path: str | os.PathLike[str]) -> Path:

@@ -24,7 +24,7 @@ from . import backend, libllvm
 from .errors import BackendError
 from .extras import EXTRAS
 
-CORE = ("mitsuba-fspt", "mitsuba", "drjit", "numpy", "trimesh", "OpenEXR", "typer", "rich")
+CORE = ("mitsuba-fspt", "mitsuba", "drjit", "numpy", "scipy", "trimesh", "OpenEXR", "typer", "rich")
 
 VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
 

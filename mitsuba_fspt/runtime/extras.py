@@ -19,7 +19,6 @@ EXTRAS = (
     Extra("meshio", "meshio", "mesh"),
     Extra("h5py", "h5py", "mesh"),
     Extra("scikit-fem", "skfem", "tissue"),
-    Extra("scipy", "scipy", "tissue"),
     Extra("pytetwild", "pytetwild", "mesher"),
     Extra("dask", "distributed", "cluster"),
 )

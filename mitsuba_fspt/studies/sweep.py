@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..images import picture
+from ..images.colour_scale import ColourScale
 from ..images.image import Image, read
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import FsptError, ImageError, SceneError
@@ -30,7 +31,7 @@ COLUMNS = ("file", "power", "peak", "largest_error", "wall_time")
 # The contact sheet.
 MAX_COLUMNS = 8  # images in a row, where not several parameters vary
 GAP = 0.04  # between images, relative to the larger side of an image
-CAPTION = 0.1  # height of the text above an image, relative likewise
+CAPTION = 0.22  # height of the text above an image, relative likewise
 
 
 @dataclass(frozen=True)
@@ -251,8 +252,10 @@ def _check_folder(folder: Path) -> None:
 def write_contact_sheet(rows: Sequence[SweepRow], path: str | os.PathLike[str]) -> None:
     """Write the images of a sweep side by side to a PNG file, with one colour bar for all [W/pixel].
 
-    Above each image are its values of the parameters that vary. Where several parameters vary, there is a column for
-    every value of the last one. An image smaller than the others is in the upper left corner of its cell.
+    The scale is logarithmic where the peaks differ a lot, see `ColourScale.over`. Above each image are its values of
+    the parameters that vary and its total power. A scale bar is in the first image, and in those of another scale.
+    Where several parameters vary, there is a column for every value of the last one. An image smaller than the others
+    is in the upper left corner of its cell.
 
     Raises
     ------
@@ -263,8 +266,10 @@ def write_contact_sheet(rows: Sequence[SweepRow], path: str | os.PathLike[str]) 
     picture.require_matplotlib()
     if not rows:
         raise ImageError("contact sheet: a sweep without points. Give the rows that sweep returned.")
-    powers = [read(row.file).power for row in rows]
-    scale, unit = picture.scale_and_unit(np.array([power.max() for power in powers]))
+    images = [read(row.file) for row in rows]
+    powers = [image.power for image in images]
+    scale = ColourScale.over(powers)
+    pitches = [picture.virtual_pitch(image) for image in images]
     height, width = (max(power.shape[side] for power in powers) for side in (0, 1))
     varied, same = _parameters(rows)
     columns = len(varied[-1][1]) if len(varied) > 1 else min(len(rows), MAX_COLUMNS)
@@ -276,13 +281,15 @@ def write_contact_sheet(rows: Sequence[SweepRow], path: str | os.PathLike[str]) 
     for place, (row, power) in enumerate(zip(rows, powers, strict=True)):
         line, column = divmod(place, columns)
         top, left = line * (height + caption) + caption, column * (width + gap)
-        sheet[top : top + power.shape[0], left : left + power.shape[1]] = power / scale
+        sheet[top : top + power.shape[0], left : left + power.shape[1]] = power
         label = "  ".join(f"{name}={row.parameters[name]}" for name, _ in varied)
-        axes.text(left, top - 0.2 * caption, label, fontsize="x-small", va="bottom")
-    shown = axes.imshow(sheet, cmap=picture.COLOURS, vmin=0, vmax=float(np.nanmax(sheet)) or 1.0, interpolation="none")
+        axes.text(left, top - 0.2 * caption, f"{label}\n{row.power:.3g} W", fontsize="x-small", va="bottom")
+        if (pitch := pitches[place]) and (place == 0 or pitch != pitches[0]):
+            picture.draw_scale_bar(axes, left, top + power.shape[0], power.shape[1], pitch)
+    shown = axes.imshow(scale.values(sheet), cmap=picture.COLOURS, norm=scale.norm(), interpolation="none")
     axes.axis("off")
     axes.set_title("  ".join(f"{name}={value}" for name, (value,) in same), fontsize="small")
-    figure.colorbar(shown, ax=axes, label=f"power [{unit}]", shrink=min(1.0, 3 / lines), aspect=20)
+    figure.colorbar(shown, ax=axes, label=scale.label, shrink=min(1.0, 3 / lines), aspect=20)
     picture.save_figure(figure, file)
 
 

@@ -180,6 +180,101 @@ def test_expose_writes_electrons_and_counts(run, two_images, tmp_path):
     assert header("e.exr")["fspt:quantity"] == "electrons"
 
 
+def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
+    code, out, err = run("plot", "a.exr")
+    assert (code, out, err) == (0, "a.png: 1 image\n", "")
+    code, out, err = run("plot", *two_images, "--range", "1e-12,1e-7", "--json")
+    assert (code, err) == (0, "")
+    powers = [fspt.read(name).power.sum(dtype=float) for name in two_images]
+    assert json.loads(out) == {"output": "plot.png", "images": [*two_images], "total_power": pytest.approx(powers)}
+    assert run("plot", *two_images, "--log", "--per-panel", "-o", "b.png", "--quiet") == (0, "", "")
+    assert set(os.listdir(tmp_path)) == {*two_images, "a.png", "b.png", "plot.png"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--range", "1"), "--range 1: must be two numbers A,B in W/pixel, for example --range 0,1e-9."),
+        (("--range", "2,1"), "picture: the range must be A < B in W/pixel, got 2,1. Give 0,1e-9."),
+        (("--outline",), "picture: an image without coverage has no outline. Leave it out, or give one that"),
+        (("-o", "a.jpg"), "output file 'a.jpg' must end in .png. Give a name such as picture.png."),
+        (("none.exr",), "image file 'none.exr' does not exist. Give the path of an EXR file."),
+    ],
+)
+def test_plots_that_cannot_be_drawn(run, two_images, tmp_path, options, message):
+    code, out, err = run("plot", "a.exr", *options)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"fspt: {message}")
+    assert set(os.listdir(tmp_path)) == set(two_images)
+
+
+EXPOSE = ("expose", "a.exr", "-o", "e.exr", "--exposure-time", "1", "--wavelength-nm", "600")
+
+
+def test_expose_with_a_camera_of_ones_own(run, two_images, tmp_path):
+    """An option replaces the file's number, and the file the typical camera's; the source's power scales all.
+
+    Seen to fail with the file in place of the option, and with the power of the source left out.
+    """
+    table = "quantum_efficiency = 0.5\ndark_current = 0\nread_noise = 0\nfull_well = 1e6\ngain = 2\nbias = 7\nbits = 12"
+    (tmp_path / "c.toml").write_text(f"[lens]\nfocal_length = 50\n[detector]\n{table}\n")
+    options = ["--detector", "c.toml", "--gain", "4", "--bits", "16", "--source-power", "1e-5"]
+    code, _, err = run(*EXPOSE, *options)
+    assert (code, err) == (0, "")
+    told = header("e.exr")
+    expected = {"quantum_efficiency": 0.5, "dark_current": 0, "read_noise": 0, "full_well": 1e6, "gain": 4, "bias": 7}
+    for name, value in (expected | {"bits": 16, "source_power": 1e-5}).items():
+        assert np.asarray(told[f"fspt:{name}"]) == value
+    with OpenEXR.File("e.exr", separate_channels=True) as file:
+        electrons = file.channels()["Y"].pixels
+    # 13 nW at 1 W of source, 1e-5 of it, 600 nm: 3.3107e-19 J a photon; shot noise of four standard deviations
+    mean = 0.5 * 13e-9 * 1e-5 / 3.31074e-19
+    assert electrons[-1, -1] == pytest.approx(mean, abs=4 * mean**0.5)
+
+
+def test_the_power_of_the_source_is_given_once(run, tmp_path):
+    """`render` records it, and `expose` does not multiply by it again."""
+    write_scene(tmp_path / "s.xml")
+    assert run("render", "s.xml", "--rtol", "1e-2", "-o", "one.exr")[0] == 0
+    code, out, err = run("render", "s.xml", "--rtol", "1e-2", "-o", "a.exr", "--source-power", "2e-9")
+    assert (code, err) == (0, "")
+    one, scaled = fspt.read("one.exr"), fspt.read("a.exr")
+    np.testing.assert_allclose(scaled.power, 2e-9 * one.power.astype(float), rtol=1e-6)
+    np.testing.assert_allclose(scaled.error, 2e-9 * one.error.astype(float), rtol=1e-6)
+    assert scaled.metadata["source_power"] == 2e-9
+    assert float(re.search(r"total (\S+) W", out)[1]) == pytest.approx(scaled.power.sum(), rel=1e-5)
+    assert run(*EXPOSE)[0] == 0
+    os.remove("e.exr")
+    code, out, err = run(*EXPOSE, "--source-power", "1")
+    assert (code, out) == (2, "")
+    assert err == (
+        "fspt: image: 'source_power' is 2e-09 W already, got 1 W. Leave it out, or render the image without it.\n"
+    )
+    assert not (tmp_path / "e.exr").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--detector", "none.toml"), "'none.toml' cannot be read: No such file or directory. Check the name."),
+        (("--gain", "0"), "detector: 'gain' must be finite and > 0 e-/DN, for example 1.6, got 0.0."),
+        (("--source-power", "-1"), "image: 'source_power' must be finite and > 0 W, got -1. Give for example 1e-9."),
+    ],
+)
+def test_cameras_and_sources_that_do_not_exist(run, two_images, tmp_path, options, message):
+    before = set(os.listdir(tmp_path))
+    assert run(*EXPOSE, *options) == (2, "", f"fspt: {message}\n")
+    assert set(os.listdir(tmp_path)) == before
+
+
+def test_a_source_without_power_is_refused_before_the_work(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(render, "render", lambda *_, **__: pytest.fail("the work began"))
+    code, _, err = run("render", write_scene(tmp_path / "s.xml"), "--source-power", "nan")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "'source_power' must be finite and > 0 W, got nan" in err
+    assert os.listdir(tmp_path) == ["s.xml"]
+
+
 @pytest.mark.parametrize("counts", ["n.jpg", "nowhere/n.png", ""])
 def test_expose_leaves_both_files_or_none(run, two_images, tmp_path, counts):
     """Fails with the electrons written before the counts' place is looked at."""
@@ -278,9 +373,9 @@ def test_version_and_help(run):
     assert re.fullmatch(r"mitsuba-fspt \d+\.\d+\.\d+\S*\n", out)
     code, out, err = run("--help")
     assert (code, err) == (0, "")
-    for verb in ("render", "compare", "expose", "doctor", "flux", "converge"):
+    for verb in ("render", "plot", "compare", "expose", "doctor", "flux", "converge"):
         assert verb in out
-    for verb in ("render", "compare", "expose", "doctor", "flux", "converge"):
+    for verb in ("render", "plot", "compare", "expose", "doctor", "flux", "converge"):
         code, out, err = run(verb, "--help")
         assert (code, err) == (0, "")
         assert "Usage: fspt " + verb in out

@@ -9,6 +9,7 @@ import pytest
 
 from mitsuba_fspt.images.comparison import compare
 from mitsuba_fspt.images.image import Image
+from mitsuba_fspt.images.z_test import differences
 from mitsuba_fspt.runtime.errors import ImageError
 
 STANDARD = Image(np.array([[0.0, 2.0], [4.0, 8.0]]) * 1e-9)
@@ -132,6 +133,101 @@ def test_z_of_true_noise_and_of_a_bias():
     assert z_test(3.0).p_value < 1e-9
 
 
+TRUTH = 10 + np.random.default_rng(5).random((16, 16))
+INTEGRAL = {"method": "integral"}
+
+
+def sampled(rng, passes, truth=TRUTH):
+    """Image of so many passes with normal noise of a standard deviation of 1, and the standard error that they show."""
+    each = truth + rng.normal(size=(passes, *truth.shape))
+    return Image(each.mean(0), each.std(0, ddof=1) / math.sqrt(passes), metadata={"method": "path", "passes": passes})
+
+
+@pytest.mark.parametrize(("passes", "exact", "slack"), [(4, True, 0), (16, True, 0), (16, False, 0.1)])
+def test_variances_of_few_passes(passes, exact, slack):
+    """Rationale: with s from few passes, z is Student's t (against an exact image) or Welch's (of two Monte Carlos).
+
+    Expected: over 400 images of 256 pixels p-values are uniform: mean 1/2 ± 4/√(12 · 400), and 5 % below 0.05 ± 4
+    binomial deviations; chi2 has mean 1 ± 0.02. Welch's test errs on the safe side far out: `slack` above the mean.
+    Seen to fail for the normal distribution (p below 0.05 in all cases of 4 passes), and for `passes` in place of
+    `passes` - 1 degrees of freedom.
+    """
+    rng = np.random.default_rng(passes)
+
+    def z_test():
+        return compare(Image(TRUTH) if exact else sampled(rng, passes), sampled(rng, passes)).z_test
+
+    found = [z_test() for _ in range(400)]
+    p = np.array([z.p_value for z in found])
+    tolerance = 4 / math.sqrt(12 * 400)
+    assert 0.5 - tolerance < p.mean() < 0.5 + tolerance + slack
+    assert np.mean(p < 0.05) == pytest.approx(0.05, abs=4 * math.sqrt(0.05 * 0.95 / 400))
+    assert np.mean([z.chi2 for z in found]) == pytest.approx(1, abs=0.02 + slack)
+
+
+def test_error_of_the_integral_is_a_bound():
+    """A difference of 5 with a bound of 3 and s = 2 is z = 1, not 5/√13; within the bound it is 0.
+
+    Seen to fail with both errors added in quadrature.
+    """
+    standard = replace(STANDARD, error=np.full((2, 2), 2e-9))  # of any number of samples: a known deviation
+    power = np.array([[0.0, 7.0], [1.5, 8.0]]) * 1e-9
+    calculated = Image(power, np.full((2, 2), 3e-9), metadata=INTEGRAL)
+    assert differences(calculated, standard) == pytest.approx(np.array([[np.nan, 1], [0, 0]]), nan_ok=True)
+    assert differences(standard, calculated)[0, 1] == pytest.approx(-1)
+    z = compare(calculated, standard).z_test
+    assert (z.max_z, z.pixels, z.noisy, z.chi2) == (pytest.approx(1), 3, 0, None)
+    # Of three pixels p_1 = 0.00334450: z = 2.934; (3 + 2.934 · 2)/8.
+    assert z.detectable == pytest.approx((3 + 2 * 2.9342) / 8, rel=1e-3)
+
+
+def test_noise_is_judged_where_it_exceeds_the_bound():
+    """Bounds far above the noise leave no power, and the test says so; far below it, chi2 is 1.
+
+    Seen to fail (chi2 0.05, p = 1, no word of it) with the bound taken as a standard deviation.
+    """
+    rng = np.random.default_rng(3)
+    noise = sampled(rng, 32)
+    tight, loose, useless = (
+        compare(Image(TRUTH, np.full(TRUTH.shape, bound), metadata=INTEGRAL), noise) for bound in (1e-3, 1.0, 20.0)
+    )
+    assert tight.z_test.chi2 == pytest.approx(1, abs=4 * math.sqrt(2 / 256))
+    assert tight.z_test.noisy == 256
+    assert tight.z_test.detectable < 0.1
+    assert (loose.z_test.chi2, loose.z_test.noisy, loose.z_test.p_value) == (None, 0, 1)
+    assert 0.1 < loose.z_test.detectable < 0.2  # a bound of 1 of 11
+    assert "chi2   none   the integral's errors exceed the noise; largest |z| 0.00 of 256 pixels, p 1\n" in str(
+        loose.render_text()
+    )
+    assert loose.render_text().endswith("smallest difference of the brightest pixel, over its power, for p < 0.01")
+    assert useless.render_text().endswith(
+        "power  none    the errors exceed the brightest pixel; give more samples or a smaller rtol"
+    )
+
+
+def test_two_integrals_have_bounds_alone():
+    """No standard error, so no z-test: pixels beyond both bounds are counted. Differences are 1, 0, 2 and 3."""
+    calculated = Image(CALCULATED.power, np.full((2, 2), 1e-9), metadata=INTEGRAL)
+    standard = Image(STANDARD.power, np.full((2, 2), 1.5e-9), metadata=INTEGRAL)
+    found = compare(calculated, standard)
+    assert (found.z_test, found.beyond) == (None, 1)
+    assert "beyond 1   pixels that differ by more than both integrals' errors together" in found.render_text()
+
+
+def test_events_that_no_sample_met():
+    """Rationale: of Poisson events the passes of a pixel that missed most of them show too small a variance.
+
+    An exact image of 9 events a pixel against Monte Carlo with one pixel of 1 event: s is 1 there, z = 8 by itself, but
+    the probability of at most one event is 1.2e-3, z = 3.2; with the variance of the expected events z = 8/3.
+    Seen to fail (8) without the variance of missed events.
+    """
+    power = np.full((5, 5), 9.0)
+    power[2, 2] = 1
+    counted = Image(power, np.sqrt(power), metadata={"method": "ptracer", "passes": 10**6})
+    exact = Image(np.where(np.eye(5), 9.0, 9.000001), metadata=INTEGRAL)
+    assert differences(exact, counted)[2, 2] == pytest.approx(8 / 3, rel=1e-4)
+
+
 def test_p_value_at_its_ends():
     error = np.full((2, 2), 1e-9)
     same = compare(replace(STANDARD, error=error), STANDARD).z_test
@@ -153,6 +249,8 @@ def test_json():
         "standard": [4e-9, 8e-9],
     }
     assert compare(CALCULATED, STANDARD).to_dict()["z_test"] is None
+    bound = replace(CALCULATED, error=np.full((2, 2), 1.5e-9), metadata={"method": "integral"})
+    assert compare(bound, STANDARD).to_dict()["beyond"] == 2
 
 
 @pytest.mark.parametrize(

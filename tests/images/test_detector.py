@@ -207,6 +207,59 @@ def test_counts_files_that_cannot_be_written(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+TOML = """
+[lens]
+focal_length = 50
+
+[detector]
+name = "CCD 1"
+quantum_efficiency = 0.9
+dark_current = 2e-3
+read_noise = 4
+full_well = 6e4
+gain = 0.8
+bias = 300
+bits = 14
+"""
+
+
+def test_detector_of_a_file(tmp_path):
+    """Every number of the table [detector] is the class's; a table [lens] beside it is not read."""
+    (tmp_path / "c.toml").write_text(TOML)
+    found = Detector.from_toml(tmp_path / "c.toml")
+    assert found == Detector(0.9, 2e-3, 4, 6e4, 0.8, 300, 14, None, "CCD 1")
+    (tmp_path / "c.toml").write_text(TOML.replace('name = "CCD 1"', "pixel_pitch = 0.013"))
+    assert Detector.from_toml(tmp_path / "c.toml").pixel_pitch == 0.013
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[detector]", "[camera]", r"the table \[detector\] is missing\. Give it, with quantum_efficiency, "),
+        ("[lens]", "[lense]", r"'lense' means nothing here\. Put it into \[detector\], or leave it out"),
+        ("read_noise", "readnoise", r"\[detector\]: 'readnoise' means nothing here\. Give quantum_efficiency, "),
+        ("read_noise = 4", "", r"\[detector\]: 'read_noise' is missing\. Give for example read_noise = 3\.5"),
+        ("= 4", '= "low"', r"\[detector\]: 'read_noise' must be a number, got 'low'\. Give for example 3\.5"),
+        ("= 4", "= true", "'read_noise' must be a number, got True"),
+        ("= 0.9", "= 90", r"\[detector\]: 'quantum_efficiency' must be finite and in \(0, 1\].*, got 90"),
+        ('"CCD 1"', "1", r"'name' must be a text in quotes, got 1\. Give for example"),
+        ("= 4", "= ", "is no TOML file: "),
+    ],
+)
+def test_files_of_no_detector(tmp_path, old, new, message):
+    assert old in TOML
+    (tmp_path / "c.toml").write_text(TOML.replace(old, new))
+    with pytest.raises(DetectorError, match=message) as raised:
+        Detector.from_toml(tmp_path / "c.toml")
+    assert "\n" not in str(raised.value)
+    assert str(raised.value).startswith(f"'{tmp_path / 'c.toml'}'")
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(DetectorError, match=r"c\.toml' cannot be read: No such file or directory\. Check the name"):
+        Detector.from_toml(tmp_path / "c.toml")
+
+
 @pytest.mark.parametrize(
     ("name", "value", "rule"),
     [

@@ -84,6 +84,35 @@ def test_foreign_file(tmp_path, kind):
     assert image.metadata == {"quantity": "power", "unit": "W"}
 
 
+def test_scaled_to_a_source():
+    """Power and error take the factor, the coverage does not; twice is refused.
+
+    Seen to fail with the error left as it was, and with the coverage multiplied too.
+    """
+    image = Image([[2.0, 4.0]], [[0.5, 1.0]], [[0.25, 1.0]], {"f_number": 8.0})
+    scaled = image.scaled(3e-9)
+    np.testing.assert_allclose(scaled.power, [[6e-9, 12e-9]], rtol=1e-12)
+    np.testing.assert_allclose(scaled.error, [[1.5e-9, 3e-9]], rtol=1e-12)
+    np.testing.assert_array_equal(scaled.coverage, image.coverage)
+    assert scaled.metadata == image.metadata | {"source_power": 3e-9}
+    assert "source_power" not in image.metadata
+    with pytest.raises(ImageError, match=r"'source_power' is 3e-09 W already, got 2 W\. Leave it out"):
+        scaled.scaled(2)
+    assert Image([[1.0]]).scaled(2).error is None
+
+
+@pytest.mark.parametrize("watt", [0, -1, np.nan, np.inf, "much", True])
+def test_powers_of_no_source(watt):
+    with pytest.raises(ImageError, match=rf"'source_power' must be .*, got '?{watt}'?\. Give for example 1e-9"):
+        Image([[1.0]]).scaled(watt)
+
+
+def test_a_small_source_does_not_lose_digits():
+    """float32 pixels of 1e-30 W times 1e-12 W are below what float32 holds. Seen to fail without the doubles."""
+    scaled = Image(np.full((1, 1), 1e-30, np.float32)).scaled(1e-12)
+    assert float(scaled.power[0, 0]) == pytest.approx(1e-42, rel=1e-6, abs=0)
+
+
 def test_images_cannot_be_written_into():
     values = np.ones((2, 2))
     image = Image(values)

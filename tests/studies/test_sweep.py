@@ -172,7 +172,11 @@ def test_the_contact_sheet_shows_all_on_one_scale(scene, monkeypatch):
     assert shown.get_clim() == pytest.approx((0, max(row.peak for row in rows) / scale))
     assert np.nansum(shown.get_array().filled(0)) * scale == pytest.approx(sum(row.power for row in rows), rel=1e-5)
     labels = [text.get_text() for text in axes.texts]
-    assert labels == [f"f_number={f}  distance={d}" for f, d in product(F_NUMBERS, DISTANCES)]
+    titles = [
+        f"f_number={f}  distance={d}\n{row.power:.3g} W"
+        for (f, d), row in zip(product(F_NUMBERS, DISTANCES), rows, strict=True)
+    ]
+    assert labels == [titles[0], "2 mm", *titles[1:]]  # the scale bar of the first image
 
 
 # --- which parameters only move the lens ---

@@ -1,0 +1,178 @@
+"""Test of two images' difference against their errors: Student's t on every pixel, Šidák's correction over them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .image import Image
+
+LEVEL = 0.01  # probability of a false alarm, to which `ZTest.detectable` refers
+NOISY = 0.5  # largest bound over standard error of a pixel that counts for chi2: a bias of that size adds 0.25 to it
+
+Plane = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ZTest:
+    """Test of the differences in units of their standard error, z = max(|P_cal − P_std| − bound, 0) / s.
+
+    s is the standard error of the difference, √(s_cal² + s_std²). The `error` of a deterministic image (`method` =
+    integral in its metadata) is no standard deviation: it is the bound, within which that image may be wrong. Any
+    other image's `error` is a standard error; where the metadata hold `passes`, s was estimated from the scatter of so
+    few passes, and z follows Student's t with passes − 1 degrees of freedom (two images: Welch's). All z below are
+    those of a normal distribution with the same probability.
+
+    Attributes
+    ----------
+    max_z : the largest |z|
+    chi2 : mean of z² without the bound, about 1 if the standard errors are right, over the `noisy` pixels; None if
+        there are none
+    p_value : probability that the smallest of `pixels` independent p_1 is at most the one found, p = 1 − (1 −
+        p_1)^pixels (Šidák's correction), p_1 = erfc(|z|/√2); a small value means that the images differ
+    pixels : number of pixels with light in either image and a standard error above 0, which are tested
+    unjudged : number of pixels without a standard error that differ by more than the bound; they are not tested
+    noisy : number of the tested pixels whose bound is at most half the standard error
+    detectable : smallest difference on the standard's brightest pixel, over its power, for which p < 0.01; None if
+        that pixel is not tested
+    """
+
+    max_z: float
+    chi2: float | None
+    p_value: float
+    pixels: int
+    unjudged: int
+    noisy: int
+    detectable: float | None
+
+    def render_text(self) -> str:
+        """Two lines: the test, and the smallest difference that it detects."""
+        chi2 = "none   the integral's errors exceed the noise" if self.chi2 is None else f"{self.chi2:.3f}   per pixel"
+        test = f"chi2   {chi2}; largest |z| {self.max_z:.2f} of {self.pixels} pixels, p {self.p_value:.2g}"
+        if self.detectable is None or self.detectable >= 1:
+            power = "none    the errors exceed the brightest pixel; give more samples or a smaller rtol"
+        else:
+            power = (
+                f"{self.detectable:.2e}   smallest difference of the brightest pixel, over its power, for p < {LEVEL}"
+            )
+        return f"{test}\npower  {power}"
+
+
+def is_deterministic(image: Image) -> bool:
+    """True if `error` is the integral's estimate, not a standard error."""
+    return image.metadata.get("method") == "integral"
+
+
+def error_bound(*images: Image) -> Plane:
+    """Sum of the errors [W] of the deterministic images, shape (h, w)."""
+    given = [image.error for image in images if image.error is not None and is_deterministic(image)]
+    return np.sum([np.zeros(images[0].shape), *given], axis=0, dtype=np.float64)
+
+
+def differences(calculated: Image, standard: Image) -> Plane:
+    """z of every pixel with the sign of P_cal − P_std, shape (h, w); NaN on pixels that are not tested."""
+    return _Differences(calculated, standard).signed_z()
+
+
+def z_test(calculated: Image, standard: Image) -> ZTest | None:
+    """Test of the differences against their errors; None if no image has a standard error above 0."""
+    found = _Differences(calculated, standard)
+    if not found.error.any():
+        return None
+    tested = found.tested
+    pixels = int(tested.sum())
+    z = np.abs(found.signed_z()[tested])
+    noisy = tested & (found.bound <= NOISY * found.error)
+    whole = np.abs(found.normal(found.difference, found.error))[noisy]
+    p_one = math.erfc(float(z.max()) / math.sqrt(2)) if pixels else 1.0
+    return ZTest(
+        max_z=float(z.max()) if pixels else 0.0,
+        chi2=float(np.square(whole).mean()) if whole.size else None,
+        # log1p and expm1 keep a p_one far below 1e-16, which 1 − (1 − p_one)^pixels would round to 0.
+        p_value=abs(math.expm1(pixels * math.log1p(-p_one))) if p_one < 1 else 1.0,
+        pixels=pixels,
+        unjudged=int(np.count_nonzero((found.error == 0) & (found.excess > 0))),
+        noisy=int(noisy.sum()),
+        detectable=found.detectable(np.unravel_index(standard.power.argmax(), standard.shape), pixels),
+    )
+
+
+class _Differences:
+    """Difference of two images and its errors, arrays of shape (h, w).
+
+    power : of the standard [W]
+    difference : P_cal − P_std [W]
+    bound : error of the deterministic images [W]
+    excess : max(|difference| − bound, 0) [W]
+    error : standard error s of the difference [W]
+    freedom : its degrees of freedom, Welch's; infinite where s counts as known
+    tested : pixels with light in either image and s > 0. Without light in both there is nothing to test, and the error
+        of the Monte Carlo is that of a sample that could have been.
+    """
+
+    def __init__(self, calculated: Image, standard: Image) -> None:
+        p_cal, self.power = (image.power.astype(np.float64) for image in (calculated, standard))
+        self.difference = p_cal - self.power
+        self.bound = error_bound(calculated, standard)
+        self.excess = np.maximum(np.abs(self.difference) - self.bound, 0)
+        variance, spread = np.zeros(self.power.shape), np.zeros(self.power.shape)
+        noisy = [image for image in (calculated, standard) if image.error is not None and not is_deterministic(image)]
+        self.scale = (
+            max([float(np.abs(image.error).max()) for image in noisy if image.error is not None], default=0.0) or 1.0
+        )
+        for image in noisy:
+            own = np.square(
+                np.asarray(image.error, np.float64) / self.scale
+            )  # over their largest: s⁴ must not underflow
+            variance += own
+            passes = int(image.metadata.get("passes", 0))
+            spread += own * own / (passes - 1) if passes > 1 else 0.0
+        self.error = self.scale * np.sqrt(variance)
+        self.freedom = np.divide(variance**2, spread, out=np.full_like(spread, np.inf), where=spread > 0)
+        self.tested = (self.error > 0) & ((p_cal != 0) | (self.power != 0))
+        self.missed = self._missed(calculated, standard)
+
+    def _missed(self, calculated: Image, standard: Image) -> Plane:
+        """Variance [W²] that the passes cannot show, where the Monte Carlo is darker than a deterministic image.
+
+        If light arrives in events of power w, the passes of a pixel that missed some of them give w P in place of w
+        (P + d), d the difference; w = s²/P, the largest in the 3 × 3 neighbourhood.
+        """
+        sampled = [image for image in (calculated, standard) if not is_deterministic(image)]
+        if len(sampled) != 1 or "passes" not in sampled[0].metadata:
+            return np.zeros(self.power.shape)
+        power = np.maximum(sampled[0].power.astype(np.float64), 0)
+        event = np.divide(self.error, power, out=np.zeros_like(power), where=power > 0) * self.error
+        height, width = event.shape
+        padded = np.pad(event, 1)
+        largest = np.max([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
+        darker = self.difference < 0 if sampled[0] is calculated else self.difference > 0
+        return np.where(darker, largest * self.excess, 0)
+
+    def signed_z(self) -> Plane:
+        """z of the excess with the sign of the difference; NaN where not tested."""
+        error = np.sqrt(np.square(self.error) + self.missed)
+        return np.where(self.tested, np.copysign(self.normal(self.excess, error), self.difference), np.nan)
+
+    def normal(self, excess: Plane, error: Plane) -> Plane:
+        """z of a normal distribution with the probability of Student's t = |excess|/error; 0 where `error` is 0."""
+        from scipy.special import ndtri, stdtr
+
+        t = np.abs(np.divide(excess, error, out=np.zeros_like(excess), where=error > 0))
+        finite = np.isfinite(self.freedom)
+        tail = stdtr(np.where(finite, self.freedom, 1.0), -t)
+        return np.where(finite, -ndtri(np.clip(tail, 1e-300, 0.5)), t)  # beyond 1e-300 z stays at 37
+
+    def detectable(self, pixel: tuple[np.intp, ...], pixels: int) -> float | None:
+        """Difference on `pixel` over the standard's power there with p = `LEVEL` among so many pixels."""
+        from scipy.special import ndtri, stdtrit
+
+        if not self.tested[pixel]:
+            return None
+        tail = -math.expm1(math.log1p(-LEVEL) / pixels) / 2
+        freedom = self.freedom[pixel]
+        t = -(stdtrit(freedom, tail) if math.isfinite(freedom) else ndtri(tail))
+        return float((self.bound[pixel] + t * self.error[pixel]) / self.power[pixel])
