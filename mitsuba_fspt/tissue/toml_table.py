@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
-from ..runtime.errors import BackendError, FluxError
+from ..runtime.errors import FluxError
+from ..runtime.toml_file import read_toml
 
 REQUIRED: Any = object()
 
@@ -27,22 +27,7 @@ class Table:
         FluxError : the file cannot be read, or is no TOML.
         BackendError : Python 3.10 without the package tomli.
         """
-        if sys.version_info >= (3, 11):
-            import tomllib
-        else:
-            try:
-                import tomli as tomllib
-            except ImportError as cause:
-                raise BackendError(
-                    f"flux solve: TOML needs tomli on Python 3.10 ({cause}). pip install 'mitsuba-fspt[tissue]'."
-                ) from cause
-        try:
-            return cls(tomllib.loads(path.read_text(encoding="utf-8")), f"'{path.name}'")
-        except OSError as cause:
-            raise FluxError(f"'{path}' cannot be read: {cause.strerror}. Check the name.") from cause
-        except ValueError as cause:  # of the encoding, or of TOML itself
-            reason = " ".join(str(cause).split())
-            raise FluxError(f"'{path}' is no TOML file: {reason}.") from cause
+        return cls(read_toml(path, FluxError), f"'{path.name}'")
 
     def number(self, key: str, default: float = REQUIRED) -> float:
         """Value of `key`, a number, whole or not."""

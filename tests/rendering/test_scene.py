@@ -175,7 +175,7 @@ TEXT = f'<scene version="3.0.0">{DEFAULTS_XML}{LENS_XML}</scene>'
         ("<bsdf version='3.0.0' type='diffuse'/>", {}, "XML text: the root is <diffuse>"),
         ({"type": "scene"}, {"view": 3}, "dictionary: a scene given so has no parameter 'view'"),
         ({"type": "sphere"}, {}, "dictionary: its 'type' is 'sphere', a scene has 'scene'"),
-        ({"type": "scene", "a": {"type": "spherre"}}, {}, 'dictionary node "a": cannot load the unknown \'spherre\''),
+        ({"type": "scene", "a": {"type": "spherre"}}, {}, "dictionary node \"a\": cannot load the unknown 'spherre'"),
         (7, {}, "scene: must be the name of a file, XML text or a dictionary, got int"),
     ],
 )
