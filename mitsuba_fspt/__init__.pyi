@@ -5,6 +5,7 @@ from .images.detector import Exposure as Exposure
 from .images.image import Image as Image
 from .images.image import read as read
 from .phantom.flux_import import import_flux as import_flux
+from .phantom.framed_scene import scene_xml as scene_xml
 from .phantom.phantom import Phantom as Phantom
 from .rendering.render import render as render
 from .rendering.scene import load as load

@@ -48,6 +48,7 @@ PUBLIC = [
     "load",
     "read",
     "render",
+    "scene_xml",
     "sweep",
 ]
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..runtime.backend import quiet_mitsuba
-from .options import Domain, Parameters, Rtol, SceneFile, definitions
+from .options import Domain, Parameters, Rtol, SceneFile, Sensor, definitions
 from .terminal import progress_bar
 
 
@@ -49,6 +49,7 @@ def explain(
     define: Parameters = None,
     rtol: Rtol = None,
     domain: Domain = None,
+    sensor: Sensor = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
 ) -> None:
     """Tell what the integral leaves out of a scene, why, and what that saves: 'render --no-shortcuts' goes without."""
@@ -57,7 +58,7 @@ def explain(
         from ..studies.explain import HEADER, explain
 
         quiet_mitsuba()
-        rows = explain(load(scene, **definitions(define)), rtol=rtol, domain=domain)
+        rows = explain(load(scene, **definitions(define)), sensor=sensor, rtol=rtol, domain=domain)
     if as_json:
         typer.echo(json.dumps([row.to_dict() for row in rows]))
         return

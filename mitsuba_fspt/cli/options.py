@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Annotated
 
@@ -20,10 +22,12 @@ Method = Annotated[str | None, typer.Option(help="integral, path or ptracer; the
 Rtol = Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")]
 Domain = Annotated[str | None, typer.Option(help="pupil or surface; the scene's own if left out.")]
 Spp = Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")]
+Sensor = Annotated[int, typer.Option(metavar="K", help="Number of the scene's sensor, counted from 0.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
 SourcePower = Annotated[
     float | None, typer.Option(metavar="W", help="Power of the light source [W], for a scene that is per 1 W of it.")
 ]
+MOST = 100_000  # values of a range
 NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
 
 
@@ -38,6 +42,36 @@ def definitions(define: list[str] | None) -> dict[str, str]:
             raise SceneError(f"-D {text}: {name} is {pairs[name]} already. Give each name once.")
         pairs[name] = value
     return pairs
+
+
+def several(name: str, text: str) -> list[str]:
+    """Values of a parameter from text: V1,V2,… and ranges start:stop:step, whose stop is left out.
+
+    Raises SceneError for a range that never ends, or has more than `MOST` values.
+    """
+    return [value for piece in text.split(",") for value in (_range(name, piece) or [piece.strip()])]
+
+
+def _range(name: str, text: str) -> list[str] | None:
+    """Values of a range, without rounding errors; None for text that is no range of numbers."""
+    try:
+        numbers = [Decimal(part.strip()) for part in text.split(":")]
+    except InvalidOperation:
+        return None
+    if len(numbers) == 1:
+        return None
+    if len(numbers) != 3 or not all(number.is_finite() for number in numbers):
+        raise SceneError(f"{name}={text}: a range is start:stop:step. Give for example {name}=0:360:10.")
+    start, stop, step = numbers
+    if step == 0 or (stop - start) * step <= 0:
+        raise SceneError(
+            f"{name}={text}: the step {step} does not lead from {start} to {stop}. Give start:stop:step, for "
+            f"example {name}=0:360:10; stop is left out."
+        )
+    count = math.ceil((stop - start) / step)
+    if count > MOST:
+        raise SceneError(f"{name}={text}: has {count} values, at most {MOST} are taken. Give a larger step.")
+    return [f"{(start + k * step).normalize():f}" for k in range(count)]
 
 
 def require_writable(path: Path, suffix: str | None = None, error: type[FsptError] = ImageError) -> None:

@@ -1,73 +1,173 @@
-"""`fspt render`: the image of a scene."""
+"""`fspt render`: the image of a scene, or images of a phantom from several sides."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from ..rendering.scene_xml import read_xml
+from ..images.image import required_source_power
+from ..rendering.scene_rules import is_number
+from ..rendering.scene_xml import read_text, read_xml
 from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
-from ..runtime.errors import ImageError
+from ..runtime.errors import ImageError, SceneError
 from .options import (
     Domain,
     Method,
     Parameters,
     Rtol,
-    SceneFile,
     Seed,
+    Sensor,
     SourcePower,
     Spp,
     definitions,
     require_picture,
     require_writable,
+    several,
 )
-from .terminal import progress_bar
+from .terminal import Interrupted, progress_bar
 
 if TYPE_CHECKING:
     from ..images.image import Image
 
 
+class Shot(NamedTuple):
+    """One image to render.
+
+    scene : name of the scene file, or its text
+    parameters : values for its `<default>` parameters
+    output : the image to write
+    origin : what the metadata call the scene, with its parameters; None leaves that to `load`
+    """
+
+    scene: Path | str
+    parameters: dict[str, str]
+    output: Path
+    origin: str | None = None
+
+
 def render(
-    scene: SceneFile,
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE.xml|PHANTOM.ply", help="Mitsuba scene with an fspt_lens, or a phantom.")
+    ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Image to write, .exr.")] = None,
+    view: Annotated[
+        str | None, typer.Option(metavar="0,90,...", help="Of a phantom: turns about +z [degrees], an image each.")
+    ] = None,
+    focal_length: Annotated[float | None, typer.Option(help="Before a phantom: F [mm], 50 if left out.")] = None,
+    f_number: Annotated[float | None, typer.Option(help="Before a phantom: F/D, 1.8 if left out.")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="CAMERA.toml", help="Before a phantom: camera with a table [lens].")
+    ] = None,
     method: Method = None,
     rtol: Rtol = None,
     domain: Domain = None,
     spp: Spp = None,
     seed: Seed = None,
+    sensor: Sensor = 0,
     source_power: SourcePower = None,
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
 ) -> None:
-    """Render a scene to an EXR with the power [W], its error and the coverage of every pixel."""
-    output = output or Path((scene.stem or "image") + ".exr")
-    require_writable(output, ".exr")
-    picture, parameters = output.with_suffix(".png") if png else None, definitions(define)
-    if picture:
-        require_picture(picture)
-    for written in (output, picture) if picture else (output,):
-        require_apart(written, read_xml(scene, parameters).sources(), error=ImageError)
-    if source_power is not None:
-        from ..images.image import required_source_power
+    """Render a scene to an EXR with the power [W], its error and the coverage of every pixel.
 
+    Of PHANTOM.ply, as 'fspt flux' writes it, the camera stands on the +x
+    axis, is focused on the front and sees the whole phantom, up is +z. The
+    images are OUT_view0.exr, OUT_view90.exr, one for each view; -D sets
+    the parameters of scene_xml.
+    """
+    framing = {"view": view, "focal_length": focal_length, "f_number": f_number, "camera": camera}
+    shots = _shots(scene, output, definitions(define), {name: v for name, v in framing.items() if v is not None})
+    _check_outputs(shots, [scene, camera] if camera else [scene], png)
+    if source_power is not None:
         required_source_power(source_power)
-    with progress_bar() as progress:
+    images: list[Image] = []
+    with _kept(shots, images), progress_bar() as progress:
         from ..rendering.render import render
         from ..rendering.scene import load
 
         quiet_mitsuba()
-        loaded = load(scene, **parameters)
-        image = render(
-            loaded, method=method, rtol=rtol, domain=domain, shortcuts=shortcuts, spp=spp, seed=seed, progress=progress
+        settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
+        for shot in shots:
+            loaded = load(shot.scene, **shot.parameters)
+            image = render(loaded, sensor=sensor, progress=progress, **settings)  # type: ignore[arg-type]
+            image = image if source_power is None else image.scaled(source_power)
+            if shot.origin:
+                image = replace(image, metadata=image.metadata | {"scene": shot.origin})
+            _write(image, shot.output, _picture(shot, png))
+            images.append(image)
+    for shot, image in zip(shots, images, strict=True):
+        _print_summary(image, shot.output, _picture(shot, png))
+
+
+def _shots(scene: Path, output: Path | None, parameters: dict[str, str], framing: dict[str, Any]) -> list[Shot]:
+    """What to render: the scene, or every view of a phantom; SceneError for an option that does not go with it."""
+    output = output or Path((scene.stem or "image") + ".exr")
+    if scene.suffix.lower() == ".ply":
+        return _views(scene, output, parameters, framing)
+    if framing:
+        option = "--" + next(iter(framing)).replace("_", "-")
+        raise SceneError(
+            f"{option} goes with PHANTOM.ply, '{scene}' is a scene with parameters of its own. Give -D NAME=VALUE."
         )
-    image = image if source_power is None else image.scaled(source_power)
-    _write(image, output, picture)
-    _print_summary(image, output, picture)
+    return [Shot(scene, parameters, output)]
+
+
+def _views(phantom: Path, output: Path, parameters: dict[str, str], framing: dict[str, Any]) -> list[Shot]:
+    """A phantom's views, in the order given; -D and options overrule the camera's file."""
+    from ..phantom.framed_scene import camera_lens, scene_xml
+
+    if twice := set(parameters) & set(framing):
+        name = min(twice)
+        raise SceneError(f"-D {name}={parameters[name]}: --{name.replace('_', '-')} gives it already. Give it once.")
+    numbers = {name: float(text) if is_number(text) else text for name, text in parameters.items() if name != "view"}
+    lens = camera_lens(framing.pop("camera")) if "camera" in framing else {}
+    views = several("view", framing.pop("view", parameters.get("view", "0")))
+    if wrong := [view for view in views if not is_number(view) or views.count(view) > 1]:
+        raise SceneError(f"--view: must be different numbers of degrees, got '{wrong[0]}'. Give for example 0,90,180.")
+    text = scene_xml(phantom, **lens | numbers | framing)
+    shots = []
+    for view in views:
+        values = read_text(text, {}).defaults | {"view": view}
+        origin = " ".join([str(phantom), *(f"{name}={value}" for name, value in values.items())])
+        image = output.with_name(f"{output.stem}_view{view}{output.suffix or '.exr'}")
+        shots.append(Shot(text, {"view": view}, image, origin))
+    return shots
+
+
+def _picture(shot: Shot, png: bool) -> Path | None:
+    """The PNG beside an image, if one is wanted."""
+    return shot.output.with_suffix(".png") if png else None
+
+
+def _check_outputs(shots: list[Shot], inputs: list[Path], png: bool) -> None:
+    """Raise ImageError for an image or picture that cannot be written, or that would overwrite what is read."""
+    for shot in shots:
+        require_writable(shot.output, ".exr")
+        picture = _picture(shot, png)
+        if picture:
+            require_picture(picture)
+        read = read_xml(shot.scene, shot.parameters).sources() if isinstance(shot.scene, Path) else inputs
+        for written in (shot.output, picture) if picture else (shot.output,):
+            require_apart(written, read, error=ImageError)
+
+
+@contextmanager
+def _kept(shots: list[Shot], images: list[Image]) -> Iterator[None]:
+    """Ctrl-C in the block after the first of several images raises `Interrupted`, which says what is written."""
+    try:
+        yield
+    except KeyboardInterrupt as cause:
+        if not images:
+            raise
+        names = ", ".join(str(shot.output) for shot in shots[: len(images)])
+        raise Interrupted(f"interrupted; {len(images)} of {len(shots)} images are written: {names}.") from cause
 
 
 def _write(image: Image, output: Path, picture: Path | None) -> None:

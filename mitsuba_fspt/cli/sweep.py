@@ -11,7 +11,7 @@ import typer
 
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import BackendError, SceneError
-from .options import Method, Rtol, SceneFile, Seed, Spp
+from .options import Method, Rtol, SceneFile, Seed, Sensor, Spp, several
 from .terminal import Interrupted, progress_bar
 
 if TYPE_CHECKING:
@@ -23,7 +23,10 @@ def sweep(
     define: Annotated[
         list[str] | None,
         typer.Option(
-            "-D", "--define", metavar="NAME=V1,V2,...", help="Values for a <default> of the scene; repeatable."
+            "-D",
+            "--define",
+            metavar="NAME=V1,V2,...",
+            help="Values for a <default> of the scene, or start:stop:step with stop left out; repeatable.",
         ),
     ] = None,
     output: Annotated[
@@ -33,6 +36,7 @@ def sweep(
     rtol: Rtol = None,
     spp: Spp = None,
     seed: Seed = None,
+    sensor: Sensor = 0,
     jobs: Annotated[int | None, typer.Option(help="Processes on this machine.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
@@ -51,9 +55,8 @@ def sweep(
         with progress_bar() as progress:
             quiet_mitsuba()
             settings = {"method": method, "rtol": rtol, "spp": spp, "seed": seed, "jobs": jobs, "scheduler": scheduler}
-            rows = sweep(scene, values, folder, progress=progress, **settings)  # type: ignore[arg-type]
-        total = sum(row.wall_time for row in rows)
-        typer.echo(f"{folder / INDEX}: {len(rows)} points, {total:.3g} s of rendering")
+            rows = sweep(scene, values, folder, sensor=sensor, progress=progress, **settings)  # type: ignore[arg-type]
+        typer.echo(f"{folder / INDEX}: {len(rows)} points, {_work(rows)}")
         _write_sheet(rows, folder / "contact_sheet.png")
 
 
@@ -66,6 +69,15 @@ def _resumable(folder: Path) -> Iterator[None]:
         raise Interrupted(
             f"interrupted; finished images stay in {folder}, the same command goes on from there."
         ) from cause
+
+
+def _work(rows: list[SweepRow]) -> str:
+    """How many points were rendered, in what time, and how many images were there already."""
+    rendered = [row for row in rows if not row.reused]
+    reused = f"{len(rows) - len(rendered)} reused"
+    if not rendered:
+        return reused
+    return f"{len(rendered)} rendered in {sum(row.wall_time for row in rendered):.3g} s, {reused}"
 
 
 def _write_sheet(rows: list[SweepRow], path: Path) -> None:
@@ -83,10 +95,10 @@ def _values(define: list[str] | None) -> dict[str, list[str]]:
     """Lists of values by name from the options -D NAME=V1,V2,...; SceneError as of `definitions`."""
     values: dict[str, list[str]] = {}
     for text in define or ():
-        name, equals, several = text.partition("=")
+        name, equals, listed = text.partition("=")
         if not (name and equals):
             raise SceneError(f"-D {text}: must be NAME=V1,V2,…, for example -D f_number=2.8,5.6.")
         if name in values:
             raise SceneError(f"-D {text}: '{name}' is given twice. Put all values into one, -D {name}=1,2.")
-        values[name] = several.split(",")
+        values[name] = several(name, listed)
     return values

@@ -96,6 +96,12 @@ class Phantom:
         return float(shares(self.vertices, self.faces, self.per) @ self.exitance)
 
     @cached_property
+    def bounds(self) -> tuple[Points, Points]:
+        """Lowest and highest corner of the box around the faces, each of shape (3,) [mm]."""
+        corners = self.vertices[self.faces].reshape(-1, 3)
+        return corners.min(axis=0), corners.max(axis=0)
+
+    @cached_property
     def closure(self) -> Closure:
         """Closure and orientation of the surface."""
         return closure(self.vertices, self.faces)

@@ -1,11 +1,11 @@
-"""Loading of scene files: from XML with `<default>` parameters to a Mitsuba scene."""
+"""Loading of scenes: from XML with `<default>` parameters, or a dictionary, to a Mitsuba scene."""
 
 from __future__ import annotations
 
 import itertools
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,78 +15,143 @@ from ..runtime import backend
 from ..runtime.errors import SceneError
 from ..runtime.interrupt import ctrl_c_noted
 from .scene_rules import check_text
-from .scene_xml import SceneXml, read_xml
+from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 
 COLOUR_FORMATS = ("rgb", "rgba", "xyz", "xyza")
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    Parser = Callable[[mi.parser.ParserConfig], mi.parser.ParserState]
 
-def load(path: str | os.PathLike[str], /, **parameters: object) -> mi.Scene:
-    """Mitsuba scene of an XML file; keywords replace the file's `<default>` values.
+
+def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: object) -> mi.Scene:
+    """Mitsuba scene of an XML file, of XML text or of a dictionary; keywords replace the XML's `<default>` values.
 
     Sets a variant if none is active (see `backend.ensure_variant`), and turns Embree's robust mode on. The scene's
     `id()` is the file and its parameters, for example 'scenes/nylon_cylinder.xml f_number=8'.
+
+    Parameters
+    ----------
+    scene : name of an XML file; text of one, which starts with '<' (`scene_xml` writes it; files that it names are
+        searched for in the current folder); or a dictionary as of `mi.load_dict`
+    parameters : values for `<default>` parameters
 
     Raises
     ------
     SceneError : the file cannot be read, is no valid scene, has no such parameter, or a value does not fit its
         parameter; one line with the cause.
     """
-    path = Path(path)
     backend.ensure_variant()
     import mitsuba as mi
 
     from ..emission.face_probe import probe_beside
 
-    check_parameters(path, parameters)
-    check_text(path, _xml_of(path, parameters))
-    texts = {name: parameter_text(value) for name, value in parameters.items()}
+    if isinstance(scene, Mapping):
+        path, folder, parse = Path("dictionary"), Path(), _parser_of_dictionary(scene, parameters)
+    elif is_text(scene):
+        path, folder, parse = TEXT, Path(), _parser_of_text(str(scene), parameters)
+    else:
+        path = _path_of(scene)
+        folder, parse = path.resolve().parent, _parser_of_file(path, parameters)
     config = mi.parser.ParserConfig(mi.variant())
     resolver = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(resolver))
-    mi.file_resolver().prepend(str(path.resolve().parent))
+    mi.file_resolver().prepend(str(folder))
     try:
         with ctrl_c_noted():
-            state = mi.parser.parse_file(config, str(path), **texts)
-            if state.root.props.plugin_name() != "scene":
-                raise SceneError(
-                    f"{path}: the root is <{state.root.props.plugin_name()}>, a scene file has <scene>. Give one."
-                )
-            state.root.props["embree_use_robust_intersections"] = True
-            state.root.props.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in texts.items())]))
-            _name_children(state)
-            _set_film_formats(state)
+            state = parse(config)
+            _set_up(state, path, parameters)
             mi.parser.transform_all(config, state)
-            scene = mi.parser.instantiate(config, state)
+            loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, ValueError) as error:
         raise error if isinstance(error, SceneError) else SceneError(_one_line(str(error))) from error
     finally:
         mi.set_file_resolver(resolver)
-    scene = scene[0] if isinstance(scene, list) else scene
-    probe_beside(scene)
-    return scene
+    loaded = loaded[0] if isinstance(loaded, list) else loaded
+    probe_beside(loaded)
+    return loaded
 
 
-def loaded(scene: mi.Scene | str | os.PathLike[str]) -> mi.Scene:
-    """`scene` itself, or the scene loaded from the file of that name."""
-    return load(scene) if isinstance(scene, (str, os.PathLike)) else scene
+def _path_of(scene: object) -> Path:
+    """Name of a scene file as a path; SceneError for what is none."""
+    if not isinstance(scene, (str, os.PathLike)):
+        raise SceneError(
+            f"scene: must be the name of a file, XML text or a dictionary, got {type(scene).__name__}. Give one."
+        )
+    return Path(scene)
+
+
+def _parser_of_file(path: Path, parameters: Mapping[str, object]) -> Parser:
+    """Function that parses a scene file with these values of its parameters, after their check."""
+    import mitsuba as mi
+
+    check_parameters(path, parameters)
+    check_text(path, _xml_of(path, parameters))
+    return lambda config: mi.parser.parse_file(config, str(path), **_texts(parameters))
+
+
+def _parser_of_text(text: str, parameters: Mapping[str, object]) -> Parser:
+    """Function that parses the text of a scene, likewise."""
+    import mitsuba as mi
+
+    xml = read_text(text, _texts(parameters))
+    _require_known(TEXT, xml, parameters)
+    check_text(TEXT, xml)
+    return lambda config: mi.parser.parse_string(config, text, **_texts(parameters))
+
+
+def _parser_of_dictionary(scene: Mapping[str, object], parameters: Mapping[str, object]) -> Parser:
+    """Function that parses a scene's dictionary, which has no parameters."""
+    import mitsuba as mi
+
+    if parameters:
+        names = ", ".join(f"'{name}'" for name in parameters)
+        raise SceneError(f"dictionary: a scene given so has no parameter {names}. Put the values into it.")
+    if scene.get("type") != "scene":
+        raise SceneError(f"dictionary: its 'type' is {scene.get('type')!r}, a scene has 'scene'. Give one.")
+    return lambda config: mi.parser.parse_dict(config, dict(scene))
+
+
+def _set_up(state: mi.parser.ParserState, path: Path, parameters: Mapping[str, object]) -> None:
+    """Set in a parsed scene what `load` promises: robust mode, ids and films; SceneError for the root of another."""
+    root = state.root.props
+    if root.plugin_name() != "scene":
+        raise SceneError(f"{path}: the root is <{root.plugin_name()}>, a scene file has <scene>. Give one.")
+    root["embree_use_robust_intersections"] = True
+    root.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in _texts(parameters).items())]))
+    _name_children(state)
+    _set_film_formats(state)
+
+
+def loaded(scene: mi.Scene | str | os.PathLike[str] | Mapping[str, object]) -> mi.Scene:
+    """`scene` itself, or the scene loaded from the file of that name, from XML text or from a dictionary."""
+    return load(scene) if isinstance(scene, (str, os.PathLike, Mapping)) else scene
+
+
+def _texts(parameters: Mapping[str, object]) -> dict[str, str]:
+    """Texts of the parameters' values."""
+    return {name: parameter_text(value) for name, value in parameters.items()}
 
 
 def _xml_of(path: Path, parameters: Mapping[str, object]) -> SceneXml:
     """XML of the scene file with these values of its parameters."""
-    return read_xml(path, {name: parameter_text(value) for name, value in parameters.items()})
+    return read_xml(path, _texts(parameters))
 
 
 def check_parameters(path: Path, parameters: Mapping[str, object]) -> None:
     """Raise SceneError for a name that is no `<default>` of the file or of the files it includes with these values."""
-    known = _xml_of(path, parameters).defaults
+    _require_known(path, _xml_of(path, parameters), parameters)
+
+
+def _require_known(path: Path, xml: SceneXml, parameters: Mapping[str, object]) -> None:
+    """Raise SceneError for a name that is no `<default>` of this XML, or that the parser cannot set."""
+    known = xml.defaults
     for name in parameters:
         if name not in known:
             names = ", ".join(known) or "none"
             raise SceneError(f"{path}: the scene has no parameter '{name}'. Its <default> parameters: {names}.")
-        if name in ("config", "filename"):  # names of arguments of Mitsuba's parser
+        if name in ("config", "filename", "string"):  # names of arguments of Mitsuba's parser
             raise SceneError(f"{path}: Mitsuba cannot set a parameter '{name}'. Give the <default> another name.")
 
 
@@ -124,9 +189,11 @@ def _one_line(message: str) -> str:
     lines = [re.sub(r"\[[\w.]+:\d+\] ", "", line).strip() for line in message.splitlines()]
     text = " ".join(filter(None, lines))
     found = re.match(
-        r"(?:At|Error while loading|While loading|Parsing of XML file) (.*?\(line \d+, col \d+\)):? (.*)", text
+        r"(?:At|Error while loading|While loading|Parsing of XML file) "
+        r"(.*?\(line \d+, col \d+\)|dictionary node \"[^\"]*\"):? (.*)",
+        text,
     )
-    position, cause = (found[1] + ": ", found[2]) if found else ("", text)
+    position, cause = (re.sub("^string ", f"{TEXT} ", found[1]) + ": ", found[2]) if found else ("", text)
     ours = [line for line in lines if re.match(r"(\w+\.)*\w*(Error|Exception): ", line)]
     unknown = re.match(r'Found \d+ unreferenced .* plugin of type "(\w+)": ', cause)
     broken = re.match(r'failed to instantiate (\w+) plugin of type "(\w+)": (.*)', cause)

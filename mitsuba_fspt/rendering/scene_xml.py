@@ -11,6 +11,8 @@ from pathlib import Path
 
 from ..runtime.errors import SceneError
 
+TEXT = Path("XML text")  # stands for the file's name in messages where a scene is given as text
+
 
 @dataclass(frozen=True)
 class SceneXml:
@@ -56,6 +58,19 @@ def read_xml(path: Path, given: Mapping[str, str]) -> SceneXml:
     return scene
 
 
+def read_text(text: str, given: Mapping[str, str]) -> SceneXml:
+    """Content of the text of a scene with the values `given`; its files are searched for in the current folder."""
+    scene = SceneXml(given, folders=[Path()])
+    scene.files.append(TEXT)
+    _add(_root(TEXT, text), TEXT, scene, ())
+    return scene
+
+
+def is_text(scene: object) -> bool:
+    """True for the text of a scene, which starts with '<', and not the name of its file."""
+    return isinstance(scene, str) and scene.lstrip("\ufeff \t\r\n").startswith("<")
+
+
 def _read(path: Path, scene: SceneXml, outer: tuple[Path, ...]) -> None:
     """Add the content of a file to `scene`; `outer`: the chain of files whose includes lead to it."""
     if os.path.realpath(path) in map(os.path.realpath, outer):
@@ -63,7 +78,12 @@ def _read(path: Path, scene: SceneXml, outer: tuple[Path, ...]) -> None:
     if path in scene.files:  # a second time
         return
     scene.files.append(path)
-    for node in _root(path).iter():
+    _add(_root(path), path, scene, outer)
+
+
+def _add(root: ElementTree.Element, path: Path, scene: SceneXml, outer: tuple[Path, ...]) -> None:
+    """Add the elements of a file to `scene`, and the files that it includes."""
+    for node in root.iter():
         scene.nodes.append(node)
         if node.tag == "default":
             scene.defaults.setdefault(node.get("name", ""), scene.fill_in(node.get("value", "")))
@@ -74,10 +94,10 @@ def _read(path: Path, scene: SceneXml, outer: tuple[Path, ...]) -> None:
                 _read(inner, scene, (*outer, path))
 
 
-def _root(path: Path) -> ElementTree.Element:
-    """Root element of an XML file; SceneError if it cannot be read."""
+def _root(path: Path, text: str | None = None) -> ElementTree.Element:
+    """Root element of an XML file, or of a text; SceneError if it cannot be read."""
     try:
-        return ElementTree.parse(path).getroot()
+        return ElementTree.parse(path).getroot() if text is None else ElementTree.fromstring(text)
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene file: {error.strerror}. Check the name.") from error
     except LookupError as error:

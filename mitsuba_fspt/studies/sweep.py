@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ import numpy as np
 from ..images import picture
 from ..images.colour_scale import ColourScale
 from ..images.image import Image, read
+from ..rendering.scene_rules import is_number
+from ..rendering.scene_xml import is_text
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import FsptError, ImageError, SceneError
 from ..runtime.interrupt import ctrl_c_held
@@ -38,19 +41,21 @@ CAPTION = 0.22  # height of the text above an image, relative likewise
 class SweepRow:
     """One point of a sweep, one row of its index.
 
-    parameters : name and value, as text
+    parameters : name and value: a number where the value is one, else its text
     file : path of its image
     power, peak : power on all pixels and on the brightest one [W]
     largest_error : largest error of a pixel [W]; None where the image has no error
     wall_time : time of the rendering [s]
+    reused : True if the image was there already
     """
 
-    parameters: dict[str, str]
+    parameters: dict[str, str | int | float]
     file: Path
     power: float
     peak: float
     largest_error: float | None
     wall_time: float
+    reused: bool = field(default=False, compare=False)
 
 
 def sweep(
@@ -62,6 +67,7 @@ def sweep(
     rtol: float | None = None,
     spp: int | None = None,
     seed: int | None = None,
+    sensor: int = 0,
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
@@ -81,7 +87,7 @@ def sweep(
     scene : name of a scene file
     parameters : values for `<default>` parameters of the scene: a list of values or one value for each name
     folder : folder of the images; created if its parent exists
-    method, rtol, spp, seed : as in `render`
+    method, rtol, spp, seed, sensor : as in `render`
     jobs : number of processes, >= 1; None renders in this one (with scheduler 'local': one process a core). Each
         imports the script that calls: keep the call behind `if __name__ == "__main__":`
     scheduler : address of a dask.distributed scheduler, for example 'tcp://10.0.0.1:8786', or 'local' to start one
@@ -98,19 +104,35 @@ def sweep(
     folder = Path(folder)
     jobs = None if jobs is None else whole("sweep: 'jobs'", jobs, SceneError, "2")
     _check_jobs(jobs, scheduler)
-    wanted = points(Path(scene), parameters, _settings(method, rtol, spp, seed))
+    wanted = points(_path_of(scene), parameters, _settings(method, rtol, spp, seed, sensor))
     _check_names(wanted)
     _check_folder(folder)
     return _completed(wanted, folder, jobs, scheduler, progress)
 
 
-def _settings(method: str | None, rtol: float | None, spp: int | None, seed: int | None) -> dict[str, Setting]:
+def _path_of(scene: object) -> Path:
+    """Name of the scene file as a path; SceneError for a scene that is loaded, or given as text or dictionary."""
+    if isinstance(scene, (str, os.PathLike)) and not is_text(scene):
+        return Path(scene)
+    is_loaded = hasattr(scene, "id")
+    file = str(scene.id()).partition(" ")[0] if is_loaded else ""  # type: ignore[attr-defined]  # no Mitsuba here
+    kind = "XML text" if is_text(scene) else "a loaded scene" if is_loaded else type(scene).__name__
+    name = file if file.endswith(".xml") else "scenes/nylon_cylinder.xml"
+    raise SceneError(
+        f"sweep: the scene must be the name of a file, whose parameters vary, got {kind}. Give for example '{name}'."
+    )
+
+
+def _settings(
+    method: str | None, rtol: float | None, spp: int | None, seed: int | None, sensor: int
+) -> dict[str, Setting]:
     """The settings common to all points; SceneError for a value that is no number."""
     return {
         "method": method,
         "rtol": None if rtol is None else number("sweep: 'rtol'", rtol, SceneError, "1e-3"),
         "spp": None if spp is None else whole("sweep: 'spp'", spp, SceneError, "256"),
         "seed": None if seed is None else whole("sweep: 'seed'", seed, SceneError, "1"),
+        "sensor": whole("sweep: 'sensor'", sensor, SceneError, "0"),
     }
 
 
@@ -143,7 +165,7 @@ def _completed(
     finally:
         if rows:
             with ctrl_c_held():
-                _write_index([rows[point.file] for point in wanted if point.file in rows], folder / INDEX)
+                _write_index([(point, rows[point.file]) for point in wanted if point.file in rows], folder / INDEX)
     _require_all(wanted, failed)
     return [rows[point.file] for point in wanted]
 
@@ -196,7 +218,8 @@ def _finished(point: SweepPoint, folder: Path) -> SweepRow | None:
         image = read(folder / point.file)
     except ImageError:
         return None
-    return _row(point, folder, image) if image.metadata.get("fingerprint") == point.fingerprint else None
+    made_so = image.metadata.get("fingerprint") == point.fingerprint
+    return replace(_row(point, folder, image), reused=True) if made_so else None
 
 
 def _row(point: SweepPoint, folder: Path, image: Image) -> SweepRow:
@@ -204,16 +227,25 @@ def _row(point: SweepPoint, folder: Path, image: Image) -> SweepRow:
     power = image.power.astype(np.float32)
     error = None if image.error is None else float(image.error.astype(np.float32).max())
     total, peak = float(power.sum(dtype=np.float64)), float(power.max())
-    return SweepRow(point.parameters, folder / point.file, total, peak, error, float(image.metadata["wall_time"]))
+    values = {name: _value(text) for name, text in point.parameters.items()}
+    return SweepRow(values, folder / point.file, total, peak, error, float(image.metadata["wall_time"]))
 
 
-def _write_index(rows: list[SweepRow], path: Path) -> None:
+def _value(text: str) -> str | int | float:
+    """The number that a text stands for, whole where it is written so; any other text unchanged."""
+    if not is_number(text):
+        return text
+    return int(text) if re.fullmatch(r"[+-]?\d+", text) else float(text)
+
+
+def _write_index(rows: list[tuple[SweepPoint, SweepRow]], path: Path) -> None:
+    """Write the table of the points, with the texts of their values."""
     with atomic_path(path, ImageError) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*rows[0].parameters, *COLUMNS])
-        for row in rows:
+        writer.writerow([*rows[0][0].parameters, *COLUMNS])
+        for point, row in rows:
             numbers = (row.power, row.peak, row.largest_error, row.wall_time)
-            writer.writerow([*row.parameters.values(), row.file.name, *numbers])
+            writer.writerow([*point.parameters.values(), row.file.name, *numbers])
 
 
 def _check_jobs(jobs: int | None, scheduler: str | None) -> None:

@@ -141,6 +141,51 @@ def test_a_parameter_may_be_called_path_but_not_filename(tmp_path):
         fspt.load(path, filename="x")
 
 
+def test_text_of_a_scene_loads_like_its_file(tmp_path, monkeypatch):
+    """With its parameters; files that it names are searched for in the current folder."""
+    sheet(tmp_path / "a.ply")
+    path = write_scene(tmp_path / "s.xml", shapes=PLY_XML.format(name="a.ply"))
+    image = fspt.render(fspt.load(path, f_number=4))
+    monkeypatch.chdir(tmp_path)
+    scene = fspt.load(path.read_text(), f_number=4)
+    assert scene.id() == "XML text f_number=4"
+    same_power(fspt.render(scene).power, image.power)
+    same_power(fspt.render("\n  " + path.read_text()).power, fspt.render(path).power)
+
+
+def test_a_dictionary_loads_with_robust_tracing_and_names_that_stay():
+    """Like `mi.load_dict`'s."""
+    scene = fspt.load({"type": "scene", "sensor": lens(size=(8, 6)), "sphere": ball(radius=3.0)})
+    assert scene.id() == "dictionary"
+    assert {"sensor.f_number", "sphere.emitter.exitance.value"} <= set(mi.traverse(scene).keys())
+    same_power(fspt.render(scene).power, fspt.render(world_scene(ball(radius=3.0), sensor=lens(size=(8, 6)))).power)
+
+
+DEFAULTS_XML = '<default name="f_number" value="8"/><default name="distance" value="165"/>'
+TEXT = f'<scene version="3.0.0">{DEFAULTS_XML}{LENS_XML}</scene>'
+
+
+@pytest.mark.parametrize(
+    ("scene", "given", "message"),
+    [
+        (TEXT, {"colour": 1}, "XML text: the scene has no parameter 'colour'"),
+        (TEXT, {"f_number": "x"}, "XML text: parameter 'f_number' must be a finite number, got 'x'"),
+        (TEXT.replace("fspt_lens", "fspt_lenz"), {}, "XML text (line 2, col "),
+        (TEXT[:-3], {}, "XML text: not valid XML"),
+        ("<bsdf version='3.0.0' type='diffuse'/>", {}, "XML text: the root is <diffuse>"),
+        ({"type": "scene"}, {"view": 3}, "dictionary: a scene given so has no parameter 'view'"),
+        ({"type": "sphere"}, {}, "dictionary: its 'type' is 'sphere', a scene has 'scene'"),
+        ({"type": "scene", "a": {"type": "spherre"}}, {}, "dictionary node \"a\": cannot load the unknown 'spherre'"),
+        (7, {}, "scene: must be the name of a file, XML text or a dictionary, got int"),
+    ],
+)
+def test_texts_and_dictionaries_that_are_no_scene(scene, given, message):
+    with pytest.raises(SceneError) as caught:
+        fspt.load(scene, **given)
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
 def test_unnamed_shapes_and_sensors_get_names_that_stay(tmp_path):
     path = write_scene(tmp_path / "s.xml", shapes=BALL_XML * 2 + BALL_XML.replace("<shape", '<shape id="mouse"'))
     keys = [set(mi.traverse(fspt.load(path)).keys()) for _ in range(2)]
@@ -336,6 +381,17 @@ def test_lost_rays_are_found_however_few_the_vertices(tmp_path, cells):
     plain, ours = mi.load_file(str(path)), fspt.load(path)
     assert lost_rays(plain, plain.sensors()[0]) > 0
     assert lost_rays(ours, ours.sensors()[0]) == 0
+
+
+@llvm_only
+def test_texts_and_dictionaries_are_traced_robustly_too(aligned, monkeypatch):
+    monkeypatch.chdir(aligned.parent)
+    of_sheet = {"type": "ply", "filename": "grid.ply", "face_normals": True, "emitter": glow()}
+    for scene in (aligned.read_text(), {"type": "scene", "sheet": of_sheet, "lens": lens(size=7)}):
+        loaded = fspt.load(scene)
+        assert lost_rays(loaded, loaded.sensors()[0]) == 0
+    plain = mi.load_dict(scene)
+    assert lost_rays(plain, plain.sensors()[0]) > 0
 
 
 def test_a_scene_that_no_robust_mode_mends_is_taken_as_it_is(aligned, monkeypatch, capfd):

@@ -21,6 +21,7 @@ import pytest
 from small_scenes import BALL_XML, LENS_XML, write_ply, write_scene
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.cli.options import several
 from mitsuba_fspt.images import picture
 from mitsuba_fspt.runtime.errors import BackendError, ImageError, SceneError
 from mitsuba_fspt.studies import scene_cache, sweep, sweep_workers
@@ -96,7 +97,7 @@ def index_without_times(folder):
 def test_every_combination_becomes_an_image_and_a_row(run, tmp_path):
     code, out, err = run("sweep", "s.xml", *DEFINE)
     assert (code, err) == (0, "")
-    assert out.startswith("s_sweep/index.csv: 4 points, ")
+    assert re.match(r"s_sweep/index\.csv: 4 points, 4 rendered in \S+ s, 0 reused\n", out)
     assert out.endswith("s_sweep/contact_sheet.png: all of them to look at\n")
     folder = tmp_path / "s_sweep"
     assert sorted(os.listdir(folder)) == sorted([*NAMES, "index.csv", "contact_sheet.png"])
@@ -131,7 +132,9 @@ def test_one_load_a_geometry_and_the_bits_of_scenes_loaded_one_by_one(scene, tmp
 
 def test_values_are_numbers_arrays_text_or_one_alone(scene):
     rows = fspt.sweep(scene, {"f_number": np.array([4.0, 5.6]), "distance": np.array(170)}, "o")
-    assert [row.parameters for row in rows] == [{"f_number": f, "distance": "170"} for f in ("4.0", "5.6")]
+    assert [row.parameters for row in rows] == [{"f_number": f, "distance": 170} for f in (4.0, 5.6)]
+    assert [type(value) for value in rows[0].parameters.values()] == [float, int]
+    assert [row["f_number"] for row in index_without_times(Path("o"))] == ["4.0", "5.6"]  # the texts as given
     assert rows[1].file.name == "s_f_number=5.6_distance=170.exr"
 
 
@@ -139,6 +142,7 @@ def test_values_that_no_file_name_holds_stay_apart(tmp_path):
     shapes = '<default name="note" value=""/>' + BALL_XML.replace("<shape", '<shape id="$note"')
     path = write_scene(tmp_path / "m.xml", shapes=shapes)
     rows = fspt.sweep(path, {"note": ["a/b", "a-b"]}, "o")
+    assert [row.parameters["note"] for row in rows] == ["a/b", "a-b"]
     assert rows[0].file.name.startswith("m_note=a-b-")
     assert rows[1].file.name == "m_note=a-b.exr"
     assert rows[0].peak == rows[1].peak > 0
@@ -179,6 +183,53 @@ def test_the_contact_sheet_shows_all_on_one_scale(scene, monkeypatch):
     assert labels == [titles[0], "2 mm", *titles[1:]]  # the scale bar of the first image
 
 
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("0:360:90", "0 90 180 270"),
+        ("0:0.4:0.1", "0 0.1 0.2 0.3"),
+        ("1:0:-.25", "1 0.75 0.5 0.25"),
+        ("-90:91:90", "-90 0 90"),
+        ("10:31:10,5", "10 20 30 5"),
+        ("1e1:3e1:1e1", "10 20"),
+        ("a:b:c", "a:b:c"),
+        ("2.80,x", "2.80 x"),
+    ],
+)
+def test_ranges_leave_their_stop_out(text, values):
+    """In decimal: three steps of 0.1 are 0.3, and no rounding error adds the stop."""
+    assert several("view", text) == values.split()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0:360", "a range is start:stop:step. Give for example view=0:360:10."),
+        ("0:360:10:2", "a range is start:stop:step"),
+        ("0:inf:1", "a range is start:stop:step"),
+        ("0:360:0", "the step 0 does not lead from 0 to 360"),
+        ("0:360:-10", "the step -10 does not lead from 0 to 360"),
+        ("0:-90:10", "the step 10 does not lead from 0 to -90"),
+        ("5:5:1", "the step 1 does not lead from 5 to 5"),
+        ("0:1:1e-9", "has 1000000000 values, at most 100000 are taken"),
+    ],
+)
+def test_ranges_that_lead_nowhere(run, tmp_path, text, message):
+    code, _, err = run("sweep", "s.xml", "-D", f"view={text}")
+    assert (code, err.count("\n")) == (2, 1)
+    assert message in err
+    assert os.listdir(tmp_path) == ["s.xml"]
+
+
+@pytest.mark.parametrize("kind", ["loaded", "text", "dictionary"])
+def test_a_sweep_needs_the_file(scene, kind):
+    given = {"loaded": fspt.load(scene), "text": scene.read_text(), "dictionary": {"type": "scene"}}[kind]
+    name = {"loaded": "a loaded scene. Give for example 's.xml'", "text": "XML text", "dictionary": "dict"}[kind]
+    with pytest.raises(SceneError, match=f"must be the name of a file, whose parameters vary, got {name}"):
+        fspt.sweep(given, {"f_number": 8}, "o")
+    assert not os.path.exists("o")
+
+
 # --- which parameters only move the lens ---
 
 
@@ -216,6 +267,28 @@ def test_a_second_run_renders_what_is_missing_broken_or_another(scene, tmp_path,
     assert rendered == loaded == []
     assert [row.power for row in second] == [row.power for row in first]
     assert index_without_times(tmp_path / "o") == index
+
+
+def test_the_report_tells_what_was_rendered_from_what_was_there(run):
+    """Seen to fail with the time of all images, old ones too, called the time of rendering."""
+    assert run("sweep", "s.xml", "-D", "f_number=2.8,8")[0] == 0
+    _, out, _ = run("sweep", "s.xml", "-D", "f_number=2.8,8,11")
+    assert re.match(r"s_sweep/index\.csv: 3 points, 1 rendered in \S+ s, 2 reused\n", out)
+    _, out, _ = run("sweep", "s.xml", "-D", "f_number=2.8,8,11")
+    assert out.startswith("s_sweep/index.csv: 3 points, 3 reused\n")
+
+
+def test_another_sensor_makes_another_image(tmp_path, run):
+    path = write_scene(tmp_path / "two.xml", sensor=LENS_XML + LENS_XML.replace('"0.8"', '"0.4"'))
+    first, second = (fspt.sweep(path, {"f_number": 8}, "o", sensor=k)[0] for k in (0, 1))
+    assert second.power == pytest.approx(fspt.render(fspt.load(path), sensor=1).power.sum(), rel=1e-5)
+    assert not second.reused
+    assert first.peak > 3 * second.peak > 0
+    code, _, _ = run("sweep", "two.xml", "-D", "f_number=8", "--sensor", 1, "-o", "o")
+    assert code == 0
+    code, _, err = run("sweep", "two.xml", "-D", "f_number=8", "--sensor", 2, "-o", "o")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "sensor 2 does not exist, the scene has 2. Give 0 to 1." in err
 
 
 @pytest.mark.parametrize("what", ["scene", "included", "data", "rtol", "nothing"])

@@ -1,0 +1,298 @@
+"""Scene file of a phantom: a camera that is placed so that the phantom fills the film from every side."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..optics.thin_lens import FOCUS, Lens, number_names
+from ..runtime.errors import OpticsError, SceneError
+from ..runtime.numbers import number, whole
+from ..runtime.toml_file import read_toml
+from .phantom import Phantom
+
+FILLED = 0.9  # of the film's side, by what the phantom covers of it in its widest view, blur included
+LEAST, MOST = 1e-6, 1e6  # magnifications among which the one that fills the film is searched for
+DIGITS = 3  # of the magnification that is found
+
+TEMPLATE = """<?xml version="1.0" encoding="utf-8"?>
+<!--
+The phantom {title} through a {focal_length:g} mm lens at f/{f_number:g}.
+
+Units     mm; exitance in W/mm^2, so a pixel holds W.
+World     z up, origin in the centre of the phantom's bounding box, which is {size} mm large; the camera
+          stands on the +x axis, +y is to the right of the picture.
+view      turns the phantom about the z axis by so many degrees, counterclockwise seen from above.
+Camera    magnification puts the virtual detector plane on the front of the phantom, which stands with its axis at
+          distance from the lens. With another magnification t give distance = focal_length (1 + 1/t) + {radius:.6g}.
+-->
+<scene version="3.0.0">
+{defaults}
+
+    <!-- Without it Embree loses rays that meet the edges of the mesh. -->
+    <boolean name="embree_use_robust_intersections" value="true"/>
+
+    <integrator type="fspt_integral">
+        <float name="rtol" value="$rtol"/>
+    </integrator>
+
+    <sensor type="fspt_lens" id="camera">
+        <float name="focal_length" value="$focal_length"/>
+        <float name="f_number" value="$f_number"/>
+        <float name="magnification" value="$magnification"/>
+        <float name="pixel_pitch" value="$pixel_pitch"/>
+{borders}        <transform name="to_world">
+            <lookat origin="$distance, 0, 0" target="0, 0, 0" up="0, 0, 1"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="$width"/>
+            <integer name="height" value="$height"/>
+            <string name="component_format" value="float32"/>
+            <string name="pixel_format" value="luminance"/>
+            <rfilter type="box"/>
+        </film>
+    </sensor>
+
+    <shape type="ply" id="phantom">
+        <string name="filename" value={filename}/>
+        <!-- The outward side is that of the flat face, at the rim too. -->
+        <boolean name="face_normals" value="true"/>
+        <transform name="to_world">
+            <translate x="{shift[0]!r}" y="{shift[1]!r}" z="{shift[2]!r}"/>
+            <rotate z="1" angle="$view"/>
+        </transform>
+        <emitter type="fspt_surface">
+            <!-- The PLY property exitance_x. -->
+            <texture type="mesh_attribute" name="exitance">
+                <string name="name" value="{per}_exitance"/>
+            </texture>
+        </emitter>
+    </shape>
+</scene>
+"""
+
+
+def scene_xml(
+    phantom: str | os.PathLike[str],
+    *,
+    focal_length: float = 50.0,
+    f_number: float = 1.8,
+    magnification: float | None = None,
+    distance: float | None = None,
+    pixel_pitch: float = 0.108,
+    width: int = 256,
+    height: int = 256,
+    rtol: float = 1e-3,
+    view: float = 0.0,
+    **lens: float | str,
+) -> str:
+    """Text of a scene file that shows a phantom, for `load` or to be saved; its `<default>`s have these values.
+
+        scene = fspt.load(fspt.scene_xml("phantom.ply", focal_length=50, f_number=1.8), view=90)
+
+    The lens is on the +x axis and looks at the centre of the phantom's bounding box, which is moved to the origin; up
+    is +z. It is focused on the front: on the vertical plane that touches the phantom in the view in which it is
+    nearest. Magnification and distance are such that in every view all of the phantom, its blur included, lies within
+    0.9 of the film's width and height, and fills that of one of them in the widest view.
+
+    Parameters
+    ----------
+    phantom : PLY file with J_n as property `exitance_x` of its vertices or of its faces, as `fspt flux` writes it
+    focal_length : F [mm]
+    f_number : f_num = F/D
+    magnification : t = v/u; None finds it
+    distance : from the lens to the axis about which the phantom turns [mm]; None finds it. Of a `magnification` or a
+        `distance` given alone the other one follows, so that the front is in focus.
+    pixel_pitch : side of a pixel [mm]
+    width, height : of the film [pixels]
+    rtol : error of the integral relative to the brightest pixel
+    view : turns the phantom counterclockwise about +z [degrees]
+    lens : further parameters of `fspt_lens` by name, such as lens_diameter [mm], and in place of the magnification
+        focus_distance or image_distance [mm]
+
+    Raises
+    ------
+    FluxError, ExitanceError : the file cannot be read, or has no exitance.
+    OpticsError : a lens that cannot exist.
+    SceneError : another value that cannot be used, or a camera that stands in the phantom.
+    """
+    path = Path(phantom)
+    if "$" in str(path.absolute()):
+        raise SceneError(f"scene: '{path}' has a $ in its path, which marks a parameter in a scene file. Rename it.")
+    numbers = _numbers(focal_length=focal_length, f_number=f_number, pixel_pitch=pixel_pitch, rtol=rtol, view=view)
+    film = {"width": _pixels("width", width), "height": _pixels("height", height)}
+    mesh = Phantom.read(path)
+    frame = Frame(Outline.of(mesh), focal_length, f_number, numbers["pixel_pitch"], film, lens)
+    found = dict(zip(("magnification", "distance"), frame.placed(magnification, distance), strict=True))
+    return _filled_in(path, mesh.per, frame, numbers | found | film)
+
+
+def _filled_in(path: Path, per: str, frame: Frame, values: dict[str, float]) -> str:
+    """The template with these values of its `<default>` parameters."""
+    order = ("f_number", "view", "rtol", "focal_length", "magnification", "distance", "width", "height", "pixel_pitch")
+    return TEMPLATE.format(
+        title=path.name.replace("--", "- -"),
+        focal_length=values["focal_length"],
+        f_number=values["f_number"],
+        size=" x ".join(f"{side:.4g}" for side in frame.outline.size),
+        radius=frame.outline.radius,
+        defaults="\n".join(f'    <default name="{name}" value="{values[name]:.10g}"/>' for name in order),
+        borders="".join(_property(name, value) for name, value in frame.lens.items() if name not in FOCUS),
+        filename=quoteattr(str(path.absolute())),
+        shift=tuple(-float(c) + 0.0 for c in frame.outline.centre),
+        per=per,
+    )
+
+
+def camera_lens(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Keywords of `scene_xml` from the table [lens] of a camera's TOML file; other tables are not read.
+
+    A key `name` is for people and left out.
+
+    Raises
+    ------
+    SceneError : the file cannot be read, has no table [lens], or a value there is neither number nor text.
+    """
+    content = read_toml(path, SceneError)
+    if not isinstance(content.get("lens"), dict):
+        raise SceneError(f"'{path}' has no table [lens]. Give it one, with focal_length [mm] and f_number.")
+    lens = {name: value for name, value in content["lens"].items() if name != "name"}
+    for name, value in lens.items():
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise SceneError(f"'{path}' [lens]: '{name}' must be a number or a text, got {value!r}. Correct it.")
+    return lens
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """What a phantom needs of the camera's field while it turns about the vertical axis of its bounding box.
+
+    centre, size : of the bounding box (3,) [mm]
+    radii, heights : of each vertex, its distance from that axis and from the middle plane (V,) [mm]
+    """
+
+    centre: NDArray[np.float64]
+    size: NDArray[np.float64]
+    radii: NDArray[np.float64]
+    heights: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, phantom: Phantom) -> Outline:
+        """Outline of a phantom."""
+        low, high = phantom.bounds
+        points = phantom.vertices[np.unique(phantom.faces)] - (low + high) / 2
+        return cls((low + high) / 2, high - low, np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2]))
+
+    @property
+    def radius(self) -> float:
+        """Largest distance of a vertex from the axis [mm]."""
+        return float(self.radii.max())
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Camera before a phantom: the lens without its focus, and the film.
+
+    focal_length : F [mm]; f_number; pixel_pitch [mm]; film : width and height [pixels]
+    lens : further parameters of `fspt_lens`
+    """
+
+    outline: Outline
+    focal_length: float
+    f_number: float
+    pixel_pitch: float
+    film: dict[str, int]
+    lens: dict[str, float | str]
+
+    def placed(self, magnification: float | None, distance: float | None) -> tuple[float, float]:
+        """Magnification and distance [mm] of the axis from the lens; see `scene_xml`."""
+        radius = self.outline.radius
+        magnification = self._focus(magnification)
+        if distance is not None:
+            distance = number("scene: 'distance'", distance, SceneError, "180")
+            nearest = radius if magnification else radius + self.focal_length
+            if not nearest < distance < math.inf:
+                raise SceneError(
+                    f"scene: 'distance' must be > {nearest:.6g} mm and finite, got {distance:g}: the phantom reaches "
+                    f"{radius:.6g} mm from its axis. Give a larger one, or leave it out."
+                )
+            return magnification or self.focal_length / (distance - radius - self.focal_length), distance
+        magnification = magnification or self._filling()
+        return magnification, self.focal_length * (1 + 1 / magnification) + radius
+
+    def _focus(self, magnification: float | None) -> float | None:
+        """The magnification that is given, by itself or as focus_distance or image_distance; None if none is.
+
+        Raises OpticsError for a lens that cannot exist.
+        """
+        known = number_names()
+        numbers = {name: value for name, value in self.lens.items() if name in known}
+        if magnification is not None:
+            numbers["magnification"] = magnification
+        focused = any(name in numbers for name in FOCUS)
+        model = str(self.lens.get("model", "diaphragm"))
+        start = {} if focused else {"magnification": 1.0}
+        found = Lens.focused(self.focal_length, self.f_number, model=model, **numbers, **start)  # type: ignore[arg-type]
+        return found.magnification if focused else None
+
+    def _filling(self) -> float:
+        """Magnification at which the phantom fills the film, rounded down."""
+        low, high = LEAST, MOST
+        if not self._filled(low) < FILLED < self._filled(high):
+            raise OpticsError(
+                f"scene: no magnification from {LEAST:g} to {MOST:g} fills the film of {self.film['width']} x "
+                f"{self.film['height']} pixels of {self.pixel_pitch:g} mm with a phantom of radius "
+                f"{self.outline.radius:.3g} mm. Check the units, or give 'magnification'."
+            )
+        while high / low > 1 + 1e-9:
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if self._filled(middle) < FILLED else (low, middle)
+        step = 10.0 ** (math.floor(math.log10(low)) - DIGITS + 1)
+        return float(f"{math.floor(low / step) * step:.{DIGITS}g}")
+
+    def _filled(self, magnification: float) -> float:
+        """Share of the film's width or height, whichever is larger, that the phantom covers in its widest view.
+
+        A silhouette at the depth z and the angle α to the optical axis reaches v (tan α + R (1/u - 1/z)) on the
+        detector, with the pupil's radius R.
+        """
+        u, v = self.focal_length * (1 + 1 / magnification), self.focal_length * (1 + magnification)
+        pupil = self.focal_length / self.f_number / 2
+        axis, radius = u + self.outline.radius, self.outline.radius
+        across = radius / math.sqrt(axis**2 - radius**2) + pupil * (1 / u - 1 / axis)
+        depths = axis - self.outline.radii
+        up = float((self.outline.heights / depths + pupil * (1 / u - 1 / depths)).max())
+        half = {name: pixels * self.pixel_pitch / 2 for name, pixels in self.film.items()}
+        return v * max(across / half["width"], up / half["height"])
+
+
+def _pixels(name: str, value: int) -> int:
+    """A side of the film [pixels]; SceneError unless it is a whole number >= 1."""
+    found = whole(f"scene: '{name}'", value, SceneError, "256")
+    if found < 1:
+        raise SceneError(f"scene: '{name}' must be >= 1 pixel, got {found}. Give for example 256.")
+    return found
+
+
+def _numbers(**given: float) -> dict[str, float]:
+    """The values as floats; SceneError for one that is none, or not finite, and for a pitch that is not > 0."""
+    examples = {"focal_length": "50", "f_number": "1.8", "pixel_pitch": "0.108", "rtol": "1e-3", "view": "90"}
+    found = {name: number(f"scene: '{name}'", value, SceneError, examples[name]) for name, value in given.items()}
+    for name, value in found.items():
+        if not math.isfinite(value) or (name == "pixel_pitch" and value <= 0):
+            rule = "> 0 mm and finite" if name == "pixel_pitch" else "finite"
+            raise SceneError(f"scene: '{name}' must be {rule}, got {value:g}. Give for example {examples[name]}.")
+    return found
+
+
+def _property(name: str, value: float | str) -> str:
+    """Line of a parameter of the lens."""
+    tag = "string" if isinstance(value, str) else "float"
+    return f"        <{tag} name={quoteattr(name)} value={quoteattr(str(value))}/>\n"
