@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from ..images.image import required_source_power
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import read_text, read_xml
 from ..runtime.atomic_files import require_apart
@@ -86,7 +85,7 @@ def render(
     shots = _shots(scene, output, definitions(define), {name: v for name, v in framing.items() if v is not None})
     _check_outputs(shots, [scene, camera] if camera else [scene], png)
     if source_power is not None:
-        required_source_power(source_power)
+        _require_source_power(source_power)
     images: list[Image] = []
     with _kept(shots, images), progress_bar() as progress:
         from ..rendering.render import render
@@ -104,6 +103,13 @@ def render(
             images.append(image)
     for shot, image in zip(shots, images, strict=True):
         _print_summary(image, shot.output, _picture(shot, png))
+
+
+def _require_source_power(watts: float) -> None:
+    """Raise ImageError, before the work, for a source power that no image can be scaled by."""
+    from ..images.image import required_source_power
+
+    required_source_power(watts)
 
 
 def _shots(scene: Path, output: Path | None, parameters: dict[str, str], framing: dict[str, Any]) -> list[Shot]:

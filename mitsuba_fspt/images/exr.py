@@ -108,8 +108,9 @@ def _attribute(key: str, value: object) -> str | int | NDArray[np.float64]:
 def _float32(name: str, values: NDArray) -> NDArray[np.float32]:
     """`values` as contiguous float32; ImageError if one is not finite or too large."""
     limit = float(np.finfo(np.float32).max)
-    unfit = ~(np.abs(values) <= limit)  # true for NaN too
-    if unfit.any():
+    # Whole planes of temporaries only on failure: a large picture hardly fits. NaN is neither larger nor smaller.
+    if not (values.min() >= -limit and values.max() <= limit):
+        unfit = ~(np.abs(values) <= limit)
         row, column = np.argwhere(unfit)[0]
         raise ImageError(
             f"image channel '{name}' is {values[row, column]:g} at row {row}, column {column}; the file "

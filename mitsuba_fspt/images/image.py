@@ -92,7 +92,7 @@ class Image:
         ------
         ImageError : the suffix is not .exr, a value does not fit into float32, or the file cannot be written.
         """
-        peak = np.abs(self.power).max()
+        peak = max(self.power.max(), -self.power.min())
         if 0 < peak < np.finfo(np.float32).tiny:
             raise ImageError(
                 f"image: the brightest pixel has {peak:g} W, below what the file can hold (1.2e-38 W). "

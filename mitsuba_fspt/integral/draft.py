@@ -39,10 +39,14 @@ class Draft:
     shown : False on the rim, True everywhere where there is none
     clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
     open, known : False where the value is known from elsewhere, and that value
+    least_peak : lower bound of the brightest pixel, of a picture that this one is a tile of [W/mm²/sr]
     """
 
-    def __init__(self, view: View, window: Window, quadrature: Quadrature, known: Solution | None) -> None:
+    def __init__(
+        self, view: View, window: Window, quadrature: Quadrature, known: Solution | None, least_peak: float = 0.0
+    ) -> None:
         self.view, self.lens, self.window, self.quadrature = view, view.lens, window, quadrature
+        self.least_peak = least_peak
         self.area = quadrature.pixel == "area"
         self.grid = grid = Grid(window.shape)
         self.value, self.error, self.coverage, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
@@ -63,12 +67,16 @@ class Draft:
 
     @property
     def peak(self) -> PixelArray:
-        """The largest value that is shown [W/mm²/sr], of all if those are dark, one lane."""
+        """The largest value that is shown [W/mm²/sr], of all if those are dark, one lane; at least `least_peak`."""
         most = dr.max(self.value)
-        if len(self.shown) == 1:
-            return most
-        shown = dr.max(dr.select(self.shown, self.value, 0))
-        return dr.select(shown > 0, shown, most)
+        if len(self.shown) > 1:
+            shown = dr.max(dr.select(self.shown, self.value, 0))
+            most = dr.select(shown > 0, shown, most)
+        return self.at_least_peak(most)
+
+    def at_least_peak(self, value: PixelArray) -> PixelArray:
+        """`value`, or `least_peak` if that is larger."""
+        return dr.maximum(value, dr.opaque(mi.Float64, self.least_peak)) if self.least_peak else value
 
     @property
     def tolerance(self) -> PixelArray:

@@ -52,20 +52,21 @@ class NarrowLight:
     in_focus: PixelArray
 
 
-def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
-    """What `lens` sees of the light of narrow spots; nothing where no emitter is an `fspt_surface`."""
-    on_pixels = np.zeros(window.shape)
+def points_on_surfaces(scene: mi.Scene, lens: mi.Sensor) -> Points | None:
+    """Points all over the surfaces as `lens` sees them; None where no emitter is an `fspt_surface`."""
     parts = [_seen(scene, emitter, lens) for emitter in scene.emitters() if is_surface(emitter)]
-    if not parts or not on_pixels.size:
+    return Points.joined(parts) if parts else None
+
+
+def narrow_light(points: Points | None, window: Window) -> NarrowLight:
+    """Of the light of points all over the surfaces, that of narrow spots; nothing without points."""
+    on_pixels = np.zeros(window.shape)
+    if points is None or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0, on_pixels)
-    points = _Points.joined(parts).on(window)
-    points = points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
+    points = points.seen_in(window)
     if not (points.radiance > 0).any():
         return NarrowLight(on_pixels, 0.0, on_pixels)
-    # A blur disc spreads a point's light over so many pixels; discs that overlap add up. More than all of a disc does
-    # not come from an element, however wide.
-    light = points.radiance * np.minimum(points.area / (math.pi * points.blur**2 + 1), 1)
-    level = np.round(np.log2(np.maximum(points.blur, 1)))
+    light, level = points.light(), points.level()
     shown = points.shown_in(window)
     if not (light[shown] > 0).any():
         shown[:] = True
@@ -82,8 +83,26 @@ def narrow_light(scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLigh
     return NarrowLight(on_pixels, float(brightest), points.on_pixels(light, window.shape))
 
 
+def peak_of_points(points: Points | None, window: Window) -> float:
+    """Lower bound of the brightest pixel that is shown [W/mm²/sr], from points on surfaces; 0 without points.
+
+    As `NarrowLight.brightest`, less the factor of two, for windows of any size.
+    """
+    if points is None:
+        return 0.0
+    points = points.seen_in(window)
+    points = points[points.shown_in(window)]
+    light, level, brightest = points.light(), points.level(), 0.0
+    for k in np.unique(level):
+        here = level == k
+        column, row = (np.floor(c[here] / 2**k).astype(np.int64) for c in (points.x, points.y))
+        cell = np.unique(row * (1 << 32) + column, return_inverse=True)[1]
+        brightest = max(brightest, np.bincount(cell, light[here]).max())
+    return float(brightest) / 2
+
+
 @dataclass(frozen=True)
-class _Points:
+class Points:
     """Points all over surfaces, columns (n,).
 
     radiance : to the lens; 0 where a point has no image, or another body hides it
@@ -103,17 +122,30 @@ class _Points:
     y: Column
 
     @classmethod
-    def joined(cls, parts: list[_Points]) -> _Points:
+    def joined(cls, parts: list[Points]) -> Points:
         """All of them."""
         return cls(*(np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)))
 
-    def __getitem__(self, which: NDArray[np.bool_]) -> _Points:
-        return _Points(*(column[which] for column in vars(self).values()))
+    def __getitem__(self, which: NDArray[np.bool_]) -> Points:
+        return Points(*(column[which] for column in vars(self).values()))
 
-    def on(self, window: Window) -> _Points:
-        """Places counted from the corner of a window."""
+    def seen_in(self, window: Window) -> Points:
+        """Those that shine into a window, with places counted from its corner."""
         left, top = window.corner
-        return replace(self, x=self.x - left, y=self.y - top)
+        points = replace(self, x=self.x - left, y=self.y - top)
+        return points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
+
+    def light(self) -> Column:
+        """Radiance on film [W/mm²/sr] that each gives to a pixel, by itself.
+
+        A blur disc spreads a point's light over so many pixels; discs that overlap add up. More than all of a disc does
+        not come from an element, however wide.
+        """
+        return self.radiance * np.minimum(self.area / (math.pi * self.blur**2 + 1), 1)
+
+    def level(self) -> Column:
+        """Of each blur disc larger than a pixel the logarithm of its radius, rounded."""
+        return np.round(np.log2(np.maximum(self.blur, 1)))
 
     def near(self, far: float | Column, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """True less than `far` from a picture of this shape."""
@@ -141,7 +173,7 @@ class _Points:
         return _Cells((int(row.max()) + 1, width), row * width + column)
 
 
-def _hidden(points: _Points, side: float) -> NDArray[np.bool_]:
+def _hidden(points: Points, side: float) -> NDArray[np.bool_]:
     """True of points that outshine the squares of a `side` [pixels] around, and are not the limb of a wide body.
 
     Beyond the limb lies what only a part of the pupil sees, beside what its middle does.
@@ -173,7 +205,7 @@ class _Cells:
         return np.bincount(self.number, weight, minlength=math.prod(self.shape)).reshape(self.shape)
 
 
-def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) -> PixelArray:
+def _spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) -> PixelArray:
     """Sums of `light` within `reach` pixels of each pixel of the window, (h, w)."""
     height, width = shape
     reach = min(reach, height + width)
@@ -185,7 +217,7 @@ def _spread(light: Column, points: _Points, reach: int, shape: tuple[int, int]) 
     return grid.array(grid.box_sum(grid.flat(sums), reach))[reach : reach + height, reach : reach + width]
 
 
-def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
+def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> Points:
     """Points all over a surface as the lens sees them."""
     shape = emitter.get_shape()
     texels = texels_of(emitter.exitance)
@@ -210,13 +242,13 @@ def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> _Points:
     radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
     # What is half as thick as a unit covers half of some square by itself.
     apart = np.repeat(np.where(area < unit**2 * reach, reach / counts, np.inf), counts)
-    return _Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
+    return Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
 
 
 @dataclass
 class _Look:
     """At points of elements: `radiance` to where the lens sees most of them, area of the element's `image` from there
-    [pixels²]; cosine, front, blur and `centre` on film as in `_Points`; `place` in the world.
+    [pixels²]; cosine, front, blur and `centre` on film as in `Points`; `place` in the world.
     """
 
     radiance: mi.Float

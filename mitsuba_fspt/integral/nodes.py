@@ -102,7 +102,7 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
 
 def _dark(draft: Draft) -> Mask:
     """True while no line of sight of any pixel has met light, one lane: what glows is on the film, or may be."""
-    return ~dr.any(draft.value > 0)
+    return mi.Bool(False) if draft.least_peak else ~dr.any(draft.value > 0)
 
 
 def _passed_by(draft: Draft, light: PixelArray) -> Mask:

@@ -9,6 +9,7 @@ by one, so that only the variation along the edge is left to sample. Each line o
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -31,15 +32,25 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+FEW = 1 << 18  # pixels, all over a picture, of which the brightest tells how bright a picture is at least
+MARGIN = 0.9  # so much of what twelve nodes find there counts, which may be wrong
+
+
 def solve(
-    view: View, window: Window, quadrature: Quadrature, light: NDArray[np.float64], known: Solution | None = None
+    view: View,
+    window: Window,
+    quadrature: Quadrature,
+    light: NDArray[np.float64],
+    known: Solution | None = None,
+    least_peak: float = 0.0,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
     Only pixels of the `window` are computed, the others are dark. `light`: of surfaces as if in focus, see
-    `NarrowLight`. Pixels on which a partial solution is `known` are not refined.
+    `NarrowLight`. Pixels on which a partial solution is `known` are not refined. `least_peak`: lower bound of the
+    brightest pixel's mean radiance on film [W/mm²/sr].
     """
-    draft = Draft(view, window, quadrature, known)
+    draft = Draft(view, window, quadrature, known, least_peak)
     rough = first_nodes(draft, light)
     levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
     if quadrature.max_nodes >= BOTH:
@@ -49,6 +60,16 @@ def solve(
     elif dr.any(rough):
         integrate_by_transects(draft, rough, levels)
     return draft.solution()
+
+
+def peak_of_few(view: View, window: Window, quadrature: Quadrature) -> float:
+    """Lower bound of the brightest pixel's mean radiance on film [W/mm²/sr], from pixels on a coarse lattice."""
+    height, width = window.shape
+    step = math.ceil(math.sqrt(height * width / FEW))
+    y, x = (np.arange(step // 2, side, step, dtype=np.uint32) for side in window.shape)
+    centres = window.centres(mi.UInt32((y[:, None] * np.uint32(width) + x).ravel()))
+    seen = apply_rule(view, centres, node_rules.twelve(quadrature.pixel == "area"))
+    return MARGIN * float(dr.max(seen.value)[0])
 
 
 def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:

@@ -265,7 +265,7 @@ def _transect_sums(
     area = dr.opaque(mi.Float, float(draft.area))
     place = dr.select(sharp, even, gauss)
     curve = transect(draft.window.centres(pixel), angle, blur, place, area)
-    outline, least = mi.Float(2 * dr.max(draft.value)), mi.Float(LEAST_JUMP * draft.tolerance)
+    outline, least = mi.Float(2 * draft.at_least_peak(dr.max(draft.value))), mi.Float(LEAST_JUMP * draft.tolerance)
     found = integrate_transect(draft.view, curve, phase, along, outline, least)
     value, coverage, jumps, depth, looks = (mi.Float64(column) for column in found)
     share = mi.Float64(weight) * value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -46,9 +46,30 @@ class Window:
         return self._common()[0]
 
     @property
+    def rim(self) -> int:
+        """Pixels around the crop window, or around a tile of it, that are searched for silhouettes."""
+        return 1 + math.ceil(min(GAP[4] * self.blur, MOST_RIM - 1))
+
+    @property
     def count(self) -> int:
         """Pixels of the crop window in this one."""
         return math.prod(side.stop - side.start for side in self.inner)
+
+    def around(self, rows: range, columns: range, reach: int) -> Window:
+        """This window's part within `reach` pixels of these rows and columns of the crop window."""
+        ends = [
+            (max(start, side.start - reach), min(start + size, side.stop + reach))
+            for start, size, side in zip((self.top, self.left), self.shape, (rows, columns), strict=True)
+        ]
+        (top, bottom), (left, right) = ends
+        return replace(self, top=top, left=left, shape=(bottom - top, right - left))
+
+    def tile(self, rows: range, columns: range) -> Window:
+        """These rows and columns of the crop window with a rim, as the window of a picture of them alone."""
+        near = self.around(rows, columns, self.rim)
+        offset = self.crop_offset[0] + columns.start, self.crop_offset[1] + rows.start
+        top, left = near.top - rows.start, near.left - columns.start
+        return replace(near, top=top, left=left, full=(len(rows), len(columns)), crop_offset=offset)
 
     def centres(self, number: mi.UInt32) -> mi.Point2f:
         """Film positions [pixels] of the centres of the window's pixels of so much `number`, row by row."""
@@ -130,15 +151,15 @@ def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False) -> Window
         low, high = np.full(2, -np.inf), np.full(2, np.inf)
     middle, radius = 0.5 * np.array(film.size(), np.float64), lens.optics.seen_field / lens.virtual_pitch
     low, high = np.maximum(low, middle - radius), np.minimum(high, middle + radius)
-    rim = 1 + math.ceil(min(GAP[4] * blur, MOST_RIM - 1))
+    crop = Window(0, 0, (height, width), (height, width), offset, float(blur))
     # One pixel more than needed on each side keeps second differences and rounding inside.
     (left, right), (top, bottom) = (
         (
-            int(np.clip(np.floor(low[k]) - offset[k] - 1, -rim, size + rim)),
-            int(np.clip(np.ceil(high[k]) - offset[k] + 1, -rim, size + rim)),
+            int(np.clip(np.floor(low[k]) - offset[k] - 1, -crop.rim, size + crop.rim)),
+            int(np.clip(np.ceil(high[k]) - offset[k] + 1, -crop.rim, size + crop.rim)),
         )
         for k, size in enumerate((width, height))
     )
     if left >= width or top >= height or right <= 0 or bottom <= 0:  # only the rim sees it
         right, bottom = left, top
-    return Window(top, left, (max(0, bottom - top), max(0, right - left)), (height, width), offset, float(blur))
+    return replace(crop, top=top, left=left, shape=(max(0, bottom - top), max(0, right - left)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -15,14 +16,14 @@ from numpy.typing import NDArray
 from ..emission.face_table import FaceTable, edition_of, mark_of
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
-from ..integral.narrow import NarrowLight, narrow_light
+from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
 from ..integral.quadrature import Quadrature
 from ..integral.scene_checks import check_scene, check_surfaces_alone
 from ..integral.shortcuts import SHORTCUTS, Finding
 from ..integral.solution import Solution
+from ..integral.tiles import Mosaic
 from ..integral.window import Window, glowing_boxes, window_of
 from ..jit.mesh_buffers import buffers
-from ..jit.pixel_grid import Grid
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
 from ..runtime.errors import SceneError, named
@@ -73,45 +74,85 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
         self._window, self._narrow, self._faces = CachedValue(), CachedValue(), CachedValue()
 
-    def solve(self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None) -> Solution:
+    def solve(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        quadrature: Quadrature | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> Solution:
         """Power, error and coverage of the sensor's crop window, by `quadrature` or the integrator's own.
+
+        A large film is solved in tiles; `progress` is called with the share done before each.
 
         Raises
         ------
-        SceneError, ExitanceError : as in `check_scene`, or the scene has an environment emitter.
+        SceneError, ExitanceError : as in `check_scene`, or the scene has an environment emitter, or the memory does not
+            suffice for the film.
         """
         quadrature = quadrature or self.quadrature
         check_scene(scene, sensor)
         check_surfaces_alone(scene)
         with recording(), dr.suspend_grad():
-            traced = self._traced(scene, sensor)
             window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
-            solution = self._solve_in(window, traced, sensor, quadrature)
-        error = solution.error
-        if sensor.rounding >= LEAST_DISPLACEMENT and 0 not in window.shape:  # smaller displacements are random
-            error = error + window.expand(_displacement_error(window.cut(solution.power), sensor.rounding))
-        return replace(solution, error=error, findings=(_outside(window), *solution.findings))
+            mosaic = Mosaic(window)
+            if mosaic.tiles:
+                self._fill(mosaic, self._traced(scene, sensor), sensor, quadrature, progress)
+            # Smaller displacements are random.
+            rounding = sensor.rounding if sensor.rounding >= LEAST_DISPLACEMENT else 0.0
+            solution = mosaic.solution(quadrature.least_error, rounding)
+        return replace(solution, findings=(_outside(window), *solution.findings))
 
-    def _solve_in(self, window: Window, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature) -> Solution:
-        """Solution by the requested form of Eq. 9; pixels with light of narrow spots always take the surface form."""
-        if 0 in window.shape:
-            return Solution(*np.zeros((3, *window.full)), rays=0)
+    def _fill(
+        self,
+        mosaic: Mosaic,
+        scene: mi.Scene,
+        lens: mi.Sensor,
+        quadrature: Quadrature,
+        progress: Callable[[float], None] | None,
+    ) -> None:
+        """Solve all tiles; several ones share the tolerance that follows from a lower bound of the brightest pixel."""
+        tiles, window = mosaic.tiles, mosaic.window
         view = View.of(scene, lens, window, self._faces_of(scene) if quadrature.takes("record") else None)
+        least_peak, points = 0.0, None
+        if len(tiles) > 1:
+            points = points_on_surfaces(scene, lens)
+            least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points, window))
+        for k, tile in enumerate(tiles):
+            if progress:
+                progress(k / len(tiles))
+            narrow = partial(narrow_light, points, tile) if points else partial(self._narrow_light, scene, lens, tile)
+            mosaic.put(tile, self._solve_tile(tile, view, quadrature, narrow, least_peak))
+
+    def _solve_tile(
+        self,
+        window: Window,
+        view: View,
+        quadrature: Quadrature,
+        narrow_light: Callable[[], NarrowLight],
+        least_peak: float,
+    ) -> Solution:
+        """Solution by the requested form of Eq. 9; pixels with light of narrow spots always take the surface form.
+
+        least_peak : lower bound of the brightest pixel of all tiles [W/mm²/sr]
+        """
+        scene, lens = view.scene, view.lens
         # The surface form ignores the border of the image-plane stop: pixels that it cuts take lines of sight.
         inside, cut = window.field_stop(lens)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
-            return surface_form.solve(scene, lens, window, quadrature)
-        narrow = self._narrow_light(scene, lens, window)
-        where, least_peak = inside, 0.0
+            return surface_form.solve(scene, lens, window, quadrature, least_peak=least_peak)
+        narrow = narrow_light()
+        where, peak = inside, least_peak
         if not everywhere:
-            where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * narrow.brightest)
-            least_peak = narrow.brightest / 2
+            where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
+            peak = max(narrow.brightest / 2, least_peak)
         if where.any():
-            known = surface_form.solve(scene, lens, window, quadrature, where, least_peak)
-            solution = known.completed_by(pupil_form.solve(view, window, quadrature, narrow.in_focus, known))
+            known = surface_form.solve(scene, lens, window, quadrature, where, peak)
+            rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak)
+            solution = known.completed_by(rest)
         else:
-            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus)
+            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, least_peak=least_peak)
         return replace(solution, error=np.maximum(solution.error, _missed(narrow, where, cut, window, lens, solution)))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
@@ -140,7 +181,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         emitters = scene.emitters()
         editions = [(mark_of(emitter), getattr(emitter, "edition", 0)) for emitter in emitters]
         state = (editions, glowing_boxes(scene), _poses(scene.shapes()), _view(lens), window)
-        return self._narrow.recall(state, lambda: narrow_light(scene, lens, window))
+        return self._narrow.recall(state, lambda: narrow_light(points_on_surfaces(scene, lens), window))
 
     def render(
         self,
@@ -234,13 +275,6 @@ def _missed(
     light = np.where(where, 0, UNCERTAINTY * narrow.on_pixels)
     bright = window.expand(np.where(cut, light, 0)) * lens.etendue - of.power
     return np.maximum(bright, window.expand(np.where(cut, 0, light)) * lens.etendue)
-
-
-def _displacement_error(power: NDArray[np.float64], rounding: float) -> NDArray[np.float64]:
-    """Change of the power [W], shape (h, w), if float32 displaces lines of sight by `rounding` [pixels]."""
-    grid = Grid(power.shape)
-    x, y = grid.gradient(grid.flat(power))
-    return rounding * grid.array(grid.spread_max(dr.sqrt(x * x + y * y)))
 
 
 def _outside(window: Window) -> Finding:

@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
@@ -106,10 +107,9 @@ def _integrate(
     """Power, error [W] and coverage, shape (h, w), by the deterministic integral, and metadata."""
     own = asdict(integrator.quadrature)
     wanted = own | {name: value for name, value in accuracy.items() if value is not None}
-    progress("integrating", 0.0)
     with named("fspt_integral"):
         quadrature = Quadrature(**wanted)
-    solution = integrator.solve(scene, lens, quadrature)
+    solution = integrator.solve(scene, lens, quadrature, partial(progress, "integrating"))
     how = {"method": "integral", **asdict(quadrature), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
     how["shortcuts_off"] = ", ".join(sorted(quadrature.shortcuts_off)) or "nothing"
     how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
