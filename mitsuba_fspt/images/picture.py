@@ -125,21 +125,20 @@ def draw_panels(
 
     Raises
     ------
-    ImageError : limits that are no range or given with `per_panel`, or an outline of an image without coverage.
+    ImageError : no images, limits that are no range or given with `per_panel`, an outline without coverage.
     BackendError : matplotlib is not installed.
     """
+    if not images:
+        raise ImageError("picture: no images to draw. Give one or more.")
     if per_panel and limits is not None:
         raise ImageError("picture: one range for all panels and a scale for each exclude each other. Leave one out.")
     scales = [ColourScale.over([image.power], log=log) for image in images]
     if not per_panel:
         scales = [ColourScale.over([image.power for image in images], log=log, limits=limits)] * len(images)
-    columns = min(len(images), COLUMNS)
-    rows = -(-len(images) // columns)
-    width = 6.0 if columns == 1 else 1.0 + (4.2 if per_panel else 3.4) * columns
-    height = 4.4 if columns == 1 else 3.0
-    figure = empty_figure(width, 1.0 + rows * (0.5 + height * max(map(_aspect, images))))
-    grid = figure.subplots(rows, columns, squeeze=False)
+    figure, grid = _panel_grid(images, wide=per_panel)
+    rows, columns = grid.shape
     common = len(images) > 1 and len(set(map(caption, images))) == 1
+    alike = len({_extent(image) for image in images}) == 1  # one row of axis labels will do
     own_bar = per_panel or len(images) == 1
     for place, axes in enumerate(grid.flat):
         if place >= len(images):
@@ -147,21 +146,29 @@ def draw_panels(
             continue
         image, name = images[place], names[place] if names else ""
         draw_image(axes, image, scales[place], outline=outline, bar=own_bar)
-        lines = [*textwrap.wrap(title(image, name), 44)] + ([] if common else [caption(image)])
+        lines = [*textwrap.wrap(name, 44), title(image)] if len(images) > 1 else [title(image, name)]
+        lines += [] if common else [caption(image)]
         axes.set_title("\n".join(filter(None, lines)), fontsize="medium" if columns == 1 else "small")
-        axes.label_outer()
+        if alike and place % columns:
+            axes.set(ylabel="", yticklabels=[])
+        if alike and place + columns < len(images):
+            axes.set(xlabel="", xticklabels=[])
     figure.suptitle(caption(images[0]) if common else "", fontsize="medium")
     if not own_bar:
         shown = grid.flat[0].get_images()[0]
-        figure.colorbar(
-            shown,
-            ax=grid,
-            label=scales[0].label,
-            shrink=0.9 if rows == 1 else min(1.0, 2 / rows),
-            aspect=25,
-            extend=_extend(images, scales[0]),
-        )
+        ends, shrink = _extend(images, scales[0]), 0.9 if rows == 1 else min(1.0, 2 / rows)
+        figure.colorbar(shown, ax=grid, label=scales[0].label, shrink=shrink, aspect=25, extend=ends)
     return figure
+
+
+def _panel_grid(images: Sequence[Image], wide: bool) -> tuple[Figure, NDArray[np.object_]]:
+    """Empty figure and its axes, shape (rows, columns), with room for all images; `wide`: for a colour bar each too."""
+    columns = len(images) if len(images) < COLUMNS else min(COLUMNS, math.ceil(len(images) ** 0.5))
+    rows = -(-len(images) // columns)
+    width = 6.0 if columns == 1 else 1.0 + (4.2 if wide else 3.4) * columns
+    height = 4.4 if columns == 1 else 3.0
+    figure = empty_figure(width, 1.0 + rows * (0.5 + height * max(map(_aspect, images))))
+    return figure, figure.subplots(rows, columns, squeeze=False)
 
 
 def draw_image(axes: Axes, image: Image, scale: ColourScale, *, outline: bool = False, bar: bool = True) -> None:

@@ -109,6 +109,7 @@ class _Differences:
     excess : max(|difference| − bound, 0) [W]
     error : standard error s of the difference [W]
     freedom : its degrees of freedom, Welch's; infinite where s counts as known
+    missed : standard deviation [W] beside s, of light that no sample met
     tested : pixels with light in either image and s > 0. Without light in both there is nothing to test, and the error
         of the Monte Carlo is that of a sample that could have been.
     """
@@ -136,7 +137,7 @@ class _Differences:
         self.missed = self._missed(calculated, standard)
 
     def _missed(self, calculated: Image, standard: Image) -> Plane:
-        """Variance [W²] that the passes cannot show, where the Monte Carlo is darker than a deterministic image.
+        """Standard deviation [W] that the passes cannot show, where Monte Carlo is darker than a deterministic image.
 
         If light arrives in events of power w, the passes of a pixel that missed some of them give w P in place of w
         (P + d), d the difference; w = s²/P, the largest in the 3 × 3 neighbourhood.
@@ -150,11 +151,11 @@ class _Differences:
         padded = np.pad(event, 1)
         largest = np.max([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
         darker = self.difference < 0 if sampled[0] is calculated else self.difference > 0
-        return np.where(darker, largest * self.excess, 0)
+        return np.where(darker, np.sqrt(largest) * np.sqrt(self.excess), 0)
 
     def signed_z(self) -> Plane:
         """z of the excess with the sign of the difference; NaN where not tested."""
-        error = np.sqrt(np.square(self.error) + self.missed)
+        error = np.hypot(self.error, self.missed)
         return np.where(self.tested, np.copysign(self.normal(self.excess, error), self.difference), np.nan)
 
     def normal(self, excess: Plane, error: Plane) -> Plane:

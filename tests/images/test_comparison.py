@@ -214,6 +214,22 @@ def test_two_integrals_have_bounds_alone():
     assert "beyond 1   pixels that differ by more than both integrals' errors together" in found.render_text()
 
 
+@pytest.mark.parametrize("scale", [1e-200, 1e200])
+def test_the_test_does_not_depend_on_the_scale_of_both(scale):
+    """Seen to fail (z = 0) with squares of the errors, which underflow."""
+    rng = np.random.default_rng(2)
+    image = sampled(rng, 16)
+    exact = Image(TRUTH, np.full(TRUTH.shape, 0.01), metadata=INTEGRAL)
+
+    def z_test(factor):
+        scaled = (replace(one, power=one.power * factor, error=one.error * factor) for one in (exact, image))
+        return compare(*scaled).z_test
+
+    one, other = z_test(1.0), z_test(scale)
+    for name in ("max_z", "chi2", "p_value", "detectable"):
+        assert getattr(other, name) == pytest.approx(getattr(one, name), rel=1e-9)
+
+
 def test_events_that_no_sample_met():
     """Rationale: of Poisson events the passes of a pixel that missed most of them show too small a variance.
 

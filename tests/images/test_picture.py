@@ -121,6 +121,16 @@ def test_panels_share_a_scale_or_have_their_own():
     assert shared.get_suptitle() == caption(images[0])  # one camera for all
 
 
+def test_axis_labels_stand_at_the_outer_panels_where_all_are_alike():
+    """Five panels in rows of three: the third has none below it. Seen to fail with the last row alone labelled."""
+    alike = panels(draw_panels([spot(**LENS)] * 5, list("abcde")))
+    assert [axes.get_xlabel() != "" for axes in alike] == [False, False, True, True, True]
+    assert [axes.get_ylabel() != "" for axes in alike] == [True, False, False, True, False]
+    assert [axes.get_title() for axes in alike] == [f"{name}\ntotal 2.5e-10 W" for name in "abcde"]
+    other = panels(draw_panels([spot(**LENS), spot(**LENS | {"magnification": 1.0})]))
+    assert all(axes.get_xlabel() and axes.get_ylabel() for axes in other)
+
+
 def test_a_dim_view_beside_a_bright_one_makes_the_scale_logarithmic():
     """70 times dimmer is black on a linear scale. The colour bar says log; three decades below the dim one are shown.
 
@@ -161,6 +171,11 @@ def test_a_given_range(limits, log, found):
 def test_panels_that_cannot_be_drawn(options, message):
     with pytest.raises(ImageError, match=message):
         draw_panels([spot()], **options)
+
+
+def test_no_panels():
+    with pytest.raises(ImageError, match="no images to draw"):
+        draw_panels([])
 
 
 def test_outline_is_where_half_of_the_lines_of_sight_meet_the_phantom():
