@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..runtime.errors import ImageError
 from .exr import Metadata, read_exr, write_exr
@@ -60,6 +60,10 @@ class Image:
     def shape(self) -> tuple[int, int]:
         """Height and width (h, w) [pixels]."""
         return self.power.shape
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
+        """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
+        return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y` (float32), metadata under `fspt:`.
