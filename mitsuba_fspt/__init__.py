@@ -22,6 +22,16 @@ def _register_plugins() -> None:
     plugins.register()
 
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    """A public name, imported on first use, or the version of the installed package."""
+    if name != "__version__":
+        return _public(name)
+    from importlib.metadata import version
+
+    return version("mitsuba-fspt")
+
 
 _backend.prepare(_register_plugins)

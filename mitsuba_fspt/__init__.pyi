@@ -14,3 +14,5 @@ from .studies.converge import converge as converge
 from .studies.convergence import Convergence as Convergence
 from .studies.explain import explain as explain
 from .studies.sweep import sweep as sweep
+
+__version__: str

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import mitsuba_fspt as fspt
@@ -205,6 +208,17 @@ def test_the_public_list_is_this():
         thing = getattr(fspt, name)
         assert callable(thing)
         assert thing.__doc__
+
+
+def test_the_package_shows_its_public_names_and_its_version():
+    """The version without any of Mitsuba, and an unknown name as an AttributeError."""
+    assert sorted(dir(fspt)) == PUBLIC
+    assert fspt.__version__ == version("mitsuba-fspt")
+    assert not hasattr(fspt, "colour")
+    program = (
+        "import sys, mitsuba_fspt as f; f.__version__; sys.exit('mitsuba' in sys.modules or 'numpy' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], cwd=PACKAGE.parent, check=False).returncode == 0
 
 
 def test_every_error_is_ours_and_an_error_of_values():

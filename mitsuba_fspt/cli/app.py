@@ -26,6 +26,7 @@ app = typer.Typer(
     help="Calibrated CCD images of glowing phantoms, in watts per pixel.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
 for verb in (render, plot, compare, expose, doctor, stability, explain, sweep, converge):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..phantom.phantom import Phantom
     from ..tissue.fluence_volume import Volume
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 
 @app.callback()
@@ -51,8 +51,9 @@ def import_(
     per: Annotated[Per | None, typer.Option(help="What the values stand on, where that is open.")] = None,
     format: Annotated[str, typer.Option(help="auto, mmc, nirfast, meshio, trimesh, ply, obj, off or npz.")] = "auto",
     length_unit: Annotated[
-        LengthUnit, typer.Option(help="Of the mesh; the values are W per square of it.")
-    ] = LengthUnit.mm,
+        LengthUnit | None,
+        typer.Option(help="Of the mesh; the values are W per square of it. Left out: m of a .glb or .gltf, else mm."),
+    ] = None,
     a: Annotated[
         str | None, typer.Option(help="The values are fluence, J_n = phi/(2A): robin, haskell or a number.")
     ] = None,
@@ -81,7 +82,7 @@ def import_(
         field=field,
         per=per.value if per else None,
         format=format,
-        length_unit=length_unit.value,
+        length_unit=length_unit.value if length_unit else None,
         a=a,
         n=n,
         clip=clip,
@@ -89,6 +90,8 @@ def import_(
     )
     phantom.write(output)
     _print_report(phantom.report() | {"output": str(output)}, as_json)
+    if "warning" in phantom.provenance:
+        typer.echo(f"fspt: {output}: {phantom.provenance['warning']}", err=True)
 
 
 @app.command()
@@ -148,7 +151,7 @@ def _print_report(report: dict[str, object], as_json: bool) -> None:
 
 def report_text(report: dict[str, object]) -> str:
     """The report as text, a line of name, value and unit for each entry."""
-    units = {"area": "mm^2", "removed_percent": "% of the power", "seconds": "s"}
+    units = {"area": "mm^2", "bounding_box": "mm", "removed_percent": "% of the power", "seconds": "s"}
     units |= dict.fromkeys(("power", "removed_power", "source_power", "absorbed_power", "exit_power"), "W")
     units |= {"min": str(report["unit"]), "max": str(report["unit"])}
     lines = []
@@ -157,6 +160,8 @@ def report_text(report: dict[str, object]) -> str:
             text = "undecided (open surface)"
         elif isinstance(value, bool):
             text = "yes" if value else "no"
+        elif name == "bounding_box" and isinstance(value, list):
+            text = " to ".join(" ".join(f"{x:.6g}" for x in corner) for corner in value)
         else:
             text = f"{value:.6g}" if isinstance(value, float) else str(value)
         lines.append(f"{name.replace('_', ' '):<16}{text} {units.get(name, '')}".rstrip())

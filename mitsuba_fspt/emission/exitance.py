@@ -38,6 +38,17 @@ def texture_of(props: mi.Properties) -> mi.Texture:
         raise ExitanceError(
             f"fspt_surface: 'exitance' must be a number or a texture, got {value}. Give W/mm² as a float."
         )
+    if props.type("exitance") == mi.Properties.Type.Color:  # a monochrome variant would take its luminance
+        colour = ", ".join(f"{share:g}" for share in np.ravel(value))
+        raise ExitanceError(
+            f"fspt_surface: 'exitance' is a colour ({colour}), J_n is one number. Give W/mm² as a float or a texture "
+            "of one channel."
+        )
+    if props.type("exitance") == mi.Properties.Type.Spectrum and not value.is_uniform():
+        raise ExitanceError(
+            "fspt_surface: 'exitance' is a spectrum, J_n is one number. Give W/mm² as a float or a texture of one "
+            "channel."
+        )
     if not isinstance(value, int | float):
         texture = props.get_emissive_texture("exitance")
         held = texture.class_name()

@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
@@ -81,6 +81,10 @@ class Image:
         error = None if self.error is None else self.error.astype(np.float64) * watt
         metadata = self.metadata | {"source_power": watt}
         return Image(self.power.astype(np.float64) * watt, error, self.coverage, metadata)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
+        """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
+        return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y` (float32), metadata under `fspt:`.

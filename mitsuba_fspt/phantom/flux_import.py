@@ -11,7 +11,7 @@ from ..optics.boundary import boundary_a
 from ..runtime.errors import ExitanceError, FluxError
 from ..runtime.numbers import number
 from .formats import MeshLike, RawMesh, SurfaceValues, ValuesLike, read_mesh, surface_values
-from .formats.length_unit import millimetres
+from .formats.length_unit import millimetres, own_unit, unit_warning
 from .phantom import UNIT, Phantom, require_finite, require_single, shares
 from .surface_mesh import closure, face_areas
 
@@ -25,7 +25,7 @@ def import_flux(
     field: str | int | None = None,
     per: str | None = None,
     format: str = "auto",
-    length_unit: str = "mm",
+    length_unit: str | None = None,
     a: str | float | None = None,
     n: float | None = None,
     clip: bool = False,
@@ -43,7 +43,7 @@ def import_flux(
     per : 'vertex' or 'face', the elements that carry the values; needed if their number and name leave that open
     format : 'auto' (by the file's name) or one of `formats.FORMATS`
     length_unit : 'mm', 'cm' or 'm', unit of the mesh **and** of its values: W per square of it. MMC's values are
-        power per face, whatever the unit.
+        power per face, whatever the unit. None: m of a glTF file (.glb, .gltf) by its standard, else mm.
     a : the values are fluence, J_n = phi/(2A), with A by 'robin', 'haskell' (see `optics.boundary`) or as a number.
         None: they are J_n, except NIRFAST's, which are always fluence, with A by 'robin' as in NIRFAST
     n : refractive index of the tissue for A; None: that of the file, else 1.37
@@ -57,7 +57,8 @@ def import_flux(
     ExitanceError : values are NaN or infinite, negative without `clip`, or 0 everywhere; J_n beyond single precision.
     BackendError : the format needs an optional package.
     """
-    scale = millimetres(length_unit, "flux import")
+    unit = own_unit(mesh) if length_unit is None else length_unit
+    scale = millimetres(unit, "flux import")
     if per not in (None, "vertex", "face"):
         raise FluxError(f"flux import: 'per' must be vertex or face, got '{per}'.")
     field = None if field is None else str(field)
@@ -70,11 +71,19 @@ def import_flux(
     with np.errstate(over="ignore"):  # require_single refuses inf
         exitance, provenance = _exitance(raw, found, scale, a, n)
     require_single(exitance)
-    provenance = {"source": source, **provenance}
+    provenance = {"source": source, **provenance, **_unit_told(found, unit, given=length_unit is not None)}
     exitance, negatives, removed = _without_negatives(found, exitance, clip)
     phantom = Phantom(found.vertices, found.faces, exitance, found.per, provenance, negatives, removed)
     _require_outward(phantom, flip)
     return phantom
+
+
+def _unit_told(found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
+    """For the provenance: the unit of the mesh, if it is not mm and not `given`, and a warning of an unusual size."""
+    told = {} if given or unit == "mm" else {"mesh_unit": f"{unit}, by the standard of its format; scaled to mm"}
+    diagonal = float(np.linalg.norm(np.ptp(found.vertices[found.faces].reshape(-1, 3), axis=0)))
+    warning = unit_warning(diagonal, unit)
+    return told | ({"warning": warning} if warning else {})
 
 
 def _exitance(

@@ -25,7 +25,18 @@ UNIT = "W/mm^2"
 LEAST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 # Keys of the report and of the PLY's comments that no provenance may overwrite.
 RESERVED = {
-    *("area", "power", "min", "max", "zeros", "negatives", "removed_power", "removed_percent", "quantity"),
+    *(
+        "bounding_box",
+        "area",
+        "power",
+        "min",
+        "max",
+        "zeros",
+        "negatives",
+        "removed_power",
+        "removed_percent",
+        "quantity",
+    ),
     *("unit", "length_unit", "watertight", "outward", "per", "vertices", "faces"),
 }
 
@@ -109,11 +120,13 @@ class Phantom:
     def report(self) -> dict[str, object]:
         """Properties to check before use: numbers, booleans and texts by name, ready for JSON.
 
-        area [mm²], power [W], min and max [W/mm²], zeros and negatives (numbers of values; negative ones have
-        become zeros), watertight, outward (None: open, undecided), unit, removed_power [W], per, vertices,
-        faces, and the provenance. `removed_percent` is relative to the remaining power.
+        bounding_box (its lowest and highest corner, x, y, z [mm]), area [mm²], power [W], min and max [W/mm²], zeros
+        and negatives (numbers of values; negative ones have become zeros), watertight, outward (None: open,
+        undecided), unit, removed_power [W], per, vertices, faces, and the provenance. `removed_percent` is relative to
+        the remaining power.
         """
         return {
+            "bounding_box": [[float(x) for x in corner] for corner in self.bounds],
             "area": self.area,
             "power": self.power,
             "min": float(self.exitance.min()),

@@ -6,7 +6,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
@@ -40,7 +40,7 @@ Progress = Callable[[str, float], None]
 
 
 def render(
-    scene: mi.Scene | str | os.PathLike[str],
+    scene: mi.Scene | str | os.PathLike[str] | Mapping[str, object],
     *,
     method: str | None = None,
     sensor: int = 0,
@@ -57,7 +57,7 @@ def render(
 
     Parameters
     ----------
-    scene : Mitsuba scene (see `load`) or the name of a scene file
+    scene : Mitsuba scene, or what `load` takes
     method : 'integral' (Eq. 9, deterministic), 'path' or 'ptracer' (Monte Carlo); None takes the scene's own
     sensor : number of the sensor, an `fspt_lens`
     rtol, domain, pixel, max_nodes : accuracy of the integral, see `Quadrature`; None takes the scene's own

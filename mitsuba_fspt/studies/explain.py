@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 ROUNDS = 3  # timed pairs of runs, of which the median counts; only one where a run takes longer than LONG [s]
 LONG = 5.0
+NO_GAIN = "no gain"  # in place of a share of the time within the noise
 WHAT_WIDTH = 1 + max(len(what) for what in SHORTCUTS.values())
 
 
@@ -38,6 +39,8 @@ class Explanation:
     what : name; `left_out`: True if it is left out of this scene; `why` : the reason
     lines_saved, time_saved : measured saving, as a share of the lines of sight and of the time without the shortcut, at
         most 1; None where it is not taken or cannot be switched off
+    time_spread : half the difference between the largest and the smallest share of the time saved in any round; a
+        median that does not exceed it is noise. 0 after a single round
     """
 
     what: str
@@ -45,19 +48,27 @@ class Explanation:
     why: str
     lines_saved: float | None = None
     time_saved: float | None = None
+    time_spread: float = 0.0
+
+    @property
+    def gains_time(self) -> bool:
+        """True if the time saved is above 0 and above the noise of its measurement."""
+        return self.time_saved is not None and self.time_saved > self.time_spread
 
     def render_text(self) -> str:
         """The row as text: what, left out or kept, lines of sight and time saved, why."""
         verdict = "left out" if self.left_out else "kept"
         lines, seconds = ("" if s is None else f"{100 * s:.0f} %" for s in (self.lines_saved, self.time_saved))
-        return f"{self.what:<{WHAT_WIDTH}} {verdict:<9} {lines:>6} {seconds:>6}  {self.why}"
+        if self.time_saved is not None and not self.gains_time:
+            seconds = NO_GAIN
+        return f"{self.what:<{WHAT_WIDTH}} {verdict:<9} {lines:>6} {seconds:>{len(NO_GAIN)}}  {self.why}"
 
     def to_dict(self) -> dict[str, str | bool | float | None]:
         """The row as plain data for JSON."""
         return asdict(self)
 
 
-HEADER = f"{'':<{WHAT_WIDTH}} {'':<9} {'lines':>6} {'time':>6}  (saved)"
+HEADER = f"{'':<{WHAT_WIDTH}} {'':<9} {'lines':>6} {'time':>{len(NO_GAIN)}}  (saved)"
 
 
 def explain(
@@ -88,15 +99,17 @@ def explain(
     rows = []
     for finding in solution.findings:
         without = replace(quadrature, shortcuts_off=quadrature.shortcuts_off | {finding.name})
-        saved = _saved(solve, quadrature, without) if finding.taken else (None, None)
+        saved = _saved(solve, quadrature, without) if finding.taken else ()
         rows.append(_row(finding, *saved))
     return rows + _never_done(scene, variant)
 
 
 def _saved(
     solve: Callable[[Quadrature], tuple[Solution, float]], quadrature: Quadrature, without: Quadrature
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """Shares of the lines of sight and of the time that a shortcut saves, from pairs of runs with and without it.
+
+    The third number is the spread of the second, as in `Explanation`.
 
     A first run without it compiles the kernels; its time does not count.
     """
@@ -104,11 +117,12 @@ def _saved(
     rounds = ROUNDS if seconds < LONG else 1
     pairs = [(solve(quadrature), solve(without)) for _ in range(rounds)]
     short = pairs[0][0][0]
-    return 1 - short.rays / max(1, long.rays), float(np.median([1 - on[1] / off[1] for on, off in pairs]))
+    times = [1 - on[1] / off[1] for on, off in pairs]
+    return 1 - short.rays / max(1, long.rays), float(np.median(times)), float(np.ptp(times)) / 2
 
 
-def _row(finding: Finding, lines: float | None, seconds: float | None) -> Explanation:
-    return Explanation(SHORTCUTS[finding.name], finding.taken, finding.why, lines, seconds)
+def _row(finding: Finding, *saved: float) -> Explanation:
+    return Explanation(SHORTCUTS[finding.name], finding.taken, finding.why, *saved)
 
 
 def _never_done(scene: mi.Scene, variant: str) -> list[Explanation]:

@@ -350,7 +350,7 @@ COMMANDS = {
     "unknown method": ((*RENDER, "--method", "radiosity"), "'method' must be one of integral, path, ptracer, got"),
     "unknown option": ((*RENDER, "--fast"), "No such option: --fast"),
     "unknown verb": (("paint",), "No such command 'paint'"),
-    "no scene named": (("render",), "Missing argument 'SCENE.xml'"),
+    "no scene named": (("render",), "Missing argument 'SCENE.xml|PHANTOM.ply'"),
     "no scene file": (("render", "gone.xml"), "gone.xml: cannot read the scene file"),
     "a folder for a scene": (("render", "folder.exr", "-o", "o.exr"), "folder.exr: cannot read the scene file"),
     "broken XML": (("render", "broken.xml"), "broken.xml: not valid XML: "),

@@ -137,6 +137,30 @@ def test_the_header_tells_all_and_reproduces_the_file(run, tmp_path, options, to
         np.testing.assert_allclose(getattr(repeated, name), getattr(image, name), rtol=0, atol=tolerance)
 
 
+# --- help ---
+
+
+def commands(group, path=()):
+    """Every verb below a group, with its words."""
+    for name, command in group.commands.items():
+        yield from commands(command, (*path, name)) if hasattr(command, "commands") else [((*path, name), command)]
+
+
+VERBS = dict(commands(typer.main.get_command(app.app)))
+
+
+@pytest.mark.parametrize("words", VERBS, ids=" ".join)
+def test_help_shows_every_word_of_it(run, words):
+    """Units in brackets, too: seen to fail with rich, which takes [s] for markup and prints 'Exposure time .'."""
+    code, out, err = run(*words, "--help")
+    assert (code, err) == (0, "")
+    text = " ".join(out.split())
+    assert "[mm]" in text or words != ("render",)
+    for parameter in VERBS[words].params:
+        told = getattr(parameter, "help", None)
+        assert not told or " ".join(told.split()) in text.replace("- ", "-"), told
+
+
 # --- the other verbs ---
 
 

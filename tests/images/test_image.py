@@ -294,3 +294,16 @@ def test_channels_of_any_quantity(tmp_path):
     channels, metadata = read_exr(tmp_path / "e.exr")
     np.testing.assert_array_equal(channels["Y"], np.eye(3))
     assert metadata == {"quantity": "electrons", "unit": "e-"}
+
+
+def test_an_image_as_an_array_is_its_power():
+    """np.asarray shares the memory and cannot be written; a copy can."""
+    image = Image(np.arange(6.0, dtype=np.float32).reshape(2, 3))
+    shared = np.asarray(image)
+    assert np.shares_memory(shared, image.power)
+    assert not shared.flags.writeable
+    assert (shared.dtype, shared.shape) == (np.float32, (2, 3))
+    assert np.asarray(image, dtype=np.float64).dtype == np.float64
+    copy = np.array(image)
+    copy[0, 0] = 7
+    assert (image.power[0, 0], copy[0, 0], np.sum(image)) == (0, 7, 15)

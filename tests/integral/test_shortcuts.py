@@ -212,7 +212,7 @@ def test_explain_and_render_without_shortcuts_from_the_command_line(tmp_path, mo
     assert all(what in table for what in (SHORTCUTS["outside"], SHORTCUTS["smooth"], "gradients"))
     assert app.run(["explain", scene, *small, "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
-    assert {"what", "left_out", "why", "lines_saved", "time_saved"} == set(rows[0])
+    assert {"what", "left_out", "why", "lines_saved", "time_saved", "time_spread"} == set(rows[0])
     assert app.run(["render", scene, *small, "--no-shortcuts"]) == 0
     assert fspt.read("two_spheres.exr").metadata["shortcuts_off"] == ", ".join(sorted(SHORTCUTS))
 

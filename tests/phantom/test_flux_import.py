@@ -82,10 +82,21 @@ def test_trimesh_formats_with_values_beside(tmp_path, suffix, per):
         with pytest.raises(FluxError, match="STL"):
             import_flux(mesh, values, per=per)
         return
-    phantom = import_flux(mesh, values)
+    phantom = import_flux(mesh, values, length_unit="mm")  # a GLB would be in metres
     assert phantom.per == per
     assert len(phantom.vertices) == len(VERTICES)
     assert_law(phantom, SPHERE.area)
+
+
+def test_a_glb_is_in_metres(tmp_path):
+    """By glTF's standard; its values are W/m², so that the power is that of the same numbers in W/mm² and mm."""
+    SPHERE.export(tmp_path / "mesh.glb")
+    in_mm = import_flux(tmp_path / "mesh.glb", law(VERTICES), length_unit="mm")
+    phantom = import_flux(tmp_path / "mesh.glb", law(VERTICES))
+    assert phantom.area == pytest.approx(1e6 * in_mm.area)
+    assert phantom.power == pytest.approx(in_mm.power)
+    assert phantom.report()["mesh_unit"] == "m, by the standard of its format; scaled to mm"
+    assert "mesh_unit" not in in_mm.report()
 
 
 def test_obj_of_a_modeller_keeps_the_order_of_its_lines(tmp_path):
@@ -313,6 +324,8 @@ def test_nirfast(tmp_path, suffix):
     phantom = import_flux(tmp_path / "cube.node", values, field=field)
     assert_law(phantom, 6 * 36)
     assert phantom.provenance["boundary_factor"] == "2.57006 (robin, n = 1.37)"
+    by_base_name = import_flux(tmp_path / "cube", values, field=field)
+    np.testing.assert_array_equal(by_base_name.exitance, phantom.exitance)
     in_memory = import_flux((nodes, elements + 1), phi, format="nirfast")
     np.testing.assert_allclose(in_memory.exitance, phantom.exitance, rtol=1e-6)
 

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
+from mitsuba_fspt.cli import run as cli
 from mitsuba_fspt.cli.flux import app
 from mitsuba_fspt.phantom.flux_import import import_flux
 from mitsuba_fspt.runtime.errors import BackendError, ExitanceError, FluxError
@@ -45,6 +46,52 @@ def test_length_unit_goes_for_the_mesh_and_its_values(unit, millimetres):
     assert phantom.power == pytest.approx(expected.power, rel=1e-12)
     assert phantom.area == pytest.approx(52)
     np.testing.assert_allclose(phantom.exitance, exitance)
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "suggested"),
+    [
+        (80, "mm", None),
+        (5, "mm", None),
+        (900, "mm", None),
+        (8, "cm", None),
+        (0.08, "mm", "m"),  # a mouse in metres
+        (2.4, "mm", "cm"),
+        (300, "m", "mm"),
+        (250, "cm", "mm"),
+        (1e6, "mm", ""),
+    ],
+)
+def test_a_size_that_suggests_another_unit_draws_a_warning(size, unit, suggested):
+    """`size` from corner to corner in the file's unit; '' for one that no unit makes usual."""
+    scaled = VERTICES / np.linalg.norm(np.ptp(VERTICES, axis=0)) * size
+    report = import_flux((scaled, FACES), np.ones(8), length_unit=unit).report()
+    if suggested is None:
+        assert "warning" not in report
+    elif suggested:
+        assert report["warning"].endswith(f"If that is right give --length-unit {suggested}.")
+    else:
+        assert report["warning"].endswith("Check --length-unit, or scale the mesh.")
+
+
+def test_cli_prints_the_box_and_warns_of_the_unit(tmp_path, capfd):
+    box = BOX.copy()
+    box.apply_scale(1e-2)
+    box.export(tmp_path / "box.off")
+    np.save(tmp_path / "jn.npy", np.ones(8))
+    arguments = ["flux", "import", tmp_path / "box.off", "--values", tmp_path / "jn.npy", "-o", tmp_path / "b.ply"]
+    assert cli(list(map(str, arguments))) == 0
+    out, err = capfd.readouterr()
+    low, high = BOX.bounds
+    numbers = [" ".join(f"{x / 100:.6g}" for x in corner) for corner in (low, high)]
+    assert f"bounding box    {numbers[0]} to {numbers[1]} mm\n" in out
+    assert err.count("\n") == 1
+    assert err.startswith(f"fspt: {tmp_path / 'b.ply'}: the mesh is ")
+    assert err.endswith("give --length-unit m.\n")
+    assert cli(list(map(str, [*arguments, "--length-unit", "m", "--json"]))) == 0
+    out, err = capfd.readouterr()
+    assert err == ""
+    assert np.allclose(json.loads(out)["bounding_box"], 10 * BOX.bounds)
 
 
 def test_power_per_vertex_is_the_integral_of_linear_exitance():
@@ -208,6 +255,8 @@ def test_bad_value_files(tmp_path, name, content, message):
         ("phi;J_n\n0;1\n" + "0;2\n" * 7, "J_n"),
         ("# made by hand\n# phi J_n\n0 1\n" + "0 2\n" * 7, "J_n"),
         ("1,1\n" + "2,2\n" * 7, "2"),
+        ("phi;J_n;\r\n0,5;1,0;\r\n" + "0,5;2,0;\r\n" * 7, "J_n"),
+        ("0,25;1\n" + "0,25;2\n" * 7, "2"),
         ("\ufeffJ_n\n\n1\n" + "2\n" * 7, None),
     ],
 )

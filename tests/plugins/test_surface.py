@@ -273,6 +273,24 @@ def test_positions_lie_on_the_patches_in_proportion_to_their_power(case):
     assert scipy.stats.chisquare(counts, expected).pvalue > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("exitance", "what"),
+    [
+        ({"type": "rgb", "value": [1, 0, 0]}, "a colour (1, 0, 0)"),
+        ({"type": "rgb", "value": 0.5}, "a colour (0.5, 0.5, 0.5)"),
+        ({"type": "spectrum", "value": [(400, 1), (700, 2)]}, "a spectrum"),
+    ],
+)
+def test_colours_and_spectra_of_a_dictionary_are_refused(exitance, what):
+    """Seen to fail: monochrome variants took the luminance 0.213 of red for J_n in W/mm²."""
+    with pytest.raises(RuntimeError) as caught:
+        world_scene(ball() | {"emitter": glow(exitance)})
+    assert f"ExitanceError: fspt_surface: 'exitance' is {what}, J_n is one number. Give W/mm²" in str(caught.value)
+    del caught  # the traceback holds the emitter, which later kernels would record
+    gc.collect()
+    assert world_scene(ball() | {"emitter": glow({"type": "uniform", "value": 2.0})}).emitters()
+
+
 def test_new_exitance_leaves_the_probe_in_its_place_and_a_new_shape_does_not(tmp_path):
     """On CUDA one that was set up beside the scene would be lost, and light with it."""
     path = write_ply(tmp_path / "one.ply", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])

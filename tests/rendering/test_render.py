@@ -251,7 +251,7 @@ def test_a_scene_of_another_variant_is_told_from_what_is_no_scene(scene):
             fspt.render(scene)
     finally:
         mi.set_variant(before)
-    for wrong in (None, 5, {"type": "scene"}, scene.sensors()[0]):
+    for wrong in (None, 5, scene.sensors()[0]):
         with pytest.raises(SceneError, match=r"must be a Mitsuba scene or the name of a file, got \w+\. Give"):
             fspt.render(wrong)
 

@@ -13,7 +13,9 @@ import pytest
 import trimesh
 from cylinder_diffusion import Phantom, exitance
 
+import mitsuba_fspt as fspt
 from mitsuba_fspt.cli import app
+from mitsuba_fspt.runtime import backend
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = ROOT / "scenes"
@@ -21,7 +23,10 @@ NAMES = ("l_shape", "nylon_cylinder", "textured_sphere", "two_spheres", "uniform
 
 sys.path.insert(0, str(ROOT / "scripts"))
 
+backend.ensure_variant()
+
 import make_scenes  # noqa: E402
+import mitsuba as mi  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -275,6 +280,15 @@ def test_scene_has_the_paper_s_lens_and_watts_in_float32(name):
         emitter = shape.find("emitter[@type='fspt_surface']")
         assert emitter.find("*[@name='exitance']") is not None
         assert shape.findall("transform/rotate")[-1].attrib == {"z": "1", "angle": "$view"}
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.xml")), ids=lambda path: path.stem)
+def test_keys_of_a_scene_are_the_same_in_every_run_and_with_plain_mitsuba(path):
+    """Objects without an id are called by their address in memory, object_94762123089456."""
+    plain = list(mi.traverse(mi.load_file(str(path))).keys())
+    assert plain == list(mi.traverse(fspt.load(path)).keys())
+    assert "camera.f_number" in plain
+    assert not [key for key in plain if re.search(r"\d{5}", key)]
 
 
 def test_all_scenes_are_listed_here():

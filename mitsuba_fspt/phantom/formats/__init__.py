@@ -58,6 +58,8 @@ def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, form
     if isinstance(mesh, tuple):
         return _from_arrays(mesh, values, field, format)
     path = Path(mesh)
+    if format == "auto" and not os.path.exists(path) and os.path.isfile(path.with_name(f"{path.name}.node")):
+        format = "nirfast"
     if not os.path.exists(path) and format != "nirfast":  # a NIRFAST name may lack the suffix
         raise FluxError(f"mesh '{path}' does not exist. Check the name.")
     if format == "auto":

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from ...runtime.errors import FluxError
 
+IN_METRES = (".glb", ".gltf")  # by the standard of glTF 2.0
+# Diagonals of a bounding box [mm]: those of phantoms and small animals pass without a word, and a warning suggests the
+# unit that leads to one that is usual.
+PASSED, USUAL = (5.0, 1000.0), (10.0, 500.0)
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 
 
@@ -13,3 +19,24 @@ def millimetres(length_unit: str, where: str) -> float:
         known = ", ".join(MILLIMETRES)
         raise FluxError(f"{where}: 'length_unit' must be one of {known}, got '{length_unit}'. Give one of these.")
     return MILLIMETRES[length_unit]
+
+
+def own_unit(mesh: object) -> str:
+    """Unit of a mesh whose unit is not given: m of a glTF file, mm of any other and of arrays."""
+    return "m" if isinstance(mesh, str | Path) and Path(mesh).suffix.lower() in IN_METRES else "mm"
+
+
+def unit_warning(diagonal: float, length_unit: str) -> str | None:
+    """Sentence on a mesh that is too small or too large for a phantom, with the unit it suggests; None for any other.
+
+    diagonal : of the bounding box [mm], with the mesh in `length_unit`
+    """
+    if PASSED[0] <= diagonal <= PASSED[1]:
+        return None
+    raw = diagonal / MILLIMETRES[length_unit]
+    better = next((unit for unit, factor in MILLIMETRES.items() if USUAL[0] <= raw * factor <= USUAL[1]), None)
+    found = f"the mesh is {diagonal:.3g} mm from corner to corner if its unit is {length_unit}"
+    if better is None:
+        return f"{found}, unusual for a phantom. Check --length-unit, or scale the mesh."
+    size = raw * MILLIMETRES[better]
+    return f"{found}, and {size:.3g} mm if it is {better}. If that is right give --length-unit {better}."

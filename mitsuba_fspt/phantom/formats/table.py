@@ -21,7 +21,7 @@ def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
 
     `field` chooses one of several: a column by its name in the header line or by its number from 1, an array of an
     `.npz` or a variable of a `.mat` by its name. Text may have comments (#), a header line, and commas, semicolons,
-    tabs or spaces between its columns.
+    tabs or spaces between its columns; numbers between semicolons may have a decimal comma.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], li
     if skip is None:
         raise FluxError(f"'{path}' holds no values. Give one number a line.")
     try:
-        table = np.loadtxt(StringIO(text), delimiter=delimiter, skiprows=skip, ndmin=2)
+        table = np.loadtxt(StringIO(_with_points(text, delimiter)), delimiter=delimiter, skiprows=skip, ndmin=2)
     except ValueError as cause:
         raise FluxError(f"'{path}' is not a table of numbers: {one_line(cause)}. Fix that line.") from cause
     return table, names if len(names) == table.shape[1] else []
@@ -146,10 +146,21 @@ def _layout(text: str, skip_lines: int) -> tuple[list[str], str | None, int | No
         if line.startswith("#") or not (headed or _is_numeric(line)):
             header = line
             continue
-        delimiter = next((mark for mark in ",;\t" if mark in line), None)
-        names = [name.strip(' "') for name in header.lstrip("# ").split(delimiter)] if header else []
+        delimiter = next((mark for mark in ";,\t" if mark in line), None)
+        header = header.lstrip("# ").rstrip(";")
+        names = [name.strip(' "') for name in header.split(delimiter)] if header else []
         return names, delimiter, number
     return [], None, None
+
+
+def _with_points(text: str, delimiter: str | None) -> str:
+    """Lines of a table whose numbers have decimal points: where semicolons separate them, they may have commas.
+
+    A semicolon at the end of a line begins no column.
+    """
+    if delimiter != ";":
+        return text
+    return "\n".join(line.rstrip().rstrip(";").replace(",", ".") for line in text.split("\n"))
 
 
 def _is_numeric(line: str) -> bool:
