@@ -1,6 +1,7 @@
 """The doctor reports what is there, survives what is not, and is content only if a backend computes right."""
 
 import re
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -53,7 +54,10 @@ def test_a_trial_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_missing_package_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_version", lambda name: None)
+    def missing(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", missing)
     rows = {row.name: row for row in [*doctor._versions(), *doctor._optional()]}
     assert rows["scikit-fem"].value == "not installed: pip install 'mitsuba-fspt[tissue]'"
     assert rows["scikit-fem"].ok  # optional
