@@ -261,7 +261,10 @@ def _barycentric(d: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Point2f
 
 
 class ElementDistribution:
-    """Distribution of surface points whose density [1/mm²] is ∝ the mean exitance of their element."""
+    """Distribution of surface points whose density [1/mm²] is ∝ the mean exitance of their element.
+
+    It is even where all elements are dark.
+    """
 
     def __init__(self, elements: Elements, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
         self.elements = elements
@@ -270,6 +273,8 @@ class ElementDistribution:
         for point in _FIVE_POINTS:
             si, area = elements.place(index, mi.Point2f(*point))
             power += area * dr.maximum(exitance(si), 0)
+        if not dr.any(power > 0):  # points are drawn all the same, where no light leaves
+            power = elements.areas()
         share = power + (UNIFORM_SHARE * dr.mean(power) / dr.mean(elements.areas())) * elements.areas()
         # First a row of elements, then an element of the row: the 24 bits of one random number do not resolve 10⁵
         # elements evenly (the power of each is off by 1 %), those of two do.

@@ -176,12 +176,11 @@ def texels_of(texture: mi.Texture) -> int:
 
 
 def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
-    """Largest J_n [W/mm²] of the corners and centres of a shape's elements.
+    """Largest J_n [W/mm²] of the corners and centres of a shape's elements; 0 where nothing glows.
 
     Raises
     ------
-    ExitanceError : a value is negative or not finite, all are 0, or the shape has no area or vertices that are not
-        finite.
+    ExitanceError : a value is negative or not finite, or the shape has no area or vertices that are not finite.
     """
     if shape.is_mesh() and not dr.all(dr.isfinite(triangles(shape)[0])):
         raise ExitanceError(f"fspt_surface: shape '{shape.id()}' has vertices that are not finite. Fix its mesh.")
@@ -203,9 +202,7 @@ def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
     texels = ExitanceState.of(shape, texture).bitmap
     if brightest == 0 and texels is not None:  # the checked points may miss the only bright texel
         brightest = float(dr.max(texels)[0])
-    if brightest <= 0:
-        raise ExitanceError(f"{name} is 0 everywhere: nothing glows. Give J_n in W/mm².")
-    return brightest
+    return max(brightest, 0.0)
 
 
 def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -1,6 +1,6 @@
 """Checks of a scene before it is traced.
 
-Float32 resolves its lengths and powers, something glows, J_n is sane, the camera is outside every closed surface, no
+Float32 resolves its lengths and powers, something may glow, J_n is sane, the camera is outside every closed surface, no
 surface lies in another one.
 """
 
@@ -83,6 +83,8 @@ def check_surfaces_alone(scene: mi.Scene) -> None:
 def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
     """Raise ExitanceError where J_n, or the power on a pixel that follows from it, leaves the range of float32."""
     brightest = emitter.brightest
+    if brightest == 0:  # dark, as an optimiser may begin
+        return
     name = f"fspt_surface: 'exitance' of shape '{emitter.get_shape().id()}'"
     if not EXITANCES[0] <= brightest <= EXITANCES[1]:
         raise ExitanceError(

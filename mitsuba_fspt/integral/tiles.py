@@ -23,8 +23,9 @@ from .window import Window
 
 SIDE = 2048  # pixels along a tile with its rim; Dr.Jit allocates powers of two
 LARGE = 1 << 26  # pixels: the planes of a larger picture are of float32, as they are in its file
-WORK = 3 << 28  # bytes that the work on one tile takes beside the planes
-WRITING = 2  # bytes a pixel that checks and the compression of the file take beside the planes
+# Beside the planes: bytes that the work on one tile takes; then a pixel, that checks and the file take, and that copies
+# of planes of float64 in float32 take, by the bytes of a value.
+WORK, WRITING = 1 << 30, {4: 2, 8: 14}
 REACH = 2  # pixels around that the error of a displacement depends on
 COUNT = re.compile(r"\b\d+\b")
 
@@ -57,7 +58,7 @@ class Mosaic:
     def __init__(self, window: Window) -> None:
         self.window, self.tiles = window, tiles_of(window)
         kind = np.dtype(np.float64 if math.prod(window.full) <= LARGE else np.float32)
-        _require_memory(window.full, 3 * kind.itemsize)
+        _require_memory(window.full, kind.itemsize)
         self.power, self.error, self.coverage = (np.zeros(window.full, kind) for _ in range(3))
         self._rays = 0
         self._levels: list[str] = []
@@ -77,17 +78,13 @@ class Mosaic:
         least_error : smallest error that is stated, over the brightest pixel
         rounding : by which float32 displaces lines of sight [pixels], 0 where that does not count
         """
-        least = least_error * float(self.power.max(initial=0.0))
-        for tile in self.tiles:
-            here = self._place(tile)
-            error = self.error[here]
-            if len(self.tiles) > 1:  # a tile knows its own brightest pixel alone
-                np.maximum(error, least, out=error, where=self.coverage[here] > 0)
-            if rounding:
-                error += self._displacement_error(here, rounding)
         levels, findings = tuple(self._levels), tuple(self._findings)
         if len(self.tiles) > 1:
+            self._level_errors(least_error, rounding)
             levels, findings = _added_levels(levels), _common_findings(findings)
+        elif self.tiles and rounding:
+            change = rounding * _steepest(self.window.cut(self.power))
+            self.error += self.window.expand(change)
         return Solution(self.power, self.error, self.coverage, self._rays, levels, findings=findings)
 
     def _place(self, tile: Window) -> tuple[slice, slice]:
@@ -95,22 +92,37 @@ class Mosaic:
         left, top = (its - own for its, own in zip(tile.crop_offset, self.window.crop_offset, strict=True))
         return slice(top, top + tile.full[0]), slice(left, left + tile.full[1])
 
-    def _displacement_error(self, here: tuple[slice, slice], rounding: float) -> NDArray[np.float64]:
-        """Change of the power [W] on a tile if float32 displaces lines of sight by `rounding` [pixels]."""
-        around = self.window.around(*(range(side.start, side.stop) for side in here), REACH)
-        grid = Grid(around.shape)
-        x, y = grid.gradient(grid.flat(around.cut(self.power).astype(np.float64)))
-        change = rounding * grid.array(grid.spread_max(dr.sqrt(x * x + y * y)))
-        first = here[0].start - around.top, here[1].start - around.left
-        return change[tuple(slice(k, k + side.stop - side.start) for k, side in zip(first, here, strict=True))]
+    def _level_errors(self, least_error: float, rounding: float) -> None:
+        """Complete the errors with what follows from the whole picture; parameters as of `solution`."""
+        least = least_error * float(self.power.max(initial=0.0))
+        for tile in self.tiles:
+            here = self._place(tile)
+            error = self.error[here]
+            np.maximum(error, least, out=error, where=self.coverage[here] > 0)
+            if rounding:
+                error += rounding * self._steepest_on(here)
+
+    def _steepest_on(self, here: tuple[slice, slice]) -> NDArray[np.float64]:
+        """`_steepest` on a tile, with what lies around it."""
+        first = [max(0, side.start - REACH) for side in here]
+        around = tuple(slice(start, side.stop + REACH) for start, side in zip(first, here, strict=True))
+        steepest = _steepest(self.power[around].astype(np.float64))
+        return steepest[tuple(slice(side.start - k, side.stop - k) for k, side in zip(first, here, strict=True))]
 
 
-def _require_memory(full: tuple[int, int], each: int) -> None:
-    """Raise SceneError where planes of `each` bytes a pixel, with the work on a tile or writing, exceed the memory."""
+def _steepest(power: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Largest gradient [W/pixel] of the power (h, w) on each pixel and its neighbours."""
+    grid = Grid(power.shape)
+    x, y = grid.gradient(grid.flat(power))
+    return grid.array(grid.spread_max(dr.sqrt(x * x + y * y)))
+
+
+def _require_memory(full: tuple[int, int], size: int) -> None:
+    """Raise SceneError where three planes with values of `size` bytes, and the work or the writing, do not fit."""
     pixels = math.prod(full)
-    needed = pixels * each + max(WORK, pixels * WRITING)
-    free = available_memory()
-    if pixels > SIDE**2 and free is not None and needed > free:
+    needed = pixels * 3 * size + max(WORK, pixels * WRITING[size])
+    free = available_memory() if pixels > SIDE**2 else None
+    if free is not None and needed > free:
         height, width = full
         raise SceneError(
             f"fspt_integral: a film of {width} x {height} pixels needs {needed} bytes ({needed / 2**30:.1f} GiB) of "
@@ -119,29 +131,27 @@ def _require_memory(full: tuple[int, int], each: int) -> None:
 
 
 def _added_levels(levels: Sequence[str]) -> tuple[str, ...]:
-    """What each step of the refinement did on all tiles."""
+    """What each step of the refinement did, on all tiles together."""
     steps: dict[str, list[str]] = {}
     for text in levels:
-        steps.setdefault(text.partition(":")[0], []).append(text)
-    return tuple(map(_added, steps.values()))
+        steps.setdefault(text.partition(":")[0], []).append(text.partition(":")[2])
+    return tuple(f"{step}:{_added(counts)}" for step, counts in steps.items())
 
 
 def _common_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Of each shortcut whether it was taken on any tile."""
+    """Of each shortcut whether it was taken on any tile; the reason is that of the first such tile, or of the first."""
     shortcuts: dict[str, list[Finding]] = {}
     for finding in findings:
         shortcuts.setdefault(finding.name, []).append(finding)
-    return tuple(
-        Finding(name, any(one.taken for one in some), _added([one.why for one in some if one.taken] or [some[0].why]))
-        for name, some in shortcuts.items()
-    )
+    common = []
+    for name, some in shortcuts.items():
+        first = next((finding for finding in some if finding.taken), some[0])
+        why = _added([finding.why for finding in some]) if name == "smooth" else first.why  # that counts pixels
+        common.append(Finding(name, first.taken, why))
+    return tuple(common)
 
 
 def _added(texts: Sequence[str]) -> str:
-    """The text, with sums of the whole numbers behind its colon where the texts differ by them alone; or the first."""
-    head, colon, tail = texts[0].rpartition(": ")
-    if len({COUNT.sub("", text) for text in texts}) > 1 or (len(set(texts)) == 1 and not colon):
-        return texts[0]
-    counts = np.array([COUNT.findall(text.rpartition(": ")[2]) for text in texts], object).astype(int).sum(axis=0)
-    sums = iter(counts.tolist())
-    return head + colon + COUNT.sub(lambda _: str(next(sums)), tail)
+    """A text with the sums of the whole numbers in these texts, which differ in them alone."""
+    sums = iter(np.sum([[int(count) for count in COUNT.findall(text)] for text in texts], axis=0).tolist())
+    return COUNT.sub(lambda _: str(next(sums)), texts[0])

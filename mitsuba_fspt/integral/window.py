@@ -55,21 +55,17 @@ class Window:
         """Pixels of the crop window in this one."""
         return math.prod(side.stop - side.start for side in self.inner)
 
-    def around(self, rows: range, columns: range, reach: int) -> Window:
-        """This window's part within `reach` pixels of these rows and columns of the crop window."""
-        ends = [
-            (max(start, side.start - reach), min(start + size, side.stop + reach))
-            for start, size, side in zip((self.top, self.left), self.shape, (rows, columns), strict=True)
-        ]
-        (top, bottom), (left, right) = ends
-        return replace(self, top=top, left=left, shape=(bottom - top, right - left))
-
     def tile(self, rows: range, columns: range) -> Window:
-        """These rows and columns of the crop window with a rim, as the window of a picture of them alone."""
-        near = self.around(rows, columns, self.rim)
+        """These rows and columns of the crop window with the rim that this window has of them, as a window of its own.
+
+        Its crop window is the rows and columns alone.
+        """
+        (top, bottom), (left, right) = (
+            (max(start, side.start - self.rim) - side.start, min(start + size, side.stop + self.rim) - side.start)
+            for start, size, side in zip((self.top, self.left), self.shape, (rows, columns), strict=True)
+        )
         offset = self.crop_offset[0] + columns.start, self.crop_offset[1] + rows.start
-        top, left = near.top - rows.start, near.left - columns.start
-        return replace(near, top=top, left=left, full=(len(rows), len(columns)), crop_offset=offset)
+        return Window(top, left, (bottom - top, right - left), (len(rows), len(columns)), offset, self.blur)
 
     def centres(self, number: mi.UInt32) -> mi.Point2f:
         """Film positions [pixels] of the centres of the window's pixels of so much `number`, row by row."""

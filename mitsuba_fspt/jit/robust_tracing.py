@@ -18,19 +18,22 @@ STEP = 1e-4  # distance from a probed point to its four neighbours in the test, 
 STEPS = (3242174889, 2447445414)  # of the R₂ sequence, in units of 2⁻³²: uniform over edges and positions on them
 
 
-def robust_scene(scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
-    """`scene` itself, or, if it loses rays, a scene of the same shapes in Embree's robust mode, with a warning."""
+def robust_scene(scene: mi.Scene, lens: mi.Sensor, warn: bool = True) -> mi.Scene:
+    """`scene` itself, or, if it loses rays, a scene of the same shapes in Embree's robust mode, by default with a
+    warning.
+    """
     lost = lost_rays(scene, lens)
     if not lost:
         return scene
     robust = traced_robustly(scene.shapes())
     if lost_rays(robust, lens) >= lost:  # `scene` was robust: a few rays are lost in any case
         return scene
-    mi.Log(
-        mi.LogLevel.Warn,
-        "fspt_integral: this scene loses rays that meet mesh edges, so its shapes are set up anew. Put <boolean "
-        'name="embree_use_robust_intersections" value="true"/> into the scene, or load it with mitsuba_fspt.load.',
-    )
+    if warn:
+        mi.Log(
+            mi.LogLevel.Warn,
+            "fspt_integral: this scene loses rays that meet mesh edges, so its shapes are set up anew. Put <boolean "
+            'name="embree_use_robust_intersections" value="true"/> into the scene, or load it with mitsuba_fspt.load.',
+        )
     return robust
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import sys
+from functools import wraps
+from typing import Any
 
 import mitsuba as mi
 
-from ..runtime.errors import BackendError
+from ..runtime.errors import BackendError, FsptError
 
 _NAMES = ("surface", "lens", "integral")
 _registered: set[str] = set()
@@ -20,7 +22,10 @@ def register() -> None:
     Scalar variants get plugins that refuse: Python plugins are very slow there, and mesh attribute emitters crash.
     """
     variant = mi.variant()
-    if variant is None or variant in _registered:
+    if variant is None:
+        return
+    _end_in_own_errors()
+    if variant in _registered:
         return
     _refuse_in("scalar_rgb")
     if variant.startswith("scalar"):
@@ -33,6 +38,33 @@ def register() -> None:
             importlib.reload(sys.modules[module])
         else:
             importlib.import_module(module)
+
+
+def _end_in_own_errors() -> None:
+    """Let `mi.render` raise this package's errors themselves.
+
+    Dr.Jit, which `mi.render` calls the integrator through, wraps an error of any integrator in a RuntimeError, so that
+    the last line of the output only says that the reason stands somewhere above. All other errors stay as they are.
+    """
+    inner = mi.render
+    if getattr(inner, "ends_in_own_errors", False):
+        return
+
+    @wraps(inner)
+    def render(*arguments: Any, **named: Any) -> Any:
+        try:
+            return inner(*arguments, **named)
+        except RuntimeError as error:
+            own = error.__cause__
+            if not isinstance(own, FsptError):
+                raise
+        try:
+            raise own  # out of the handler, or it would have the RuntimeError as its context
+        finally:
+            del own  # which refers to this frame
+
+    render.ends_in_own_errors = True  # type: ignore[attr-defined]
+    mi.render = render
 
 
 def _refuse_in(variant: str) -> None:

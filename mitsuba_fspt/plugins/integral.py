@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..emission.face_table import FaceTable, edition_of, mark_of
+from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
@@ -72,6 +72,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         self.quadrature = _quadrature_of(props)
         # Results about the last scene; a reference to the scene, whose child this integrator is, would be a cycle.
         self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
+        self._robust: RobustCopy | None = None
         self._window, self._narrow, self._faces = CachedValue(), CachedValue(), CachedValue()
 
     def solve(
@@ -156,14 +157,21 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         return replace(solution, error=np.maximum(solution.error, _missed(narrow, where, cut, window, lens, solution)))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
-        """`scene`, or a robust copy if it loses rays; a scene without loss is tested once."""
+        """`scene`, or a robust copy if it loses rays; tested once, and again if the geometry of a copy changes."""
         marks = [mark_of(emitter) for emitter in scene.emitters()]
-        if marks != self._lossless:
-            robust = robust_scene(scene, lens)
-            if robust is not scene:
-                return robust
-            self._lossless = marks
-        return scene
+        if marks == self._lossless:
+            return scene
+        shapes, old = scene.shapes(), self._robust
+        state = (marks, [(shape_number(shape), _pose(shape)) for shape in shapes])
+        if old is None or old.state != state:
+            known = old is not None and old.state[0] == marks
+            robust = robust_scene(scene, lens, warn=not known)
+            if robust is scene:
+                self._lossless, self._robust = marks, None
+                return scene
+            positions = tuple(buffers(shape)[0] for shape in shapes if shape.is_mesh())
+            self._robust = old = RobustCopy(robust, state, positions)
+        return old.scene
 
     def _visible_window(self, scene: mi.Scene, lens: mi.Sensor, everywhere: bool) -> Window:
         """Window of the pixels that can see an emitter, or of all `everywhere`; cached."""
@@ -226,6 +234,19 @@ def _quadrature_of(props: mi.Properties) -> Quadrature:
             max_nodes=props.get("max_nodes", defaults.max_nodes),
             shortcuts_off=frozenset() if shortcuts else frozenset(SHORTCUTS),
         )
+
+
+@dataclass(frozen=True)
+class RobustCopy:
+    """Robust copy of a scene that loses rays: of its shapes alone, so that nothing in it refers to the integrator.
+
+    state : marks of the emitters, and numbers and poses of the shapes that it was built from
+    positions : their vertices, kept so that no other ones get their indices, by which poses are compared
+    """
+
+    scene: mi.Scene
+    state: tuple[list[object], list[tuple[int, tuple[float, ...]]]]
+    positions: tuple[mi.Float, ...]
 
 
 class CachedValue:

@@ -25,7 +25,7 @@ class FsptSurface(mi.Emitter):
 
      * - exitance
        - |float| or |texture| [W/mm²]
-       - Surface flux density J_n >= 0, finite, > 0 somewhere: a number, a mesh attribute, a raw bitmap.
+       - Surface flux density J_n >= 0, finite: a number, a mesh attribute, a raw bitmap.
          Updatable, differentiable.
      * - emission
        - |string|

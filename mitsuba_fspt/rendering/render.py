@@ -33,8 +33,8 @@ METHODS = ("integral", "path", "ptracer")
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples of one pass
 DARK = (
-    "the picture is dark, no light reaches the lens. Check the lens's 'to_world', and that the faces' normals point "
-    "outwards"
+    "the picture is dark, no light reaches the lens. Check the lens's 'to_world', that 'exitance' is not 0 everywhere, "
+    "and that the faces' normals point outwards"
 )
 Progress = Callable[[str, float], None]
 

@@ -13,7 +13,7 @@ class OpticsError(FsptError):
 
 
 class ExitanceError(FsptError):
-    """A surface flux density J_n that is missing, not finite, negative or zero everywhere."""
+    """A surface flux density J_n that is missing, not finite or negative."""
 
 
 class SceneError(FsptError):

@@ -66,7 +66,6 @@ def mesh(name, kind="vertex"):
 def write_meshes(folder):
     write_ply(folder / "negative.ply", SQUARE, FACES, vertex=[1, 1, -2, 1])
     write_ply(folder / "negative_face.ply", SQUARE, FACES, face=[1, -2])
-    write_ply(folder / "dark.ply", SQUARE, FACES, vertex=[0, 0, 0, 0])
     write_ply(folder / "plain.ply", SQUARE, FACES)
     write_ply(folder / "point.ply", [(1, 1, 1)] * 4, FACES, vertex=[1] * 4)
     write_ply(folder / "line.ply", [(0, 0, z) for z in range(4)], FACES, vertex=[1] * 4)
@@ -125,7 +124,6 @@ SURFACES = {
     ),
     "nan": (of_ball("1e-3", "nan"), "'exitance' of shape 'sphere' has NaN or infinite values"),
     "infinite": (of_ball("1e-3", "inf"), "has NaN or infinite values"),
-    "zero": (of_ball("1e-3", "0"), "'exitance' of shape 'sphere' is 0 everywhere"),
     "true": (
         of_ball('<float name="exitance" value="1e-3"/>', '<boolean name="exitance" value="true"/>'),
         "'exitance' must be a number or a texture, got True",
@@ -149,7 +147,6 @@ SURFACES = {
     "a face negative": (mesh("negative_face.ply", "face"), "its lowest value is -2"),
     "a vertex nan": (mesh("nan.ply"), "'exitance' of shape 'mouse' has NaN or infinite values"),
     "a vertex infinite": (mesh("inf.ply"), "has NaN or infinite values"),
-    "all vertices 0": (mesh("dark.ply"), "'exitance' of shape 'mouse' is 0 everywhere"),
     "no such attribute": (mesh("plain.ply"), "shape 'mouse' has no mesh attribute 'vertex_exitance'. In a PLY name"),
     "attribute on the faces": (mesh("negative_face.ply"), "has no mesh attribute 'vertex_exitance'"),
     "mesh of one point": (mesh("point.ply"), "shape 'mouse' has no area to glow"),
