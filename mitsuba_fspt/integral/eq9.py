@@ -78,7 +78,7 @@ class View:
     radius; a late start avoids it.
 
     detail : triangles of the scene a pixel
-    emitting : 1 at the number of each shape with an `fspt_surface`, 0 elsewhere; None where all shapes have one
+    emitting : 1 at the number of each shape with an `fspt_surface`, 0 elsewhere; None where all shapes count
     """
 
     scene: mi.Scene
@@ -138,10 +138,11 @@ class View:
 
 
 def _emitting(shapes: list[mi.Shape]) -> mi.Float | None:
-    """The table `View.emitting` of these shapes."""
-    if all(is_surface(shape.emitter()) for shape in shapes):
+    """The table `View.emitting` of these shapes; None too where none has an `fspt_surface`, as in a scene of tissue."""
+    emitting = [is_surface(shape.emitter()) for shape in shapes]
+    if all(emitting) or not any(emitting):
         return None
     numbers = [shape_number(shape) for shape in shapes]
     table = np.zeros(max(numbers) + 1, np.float32)
-    table[numbers] = [is_surface(shape.emitter()) for shape in shapes]
+    table[numbers] = emitting
     return mi.Float(table)
