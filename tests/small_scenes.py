@@ -1,9 +1,8 @@
 """Small scenes for the tests: objects in the camera frame or around the world's origin, and scene files.
 
-`camera_scene` puts the lens into the origin: +z to the object, +x to the left. All its films are of 40 × 32 pixels,
-a size that is compiled into the kernels, so that the tests share them. `world_scene` has its objects around the origin
-and the `lens` on the +x axis. Importing this module sets a variant of Mitsuba unless one is set; the fixture `mono`
-sets llvm_ad_mono.
+`camera_scene` puts the lens into the origin: +z to the object, +x to the left. All its films are of 40 × 32 pixels; a
+crop window is quicker. `world_scene` has its objects around the origin and the `lens` on the +x axis. Importing this
+module sets a variant of Mitsuba unless one is set; the fixture `mono` sets llvm_ad_mono.
 """
 
 from __future__ import annotations
@@ -48,10 +47,15 @@ PITCH = 0.4  # mm
 SIDE = PITCH / MAGNIFICATION  # of a virtual pixel [mm]
 
 
-def load_scene(name, **parameters):
-    """A scene of scenes/ with its whole field on the small film."""
+def load_scene(name, crop=None, **parameters):
+    """A scene of scenes/ with its whole field on the small film, of which `crop` is looked at: x, y, width, height."""
     whole = {"width": WIDTH, "height": HEIGHT, "pixel_pitch": 256 * 0.108 / HEIGHT}
-    return fspt.load(SCENES / f"{name}.xml", **whole | parameters)
+    scene = fspt.load(SCENES / f"{name}.xml", **whole | parameters)
+    if crop:
+        film = mi.traverse(scene.sensors()[0].film())
+        film["crop_offset"], film["crop_size"] = crop[:2], crop[2:]
+        film.update()
+    return scene
 
 
 def camera_scene(*shapes, exitance=1.0, crop=None, lamp=None, **optics):

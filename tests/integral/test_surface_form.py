@@ -35,11 +35,11 @@ pytestmark = pytest.mark.usefixtures("mono")
 
 RTOL = 1e-2
 CASES = [
-    ("nylon_cylinder", 2.8),
-    ("nylon_cylinder", 8.0),
-    ("two_spheres", 2.8),
-    ("textured_sphere", 8.0),
-    ("l_shape", 2.8),
+    ("nylon_cylinder", 2.8, None),
+    ("nylon_cylinder", 8.0, None),
+    ("two_spheres", 2.8, None),
+    ("textured_sphere", 8.0, (14, 6, 14, 14)),  # the letter, bands, the limb above and to the right
+    ("l_shape", 2.8, None),
 ]
 
 
@@ -54,8 +54,8 @@ def test_both_forms_are_one_integral(case):
 
     Seen to fail with the cosine at the surface dropped, and on the cylinder with blur discs of half the radius.
     """
-    name, f_number = case
-    surface, pupil = both(load_scene(name, f_number=f_number))
+    name, f_number, crop = case
+    surface, pupil = both(load_scene(name, f_number=f_number, crop=crop))
     off, peak = np.abs(surface.power - pupil.power), pupil.power.max()
     assert off.max() < RTOL * peak
     assert np.mean(off <= surface.error + pupil.error) >= 0.99
@@ -91,7 +91,8 @@ def test_a_shadows_border_lies_where_lines_of_sight_find_it():
     far = 2000.0
     ball = sphere(150.0, 4.0, far + 3) | {"emitter": glow(0.01)}
     place = mi.ScalarTransform4f().translate([far, 0, 0])
-    surface, pupil = both(camera_scene(disk(175.0, 9.0, far, tilt=30), ball, to_world=place))
+    crop = (10, 4, 14, 12)  # the disk's upper half and the border on it
+    surface, pupil = both(camera_scene(disk(175.0, 9.0, far, tilt=30), ball, to_world=place, crop=crop))
     np.testing.assert_allclose(surface.power, pupil.power, atol=RTOL * pupil.power.max())
     np.testing.assert_allclose(surface.power.sum(), pupil.power.sum(), rtol=1e-3)
 
@@ -206,8 +207,8 @@ def test_light_that_only_grazes_the_pupil_is_seen():
     depth, radius, off_axis = 180.0, 3.0, 1.0
     ends = {"p0": [off_axis, off_axis, depth], "p1": [off_axis, off_axis, depth + 1]}
     picture = fspt.render(camera_scene({"type": "cylinder", **ends, "radius": radius}), rtol=0.05)
-    turn = np.linspace(0, 2 * np.pi, 720, endpoint=False)[:, None]
-    ax, ay = RADIUS * even_disc(20000)
+    turn = np.linspace(0, 2 * np.pi, 360, endpoint=False)[:, None]
+    ax, ay = RADIUS * even_disc(10000)
     dx, dy = ax - off_axis - radius * np.cos(turn), ay - off_axis - radius * np.sin(turn)
     z = depth + 0.5
     seen = np.maximum(dx * np.cos(turn) + dy * np.sin(turn), 0) * z / (dx**2 + dy**2 + z**2) ** 2
@@ -362,12 +363,12 @@ def test_no_pixel_is_dark_because_the_first_lines_of_sight_pass_it_by(tmp_path):
 def test_a_spot_on_a_wall_of_two_faces_adds_its_light(domain):
     """Disks of a tenth of a pixel's width, three times as bright as the wall in focus behind them.
 
-    Expected: rtol against what they cover and what they add. Seen to fail, by 4e-3 of the brightest pixel, where a face
-    that is wider than the picture counts as if all its light fell on one pixel, which rtol then is counted from.
+    Expected: rtol against what they cover and what they add. Seen to fail, by 3.6e-3 of the brightest pixel, where a
+    face that is wider than the picture counts as if all its light fell on one pixel, which rtol then is counted from.
     """
     pitch = 0.5
     wall = {"type": "rectangle", "to_world": mi_turned(0, 0, 180.0, 6.0)}
-    spots = [(x, y) for x in (-2.25, -0.25, 1.75) for y in (-1.25, 0.75)]
+    spots = [(-0.25, 0.75), (1.75, -1.25)]
     disks = [{"type": "disk", "to_world": mi_turned(x, y, 179.99, 0.1 * pitch)} for x, y in spots]
     shapes = [wall | {"emitter": glow(1.0)}, *(disk | {"emitter": glow(3.0)} for disk in disks)]
     optics = {"f_number": 4.0, "magnification": None, "focus_distance": 180.0, "to_world": None}
