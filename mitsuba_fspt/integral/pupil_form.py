@@ -25,6 +25,7 @@ from .node_sums import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
 from .quadrature import Quadrature
 from .solution import Solution
+from .specular import Specular
 from .transects import integrate_by_transects
 from .window import Window, visible_window
 
@@ -77,7 +78,7 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
     window = visible_window(scene, lens)
     if 0 in window.shape:
         return np.zeros(window.full)
-    grid, view = Grid(window.shape), View.of(scene, lens, window)
+    grid, view = Grid(window.shape), View.of(scene, lens, window, specular=Specular.of(scene, lens))
     image = grid.full(mi.Float64, 0)
     for part in batches(grid.number):
         coverage = apply_rule(view, window.centres(part), node_rules.twelve(True)).coverage

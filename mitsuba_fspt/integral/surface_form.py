@@ -20,10 +20,11 @@ from ..jit.spectra import scalar
 from .eq9 import eq9, etendue_from_surface
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow
-from .occlusion import hidden, hides_nothing
+from .occlusion import hides_nothing
 from .quadrature import Quadrature
 from .shortcuts import Finding
 from .solution import Solution
+from .specular import Specular, transmission
 from .window import Window
 
 # Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second
@@ -50,6 +51,7 @@ def solve(
     quadrature: Quadrature,
     where: NDArray[np.bool_] | None = None,
     least_peak: float = 0.0,
+    specular: Specular | None = None,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
@@ -58,17 +60,20 @@ def solve(
     [W/mm²/sr].
 
     `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
-    Coverage counts the lines of sight that meet a glowing surface, not those that meet a dark one. Raises SceneError
-    where an emitter has no surface.
+    Light goes on through `specular` shapes where it stays straight. Coverage counts the lines of sight that meet a
+    glowing surface, not those that meet a dark one. Raises SceneError where an emitter has no surface.
     """
-    return _Refinement(scene, lens, window, quadrature).run(where, least_peak)
+    return _Refinement(scene, lens, window, quadrature, specular).run(where, least_peak)
 
 
 class _Refinement:
     """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
 
-    def __init__(self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature) -> None:
+    def __init__(
+        self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, specular: Specular | None
+    ) -> None:
         self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
+        self.specular = specular
         dark = quadrature.takes("dark")
         self.glows = [Glow.seen(emitter, lens, window, quadrature.rtol, dark) for emitter in scene.emitters()]
         self.value, self.error, self.coverage = (np.zeros(self.window.shape) for _ in range(3))
@@ -149,12 +154,14 @@ class _Refinement:
         to_lens = dr.normalize(lens_point - middle.p)
         cos_s = dr.dot(middle.n, to_lens)
         active = (cos_s > 0) & (arrival > 0)
+        through = mi.Float(1)
         if self.hidden:
-            active &= ~hidden(self.scene, spot.p, lens_point, active)
+            through = transmission(self.scene, self.specular, spot.p, lens_point, active)
+            active &= through > 0
         spot.sh_frame.n = spot.n  # not the normal that a mesh is shaded with
         spot.initialize_sh_frame()
         spot.wi = spot.to_local(_turned_along(to_lens, middle.n, spot.n))
-        radiance = dr.select(active, scalar(batch.glow.emitter.eval(spot, active)), 0)
+        radiance = dr.select(active, through * scalar(batch.glow.emitter.eval(spot, active)), 0)
         virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
         cell = [_corner(i + x, j + y, m) for x, y in CORNERS]
         etendue = dr.select(active, etendue_from_surface(cos_s, area, arrival, _area(cell), virtual_pixel), 0)

@@ -16,12 +16,15 @@ FEW = 20  # events on a pixel, below which its own passes estimate the variance 
 Plane = NDArray[np.float64]
 
 
-def tracer(method: str) -> mi.Integrator:
-    """Mitsuba's integrator `path` or `ptracer` with one ray per sample."""
+def tracer(method: str, max_depth: int) -> mi.Integrator:
+    """Mitsuba's integrator `path` or `ptracer` that follows light over so many legs.
+
+    One leg goes from the surface straight into the lens, which is all light in free space; each further one takes a
+    surface that reflects light or lets it through.
+    """
     import mitsuba as mi
 
-    # Depth 1 is light that goes from the surface straight into the lens, which is all light in free space.
-    return mi.load_dict({"type": method, "max_depth": 1})
+    return mi.load_dict({"type": method, "max_depth": max_depth})
 
 
 def passes(

@@ -55,6 +55,7 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
         path = _path_of(scene)
         folder, parse = path.resolve().parent, _parser_of_file(path, parameters)
     config = mi.parser.ParserConfig(mi.variant())
+    config.merge_meshes = False  # shapes keep their ids, and rectangles their bounding boxes
     resolver = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(resolver))
     mi.file_resolver().prepend(str(folder))
