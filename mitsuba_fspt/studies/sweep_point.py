@@ -34,7 +34,7 @@ class SweepPoint:
     path : its absolute path, for a process that works in another folder
     parameters : name and value, as in the scene's `<default>`
     lens : names of the lens numbers that a parameter sets, for parameters that set nothing else
-    settings : method, rtol, spp, seed, sensor as `render` takes them
+    settings : method, rtol, spp, seed, sensor as `render` takes them, and source_power [W]
     geometry : hash of the scene without its lens; points of equal `geometry` can use the same loaded scene
     fingerprint : hash of the scene's files, the parameters, the settings and the versions
     """
