@@ -69,9 +69,8 @@ Camera    magnification puts the virtual detector plane on the front of the phan
             <rotate z="1" angle="$view"/>
         </transform>
         <emitter type="fspt_surface">
-            <!-- The PLY property exitance_x. -->
             <texture type="mesh_attribute" name="exitance">
-                <string name="name" value="{per}_exitance"/>
+                <string name="name" value="{attribute}"/>
             </texture>
         </emitter>
     </shape>
@@ -104,7 +103,8 @@ def scene_xml(
 
     Parameters
     ----------
-    phantom : PLY file with J_n as property `exitance_x` of its vertices or of its faces, as `fspt flux` writes it
+    phantom : PLY file with J_n as property `exitance_x` of its vertices or of its faces, as `fspt flux` writes it, or
+        as its only property with a name like `jn_x`; see `Phantom.read`
     focal_length : F [mm]
     f_number : f_num = F/D
     magnification : t = v/u; None finds it
@@ -131,10 +131,10 @@ def scene_xml(
     mesh = Phantom.read(path)
     frame = Frame(Outline.of(mesh), focal_length, f_number, numbers["pixel_pitch"], film, lens)
     found = dict(zip(("magnification", "distance"), frame.placed(magnification, distance), strict=True))
-    return _filled_in(path, mesh.per, frame, numbers | found | film)
+    return _filled_in(path, f"{mesh.per}_{mesh.attribute}", frame, numbers | found | film)
 
 
-def _filled_in(path: Path, per: str, frame: Frame, values: dict[str, float]) -> str:
+def _filled_in(path: Path, attribute: str, frame: Frame, values: dict[str, float]) -> str:
     """The template with these values of its `<default>` parameters."""
     order = ("f_number", "view", "rtol", "focal_length", "magnification", "distance", "width", "height", "pixel_pitch")
     return TEMPLATE.format(
@@ -147,7 +147,7 @@ def _filled_in(path: Path, per: str, frame: Frame, values: dict[str, float]) -> 
         borders="".join(_property(name, value) for name, value in frame.lens.items() if name not in FOCUS),
         filename=quoteattr(str(path.absolute())),
         shift=tuple(-float(c) + 0.0 for c in frame.outline.centre),
-        per=per,
+        attribute=attribute,
     )
 
 
