@@ -17,6 +17,7 @@ from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
+from ..integral.progress import Progress
 from ..integral.quadrature import Quadrature
 from ..integral.scene_checks import check_scene, check_surfaces_alone
 from ..integral.shortcuts import SHORTCUTS, Finding
@@ -84,7 +85,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     ) -> Solution:
         """Power, error and coverage of the sensor's crop window, by `quadrature` or the integrator's own.
 
-        A large film is solved in tiles; `progress` is called with the share done before each.
+        A large film is solved in tiles; `progress` is called with the share done, 0 … 1, after every level of each.
 
         Raises
         ------
@@ -98,7 +99,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
             mosaic = Mosaic(window)
             if mosaic.tiles:
-                self._fill(mosaic, self._traced(scene, sensor), sensor, quadrature, progress)
+                self._fill(mosaic, self._traced(scene, sensor), sensor, quadrature, Progress(progress))
             # Smaller displacements are random.
             rounding = sensor.rounding if sensor.rounding >= LEAST_DISPLACEMENT else 0.0
             solution = mosaic.solution(quadrature.least_error, rounding)
@@ -110,20 +111,19 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         scene: mi.Scene,
         lens: mi.Sensor,
         quadrature: Quadrature,
-        progress: Callable[[float], None] | None,
+        progress: Progress,
     ) -> None:
         """Solve all tiles; several ones share the tolerance that follows from a lower bound of the brightest pixel."""
         tiles, window = mosaic.tiles, mosaic.window
         view = View.of(scene, lens, window, self._faces_of(scene) if quadrature.takes("record") else None)
         least_peak, points = 0.0, None
+        progress(0.0)
         if len(tiles) > 1:
             points = points_on_surfaces(scene, lens)
             least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points, window))
         for k, tile in enumerate(tiles):
-            if progress:
-                progress(k / len(tiles))
             narrow = partial(narrow_light, points, tile) if points else partial(self._narrow_light, scene, lens, tile)
-            mosaic.put(tile, self._solve_tile(tile, view, quadrature, narrow, least_peak))
+            mosaic.put(tile, self._solve_tile(tile, view, quadrature, narrow, least_peak, progress.part(k, len(tiles))))
 
     def _solve_tile(
         self,
@@ -132,6 +132,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         quadrature: Quadrature,
         narrow_light: Callable[[], NarrowLight],
         least_peak: float,
+        progress: Progress,
     ) -> Solution:
         """Solution by the requested form of Eq. 9; pixels with light of narrow spots always take the surface form.
 
@@ -142,18 +143,20 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         inside, cut = window.field_stop(lens)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
-            return surface_form.solve(scene, lens, window, quadrature, least_peak=least_peak)
+            known = surface_form.solve(scene, lens, window, quadrature, None, least_peak, progress)
+            return _with_dark_coverage(known, view, window)
         narrow = narrow_light()
         where, peak = inside, least_peak
         if not everywhere:
             where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
             peak = max(narrow.brightest / 2, least_peak)
         if where.any():
-            known = surface_form.solve(scene, lens, window, quadrature, where, peak)
-            rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak)
+            known = surface_form.solve(scene, lens, window, quadrature, where, peak, progress.part(0, 2))
+            known = _with_dark_coverage(known, view, window)
+            rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak, progress.part(1, 2))
             solution = known.completed_by(rest)
         else:
-            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, least_peak=least_peak)
+            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, None, least_peak, progress)
         return replace(solution, error=np.maximum(solution.error, _missed(narrow, where, cut, window, lens, solution)))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
@@ -283,6 +286,14 @@ def _pose(shape: mi.Shape) -> tuple[float, ...]:
         return (buffers(shape)[0].index, *box)
     parameters = mi.traverse(shape)
     return (*box, *np.ravel(parameters["to_world"].matrix).tolist()) if "to_world" in parameters else box
+
+
+def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solution:
+    """The surface form's `solution` with the coverage of elements that do not glow, which that form leaves out."""
+    if not any(finding.name == "dark" and finding.taken for finding in solution.findings):
+        return solution
+    met = np.where(solution.where, pupil_form.coverage_of(view, window), 0)
+    return replace(solution, coverage=np.maximum(solution.coverage, met))
 
 
 def _missed(
