@@ -16,6 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from ..optics.thin_lens import Lens, number_names
+from ..optics.transmittance import NUMBERS as LIGHT
 from ..rendering.scene import check_parameters, parameter_text
 from ..rendering.scene_rules import REFERENCE, check_values, is_number
 from ..rendering.scene_xml import read_xml
@@ -157,7 +158,7 @@ class SceneSource:
         lens_nodes = []
         for node in self._lens:
             reference = REFERENCE.fullmatch(node.get("value", ""))
-            if reference and node.tag == "float" and node.get("name") in (*number_names(), "pixel_pitch"):
+            if reference and node.tag == "float" and node.get("name") in (*number_names(), "pixel_pitch", *LIGHT):
                 found[reference[1]] = (*found.get(reference[1], ()), node.get("name", ""))
                 lens_nodes.append(node)
         elsewhere = " ".join(text for node in self._nodes if node not in lens_nodes for text in node.attrib.values())
