@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 import typer
 
 from ..runtime.backend import quiet_mitsuba
-from .options import Domain, Parameters, Rtol, SceneFile, Sensor, definitions
-from .terminal import progress_bar
+from .options import AsJson, Domain, Parameters, Quiet, Rows, Rtol, SceneFile, Sensor, definitions
+from .terminal import print_result, progress_bar
 
 
-def doctor() -> None:
+def doctor(as_json: AsJson = False, quiet: Quiet = False) -> None:
     """Print versions, the chosen LLVM and why, devices, and a timed first kernel."""
     from ..runtime.doctor import diagnose
 
     diagnosis = diagnose()
-    typer.echo(diagnosis.render_text())
+    print_result(diagnosis.render_text(), diagnosis.to_dict(), as_json=as_json, quiet=quiet)
     raise typer.Exit(0 if diagnosis.usable else 2)
 
 
 def stability(
     everything: Annotated[bool, typer.Option("--all", help="Also the row of 3 million triangles.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
+    as_json: Rows = False,
+    quiet: Quiet = False,
 ) -> None:
     """Try stiff and extreme cases against the truth: each must be right to its tolerance, or refused."""
     from ..validation.stability import check
@@ -34,13 +34,11 @@ def stability(
     for case in cases():
         if everything or not case.slow:
             results.append(check(case))
-            if not as_json:
+            if not (as_json or quiet):
                 typer.echo(results[-1].render_text())
     held = sum(result.ok for result in results)
-    if as_json:
-        typer.echo(json.dumps([result.to_dict() for result in results]))
-    else:
-        typer.echo(f"{held} of {len(results)} hold, {sum(result.seconds for result in results):.0f} s")
+    summary = f"{held} of {len(results)} hold, {sum(result.seconds for result in results):.0f} s"
+    print_result(summary, [result.to_dict() for result in results], as_json=as_json, quiet=quiet)
     raise typer.Exit(0 if held == len(results) else 1)
 
 
@@ -50,17 +48,15 @@ def explain(
     rtol: Rtol = None,
     domain: Domain = None,
     sensor: Sensor = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")] = False,
+    as_json: Rows = False,
+    quiet: Quiet = False,
 ) -> None:
     """Tell what the integral leaves out of a scene, why, and what that saves: 'render --no-shortcuts' goes without."""
-    with progress_bar():
+    with progress_bar(quiet):
         from ..rendering.scene import load
         from ..studies.explain import HEADER, explain
 
         quiet_mitsuba()
         rows = explain(load(scene, **definitions(define)), sensor=sensor, rtol=rtol, domain=domain)
-    if as_json:
-        typer.echo(json.dumps([row.to_dict() for row in rows]))
-        return
-    for line in (HEADER, *(row.render_text() for row in rows)):
-        typer.echo(line)
+    table = "\n".join([HEADER, *(row.render_text() for row in rows)])
+    print_result(table, [row.to_dict() for row in rows], as_json=as_json, quiet=quiet)

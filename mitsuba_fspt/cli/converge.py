@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from ..runtime.backend import quiet_mitsuba
-from .options import Parameters, SceneFile, definitions, require_writable
-from .terminal import progress_bar
+from .options import AsJson, Parameters, Quiet, SceneFile, definitions, require_writable
+from .terminal import print_result, progress_bar
 
 
 def converge(
@@ -24,7 +23,8 @@ def converge(
     reference: Annotated[
         Path | None, typer.Option(metavar="FILE.npz|.exr", help="Power and its error [W]; made where not given.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Measure error against run time of every method: both forms of the integral, the paper's sum, Monte Carlo.
 
@@ -39,7 +39,7 @@ def converge(
     require_writable(figure, ".png")
     require_writable(sheet, ".csv")
     require_matplotlib()
-    with progress_bar() as progress, empty_kernel_cache() as kernels:
+    with progress_bar(quiet) as progress, empty_kernel_cache() as kernels:
         from ..rendering.scene import load
 
         quiet_mitsuba()
@@ -47,8 +47,5 @@ def converge(
         found = converge(loaded, rounds=rounds, budget=budget, reference=reference, kernels=kernels, progress=progress)
     with png_file(found, figure):  # both files or none
         write_csv(found, sheet)
-    if as_json:
-        typer.echo(json.dumps(found.to_dict(), allow_nan=False))
-        return
-    typer.echo(found.render_text())
-    typer.echo(f"\n{sheet}: every setting; {figure}: the same to look at")
+    text = f"{found.render_text()}\n\n{sheet}: every setting; {figure}: the same to look at"
+    print_result(text, found.to_dict(), as_json=as_json, quiet=quiet)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from contextlib import nullcontext
 from enum import Enum
@@ -14,7 +13,8 @@ from rich.console import Console
 
 from ..runtime.atomic_files import atomic_path, require_apart
 from ..runtime.errors import FluxError
-from .options import require_writable
+from .options import AsJson, Quiet, require_writable
+from .terminal import print_result
 
 if TYPE_CHECKING:
     from ..phantom.phantom import Phantom
@@ -60,7 +60,8 @@ def import_(
     n: Annotated[float | None, typer.Option(help="Refractive index for A; 1.37 where not given.")] = None,
     clip: Annotated[bool, typer.Option("--clip", help="Set negative values to 0 and say how much.")] = False,
     flip: Annotated[bool, typer.Option("--flip", help="Turn all faces over.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write a phantom from a mesh and values on it, as other codes write them.
 
@@ -89,7 +90,8 @@ def import_(
         flip=flip,
     )
     phantom.write(output)
-    _print_report(phantom.report() | {"output": str(output)}, as_json)
+    report = phantom.report() | {"output": str(output)}
+    print_result(report_text(report), report, as_json=as_json, quiet=quiet)
     if "warning" in phantom.provenance:
         typer.echo(f"fspt: {output}: {phantom.provenance['warning']}", err=True)
 
@@ -101,7 +103,8 @@ def solve(
     volume: Annotated[
         Path | None, typer.Option(help="Also write the fluence inside on a grid, for gridvolume: .vol.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Solve the diffusion equation in a phantom and write its surface with J_n.
 
@@ -116,7 +119,7 @@ def solve(
         require_writable(volume, ".vol", FluxError)
     tissue = PhantomFile.read(description)
     _require_apart(output, volume, [description, *tissue.files])
-    with Console(stderr=True).status("mesh") as status:
+    with Console(stderr=True, quiet=quiet).status("mesh") as status:
         solution = tissue.solve(status.update)
         status.update("surface")
         phantom = solution.phantom(tissue.surface_edge)
@@ -127,7 +130,8 @@ def solve(
             grid = solution.volume(tissue.voxel)
             report |= {"volume": str(volume)} | grid.report()
     _write(phantom, output, grid, volume)
-    _print_report(report | {"seconds": time.perf_counter() - start, "output": str(output)}, as_json)
+    report |= {"seconds": time.perf_counter() - start, "output": str(output)}
+    print_result(report_text(report), report, as_json=as_json, quiet=quiet)
 
 
 def _require_apart(output: Path, volume: Path | None, inputs: list[Path]) -> None:
@@ -145,10 +149,6 @@ def _write(phantom: Phantom, output: Path, grid: Volume | None, volume: Path | N
         phantom.write(output)
 
 
-def _print_report(report: dict[str, object], as_json: bool) -> None:
-    typer.echo(json.dumps(report, allow_nan=False) if as_json else report_text(report))
-
-
 def report_text(report: dict[str, object]) -> str:
     """The report as text, a line of name, value and unit for each entry."""
     units = {"area": "mm^2", "bounding_box": "mm", "removed_percent": "% of the power", "seconds": "s"}
@@ -157,7 +157,7 @@ def report_text(report: dict[str, object]) -> str:
     lines = []
     for name, value in report.items():
         if value is None:
-            text = "undecided (open surface)"
+            text = "all of it" if name == "removed_percent" else "undecided (open surface)"
         elif isinstance(value, bool):
             text = "yes" if value else "no"
         elif name == "bounding_box" and isinstance(value, list):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +11,15 @@ import typer
 
 from ..runtime.atomic_files import require_apart
 from ..runtime.errors import ImageError
-from .options import SourcePower, require_picture
+from .options import AsJson, Quiet, SourcePower, require_picture
+from .terminal import print_result
 
 
 def compare(
     calculated: Annotated[Path, typer.Argument(metavar="CALCULATED.exr")],
     standard: Annotated[Path, typer.Argument(metavar="STANDARD.exr")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, profiles included.")] = False,
+    quiet: Quiet = False,
     png: Annotated[Path | None, typer.Option(help="Also draw both images and their difference.")] = None,
 ) -> None:
     """Compare two images: ME and CF as the paper defines them, largest and RMS error, a z-test."""
@@ -31,7 +32,7 @@ def compare(
         from ..images.picture import write_comparison_png
 
         write_comparison_png(*images, png)
-    typer.echo(json.dumps(result.to_dict()) if as_json else result.render_text())
+    print_result(result.render_text(), result.to_dict(), as_json=as_json, quiet=quiet)
 
 
 def plot(
@@ -45,8 +46,8 @@ def plot(
     ] = None,
     per_panel: Annotated[bool, typer.Option("--per-panel", help="A colour scale for each image.")] = False,
     outline: Annotated[bool, typer.Option("--outline", help="Draw the outline of the phantom.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Draw images with colour bar, axes in mm and total power; the scale is logarithmic where peaks differ a lot."""
     from ..images.image import read
@@ -60,11 +61,10 @@ def plot(
     names = [path.stem for path in images]
     figure = draw_panels(pictures, names, log=log, limits=ends, per_panel=per_panel, outline=outline)
     save_figure(figure, output)
-    if as_json:
-        totals = [float(image.power.sum(dtype="float64")) for image in pictures]
-        typer.echo(json.dumps({"output": str(output), "images": [*map(str, images)], "total_power": totals}))
-    elif not quiet:
-        typer.echo(f"{output}: {len(images)} {'image' if len(images) == 1 else 'images'}")
+    totals = [float(image.power.sum(dtype="float64")) for image in pictures]
+    record = {"output": str(output), "images": [*map(str, images)], "total_power": totals}
+    text = f"{output}: {len(images)} {'image' if len(images) == 1 else 'images'}"
+    print_result(text, record, as_json=as_json, quiet=quiet)
 
 
 def _range(text: str) -> tuple[float, float]:
@@ -97,6 +97,8 @@ def expose(
     bias: Annotated[float | None, typer.Option(help="[DN].")] = None,
     bits: Annotated[int | None, typer.Option(help="Of the converter, 1 to 16.")] = None,
     pixel_pitch: Annotated[float | None, typer.Option(help="Of the detector's own pixels [mm].")] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Expose a CCD to an image: electrons, and counts if asked.
 
@@ -122,5 +124,7 @@ def expose(
     )
     with exposure.counts_file(counts) if counts else nullcontext():  # both files or none
         exposure.write(output)
-    saturated = exposure.metadata["saturated_pixels"]
-    typer.echo(f"{output}: brightest pixel {exposure.electrons.max():.6g} electrons, {saturated} pixels saturated")
+    peak, saturated = float(exposure.electrons.max()), exposure.metadata["saturated_pixels"]
+    record = {"output": str(output), "counts": counts and str(counts), "peak": peak, "saturated_pixels": saturated}
+    text = f"{output}: brightest pixel {peak:.6g} electrons, {saturated} pixels saturated"
+    print_result(text, record, as_json=as_json, quiet=quiet)

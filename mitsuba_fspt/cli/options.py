@@ -27,6 +27,9 @@ Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
 SourcePower = Annotated[
     float | None, typer.Option(metavar="W", help="Power of the light source [W], for a scene that is per 1 W of it.")
 ]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Rows = Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print no results and no progress; warnings stay.")]
 MOST = 100_000  # values of a range
 NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
 

@@ -16,9 +16,11 @@ from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import ImageError, SceneError
 from .options import (
+    AsJson,
     Domain,
     Method,
     Parameters,
+    Quiet,
     Rtol,
     Seed,
     Sensor,
@@ -29,7 +31,7 @@ from .options import (
     require_writable,
     several,
 )
-from .terminal import Interrupted, progress_bar
+from .terminal import Interrupted, print_result, progress_bar
 
 if TYPE_CHECKING:
     from ..images.image import Image
@@ -73,6 +75,8 @@ def render(
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Render a scene to an EXR with the power [W], its error and the coverage of every pixel.
 
@@ -87,7 +91,7 @@ def render(
     if source_power is not None:
         _require_source_power(source_power)
     images: list[Image] = []
-    with _kept(shots, images), progress_bar() as progress:
+    with _kept(shots, images), progress_bar(quiet) as progress:
         from ..rendering.render import render
         from ..rendering.scene import load
 
@@ -101,8 +105,12 @@ def render(
                 image = replace(image, metadata=image.metadata | {"scene": shot.origin})
             _write(image, shot.output, _picture(shot, png))
             images.append(image)
-    for shot, image in zip(shots, images, strict=True):
-        _print_summary(image, shot.output, _picture(shot, png))
+    summaries = [_summary(image, shot.output, _picture(shot, png)) for shot, image in zip(shots, images, strict=True)]
+    text = "\n".join(map(_summary_text, summaries))
+    print_result(text, {"images": summaries}, as_json=as_json, quiet=quiet)
+    for summary in summaries:
+        if "warnings" in summary:
+            typer.echo(f"fspt: {summary['output']}: {summary['warnings']}.", err=True)
 
 
 def _require_source_power(watts: float) -> None:
@@ -184,11 +192,17 @@ def _write(image: Image, output: Path, picture: Path | None) -> None:
         image.write(output)
 
 
-def _print_summary(image: Image, output: Path, picture: Path | None) -> None:
-    """Print the files, the total power and the brightest pixel; on stderr what the metadata warn of."""
-    power, peak = image.power.sum(), image.power.max()
-    typer.echo(f"{output}: total {power:.6g} W, brightest pixel {peak:.6g} W, {image.metadata['wall_time']:.3g} s")
+def _summary(image: Image, output: Path, picture: Path | None) -> dict[str, Any]:
+    """The files, the total power and the brightest pixel [W], the time [s], and what the metadata warn of."""
+    summary: dict[str, Any] = {"output": str(output), "total_power": float(image.power.sum(dtype="float64"))}
+    summary |= {"peak": float(image.power.max()), "wall_time": image.metadata["wall_time"]}
     if picture:
-        typer.echo(f"{picture}: the same to look at")
-    if "warnings" in image.metadata:
-        typer.echo(f"fspt: {output}: {image.metadata['warnings']}.", err=True)
+        summary["picture"] = str(picture)
+    return summary | {key: image.metadata[key] for key in ("warnings",) if key in image.metadata}
+
+
+def _summary_text(summary: dict[str, Any]) -> str:
+    """A line for each file of an image."""
+    numbers = f"total {summary['total_power']:.6g} W, brightest pixel {summary['peak']:.6g} W"
+    line = f"{summary['output']}: {numbers}, {summary['wall_time']:.3g} s"
+    return f"{line}\n{summary['picture']}: the same to look at" if "picture" in summary else line

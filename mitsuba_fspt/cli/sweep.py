@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import BackendError, SceneError
-from .options import Method, Rtol, SceneFile, Seed, Sensor, Spp, several
-from .terminal import Interrupted, progress_bar
+from .options import AsJson, Method, Quiet, Rtol, SceneFile, Seed, Sensor, SourcePower, Spp, several
+from .terminal import Interrupted, print_result, progress_bar
 
 if TYPE_CHECKING:
     from ..studies.sweep import SweepRow
@@ -37,10 +38,13 @@ def sweep(
     spp: Spp = None,
     seed: Seed = None,
     sensor: Sensor = 0,
+    source_power: SourcePower = None,
     jobs: Annotated[int | None, typer.Option(help="Processes on this machine.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
     ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Render all combinations of values: an EXR each, index.csv and a contact sheet.
 
@@ -52,12 +56,24 @@ def sweep(
     folder = output or Path(f"{scene.stem}_sweep")
     values = _values(define)
     with _resumable(folder):
-        with progress_bar() as progress:
+        with progress_bar(quiet) as progress:
             quiet_mitsuba()
-            settings = {"method": method, "rtol": rtol, "spp": spp, "seed": seed, "jobs": jobs, "scheduler": scheduler}
-            rows = sweep(scene, values, folder, sensor=sensor, progress=progress, **settings)  # type: ignore[arg-type]
-        typer.echo(f"{folder / INDEX}: {len(rows)} points, {_work(rows)}")
-        _write_sheet(rows, folder / "contact_sheet.png")
+            settings: dict[str, Any] = {"method": method, "rtol": rtol, "spp": spp, "seed": seed}
+            settings |= {
+                "sensor": sensor,
+                "source_power": source_power,
+                "jobs": jobs,
+                "scheduler": scheduler,
+                "progress": progress,
+            }
+            rows = sweep(scene, values, folder, **settings)
+        sheet = _written_sheet(rows, folder / "contact_sheet.png")
+    record = {"index": str(folder / INDEX), "contact_sheet": sheet and str(sheet)}
+    text = f"{folder / INDEX}: {len(rows)} points, {_work(rows)}" + (
+        f"\n{sheet}: all of them to look at" if sheet else ""
+    )
+    points = [asdict(row) | {"file": str(row.file)} for row in rows]
+    print_result(text, record | {"points": points}, as_json=as_json, quiet=quiet)
 
 
 @contextmanager
@@ -80,15 +96,16 @@ def _work(rows: list[SweepRow]) -> str:
     return f"{len(rendered)} rendered in {sum(row.wall_time for row in rendered):.3g} s, {reused}"
 
 
-def _write_sheet(rows: list[SweepRow], path: Path) -> None:
-    """Write the contact sheet; where that cannot be drawn, say so on stderr."""
+def _written_sheet(rows: list[SweepRow], path: Path) -> Path | None:
+    """Write the contact sheet to `path`; where that cannot be drawn, say so on stderr and return None."""
     from ..studies.sweep import write_contact_sheet
 
     try:
         write_contact_sheet(rows, path)
-        typer.echo(f"{path}: all of them to look at")
     except BackendError as error:
         typer.echo(f"fspt: no contact sheet: {error}", err=True)
+        return None
+    return path
 
 
 def _values(define: list[str] | None) -> dict[str, list[str]]:

@@ -11,6 +11,7 @@ import mitsuba as mi
 from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
 from . import node_rules
 from .eq9 import View
+from .progress import SILENT, Progress
 from .quadrature import Quadrature
 from .solution import Solution
 from .window import Window
@@ -41,13 +42,20 @@ class Draft:
     clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
     open, known : False where the value is known from elsewhere, and that value
     least_peak : lower bound of the brightest pixel, of a picture that this one is a tile of [W/mm²/sr]
+    progress : called after each step with the share of the steps that is done
     """
 
     def __init__(
-        self, view: View, window: Window, quadrature: Quadrature, known: Solution | None, least_peak: float = 0.0
+        self,
+        view: View,
+        window: Window,
+        quadrature: Quadrature,
+        known: Solution | None,
+        least_peak: float = 0.0,
+        progress: Progress = SILENT,
     ) -> None:
         self.view, self.lens, self.window, self.quadrature = view, view.lens, window, quadrature
-        self.least_peak = least_peak
+        self.least_peak, self.progress = least_peak, progress
         self.area = quadrature.pixel == "area"
         self.grid = grid = Grid(window.shape)
         self.value, self.error, self.coverage, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))

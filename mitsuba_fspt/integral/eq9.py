@@ -77,7 +77,7 @@ class Sight:
 
     integrand : of Eq. 9 in the pupil form [W/mm²/sr], whose mean over pixel and pupil, times the pixel's étendue, is P
     radiance : [W/mm²/sr]
-    body : number of the surfaces met, > 0 where the line ends on one; two lines of another one have an edge between them
+    body : number of the surfaces met, > 0 where the line ends on one; where it changes lies an edge
     covered : True if it reaches a shape with an `fspt_surface`, whatever its J_n there
     depth, front : depth [mm] at which the surface where the line ends and the first surface are seen, inf without one
     lost : share of the radiance along it that is not followed through or off specular surfaces

@@ -23,6 +23,7 @@ from .draft import Draft, open_share
 from .eq9 import View
 from .node_sums import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
+from .progress import SILENT, Progress
 from .quadrature import Quadrature
 from .solution import Solution
 from .specular import Specular
@@ -44,22 +45,26 @@ def solve(
     light: NDArray[np.float64],
     known: Solution | None = None,
     least_peak: float = 0.0,
+    progress: Progress = SILENT,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
     Only pixels of the `window` are computed, the others are dark. `light`: of surfaces as if in focus, see
     `NarrowLight`. Pixels on which a partial solution is `known` are not refined. `least_peak`: lower bound of the
-    brightest pixel's mean radiance on film [W/mm²/sr].
+    brightest pixel's mean radiance on film [W/mm²/sr]. `progress` is called after every level.
     """
-    draft = Draft(view, window, quadrature, known, least_peak)
+    draft = Draft(view, window, quadrature, known, least_peak, progress)
     rough = first_nodes(draft, light)
     levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
+    progress(1 / (2 + len(levels)))
     if quadrature.max_nodes >= BOTH:
         rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
+    progress(2 / (2 + len(levels)))
     if not levels:
         draft.doubt(rough)
     elif dr.any(rough):
         integrate_by_transects(draft, rough, levels)
+    progress(1.0)
     return draft.solution()
 
 
@@ -74,13 +79,18 @@ def peak_of_few(view: View, window: Window, quadrature: Quadrature) -> float:
 
 
 def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
-    """Share of each pixel's lines of sight that meet a surface, by twelve of them; shape (h, w)."""
+    """Share of each pixel's lines of sight that meet a glowing surface, by twelve of them; shape (h, w)."""
     window = visible_window(scene, lens)
     if 0 in window.shape:
         return np.zeros(window.full)
-    grid, view = Grid(window.shape), View.of(scene, lens, window, specular=Specular.of(scene, lens))
+    return coverage_of(View.of(scene, lens, window, specular=Specular.of(scene, lens)), window)
+
+
+def coverage_of(view: View, window: Window) -> NDArray[np.float64]:
+    """As `coverage`, of the pixels of a window that is not empty; 0 on the others of the crop window, shape (h, w)."""
+    grid = Grid(window.shape)
     image = grid.full(mi.Float64, 0)
     for part in batches(grid.number):
         coverage = apply_rule(view, window.centres(part), node_rules.twelve(True)).coverage
         dr.scatter(image, mi.Float64(coverage), part)
-    return window.expand(grid.array(image * open_share(lens, window, grid)))
+    return window.expand(grid.array(image * open_share(view.lens, window, grid)))

@@ -64,9 +64,10 @@ class Specular:
 
     @classmethod
     def of(
-        cls, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature = Quadrature(), even_if_none: bool = False
+        cls, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature | None = None, even_if_none: bool = False
     ) -> Specular | None:
         """Specular shapes of a scene as a `lens` sees it; None if there is none, unless wanted `even_if_none`."""
+        quadrature = quadrature or Quadrature()
         shapes = [(shape, bsdf) for shape in scene.shapes() if (bsdf := specular_bsdf(shape)) is not None]
         if not (shapes or even_if_none):
             return None
@@ -253,7 +254,7 @@ class Found:
 
 @dataclass
 class _Lobe:
-    """A lobe where a line of sight meets a surface: its `direction`, `weight`, and the ratio of refractive `indices`."""
+    """A lobe where a line of sight meets a surface: its `direction`, `weight` and ratio of refractive `indices`."""
 
     direction: mi.Vector3f
     weight: mi.Float

@@ -10,6 +10,8 @@ piece's middle, tile the disc instead.
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -21,6 +23,7 @@ from .eq9 import eq9, etendue_from_surface
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow
 from .occlusion import hides_nothing
+from .progress import SILENT, Progress
 from .quadrature import Quadrature
 from .shortcuts import Finding
 from .solution import Solution
@@ -51,19 +54,20 @@ def solve(
     quadrature: Quadrature,
     where: NDArray[np.bool_] | None = None,
     least_peak: float = 0.0,
+    progress: Progress = SILENT,
     specular: Specular | None = None,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
     Only pixels of the `window` are computed, the others are dark. With `where`, of its shape, the solution is complete
     on the pixels marked there and 0 elsewhere. `least_peak`: lower bound of the brightest pixel's mean radiance on film
-    [W/mm²/sr].
+    [W/mm²/sr]. `progress` is called after every level.
 
     `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
     Light goes on through `specular` shapes where it stays straight. Coverage counts the lines of sight that meet a
     glowing surface, not those that meet a dark one. Raises SceneError where an emitter has no surface.
     """
-    return _Refinement(scene, lens, window, quadrature, specular).run(where, least_peak)
+    return _Refinement(scene, lens, window, quadrature, specular).run(where, least_peak, progress)
 
 
 class _Refinement:
@@ -81,17 +85,19 @@ class _Refinement:
         self.rays = 0
         self.levels: list[str] = []
 
-    def run(self, where: NDArray[np.bool_] | None, least_peak: float) -> Solution:
+    def run(self, where: NDArray[np.bool_] | None, least_peak: float, progress: Progress) -> Solution:
         # For a few pixels shadow rays are quicker than the test that makes them unnecessary.
         self.hidden = where is not None or not self._hides_nothing()
         shown = self.window.shown()
         mark = where = shown if where is None else where
         lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * FIRST_GROWTH)
+        levels = 2 + math.floor(math.log(most / (FIRST_LINES * FIRST_GROWTH), GROWTH))
         if mark.any():
             self.value, self.coverage = (np.where(where, image, 0) for image in self._level(lines, mark))
             self.glows = [glow.finer(self._tolerance(least_peak)) for glow in self.glows]
         recent, grid = None, Grid(self.window.shape)
         while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
+            progress(len(self.levels) / levels)
             value, coverage = self._level(lines, mark)
             change = np.where(mark, np.abs(value - self.value), 0)
             recent, last = SAFETY * grid.array(grid.spread_max(grid.flat(change))), recent
@@ -105,6 +111,7 @@ class _Refinement:
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.coverage, 0, 1))
         known = self.window.expand(where.astype(np.float64)) > 0
+        progress(1.0)
         return Solution(power, error, coverage, self.rays, tuple(self.levels), known, self._findings())
 
     def _tolerance(self, least_peak: float) -> float:

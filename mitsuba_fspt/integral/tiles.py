@@ -80,11 +80,11 @@ class Mosaic:
         """
         levels, findings = tuple(self._levels), tuple(self._findings)
         if len(self.tiles) > 1:
-            self._level_errors(least_error, rounding)
+            self._level_errors(least_error)
             levels, findings = _added_levels(levels), _common_findings(findings)
-        elif self.tiles and rounding:
-            change = rounding * _steepest(self.window.cut(self.power))
-            self.error += self.window.expand(change)
+        if rounding:
+            for here in map(self._place, self.tiles):
+                self.error[here] += rounding * self._steepest_on(here)
         return Solution(self.power, self.error, self.coverage, self._rays, levels, findings=findings)
 
     def _place(self, tile: Window) -> tuple[slice, slice]:
@@ -92,15 +92,13 @@ class Mosaic:
         left, top = (its - own for its, own in zip(tile.crop_offset, self.window.crop_offset, strict=True))
         return slice(top, top + tile.full[0]), slice(left, left + tile.full[1])
 
-    def _level_errors(self, least_error: float, rounding: float) -> None:
-        """Complete the errors with what follows from the whole picture; parameters as of `solution`."""
+    def _level_errors(self, least_error: float) -> None:
+        """Raise the errors to the least one that follows from the whole picture; parameter as of `solution`."""
         least = least_error * float(self.power.max(initial=0.0))
         for tile in self.tiles:
             here = self._place(tile)
             error = self.error[here]
             np.maximum(error, least, out=error, where=self.coverage[here] > 0)
-            if rounding:
-                error += rounding * self._steepest_on(here)
 
     def _steepest_on(self, here: tuple[slice, slice]) -> NDArray[np.float64]:
         """`_steepest` on a tile, with what lies around it."""

@@ -46,6 +46,7 @@ def integrate_by_transects(draft: Draft, rough: Mask, levels: list[tuple[int, no
         if not dr.any(ladder.where):
             break
         ladder.climb(level, node_rules.transects(count), along)
+        draft.progress((3 + level) / (2 + len(levels)))  # after two steps of nodes
 
 
 class _Ladder:

@@ -90,11 +90,8 @@ class Window:
     def seen_in(self, boxes: Boxes, lens: mi.Sensor) -> NDArray[np.bool_]:
         """Pixels (h, w) of this window with a line of sight into one of these boxes, and some around."""
         other = window_of(boxes, lens)
-        rows, columns = (
-            np.arange(start, start + size) for start, size in zip((self.top, self.left), self.shape, strict=True)
-        )
-        left, top = (own - its for own, its in zip(self.crop_offset, other.crop_offset, strict=True))
-        rows, columns = rows + top - other.top, columns + left - other.left
+        left, top = (own - its for own, its in zip(self.corner, other.corner, strict=True))
+        rows, columns = top + np.arange(self.shape[0]), left + np.arange(self.shape[1])
         inside = (rows >= 0) & (rows < other.shape[0])
         return inside[:, None] & (columns >= 0) & (columns < other.shape[1])
 

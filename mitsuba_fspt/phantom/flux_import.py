@@ -16,6 +16,7 @@ from .phantom import UNIT, Phantom, require_finite, require_single, shares
 from .surface_mesh import closure, face_areas
 
 TISSUE_INDEX = 1.37
+DARK = "exitance is 0 everywhere, the phantom is dark. Check the field's name if it should glow."
 
 
 def import_flux(
@@ -54,7 +55,7 @@ def import_flux(
     ------
     FluxError : the input is unreadable or contradictory, the faces of a closed surface point inward, or their
         orientations are inconsistent.
-    ExitanceError : values are NaN or infinite, negative without `clip`, or 0 everywhere; J_n beyond single precision.
+    ExitanceError : values are NaN or infinite, or negative without `clip`; J_n beyond single precision.
     BackendError : the format needs an optional package.
     """
     unit = own_unit(mesh) if length_unit is None else length_unit
@@ -73,6 +74,8 @@ def import_flux(
     require_single(exitance)
     provenance = {"source": source, **provenance, **_unit_told(found, unit, given=length_unit is not None)}
     exitance, negatives, removed = _without_negatives(found, exitance, clip)
+    if not exitance.any():
+        provenance["warning"] = " ".join([*([provenance["warning"]] if "warning" in provenance else []), DARK])
     phantom = Phantom(found.vertices, found.faces, exitance, found.per, provenance, negatives, removed)
     _require_outward(phantom, flip)
     return phantom

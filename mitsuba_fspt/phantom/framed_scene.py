@@ -20,6 +20,7 @@ from .phantom import Phantom
 
 FILLED = 0.9  # of the film's side, by what the phantom covers of it in its widest view, blur included
 LEAST, MOST = 1e-6, 1e6  # magnifications among which the one that fills the film is searched for
+CURVE = "transmittance_curve"
 DIGITS = 3  # of the magnification that is found
 
 TEMPLATE = """<?xml version="1.0" encoding="utf-8"?>
@@ -69,9 +70,8 @@ Camera    magnification puts the virtual detector plane on the front of the phan
             <rotate z="1" angle="$view"/>
         </transform>
         <emitter type="fspt_surface">
-            <!-- The PLY property exitance_x. -->
             <texture type="mesh_attribute" name="exitance">
-                <string name="name" value="{per}_exitance"/>
+                <string name="name" value="{attribute}"/>
             </texture>
         </emitter>
     </shape>
@@ -104,7 +104,8 @@ def scene_xml(
 
     Parameters
     ----------
-    phantom : PLY file with J_n as property `exitance_x` of its vertices or of its faces, as `fspt flux` writes it
+    phantom : PLY file with J_n as property `exitance_x` of its vertices or of its faces, as `fspt flux` writes it, or
+        as its only property with a name like `jn_x`; see `Phantom.read`
     focal_length : F [mm]
     f_number : f_num = F/D
     magnification : t = v/u; None finds it
@@ -114,8 +115,8 @@ def scene_xml(
     width, height : of the film [pixels]
     rtol : error of the integral relative to the brightest pixel
     view : turns the phantom counterclockwise about +z [degrees]
-    lens : further parameters of `fspt_lens` by name, such as lens_diameter [mm], and in place of the magnification
-        focus_distance or image_distance [mm]
+    lens : further parameters of `fspt_lens` by name, such as lens_diameter [mm] or transmittance, and in place of the
+        magnification focus_distance or image_distance [mm]
 
     Raises
     ------
@@ -129,12 +130,14 @@ def scene_xml(
     numbers = _numbers(focal_length=focal_length, f_number=f_number, pixel_pitch=pixel_pitch, rtol=rtol, view=view)
     film = {"width": _pixels("width", width), "height": _pixels("height", height)}
     mesh = Phantom.read(path)
+    if isinstance(curve := lens.get(CURVE), str):  # the text may be saved anywhere
+        lens[CURVE] = str(Path(curve).absolute())
     frame = Frame(Outline.of(mesh), focal_length, f_number, numbers["pixel_pitch"], film, lens)
     found = dict(zip(("magnification", "distance"), frame.placed(magnification, distance), strict=True))
-    return _filled_in(path, mesh.per, frame, numbers | found | film)
+    return _filled_in(path, f"{mesh.per}_{mesh.attribute}", frame, numbers | found | film)
 
 
-def _filled_in(path: Path, per: str, frame: Frame, values: dict[str, float]) -> str:
+def _filled_in(path: Path, attribute: str, frame: Frame, values: dict[str, float]) -> str:
     """The template with these values of its `<default>` parameters."""
     order = ("f_number", "view", "rtol", "focal_length", "magnification", "distance", "width", "height", "pixel_pitch")
     return TEMPLATE.format(
@@ -147,14 +150,14 @@ def _filled_in(path: Path, per: str, frame: Frame, values: dict[str, float]) -> 
         borders="".join(_property(name, value) for name, value in frame.lens.items() if name not in FOCUS),
         filename=quoteattr(str(path.absolute())),
         shift=tuple(-float(c) + 0.0 for c in frame.outline.centre),
-        per=per,
+        attribute=attribute,
     )
 
 
 def camera_lens(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Keywords of `scene_xml` from the table [lens] of a camera's TOML file; other tables are not read.
 
-    A key `name` is for people and left out.
+    A key `name` is for people and left out; a file that `transmittance_curve` names is searched for beside the TOML.
 
     Raises
     ------
@@ -167,6 +170,8 @@ def camera_lens(path: str | os.PathLike[str]) -> dict[str, Any]:
     for name, value in lens.items():
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise SceneError(f"'{path}' [lens]: '{name}' must be a number or a text, got {value!r}. Correct it.")
+    if isinstance(curve := lens.get(CURVE), str):
+        lens[CURVE] = str(Path(path).parent / curve)
     return lens
 
 

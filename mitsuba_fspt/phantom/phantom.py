@@ -8,6 +8,7 @@ phantom.write("mouse.ply")  # fspt_surface reads it as mesh_attribute vertex_exi
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import ExitanceError, FluxError
-from .formats.ply import read_ply, write_ply
+from .formats.ply import attribute_name, read_ply, write_ply
+from .formats.raw import Field, RawMesh
 from .surface_mesh import Closure, Indices, Points, closure, face_areas
 
 UNIT = "W/mm^2"
+OTHER_UNIT = re.compile(r"(?<![a-z])[cnuµ]?m(?![a-z])")  # a length other than mm
 # Range of the renderer's 32-bit numbers.
 LEAST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 # Keys of the report and of the PLY's comments that no provenance may overwrite.
@@ -49,14 +52,15 @@ class Phantom:
     ----------
     vertices : array, shape (V, 3) [mm]
     faces : array, shape (F, 3), indices of vertices from 0, counterclockwise seen from outside
-    exitance : array, shape (V,) or (F,) as set by `per` [W/mm²], J_n, finite, >= 0, not all 0; linear between vertices
+    exitance : array, shape (V,) or (F,) as set by `per` [W/mm²], J_n, finite, >= 0; linear between vertices
     per : 'vertex' or 'face'
     provenance : origin of the values, texts by single-word keys, for the report and the PLY's comments
     negatives, removed_power : number of values that were negative and became 0, and their power [W], >= 0
+    attribute : name of J_n in the file that it was read from, as of a mesh attribute of Mitsuba
 
     Raises
     ------
-    ExitanceError : exitance is not finite, is negative, is 0 everywhere, or lies beyond single precision.
+    ExitanceError : exitance is not finite, is negative, or lies beyond single precision.
     FluxError : the arrays do not fit each other, a key of the provenance is taken, or the surface has no area or
         vertices beyond single precision.
     """
@@ -68,6 +72,7 @@ class Phantom:
     provenance: Mapping[str, str] = field(default_factory=dict)
     negatives: int = 0
     removed_power: float = 0.0
+    attribute: str = "exitance"
 
     def __post_init__(self) -> None:
         for name, kind in (("vertices", np.float64), ("faces", np.int64), ("exitance", np.float64)):
@@ -93,8 +98,6 @@ class Phantom:
             raise FluxError(f"phantom: a vertex lies at {far:.3g} mm, the renderer holds {LARGEST:.2g}. Scale it.")
         if not self.area > 0:
             raise FluxError(f"phantom: the surface has no area ({self.area:g} mm^2). Fix its vertices.")
-        if not self.power > 0:
-            raise ExitanceError("exitance: zero everywhere, the phantom would be black. Check the field's name.")
 
     @cached_property
     def area(self) -> float:
@@ -123,7 +126,7 @@ class Phantom:
         bounding_box (its lowest and highest corner, x, y, z [mm]), area [mm²], power [W], min and max [W/mm²], zeros
         and negatives (numbers of values; negative ones have become zeros), watertight, outward (None: open,
         undecided), unit, removed_power [W], per, vertices, faces, and the provenance. `removed_percent` is relative to
-        the remaining power.
+        the remaining power, None if nothing remains.
         """
         return {
             "bounding_box": [[float(x) for x in corner] for corner in self.bounds],
@@ -137,12 +140,18 @@ class Phantom:
             "outward": self.closure.outward,
             "unit": UNIT,
             "removed_power": self.removed_power,
-            "removed_percent": 100 * self.removed_power / self.power,
+            "removed_percent": self._removed_percent(),
             "per": self.per,
             "vertices": len(self.vertices),
             "faces": len(self.faces),
             **self.provenance,
         }
+
+    def _removed_percent(self) -> float | None:
+        """Removed over remaining power [%]; None if the latter is 0."""
+        if self.removed_power == 0:
+            return 0.0
+        return 100 * self.removed_power / self.power if self.power > 0 else None
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a binary PLY, completely or not at all, with the exitance as a property for Mitsuba's `ply` plugin.
@@ -167,25 +176,25 @@ class Phantom:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Phantom:
-        """Phantom from a PLY written by `write`, with bit-identical numbers.
+        """Phantom from a PLY, with bit-identical numbers if `write` wrote it.
+
+        J_n is the property `exitance_x`, or else the only scalar of vertices or faces with a name that Mitsuba reads as
+        a mesh attribute, such as `jn_x`, in W/mm².
 
         Raises
         ------
         FluxError : the file cannot be read, or its comments name other units.
-        ExitanceError : the file has no property `exitance_x`, or one on vertices and one on faces; `import_flux` reads
-            other properties.
+        ExitanceError : the file has no such property, or several; `import_flux` reads others.
         """
         raw, comments = read_ply(Path(path))
-        exitance = {f.on: f.values for f in raw.fields if f.name == "exitance_x"}
-        if len(exitance) != 1:
-            names = ", ".join(f"'{f.name}'" for f in raw.fields) or "none"
-            raise ExitanceError(
-                f"'{path}' must have one property 'exitance_x', on vertices or on faces. Properties it has: "
-                f"{names}. Make a phantom of it by fspt flux import --field NAME."
-            )
+        field = _exitance_field(raw, Path(path))
+        own = "quantity" in comments  # of the comments that `write` writes; others are free text
         for key, expected in (("quantity", "exitance"), ("unit", UNIT), ("length_unit", "mm")):
-            if comments.pop(key, expected) != expected:
-                raise FluxError(f"'{path}': the {key} of a phantom must be {expected}. Import it by fspt flux import.")
+            text = comments.pop(key, expected)
+            if text != expected if own else OTHER_UNIT.search(text):
+                raise FluxError(
+                    f"'{path}': the {key} of a phantom must be {expected}, got '{text}'. Import it by fspt flux import."
+                )
         try:
             negatives = int(comments.pop("negatives", "0"))
             removed = float(comments.pop("removed_power", "0 W").removesuffix(" W"))
@@ -194,9 +203,23 @@ class Phantom:
                 f"'{path}': its comments negatives and removed_power must be numbers. Import it anew."
             ) from cause
         comments = {key: text for key, text in comments.items() if key not in RESERVED}
-        ((on, values),) = exitance.items()
-        per = "vertex" if on == "vertex" else "face"
-        return cls(raw.points, raw.cells, values.astype(np.float64), per, comments, negatives, removed)
+        per, values = "vertex" if field.on == "vertex" else "face", field.values.astype(np.float64)
+        return cls(raw.points, raw.cells, values, per, comments, negatives, removed, attribute_name(field.name))
+
+
+def _exitance_field(raw: RawMesh, path: Path) -> Field:
+    """The field with J_n, see `Phantom.read`; ExitanceError if none or several may be it."""
+    grouped = [field for field in raw.fields if attribute_name(field.name)]
+    found = [field for field in grouped if field.name == "exitance_x"] or grouped
+    if len(found) != 1:
+        names = ", ".join(f"'{f.name}' on {'vertices' if f.on == 'vertex' else 'faces'}" for f in raw.fields) or "none"
+        twice = len({f.name for f in found}) < len(found)
+        fix = "--field NAME" + " --per vertex (or face)" * twice
+        raise ExitanceError(
+            f"'{path}' must have one property with J_n, on vertices or on faces, and a name that Mitsuba reads, "
+            f"'exitance_x' or 'jn_x'. It has: {names}. Make a phantom of it by fspt flux import {fix}."
+        )
+    return found[0]
 
 
 def shares(vertices: Points, faces: Indices, per: str) -> NDArray[np.float64]:

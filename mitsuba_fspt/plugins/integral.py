@@ -17,6 +17,7 @@ from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
+from ..integral.progress import Progress
 from ..integral.quadrature import Quadrature
 from ..integral.scene_checks import check_scene, check_surfaces_alone
 from ..integral.shortcuts import SHORTCUTS, Finding
@@ -89,7 +90,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     ) -> Solution:
         """Power, error and coverage of the sensor's crop window, by `quadrature` or the integrator's own.
 
-        A large film is solved in tiles; `progress` is called with the share done before each.
+        A large film is solved in tiles; `progress` is called with the share done, 0 … 1, after every level of each.
 
         Raises
         ------
@@ -109,7 +110,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 traced = self._traced(scene, sensor)
                 faces = self._faces_of(traced) if quadrature.takes("record") else None
                 view = View.of(traced, sensor, window, faces, specular)
-                self._fill(mosaic, view, quadrature, progress)
+                self._fill(mosaic, view, quadrature, Progress(progress))
             # Smaller displacements are random.
             rounding = sensor.rounding if sensor.rounding >= LEAST_DISPLACEMENT else 0.0
             solution = mosaic.solution(quadrature.least_error, rounding)
@@ -120,19 +121,18 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         mosaic: Mosaic,
         view: View,
         quadrature: Quadrature,
-        progress: Callable[[float], None] | None,
+        progress: Progress,
     ) -> None:
         """Solve all tiles; several ones share the tolerance that follows from a lower bound of the brightest pixel."""
         tiles, window = mosaic.tiles, mosaic.window
         least_peak, points = 0.0, None
+        progress(0.0)
         if len(tiles) > 1:
             points = points_on_surfaces(view.scene, view.lens, view.specular)
             least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points, window))
         for k, tile in enumerate(tiles):
-            if progress:
-                progress(k / len(tiles))
             narrow = partial(narrow_light, points, tile) if points else partial(self._narrow_light, view, tile)
-            mosaic.put(tile, self._solve_tile(tile, view, quadrature, narrow, least_peak))
+            mosaic.put(tile, self._solve_tile(tile, view, quadrature, narrow, least_peak, progress.part(k, len(tiles))))
 
     def _solve_tile(
         self,
@@ -141,6 +141,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         quadrature: Quadrature,
         narrow_light: Callable[[], NarrowLight],
         least_peak: float,
+        progress: Progress,
     ) -> Solution:
         """Solution by the requested form of Eq. 9; pixels with light of narrow spots always take the surface form.
 
@@ -151,7 +152,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         inside, cut = window.field_stop(lens)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
-            return surface_form.solve(scene, lens, window, quadrature, None, least_peak, specular)
+            known = surface_form.solve(scene, lens, window, quadrature, None, least_peak, progress, specular)
+            return _with_dark_coverage(known, view, window)
         narrow = narrow_light()
         where, peak = inside, least_peak
         if not everywhere:
@@ -160,11 +162,12 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if specular and specular.bending:  # the surface form follows light straight to the lens alone
             where = np.zeros(window.shape, bool)
         if where.any():
-            known = surface_form.solve(scene, lens, window, quadrature, where, peak, specular)
-            rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak)
+            known = surface_form.solve(scene, lens, window, quadrature, where, peak, progress.part(0, 2), specular)
+            known = _with_dark_coverage(known, view, window)
+            rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak, progress.part(1, 2))
             solution = known.completed_by(rest)
         else:
-            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, least_peak=least_peak)
+            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, None, least_peak, progress)
         missed = _missed(narrow, where, cut, window, lens, solution)
         if specular and specular.bending and narrow.on_pixels.any():
             # Where a mirror or glass shows a narrow spot is not known.
@@ -190,7 +193,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         return old.scene
 
     def _visible_window(self, scene: mi.Scene, lens: mi.Sensor, everywhere: bool, bending: Boxes) -> Window:
-        """Window of the pixels that can see an emitter or a shape in `bending` boxes, or of all `everywhere`; cached."""
+        """Window of the pixels that can see an emitter or a `bending` shape, or of all `everywhere`; cached."""
         boxes = glowing_boxes(scene)
         state = (boxes, bending, _view(lens), everywhere)
         return self._window.recall(state, lambda: window_of(boxes, lens, everywhere, bending))
@@ -314,6 +317,14 @@ def _pose(shape: mi.Shape) -> tuple[float, ...]:
         return (buffers(shape)[0].index, *box)
     parameters = mi.traverse(shape)
     return (*box, *np.ravel(parameters["to_world"].matrix).tolist()) if "to_world" in parameters else box
+
+
+def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solution:
+    """The surface form's `solution` with the coverage of elements that do not glow, which that form leaves out."""
+    if not any(finding.name == "dark" and finding.taken for finding in solution.findings):
+        return solution
+    met = np.where(solution.where, pupil_form.coverage_of(view, window), 0)
+    return replace(solution, coverage=np.maximum(solution.coverage, met))
 
 
 def _missed(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..integral.eq9 import etendue_from_pixel, pixel_etendue
 from ..integral.pupil import Pupil
 from ..jit.spectra import flat_share
+from ..optics import transmittance
 from ..optics.discs import defocus
 from ..optics.thin_lens import Lens, number_names
 from ..runtime.errors import OpticsError, named
@@ -59,11 +60,19 @@ class FsptLens(mi.Sensor):
        - |float| [mm]
        - Optional circular stop on the detector, centred on the optical axis: light outside it reaches no pixel, a pixel
          that its border cuts receives the light on the part inside. Updatable.
+     * - transmittance
+       - |float|
+       - Share τ of the power that lens and filters let through, in (0, 1] (Default: 1). The T-stop is f_num/√τ.
+         Updatable.
+     * - transmittance_curve, wavelength_nm
+       - |string|, |float| [nm]
+       - In place of a number: CSV file with rows of nm,τ, linear between them, and the wavelength of the light, which
+         must not lie outside. The wavelength is updatable.
      * - to_world
        - |transform|
        - Rotation and translation. Puts the lens centre at the origin looking along +z. Updatable.
 
-    The sensor weights a line of sight from lens point a to virtual point r_vd by A_vd A_pupil cos⁴θ/u², so that
+    The sensor weights a line of sight from lens point a to virtual point r_vd by τ A_vd A_pupil cos⁴θ/u², so that
     the mean of weight × radiance over a pixel is the power on it [W] (pupil form of Eq. 9). A pixel stores its power as
     one float32 number that no other pixel contributes to, so any film of the scene file is replaced by a monochrome
     float32 film with a box filter; size and crop window are kept.
@@ -73,11 +82,15 @@ class FsptLens(mi.Sensor):
         own_film(props)
         default_sampler(props)
         super().__init__(props)
-        self._numbers = {n: number(props, n) for n in (*number_names(), "pixel_pitch") if n in props}
+        names = (*number_names(), "pixel_pitch", *transmittance.NUMBERS)
+        self._numbers = {n: number(props, n) for n in names if n in props}
         missing = [name for name in REQUIRED if name not in self._numbers]
         if missing:
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
         self._model = str(props.get("model", "diaphragm"))
+        self._curve = _curve_of(props)
+        if self._curve is None:
+            self._numbers.setdefault("transmittance", mi.Float64(1.0))
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
         self.fault: OpticsError | None = None
         self._update()
@@ -99,6 +112,7 @@ class FsptLens(mi.Sensor):
         """Check the numbers and derive the kernels' inputs, opaque so that a new value needs no compilation."""
         numbers = {name: float(value[0]) for name, value in self._numbers.items()}
         pitch = numbers.pop("pixel_pitch")
+        light = {name: numbers.pop(name) for name in transmittance.NUMBERS if name in numbers}
         if not 0 < pitch < float("inf"):
             raise OpticsError(f"fspt_lens: 'pixel_pitch' must be > 0 and finite, got {pitch:g}. Give mm, say 0.0135.")
         matrix = np.array(self.m_to_world.matrix, np.float64).reshape(4, 4)
@@ -108,6 +122,7 @@ class FsptLens(mi.Sensor):
             raise OpticsError("fspt_lens: 'to_world' scales lengths or mirrors. Give a rotation and a translation.")
         with named("fspt_lens"):
             self.optics = Lens.focused(model=self._model, **numbers)
+            passed = transmittance.transmittance_of(light, self._curve)
         if (stop := numbers.get("image_stop_diameter", pitch)) < pitch:
             raise OpticsError(
                 f"fspt_lens: 'image_stop_diameter' = {stop:g} mm is below a pixel. Give at least {pitch:g} mm."
@@ -120,14 +135,24 @@ class FsptLens(mi.Sensor):
         self._pitch = dr.opaque(mi.Float, self.virtual_pitch)
         # Opaque: films of all sizes share the kernels.
         self._middle = mi.Point2f(*(dr.opaque(mi.Float, 0.5 * int(n)) for n in self.film().size()))
-        self.etendue = pixel_etendue(self.virtual_pitch, self.optics.discs[0].radius, self.optics.focus_distance)
-        self._flat = dr.opaque(mi.Float, flat_share())
+        self.transmittance, self._wavelength = passed, light.get("wavelength_nm")
+        bare = pixel_etendue(self.virtual_pitch, self.optics.discs[0].radius, self.optics.focus_distance)
+        self.etendue = passed * bare  # by which all forms and integrators turn radiance into power
         self._etendue = dr.opaque(mi.Float, self.etendue * flat_share())
-        self._solid_angle = dr.opaque(mi.Float, self.etendue / self.virtual_pitch**2)
+        self._solid_angle = dr.opaque(mi.Float, bare / self.virtual_pitch**2)
+        self._passed = dr.opaque(mi.Float, passed * flat_share())
         dr.make_opaque(self.m_to_world)
         # Largest displacement of a line of sight by float32 on the virtual detector plane [virtual pixels].
         farthest = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
         self.rounding = EPSILON * (farthest + self.optics.focus_distance) / self.virtual_pitch
+
+    def numbers(self) -> dict[str, float | str]:
+        """Numbers of the lens and its pixels for an image's metadata: lengths in mm, wavelength in nm."""
+        light: dict[str, float | str] = {"transmittance": self.transmittance}
+        light["t_stop"] = transmittance.t_stop(self.optics.f_number, self.transmittance)
+        if self._curve:
+            light |= {"transmittance_curve": self._curve.file, "wavelength_nm": self._wavelength}
+        return self.optics.numbers() | light | {"pixel_pitch": self.pixel_pitch}
 
     # ------------------------------------------------------------------ lines of sight
 
@@ -260,7 +285,7 @@ class FsptLens(mi.Sensor):
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Line of sight through a uniform point of the crop window and a uniform point of the pupil, and its weight.
 
-        The weight is the étendue of a pixel times cos⁴θ [mm² sr], 0 where no light passes; spectral variants multiply
+        The weight is the étendue of a pixel times τ cos⁴θ [mm² sr], 0 where no light passes; spectral variants multiply
         it by the weight of the wavelengths.
         """
         film = self.film()
@@ -278,7 +303,7 @@ class FsptLens(mi.Sensor):
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """Direction from `it` to a uniform point of the pupil, with the film position at which its light arrives.
 
-        The weight is A_pupil cosθ/d² [sr] over the number of crop pixels, by which light tracers multiply again.
+        The weight is τ A_pupil cosθ/d² [sr] over the number of crop pixels, by which light tracers multiply again.
         """
         film = self.film()
         pupil = mi.warp.square_to_uniform_disk_concentric(sample)
@@ -294,7 +319,7 @@ class FsptLens(mi.Sensor):
         ds.dist = dr.norm(ds.d)
         ds.d /= ds.dist
         ds.pdf = dr.select(inside, dr.rcp(solid_angle), 0)
-        return ds, mi.Spectrum(dr.select(inside, self._flat * solid_angle / (size.x * size.y), 0))
+        return ds, mi.Spectrum(dr.select(inside, self._passed * solid_angle / (size.x * size.y), 0))
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         """Density [1/sr] that `sample_direction` has written into `ds`; other records are not supported."""
@@ -306,7 +331,19 @@ class FsptLens(mi.Sensor):
 
     def to_string(self) -> str:
         rows = [f"  {name} = {float(value[0]):g}," for name, value in self._numbers.items()]
+        rows += [f"  transmittance_curve = {self._curve.file},"] if self._curve else []
         return "\n".join(["FsptLens[", f"  model = {self._model},", *rows, f"  film = {self.film()}", "]"])
+
+
+def _curve_of(props: mi.Properties) -> transmittance.Curve | None:
+    """Curve of the file that the scene names, searched for as Mitsuba searches for bitmaps; None if it names none."""
+    if "transmittance_curve" not in props:
+        return None
+    name = props["transmittance_curve"]
+    with named("fspt_lens"):
+        if not isinstance(name, str) or not name:
+            raise OpticsError(f"'transmittance_curve' must be the name of a CSV file, got {name!r}. Give a text.")
+        return transmittance.Curve.read(str(mi.file_resolver().resolve(name)))
 
 
 mi.register_sensor("fspt_lens", FsptLens)

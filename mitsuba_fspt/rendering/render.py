@@ -98,7 +98,7 @@ def render(
             *planes, how = _sample(scene, lens, integrator, spp, seed, report)
         check_interrupt()
     how |= {"wall_time": time.perf_counter() - start} | ({} if planes[0].any() else {"warnings": DARK})
-    return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
+    return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **lens.numbers(), **_versions()})
 
 
 def _integrate(
@@ -250,11 +250,6 @@ def _refuse(settings: dict[str, object], method: str) -> None:
     for name, value in settings.items():
         if value is not None:
             raise SceneError(f"render: '{name}' = {value} has no meaning for {method}. Leave it out or set 'method'.")
-
-
-def _lens_numbers(lens: mi.Sensor) -> dict[str, float | int | str]:
-    optics = lens.optics
-    return optics.numbers() | {"pixel_pitch": lens.pixel_pitch}
 
 
 def _versions() -> dict[str, str]:

@@ -18,6 +18,10 @@ from .scene_rules import check_text
 from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 
 COLOUR_FORMATS = ("rgb", "rgba", "xyz", "xyza")
+COLOURS = {  # plugins of colours and of spectra
+    **dict.fromkeys(("d65", "srgb"), "colour"),
+    **dict.fromkeys(("blackbody", "regular", "irregular"), "spectrum"),
+}
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -121,6 +125,7 @@ def _set_up(state: mi.parser.ParserState, path: Path, parameters: Mapping[str, o
         raise SceneError(f"{path}: the root is <{root.plugin_name()}>, a scene file has <scene>. Give one.")
     root["embree_use_robust_intersections"] = True
     root.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in _texts(parameters).items())]))
+    _refuse_colours(path, state)
     _name_children(state)
     _set_film_formats(state)
 
@@ -159,6 +164,33 @@ def _require_known(path: Path, xml: SceneXml, parameters: Mapping[str, object]) 
 def parameter_text(value: object) -> str:
     """Text of a parameter's value for Mitsuba's parser."""
     return str(value).lower() if isinstance(value, (bool, np.bool_)) else str(value)
+
+
+def _refuse_colours(path: Path, state: mi.parser.ParserState) -> None:
+    """Raise SceneError for J_n as a colour or a spectrum, also within a texture: variants make different watts of it.
+
+    Here, before the plugins are made: monochrome and colour variants replace `d65` by a number.
+    """
+    import mitsuba as mi
+
+    todo = [node.props for node in state.nodes if node.props.plugin_name() == "fspt_surface"]
+    while todo:
+        props = todo.pop()
+        for name in props.keys():  # they do not iterate themselves
+            kind, used, value = props.type(name), props.was_queried(name), props[name]
+            props.mark_queried(name, used)  # by its plugin, not here: else a name that no plugin has would pass
+            what = "colour" if kind == mi.Properties.Type.Color else ""
+            if kind == mi.Properties.Type.Spectrum and not value.is_uniform():
+                what = "spectrum"
+            if kind == mi.Properties.Type.ResolvedReference:
+                inner = state.nodes[value.index()].props
+                todo.append(inner)
+                what = COLOURS.get(inner.plugin_name(), "")
+            if what:
+                raise SceneError(
+                    f"{path}: '{name}' of an fspt_surface is a {what}, J_n is one number. Give W/mm² as a float or a "
+                    "texture of one channel."
+                )
 
 
 def _name_children(state: mi.parser.ParserState) -> None:

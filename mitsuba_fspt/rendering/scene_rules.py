@@ -26,8 +26,6 @@ def check_text(path: Path, scene: SceneXml) -> None:
         _check_duplicates(path, node)
         _check_source(path, node, scene)
         _check_parents(path, node)
-        if node.get("type") == "fspt_surface":
-            _check_colours(path, node, scene)
 
 
 def check_values(path: Path, scene: SceneXml) -> None:
@@ -91,15 +89,3 @@ def _check_parents(path: Path, node: ElementTree.Element) -> None:
     for child in node if node.tag != "shape" else ():
         if child.get("type") == "fspt_surface" and not child.get("id"):
             raise SceneError(f"{path}: an fspt_surface stands in <{node.tag}>. Put it into the <shape> that glows.")
-
-
-def _check_colours(path: Path, emitter: ElementTree.Element, scene: SceneXml) -> None:
-    """Raise SceneError for J_n as a colour or a spectrum, which monochrome variants silently turn into luminance."""
-    for child in emitter:
-        colour = child.tag == "rgb" or child.get("type") == "d65"
-        spectrum = child.tag == "spectrum" and ":" in scene.fill_in(child.get("value", ""))
-        if colour or spectrum or (child.tag == "spectrum" and child.get("filename")):
-            raise SceneError(
-                f"{path}: '{child.get('name')}' of an fspt_surface is a {'colour' if colour else 'spectrum'} "
-                f"(<{child.tag}>), J_n is one number. Give W/mm² as a float or a texture of one channel."
-            )

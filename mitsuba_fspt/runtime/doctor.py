@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
@@ -48,6 +48,10 @@ class Diagnosis:
 
     rows: tuple[ReportLine, ...]
     usable: bool
+
+    def to_dict(self) -> dict[str, object]:
+        """Report as texts, booleans and lists, ready for JSON."""
+        return {"usable": self.usable, "rows": [asdict(row) for row in self.rows]}
 
     def render_text(self) -> str:
         """Report as plain text, section by section, with `!` before the rows that are not ok."""

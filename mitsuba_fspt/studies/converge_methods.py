@@ -145,6 +145,8 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
 
     own = dict(mi.traverse(lens))
     numbers = {name: float(value[0]) for name, value in own.items() if isinstance(value, mi.Float64)}
+    numbers.pop("wavelength_nm", None)  # of a curve, whose value there is the transmittance
+    numbers["transmittance"] = lens.transmittance
     film = lens.film()
     names = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
     sizes = (int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))

@@ -39,7 +39,10 @@ class SceneCache:
         """
         try:
             with self._one_at_a_time:
-                image = render(self._set_up(point), **point.settings)  # type: ignore[arg-type]
+                settings = dict(point.settings)
+                watt = settings.pop("source_power")
+                image = render(self._set_up(point), **settings)  # type: ignore[arg-type]
+            image = image if watt is None else image.scaled(watt)  # type: ignore[arg-type]
         except FsptError as error:
             raise type(error)(f"{point.label}: {error}") from error
         origin = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint}

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..images import picture
 from ..images.colour_scale import ColourScale
-from ..images.image import Image, read
+from ..images.image import Image, read, required_source_power
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.atomic_files import atomic_path
@@ -68,6 +68,7 @@ def sweep(
     spp: int | None = None,
     seed: int | None = None,
     sensor: int = 0,
+    source_power: float | None = None,
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
@@ -88,6 +89,7 @@ def sweep(
     parameters : values for `<default>` parameters of the scene: a list of values or one value for each name
     folder : folder of the images; created if its parent exists
     method, rtol, spp, seed, sensor : as in `render`
+    source_power : power of the light source [W], for a scene that is per 1 W of it, as in `Image.scaled`
     jobs : number of processes, >= 1; None renders in this one (with scheduler 'local': one process a core). Each
         imports the script that calls: keep the call behind `if __name__ == "__main__":`
     scheduler : address of a dask.distributed scheduler, for example 'tcp://10.0.0.1:8786', or 'local' to start one
@@ -104,7 +106,7 @@ def sweep(
     folder = Path(folder)
     jobs = None if jobs is None else whole("sweep: 'jobs'", jobs, SceneError, "2")
     _check_jobs(jobs, scheduler)
-    wanted = points(_path_of(scene), parameters, _settings(method, rtol, spp, seed, sensor))
+    wanted = points(_path_of(scene), parameters, _settings(method, rtol, spp, seed, sensor, source_power))
     _check_names(wanted)
     _check_folder(folder)
     return _completed(wanted, folder, jobs, scheduler, progress)
@@ -124,7 +126,12 @@ def _path_of(scene: object) -> Path:
 
 
 def _settings(
-    method: str | None, rtol: float | None, spp: int | None, seed: int | None, sensor: int
+    method: str | None,
+    rtol: float | None,
+    spp: int | None,
+    seed: int | None,
+    sensor: int,
+    source_power: float | None,
 ) -> dict[str, Setting]:
     """The settings common to all points; SceneError for a value that is no number."""
     return {
@@ -133,6 +140,7 @@ def _settings(
         "spp": None if spp is None else whole("sweep: 'spp'", spp, SceneError, "256"),
         "seed": None if seed is None else whole("sweep: 'seed'", seed, SceneError, "1"),
         "sensor": whole("sweep: 'sensor'", sensor, SceneError, "0"),
+        "source_power": None if source_power is None else required_source_power(source_power),
     }
 
 

@@ -16,6 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from ..optics.thin_lens import Lens, number_names
+from ..optics.transmittance import NUMBERS as LIGHT
 from ..rendering.scene import check_parameters, parameter_text
 from ..rendering.scene_rules import REFERENCE, check_values, is_number
 from ..rendering.scene_xml import read_xml
@@ -34,7 +35,7 @@ class SweepPoint:
     path : its absolute path, for a process that works in another folder
     parameters : name and value, as in the scene's `<default>`
     lens : names of the lens numbers that a parameter sets, for parameters that set nothing else
-    settings : method, rtol, spp, seed, sensor as `render` takes them
+    settings : method, rtol, spp, seed, sensor as `render` takes them, and source_power [W]
     geometry : hash of the scene without its lens; points of equal `geometry` can use the same loaded scene
     fingerprint : hash of the scene's files, the parameters, the settings and the versions
     """
@@ -157,7 +158,7 @@ class SceneSource:
         lens_nodes = []
         for node in self._lens:
             reference = REFERENCE.fullmatch(node.get("value", ""))
-            if reference and node.tag == "float" and node.get("name") in (*number_names(), "pixel_pitch"):
+            if reference and node.tag == "float" and node.get("name") in (*number_names(), "pixel_pitch", *LIGHT):
                 found[reference[1]] = (*found.get(reference[1], ()), node.get("name", ""))
                 lens_nodes.append(node)
         elsewhere = " ".join(text for node in self._nodes if node not in lens_nodes for text in node.attrib.values())

@@ -47,7 +47,7 @@ def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Plane, in
                 pairs += len(index)
                 _add(power, scene, lens, emitter, elements, index, pixel)
                 dr.eval(power)
-    return power.numpy().reshape(height, width), pairs
+    return lens.transmittance * power.numpy().reshape(height, width), pairs
 
 
 def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]:

@@ -135,10 +135,6 @@ SURFACES = {
         "fspt_surface: 'to_world' has no meaning, light comes from the shape. Give it to that.",
     ),
     "an index in words": (law('<string name="int_ior" value="water"/>'), "'int_ior' must be a number, got 'water'"),
-    "a spectrum by its plugin": (
-        of_ball('<float name="exitance" value="1e-3"/>', BLACKBODY),
-        "'exitance' is a spectrum (BlackBodySpectrum), J_n is one number",
-    ),
     "missing": (of_ball('<float name="exitance" value="1e-3"/>', ""), "'exitance' is missing"),
     "a vertex negative": (
         mesh("negative.ply"),
@@ -161,11 +157,15 @@ FILES = {
     "nothing there": ({"shapes": ""}, "nothing glows"),
     "a colour": (
         of_ball('<float name="exitance" value="1e-3"/>', '<rgb name="exitance" value="1, 2, 3"/>'),
-        "'exitance' of an fspt_surface is a colour (<rgb>), J_n is one number",
+        "'exitance' of an fspt_surface is a colour, J_n is one number",
+    ),
+    "a spectrum by its plugin": (
+        of_ball('<float name="exitance" value="1e-3"/>', BLACKBODY),
+        "'exitance' of an fspt_surface is a spectrum, J_n is one number",
     ),
     "a spectrum": (
         of_ball('<float name="exitance" value="1e-3"/>', '<spectrum name="exitance" value="400:1, 700:2"/>'),
-        "'exitance' of an fspt_surface is a spectrum (<spectrum>), J_n is one number",
+        "'exitance' of an fspt_surface is a spectrum, J_n is one number",
     ),
     "a Monte Carlo that hides what glows": (
         {"integrator": '<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'},

@@ -17,7 +17,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import typer
-from small_scenes import LENS_XML, SCENES, write_ply, write_scene
+from small_scenes import BALL_XML, LENS_XML, SCENES, write_ply, write_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.cli import app
@@ -161,6 +161,35 @@ def test_help_shows_every_word_of_it(run, words):
         assert not told or " ".join(told.split()) in text.replace("- ", "-"), told
 
 
+@pytest.mark.parametrize("words", VERBS, ids=" ".join)
+def test_every_verb_takes_json_and_quiet(words):
+    names = {name for parameter in VERBS[words].params for name in parameter.opts}
+    assert {"--json", "--quiet"} <= names
+
+
+def test_render_as_json_and_quiet(run, tmp_path):
+    """A warning stays on stderr. Seen to fail with the warning among the results."""
+    shapes = BALL_XML.replace('value="1e-3"', 'value="0"')
+    for name, words in (("s", {}), ("dark", {"shapes": shapes})):
+        write_scene(tmp_path / f"{name}.xml", **words)
+    code, out, err = run("render", "s.xml", "--png", "--json")
+    assert (code, err) == (0, "")
+    (told,) = json.loads(out)["images"]
+    image = fspt.read("s.exr")
+    assert told == {
+        "output": "s.exr",
+        "picture": "s.png",
+        "total_power": pytest.approx(image.power.sum(dtype=float)),
+        "peak": pytest.approx(image.power.max()),
+        "wall_time": image.metadata["wall_time"],
+    }
+    code, out, err = run("render", "dark.xml", "--quiet")
+    assert (code, out) == (0, "")
+    assert err.startswith("fspt: dark.exr: the picture is dark")
+    code, out, _ = run("render", "dark.xml", "--json")
+    assert "the picture is dark" in json.loads(out)["images"][0]["warnings"]
+
+
 # --- the other verbs ---
 
 
@@ -192,6 +221,7 @@ def test_compare_as_json_is_one_object(run, two_images):
     assert told["cf"] == truth.cf
     assert told["rms"] == truth.rms
     assert [profile["line"] for profile in told["profiles"]] == ["row", "column"]
+    assert run("compare", *two_images, "--quiet") == (0, "", "")
     assert told["profiles"][0]["standard"] == pytest.approx(fspt.read("b.exr").power[5].tolist())
 
 
@@ -202,6 +232,13 @@ def test_expose_writes_electrons_and_counts(run, two_images, tmp_path):
     assert re.fullmatch(r"e\.exr: brightest pixel \S+ electrons, \d+ pixels saturated\n", out)
     assert {"e.exr", "n.png"} < set(os.listdir(tmp_path))
     assert header("e.exr")["fspt:quantity"] == "electrons"
+    code, out, err = run("expose", "a.exr", "-o", "e.exr", *options, "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    with OpenEXR.File("e.exr") as file:
+        assert told.pop("peak") == file.channels()["Y"].pixels.max() > 0
+    assert told == {"output": "e.exr", "counts": None, "saturated_pixels": header("e.exr")["fspt:saturated_pixels"]}
+    assert run("expose", "a.exr", "-o", "e.exr", *options, "--quiet") == (0, "", "")
 
 
 def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
@@ -375,6 +412,10 @@ def test_doctor_says_whether_it_is_ready(run, monkeypatch, works):
     assert ("ready" in out) is works
     assert "LLVM" in out
     assert "mitsuba-fspt" in out
+    code, out, err = run("doctor", "--json")
+    assert (code, err) == (0 if works else 2, "")
+    assert json.loads(out)["usable"] is works
+    assert {"versions", "backends"} < {row["section"] for row in json.loads(out)["rows"]}
 
 
 def test_an_output_without_the_letters_does_not_end_the_work(tmp_path):

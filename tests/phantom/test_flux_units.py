@@ -127,10 +127,16 @@ def test_nan_and_inf_are_refused_always(bad, clip):
         import_flux(MESH, values, clip=clip)
 
 
+CHECK = "Check the field's name if it should glow."
+
+
 @pytest.mark.parametrize("values", [np.zeros(8), np.full(8, -1.0)])
-def test_a_black_phantom_is_refused(values):
-    with pytest.raises(ExitanceError, match="zero everywhere"):
-        import_flux(MESH, values, clip=True)
+def test_a_dark_phantom_is_taken_with_a_warning(values):
+    """A control without light; of values that are all clipped nothing remains to compare with."""
+    phantom = import_flux(MESH, values, clip=True)
+    assert not phantom.exitance.any()
+    assert phantom.provenance["warning"].endswith("exitance is 0 everywhere, the phantom is dark. " + CHECK)
+    assert phantom.report()["removed_percent"] == (None if values.any() else 0)
 
 
 def test_inside_out_is_refused_until_flipped():

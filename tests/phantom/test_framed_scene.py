@@ -9,6 +9,7 @@ import pytest
 from small_scenes import SCENES, write_ply
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.phantom.formats.ply import write_ply as write_any_ply
 from mitsuba_fspt.phantom.framed_scene import camera_lens
 from mitsuba_fspt.runtime.errors import ExitanceError, FluxError, OpticsError, SceneError
 
@@ -128,12 +129,21 @@ def test_what_no_camera_can_be(given, error, message):
 
 
 def test_a_file_without_exitance_is_refused(tmp_path):
-    with pytest.raises(ExitanceError, match=r"l_shape\.ply.*must have one property 'exitance_x'.*flux import"):
+    with pytest.raises(ExitanceError, match=r"l_shape\.ply.*must have one property with J_n.*flux import"):
         fspt.scene_xml(SCENES / "l_shape.ply")
     with pytest.raises(FluxError, match="no such file"):
         fspt.scene_xml(tmp_path / "none.ply")
     with pytest.raises(SceneError, match=r"has a \$ in its path"):
         fspt.scene_xml(box(tmp_path / "a$b.ply"))
+
+
+def test_a_file_with_another_name_of_the_exitance_gives_the_same_image(tmp_path):
+    """Seen to fail with the attribute vertex_exitance, which that file does not have."""
+    phantom = fspt.Phantom.read(box(tmp_path / "own.ply"))
+    write_any_ply(tmp_path / "other.ply", phantom.vertices, phantom.faces, {"jn_x": phantom.exitance}, phantom.per, {})
+    own, other = (fspt.render(fspt.scene_xml(tmp_path / f"{name}.ply", **SMALL)).power for name in ("own", "other"))
+    assert own.any()
+    np.testing.assert_array_equal(own, other)
 
 
 @pytest.mark.parametrize("name", ["a & b.ply", 'quote"s.ply', "a--b.ply", "ü.ply"])

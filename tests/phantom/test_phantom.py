@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from mitsuba_fspt.phantom.formats.ply import write_ply
 from mitsuba_fspt.phantom.phantom import Phantom
 from mitsuba_fspt.runtime.errors import ExitanceError, FluxError
 
@@ -51,6 +52,45 @@ def test_mitsuba_finds_the_exitance(tmp_path, per):
     assert np.array_equal(np.array(parameters["vertex_positions"]).reshape(-1, 3), VERTICES.astype(np.float32))
 
 
+@pytest.mark.parametrize(("name", "attribute"), [("jn_x", "jn"), ("Jn_0", "Jn"), ("my_jn_1", "my_jn")])
+@pytest.mark.parametrize("per", ["vertex", "face"])
+def test_other_names_that_mitsuba_reads(tmp_path, per, name, attribute):
+    """The attribute of that name is what Mitsuba finds in the same file."""
+    written = phantom(per)
+    write_ply(tmp_path / "p.ply", VERTICES, FACES, {name: written.exitance}, per, {})
+    read = Phantom.read(tmp_path / "p.ply")
+    assert (read.attribute, read.per) == (attribute, per)
+    assert np.array_equal(read.exitance, written.exitance)
+    mi.set_variant("llvm_ad_mono")
+    parameters = mi.traverse(mi.load_dict({"type": "ply", "filename": str(tmp_path / "p.ply")}))
+    assert len(np.array(parameters[f"{per}_{attribute}"])) == len(written.exitance)
+
+
+@pytest.mark.parametrize("names", [("jn",), ("exitance",), ("jn_x", "phi_x"), ("jn_y",), ()])
+def test_names_that_leave_open_what_is_meant(tmp_path, names):
+    values = phantom().exitance
+    write_ply(tmp_path / "p.ply", VERTICES, FACES, dict.fromkeys(names, values), "vertex", {})
+    listed = ", ".join(f"'{name}' on vertices" for name in names) or "none"
+    with pytest.raises(ExitanceError, match=rf"It has: {listed}\. Make a phantom of it by fspt flux import --field"):
+        Phantom.read(tmp_path / "p.ply")
+
+
+def test_the_own_name_goes_before_others(tmp_path):
+    values = phantom().exitance
+    write_ply(tmp_path / "p.ply", VERTICES, FACES, {"jn_x": 2 * values, "exitance_x": values}, "vertex", {})
+    read = Phantom.read(tmp_path / "p.ply")
+    assert read.attribute == "exitance"
+    assert np.array_equal(read.exitance, values)
+
+
+def test_a_dark_phantom_is_written_and_read(tmp_path):
+    """J_n = 0 everywhere is a control measurement; seen to be refused."""
+    dark = phantom(exitance=np.zeros(42))
+    assert (dark.power, dark.report()["removed_percent"]) == (0, 0)
+    dark.write(tmp_path / "p.ply")
+    assert not Phantom.read(tmp_path / "p.ply").exitance.any()
+
+
 def test_power_of_a_sphere():
     """J_n A for uniform J_n; the sphere of triangles is a little smaller than 16π mm²."""
     for per, count in (("vertex", 42), ("face", 80)):
@@ -65,7 +105,6 @@ def test_power_of_a_sphere():
         ({"exitance": np.ones(5)}, FluxError, r"must fit, got shapes \(42, 3\), \(80, 3\) and \(5,\)"),
         ({"exitance": np.full(42, np.nan)}, ExitanceError, r"42 of 42 values are NaN or inf"),
         ({"exitance": np.full(42, -1.0)}, ExitanceError, r"must be >= 0, the least is -1 W/mm\^2"),
-        ({"exitance": np.zeros(42)}, ExitanceError, r"zero everywhere"),
         ({"per": "edge"}, FluxError, r"'per' must be vertex or face, got 'edge'"),
         ({"faces": FACES + 1}, FluxError, r"numbers of the 42 vertices"),
         ({"faces": FACES[:0]}, FluxError, r"numbers of the 42 vertices"),
@@ -90,13 +129,27 @@ def test_a_ply_of_another_kind_is_refused(tmp_path):
     mesh = SPHERE.copy()
     mesh.vertex_attributes["jn"] = np.ones(42)
     mesh.export(tmp_path / "mesh.ply")
-    with pytest.raises(ExitanceError, match=r"'exitance_x'.* Properties it has: 'jn'.* fspt flux import"):
+    with pytest.raises(ExitanceError, match=r"'exitance_x'.* It has: 'jn' on vertices.* fspt flux import"):
         Phantom.read(tmp_path / "mesh.ply")
     phantom().write(tmp_path / "p.ply")
     other = (tmp_path / "p.ply").read_bytes().replace(b"comment unit W/mm^2", b"comment unit W/cm^2")
     (tmp_path / "p.ply").write_bytes(other)
     with pytest.raises(FluxError, match=r"the unit of a phantom must be W/mm\^2"):
         Phantom.read(tmp_path / "p.ply")
+
+
+@pytest.mark.parametrize(
+    ("comment", "taken"),
+    [("mm; jn in 1/mm^2 per unit source power", True), ("W/cm^2", False), ("m", False), ("W/mm^2", True)],
+)
+def test_units_in_the_comments_of_others(tmp_path, comment, taken):
+    """Free text with a length other than mm is refused: J_n would be wrong by a factor of 100 without a word."""
+    write_ply(tmp_path / "p.ply", VERTICES, FACES, {"jn_x": phantom().exitance}, "vertex", {"unit": comment})
+    if taken:
+        assert Phantom.read(tmp_path / "p.ply").power == phantom().power
+    else:
+        with pytest.raises(FluxError, match=r"the unit of a phantom must be W/mm\^2, got '"):
+            Phantom.read(tmp_path / "p.ply")
 
 
 @pytest.mark.parametrize(("name", "what"), [("gone.ply", "there is no such file"), ("", "it is a folder")])

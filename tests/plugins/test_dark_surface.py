@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from small_scenes import HEIGHT, WIDTH, attribute, camera_scene, disk, glow, mi, sphere, write_ply
+from small_scenes import HEIGHT, SIDE, WIDTH, attribute, camera_scene, disk, glow, mi, sphere, write_ply
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.runtime.errors import ExitanceError
@@ -48,6 +48,21 @@ def test_a_dark_body_gives_a_dark_picture_and_a_warning(body, method, tmp_path):
     assert "'exitance' is not 0 everywhere" in image.metadata["warnings"]
     if method != "surface":  # which leaves out elements that do not glow
         assert image.coverage.max() == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("domain", ["pupil", "surface"])
+def test_coverage_counts_dark_faces_of_a_glowing_mesh(domain, tmp_path):
+    """A square of which one triangle glows covers all its pixels. Seen to fail: 0 on the dark one's by the surface."""
+    corners = [(-9, -9, 165), (9, -9, 165), (9, 9, 165), (-9, 9, 165)]
+    write_ply(tmp_path / "square.ply", corners, [(0, 2, 1), (0, 3, 2)], face=[1.0, 0.0])
+    settings = {"filename": str(tmp_path / "square.ply"), "face_normals": True}
+    square = {"type": "ply", **settings, "emitter": glow(attribute("face_exitance"))}
+    image = fspt.render(camera_scene(square), method="integral", domain=domain, rtol=1e-2)
+    dark = image.power == 0
+    assert (dark & (image.coverage > 0.99)).sum() > 200
+    assert (~dark & (image.coverage > 0.99)).sum() > 200
+    # 22.5 x 22.5 pixels; by few lines of sight on the pixels of its border.
+    assert image.coverage.sum() == pytest.approx((18 / SIDE) ** 2, rel=0.03)
 
 
 @pytest.mark.parametrize("method", METHODS)

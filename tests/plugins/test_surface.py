@@ -21,8 +21,9 @@ backend.ensure_variant()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-from small_scenes import attribute, ball, glow, world_scene, write_ply  # noqa: E402
+from small_scenes import attribute, ball, glow, lens, world_scene, write_ply  # noqa: E402
 
+import mitsuba_fspt as fspt  # noqa: E402
 from mitsuba_fspt.emission.elements import UNIFORM_SHARE  # noqa: E402
 from mitsuba_fspt.runtime.errors import SceneError  # noqa: E402
 
@@ -289,6 +290,22 @@ def test_colours_and_spectra_of_a_dictionary_are_refused(exitance, what):
     del caught  # the traceback holds the emitter, which later kernels would record
     gc.collect()
     assert world_scene(ball() | {"emitter": glow({"type": "uniform", "value": 2.0})}).emitters()
+
+
+@pytest.mark.parametrize(
+    ("exitance", "message"),
+    [
+        ({"type": "d65"}, "'exitance' of an fspt_surface is a colour"),
+        ({"type": "checkerboard", "color0": {"type": "rgb", "value": [1, 0, 0]}}, "'color0' of an fspt_surface is a c"),
+        ({"type": "checkerboard", "color1": {"type": "d65"}}, "'color1' of an fspt_surface is a colour"),
+        ({"type": "blackbody", "temperature": 5000.0}, "'exitance' of an fspt_surface is a spectrum"),
+    ],
+)
+def test_load_refuses_what_the_variant_would_turn_into_a_number(exitance, message):
+    """Seen to fail: `d65` and colours within a texture rendered, `d65` as 1 W/mm²."""
+    scene = {"type": "scene", "camera": lens(), "ball": ball() | {"emitter": glow(exitance)}}
+    with pytest.raises(SceneError, match=f"dictionary: {message}"):
+        fspt.load(scene)
 
 
 def test_new_exitance_leaves_the_probe_in_its_place_and_a_new_shape_does_not(tmp_path):

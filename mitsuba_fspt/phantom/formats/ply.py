@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from .surface_files import load_triangles
 # Properties of geometry and colour.
 NOT_VALUES = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
 TEXTURE = {"s", "t", "u", "v"}
+GROUPED = re.compile(r"(\w+)_[x01]")  # of a scalar that Mitsuba reads as a mesh attribute
 
 
 def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
@@ -47,6 +49,12 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
         fields += [Field(name, v, on, name in TEXTURE) for name, v in values.items() if len(v) == fitting]
     points, cells = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     return RawMesh(points, cells, path.name, scalars(fields)), _comments(path)
+
+
+def attribute_name(name: str) -> str:
+    """Name of the mesh attribute that Mitsuba makes of a scalar property, 'jn' of 'jn_x'; '' if it ignores it."""
+    grouped = GROUPED.fullmatch(name)
+    return grouped[1] if grouped else ""
 
 
 def _require_corners(faces: Any, path: Path) -> None:

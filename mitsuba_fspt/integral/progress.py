@@ -1,0 +1,31 @@
+"""Share of the integral's work that is done, reported after every level of refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Reports shares of a part of the work as shares of the whole: `start` … `stop` of it, in [0, 1].
+
+    report : called with the share of the whole that is done; None: nothing is reported
+    """
+
+    report: Callable[[float], None] | None = None
+    start: float = 0.0
+    stop: float = 1.0
+
+    def __call__(self, done: float) -> None:
+        """Report that the share `done`, in [0, 1], of this part is done."""
+        if self.report:
+            self.report(self.start + done * (self.stop - self.start))
+
+    def part(self, number: int, count: int) -> Progress:
+        """The part of this `number`, from 0, of `count` equal parts."""
+        width = (self.stop - self.start) / count
+        return Progress(self.report, self.start + number * width, self.start + (number + 1) * width)
+
+
+SILENT = Progress()  # reports nothing
