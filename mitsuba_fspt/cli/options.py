@@ -22,6 +22,9 @@ Method = Annotated[str | None, typer.Option(help="integral, path or ptracer; the
 Rtol = Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")]
 Domain = Annotated[str | None, typer.Option(help="pupil or surface; the scene's own if left out.")]
 Spp = Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")]
+MaxDepth = Annotated[
+    int | None, typer.Option(metavar="N", help="Legs of light that path and ptracer follow; what the scene needs.")
+]
 Sensor = Annotated[int, typer.Option(metavar="K", help="Number of the scene's sensor, counted from 0.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
 SourcePower = Annotated[

@@ -18,6 +18,7 @@ from ..runtime.errors import ImageError, SceneError
 from .options import (
     AsJson,
     Domain,
+    MaxDepth,
     Method,
     Parameters,
     Quiet,
@@ -69,6 +70,7 @@ def render(
     rtol: Rtol = None,
     domain: Domain = None,
     spp: Spp = None,
+    max_depth: MaxDepth = None,
     seed: Seed = None,
     sensor: Sensor = 0,
     source_power: SourcePower = None,
@@ -92,17 +94,11 @@ def render(
         _require_source_power(source_power)
     images: list[Image] = []
     with _kept(shots, images), progress_bar(quiet) as progress:
-        from ..rendering.render import render
-        from ..rendering.scene import load
-
         quiet_mitsuba()
         settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
         for shot in shots:
-            loaded = load(shot.scene, **shot.parameters)
-            image = render(loaded, sensor=sensor, progress=progress, **settings)  # type: ignore[arg-type]
+            image = _rendered(shot, settings | {"max_depth": max_depth, "sensor": sensor, "progress": progress})
             image = image if source_power is None else image.scaled(source_power)
-            if shot.origin:
-                image = replace(image, metadata=image.metadata | {"scene": shot.origin})
             _write(image, shot.output, _picture(shot, png))
             images.append(image)
     summaries = [_summary(image, shot.output, _picture(shot, png)) for shot, image in zip(shots, images, strict=True)]
@@ -111,6 +107,15 @@ def render(
     for summary in summaries:
         if "warnings" in summary:
             typer.echo(f"fspt: {summary['output']}: {summary['warnings']}.", err=True)
+
+
+def _rendered(shot: Shot, settings: dict[str, Any]) -> Image:
+    """Image of a shot with these settings of `render`."""
+    from ..rendering.render import render
+    from ..rendering.scene import load
+
+    image = render(load(shot.scene, **shot.parameters), **settings)
+    return replace(image, metadata=image.metadata | {"scene": shot.origin}) if shot.origin else image
 
 
 def _require_source_power(watts: float) -> None:

@@ -97,7 +97,9 @@ class Draft:
         least = dr.opaque(mi.Float64, self.quadrature.least_error) * self.peak
         error = dr.select(self.coverage == 0, self.error, dr.maximum(self.error, least))
         if self.view.specular:
-            error += self.lost * dr.opaque(mi.Float64, self.view.most_radiance())
+            # The few lines of a pixel may pass by what a neighbour's meet.
+            lost = self.grid.spread_max(self.lost, self.reach(self.nodes)[1])
+            error += lost * dr.opaque(mi.Float64, self.view.most_radiance())
         coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))
         etendue = dr.opaque(mi.Float64, self.lens.etendue)
         power, error = etendue * self.value, etendue * dr.select(self.outside, 0, error)

@@ -47,7 +47,7 @@ def integrate_transect(
             return mi.Vector4f(sight.radiance, sight.body, sight.depth, sight.front)
         return mi.Point3f(sight.radiance, sight.body, sight.depth)
 
-    found = _search(look, phase, along, outline, least, specular=view.specular is not None)
+    found = _search(look, phase, along, outline, least, mi.Vector4f(0) if view.specular else mi.Point3f(0))
     jumps, places = found.jumps, found.places()
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
@@ -116,6 +116,12 @@ class _Jump:
             before, after = dr.maximum(before, 0), dr.maximum(after, 0)
         return dr.abs(self.after.x - self.before.x) + dr.select(before != after, outline, 0)
 
+    def larger_half(self, s: mi.Float, seen: Seen, outline: mi.Float) -> _Jump:
+        """Of the two parts that a look at s makes the one with the larger jump."""
+        left = _Jump(mi.Point2f(self.at.x, s), self.before, seen)
+        right = _Jump(mi.Point2f(s, self.at.y), seen, self.after)
+        return dr.select(left.size(outline) >= right.size(outline), left, right)
+
 
 @dataclass
 class _Search:
@@ -147,15 +153,23 @@ class _Search:
         return ordered
 
 
+def _met(seen: Seen) -> mi.Bool:
+    """True where a line of sight met anything; weak light along it may come from elsewhere than its end."""
+    return seen.y > 0 if len(seen) == 3 else (seen.y > 0) | (seen.x > 0)
+
+
 def _search(
     look: Callable[[mi.Float], Seen],
     phase: mi.Float,
     along: AlongTransect,
     outline: mi.Float,
     least: mi.Float,
-    specular: bool,
+    nothing: Seen,
 ) -> _Search:
-    """Jumps of what lines of sight `look` at; scan and bisection are one loop, so that it is compiled once."""
+    """Jumps of what lines of sight `look` at; scan and bisection are one loop, so that it is compiled once.
+
+    `nothing`: what a line of sight sees that meets nothing.
+    """
     intervals, bisections = dr.opaque(mi.UInt32, along.scan), dr.opaque(mi.UInt32, along.bisections)
     number = mi.Float(intervals)
     # Where edges run along pixels they would lie on points to bisect, and rounding choose the side.
@@ -179,17 +193,12 @@ def _search(
                 jump = jump | (most > dr.maximum(STEEP * rest / (number - (k + 1)), least))
             large &= jump
             jumps += dr.select(large, mi.UInt32(1), 0)
-        # What is weak beside the light along a line may come from elsewhere than its end.
-        met = (seen.y > 0) | (seen.x > 0) if specular else seen.y > 0
-        lit = dr.select(met, mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
+        lit = dr.select(_met(seen), mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
         return _Search(largest, s, seen, total, lit, jumps, found.looks)
 
     def bisect(found: _Search, turn: mi.UInt32, jump: _Jump, s: mi.Float, seen: Seen) -> _Search:
-        left = _Jump(mi.Point2f(jump.at.x, s), jump.before, seen)
-        right = _Jump(mi.Point2f(s, jump.at.y), seen, jump.after)
-        half = dr.select(left.size(outline) >= right.size(outline), left, right)
-        largest = [dr.select(turn == k, half, old) for k, old in enumerate(found.largest)]
-        return replace(found, largest=largest)
+        half = jump.larger_half(s, seen, outline)
+        return replace(found, largest=[dr.select(turn == k, half, old) for k, old in enumerate(found.largest)])
 
     def once(found: _Search) -> tuple[_Search]:
         k = found.looks
@@ -206,9 +215,8 @@ def _search(
         return (found,)
 
     # Not `dr.zeros`: of a dataclass's fields it keeps the types of the variant that it meets first.
-    nothing = mi.Vector4f if specular else mi.Point3f
-    none = [_Jump(mi.Point2f(0), nothing(0), nothing(0)) for _ in range(MOST_JUMPS)]
-    start = _Search(none, mi.Float(0), nothing(0), mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
+    none = [_Jump(mi.Point2f(0), nothing, nothing) for _ in range(MOST_JUMPS)]
+    start = _Search(none, mi.Float(0), nothing, mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
     return dr.while_loop((start,), lambda found: found.looks <= intervals + found.jumps * bisections, once)[0]
 
 

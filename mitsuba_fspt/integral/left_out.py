@@ -12,22 +12,28 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..jit.plugin_objects import made
 from ..jit.spectra import at_one_wavelength, scalar
 from .eq9 import View, etendue_from_pixel
 from .occlusion import hides_nothing
+from .quadrature import Quadrature
 
 PATHS = 1 << 14  # a share of 5 % is known to about 0.1 %
 BOUNCES = 2  # scattering reflections that are counted: further ones are weaker by the albedo each
 SURE = 2.0  # standard errors from which on a share is told from none
 
 
-@dataclass(frozen=True)
+@dataclass
 class LeftOut:
-    """Share of a picture's power that Eq. 9 leaves out, its standard error, and ids of the shapes that scatter."""
+    """Share of a picture's power that Eq. 9 leaves out, its standard error, and ids of the shapes that scatter.
+
+    told : True once a user has been told
+    """
 
     share: float
     error: float
     bodies: tuple[str, ...]
+    told: bool = False
 
     def warning(self, rtol: float) -> str | None:
         """One line about it; None where it is below `rtol`, or not told from none."""
@@ -40,19 +46,16 @@ class LeftOut:
         )
 
 
-def light_left_out(view: View, max_specular: int) -> LeftOut | None:
-    """Share of the power on the crop window that the integral leaves out; None where nothing can be.
-
-    max_specular : specular surfaces one after the other that paths follow at most
-    """
+def light_left_out(view: View, quadrature: Quadrature) -> LeftOut | None:
+    """Share of the power on the crop window that the integral leaves out; None where nothing can be."""
     scene = view.scene
     bodies = scattering_shapes(scene)
     others = [e for e in scene.emitters() if not mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
     if not (bodies or others) or (not others and hides_nothing(scene)):
         return None
-    depth = 1 + BOUNCES + (max_specular if view.specular else 0)
-    path = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": depth})
-    sampler = mi.load_dict({"type": "independent"})
+    depth = 1 + BOUNCES + (quadrature.max_specular if view.specular else 0)
+    path = made("path", max_depth=depth, rr_depth=depth)
+    sampler = made("independent")
     sampler.seed(0, PATHS)
     lens, film = view.lens, view.lens.film()
     position = sampler.next_2d() * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())

@@ -21,14 +21,16 @@ from numpy.typing import NDArray
 
 from ..emission.face_table import shape_number
 from ..jit.mesh_buffers import box_of, triangles
+from ..jit.plugin_objects import made
 from ..jit.spectra import at_one_wavelength, scalar
 from ..runtime.plugin_types import is_surface
-from .occlusion import clear_of, hidden, ray_to_lens
+from .occlusion import hidden, ray_to_lens
 from .quadrature import Quadrature
 
 SMOOTHEST = 1e-4  # roughness below which Mitsuba's rough conductor has the lobe of this roughness: a mirror's
 FLAT = 1e-5  # of its size: how far a flat shape may leave its plane
 ROUNDING = 2e-6  # of the largest coordinate: margin of a box
+LIFT = 4e-7  # of a shape's largest coordinate: distance from it at which float32 tells its sides apart
 CODES = 4095  # numbers for a first surface, and for those after it, that float32 holds together
 DELTA = {
     "null": mi.BSDFFlags.Null,
@@ -48,6 +50,7 @@ class Specular:
     bending : boxes of the shapes that lead lines of sight elsewhere than straight on
     bsdf : Dr.Jit's number of a shape's BSDF; 0 where lines of sight end
     reach : box of all that light can come from which leaves a shape, six numbers [mm]
+    lift : how far from a shape a line goes on [mm]
     most : longest sequence of lobes that is followed
     least : smallest weight with which a sequence is followed
     kept : BSDFs that stand for others, kept alive
@@ -58,6 +61,7 @@ class Specular:
     bending: tuple[Box, ...]
     bsdf: mi.UInt32
     reach: mi.Float
+    lift: mi.Float
     most: int
     least: float
     kept: tuple[mi.BSDF, ...]
@@ -82,7 +86,7 @@ class Specular:
             return None
         boxes = [_box(shape) for shape, _ in bent]
         count = 1 + max(map(shape_number, scene.shapes()))
-        bsdf, reach = np.zeros(count, np.uint32), np.zeros((count, 6), np.float32)
+        bsdf, reach, lift = np.zeros(count, np.uint32), np.zeros((count, 6), np.float32), np.zeros(count, np.float32)
         for shape, its in shapes:
             number = shape_number(shape)
             bsdf[number] = dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(its))[0]
@@ -90,12 +94,14 @@ class Specular:
                 box for (other, _), box in zip(bent, boxes, strict=True) if other is not shape or not _plane(shape)
             ]
             reach[number] = _around([*glowing, *others])
+            lift[number] = LIFT * np.abs(_box(shape)).max()
         return cls(
             tuple(shape.id() for shape, _ in shapes),
             tuple(name for name in DELTA if name in lobes) or ("null",),
             tuple(boxes),
             mi.UInt32(bsdf),
             mi.Float(reach.ravel()),
+            mi.Float(lift),
             quadrature.max_specular,
             quadrature.least_weight,
             tuple(its for _, its in shapes),
@@ -127,7 +133,7 @@ def _mirror(rough: mi.BSDF) -> mi.BSDF | None:
     alphas = [np.ravel(numbers[key]) for key in numbers.keys() if key.startswith("alpha")]
     if not alphas or np.max([np.max(alpha) for alpha in alphas]) > SMOOTHEST:
         return None
-    mirror = mi.load_dict({"type": "conductor"})
+    mirror = made("conductor")
     parameters = mi.traverse(mirror)
     for key in parameters.keys():
         if key in numbers:
@@ -198,9 +204,8 @@ def transmission(
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active=goes_on)
         through = scalar(dr.reinterpret_array(mi.BSDFPtr, index).eval_null_transmission(si, goes_on))
         share = dr.select(met, dr.select(goes_on, share * through, 0), share)
-        onward = ray(pi.t)
-        step = pi.t + clear_of(onward)
-        ray = mi.Ray3f(ray(step), ray.d, ray.maxt - step, ray.time, ray.wavelengths)
+        origin = _off(si, ray.d, dr.gather(mi.Float, specular.lift, number, goes_on))
+        ray = mi.Ray3f(origin, ray.d, ray.maxt - pi.t, ray.time, ray.wavelengths)
         return share, ray, count + 1, goes_on & (share > 0) & (ray.maxt > 0)
 
     state = (mi.Float(1), ray, mi.UInt32(0), mi.Bool(active))
@@ -254,8 +259,12 @@ class Found:
 
 @dataclass
 class _Lobe:
-    """A lobe where a line of sight meets a surface: its `direction`, `weight` and ratio of refractive `indices`."""
+    """A lobe where a line of sight meets a surface: its `direction`, `weight` and ratio of refractive `indices`.
 
+    origin : where the line goes on
+    """
+
+    origin: mi.Point3f
     direction: mi.Vector3f
     weight: mi.Float
     indices: mi.Float
@@ -299,7 +308,7 @@ def follow(
         glows = met & covers(number)
         found = _noted(found, course, foremost, met, number, depth, dr.select(met, radiance(pi, ray), 0), glows)
         lobes = _lobes(specular, pi, ray, number, met)
-        nexts = [_onward(course, lobe, pi, ray, depth, most) for lobe in lobes]
+        nexts = [_onward(course, lobe, depth) for lobe in lobes]
         best, others = _strongest_first(nexts)
         best.plain = course.plain
         # What lets light through is no end.
@@ -366,12 +375,12 @@ def _lobes(
     index = dr.gather(mi.UInt32, specular.bsdf, number, met)
     goes_on = met & (index > 0)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active=goes_on)
-    bsdf = dr.reinterpret_array(mi.BSDFPtr, index)
+    bsdf, lift = dr.reinterpret_array(mi.BSDFPtr, index), dr.gather(mi.Float, specular.lift, number, goes_on)
     lobes = []
     for name in specular.lobes:
         if name == "null":
             weight = dr.select(goes_on, scalar(bsdf.eval_null_transmission(si, goes_on)), 0)
-            lobes.append(_Lobe(mi.Vector3f(ray.d), weight, mi.Float(1), mi.Bool(True)))
+            lobes.append(_Lobe(_off(si, ray.d, lift), mi.Vector3f(ray.d), weight, mi.Float(1), mi.Bool(True)))
             continue
         context = mi.BSDFContext()
         context.type_mask = DELTA[name]
@@ -379,18 +388,21 @@ def _lobes(
         sample, value = bsdf.sample(context, si, 0.0, mi.Point2f(0.5), goes_on)
         of_kind = goes_on & mi.has_flag(sample.sampled_type, DELTA[name])
         weight = dr.select(of_kind, scalar(value) * sample.pdf, 0)
-        lobes.append(_Lobe(si.to_world(sample.wo), weight, dr.select(of_kind, sample.eta, 1), mi.Bool(False)))
+        direction, indices = si.to_world(sample.wo), dr.select(of_kind, sample.eta, 1)
+        lobes.append(_Lobe(_off(si, direction, lift), direction, weight, indices, mi.Bool(False)))
     return lobes
 
 
-def _onward(
-    course: Course, lobe: _Lobe, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, depth: mi.Float, most: mi.UInt32
-) -> Course:
+def _off(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, lift: mi.Float) -> mi.Point3f:
+    """Where a ray with this direction leaves a surface, off it by a little more than its coordinates are rounded."""
+    return mi.Point3f(si.p + dr.mulsign(lift, dr.dot(si.n, direction)) * si.n)
+
+
+def _onward(course: Course, lobe: _Lobe, depth: mi.Float) -> Course:
     """A course and one lobe more."""
-    point = ray(dr.select(lobe.weight > 0, pi.t, 0))
     return replace(
         course,
-        origin=mi.Point3f(point + clear_of(point) * lobe.direction),
+        origin=lobe.origin,
         direction=mi.Vector3f(lobe.direction),
         weight=course.weight * lobe.weight,
         depth=depth,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
+from ..integral.left_out import LeftOut, light_left_out
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
 from ..integral.progress import Progress
 from ..integral.quadrature import Quadrature
@@ -24,7 +25,7 @@ from ..integral.shortcuts import SHORTCUTS, Finding
 from ..integral.solution import Solution
 from ..integral.specular import Specular
 from ..integral.tiles import Mosaic
-from ..integral.window import Boxes, Window, glowing_boxes, window_of
+from ..integral.window import Boxes, Window, glowing_boxes, visible_window, window_of
 from ..jit.mesh_buffers import box_of, buffers
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
@@ -79,7 +80,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         # Results about the last scene; a reference to the scene, whose child this integrator is, would be a cycle.
         self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
         self._robust: RobustCopy | None = None
-        self._window, self._narrow, self._faces = CachedValue(), CachedValue(), CachedValue()
+        self._window, self._narrow, self._faces, self._left_out = (CachedValue() for _ in range(4))
 
     def solve(
         self,
@@ -115,6 +116,18 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             rounding = sensor.rounding if sensor.rounding >= LEAST_DISPLACEMENT else 0.0
             solution = mosaic.solution(quadrature.least_error, rounding)
         return replace(solution, findings=(_outside(window), *solution.findings))
+
+    def light_left_out(
+        self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None
+    ) -> LeftOut | None:
+        """Light of a scene that `solve` can render which Eq. 9 leaves out; None where there can be none."""
+        quadrature = quadrature or self.quadrature
+        with recording(), dr.suspend_grad():
+            window = visible_window(scene, sensor)
+            if 0 in window.shape:
+                return None
+            view = View.of(scene, sensor, window, None, Specular.of(scene, sensor, quadrature))
+            return light_left_out(view, quadrature)
 
     def _fill(
         self,
@@ -227,7 +240,18 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
         solution = self.solve(scene, sensor)
+        self._tell_left_out(scene, sensor)
         return mi.TensorXf(solution.power[..., None].astype(np.float32))
+
+    def _tell_left_out(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Log a warning about light that is left out, once as long as shapes and lens stay."""
+        shapes = scene.shapes()
+        state = ([shape_number(shape) for shape in shapes], [_pose(shape) for shape in shapes], _view(sensor))
+        found = self._left_out.recall(state, lambda: self.light_left_out(scene, sensor))
+        warning = found.warning(self.quadrature.rtol) if found else None
+        if warning and not found.told:
+            mi.Log(mi.LogLevel.Warn, f"fspt_integral: {warning}.")
+            found.told = True
 
     def to_string(self) -> str:
         return f"FsptIntegral[{self.quadrature}]"
