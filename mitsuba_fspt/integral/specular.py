@@ -107,10 +107,21 @@ class Specular:
             tuple(its for _, its in shapes),
         )
 
+    def state(self) -> tuple[object, ...]:
+        """Key of what the light through these shapes depends on, beside where they stand."""
+        values = [mi.traverse(bsdf) for bsdf in self.kept]
+        return self.names, self.lobes, tuple(_key(value[name]) for value in values for name in value.keys())
+
     @property
     def straight(self) -> bool:
         """True if lines of sight that lead to light go straight on."""
         return not self.bending
+
+
+def _key(value: object) -> object:
+    """A number itself, of an array the index of its data, alike as long as these live."""
+    held = getattr(value, "array", value)
+    return held.index if dr.is_array_v(held) and dr.width(held) > 1 else str(value)
 
 
 def specular_bsdf(shape: mi.Shape) -> mi.BSDF | None:
@@ -236,6 +247,10 @@ class Course:
     plain: mi.UInt32
     length: mi.UInt32
 
+    def carries(self) -> mi.Float:
+        """Share of the light along the line: radiance over the squared index is what refraction leaves alone."""
+        return self.weight * dr.square(self.index)
+
 
 @dataclass
 class Found:
@@ -246,7 +261,7 @@ class Found:
     body : number of all that the course of the strongest lobes met, the first surface in its last 12 bits; 0 where it
         met nothing
     depth, front : depth [mm] at which the surface where that course ends and the first one are seen, inf without one
-    lost : Σ weight of what is cut off
+    lost : share of the light that is cut off
     """
 
     radiance: mi.Float
@@ -314,13 +329,12 @@ def follow(
         # What lets light through is no end.
         found.depth = dr.select(foremost & (best.weight > 0) & ~glows, dr.inf, found.depth)
         leads = _leads_to_light(specular, number, best)
-        lost = dr.select(leads, best.weight, 0)
-        on = leads & (best.weight > least) & (best.length <= most)
-        found.lost += dr.select(on, 0, lost)
+        on = leads & (best.carries() > least) & (best.length <= most)
+        found.lost += dr.select(leads & ~on, best.carries(), 0)
         for other in others:
             leads = _leads_to_light(specular, number, other)
-            push = leads & (other.weight > least) & (other.length <= most)
-            found.lost += dr.select(leads & ~push, other.weight, 0)
+            push = leads & (other.carries() > least) & (other.length <= most)
+            found.lost += dr.select(leads & ~push, other.carries(), 0)
             stack.write(other, pending, push)
             pending = pending + dr.select(push, mi.UInt32(1), 0)
         pop = ~on & (pending > 0)
@@ -413,10 +427,10 @@ def _onward(course: Course, lobe: _Lobe, depth: mi.Float) -> Course:
 
 
 def _strongest_first(courses: list[Course]) -> tuple[Course, list[Course]]:
-    """The course of the largest weight, the first of equal ones, and the others."""
+    """The course that carries most, the first of equal ones, and the others."""
     best, others = courses[0], []
     for course in courses[1:]:
-        stronger = course.weight > best.weight
+        stronger = course.carries() > best.carries()
         others.append(dr.select(stronger, best, course))
         best = dr.select(stronger, course, best)
     return best, others

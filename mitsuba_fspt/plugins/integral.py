@@ -218,14 +218,13 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         return None if edition is None else self._faces.recall(edition, lambda: FaceTable.of(shapes))
 
     def _narrow_light(self, view: View, window: Window) -> NarrowLight:
-        """Light of objects and spots that lines of sight may miss; cached, but behind panes and masks."""
+        """Light of objects and spots that lines of sight may miss; cached."""
         scene, lens, specular = view.scene, view.lens, view.specular
-        if specular:
-            return narrow_light(points_on_surfaces(scene, lens, specular), window)
         emitters = scene.emitters()
         editions = [(mark_of(emitter), getattr(emitter, "edition", 0)) for emitter in emitters]
-        state = (editions, glowing_boxes(scene), _poses(scene.shapes()), _view(lens), window)
-        return self._narrow.recall(state, lambda: narrow_light(points_on_surfaces(scene, lens), window))
+        through = specular.state() if specular else ()
+        state = (editions, glowing_boxes(scene), _poses(scene.shapes()), through, _view(lens), window)
+        return self._narrow.recall(state, lambda: narrow_light(points_on_surfaces(scene, lens, specular), window))
 
     def render(
         self,
