@@ -24,6 +24,7 @@ from ..runtime.interrupt import ctrl_c_noted
 from ..runtime.numbers import whole
 from ..runtime.plugin_types import is_integral
 from . import monte_carlo
+from .provenance import origin_of
 from .scene import loaded
 
 if TYPE_CHECKING:
@@ -98,7 +99,8 @@ def render(
             *planes, how = _sample(scene, lens, integrator, spp, seed, report)
         check_interrupt()
     how |= {"wall_time": time.perf_counter() - start} | ({} if planes[0].any() else {"warnings": DARK})
-    return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
+    origin = {"scene": scene.id(), "sensor": sensor, **origin_of(scene, lens)}
+    return Image(*planes, {**origin, **how, **_lens_numbers(lens), **_versions()})
 
 
 def _integrate(
