@@ -108,13 +108,19 @@ class ColumnCanvas:
         dr.eval(self._level, self._slope)
 
     def lay(
-        self, columns: Sequence[mi.UInt32], planes: Sequence[Plane], ring: Sequence[mi.Point2d], active: mi.Bool
+        self,
+        columns: Sequence[mi.UInt32],
+        planes: Sequence[Plane],
+        ring: Sequence[mi.Point2d],
+        count: mi.UInt32,
+        active: mi.Bool,
     ) -> None:
         """Lay light of linear density within a polygon of four corners [pixels] on the windows of several columns.
 
-        What lies beside a column's window is dropped; a column without window gets nothing.
+        `count`: its edges, 3 for a triangle, whose last corner is its first. What lies beside a column's window is
+        dropped; a column without window gets nothing.
         """
-        turn = _cross(ring[2] - ring[0], ring[3] - ring[1])
+        turn = _cross(ring[2] - ring[0], ring[3] - ring[1])  # of a triangle, too, twice its area
         # A path all around adds up minus the area, or its opposite.
         way = dr.select(turn > 0, -1 / QUANTUM, 1 / QUANTUM)
         low_y = dr.minimum(dr.minimum(ring[0].y, ring[1].y), dr.minimum(ring[2].y, ring[3].y))
@@ -135,7 +141,7 @@ class ColumnCanvas:
             for place, plane in zip(places, scaled, strict=True):
                 self._add(place, plane, (column, row), (xa, ya, xb, yb), (x, y))
 
-        along_edges(ring, active, self._size, add)
+        along_edges(ring, active, self._size, add, count)
 
     @property
     def _fields(self) -> mi.Int32:

@@ -1,10 +1,10 @@
 """Columns of the transport matrix: Eq. 9 in its surface form (M.9) for unit J_n of one vertex or face at a time.
 
-Every face sends its light through M × M nodes of the pupil. Through one node the image of a flat triangle is a triangle,
-and the étendue a pixel takes of it is cos⁴θ (Eq. M.5) times the part of the pixel inside: the light of each of its
-columns, linear over the triangle, is distributed exactly over the pixels (`ColumnCanvas`), whatever the sizes of face
-and pixel. Only the pupil is sampled. Of a face much smaller than its blur disc not the face but the pupil is laid: the
-images of the pupil's cells through the middle of a piece, which tile the blur disc.
+Every face sends its light through M × M nodes of the pupil. Through one node the image of a flat triangle is a
+triangle, and the étendue that a pixel takes of it is cos⁴θ (Eq. M.5) times the part of the pixel inside: the light of
+each of its columns, linear over the triangle, is distributed exactly over the pixels (`ColumnCanvas`), whatever the
+sizes of face and pixel. Only the pupil is sampled. Of a face much smaller than its blur disc not the face but the pupil
+is laid: the images of the pupil's cells through the middle of a piece, which tile the blur disc.
 
 All columns are computed twice, with the cells and pieces of `ColumnRule` and with half of them; the difference of the
 two shows what is left.
@@ -47,8 +47,8 @@ Mask = NDArray[np.bool_]
 class ColumnRule:
     """Numbers of cells and pieces, each with the error it bounds.
 
-    edge : error at an edge of J_n between two faces, over its step: cells M along the pupil = √(edge_factor · r^1.2/edge)
-        for a blur radius r [pixels], which is what middles of cells leave of a half plane averaged over pixels
+    edge : error at an edge of J_n between two faces, over its step: cells M along the pupil are
+        √(edge_factor · r^1.2/edge) for a blur radius r [pixels], which is what middles of cells leave of a half plane averaged over pixels
     edge_factor : measured for half planes of all directions and offsets, r = 0.3 … 4, M = 2 … 16
     fewest, most : least and largest M
     partial : least M where a face turns away from part of the pupil, or a second border cuts the pupil
@@ -73,10 +73,10 @@ class ColumnRule:
     @classmethod
     def of(cls, rtol: float) -> ColumnRule:
         """The rule for a tolerance relative to the brightest pixel: columns are right to some ten times that."""
-        edge = 5 * rtol
-        finer = math.sqrt(min(edge / 5e-3, 1))
+        edge = 3 * rtol
+        finer = math.sqrt(min(rtol / 1e-3, 1))
         cells = 2 * math.ceil(3 / math.sqrt(finer))
-        partial = 2 * math.ceil(8 / math.sqrt(finer))
+        partial = 2 * math.ceil(6 / math.sqrt(finer))
         return cls(edge, cells=cells, partial=partial, point=0.5 * finer, shadow=0.7 * finer, drop=1e-2 * rtol)
 
 
@@ -103,8 +103,8 @@ class FaceLight:
     """The faces of one mesh as a lens sees them.
 
     corners (F, 3): numbers of their vertices. low, high (F, 2): bounds of their light [pixels of the crop window],
-    empty for a face that sends none. sides, blur (F,): longest edge and blur radius of the image [pixels]. partial (F,):
-    only part of the pupil takes light of the face. mixed (F,): one surface hides part of another here.
+    empty for a face that sends none. sides, blur (F,): longest edge and blur radius of the image [pixels]. partial (F,): only
+    part of the pupil takes light of the face. mixed (F,): one surface hides part of another here.
     """
 
     emitter: mi.Emitter
@@ -334,9 +334,9 @@ def _laid(
         face, m, cut, points = (dr.gather(mi.UInt32, mi.UInt32(values.astype(np.uint32)), row) for values in of)
         # Array entries beyond the last line gather 0, and whole numbers divided by 0 end the process.
         lines = _Lines(face, dr.maximum(m, 1), dr.maximum(cut, 1), points > 0, mi.UInt32(number.astype(np.uint32)))
-        planes, ring, active = lines.image(scene, lens, faces, on)
+        planes, ring, count, active = lines.image(scene, lens, faces, on)
         columns = [face] if on == "face" else [dr.gather(mi.UInt32, corners, 3 * face + k) for k in range(3)]
-        canvas.lay(columns, planes, ring, active)
+        canvas.lay(columns, planes, ring, count, active)
         canvas.evaluate()
     return canvas.light()
 
@@ -353,8 +353,9 @@ class _Lines:
 
     def image(
         self, scene: mi.Scene, lens: mi.Sensor, faces: FaceLight, on: str
-    ) -> tuple[list[Plane], list[mi.Point2d], mi.Bool]:
-        """Density of the light of each column, the polygon on the crop window that it fills, and where there is any."""
+    ) -> tuple[list[Plane], list[mi.Point2d], mi.UInt32, mi.Bool]:
+        """Density of the light of each column, the polygon on the crop window that it fills with the number of
+        its edges, and where there is any."""
         m, elements, face = self.m, faces.elements, self.face
         part, i, j = self.number // (m * m), self.number % m, self.number // m % m
         node = pupil_cells.middle(i, j, m)
@@ -371,7 +372,7 @@ class _Lines:
         images, values, shares, mean = [], [], [], mi.Float64(0)
         for at in CORNERS:
             corner, _ = elements.place(face, mi.Point2f(*at), self.cut, part)
-            position, to, passes, cos_theta = lens.arrival(corner.p, node)
+            position, to, _, cos_theta = lens.arrival(corner.p, node)
             profile = faces.emitter.law.profile(middle, dr.normalize(to - corner.p), active)
             cos4 = mi.Float64(etendue_from_pixel(cos_theta, True))
             images.append(mi.Point2d(position - origin))
@@ -387,33 +388,34 @@ class _Lines:
         own = dr.select(self.points, pupil_cells.area(cell), dr.pi / mi.Float(m * m))
         virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
         etendue = mi.Float64(etendue_from_surface(cos_s, area, arrival, own, virtual_pixel))
-        ring, light_area, flat = _polygon(images, tile, self.points)
+        ring, count, light_area, flat = _polygon(images, tile, self.points)
         turn = _cross(images[1] - images[0], images[2] - images[0])
         large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
         values = [etendue / (light_area * mean) * value for value in values]
         weights = [values] if on == "face" else [[values[c] * shares[c][k] for c in range(3)] for k in range(3)]
-        return [_plane(images, w, turn, self.points | flat) for w in weights], ring, active
+        return [_plane(images, w, turn, self.points | flat) for w in weights], ring, count, active
 
 
 def _polygon(
     images: list[mi.Point2d], tile: list[mi.Point2d], points: mi.Bool
-) -> tuple[list[mi.Point2d], mi.Float64, mi.Bool]:
+) -> tuple[list[mi.Point2d], mi.UInt32, mi.Float64, mi.Bool]:
     """Polygon that the light fills: the image of a piece or of a cell, or a small square where that has no size.
 
-    Beside it its area [pixels²], and True where the density over it is taken as constant.
+    Beside it the number of its edges, its area [pixels²], and True where the density over it is taken as constant.
     """
-    ring = [dr.select(points, t, c) for t, c in zip(tile, (*images, images[2]), strict=True)]
+    ring = [dr.select(points, t, c) for t, c in zip(tile, (*images, images[0]), strict=True)]
     area = 0.5 * dr.abs(_cross(ring[2] - ring[0], ring[3] - ring[1]))
     longest = mi.Float64(0)
     for k in range(4):
         longest = dr.maximum(longest, dr.squared_norm(ring[k] - ring[k - 1]))
     flat = 2 * area < LEAST_HEIGHT * dr.sqrt(longest)
     none = ~(area > LEAST_AREA)
+    count = dr.select(points | none, mi.UInt32(4), 3)
     middle = 0.25 * (ring[0] + ring[1] + ring[2] + ring[3])
     speck = [middle + SPECK * mi.Vector2d(x, y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     ring = [dr.select(none, s, own) for s, own in zip(speck, ring, strict=True)]
-    return ring, dr.select(none, 4 * SPECK**2, area), flat | none
+    return ring, count, dr.select(none, 4 * SPECK**2, area), flat | none
 
 
 def _plane(images: list[mi.Point2d], values: list[mi.Float64], turn: mi.Float64, constant: mi.Bool) -> Plane:

@@ -54,7 +54,7 @@ class Canvas:
         low, high = _bound(dr.minimum, ring), _bound(dr.maximum, ring)
         # False also where a corner is not finite.
         active &= (low.x < self._width) & (low.y < self._height) & (high.y > 0) & (low.x > -dr.inf) & (high.x < dr.inf)
-        add = self._add_area if not self.centres else self._add_crossing
+        add = self._add_crossing if self.centres else self._add_area
         along_edges(ring, active, (self._width, self._height), lambda a, b, crosses: add(densities, a, b, crosses))
 
     def _add_area(self, densities: Sequence[mi.Float64], a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> None:
@@ -88,10 +88,12 @@ def along_edges(
     active: mi.Bool,
     size: tuple[mi.Float64, mi.Float64],
     add: Callable[[mi.Point2d, mi.Point2d, mi.Bool], None],
+    count: mi.UInt32 | int = 4,
 ) -> None:
     """Call `add(a, b, crosses)` for every part, within one pixel, of the edges of a polygon of four corners [pixels].
 
-    `crosses`: b lies on a line between rows. Edges beyond a film of `size` (w, h) are not divided.
+    `crosses`: b lies on a line between rows. Edges beyond a film of `size` (w, h) are not divided. `count`: 3 for a
+    triangle, whose last corner is its first.
     """
     border = mi.Point2d(*size)
 
@@ -110,7 +112,7 @@ def along_edges(
         rest = [dr.select(arrived, new, old) for new, old in zip((*rest, q), (q, *rest), strict=True)]
         return k + 1, edge + dr.select(arrived, 1, 0), b, *rest
 
-    edges = dr.select(active, mi.UInt32(4), 0)
+    edges = dr.select(active, mi.UInt32(count), 0)
     most = mi.UInt32(4 * (border.x + border.y + 8))
     start = (mi.UInt32(0), mi.UInt32(0), ring[0], *ring[1:], ring[0])
     dr.while_loop(start, lambda k, edge, *_: (edge < edges) & (k < most), step)

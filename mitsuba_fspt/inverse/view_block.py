@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 ON = ("vertex", "face")
-ROWS_RTOL = 1 / 3  # of rtol: of the picture of J_n = 1, which the sums of the rows follow
+CERTAIN = 0.35  # of its estimated error: what the picture of J_n = 1 is wrong by at the most, as a rule
 LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
 SAFETY = 2.0  # half the cells and pieces change an entry by some three times what is left; neighbours may err alike
 NEIGHBOURS = 3  # pixels across that share their errors
@@ -177,7 +177,7 @@ def block_of(
         for emitter in emitters:
             stack.enter_context(emitter.shining(1.0))
         with named("fspt_integral"):
-            quadrature = Quadrature(rtol=max(ROWS_RTOL * rtol, 2e-7))
+            quadrature = Quadrature(rtol=rtol)
         solution = integrator_of(scene, "integral").solve(scene, lens, quadrature)
         with recording(), dr.suspend_grad():
             alone = hides_nothing(scene)
@@ -244,7 +244,7 @@ def _block(columns: list[Any], count: int, solution: Any, etendue: float) -> Blo
     picture, error = solution.power.ravel(), solution.error.ravel()
     sums, coarse_sums = (np.bincount(pixels, values, minlength=len(picture)) for values in (fine, fine - change))
     off = picture - sums
-    sure = np.sign(off) * np.maximum(np.abs(off) - error, 0)
+    sure = np.where(np.abs(off) > CERTAIN * error, off, 0)
     factor = np.clip(1 + np.divide(sure, sums, out=np.zeros_like(sums), where=sums > 0), 0, LARGEST_FACTOR)
     left = np.maximum(np.abs(picture - factor * sums), error)
     coarse_factor = np.divide(factor * sums, coarse_sums, out=factor.copy(), where=coarse_sums > 0)
