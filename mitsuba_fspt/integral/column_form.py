@@ -48,13 +48,16 @@ class ColumnRule:
     """Numbers of cells and pieces, each with the error it bounds.
 
     edge : error at an edge of J_n between two faces, over its step: cells M along the pupil are
-        √(edge_factor · r^1.2/edge) for a blur radius r [pixels], which is what middles of cells leave of a half plane averaged over pixels
-    edge_factor : measured for half planes of all directions and offsets, r = 0.3 … 4, M = 2 … 16
+        √(edge_factor · r^1.2/edge) for a blur radius r [pixels]
+    edge_factor : by what middles of cells leave of a half plane averaged over pixels, the most of all directions and
+        offsets; fitted for r = 0.3 … 4, M = 2 … 16
     fewest, most : least and largest M
     partial : least M where a face turns away from part of the pupil, or a second border cuts the pupil
     cells : M where the cells are laid; their étendue is constant in each
     point : largest piece [pixels] that is taken as a point then; it misplaces light by its square
-    piece : largest piece [pixels]; the perspective of a larger one is not linear
+    piece : largest piece [pixels], over which étendue and exit law are linear
+    perspective : J_n that perspective misplaces within a piece, over its change along the face: pieces along a side of
+        a face of relative depth δ are √(δ/(8 · perspective))
     shadow : largest piece [pixels] where one surface may hide another: lines of sight through a piece are sampled
     drop : entries below this share of a column's brightest are left out
     """
@@ -67,6 +70,7 @@ class ColumnRule:
     cells: int = 6
     point: float = 0.5
     piece: float = 8.0
+    perspective: float = 3e-4
     shadow: float = 0.7
     drop: float = 1e-5
 
@@ -77,7 +81,15 @@ class ColumnRule:
         finer = math.sqrt(min(rtol / 1e-3, 1))
         cells = 2 * math.ceil(3 / math.sqrt(finer))
         partial = 2 * math.ceil(6 / math.sqrt(finer))
-        return cls(edge, cells=cells, partial=partial, point=0.5 * finer, shadow=0.7 * finer, drop=1e-2 * rtol)
+        return cls(
+            edge,
+            cells=cells,
+            partial=partial,
+            point=0.5 * finer,
+            shadow=0.7 * finer,
+            perspective=0.3 * rtol,
+            drop=1e-2 * rtol,
+        )
 
 
 @dataclass(frozen=True)
@@ -103,8 +115,9 @@ class FaceLight:
     """The faces of one mesh as a lens sees them.
 
     corners (F, 3): numbers of their vertices. low, high (F, 2): bounds of their light [pixels of the crop window],
-    empty for a face that sends none. sides, blur (F,): longest edge and blur radius of the image [pixels]. partial (F,): only
-    part of the pupil takes light of the face. mixed (F,): one surface hides part of another here.
+    empty for a face that sends none. sides, blur (F,): longest edge and blur radius of the image [pixels]. slant (F,):
+    depth of the face over its distance. partial (F,): only part of the pupil takes light of the face. mixed (F,): one
+    surface hides part of another here.
     """
 
     emitter: mi.Emitter
@@ -114,6 +127,7 @@ class FaceLight:
     high: Array
     sides: Array
     blur: Array
+    slant: Array
     partial: Mask
     mixed: Mask
     shadows: bool
@@ -141,9 +155,11 @@ class FaceLight:
         low[dark], high[dark] = np.inf, -np.inf
         partial = ~dark & ((least < 0) | (rim < 1))
         none = np.zeros(len(corners), bool)
+        depth = _scales(mesh, lens)[corners]
+        slant = np.ptp(depth, axis=1) / np.maximum(np.abs(depth).min(axis=1), 1e-3 * np.abs(depth).max(axis=1))
         bounded = np.isfinite(blur)
         sides, blur = np.where(bounded, sides, np.inf), np.where(bounded, blur, math.hypot(*shape))
-        return cls(emitter, elements, corners, low, high, sides, blur, partial, none, shadows=False)
+        return cls(emitter, elements, corners, low, high, sides, blur, slant, partial, none, shadows=False)
 
     @property
     def bright(self) -> Mask:
@@ -171,7 +187,10 @@ class FaceLight:
         """How the faces are divided: the cheaper of nodes with images of pieces and pieces with images of cells."""
         largest = np.where(self.mixed, rule.shadow, rule.piece)
         most = max(math.isqrt(BATCH) // rule.most, 1)
-        pieces = np.clip(np.ceil(np.minimum(self.sides, 1e6) / largest), 1, most).astype(np.int64)
+        pieces = np.ceil(np.minimum(self.sides, 1e6) / largest)
+        # Within a pixel nothing is misplaced.
+        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant / (8 * rule.perspective)), self.sides))
+        pieces = np.clip(np.ceil(pieces), 1, most).astype(np.int64)
         side = np.minimum(self.sides, 1e6) / pieces
         nodes = np.sqrt(rule.edge_factor * self.blur**1.2 / rule.edge)
         nodes = np.maximum(nodes, 2 * self.blur / np.maximum(self.sides, 1e-3))  # their images overlap
@@ -184,6 +203,12 @@ class FaceLight:
         as_points = by_cells < by_nodes
         nodes = np.minimum(nodes, rule.most).astype(np.int64)
         return Plan(np.where(as_points, cells, nodes), np.where(as_points, points, pieces), as_points)
+
+
+def _scales(mesh: mi.Shape, lens: mi.Sensor) -> Array:
+    """Of every vertex the side of a virtual pixel at its depth [mm], which is linear in the depth."""
+    positions = triangles(mesh)[0]
+    return lens.blur_disc(dr.unravel(mi.Point3f, positions))[2].numpy().astype(np.float64)
 
 
 def _facing(elements: Elements, lens: mi.Sensor) -> tuple[Array, Array, Array]:
@@ -369,7 +394,7 @@ class _Lines:
             _, to, _, _ = lens.arrival(spot.p, mi.warp.square_to_uniform_disk_concentric(aim))
             active &= ~hidden(scene, spot.p, to, active)
         origin = mi.Vector2f(*(dr.opaque(mi.Float, int(n)) for n in lens.film().crop_offset()))
-        images, values, shares, mean = [], [], [], mi.Float64(0)
+        images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)
         for at in CORNERS:
             corner, _ = elements.place(face, mi.Point2f(*at), self.cut, part)
             position, to, _, cos_theta = lens.arrival(corner.p, node)
@@ -380,6 +405,7 @@ class _Lines:
             mean += cos4 / 3
             b = of_part(part, self.cut, mi.warp.square_to_uniform_triangle(mi.Point2f(*at)))
             shares.append([mi.Float64(1 - b.x - b.y), mi.Float64(b.x), mi.Float64(b.y)])
+            depths.append(mi.Float64(lens.blur_disc(corner.p)[2]))
             active &= dr.isfinite(position.x) & dr.isfinite(position.y)
         centre, radius, side = lens.blur_disc(middle.p)
         active &= side > 0
@@ -393,8 +419,28 @@ class _Lines:
         large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
         values = [etendue / (light_area * mean) * value for value in values]
-        weights = [values] if on == "face" else [[values[c] * shares[c][k] for c in range(3)] for k in range(3)]
+        weights = [values] if on == "face" else _weights(values, shares, depths)
         return [_plane(images, w, turn, self.points | flat) for w in weights], ring, count, active
+
+
+def _weights(
+    values: list[mi.Float64], shares: list[list[mi.Float64]], depths: list[mi.Float64]
+) -> list[list[mi.Float64]]:
+    """Density of the light of each of three columns at the corners of an image.
+
+    values : density of all light at the corners; shares : φ of each column there; depths : up to a factor
+
+    On the film φ is not linear but, with λ the barycentric coordinates of the image and δ the relative depth,
+    λ_k (1 - δ_k + Σ λ_m δ_m) to first order: on average over the image (Σ δ - 3 δ_k)/12 more than λ_k.
+    """
+    mean_depth = (depths[0] + depths[1] + depths[2]) / 3
+    more = [(1 - depth / mean_depth) / 4 for depth in depths]  # where Σ δ = 0
+    mean = (values[0] + values[1] + values[2]) / 3
+    weights = []
+    for k in range(3):
+        shift = sum((more[c] * shares[c][k] for c in range(3)), mi.Float64(0)) * mean
+        weights.append([values[c] * shares[c][k] + shift for c in range(3)])
+    return weights
 
 
 def _polygon(

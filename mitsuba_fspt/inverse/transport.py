@@ -262,7 +262,6 @@ def _joined(
 ) -> TransportMatrix:
     """The matrix of all views, in memory or in its file."""
     found: dict[int, ViewResult] = {}
-    sensitivities: dict[int, Any] = {}
     for k, result in results:
         first = next(iter(found.values()), result)
         _require_alike(tasks[k], result, first)
@@ -273,10 +272,11 @@ def _joined(
     ends = np.cumsum([0, *(part.count for part in parts)]).tolist()
     blocks: Any = [result.block for result in ordered]
     if partial is not None:
-        partial.count = len(tasks)
+        partial.views = len(tasks)
         blocks = partial
-    for k, block in enumerate(blocks):
-        sensitivities[k] = np.bincount(block.columns, block.values.astype(np.float64), minlength=ends[-1])
+    sensitivity = np.zeros(ends[-1])
+    for block in blocks:
+        sensitivity += np.bincount(block.columns, block.values.astype(np.float64), minlength=ends[-1])
     areas = np.concatenate([part.areas for part in parts])
     meta = {
         "format": FORMAT,
@@ -294,7 +294,6 @@ def _joined(
         "versions": {name: version(name) for name in ("mitsuba-fspt", "mitsuba", "drjit", "numpy")},
         "fingerprints": [task.fingerprint for task in tasks],
     }
-    sensitivity = sum(sensitivities.values())
     if partial is None:
         return TransportMatrix(blocks, meta, areas, sensitivity)
     partial.finish(meta, areas, sensitivity)
@@ -314,8 +313,8 @@ def _require_alike(task: ViewTask, result: ViewResult, first: ViewResult) -> Non
     size, first_size = result.lens["film"][:2], first.lens["film"][:2]
     if size != first_size:
         raise TransportError(
-            f"transport: {task.label} has {size[0]} x {size[1]} pixels, another view {first_size[0]} x {first_size[1]}. "
-            "Make a matrix for each size."
+            f"transport: {task.label} has {size[0]} x {size[1]} pixels, another view {first_size[0]} x "
+            f"{first_size[1]}. Make a matrix for each size."
         )
     one, other = (" ".join(part.digest for part in of.parts) for of in (result, first))
     if not same_mesh(one, other) or [p.name for p in result.parts] != [p.name for p in first.parts]:

@@ -1,8 +1,8 @@
 """Files of transport matrices: npz, not compressed, with the arrays of each view apart, so that one can be read alone.
 
 Members: `meta` (JSON: format, views, lenses, parts, …), `areas` and `sensitivity` (n,), and for view k
-`view_k/values`, `columns`, `starts`, `change`, `row_error` as in `Block`. While a matrix is made, finished views stand in
-a folder beside the file, so that an interrupted run goes on with the next one.
+`view_k/values`, `columns`, `starts`, `change`, `row_error` as in `Block`. While a matrix is made, finished views stand
+in a folder beside the file, so that an interrupted run goes on with the next one.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
 def _damaged(path: Path, cause: Exception) -> TransportError:
     text = " ".join(str(cause).split()) or type(cause).__name__
     return TransportError(
-        f"transport matrix '{path}' is truncated or no file of 'fspt matrix' ({text}). Make it again with 'fspt matrix'."
+        f"transport matrix '{path}' is truncated or no file of 'fspt matrix' ({text}). Make it again with that."
     )
 
 
@@ -146,7 +146,7 @@ class PartialFile(Sequence[Block]):
         self.path = _npz(path)
         require_place(self.path, TransportError)
         self.folder = self.path.with_name(self.path.name + ".views")
-        self.count = 0
+        self.views = 0
 
     def has(self, number: int, fingerprint: str) -> bool:
         """True if a view of this fingerprint is there, whole."""
@@ -169,17 +169,17 @@ class PartialFile(Sequence[Block]):
             np.savez(file, fingerprint=fingerprint, shape=[*block.shape, block.count], **arrays)
 
     def __len__(self) -> int:
-        return self.count
+        return self.views
 
     def __getitem__(self, number: int) -> Block:  # type: ignore[override]  # no slices
-        if not 0 <= number < self.count:
+        if not 0 <= number < self.views:
             raise IndexError(number)
         with np.load(self._view(number), allow_pickle=False) as file:
             height, width, count = (int(n) for n in file["shape"])
             return Block((height, width), count, **{name: file[name] for name in ARRAYS})
 
     def __iter__(self) -> Iterator[Block]:
-        return (self[number] for number in range(self.count))
+        return (self[number] for number in range(self.views))
 
     def finish(self, meta: Mapping[str, Any], areas: NDArray[Any], sensitivity: NDArray[Any]) -> None:
         """Join the views into the file and remove their folder."""

@@ -191,8 +191,8 @@ def _differences(
     pitch = metadata.get("pixel_pitch")
     if pitch is not None and abs(float(pitch) - lens["pixel_pitch"]) > PITCH_TOLERANCE * lens["pixel_pitch"]:
         raise TransportError(
-            f"transport: image {number} has a pixel pitch of {float(pitch):g} mm, the matrix {lens['pixel_pitch']:g} mm. "
-            "Give images of the same film."
+            f"transport: image {number} has a pixel pitch of {float(pitch):g} mm, the matrix {lens['pixel_pitch']:g} "
+            "mm. Give images of the same film."
         )
     notes = []
     try:
@@ -204,8 +204,8 @@ def _differences(
         for place, one in enumerate(matrix.views):
             if place != number and all(made.get(name) == value for name, value in one.items()):
                 raise TransportError(
-                    f"transport: image {number} was made for view {place}, {_text(one)}, not for {_text(view)}. Give the "
-                    "images in the order of the views."
+                    f"transport: image {number} was made for view {place}, {_text(one)}, not for {_text(view)}. Give "
+                    "the images in the order of the views."
                 )
         notes.append(f"image {number} was made with {_text(other)}, its view of the matrix has {_text(view)}.")
     digest = metadata.get("mesh_digest")

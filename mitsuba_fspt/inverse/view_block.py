@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 
 from ..integral.quadrature import Quadrature
 from ..runtime.errors import SceneError, TransportError, named
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 ON = ("vertex", "face")
 CERTAIN = 0.35  # of its estimated error: what the picture of J_n = 1 is wrong by at the most, as a rule
+ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further from it are computed by lines of sight
+ROW_LINES = 4096  # of these pixels at rtol 1e-3
 LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
 SAFETY = 2.0  # half the cells and pieces change an entry by some three times what is left; neighbours may err alike
 NEIGHBOURS = 3  # pixels across that share their errors
@@ -106,18 +108,19 @@ def glowing_meshes(scene: mi.Scene) -> list[mi.Emitter]:
     for emitter in scene.emitters():
         if not is_surface(emitter):
             raise TransportError(
-                f"transport: emitter {emitter.class_name()} is no fspt_surface, whose J_n the matrix takes. Leave it out."
+                f"transport: emitter {emitter.class_name()} is no fspt_surface, whose J_n the matrix takes. Leave it "
+                "out."
             )
         shape = emitter.get_shape()
         if not shape.is_mesh():
             raise TransportError(
-                f"transport: shape '{shape.id()}' is a {shape.class_name().lower()}, J_n needs the vertices or faces of "
-                "a mesh. Give a PLY, for example of trimesh.creation."
+                f"transport: shape '{shape.id()}' is a {shape.class_name().lower()}, J_n needs the vertices or faces "
+                "of a mesh. Give a PLY, for example of trimesh.creation."
             )
         if emitter.exitance.class_name().startswith("Bitmap"):
             raise TransportError(
-                f"transport: 'exitance' of shape '{shape.id()}' is a bitmap, the columns are vertices or faces. Give J_n "
-                "as a mesh attribute or a number."
+                f"transport: 'exitance' of shape '{shape.id()}' is a bitmap, the columns are vertices or faces. Give "
+                "J_n as a mesh attribute or a number."
             )
         if not emitter.law.linear:
             raise TransportError(
@@ -192,7 +195,77 @@ def block_of(
                 part = _columns(scene, lens, emitter, on, ColumnRule.of(rtol), alone, report, most_bytes)
                 counts.append(len(part.counts))
                 columns.append(part)
-    return _block(columns, sum(counts), solution, lens.etendue)
+            entries = _Entries.of(columns)
+            rough = _rough(scene, lens, entries, solution, rtol)
+            if rough.size:
+                entries = entries.with_rows(_rows(scene, lens, emitters, counts, rough, on, rtol), rough)
+    return _block(entries, sum(counts), solution, lens.etendue)
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """Entries of one view in any order: pixel, column, light over that of a filled pixel, and its change."""
+
+    pixels: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    light: Array
+    change: Array
+
+    @classmethod
+    def of(cls, parts: list[Any]) -> _Entries:
+        """Those of the columns of several meshes, one after the other."""
+        counts = np.concatenate([part.counts for part in parts])
+        pixels, light, change = (np.concatenate([getattr(p, n) for p in parts]) for n in ("pixels", "light", "change"))
+        return cls(pixels, np.repeat(np.arange(len(counts)), counts), light, change)
+
+    def with_rows(self, rows: _Entries, pixels: NDArray[np.int64]) -> _Entries:
+        """The same with the rows of these pixels replaced."""
+        replaced = np.zeros(int(max(self.pixels.max(initial=0), pixels.max())) + 1, bool)
+        replaced[pixels] = True
+        kept = ~replaced[self.pixels]
+        mine, theirs = ((e.pixels, e.columns, e.light, e.change) for e in (self, rows))
+        return _Entries(*(np.concatenate([a[kept], b]) for a, b in zip(mine, theirs, strict=True)))
+
+
+def _rough(scene: mi.Scene, lens: mi.Sensor, entries: _Entries, solution: Any, rtol: float) -> NDArray[np.int64]:
+    """Pixels whose row the surface form gives wrongly: cut by the image-plane stop, or far from the picture."""
+    from ..integral.window import visible_window
+
+    window = visible_window(scene, lens, everywhere=True)
+    _, cut = window.field_stop(lens)
+    cut = window.expand(cut.astype(np.float64)).ravel() > 0
+    picture = solution.power.ravel() / lens.etendue
+    sums = np.bincount(entries.pixels, entries.light, minlength=picture.size)
+    return np.flatnonzero((cut & (picture > 0)) | (np.abs(picture - sums) > ROUGH * rtol * picture.max()))
+
+
+def _rows(
+    scene: mi.Scene, lens: mi.Sensor, emitters: Any, counts: list[int], pixels: NDArray[np.int64], on: str, rtol: float
+) -> _Entries:
+    """Rows of these pixels by lines of sight; the change is what half of the lines make of them."""
+    from ..integral.row_form import rows_of
+    from ..jit.mesh_buffers import triangles
+
+    lines = int(min(ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
+    found: list[tuple[Any, ...]] = []
+    first = 0
+    for emitter, count, row in zip(emitters, counts, rows_of(scene, lens, emitters, pixels, lines), strict=True):
+        light, half = row.light / lines, np.where(row.line < lines // 2, 2 * row.light / lines, 0)
+        if on == "face":
+            found.append((row.place, first + row.face, light, half))
+        else:
+            corners = triangles(emitter.get_shape())[1].numpy().reshape(-1, 3)[row.face]
+            found += [
+                (row.place, first + corners[:, k].astype(np.int64), light * row.corners[:, k], half * row.corners[:, k])
+                for k in range(3)
+            ]
+        first += count
+    place, column, light, half = (np.concatenate(values) for values in zip(*found, strict=True))
+    whole, halves = (csr_array((v, (place, column)), shape=(len(pixels), first)) for v in (light, half))
+    whole.eliminate_zeros()
+    entries = whole.tocoo()
+    of_half = np.asarray(halves[entries.coords[0], entries.coords[1]]).ravel()
+    return _Entries(pixels[entries.coords[0]], entries.coords[1], entries.data, entries.data - of_half)
 
 
 def _columns(
@@ -233,14 +306,10 @@ def _require_memory(entries: int, most_bytes: int | None) -> None:
         )
 
 
-def _block(columns: list[Any], count: int, solution: Any, etendue: float) -> Block:
-    """The rows of one view from the columns of its meshes and the picture of J_n = 1."""
+def _block(found: _Entries, count: int, solution: Any, etendue: float) -> Block:
+    """The rows of one view from its entries and the picture of J_n = 1."""
     shape = solution.power.shape
-    starts = np.concatenate([[0], np.cumsum(np.concatenate([part.counts for part in columns]))])
-    pixels, fine, change = (
-        np.concatenate([getattr(part, name) for part in columns]) for name in ("pixels", "light", "change")
-    )
-    fine, change = fine * etendue, change * etendue
+    pixels, fine, change = found.pixels, found.light * etendue, found.change * etendue
     picture, error = solution.power.ravel(), solution.error.ravel()
     sums, coarse_sums = (np.bincount(pixels, values, minlength=len(picture)) for values in (fine, fine - change))
     off = picture - sums
@@ -250,7 +319,8 @@ def _block(columns: list[Any], count: int, solution: Any, etendue: float) -> Blo
     coarse_factor = np.divide(factor * sums, coarse_sums, out=factor.copy(), where=coarse_sums > 0)
     entries = fine * factor[pixels]
     change = entries - (fine - change) * np.minimum(coarse_factor, LARGEST_FACTOR)[pixels]
-    whole = csc_array((np.arange(1, len(pixels) + 1), pixels, starts), shape=(len(picture), count)).tocsr()
+    numbers = np.arange(1, len(pixels) + 1)
+    whole = csr_array((numbers, (pixels, found.columns)), shape=(len(picture), count))
     order = whole.data - 1
     entries, change = entries[order], change[order]
     relative = np.divide(change, entries, out=np.zeros_like(entries), where=entries > 0)

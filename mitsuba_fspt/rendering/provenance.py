@@ -6,7 +6,7 @@ import hashlib
 import json
 from base64 import b64decode, b64encode
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ def scene_digest(scene: mi.Scene) -> str:
     return " ".join(digest_of(emitter, shape) for emitter, shape in shapes if shape is not None and shape.is_mesh())
 
 
-def digest_of(emitter: mi.Emitter, mesh: mi.Shape) -> str:
+def digest_of(emitter: Any, mesh: mi.Shape) -> str:
     """Digest of the mesh of an emitter, computed once for each state of the mesh."""
     from ..jit.mesh_buffers import triangles
 

@@ -179,10 +179,10 @@ def images_of_cluster(
 def results_of_cluster(
     points: list[Any], scheduler: str, jobs: int | None, work: Callable[[Any, int | None], Any]
 ) -> Iterator[tuple[Any, Any]]:
-    """Points and what `work` makes of each, in the order they are finished, by workers of the scheduler at this address.
+    """Points and what `work` makes of each, in the order they are finished, by workers of the scheduler at an address.
 
-    'local' starts a scheduler and `jobs` workers on this machine. When a worker ends, its points are tried again. `work`
-    takes a point, which has a `label`, and a number of threads, None for that of the worker.
+    'local' starts a scheduler and `jobs` workers on this machine. When a worker ends, its points are tried again.
+    `work` takes a point, which has a `label`, and a number of threads, None for that of the worker.
 
     Instead of a result: the FsptError that `work` returned, or BackendError where the point ended every worker that
     tried it.
