@@ -50,6 +50,19 @@ def definitions(define: list[str] | None) -> dict[str, str]:
     return pairs
 
 
+def value_lists(define: list[str] | None) -> dict[str, list[str]]:
+    """Lists of values by name from the options -D NAME=V1,V2,...; SceneError as of `definitions`."""
+    values: dict[str, list[str]] = {}
+    for text in define or ():
+        name, equals, listed = text.partition("=")
+        if not (name and equals):
+            raise SceneError(f"-D {text}: must be NAME=V1,V2,…, for example -D f_number=2.8,5.6.")
+        if name in values:
+            raise SceneError(f"-D {text}: '{name}' is given twice. Put all values into one, -D {name}=1,2.")
+        values[name] = several(name, listed)
+    return values
+
+
 def several(name: str, text: str) -> list[str]:
     """Values of a parameter from text: V1,V2,… and ranges start:stop:step, whose stop is left out.
 

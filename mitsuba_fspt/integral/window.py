@@ -127,14 +127,14 @@ class Window:
         return here, tuple(slice(a, b) for a, b in ends)
 
 
-def visible_window(scene: mi.Scene, lens: mi.Sensor) -> Window:
+def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -> Window:
     """Window of the pixels with a line of sight into the bounding box of emitting surfaces; all if it holds the lens.
 
-    Emitters other than `fspt_surface` count with the bounding box of the scene; mirrors and glass, in which light is
-    seen, count, too.
+    `everywhere`: all pixels. Emitters other than `fspt_surface` count with the bounding box of the scene; mirrors and
+    glass, in which light is seen, count, too.
     """
     specular = Specular.of(scene, lens)
-    return window_of(glowing_boxes(scene), lens, bending=specular.bending if specular else ())
+    return window_of(glowing_boxes(scene), lens, everywhere, specular.bending if specular else ())
 
 
 def glowing_boxes(scene: mi.Scene) -> Boxes:

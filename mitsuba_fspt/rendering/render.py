@@ -24,6 +24,7 @@ from ..runtime.interrupt import ctrl_c_noted
 from ..runtime.numbers import whole
 from ..runtime.plugin_types import is_integral
 from . import monte_carlo
+from .provenance import origin_of
 from .scene import loaded
 
 if TYPE_CHECKING:
@@ -96,7 +97,8 @@ def render(
     how |= {"wall_time": time.perf_counter() - start}
     if not planes[0].any():
         how["warnings"] = DARK
-    return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **lens.numbers(), **_versions()})
+    origin = {"scene": scene.id(), "sensor": sensor, **origin_of(scene, lens)}
+    return Image(*planes, {**origin, **how, **lens.numbers(), **_versions()})
 
 
 def _reporting(progress: Progress | None, check_interrupt: Callable[[], None]) -> Progress:
