@@ -4,7 +4,8 @@ Three rules in turn. Every pixel takes four nodes over pupil and pixel, or one n
 and the blur disc stays in the pixel; pixels on which the picture is curved take twelve; pixels on which the radiance
 jumps from line to line (a silhouette, an occluder, an edge of J_n) take transects: curves across the edge through pixel
 and pupil together. Along each transect the jumps are found by bisection and the pieces between them are integrated one
-by one, so that only the variation along the edge is left to sample. Each line of sight is `eq9.View.integrand`.
+by one, so that only the variation along the edge is left to sample. Pixels that transects do not settle take lattices
+of lines of sight, whose scatter is their error. Each line of sight is `eq9.View.integrand`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from ..jit.pixel_grid import Grid
 from . import node_rules
 from .draft import Draft, open_share
 from .eq9 import View
+from .lattices import settle_by_lattices
 from .node_sums import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
 from .progress import SILENT, Progress
@@ -64,6 +66,7 @@ def solve(
         draft.doubt(rough)
     elif dr.any(rough):
         integrate_by_transects(draft, rough, levels)
+        settle_by_lattices(draft)
     progress(1.0)
     return draft.solution()
 

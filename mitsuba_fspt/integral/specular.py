@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -37,6 +38,10 @@ DELTA = {
     "transmission": mi.BSDFFlags.DeltaTransmission,
     "reflection": mi.BSDFFlags.DeltaReflection,
 }
+
+if TYPE_CHECKING:
+    Radiance = Callable[[mi.PreliminaryIntersection3f, mi.Ray3f], mi.Float]
+    Covers = Callable[[mi.UInt32], mi.Bool]
 
 Box = tuple[float, ...]  # x, y, z of the lowest and of the highest corner [mm]
 
@@ -284,10 +289,6 @@ class _Lobe:
     weight: mi.Float
     indices: mi.Float
     straight: mi.Bool
-
-
-Radiance = Callable[[mi.PreliminaryIntersection3f, mi.Ray3f], mi.Float]
-Covers = Callable[[mi.UInt32], mi.Bool]
 
 
 def follow(
