@@ -11,13 +11,13 @@ import typer
 
 from ..runtime.atomic_files import require_apart
 from ..runtime.errors import ImageError
-from .options import AsJson, Quiet, SourcePower, require_picture
+from .options import AsJson, Quiet, SourcePower, require_image, require_picture
 from .terminal import print_result
 
 
 def compare(
-    calculated: Annotated[Path, typer.Argument(metavar="CALCULATED.exr")],
-    standard: Annotated[Path, typer.Argument(metavar="STANDARD.exr")],
+    calculated: Annotated[Path, typer.Argument(metavar="CALCULATED")],
+    standard: Annotated[Path, typer.Argument(metavar="STANDARD")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, profiles included.")] = False,
     quiet: Quiet = False,
     png: Annotated[Path | None, typer.Option(help="Also draw both images and their difference.")] = None,
@@ -36,7 +36,7 @@ def compare(
 
 
 def plot(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE.exr...", help="Images, a panel each.")],
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Images, a panel each.")],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Picture to write, .png; IMAGE.png, or plot.png for several.")
     ] = None,
@@ -77,8 +77,8 @@ def _range(text: str) -> tuple[float, float]:
 
 
 def expose(
-    image: Annotated[Path, typer.Argument(metavar="IMAGE.exr", help="Power image, as 'fspt render' writes it.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Electrons to write, .exr.")],
+    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Power image, as 'fspt render' writes it.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Electrons to write: .exr, .tif, .h5, .npz or .fits.")],
     exposure_time: Annotated[float, typer.Option(help="Exposure time [s].")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
     source_power: SourcePower = None,
@@ -108,6 +108,7 @@ def expose(
     from ..images.detector import Detector
     from ..images.image import read
 
+    require_image(output)
     require_apart(output, [image], error=ImageError)
     numbers: dict[str, Any] = {
         "quantum_efficiency": quantum_efficiency,

@@ -31,7 +31,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rows = Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print no results and no progress; warnings stay.")]
 MOST = 100_000  # values of a range
-NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
+NAMES = {".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
 
 
 def definitions(define: list[str] | None) -> dict[str, str]:
@@ -84,6 +84,14 @@ def require_writable(path: Path, suffix: str | None = None, error: type[FsptErro
     require_place(path, error)
     if not os.access(path.parent, os.W_OK):
         raise error(f"output file '{path}': the folder '{path.parent}' is not writable. Write elsewhere with -o.")
+
+
+def require_image(path: Path) -> None:
+    """Raise ImageError for an image that cannot be written, BackendError where its format needs a missing package."""
+    from ..images.formats import format_of
+
+    format_of(path)
+    require_writable(path)
 
 
 def require_picture(path: Path) -> None:

@@ -27,8 +27,8 @@ from .options import (
     SourcePower,
     Spp,
     definitions,
+    require_image,
     require_picture,
-    require_writable,
     several,
 )
 from .terminal import Interrupted, print_result, progress_bar
@@ -56,7 +56,9 @@ def render(
     scene: Annotated[
         Path, typer.Argument(metavar="SCENE.xml|PHANTOM.ply", help="Mitsuba scene with an fspt_lens, or a phantom.")
     ],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Image to write, .exr.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Image to write: .exr, .tif, .h5, .npz or .fits.")
+    ] = None,
     view: Annotated[
         str | None, typer.Option(metavar="0,90,...", help="Of a phantom: turns about +z [degrees], an image each.")
     ] = None,
@@ -78,7 +80,7 @@ def render(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a scene to an EXR with the power [W], its error and the coverage of every pixel.
+    """Render a scene to an image with the power [W], its error and the coverage of every pixel.
 
     Of PHANTOM.ply, as 'fspt flux' writes it, the camera stands on the +x
     axis, is focused on the front and sees the whole phantom, up is +z. The
@@ -90,27 +92,34 @@ def render(
     _check_outputs(shots, [scene, camera] if camera else [scene], png)
     if source_power is not None:
         _require_source_power(source_power)
-    images: list[Image] = []
-    with _kept(shots, images), progress_bar(quiet) as progress:
-        from ..rendering.render import render
-        from ..rendering.scene import load
-
-        quiet_mitsuba()
-        settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
-        for shot in shots:
-            loaded = load(shot.scene, **shot.parameters)
-            image = render(loaded, sensor=sensor, progress=progress, **settings)  # type: ignore[arg-type]
-            image = image if source_power is None else image.scaled(source_power)
-            if shot.origin:
-                image = replace(image, metadata=image.metadata | {"scene": shot.origin})
-            _write(image, shot.output, _picture(shot, png))
-            images.append(image)
+    settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
+    images = _rendered(shots, settings | {"sensor": sensor}, source_power, png, quiet)
     summaries = [_summary(image, shot.output, _picture(shot, png)) for shot, image in zip(shots, images, strict=True)]
     text = "\n".join(map(_summary_text, summaries))
     print_result(text, {"images": summaries}, as_json=as_json, quiet=quiet)
     for summary in summaries:
         if "warnings" in summary:
             typer.echo(f"fspt: {summary['output']}: {summary['warnings']}.", err=True)
+
+
+def _rendered(
+    shots: list[Shot], settings: dict[str, Any], source_power: float | None, png: bool, quiet: bool
+) -> list[Image]:
+    """Images of all shots, each written as soon as it is there; `settings` as of `rendering.render`."""
+    images: list[Image] = []
+    with _kept(shots, images), progress_bar(quiet) as progress:
+        from ..rendering.render import render
+        from ..rendering.scene import load
+
+        quiet_mitsuba()
+        for shot in shots:
+            image = render(load(shot.scene, **shot.parameters), progress=progress, **settings)
+            image = image if source_power is None else image.scaled(source_power)
+            if shot.origin:
+                image = replace(image, metadata=image.metadata | {"scene": shot.origin})
+            _write(image, shot.output, _picture(shot, png))
+            images.append(image)
+    return images
 
 
 def _require_source_power(watts: float) -> None:
@@ -163,7 +172,7 @@ def _picture(shot: Shot, png: bool) -> Path | None:
 def _check_outputs(shots: list[Shot], inputs: list[Path], png: bool) -> None:
     """Raise ImageError for an image or picture that cannot be written, or that would overwrite what is read."""
     for shot in shots:
-        require_writable(shot.output, ".exr")
+        require_image(shot.output)
         picture = _picture(shot, png)
         if picture:
             require_picture(picture)

@@ -24,7 +24,7 @@ from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
-from .exr import Metadata, write_exr
+from .formats import Metadata, write_planes
 from .image import Image
 
 # Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
@@ -62,11 +62,11 @@ class Exposure:
     metadata: Metadata
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the electrons to an EXR file: channel `Y`, the metadata under `fspt:`.
+        """Write the electrons and the metadata; the suffix chooses the format, in an EXR the channel is `Y`.
 
-        Raises ImageError if the suffix is not .exr or the file cannot be written.
+        Raises ImageError and BackendError as `Image.write`.
         """
-        write_exr(path, {"Y": self.electrons}, self.metadata)
+        write_planes(path, {"electrons": self.electrons}, self.metadata)
 
     def write_counts(self, path: str | os.PathLike[str]) -> None:
         """Write the counts, unscaled, to a 16-bit greyscale PNG or TIFF; metadata as JSON in its description.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
-from .exr import Metadata, read_exr, write_exr
+from .formats import Metadata, read_planes, write_planes
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +87,17 @@ class Image:
         return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y` (float32), metadata under `fspt:`.
+        """Write a file of float32 planes and all metadata; its suffix chooses the format, see docs/images.md.
 
+        .exr has the channels `Y`, `error.Y`, `coverage.Y` and metadata under `fspt:`; .tif, .h5, .npz and .fits hold
+        the same.
         The file is written completely or not at all. Pixels below float32's 1e-38 may become 0; an image whose
         brightest pixel lies below that is refused.
 
         Raises
         ------
-        ImageError : the suffix is not .exr, a value does not fit into float32, or the file cannot be written.
+        ImageError : no format has the suffix, a value does not fit into float32, or the file cannot be written.
+        BackendError : the format needs a package that is not installed.
         """
         peak = max(self.power.max(), -self.power.min())
         if 0 < peak < np.finfo(np.float32).tiny:
@@ -102,28 +105,30 @@ class Image:
                 f"image: the brightest pixel has {peak:g} W, below what the file can hold (1.2e-38 W). "
                 "Scale the exitance up."
             )
-        planes = {"Y": self.power, "error.Y": self.error, "coverage.Y": self.coverage}
-        write_exr(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
+        planes = {"power": self.power, "error": self.error, "coverage": self.coverage}
+        write_planes(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
 
 
 def read(path: str | os.PathLike[str]) -> Image:
-    """Image of an EXR file with a channel `Y`, whose values count as power [W] on a pixel.
+    """Image of a file that `Image.write` wrote, or of any EXR file with a channel `Y`, which counts as power [W].
 
-    `error` and `coverage` are None if the file has no channel `error.Y`, `coverage.Y`.
+    `error` and `coverage` are None if the file does not have them.
 
     Raises
     ------
-    ImageError : the file does not exist, is no EXR file or damaged, has no channel `Y`, or holds values that are
-        not finite or, by its metadata, no power.
+    ImageError : the file does not exist, has the suffix of no format, is damaged, is that of another program, has no
+        power, or holds values that are not finite or, by its metadata, no power.
+    BackendError : the format needs a package that is not installed.
     """
-    channels, metadata = read_exr(path)
-    if "Y" not in channels:
+    planes, metadata = read_planes(path)
+    quantity = str(metadata.get("quantity", "power"))
+    if quantity not in planes:
         raise ImageError(
-            f"image file '{path}' has no channel 'Y' (power in W), its channels are {', '.join(channels)}. "
-            "Give a file that fspt wrote."
+            f"image file '{path}' has no plane of power in W ('Y' in an EXR), it has {', '.join(planes)}. Give a file "
+            "that fspt wrote."
         )
     try:
-        return Image(channels["Y"], channels.get("error.Y"), channels.get("coverage.Y"), metadata)
+        return Image(planes[quantity], planes.get("error"), planes.get("coverage"), metadata)
     except ImageError as cause:
         raise ImageError(f"image file '{path}': {cause}") from cause
 

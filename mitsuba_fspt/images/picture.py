@@ -20,6 +20,7 @@ from .colour_scale import ColourScale
 from .colour_scale import scale_and_unit as scale_and_unit
 from .comparison import Comparison, Profile, compare
 from .image import Image
+from .pixel_axes import PixelAxes
 from .z_test import differences, error_bound
 
 if TYPE_CHECKING:
@@ -190,8 +191,8 @@ def draw_outline(axes: Axes, image: Image) -> None:
             "picture: an image without coverage has no outline. Leave it out, or give one that 'fspt render' wrote."
         )
     if image.coverage.min() < 0.5 < image.coverage.max() and min(image.shape) > 1:
-        x, y = _centres(image)
-        axes.contour(x, y, image.coverage, levels=[0.5], colors=OUTLINE, linewidths=1.0)
+        place = _axes_of(image)
+        axes.contour(place.x, place.y, image.coverage, levels=[0.5], colors=OUTLINE, linewidths=1.0)
 
 
 def draw_scale_bar(axes: Axes, left: float, bottom: float, width: float, side: float) -> None:
@@ -250,7 +251,7 @@ def _show_deviation(axes: Axes, calculated: Image, standard: Image, comparison: 
 def _show_profile(axes: Axes, profile: Profile, calculated: Image, standard: Image, scale: ColourScale) -> None:
     """Draw the power along a row or column of both images, the calculated one as a thin line on a wide one."""
     row = profile.line == "row"
-    x = _centres(standard)[0 if row else 1]
+    x = _axes_of(standard).x if row else _axes_of(standard).y
     pairs = (
         (standard, profile.standard, "standard", "0.65", 4.0),
         (calculated, profile.calculated, "calculated", "C3", 1.2),
@@ -280,28 +281,14 @@ def _extend(images: Sequence[Image], scale: ColourScale) -> Literal["neither", "
 
 def _extent(image: Image) -> tuple[tuple[float, float, float, float], str]:
     """(left, right, bottom, top) of the picture [mm or pixels], and the axis label with unit and plane."""
-    height, width = image.shape
-    side = virtual_pitch(image)
-    if not side:
-        return (-0.5, width - 0.5, height - 0.5, -0.5), "pixel"
-    x, y = side * width / 2, side * height / 2
-    plane = "virtual detector plane" if image.metadata.get("magnification") else "detector"
-    return (-x, x, -y, y), f"mm on the {plane}"
+    axes = _axes_of(image)
+    across, down = axes.step / 2, axes.down / 2
+    ends = (axes.x[0] - across, axes.x[-1] + across, axes.y[-1] + down, axes.y[0] - down)
+    return tuple(map(float, ends)), axes.label  # type: ignore[return-value]
 
 
-def virtual_pitch(image: Image) -> float | None:
-    """Side of a pixel [mm] on the virtual detector plane, on the detector without a magnification; None if unknown."""
-    pitch, magnification = (image.metadata.get(key) for key in ("pixel_pitch", "magnification"))
-    return float(pitch) / float(magnification or 1.0) if pitch else None
-
-
-def _centres(image: Image) -> tuple[NDArray, NDArray]:
-    """Positions of the columns, shape (w,), and of the rows, shape (h,), in the unit of `_extent`."""
-    (left, right, bottom, top), _ = _extent(image)
-    height, width = image.shape
-    x = left + (np.arange(width) + 0.5) * (right - left) / width
-    y = top + (np.arange(height) + 0.5) * (bottom - top) / height
-    return x, y
+def _axes_of(image: Image) -> PixelAxes:
+    return PixelAxes.of(image.shape, image.metadata)
 
 
 def _aspect(image: Image) -> float:

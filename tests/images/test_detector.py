@@ -11,7 +11,7 @@ import pytest
 from PIL import Image as Picture
 
 from mitsuba_fspt.images.detector import EXAMPLES, Detector
-from mitsuba_fspt.images.exr import read_exr
+from mitsuba_fspt.images.formats import read_planes
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.runtime.errors import BackendError, DetectorError, ImageError
 
@@ -172,8 +172,8 @@ def test_exr(tmp_path):
     image = flat(100.0, 16, pixel_pitch=0.0135, f_number=2.8, seed=77)
     exposure = CCD.expose(image, 30.0, WAVELENGTH_NM, binning=4, seed=12)
     exposure.write(tmp_path / "e.exr")
-    channels, metadata = read_exr(tmp_path / "e.exr")
-    np.testing.assert_array_equal(channels["Y"], exposure.electrons)
+    planes, metadata = read_planes(tmp_path / "e.exr")
+    np.testing.assert_array_equal(planes["electrons"], exposure.electrons)
     expected = {"quantity": "electrons", "unit": "e-", "f_number": 2.8, "seed": 77, "detector_seed": 12}
     expected |= {"exposure_time": 30.0, "wavelength_nm": 650.0, "binning": 4, "pixel_pitch": 0.054}
     expected |= {"quantum_efficiency": 0.85, "dark_current": 1e-3, "read_noise": 3.5, "full_well": 1e5}
