@@ -16,7 +16,7 @@ from ..runtime.interrupt import ctrl_c_noted, terminated_as_by_ctrl_c
 from .checks import doctor, explain, stability
 from .converge import converge
 from .flux import app as flux
-from .images import compare, expose, plot
+from .images import compare, expose, plot, roi
 from .render import render
 from .sweep import sweep
 from .terminal import Interrupted
@@ -29,7 +29,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
-for verb in (render, plot, compare, expose, doctor, stability, explain, sweep, converge):
+for verb in (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge):
     app.command()(verb)
 app.add_typer(flux, name="flux")
 

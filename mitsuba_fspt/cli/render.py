@@ -26,6 +26,7 @@ from .options import (
     Sensor,
     SourcePower,
     Spp,
+    WavelengthNm,
     definitions,
     require_image,
     require_picture,
@@ -52,6 +53,31 @@ class Shot(NamedTuple):
     origin: str | None = None
 
 
+class Output(NamedTuple):
+    """How images are written.
+
+    source_power : of the light source [W], None for images as they are
+    unit, wavelength_nm : of the values, see `images.radiometry`
+    png : a picture beside each image
+    """
+
+    source_power: float | None
+    unit: str
+    wavelength_nm: float | None
+    png: bool
+
+    def write(self, image: Image, output: Path, picture: Path | None) -> None:
+        """Write the image and, if `picture` is given, its PNG: both files or none."""
+        from ..images.picture import png_file
+        from ..images.radiometry import in_unit
+
+        with png_file(image, picture) if picture else nullcontext():
+            if self.unit == "W":
+                image.write(output)
+            else:
+                in_unit(image, self.unit, self.wavelength_nm).write(output, image)
+
+
 def render(
     scene: Annotated[
         Path, typer.Argument(metavar="SCENE.xml|PHANTOM.ply", help="Mitsuba scene with an fspt_lens, or a phantom.")
@@ -74,6 +100,10 @@ def render(
     seed: Seed = None,
     sensor: Sensor = 0,
     source_power: SourcePower = None,
+    unit: Annotated[
+        str, typer.Option(metavar="W|photons/s|p/s/cm2/sr", help="Of the values written: power or radiance.")
+    ] = "W",
+    wavelength_nm: WavelengthNm = None,
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
@@ -90,11 +120,13 @@ def render(
     framing = {"view": view, "focal_length": focal_length, "f_number": f_number, "camera": camera}
     shots = _shots(scene, output, definitions(define), {name: v for name, v in framing.items() if v is not None})
     _check_outputs(shots, [scene, camera] if camera else [scene], png)
-    if source_power is not None:
-        _require_source_power(source_power)
+    require_scaling(source_power, unit, wavelength_nm)
     settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
-    images = _rendered(shots, settings | {"sensor": sensor}, source_power, png, quiet)
-    summaries = [_summary(image, shot.output, _picture(shot, png)) for shot, image in zip(shots, images, strict=True)]
+    images = _rendered(shots, settings | {"sensor": sensor}, Output(source_power, unit, wavelength_nm, png), quiet)
+    summaries = [
+        _summary(image, shot.output, _picture(shot, png), unit, wavelength_nm)
+        for shot, image in zip(shots, images, strict=True)
+    ]
     text = "\n".join(map(_summary_text, summaries))
     print_result(text, {"images": summaries}, as_json=as_json, quiet=quiet)
     for summary in summaries:
@@ -102,9 +134,7 @@ def render(
             typer.echo(f"fspt: {summary['output']}: {summary['warnings']}.", err=True)
 
 
-def _rendered(
-    shots: list[Shot], settings: dict[str, Any], source_power: float | None, png: bool, quiet: bool
-) -> list[Image]:
+def _rendered(shots: list[Shot], settings: dict[str, Any], output: Output, quiet: bool) -> list[Image]:
     """Images of all shots, each written as soon as it is there; `settings` as of `rendering.render`."""
     images: list[Image] = []
     with _kept(shots, images), progress_bar(quiet) as progress:
@@ -114,19 +144,22 @@ def _rendered(
         quiet_mitsuba()
         for shot in shots:
             image = render(load(shot.scene, **shot.parameters), progress=progress, **settings)
-            image = image if source_power is None else image.scaled(source_power)
+            image = image if output.source_power is None else image.scaled(output.source_power)
             if shot.origin:
                 image = replace(image, metadata=image.metadata | {"scene": shot.origin})
-            _write(image, shot.output, _picture(shot, png))
+            output.write(image, shot.output, _picture(shot, output.png))
             images.append(image)
     return images
 
 
-def _require_source_power(watts: float) -> None:
-    """Raise ImageError, before the work, for a source power that no image can be scaled by."""
+def require_scaling(source_power: float | None, unit: str, wavelength_nm: float | None) -> None:
+    """Raise ImageError, before the work, for a source power or a unit that no image can have."""
     from ..images.image import required_source_power
+    from ..images.radiometry import require_unit
 
-    required_source_power(watts)
+    if source_power is not None:
+        required_source_power(source_power)
+    require_unit(unit, wavelength_nm)
 
 
 def _shots(scene: Path, output: Path | None, parameters: dict[str, str], framing: dict[str, Any]) -> list[Shot]:
@@ -193,18 +226,15 @@ def _kept(shots: list[Shot], images: list[Image]) -> Iterator[None]:
         raise Interrupted(f"interrupted; {len(images)} of {len(shots)} images are written: {names}.") from cause
 
 
-def _write(image: Image, output: Path, picture: Path | None) -> None:
-    """Write the image and, if `picture` is given, its PNG: both files or none."""
-    from ..images.picture import png_file
+def _summary(
+    image: Image, output: Path, picture: Path | None, unit: str, wavelength_nm: float | None
+) -> dict[str, Any]:
+    """The files, the total power [W], the brightest pixel [unit], the time [s], and what the metadata warn of."""
+    from ..images.radiometry import in_unit
 
-    with png_file(image, picture) if picture else nullcontext():
-        image.write(output)
-
-
-def _summary(image: Image, output: Path, picture: Path | None) -> dict[str, Any]:
-    """The files, the total power and the brightest pixel [W], the time [s], and what the metadata warn of."""
+    shown = in_unit(image, unit, wavelength_nm)
     summary: dict[str, Any] = {"output": str(output), "total_power": float(image.power.sum(dtype="float64"))}
-    summary |= {"peak": float(image.power.max()), "wall_time": image.metadata["wall_time"]}
+    summary |= {"peak": float(shown.values.max()), "unit": shown.unit, "wall_time": image.metadata["wall_time"]}
     if picture:
         summary["picture"] = str(picture)
     return summary | {key: image.metadata[key] for key in ("warnings",) if key in image.metadata}
@@ -212,6 +242,6 @@ def _summary(image: Image, output: Path, picture: Path | None) -> dict[str, Any]
 
 def _summary_text(summary: dict[str, Any]) -> str:
     """A line for each file of an image."""
-    numbers = f"total {summary['total_power']:.6g} W, brightest pixel {summary['peak']:.6g} W"
+    numbers = f"total {summary['total_power']:.6g} W, brightest pixel {summary['peak']:.6g} {summary['unit']}"
     line = f"{summary['output']}: {numbers}, {summary['wall_time']:.3g} s"
     return f"{line}\n{summary['picture']}: the same to look at" if "picture" in summary else line

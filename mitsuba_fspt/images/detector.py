@@ -26,6 +26,7 @@ from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
 from .formats import Metadata, write_planes
 from .image import Image
+from .radiometry import PLANCK_TIMES_LIGHT, wavelength_of
 
 # Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
 # `pixel_pitch` is that of the pixels read out.
@@ -41,8 +42,6 @@ EXAMPLES = {
 }
 TABLES = ("detector", "lens")  # of a camera's TOML file; the lens is for other readers
 RECORDED = {name: name for name in EXAMPLES} | {"pixel_pitch": "detector_pixel_pitch"}
-
-PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +229,7 @@ class Detector:
         Parameters and errors as for `expose`.
         """
         exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
+        wavelength_of(image, wavelength_nm)
         if (darkest := image.power.min()) < 0:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
         energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
@@ -256,6 +256,7 @@ class Detector:
         Raises
         ------
         DetectorError : a parameter is outside its range, or the binning does not divide the image.
+        ImageError : the image was rendered for another wavelength.
         """
         exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
         seed, binning = _whole("seed", seed), _whole("binning", binning)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -12,6 +13,9 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
 from .formats import Metadata, read_planes, write_planes
+
+if TYPE_CHECKING:
+    from xarray import DataArray, Dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +89,30 @@ class Image:
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
         """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
         return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
+
+    def to_radiance(self, wavelength_nm: float | None = None) -> DataArray:
+        """Apparent radiance [photons/s/cm²/sr] of what lies in focus, dimensions y and x as of `to_xarray`.
+
+        P/(τ G ⟨cos⁴θ⟩) of every pixel, with its étendue and the transmittance τ of the lens (Eq. M.6); 0 where no light
+        passes. Its `error` and `coverage` are coordinates.
+
+        wavelength_nm : of the light [nm]; None: that of the lens's filter, if the image has one
+
+        Raises ImageError if the metadata lack the lens or the wavelength, BackendError if xarray is not installed.
+        """
+        from .labelled import radiance_array
+
+        return radiance_array(self, wavelength_nm)
+
+    def to_xarray(self) -> Dataset:
+        """Dataset of `power`, `error` and `coverage`, dimensions (y, x), with `units` and the metadata as attributes.
+
+        Coordinates are the pixels' centres [mm] on the virtual detector plane, x to the right and y up: the first row
+        has the largest y. Raises BackendError if xarray is not installed.
+        """
+        from .labelled import dataset
+
+        return dataset(self)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a file of float32 planes and all metadata; its suffix chooses the format, see docs/images.md.

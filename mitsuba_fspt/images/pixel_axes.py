@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class PixelAxes:
-    """Centres of the pixels, x to the right and y up, 0 in the middle of the image.
+    """Centres of the pixels, x to the right and y up, 0 on the optical axis: in the middle of the image.
+
+    Of a crop window the metadata `film_width`, `film_height`, `crop_offset_x` and `crop_offset_y` [pixels] are needed.
 
     x, y : of the columns (w,) and of the rows (h,), the top one first [`unit`]
     side : of a pixel [mm]; None if it is unknown, then x and y count columns and rows from 0
@@ -33,7 +35,10 @@ class PixelAxes:
         if not side:
             return cls(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64), None, "pixel", "pixel")
         plane = "virtual detector plane" if metadata.get("magnification") else "detector"
-        x, y = (np.float64(side) * (np.arange(count) + 0.5 - count / 2) for count in (width, height))
+        x, y = (
+            np.float64(side) * (np.arange(count) + 0.5 + _first(metadata, axis) - _film(metadata, name, count) / 2)
+            for count, axis, name in ((width, "x", "film_width"), (height, "y", "film_height"))
+        )
         return cls(x, -y, side, "mm", f"mm on the {plane}")
 
     @property
@@ -45,6 +50,16 @@ class PixelAxes:
     def down(self) -> float:
         """From a row to the one below [`unit`]; < 0 where y points up."""
         return -self.side if self.side else 1.0
+
+
+def _first(metadata: Mapping[str, object], axis: str) -> float:
+    """Pixels of the film before the first one of the image."""
+    return float(metadata.get(f"crop_offset_{axis}", 0))  # type: ignore[arg-type]
+
+
+def _film(metadata: Mapping[str, object], name: str, count: int) -> float:
+    """Pixels of the film along an axis, those of the image if it is whole."""
+    return float(metadata.get(name, count))  # type: ignore[arg-type]
 
 
 def virtual_pitch(metadata: Mapping[str, object]) -> float | None:

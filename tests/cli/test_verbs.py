@@ -181,6 +181,7 @@ def test_render_as_json_and_quiet(run, tmp_path):
         "picture": "s.png",
         "total_power": pytest.approx(image.power.sum(dtype=float)),
         "peak": pytest.approx(image.power.max()),
+        "unit": "W",
         "wall_time": image.metadata["wall_time"],
     }
     code, out, err = run("render", "dark.xml", "--quiet")

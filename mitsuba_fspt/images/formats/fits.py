@@ -13,7 +13,12 @@ from ..pixel_axes import PixelAxes
 from . import Format, Metadata, Planes, units
 
 TABLE = "METADATA"
-UNITS = {"1": "", "e-": "electron"}  # as the standard spells them
+UNITS = {  # as the standard spells them
+    "1": "",
+    "e-": "electron",
+    "photons/s": "photon s-1",
+    "photons/s/cm²/sr": "photon s-1 cm-2 sr-1",
+}
 KEY, VALUE = "KEY", "VALUE"
 
 
