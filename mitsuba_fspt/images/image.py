@@ -15,6 +15,7 @@ from ..runtime.numbers import number
 from .formats import Metadata, read_planes, write_planes
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from xarray import DataArray, Dataset
 
 
@@ -113,6 +114,51 @@ class Image:
         from .labelled import dataset
 
         return dataset(self)
+
+    def plot(
+        self,
+        axes: Axes | None = None,
+        *,
+        log: bool = False,
+        limits: tuple[float, float] | None = None,
+        outline: bool = False,
+    ) -> Axes:
+        """Draw the picture that `--png` writes, with colour bar and axes in mm; returns matplotlib's axes.
+
+        axes : to draw into; None: those of a new figure of pyplot
+        log, limits : of the colour scale [W/pixel], see `ColourScale.over`
+        outline : draw the silhouette of the phantom, where the coverage is 1/2
+
+        Raises ImageError for limits that are no range and for an outline without coverage, BackendError without
+        matplotlib.
+        """
+        from .picture import plot_image
+
+        return plot_image(self, axes, log=log, limits=limits, outline=outline)
+
+    def plot_profile(self, row: int | None = None, column: int | None = None, axes: Axes | None = None) -> Axes:
+        """Draw the power along a row or a column, with a band of ± error; returns matplotlib's axes.
+
+        row, column : number of one of them, from 0 at the top or left; None: the row through the brightest pixel
+        axes : to draw into; None: those of a new figure of pyplot
+
+        Raises ImageError if both are given or it does not exist, BackendError without matplotlib.
+        """
+        from .picture import plot_profile
+
+        return plot_profile(self, row, column, axes)
+
+    def _repr_png_(self) -> bytes | None:
+        """Picture for notebooks; None without matplotlib."""
+        from .notebook import image_png
+
+        return image_png(self)
+
+    def _repr_html_(self) -> str:
+        """Numbers and picture for notebooks."""
+        from .notebook import image_html
+
+        return image_html(self)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a file of float32 planes and all metadata; its suffix chooses the format, see docs/images.md.
