@@ -18,6 +18,7 @@ from .converge import converge
 from .flux import app as flux
 from .images import compare, expose, plot, roi
 from .render import render
+from .scene import app as scene
 from .sweep import sweep
 from .terminal import Interrupted
 
@@ -25,13 +26,13 @@ app = typer.Typer(
     name="fspt",
     help="Calibrated CCD images of glowing phantoms, in watts per pixel.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
 for verb in (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge):
     app.command()(verb)
 app.add_typer(flux, name="flux")
+app.add_typer(scene, name="scene")
 
 INTERRUPTED = 130  # exit code after Ctrl-C or SIGTERM
 

@@ -31,6 +31,7 @@ from .options import (
     require_image,
     require_picture,
     several,
+    typed,
 )
 from .terminal import Interrupted, print_result, progress_bar
 
@@ -182,7 +183,7 @@ def _views(phantom: Path, output: Path, parameters: dict[str, str], framing: dic
     if twice := set(parameters) & set(framing):
         name = min(twice)
         raise SceneError(f"-D {name}={parameters[name]}: --{name.replace('_', '-')} gives it already. Give it once.")
-    numbers = {name: float(text) if is_number(text) else text for name, text in parameters.items() if name != "view"}
+    numbers = typed({name: text for name, text in parameters.items() if name != "view"})
     lens = camera_lens(framing.pop("camera")) if "camera" in framing else {}
     views = several("view", framing.pop("view", parameters.get("view", "0")))
     if wrong := [view for view in views if not is_number(view) or views.count(view) > 1]:

@@ -104,14 +104,14 @@ def test_what_is_refused(run, arguments, message):
 
 
 def test_ctrl_c_tells_which_views_are_written(run, monkeypatch):
-    write = verb._write
+    write = verb.Output.write
 
-    def interrupted(image, output, picture):
+    def interrupted(self, image, output, picture):
         if output.name == "phantom_view90.exr":
             raise KeyboardInterrupt
-        write(image, output, picture)
+        write(self, image, output, picture)
 
-    monkeypatch.setattr(verb, "_write", interrupted)
+    monkeypatch.setattr(verb.Output, "write", interrupted)
     code, _, err = run("render", "phantom.ply", "--view", "0,90", *FEW)
     assert (code, files()) == (130, ["phantom_view0.exr"])
     assert "interrupted; 1 of 2 images are written: phantom_view0.exr." in err
