@@ -26,6 +26,7 @@ from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
 from .formats import Metadata, write_planes
 from .image import Image
+from .pixel_axes import CROP
 from .radiometry import PLANCK_TIMES_LIGHT, wavelength_of
 
 # Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
@@ -285,6 +286,8 @@ class Detector:
         metadata |= {key: getattr(self, name) for name, key in RECORDED.items() if getattr(self, name) is not None}
         if "pixel_pitch" in image.metadata:
             metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
+        if binning > 1:  # of a crop window, in pixels of the read-out
+            metadata |= {key: float(image.metadata[key]) / binning for key in CROP if key in image.metadata}
         return Exposure(electrons, counts.astype(np.uint16), metadata)
 
 

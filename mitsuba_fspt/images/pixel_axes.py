@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+CROP = ("film_width", "film_height", "crop_offset_x", "crop_offset_y")  # [pixels], of an image that is no whole film
+
 
 @dataclass(frozen=True, eq=False)
 class PixelAxes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +64,9 @@ def _off(offset: Plane, pupil: float, height: Plane, along: Plane) -> Plane:
     return (offset - pupil * height) ** 2 + (pupil * along) ** 2
 
 
-def _over_chords(start: Plane, stop: Plane, centre: Plane, reach: Plane, function) -> Plane:  # type: ignore[no-untyped-def]
+def _over_chords(
+    start: Plane, stop: Plane, centre: Plane, reach: Plane, function: Callable[[Plane, Plane], Plane]
+) -> Plane:
     """∫∫ function(h, s) dh ds over heights from `start` to `stop` within the unit disc and that of radius `reach`."""
     nodes, weights = np.polynomial.legendre.leggauss(CHORDS)
     rows, shares = np.polynomial.legendre.leggauss(ALONG)
