@@ -4,6 +4,9 @@ from .images.detector import Detector as Detector
 from .images.detector import Exposure as Exposure
 from .images.image import Image as Image
 from .images.image import read as read
+from .inverse.transport import transport as transport
+from .inverse.transport_file import read_transport as read_transport
+from .inverse.transport_matrix import TransportMatrix as TransportMatrix
 from .phantom.flux_import import import_flux as import_flux
 from .phantom.framed_scene import scene_xml as scene_xml
 from .phantom.phantom import Phantom as Phantom

@@ -58,11 +58,11 @@ def load_scene(name, crop=None, **parameters):
     return scene
 
 
-def camera_scene(*shapes, exitance=1.0, crop=None, lamp=None, **optics):
+def camera_scene(*shapes, exitance=1.0, crop=None, lamp=None, bodies=(), **optics):
     """Scene of shapes that glow with `exitance` [W/mm²], unless they bring their own 'emitter', before the lens.
 
     `optics`: parameters of fspt_lens, by default 55 mm f/2.8 at magnification 1/2. `crop`: x, y, width, height.
-    `lamp`: another emitter.
+    `lamp`: another emitter. `bodies`: shapes that do not glow.
     """
     optics = {"focal_length": FOCAL, "f_number": F_NUMBER, "pixel_pitch": PITCH} | optics
     if not {"magnification", "focus_distance", "image_distance"} & set(optics):
@@ -73,7 +73,7 @@ def camera_scene(*shapes, exitance=1.0, crop=None, lamp=None, **optics):
         film |= dict(zip(names, crop, strict=True))
     objects = {f"shape_{k}": {"emitter": glow(exitance), **shape} for k, shape in enumerate(shapes)}
     sensor = {"type": "fspt_lens", "film": film, **optics}
-    objects |= {"lamp": lamp} if lamp else {}
+    objects |= {f"body_{k}": body for k, body in enumerate(bodies)} | ({"lamp": lamp} if lamp else {})
     whole = {"type": "scene", "embree_use_robust_intersections": True, "sensor": sensor, **objects}
     return mi.load_dict(whole, optimize=False)
 

@@ -29,13 +29,14 @@ ARROWS = {
     "rendering": {"runtime", "images", "jit", "emission", "integral"},
     "validation": {"runtime", "optics", "jit", "emission", "integral", "rendering"},
     "studies": {"runtime", "optics", "images", "jit", "emission", "integral", "rendering", "validation"},
-    "cli": {"runtime", "images", "phantom", "tissue", "rendering", "studies", "validation"},
+    "inverse": {"runtime", "images", "jit", "integral", "rendering", "studies"},
+    "cli": {"runtime", "images", "phantom", "tissue", "rendering", "studies", "inverse", "validation"},
 }
 # Beside tests, only these import the independent truths of `validation`.
 IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
 # Rooms of Dr.Jit code. Others import the renderer inside functions alone, and only these do.
 DRJIT_ROOMS = {"jit", "emission", "integral", "plugins"}
-IMPORTS_MITSUBA = {"runtime", "rendering", "validation", "studies"}
+IMPORTS_MITSUBA = {"runtime", "rendering", "validation", "studies", "inverse"}
 PUBLIC = [
     "Comparison",
     "Convergence",
@@ -44,15 +45,18 @@ PUBLIC = [
     "FsptError",
     "Image",
     "Phantom",
+    "TransportMatrix",
     "compare",
     "converge",
     "explain",
     "import_flux",
     "load",
     "read",
+    "read_transport",
     "render",
     "scene_xml",
     "sweep",
+    "transport",
 ]
 
 

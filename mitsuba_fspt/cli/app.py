@@ -17,6 +17,7 @@ from .checks import doctor, explain, stability
 from .converge import converge
 from .flux import app as flux
 from .images import compare, expose, plot, roi
+from .matrix import matrix
 from .render import render
 from .scene import app as scene
 from .sweep import sweep
@@ -29,7 +30,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
-for verb in (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge):
+for verb in (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge, matrix):
     app.command()(verb)
 app.add_typer(flux, name="flux")
 app.add_typer(scene, name="scene")

@@ -33,6 +33,9 @@ Domain = Annotated[
     typer.Option(help="pupil or surface; the scene's own if left out.", autocompletion=lambda: ["pupil", "surface"]),
 ]
 Spp = Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")]
+MaxDepth = Annotated[
+    int | None, typer.Option(metavar="N", help="Legs of light that path and ptracer follow; what the scene needs.")
+]
 Sensor = Annotated[int, typer.Option(metavar="K", help="Number of the scene's sensor, counted from 0.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
 SourcePower = Annotated[
@@ -62,6 +65,19 @@ def definitions(define: list[str] | None) -> dict[str, str]:
 def typed(values: Mapping[str, str]) -> dict[str, float | str]:
     """The values that are numbers as such, others as text."""
     return {name: float(text) if is_number(text) else text for name, text in values.items()}
+
+
+def value_lists(define: list[str] | None) -> dict[str, list[str]]:
+    """Lists of values by name from the options -D NAME=V1,V2,...; SceneError as of `definitions`."""
+    values: dict[str, list[str]] = {}
+    for text in define or ():
+        name, equals, listed = text.partition("=")
+        if not (name and equals):
+            raise SceneError(f"-D {text}: must be NAME=V1,V2,…, for example -D f_number=2.8,5.6.")
+        if name in values:
+            raise SceneError(f"-D {text}: '{name}' is given twice. Put all values into one, -D {name}=1,2.")
+        values[name] = several(name, listed)
+    return values
 
 
 def several(name: str, text: str) -> list[str]:

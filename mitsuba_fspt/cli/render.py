@@ -18,6 +18,7 @@ from ..runtime.errors import ImageError, SceneError
 from .options import (
     AsJson,
     Domain,
+    MaxDepth,
     Method,
     Parameters,
     Quiet,
@@ -98,6 +99,7 @@ def render(
     rtol: Rtol = None,
     domain: Domain = None,
     spp: Spp = None,
+    max_depth: MaxDepth = None,
     seed: Seed = None,
     sensor: Sensor = 0,
     source_power: SourcePower = None,
@@ -123,7 +125,12 @@ def render(
     _check_outputs(shots, [scene, camera] if camera else [scene], png)
     require_scaling(source_power, unit, wavelength_nm)
     settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
-    images = _rendered(shots, settings | {"sensor": sensor}, Output(source_power, unit, wavelength_nm, png), quiet)
+    images = _rendered(
+        shots,
+        settings | {"max_depth": max_depth, "sensor": sensor},
+        Output(source_power, unit, wavelength_nm, png),
+        quiet,
+    )
     summaries = [
         _summary(image, shot.output, _picture(shot, png), unit, wavelength_nm)
         for shot, image in zip(shots, images, strict=True)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..runtime.backend import quiet_mitsuba
-from ..runtime.errors import BackendError, SceneError
-from .options import AsJson, Method, Quiet, Rtol, SceneFile, Seed, Sensor, SourcePower, Spp, several
+from ..runtime.errors import BackendError
+from .options import AsJson, Method, Quiet, Rtol, SceneFile, Seed, Sensor, SourcePower, Spp, value_lists
 from .terminal import Interrupted, print_result, progress_bar
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def sweep(
     from ..studies.sweep import INDEX, sweep
 
     folder = output or Path(f"{scene.stem}_sweep")
-    values = _values(define)
+    values = value_lists(define)
     with _resumable(folder):
         with progress_bar(quiet) as progress:
             quiet_mitsuba()
@@ -108,16 +108,3 @@ def _written_sheet(rows: list[SweepRow], path: Path) -> Path | None:
         typer.echo(f"fspt: no contact sheet: {error}", err=True)
         return None
     return path
-
-
-def _values(define: list[str] | None) -> dict[str, list[str]]:
-    """Lists of values by name from the options -D NAME=V1,V2,...; SceneError as of `definitions`."""
-    values: dict[str, list[str]] = {}
-    for text in define or ():
-        name, equals, listed = text.partition("=")
-        if not (name and equals):
-            raise SceneError(f"-D {text}: must be NAME=V1,V2,…, for example -D f_number=2.8,5.6.")
-        if name in values:
-            raise SceneError(f"-D {text}: '{name}' is given twice. Put all values into one, -D {name}=1,2.")
-        values[name] = several(name, listed)
-    return values

@@ -92,8 +92,8 @@ class MeshElements(Elements):
         self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
         face, own = index // (self.k * self.k), index % (self.k * self.k)
-        within = _of_part(mi.UInt32(part), mi.UInt32(cut), mi.warp.square_to_uniform_triangle(sample))
-        si, area = self._interaction(face, _of_part(own, mi.UInt32(self.k), within))
+        within = of_part(mi.UInt32(part), mi.UInt32(cut), mi.warp.square_to_uniform_triangle(sample))
+        si, area = self._interaction(face, of_part(own, mi.UInt32(self.k), within))
         return si, area / dr.square(mi.Float(cut))
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
@@ -240,7 +240,7 @@ _UNIT_SHAPES = {
 }
 
 
-def _of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:
+def of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:
     """Barycentric coordinates (b1, b2) in a triangle of the point `b` of number `part` of its k² parts.
 
     Part r² + c lies in row r of k rows; triangles with odd c are inverted.

@@ -60,9 +60,14 @@ def texture_of(props: mi.Properties) -> mi.Texture:
             )
         _check_bitmap(texture)
         return texture
-    uniform = mi.Properties("uniform")
-    uniform["value"] = float(value)
-    return mi.PluginManager.instance().create_object(uniform)
+    return uniform(float(value))
+
+
+def uniform(value: float) -> mi.Texture:
+    """J_n of so much [W/mm²] everywhere."""
+    properties = mi.Properties("uniform")
+    properties["value"] = value
+    return mi.PluginManager.instance().create_object(properties)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from .elements import elements_of
 
 @dataclass(frozen=True)
 class FaceTable:
-    """All faces of a scene's meshes.
+    """All faces of a scene's meshes; shapes that are no mesh and do not emit have dark faces.
 
     first : index in the table of the first face of each shape, by the shape's number
     table : eight numbers per face: the least radiance at its corners, the excess over it at each corner [W/mm²/sr],
@@ -34,21 +34,24 @@ class FaceTable:
     sources: tuple[Any, ...]
 
     @classmethod
-    def of(cls, meshes: Sequence[mi.Shape]) -> FaceTable | None:
-        """Table of the faces of these meshes; None unless all that emit follow Lambert's law with a linear J_n."""
+    def of(cls, shapes: Sequence[mi.Shape]) -> FaceTable | None:
+        """Table of the faces of these shapes; None unless all that emit are meshes of a linear J_n by Lambert's law."""
         first: dict[int, int] = {}
         tables, begin = [], 0
-        for mesh in meshes:
-            radiance = _radiance_at_corners(mesh)
-            if radiance is None:
-                return None
-            tables.append(_table(mesh, radiance))
-            first[shape_number(mesh)] = begin
-            begin += face_count(mesh)
+        for shape in shapes:
+            if shape.is_mesh():
+                radiance = _radiance_at_corners(shape)
+                if radiance is None:
+                    return None
+                tables.append(_table(shape, radiance))
+            else:
+                tables.append(dr.zeros(mi.Float, 8 * max(1, shape.primitive_count())))
+            first[shape_number(shape)] = begin
+            begin += dr.width(tables[-1]) // 8
         starts = mi.UInt32([first.get(number, 0) for number in range(max(first, default=0) + 1)])
         table = dr.concat(tables)
         dr.eval(starts, table)
-        return cls(starts, table, tuple(buffers(mesh) for mesh in meshes))
+        return cls(starts, table, tuple(buffers(shape) for shape in shapes if shape.is_mesh()))
 
     def radiance(self, pi: mi.PreliminaryIntersection3f, direction: mi.Vector3f) -> mi.Float:
         """Radiance [W/mm²/sr] towards the origin of a ray with `direction` that meets a face; 0 on the inward side."""
@@ -62,14 +65,16 @@ class FaceTable:
 
 
 def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
-    """Key of the data that `FaceTable.of` depends on, for a checked scene; None unless all shapes are meshes."""
-    if not all(shape.is_mesh() for shape in shapes):
+    """Key of the data that `FaceTable.of` depends on, for a checked scene; None unless all that emit are meshes."""
+    if not all(shape.is_mesh() or shape.emitter() is None for shape in shapes):
         return None
     return [_edition(shape) for shape in shapes]
 
 
 def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
-    """Key of one mesh: shape, indices of its buffers, emitter and edition of J_n."""
+    """Key of one mesh: shape, indices of its buffers, emitter and edition of J_n; of another shape that alone."""
+    if not mesh.is_mesh():
+        return (shape_number(mesh),)
     emitter = mesh.emitter()
     indices = (buffer.index for buffer in buffers(mesh))
     return shape_number(mesh), *indices, mark_of(emitter), getattr(emitter, "edition", 0)

@@ -32,6 +32,7 @@ class Draft:
     """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `coverage`.
 
     nodes : of the rule that saw the last edges
+    lost : share of the radiance on film that is not followed through or off specular surfaces
     roughness : how far four nodes and twelve differ near by, silhouettes left out
     nearest : depth of what is nearest [mm], inf where nothing is met
     blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
@@ -60,7 +61,7 @@ class Draft:
         self.value, self.error, self.coverage, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
-        self.roughness = grid.full(mi.Float64, 0)
+        self.roughness, self.lost = (grid.full(mi.Float64, 0) for _ in range(2))
         self.shown = grid.flat(window.shown()) if window.count < len(grid) else mi.Bool(True)
         inside, cut = window.field_stop(view.lens)
         self.clipped, self.outside = grid.flat(cut & self.area), grid.flat(~(inside | cut))
@@ -71,7 +72,7 @@ class Draft:
             self.known = grid.flat(window.cut(known.power) / view.lens.etendue)
         self.nodes = self.rays = 0
         self.levels: list[str] = []
-        self.findings = [view.finding()]
+        self.findings = view.findings()
 
     @property
     def peak(self) -> PixelArray:
@@ -95,6 +96,10 @@ class Draft:
         """The picture as it is, on the crop window."""
         least = dr.opaque(mi.Float64, self.quadrature.least_error) * self.peak
         error = dr.select(self.coverage == 0, self.error, dr.maximum(self.error, least))
+        if self.view.specular:
+            # The few lines of a pixel may pass by what a neighbour's meet.
+            lost = self.grid.spread_max(self.lost, self.reach(self.nodes)[1])
+            error += lost * dr.opaque(mi.Float64, self.view.most_radiance())
         coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))
         etendue = dr.opaque(mi.Float64, self.lens.etendue)
         power, error = etendue * self.value, etendue * dr.select(self.outside, 0, error)
@@ -110,10 +115,13 @@ class Draft:
 
     # ------------------------------------------------------------------ where an edge may hide
 
-    def set_blur(self, farthest: PixelArray) -> None:
-        """From depths: of what is nearest or farthest, for from the sharp plane on blur grows either way."""
+    def set_blur(self, front: PixelArray, farthest: PixelArray) -> None:
+        """From depths: of what is nearest or farthest, for from the sharp plane on blur grows either way.
+
+        `front`: depth of what is nearest, mirrors and panes too.
+        """
         seen = dr.isfinite(self.nearest)
-        front, back = (dr.abs(self.lens.blur_radius(depth)) for depth in (self.nearest, farthest))
+        front, back = (dr.abs(self.lens.blur_radius(depth)) for depth in (front, farthest))
         most = dr.opaque(mi.Float64, max(self.grid.shape))
         blur = dr.select(seen, dr.minimum(dr.maximum(front, back), most), 0)
         sharp = seen & (dr.minimum(front, back) < IN_FOCUS)

@@ -21,10 +21,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..emission.face_table import FaceTable, shape_number
-from ..jit.mesh_buffers import face_count
+from ..jit.mesh_buffers import box_of, face_count
 from ..jit.spectra import at_one_wavelength, scalar
 from ..runtime.plugin_types import is_surface
 from .shortcuts import Finding
+from .specular import Specular, follow
 
 if TYPE_CHECKING:
     from .window import Window
@@ -71,6 +72,27 @@ def etendue_from_surface(
 
 
 @dataclass(frozen=True)
+class Sight:
+    """What is found along one line of sight.
+
+    integrand : of Eq. 9 in the pupil form [W/mm²/sr], whose mean over pixel and pupil, times the pixel's étendue, is P
+    radiance : [W/mm²/sr]
+    body : number of the surfaces met, > 0 where the line ends on one; where it changes lies an edge
+    covered : True if it reaches a shape with an `fspt_surface`, whatever its J_n there
+    depth, front : depth [mm] at which the surface where the line ends and the first surface are seen, inf without one
+    lost : share of the radiance along it that is not followed through or off specular surfaces
+    """
+
+    integrand: mi.Float
+    radiance: mi.Float
+    body: mi.Float
+    covered: mi.Bool
+    depth: mi.Float
+    front: mi.Float
+    lost: mi.Float
+
+
+@dataclass(frozen=True)
 class View:
     """What a lens sees of a scene along lines of sight, which begin at the depth `start` [mm], before all surfaces.
 
@@ -79,6 +101,7 @@ class View:
 
     detail : triangles of the scene a pixel
     emitting : 1 at the number of each shape with an `fspt_surface`, 0 elsewhere; None where all shapes count
+    specular : what lines of sight go through or off; None where they end at the first surface
     """
 
     scene: mi.Scene
@@ -87,52 +110,83 @@ class View:
     faces: FaceTable | None
     detail: float
     emitting: mi.Float | None
+    specular: Specular | None = None
 
     @classmethod
-    def of(cls, scene: mi.Scene, lens: mi.Sensor, window: Window, faces: FaceTable | None = None) -> View:
+    def of(
+        cls,
+        scene: mi.Scene,
+        lens: mi.Sensor,
+        window: Window,
+        faces: FaceTable | None = None,
+        specular: Specular | None = None,
+    ) -> View:
         """The view of a window's pixels through Mitsuba's surface records, or through the scene's face table."""
         shapes = scene.shapes()
         # In packets Embree misses some points of a disk.
         meshes = all(shape.is_mesh() for shape in shapes)
         triangles = sum(map(face_count, shapes)) if meshes else math.inf
-        start = dr.opaque(mi.Float, lens.clear_depth(scene.bbox()))
-        return cls(scene, lens, start, faces, triangles / math.prod(window.shape), _emitting(shapes))
+        start = dr.opaque(mi.Float, lens.clear_depth(box_of(shapes)))
+        return cls(scene, lens, start, faces, triangles / math.prod(window.shape), _emitting(shapes), specular)
 
-    def integrand(
-        self, position: mi.Point2f, pupil: mi.Point2f, together: bool = False
-    ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+    def integrand(self, position: mi.Point2f, pupil: mi.Point2f, together: bool = False) -> Sight:
         """Integrand of Eq. 9 in the pupil form on one line of sight, and what the line met.
 
         position : on the film [pixels]
         pupil : on the unit disc; stands for as large a share of what is open of the pupil
         together : trace the lines of neighbouring array entries as one packet
-
-        Returns the integrand [W/mm²/sr], whose mean over pixel and pupil, times the pixel's étendue, is P; the radiance
-        [W/mm²/sr]; the number of the shape met, 0 for none; its depth [mm].
         """
         pupil, open_share = self.lens.open_pupil(position, pupil)
         ray, cos_theta, passes = self.lens.line_of_sight(position, pupil, self.start)
         at_one_wavelength(ray)
+        etendue = etendue_from_pixel(cos_theta, passes, open_share)
+        if self.specular:
+            found = follow(self.scene, self.specular, ray, cos_theta, self.start, passes, self._radiance, self._covers)
+            return Sight(
+                eq9(found.radiance, etendue),
+                found.radiance,
+                dr.select(dr.isfinite(found.depth), mi.Float(found.body), -mi.Float(found.body)),
+                found.covered,
+                found.depth,
+                found.front,
+                etendue * found.lost,
+            )
         pi = self.scene.ray_intersect_preliminary(ray, coherent=together, active=passes)
-        radiance = self.faces.radiance(pi, ray.d) if self.faces else self._by_record(pi, ray)
-        shape = mi.Float(dr.reinterpret_array(mi.UInt32, pi.shape))
-        integrand = eq9(radiance, etendue_from_pixel(cos_theta, passes, open_share))
-        return integrand, radiance, shape, self.start + pi.t * cos_theta
+        radiance = self._radiance(pi, ray)
+        number = mi.UInt32(dr.reinterpret_array(mi.UInt32, pi.shape))
+        depth = self.start + pi.t * cos_theta
+        integrand = eq9(radiance, etendue)
+        return Sight(integrand, radiance, mi.Float(number), self._covers(number), depth, depth, mi.Float(0))
 
-    def covers(self, shape: mi.Float) -> mi.Bool:
-        """True where the number of a shape that `integrand` returned is that of one with an `fspt_surface`."""
-        met = shape > 0
+    def _covers(self, number: mi.UInt32) -> mi.Bool:
+        """True where the number of a shape, 0 for none, is that of one with an `fspt_surface`."""
+        met = number > 0
         if self.emitting is None:
             return met
-        return met & (dr.gather(mi.Float, self.emitting, mi.UInt32(shape), met) > 0)
+        return met & (dr.gather(mi.Float, self.emitting, number, met) > 0)
 
-    def finding(self) -> Finding:
-        """Whether lines of sight do without Mitsuba's surface records."""
-        why = "meshes alone, J_n linear on every face, the same radiance in all directions"
-        return Finding("record", self.faces is not None, why if self.faces else f"wanted: {why}")
+    def most_radiance(self) -> float:
+        """Upper bound of the radiance of any surface with an `fspt_surface` [W/mm²/sr].
 
-    def _by_record(self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Float:
-        """Exit law's radiance [W/mm²/sr] where a ray ends, on any shape and with any law."""
+        J_n/π under Lambert's law; no law sends more than J_n per steradian.
+        """
+        own = [emitter for emitter in self.scene.emitters() if is_surface(emitter)]
+        return max((e.brightest / (math.pi if e.is_isotropic() else 1) for e in own), default=0.0)
+
+    def findings(self) -> list[Finding]:
+        """Whether lines of sight end at the first surface, and do without Mitsuba's surface records."""
+        why = "what glows are meshes, J_n is linear on every face, the radiance the same in all directions"
+        record = Finding("record", self.faces is not None, why if self.faces else f"wanted: {why}")
+        if self.specular is None:
+            return [Finding("specular", True, "no surface leads them on to light"), record]
+        names = ", ".join(self.specular.names) or "nothing, as was wanted"
+        way = "straight on" if self.specular.straight else "by reflection or refraction"
+        return [Finding("specular", False, f"they go on {way} at {names}"), record]
+
+    def _radiance(self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Float:
+        """Exit law's radiance [W/mm²/sr] where a ray ends, by record on any shape and with any law."""
+        if self.faces:
+            return self.faces.radiance(pi, ray.d)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         return scalar(si.emitter(self.scene).eval(si))
 

@@ -54,28 +54,8 @@ class Canvas:
         low, high = _bound(dr.minimum, ring), _bound(dr.maximum, ring)
         # False also where a corner is not finite.
         active &= (low.x < self._width) & (low.y < self._height) & (high.y > 0) & (low.x > -dr.inf) & (high.x < dr.inf)
-        border = mi.Point2d(self._width, self._height)
         add = self._add_crossing if self.centres else self._add_area
-
-        def step(k: mi.UInt32, edge: mi.UInt32, a: mi.Point2d, q: mi.Point2d, *rest: mi.Point2d) -> tuple:
-            """From a towards the corner q as far as the next line between pixels."""
-            d = q - a
-            line = dr.clip(dr.select(d > 0, dr.floor(a) + 1, dr.ceil(a) - 1), 0, border)
-            until = dr.select((line - a) * d > 0, (line - a) / d, dr.inf)
-            t = dr.minimum(until.x, until.y)
-            b = a + t * d
-            b = dr.select(until < dr.inf, dr.select(d > 0, dr.minimum(b, line), dr.maximum(b, line)), b)
-            b = dr.select(until <= t, line, b)
-            arrived = ~(t < 1)
-            b = dr.select(arrived, q, b)
-            add(densities, a, b, ~arrived & (until.y <= t))
-            rest = [dr.select(arrived, new, old) for new, old in zip((*rest, q), (q, *rest), strict=True)]
-            return k + 1, edge + dr.select(arrived, 1, 0), b, *rest
-
-        edges = dr.select(active, mi.UInt32(4), 0)
-        most = mi.UInt32(4 * (self._width + self._height + 8))
-        start = (mi.UInt32(0), mi.UInt32(0), ring[0], *ring[1:], ring[0])
-        dr.while_loop(start, lambda k, edge, *_: (edge < edges) & (k < most), step)
+        along_edges(ring, active, (self._width, self._height), lambda a, b, crosses: add(densities, a, b, crosses))
 
     def _add_area(self, densities: Sequence[mi.Float64], a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> None:
         """Add the area to the right of ab, within one pixel, to this pixel and to all beyond in its row."""
@@ -101,6 +81,41 @@ class Canvas:
         at = mi.UInt32(dr.select(on, row * self._width + column, 0))
         # Unsigned, because that wraps around below zero and every backend can add it.
         dr.scatter_add(layer, mi.UInt64(mi.Int64(amount)), at, on)
+
+
+def along_edges(
+    ring: Sequence[mi.Point2d],
+    active: mi.Bool,
+    size: tuple[mi.Float64, mi.Float64],
+    add: Callable[[mi.Point2d, mi.Point2d, mi.Bool], None],
+    count: mi.UInt32 | int = 4,
+) -> None:
+    """Call `add(a, b, crosses)` for every part, within one pixel, of the edges of a polygon of four corners [pixels].
+
+    `crosses`: b lies on a line between rows. Edges beyond a film of `size` (w, h) are not divided. `count`: 3 for a
+    triangle, whose last corner is its first.
+    """
+    border = mi.Point2d(*size)
+
+    def step(k: mi.UInt32, edge: mi.UInt32, a: mi.Point2d, q: mi.Point2d, *rest: mi.Point2d) -> tuple:
+        """From a towards the corner q as far as the next line between pixels."""
+        d = q - a
+        line = dr.clip(dr.select(d > 0, dr.floor(a) + 1, dr.ceil(a) - 1), 0, border)
+        until = dr.select((line - a) * d > 0, (line - a) / d, dr.inf)
+        t = dr.minimum(until.x, until.y)
+        b = a + t * d
+        b = dr.select(until < dr.inf, dr.select(d > 0, dr.minimum(b, line), dr.maximum(b, line)), b)
+        b = dr.select(until <= t, line, b)
+        arrived = ~(t < 1)
+        b = dr.select(arrived, q, b)
+        add(a, b, ~arrived & (until.y <= t))
+        rest = [dr.select(arrived, new, old) for new, old in zip((*rest, q), (q, *rest), strict=True)]
+        return k + 1, edge + dr.select(arrived, 1, 0), b, *rest
+
+    edges = dr.select(active, mi.UInt32(count), 0)
+    most = mi.UInt32(4 * (border.x + border.y + 8))
+    start = (mi.UInt32(0), mi.UInt32(0), ring[0], *ring[1:], ring[0])
+    dr.while_loop(start, lambda k, edge, *_: (edge < edges) & (k < most), step)
 
 
 def _sound(polygon: Sequence[mi.Point2f], lights: Sequence[mi.Float64]) -> list[mi.Point2d]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +13,7 @@ from ..jit.loops import repeat
 from .eq9 import View
 from .node_rules import MOST_JUMPS, AlongTransect
 from .node_sums import TRANSECTS_TOGETHER
+from .specular import first_met
 from .transect import Transect
 
 MOST_STEPS = 2  # of jumps within a body: beside two the scan has too little left to tell a third from a slope
@@ -38,11 +40,14 @@ def integrate_transect(
     """
     together = view.detail <= TRANSECTS_TOGETHER
 
-    def look(s: mi.Float) -> mi.Point3f:
+    def look(s: mi.Float) -> Seen:
         position, pupil, _ = transect.at(s)
-        return mi.Point3f(*view.integrand(position, pupil, together)[1:])
+        sight = view.integrand(position, pupil, together)
+        if view.specular:
+            return mi.Vector4f(sight.radiance, sight.body, sight.depth, sight.front)
+        return mi.Point3f(sight.radiance, sight.body, sight.depth)
 
-    found = _search(look, phase, along, outline, least)
+    found = _search(look, phase, along, outline, least, mi.Vector4f(0) if view.specular else mi.Point3f(0))
     jumps, places = found.jumps, found.places()
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
@@ -62,8 +67,8 @@ def integrate_transect(
             share, slope = _towards_jumps((mi.Float(number) + phase) / mi.Float(nodes), at_start, at_end)
             s = low + (high - low) * share
             position, pupil, density = transect.at(s)
-            f, _, body, _ = view.integrand(position, pupil, together)
-            return (sums.plus(slope * density, (s - middle) / half, f, view.covers(body)),)
+            sight = view.integrand(position, pupil, together)
+            return (sums.plus(slope * density, (s - middle) / half, sight.integrand, sight.covered),)
 
         (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))
         until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
@@ -79,26 +84,43 @@ def integrate_transect(
 # ---------------------------------------------------------------------- where it jumps
 
 
+Seen: TypeAlias = (
+    "mi.Point3f | mi.Vector4f"  # radiance, number of the body, its depth; with specular surfaces that of the first
+)
+
+
 @dataclass
 class _Jump:
-    """Two neighbouring points of a transect: their places `at`, and radiance, number of the body and depth at each."""
+    """Two neighbouring points of a transect: their places `at`, and what is `Seen` at each."""
 
     at: mi.Point2f
-    before: mi.Point3f
-    after: mi.Point3f
+    before: Seen
+    after: Seen
 
     def middle(self) -> mi.Float:
         """The place half-way between the two."""
         return 0.5 * (self.at.x + self.at.y)
 
     def depth(self) -> mi.Float:
-        """Of what is nearer, and hides the other [mm]."""
-        before, after = (dr.select(seen.y > 0, seen.z, dr.inf) for seen in (self.before, self.after))
-        return dr.minimum(before, after)
+        """Of what is nearer, and hides the other [mm]: of the first surfaces where those are two."""
+        nearer = dr.minimum(self.before.z, self.after.z)
+        if len(self.before) == 3:
+            return nearer
+        alike = first_met(self.before.y) == first_met(self.after.y)
+        return dr.select(alike, nearer, dr.minimum(self.before.w, self.after.w))
 
     def size(self, outline: mi.Float) -> mi.Float:
         """How much the radiance changes; an `outline` outranks whatever steep but smooth change lies elsewhere."""
-        return dr.abs(self.after.x - self.before.x) + dr.select(self.before.y != self.after.y, outline, 0)
+        before, after = self.before.y, self.after.y
+        if len(self.before) == 4:  # behind mirrors and panes, too, nothing is nothing
+            before, after = dr.maximum(before, 0), dr.maximum(after, 0)
+        return dr.abs(self.after.x - self.before.x) + dr.select(before != after, outline, 0)
+
+    def larger_half(self, s: mi.Float, seen: Seen, outline: mi.Float) -> _Jump:
+        """Of the two parts that a look at s makes the one with the larger jump."""
+        left = _Jump(mi.Point2f(self.at.x, s), self.before, seen)
+        right = _Jump(mi.Point2f(s, self.at.y), seen, self.after)
+        return dr.select(left.size(outline) >= right.size(outline), left, right)
 
 
 @dataclass
@@ -114,7 +136,7 @@ class _Search:
 
     largest: list[_Jump]
     place: mi.Float
-    seen: mi.Point3f
+    seen: Seen
     total: mi.Float
     lit: mi.Point2f
     jumps: mi.UInt32
@@ -131,16 +153,29 @@ class _Search:
         return ordered
 
 
+def _met(seen: Seen) -> mi.Bool:
+    """True where a line of sight met anything; weak light along it may come from elsewhere than its end."""
+    return seen.y > 0 if len(seen) == 3 else (seen.y > 0) | (seen.x > 0)
+
+
 def _search(
-    look: Callable[[mi.Float], mi.Point3f], phase: mi.Float, along: AlongTransect, outline: mi.Float, least: mi.Float
+    look: Callable[[mi.Float], Seen],
+    phase: mi.Float,
+    along: AlongTransect,
+    outline: mi.Float,
+    least: mi.Float,
+    nothing: Seen,
 ) -> _Search:
-    """Jumps of what lines of sight `look` at; scan and bisection are one loop, so that it is compiled once."""
+    """Jumps of what lines of sight `look` at; scan and bisection are one loop, so that it is compiled once.
+
+    `nothing`: what a line of sight sees that meets nothing.
+    """
     intervals, bisections = dr.opaque(mi.UInt32, along.scan), dr.opaque(mi.UInt32, along.bisections)
     number = mi.Float(intervals)
     # Where edges run along pixels they would lie on points to bisect, and rounding choose the side.
     shift = SHIFT * (phase - 0.5)
 
-    def scan(found: _Search, s: mi.Float, seen: mi.Point3f) -> _Search:
+    def scan(found: _Search, s: mi.Float, seen: Seen) -> _Search:
         new = _Jump(mi.Point2f(found.place, s), found.seen, seen)
         size = dr.select(found.looks > 0, new.size(outline), 0)
         total = rest = found.total + size
@@ -158,15 +193,12 @@ def _search(
                 jump = jump | (most > dr.maximum(STEEP * rest / (number - (k + 1)), least))
             large &= jump
             jumps += dr.select(large, mi.UInt32(1), 0)
-        lit = dr.select(seen.y > 0, mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
+        lit = dr.select(_met(seen), mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
         return _Search(largest, s, seen, total, lit, jumps, found.looks)
 
-    def bisect(found: _Search, turn: mi.UInt32, jump: _Jump, s: mi.Float, seen: mi.Point3f) -> _Search:
-        left = _Jump(mi.Point2f(jump.at.x, s), jump.before, seen)
-        right = _Jump(mi.Point2f(s, jump.at.y), seen, jump.after)
-        half = dr.select(left.size(outline) >= right.size(outline), left, right)
-        largest = [dr.select(turn == k, half, old) for k, old in enumerate(found.largest)]
-        return replace(found, largest=largest)
+    def bisect(found: _Search, turn: mi.UInt32, jump: _Jump, s: mi.Float, seen: Seen) -> _Search:
+        half = jump.larger_half(s, seen, outline)
+        return replace(found, largest=[dr.select(turn == k, half, old) for k, old in enumerate(found.largest)])
 
     def once(found: _Search) -> tuple[_Search]:
         k = found.looks
@@ -183,8 +215,8 @@ def _search(
         return (found,)
 
     # Not `dr.zeros`: of a dataclass's fields it keeps the types of the variant that it meets first.
-    none = [_Jump(mi.Point2f(0), mi.Point3f(0), mi.Point3f(0)) for _ in range(MOST_JUMPS)]
-    start = _Search(none, mi.Float(0), mi.Point3f(0), mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
+    none = [_Jump(mi.Point2f(0), nothing, nothing) for _ in range(MOST_JUMPS)]
+    start = _Search(none, mi.Float(0), nothing, mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
     return dr.while_loop((start,), lambda found: found.looks <= intervals + found.jumps * bisections, once)[0]
 
 

@@ -23,7 +23,7 @@ from ..jit.pixel_grid import Grid
 from ..jit.spectra import at_one_wavelength, scalar
 from ..runtime.plugin_types import is_surface
 from .node_rules import PLASTIC, twelve
-from .occlusion import hidden
+from .specular import Specular, transmission
 from .window import Window
 
 OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
@@ -52,9 +52,12 @@ class NarrowLight:
     in_focus: PixelArray
 
 
-def points_on_surfaces(scene: mi.Scene, lens: mi.Sensor) -> Points | None:
-    """Points all over the surfaces as `lens` sees them; None where no emitter is an `fspt_surface`."""
-    parts = [_seen(scene, emitter, lens) for emitter in scene.emitters() if is_surface(emitter)]
+def points_on_surfaces(scene: mi.Scene, lens: mi.Sensor, specular: Specular | None = None) -> Points | None:
+    """Points all over the surfaces as `lens` sees them; None where no emitter is an `fspt_surface`.
+
+    It sees them straight on alone, if need be through `specular` shapes.
+    """
+    parts = [_seen(scene, emitter, lens, specular) for emitter in scene.emitters() if is_surface(emitter)]
     return Points.joined(parts) if parts else None
 
 
@@ -217,7 +220,7 @@ def _spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) -
     return grid.array(grid.box_sum(grid.flat(sums), reach))[reach : reach + height, reach : reach + width]
 
 
-def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> Points:
+def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor, specular: Specular | None) -> Points:
     """Points all over a surface as the lens sees them."""
     shape = emitter.get_shape()
     texels = texels_of(emitter.exitance)
@@ -235,7 +238,7 @@ def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor) -> Points:
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     look = _look(emitter, elements, lens, counts)
     if len(scene.shapes()) > 1:
-        look.radiance = dr.select(_in_sight(scene, lens, look.place), look.radiance, 0)
+        look.radiance = dr.select(_in_sight(scene, lens, look.place, specular), look.radiance, 0)
     columns = (look.radiance, look.image, look.cosine, look.front, look.blur, look.centre.x, look.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
@@ -279,13 +282,13 @@ def _look(emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Inde
     return look
 
 
-def _in_sight(scene: mi.Scene, lens: mi.Sensor, place: mi.Point3f) -> mi.Bool:
+def _in_sight(scene: mi.Scene, lens: mi.Sensor, place: mi.Point3f, specular: Specular | None) -> mi.Bool:
     """True of points from which nothing hides one of twelve points of the pupil."""
     x, y = (mi.Float(column) for column in twelve(False).pupil.T)
 
     def look(k: mi.UInt32, seen: mi.Bool) -> tuple[mi.Bool]:
         pupil = mi.Point2f(dr.gather(mi.Float, x, k), dr.gather(mi.Float, y, k))
-        return (seen | ~hidden(scene, place, lens.arrival(place, pupil)[1], ~seen),)
+        return (seen | (transmission(scene, specular, place, lens.arrival(place, pupil)[1], ~seen) > 0),)
 
     return repeat(dr.opaque(mi.UInt32, len(twelve(False))), look, mi.Bool(False))[0]
 

@@ -11,7 +11,7 @@ from ..jit.batches import batches
 from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
 from . import node_rules
 from .draft import Draft
-from .node_sums import NOTHING_SEEN, Sums, apply_rule
+from .node_sums import BY_SPECULAR_SURFACES, NOTHING_SEEN, Sums, apply_rule
 from .shortcuts import Finding
 
 if TYPE_CHECKING:
@@ -47,7 +47,8 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     mx, my, draft.nearest = seen.x, seen.y, seen.nearest
     draft.nodes = len(rule)
     draft.set_coverage(seen.coverage)
-    draft.set_blur(seen.farthest)
+    draft.set_blur(seen.front, seen.farthest)
+    draft.lost = seen.lost
     draft.value = value = dr.select(draft.open, seen.value, draft.known)
     # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
     square = 16 * (mx * mx + my * my)
@@ -119,10 +120,12 @@ def _one_will_do(draft: Draft) -> bool:
     lens, blur = draft.lens.optics, draft.window.blur
     curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
     will_do = curvature <= POINT * draft.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
+    bends = bool(draft.view.specular and draft.view.specular.bending)
     lambert = all(getattr(emitter, "is_isotropic", bool)() for emitter in draft.view.scene.emitters())
-    taken = will_do and lambert and draft.quadrature.takes("one line")
+    taken = will_do and lambert and not bends and draft.quadrature.takes("one line")
     why = f"cos⁴θ differs by {curvature:.1e} over the pupil, blur discs reach {blur:.2g} pixels"
     why += "" if lambert else ", the radiance depends on direction"
+    why += ", mirrors or glass bend lines of sight" if bends else ""
     draft.findings.append(Finding("one line", taken, why))
     return taken
 
@@ -136,13 +139,14 @@ def _refine(draft: Draft, where: Mask) -> PixelArray:
     draft.value = dr.select(where, seen.value, draft.value)
     draft.set_coverage(dr.select(where, seen.coverage, draft.coverage))
     draft.nearest = dr.minimum(draft.nearest, seen.nearest)
+    draft.lost = dr.select(where, dr.maximum(draft.lost, seen.lost), draft.lost)
     left = difference * dr.clip(gain, LEAST_GAIN, ROUGH_GAIN)
     rough = dr.select(parted(seen.coverage), 0, dr.maximum(left, difference))
     rough, left = draft.grid.spread_all((rough, left))
     draft.roughness = dr.maximum(draft.roughness, rough)
     error = dr.maximum(left, draft.error / MOST_GAIN)
     draft.error = dr.select(where, dr.maximum(error, draft.cut_off()), draft.error)
-    dr.eval(draft.value, draft.error, draft.roughness, draft.nearest, difference)
+    dr.eval(draft.value, draft.error, draft.roughness, draft.nearest, draft.lost, difference)
     return difference
 
 
@@ -154,11 +158,14 @@ def apply_nodes(draft: Draft, rule: node_rules.Rule, where: Mask | None = None) 
     else:
         index = draft.grid.pixels(where)
         images = Sums(*(draft.grid.full(mi.Float64, fill) for fill in NOTHING_SEEN))
+    names = [name for name in vars(images) if draft.view.specular or name not in BY_SPECULAR_SURFACES]
     for part in batches(index):
         seen = apply_rule(draft.view, draft.window.centres(part), rule)
-        for image, column in zip(vars(images).values(), vars(seen).values(), strict=True):
-            dr.scatter(image, mi.Float64(column), part)
-        dr.eval(images)
+        for name in names:
+            dr.scatter(getattr(images, name), mi.Float64(getattr(seen, name)), part)
+        dr.eval([getattr(images, name) for name in names])
+    if not draft.view.specular:
+        images.front, images.lost = images.nearest, mi.Float64(0)
     count = dr.width(index)
     draft.count(f"{len(rule)} nodes", count, count * len(rule))
     return images

@@ -19,18 +19,28 @@ CLEAR, CLEAR_OF_DISTANCE = 2.0**-16, 2.0**-20
 
 
 def hidden(scene: mi.Scene, point: mi.Point3f, lens_point: mi.Point3f, active: mi.Bool) -> mi.Bool:
-    """True where a surface lies between a surface point and a point of the lens.
+    """True where a surface lies between a surface point and a point of the lens."""
+    return scene.ray_test(ray_to_lens(point, lens_point), active=active)
 
-    The ray starts a little further along its own direction. Mitsuba's `spawn_ray` would move the start along the normal
-    by 9e-5 of the point's distance from the origin, and with it the borders of shadows by a hundredth of a pixel.
+
+def ray_to_lens(point: mi.Point3f, lens_point: mi.Point3f) -> mi.Ray3f:
+    """Ray from a surface point that ends at a point of the lens.
+
+    It starts a little further along its own direction. Mitsuba's `spawn_ray` would move the start along the normal by
+    9e-5 of the point's distance from the origin, and with it the borders of shadows by a hundredth of a pixel.
     """
     way = mi.Vector3f(lens_point - point)
     distance = dr.norm(way)
     direction = way / distance
-    clear = CLEAR * dr.max(dr.abs(point), axis=0) + CLEAR_OF_DISTANCE * distance
+    clear = clear_of(point) + CLEAR_OF_DISTANCE * distance
     ray = mi.Ray3f(point + clear * direction, direction)
     ray.maxt = distance - clear
-    return scene.ray_test(ray, active=active)
+    return ray
+
+
+def clear_of(point: mi.Point3f) -> mi.Float:
+    """How far [mm] from a surface point a ray starts that leaves it, beyond the rounding of its coordinates."""
+    return CLEAR * dr.max(dr.abs(point), axis=0)
 
 
 def hides_nothing(scene: mi.Scene) -> bool:

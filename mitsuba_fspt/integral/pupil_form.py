@@ -26,6 +26,7 @@ from .nodes import BOTH, first_nodes, twelve_nodes
 from .progress import SILENT, Progress
 from .quadrature import Quadrature
 from .solution import Solution
+from .specular import Specular
 from .transects import integrate_by_transects
 from .window import Window, visible_window
 
@@ -82,7 +83,7 @@ def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
     window = visible_window(scene, lens)
     if 0 in window.shape:
         return np.zeros(window.full)
-    return coverage_of(View.of(scene, lens, window), window)
+    return coverage_of(View.of(scene, lens, window, specular=Specular.of(scene, lens)), window)
 
 
 def coverage_of(view: View, window: Window) -> NDArray[np.float64]:

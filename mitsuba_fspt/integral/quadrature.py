@@ -13,6 +13,8 @@ DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
 # No error is stated below these shares of the tolerance and of the brightest pixel: two rules that agree may both miss
 # something, and float32 resolves lines of sight only so far.
 LEAST_CLAIM, FLOAT32_FLOOR = 0.05, 2e-7
+LEAST_WEIGHT = 0.1  # of rtol: what is followed through or off specular surfaces; weaker light counts as error
+MOST_SPECULAR = 64  # specular surfaces one after the other
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,8 @@ class Quadrature:
     pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
     max_nodes : lines of sight a pixel may take at most, four in any case (domain 'surface': on average, 256 in any
         case); bounds the time, and where it is reached the error says so
+    max_specular : specular surfaces that a line of sight goes through or off at most, 0 … 64 (default 8); what is cut
+        off there is in the error
     shortcuts_off : names of `SHORTCUTS` that are not taken; they change no more than the error asked for
     """
 
@@ -31,6 +35,7 @@ class Quadrature:
     domain: str = "pupil"
     pixel: str = "area"
     max_nodes: int = 200_000
+    max_specular: int = 8
     shortcuts_off: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -50,6 +55,10 @@ class Quadrature:
             raise SceneError(f"'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
         if self.max_nodes < 1:
             raise SceneError(f"'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 200000.")
+        specular = whole("'max_specular'", self.max_specular, SceneError, "8")
+        object.__setattr__(self, "max_specular", specular)
+        if not 0 <= specular <= MOST_SPECULAR:
+            raise SceneError(f"'max_specular' must be in 0 … {MOST_SPECULAR}, got {specular}. Give for example 8.")
         if unknown := set(self.shortcuts_off) - set(SHORTCUTS):
             raise SceneError(f"'shortcuts_off' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}.")
 
@@ -57,6 +66,11 @@ class Quadrature:
     def least_error(self) -> float:
         """Smallest error that is stated, over the brightest pixel."""
         return max(FLOAT32_FLOOR, LEAST_CLAIM * self.rtol)
+
+    @property
+    def least_weight(self) -> float:
+        """Smallest share of a line's radiance that is followed through or off specular surfaces."""
+        return LEAST_WEIGHT * self.rtol
 
     def takes(self, shortcut: str) -> bool:
         """True unless this one of `SHORTCUTS` is switched off."""

@@ -14,9 +14,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..emission.elements import elements_of
-from ..jit.mesh_buffers import triangles
+from ..jit.mesh_buffers import box_of, triangles
 from ..runtime.errors import ExitanceError, SceneError
 from ..runtime.plugin_types import is_lens, is_surface
+from .specular import specular_bsdf
 
 COARSEST = 0.1  # virtual pixels: the largest displacement of a line of sight by float32
 # W/mm² and W: outside these ranges float32 cannot hold the sums and the faint parts of a picture.
@@ -183,13 +184,17 @@ def _doubled_faces(positions: mi.Float, faces: mi.UInt32) -> int:
 
 def check_outside(scene: mi.Scene, lens: mi.Sensor) -> None:
     """Raise SceneError where the lens centre is inside a closed surface: all around it shows its inward side."""
-    if not scene.bbox().contains(mi.ScalarPoint3f(lens.placement[3:12:4])):
+    if not box_of(scene.shapes()).contains(mi.ScalarPoint3f(lens.placement[3:12:4])):
         return
     directions = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], np.float32)
     # Turned a little, so that no direction runs along the faces of an axis-aligned box.
     rays = mi.Ray3f(lens.world_transform() @ mi.Point3f(0, 0, 0), dr.normalize(mi.Vector3f(directions.T + 0.1234)))
     si = scene.ray_intersect(rays)
-    if dr.all(si.is_valid() & (dr.dot(si.n, rays.d) > 0)):
+    opaque = mi.Bool(True)  # through a chamber's panes it looks out
+    for shape in scene.shapes():
+        if specular_bsdf(shape):
+            opaque &= si.shape != mi.ShapePtr(shape)
+    if dr.all(si.is_valid() & (dr.dot(si.n, rays.d) > 0) & opaque):
         raise SceneError(
             "fspt_lens: the lens stands inside the phantom, where it sees only dark inner sides. Move it out with "
             "'to_world'."

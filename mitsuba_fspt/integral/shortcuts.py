@@ -8,6 +8,7 @@ SHORTCUTS = {
     "outside": "pixels outside the effective virtual space (Eq. 4)",
     "one line": "three of the first four lines of sight of a pixel",
     "smooth": "all further lines of sight of a pixel",
+    "specular": "lines of sight beyond the first surface",
     "record": "surface records where lines of sight end",
     "occlusion": "rays that look for an occluder",
     "dark": "surface elements that do not glow",

@@ -19,14 +19,16 @@ from numpy.typing import NDArray
 
 from ..jit.pixel_grid import Grid
 from ..jit.spectra import scalar
+from . import pupil_cells
 from .eq9 import eq9, etendue_from_surface
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow
-from .occlusion import hidden, hides_nothing
+from .occlusion import hides_nothing
 from .progress import SILENT, Progress
 from .quadrature import Quadrature
 from .shortcuts import Finding
 from .solution import Solution
+from .specular import Specular, transmission
 from .window import Window
 
 # Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second
@@ -39,9 +41,6 @@ CARRIED = 0.4  # of the estimate of the level before that the next one keeps: tw
 # No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
 # bits, and thousands of roundings on a pixel stay below 1e-9 of any but the faintest.
 HEADROOM, RESOLUTION, COVERAGE_QUANTUM = 2.0**4, 2.0**-56, 2.0**-50
-# Steps of a Kronecker sequence in four dimensions, 1/g … 1/g⁴ with g⁵ = g + 1, and from element to element (golden
-# ratio), in units of 2⁻³²: whole numbers, so that the sequence stays exact however long it gets.
-STEPS, STRIDE = (3679390609, 3152041523, 2700274807, 2313257605), 2654435769
 
 Plane = NDArray[np.float64]
 
@@ -54,6 +53,7 @@ def solve(
     where: NDArray[np.bool_] | None = None,
     least_peak: float = 0.0,
     progress: Progress = SILENT,
+    specular: Specular | None = None,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
 
@@ -62,17 +62,20 @@ def solve(
     [W/mm²/sr]. `progress` is called after every level.
 
     `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
-    Coverage counts the lines of sight that meet a glowing surface, not those that meet a dark one. Raises SceneError
-    where an emitter has no surface.
+    Light goes on through `specular` shapes where it stays straight. Coverage counts the lines of sight that meet a
+    glowing surface, not those that meet a dark one. Raises SceneError where an emitter has no surface.
     """
-    return _Refinement(scene, lens, window, quadrature).run(where, least_peak, progress)
+    return _Refinement(scene, lens, window, quadrature, specular).run(where, least_peak, progress)
 
 
 class _Refinement:
     """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
 
-    def __init__(self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature) -> None:
+    def __init__(
+        self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, specular: Specular | None
+    ) -> None:
         self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
+        self.specular = specular
         dark = quadrature.takes("dark")
         self.glows = [Glow.seen(emitter, lens, window, quadrature.rtol, dark) for emitter in scene.emitters()]
         self.value, self.error, self.coverage = (np.zeros(self.window.shape) for _ in range(3))
@@ -146,7 +149,7 @@ class _Refinement:
         elements, lens = batch.glow.elements, self.lens
         (index, cut, number), m = batch.lanes(), dr.opaque(mi.UInt32, batch.cells)
         part, i, j = number // (m * m), number % m, number // m % m
-        within, aim = _strata(i, j, m, index * STRIDE + part)
+        within, aim = pupil_cells.strata(i, j, m, index * pupil_cells.STRIDE + part)
 
         # Smooth factors are taken at a piece's middle (midpoint rule): normals that differ from line to line would make
         # a round shape noisy. J_n and occlusion, which may jump within a piece, are sampled all over it.
@@ -156,19 +159,23 @@ class _Refinement:
         to_lens = dr.normalize(lens_point - middle.p)
         cos_s = dr.dot(middle.n, to_lens)
         active = (cos_s > 0) & (arrival > 0)
+        through = mi.Float(1)
         if self.hidden:
-            active &= ~hidden(self.scene, spot.p, lens_point, active)
+            through = transmission(self.scene, self.specular, spot.p, lens_point, active)
+            active &= through > 0
         spot.sh_frame.n = spot.n  # not the normal that a mesh is shaded with
         spot.initialize_sh_frame()
         spot.wi = spot.to_local(_turned_along(to_lens, middle.n, spot.n))
-        radiance = dr.select(active, scalar(batch.glow.emitter.eval(spot, active)), 0)
+        radiance = dr.select(active, through * scalar(batch.glow.emitter.eval(spot, active)), 0)
         virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
-        cell = [_corner(i + x, j + y, m) for x, y in CORNERS]
-        etendue = dr.select(active, etendue_from_surface(cos_s, area, arrival, _area(cell), virtual_pixel), 0)
+        cell = [pupil_cells.corner(i + x, j + y, m) for x, y in CORNERS]
+        etendue = dr.select(
+            active, etendue_from_surface(cos_s, area, arrival, pupil_cells.area(cell), virtual_pixel), 0
+        )
 
         discs = {at: lens.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.window.corner))
-        middle = _middle(i, j, m)
+        middle = pupil_cells.middle(i, j, m)
         images = [centre - origin + radius * middle for centre, radius, _ in discs.values()]
         # The image of a piece through the cell's middle; or, where that is smaller than a cell's image or the blur disc
         # covers the whole shape, of the cell through the piece's middle. Either way neighbours on the surface or on the
@@ -191,51 +198,6 @@ def _turned_along(direction: mi.Vector3f, normal: mi.Normal3f, other: mi.Normal3
     """A direction turned the shortest way that takes one normal to the `other`: as slanted to that as it was."""
     a, b = mi.Vector3f(normal), mi.Vector3f(other)
     return direction - dr.dot(a + b, direction) / (1 + dr.dot(a, b)) * (a + b) + 2 * dr.dot(a, direction) * b
-
-
-def _strata(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, number: mi.UInt32) -> tuple[mi.Point2f, mi.Point2f]:
-    """Points of a piece and of the pupil, both in [0, 1]², for the line of sight through the pupil's cell (i, j).
-
-    The lines of a piece take each of its M × M parts and each cell of the pupil once: part = (turn + √-1) × cell
-    modulo M, as complex numbers, a lattice without short vectors in four dimensions. They lie off the middles,
-    differently in every piece `number`, and in turns opposite ways, so that what is linear is integrated exactly.
-    """
-    turn = 2 * mi.UInt32(dr.round(0.5 * dr.sqrt(mi.Float(m))))  # even: 1 + turn² has neither 2 nor 3 in common with M
-    strata = ((turn * i + (m - 1) * j) % m, (i + turn * j) % m, i, j)
-    way = dr.select((i + j) % 2 == 0, 1.0, -1.0)
-    off = [way * (mi.Float(number * step) * 2.0**-32 - 0.5) for step in STEPS]
-    x = [(mi.Float(stratum) + 0.5 + o) / mi.Float(m) for stratum, o in zip(strata, off, strict=True)]
-    return mi.Point2f(x[0], x[1]), mi.Point2f(x[2], x[3])
-
-
-def _middle(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32) -> mi.Point2f:
-    """Middle of the pupil's cell (i, j) in the unit disc, moved outwards for M middles to have the disc's blur.
-
-    Their mean r² would be ½ - 1/M², what a cell spreads around its middle is missing.
-    """
-    return _on_pupil(i, j, m, 0.5, 0.5) * dr.rsqrt(1 - 2 / dr.square(mi.Float(m)))
-
-
-def _corner(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32) -> mi.Point2f:
-    """Corner (i, j) of the pupil's cells in the unit disc, moved outwards for polygons to have the areas of rings.
-
-    The corners of ring k are those of a regular polygon of 8 k sides, but for its arcs as large as the disc inside.
-    """
-    half = mi.Int(m // 2)
-    ring = dr.maximum(dr.abs(mi.Int(i) - half), dr.abs(mi.Int(j) - half))
-    turn = dr.pi / (4 * mi.Float(dr.maximum(ring, 1)))
-    return _on_pupil(i, j, m, 0, 0) * dr.sqrt(turn / dr.sin(turn))
-
-
-def _on_pupil(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, x: float, y: float) -> mi.Point2f:
-    """Point (x, y) of [0, 1]² in the cell (i, j) of the pupil, in the unit disc."""
-    return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(mi.Float(i) + x, mi.Float(j) + y) / mi.Float(m))
-
-
-def _area(polygon: list[mi.Point2f]) -> mi.Float:
-    a, b, c, d = polygon
-    across, along = mi.Vector2f(c - a), mi.Vector2f(d - b)
-    return 0.5 * dr.abs(across.x * along.y - across.y * along.x)
 
 
 def _size(polygon: list[mi.Point2f]) -> mi.Float:

@@ -270,7 +270,9 @@ def _transect_sums(
     found = integrate_transect(draft.view, curve, phase, along, outline, least)
     value, coverage, jumps, depth, looks = (mi.Float64(column) for column in found)
     share = mi.Float64(weight) * value
-    blur = dr.select(jumps > 0, draft.lens.blur_radius(dr.minimum(depth, FAR)), 0)
+    # Of the edge of a weak reflection beside nothing the depth is not known.
+    known = (jumps > 0) & dr.isfinite(depth)
+    blur = dr.select(known, draft.lens.blur_radius(dr.minimum(depth, FAR)), 0)
     columns = [share, mi.Float64(weight) * coverage, share * value, dr.minimum(jumps, 1), looks]
     dr.eval(columns, blur)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
     sums = [dr.block_sum(column, len(rule)) for column in columns]

@@ -12,8 +12,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..jit.mesh_buffers import box_of
 from ..runtime.plugin_types import is_surface
 from .node_rules import GAP
+from .specular import Specular
 
 Boxes = tuple[tuple[float, ...], ...]
 
@@ -85,6 +87,14 @@ class Window:
         inside = np.hypot(x + 0.5, y + 0.5) <= radius
         return inside, ~inside & (np.hypot(np.maximum(x - 0.5, 0), np.maximum(y - 0.5, 0)) < radius)
 
+    def seen_in(self, boxes: Boxes, lens: mi.Sensor) -> NDArray[np.bool_]:
+        """Pixels (h, w) of this window with a line of sight into one of these boxes, and some around."""
+        other = window_of(boxes, lens)
+        left, top = (own - its for own, its in zip(self.corner, other.corner, strict=True))
+        rows, columns = top + np.arange(self.shape[0]), left + np.arange(self.shape[1])
+        inside = (rows >= 0) & (rows < other.shape[0])
+        return inside[:, None] & (columns >= 0) & (columns < other.shape[1])
+
     def expand(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
         """The crop window with `image` of this window in its place, 0 around it."""
         whole = np.zeros(self.full)
@@ -120,21 +130,27 @@ class Window:
 def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -> Window:
     """Window of the pixels with a line of sight into the bounding box of emitting surfaces; all if it holds the lens.
 
-    `everywhere`: all pixels. Emitters other than `fspt_surface` count with the bounding box of the scene.
+    `everywhere`: all pixels. Emitters other than `fspt_surface` count with the bounding box of the scene; mirrors and
+    glass, in which light is seen, count, too.
     """
-    return window_of(glowing_boxes(scene), lens, everywhere)
+    specular = Specular.of(scene, lens)
+    return window_of(glowing_boxes(scene), lens, everywhere, specular.bending if specular else ())
 
 
 def glowing_boxes(scene: mi.Scene) -> Boxes:
     """Bounding boxes of emitting surfaces, each as (x, y, z) of its lowest and of its highest corner [mm]."""
     emitters = scene.emitters()
     direct = all(is_surface(emitter) for emitter in emitters)
-    boxes = [emitter.bbox() for emitter in emitters] if direct else [scene.bbox()]
+    boxes = [emitter.bbox() for emitter in emitters] if direct else [box_of(scene.shapes())]
     return tuple((*map(float, box.min), *map(float, box.max)) for box in boxes)
 
 
-def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False) -> Window:
-    """As `visible_window`. Perspective keeps straight lines straight, so that corners bound a box's blurred image."""
+def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False, bending: Boxes = ()) -> Window:
+    """Window of the pixels with a line of sight into these boxes, or into those of `bending` shapes; or `everywhere`.
+
+    Perspective keeps straight lines straight, so that corners bound a box's blurred image.
+    """
+    boxes = (*boxes, *bending)
     film = lens.film()
     width, height = (int(n) for n in film.crop_size())
     offset = (int(film.crop_offset()[0]), int(film.crop_offset()[1]))
@@ -142,6 +158,10 @@ def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False) -> Window
     points = np.array([ends[:, list(pick), range(3)] for pick in itertools.product((0, 1), repeat=3)]).reshape(-1, 3)
     discs, radii = lens.film_discs(points)
     blur = radii.max(initial=0.0)
+    if bending:  # what a mirror shows lies as far behind it as its light goes on before it
+        size = float(np.linalg.norm(np.ptp(points, axis=0)))
+        far = lens.blur_radius(mi.Float64(lens.farthest_depth(points) + size))
+        blur = max(blur, abs(float(far[0])))
     low, high = (discs - radii).min(axis=0, initial=np.inf), (discs + radii).max(axis=0, initial=-np.inf)
     if everywhere or not len(points):
         low, high = np.full(2, -np.inf), np.full(2, np.inf)

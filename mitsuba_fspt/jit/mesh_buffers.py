@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import drjit as dr
@@ -33,6 +34,18 @@ def triangles(shape: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
         return mi.Float(parameters[POSITIONS]), mi.UInt32(parameters[FACES])
     corners = mi.Transform4f(parameters["to_world"]) @ mi.Point3f([-1, 1, -1, 1], [-1, -1, 1, 1], 0)
     return dr.ravel(corners), mi.UInt32(1, 2, 0, 1, 3, 2)
+
+
+def box_of(shapes: Iterable[mi.Shape]) -> mi.ScalarBoundingBox3f:
+    """Bounding box of shapes [mm]; of vertices where Mitsuba gives none, as of rectangles that it has merged."""
+    box = mi.ScalarBoundingBox3f()
+    for shape in shapes:
+        own = shape.bbox()
+        if not own.valid() and shape.is_mesh():
+            points = triangles(shape)[0].numpy().reshape(-1, 3)
+            own = mi.ScalarBoundingBox3f(points.min(axis=0), points.max(axis=0))
+        box.expand(own)
+    return box
 
 
 def set_triangles(mesh: mi.Mesh, positions: Any, faces: Any) -> mi.Mesh:

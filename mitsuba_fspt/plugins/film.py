@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from ..jit.plugin_objects import made
 from ..runtime.errors import OpticsError
 
 
@@ -21,24 +22,14 @@ def own_film(props: mi.Properties) -> None:
     film["crop_offset_x"], film["crop_offset_y"] = int(crop_offset[0]), int(crop_offset[1])
     film["crop_width"], film["crop_height"] = int(crop_size[0]), int(crop_size[1])
     film["pixel_format"], film["component_format"] = "luminance", "float32"
-    film["rfilter"] = _make(mi.Properties("box"))
-    props["film"] = _make(film)
+    film["rfilter"] = made("box")
+    props["film"] = mi.PluginManager.instance().create_object(film)
 
 
 def default_sampler(props: mi.Properties) -> None:
     """Add the best stock sampler for one bounce to `props` if the scene file names none."""
     if not any(isinstance(child, mi.Sampler) for _, child in props.objects()):
-        sampler = mi.Properties("multijitter")
-        sampler["sample_count"] = 64
-        props["sampler"] = _make(sampler)
-
-
-def _make(props: mi.Properties) -> mi.Object:
-    """Plugin object created without `mi.load_dict`, which replaces the process's file resolver for a moment.
-
-    Scenes load on several threads, and a thread that searches for a file in that moment reads freed memory.
-    """
-    return mi.PluginManager.instance().create_object(props)
+        props["sampler"] = made("multijitter", sample_count=64)
 
 
 def number(props: mi.Properties, name: str) -> mi.Float64:

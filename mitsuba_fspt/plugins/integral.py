@@ -16,15 +16,17 @@ from numpy.typing import NDArray
 from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
+from ..integral.left_out import LeftOut, light_left_out
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
 from ..integral.progress import Progress
 from ..integral.quadrature import Quadrature
 from ..integral.scene_checks import check_scene, check_surfaces_alone
 from ..integral.shortcuts import SHORTCUTS, Finding
 from ..integral.solution import Solution
+from ..integral.specular import Specular
 from ..integral.tiles import Mosaic
-from ..integral.window import Window, glowing_boxes, window_of
-from ..jit.mesh_buffers import buffers
+from ..integral.window import Boxes, Window, glowing_boxes, visible_window, window_of
+from ..jit.mesh_buffers import box_of, buffers
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
 from ..runtime.errors import SceneError, named
@@ -59,6 +61,10 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
        - |int|
        - Most lines of sight per pixel (Default: 200000), four in any case; domain surface: on average, and 256 in any
          case.
+     * - max_specular
+       - |int|
+       - Specular surfaces (null, thin and solid glass, mirrors, masks) that a line of sight goes through or off at most
+         (Default: 8). What is cut off there is in the error.
      * - shortcuts
        - |bool|
        - Omit computations that the scene does not need (Default: true). false gives the same power, within the
@@ -74,7 +80,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         # Results about the last scene; a reference to the scene, whose child this integrator is, would be a cycle.
         self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
         self._robust: RobustCopy | None = None
-        self._window, self._narrow, self._faces = CachedValue(), CachedValue(), CachedValue()
+        self._window, self._narrow, self._faces, self._left_out = (CachedValue() for _ in range(4))
 
     def solve(
         self,
@@ -96,33 +102,49 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         check_scene(scene, sensor)
         check_surfaces_alone(scene)
         with recording(), dr.suspend_grad():
-            window = self._visible_window(scene, sensor, everywhere=not quadrature.takes("outside"))
+            specular = Specular.of(scene, sensor, quadrature, even_if_none=not quadrature.takes("specular"))
+            bending = specular.bending if specular else ()
+            _refuse_bending(specular, quadrature)
+            window = self._visible_window(scene, sensor, not quadrature.takes("outside"), bending)
             mosaic = Mosaic(window)
             if mosaic.tiles:
-                self._fill(mosaic, self._traced(scene, sensor), sensor, quadrature, Progress(progress))
+                traced = self._traced(scene, sensor)
+                faces = self._faces_of(traced) if quadrature.takes("record") else None
+                view = View.of(traced, sensor, window, faces, specular)
+                self._fill(mosaic, view, quadrature, Progress(progress))
             # Smaller displacements are random.
             rounding = sensor.rounding if sensor.rounding >= LEAST_DISPLACEMENT else 0.0
             solution = mosaic.solution(quadrature.least_error, rounding)
         return replace(solution, findings=(_outside(window), *solution.findings))
 
+    def light_left_out(
+        self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None
+    ) -> LeftOut | None:
+        """Light of a scene that `solve` can render which Eq. 9 leaves out; None where there can be none."""
+        quadrature = quadrature or self.quadrature
+        with recording(), dr.suspend_grad():
+            window = visible_window(scene, sensor)
+            if 0 in window.shape:
+                return None
+            view = View.of(scene, sensor, window, None, Specular.of(scene, sensor, quadrature))
+            return light_left_out(view, quadrature)
+
     def _fill(
         self,
         mosaic: Mosaic,
-        scene: mi.Scene,
-        lens: mi.Sensor,
+        view: View,
         quadrature: Quadrature,
         progress: Progress,
     ) -> None:
         """Solve all tiles; several ones share the tolerance that follows from a lower bound of the brightest pixel."""
         tiles, window = mosaic.tiles, mosaic.window
-        view = View.of(scene, lens, window, self._faces_of(scene) if quadrature.takes("record") else None)
         least_peak, points = 0.0, None
         progress(0.0)
         if len(tiles) > 1:
-            points = points_on_surfaces(scene, lens)
+            points = points_on_surfaces(view.scene, view.lens, view.specular)
             least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points, window))
         for k, tile in enumerate(tiles):
-            narrow = partial(narrow_light, points, tile) if points else partial(self._narrow_light, scene, lens, tile)
+            narrow = partial(narrow_light, points, tile) if points else partial(self._narrow_light, view, tile)
             mosaic.put(tile, self._solve_tile(tile, view, quadrature, narrow, least_peak, progress.part(k, len(tiles))))
 
     def _solve_tile(
@@ -138,26 +160,33 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
 
         least_peak : lower bound of the brightest pixel of all tiles [W/mm²/sr]
         """
-        scene, lens = view.scene, view.lens
+        scene, lens, specular = view.scene, view.lens, view.specular
         # The surface form ignores the border of the image-plane stop: pixels that it cuts take lines of sight.
         inside, cut = window.field_stop(lens)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
-            known = surface_form.solve(scene, lens, window, quadrature, None, least_peak, progress)
+            known = surface_form.solve(scene, lens, window, quadrature, None, least_peak, progress, specular)
             return _with_dark_coverage(known, view, window)
         narrow = narrow_light()
         where, peak = inside, least_peak
         if not everywhere:
             where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
             peak = max(narrow.brightest / 2, least_peak)
+        if specular and specular.bending:  # the surface form follows light straight to the lens alone
+            where = np.zeros(window.shape, bool)
         if where.any():
-            known = surface_form.solve(scene, lens, window, quadrature, where, peak, progress.part(0, 2))
+            known = surface_form.solve(scene, lens, window, quadrature, where, peak, progress.part(0, 2), specular)
             known = _with_dark_coverage(known, view, window)
             rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak, progress.part(1, 2))
             solution = known.completed_by(rest)
         else:
             solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, None, least_peak, progress)
-        return replace(solution, error=np.maximum(solution.error, _missed(narrow, where, cut, window, lens, solution)))
+        missed = _missed(narrow, where, cut, window, lens, solution)
+        if specular and specular.bending and narrow.on_pixels.any():
+            # Where a mirror or glass shows a narrow spot is not known.
+            there = window.seen_in(specular.bending, lens)
+            missed = np.maximum(missed, window.expand(there * UNCERTAINTY * narrow.on_pixels.max() * lens.etendue))
+        return replace(solution, error=np.maximum(solution.error, missed))
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or a robust copy if it loses rays; tested once, and again if the geometry of a copy changes."""
@@ -176,10 +205,11 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             self._robust = old = RobustCopy(robust, state, positions)
         return old.scene
 
-    def _visible_window(self, scene: mi.Scene, lens: mi.Sensor, everywhere: bool) -> Window:
-        """Window of the pixels that can see an emitter, or of all `everywhere`; cached."""
+    def _visible_window(self, scene: mi.Scene, lens: mi.Sensor, everywhere: bool, bending: Boxes) -> Window:
+        """Window of the pixels that can see an emitter or a `bending` shape, or of all `everywhere`; cached."""
         boxes = glowing_boxes(scene)
-        return self._window.recall((boxes, _view(lens), everywhere), lambda: window_of(boxes, lens, everywhere))
+        state = (boxes, bending, _view(lens), everywhere)
+        return self._window.recall(state, lambda: window_of(boxes, lens, everywhere, bending))
 
     def _faces_of(self, scene: mi.Scene) -> FaceTable | None:
         """Table of the scene's faces, None if `FaceTable.of` gives none; cached."""
@@ -187,12 +217,14 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         edition = edition_of(shapes)
         return None if edition is None else self._faces.recall(edition, lambda: FaceTable.of(shapes))
 
-    def _narrow_light(self, scene: mi.Scene, lens: mi.Sensor, window: Window) -> NarrowLight:
+    def _narrow_light(self, view: View, window: Window) -> NarrowLight:
         """Light of objects and spots that lines of sight may miss; cached."""
+        scene, lens, specular = view.scene, view.lens, view.specular
         emitters = scene.emitters()
         editions = [(mark_of(emitter), getattr(emitter, "edition", 0)) for emitter in emitters]
-        state = (editions, glowing_boxes(scene), _poses(scene.shapes()), _view(lens), window)
-        return self._narrow.recall(state, lambda: narrow_light(points_on_surfaces(scene, lens), window))
+        through = specular.state() if specular else ()
+        state = (editions, glowing_boxes(scene), _poses(scene.shapes()), through, _view(lens), window)
+        return self._narrow.recall(state, lambda: narrow_light(points_on_surfaces(scene, lens, specular), window))
 
     def render(
         self,
@@ -207,7 +239,18 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
         solution = self.solve(scene, sensor)
+        self._tell_left_out(scene, sensor)
         return mi.TensorXf(solution.power[..., None].astype(np.float32))
+
+    def _tell_left_out(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Log a warning about light that is left out, once as long as shapes and lens stay."""
+        shapes = scene.shapes()
+        state = ([shape_number(shape) for shape in shapes], [_pose(shape) for shape in shapes], _view(sensor))
+        found = self._left_out.recall(state, lambda: self.light_left_out(scene, sensor))
+        warning = found.warning(self.quadrature.rtol) if found else None
+        if warning and not found.told:
+            mi.Log(mi.LogLevel.Warn, f"fspt_integral: {warning}.")
+            found.told = True
 
     def to_string(self) -> str:
         return f"FsptIntegral[{self.quadrature}]"
@@ -223,6 +266,15 @@ def _refuse_meaningless(props: mi.Properties) -> None:
             )
 
 
+def _refuse_bending(specular: Specular | None, quadrature: Quadrature) -> None:
+    """Raise SceneError for the surface form where light reaches the lens by reflection or refraction."""
+    if quadrature.domain == "surface" and specular and specular.bending:
+        raise SceneError(
+            f"fspt_integral: 'domain' = surface follows light straight to the lens, but {', '.join(specular.names)} "
+            "reflects or refracts it. Set it to pupil."
+        )
+
+
 def _quadrature_of(props: mi.Properties) -> Quadrature:
     """Quadrature from the integrator's parameters; SceneError if one is wrong."""
     defaults = Quadrature()
@@ -235,6 +287,7 @@ def _quadrature_of(props: mi.Properties) -> Quadrature:
             domain=str(props.get("domain", defaults.domain)),
             pixel=str(props.get("pixel", defaults.pixel)),
             max_nodes=props.get("max_nodes", defaults.max_nodes),
+            max_specular=props.get("max_specular", defaults.max_specular),
             shortcuts_off=frozenset() if shortcuts else frozenset(SHORTCUTS),
         )
 
@@ -281,7 +334,8 @@ def _poses(shapes: list[mi.Shape]) -> list[tuple[float, ...]]:
 
 def _pose(shape: mi.Shape) -> tuple[float, ...]:
     """Bounding box of a shape, with the index of its vertex buffer or the matrix of its `to_world`."""
-    box = (*shape.bbox().min, *shape.bbox().max)
+    own = box_of([shape])
+    box = (*own.min, *own.max)
     if shape.is_mesh():
         return (buffers(shape)[0].index, *box)
     parameters = mi.traverse(shape)

@@ -264,6 +264,11 @@ class FsptLens(mi.Sensor):
         nearest = float((ends * axis).min(axis=0).sum() + offset)
         return min(max(CLEAR * nearest, 0.0), MOST_CLEAR * self.optics.focus_distance)
 
+    def farthest_depth(self, points: NDArray[np.float64]) -> float:
+        """Depth [mm] of the farthest of world points (n, 3)."""
+        axis, offset = self._to_camera[2, :3], self._to_camera[2, 3]
+        return float((points @ axis).max() + offset)
+
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; radius inf: unbounded."""
         # A rotated sphere gives no finite position for a few of its points: z = -inf makes their discs unbounded.

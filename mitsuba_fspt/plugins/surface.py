@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import drjit as dr
 import mitsuba as mi
 
@@ -90,6 +93,17 @@ class FsptSurface(mi.Emitter):
         """Discard all results that depend on J_n."""
         self._positions = self._source = None
         self.edition += 1
+
+    @contextmanager
+    def shining(self, value: float) -> Iterator[None]:
+        """Context manager: within the block J_n is `value` [W/mm²] everywhere."""
+        own, self.exitance = self.exitance, exitance.uniform(value)
+        self._forget_exitance()
+        try:
+            yield
+        finally:
+            self.exitance = own
+            self._forget_exitance()
 
     # ------------------------------------------------------------------ radiance
 

@@ -8,20 +8,46 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..runtime.errors import SceneError
+from ..runtime.numbers import whole
+
 if TYPE_CHECKING:
     import mitsuba as mi
 
+METHODS = ("path", "ptracer")
 ALIKE = 3.0  # the errors of neighbouring pixels with the same view differ by less than this factor
 FEW = 20  # events on a pixel, below which its own passes estimate the variance badly
 Plane = NDArray[np.float64]
 
 
-def tracer(method: str) -> mi.Integrator:
-    """Mitsuba's integrator `path` or `ptracer` with one ray per sample."""
+def tracer(method: str, scene: mi.Scene, lens: mi.Sensor, max_depth: int | None = None) -> mi.Integrator:
+    """Mitsuba's integrator `path` or `ptracer` that follows light over `max_depth` legs.
+
+    One leg goes from the surface straight into the lens, which is all light in free space; each further one takes a
+    surface that reflects light or lets it through. None: as many as the scene's specular surfaces need.
+
+    Raises
+    ------
+    SceneError : `max_depth` is no whole number >= 1; or `ptracer` cannot show the light of specular surfaces.
+    """
     import mitsuba as mi
 
-    # Depth 1 is light that goes from the surface straight into the lens, which is all light in free space.
-    return mi.load_dict({"type": method, "max_depth": 1})
+    from ..integral.quadrature import Quadrature
+    from ..integral.specular import Specular
+
+    specular = Specular.of(scene, lens)
+    if specular and method == "ptracer":
+        raise SceneError(
+            f"render: method ptracer cannot connect light to the lens through or off the specular shapes "
+            f"{', '.join(specular.names)}. Give method path."
+        )
+    if max_depth is None:
+        own = getattr(scene.integrator(), "quadrature", Quadrature())
+        max_depth = 1 + own.max_specular if specular else 1
+    max_depth = whole("render: 'max_depth'", max_depth, SceneError, "3")
+    if max_depth < 1:
+        raise SceneError(f"render: 'max_depth' must be >= 1, got {max_depth}. Give 1 for light straight to the lens.")
+    return mi.load_dict({"type": method, "max_depth": max_depth})
 
 
 def passes(

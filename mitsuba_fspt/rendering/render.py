@@ -24,12 +24,13 @@ from ..runtime.interrupt import ctrl_c_noted
 from ..runtime.numbers import whole
 from ..runtime.plugin_types import is_integral
 from . import monte_carlo
+from .provenance import origin_of
 from .scene import loaded
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-METHODS = ("integral", "path", "ptracer")
+METHODS = ("integral", *monte_carlo.METHODS)
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples of one pass
 DARK = (
@@ -48,8 +49,10 @@ def render(
     domain: str | None = None,
     pixel: str | None = None,
     max_nodes: int | None = None,
+    max_specular: int | None = None,
     shortcuts: bool = True,
     spp: int | None = None,
+    max_depth: int | None = None,
     seed: int | None = None,
     progress: Progress | None = None,
 ) -> Image:
@@ -60,14 +63,16 @@ def render(
     scene : Mitsuba scene, or what `load` takes
     method : 'integral' (Eq. 9, deterministic), 'path' or 'ptracer' (Monte Carlo); None takes the scene's own
     sensor : number of the sensor, an `fspt_lens`
-    rtol, domain, pixel, max_nodes : accuracy of the integral, see `Quadrature`; None takes the scene's own
+    rtol, domain, pixel, max_nodes, max_specular : of the integral, see `Quadrature`; None takes the scene's own
     shortcuts : False takes no shortcut of the integral, see `SHORTCUTS`; True takes the scene's own setting
     spp : Monte Carlo samples per pixel, >= 2 (default 256); the error is the standard error of independent passes, and
         on a pixel where no sample met light, but one could have, about the power of a single sample
+    max_depth : legs of light that path and ptracer follow (default 1, where specular surfaces lead on 1 + max_specular)
     seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
     progress : function called with the name of the stage and the share done, 0 … 1
 
-    The metadata say in `warnings`, if anything, that `rtol` was not reached or that the picture is dark.
+    The metadata say in `warnings`, if anything, that `rtol` was not reached, that light after a scattering reflection
+    is left out, or that the picture is dark.
 
     Raises
     ------
@@ -77,28 +82,51 @@ def render(
     backend.ensure_variant()
     sensor = whole("render: 'sensor'", sensor, SceneError, "0")
     lens = sensor_of(scene, sensor)
-    integrator = integrator_of(scene, method)
-    accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
-    deterministic = is_integral(integrator)
-    other = {"spp": spp, "seed": seed} if deterministic else accuracy | {"shortcuts": None if shortcuts else False}
-    _refuse(other, "integral" if deterministic else "Monte Carlo")
+    accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes, "max_specular": max_specular}
     accuracy["shortcuts_off"] = None if shortcuts else frozenset(SHORTCUTS)
+    integrator = _integrator(scene, lens, method, accuracy, {"spp": spp, "seed": seed}, max_depth)
     start = time.perf_counter()
     with ctrl_c_noted() as check_interrupt:
-
-        def report(stage: str, share: float) -> None:
-            check_interrupt()
-            if progress:
-                progress(stage, share)
-
-        if deterministic:
+        report = _reporting(progress, check_interrupt)
+        if is_integral(integrator):
             *planes, how = _integrate(scene, lens, integrator, accuracy, report)
         else:
             spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
             *planes, how = _sample(scene, lens, integrator, spp, seed, report)
         check_interrupt()
-    how |= {"wall_time": time.perf_counter() - start} | ({} if planes[0].any() else {"warnings": DARK})
-    return Image(*planes, {"scene": scene.id(), "sensor": sensor, **how, **lens.numbers(), **_versions()})
+    how |= {"wall_time": time.perf_counter() - start}
+    if not planes[0].any():
+        how["warnings"] = DARK
+    origin = {"scene": scene.id(), "sensor": sensor, **origin_of(scene, lens)}
+    return Image(*planes, {**origin, **how, **lens.numbers(), **_versions()})
+
+
+def _reporting(progress: Progress | None, check_interrupt: Callable[[], None]) -> Progress:
+    """Function that reports to `progress`, if there is one, and ends the work after Ctrl-C."""
+
+    def report(stage: str, share: float) -> None:
+        check_interrupt()
+        if progress:
+            progress(stage, share)
+
+    return report
+
+
+def _integrator(
+    scene: mi.Scene, lens: mi.Sensor, method: str | None, accuracy: dict, sampling: dict, max_depth: int | None
+) -> mi.Integrator:
+    """Integrator of a method; SceneError for a method or a setting that does not exist or does not belong to it."""
+    if method in monte_carlo.METHODS:
+        integrator = monte_carlo.tracer(method, scene, lens, max_depth)
+    else:
+        _refuse({"max_depth": max_depth}, "the integral or the scene's own integrator")
+        integrator = integrator_of(scene, method)
+    if is_integral(integrator):
+        _refuse(sampling, "integral")
+    else:
+        off = accuracy["shortcuts_off"] is not None
+        _refuse(accuracy | {"shortcuts_off": None, "shortcuts": False if off else None}, "Monte Carlo")
+    return integrator
 
 
 def _integrate(
@@ -113,11 +141,17 @@ def _integrate(
     how = {"method": "integral", **asdict(quadrature), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
     how["shortcuts_off"] = ", ".join(sorted(quadrature.shortcuts_off)) or "nothing"
     how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
+    warnings = []
     pixels, largest = solution.beyond(quadrature.rtol)
     if pixels:
-        how["warnings"] = (
+        warnings.append(
             f"rtol {quadrature.rtol:g} not reached on {pixels} pixels (largest error {largest:.1e} of the peak)"
         )
+    if (left_out := integrator.light_left_out(scene, lens, quadrature)) is not None:
+        how["light_left_out"], how["light_left_out_error"] = left_out.share, left_out.error
+        warnings += filter(None, [left_out.warning(quadrature.rtol)])
+    if warnings:
+        how["warnings"] = "; ".join(warnings)
     return solution.power, solution.error, solution.coverage, how
 
 
@@ -206,11 +240,11 @@ def _check_kind(scene: object) -> None:
 
 
 def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
-    """Integrator of a method of `METHODS`; of None or 'integral' the scene's own, if it fits.
+    """Integrator of the scene's own method (None), or of 'integral': the scene's own, if it fits.
 
     Raises
     ------
-    SceneError : there is no such method, or the scene's own integrator gives no power.
+    SceneError : the method is another one, or the scene's own integrator gives no power.
     """
     import mitsuba as mi
 
@@ -226,9 +260,7 @@ def integrator_of(scene: mi.Scene, method: str | None) -> mi.Integrator:
         return own
     if method in (None, "integral"):
         return own if is_integral(own) else mi.load_dict({"type": "fspt_integral"})
-    if method not in METHODS:
-        raise SceneError(f"render: 'method' must be one of {', '.join(METHODS)}, got '{method}'.")
-    return monte_carlo.tracer(method)
+    raise SceneError(f"render: 'method' must be one of {', '.join(METHODS)}, got '{method}'.")
 
 
 def _require_light(scene: mi.Scene, integrator: mi.Integrator) -> None:

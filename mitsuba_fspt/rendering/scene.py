@@ -14,6 +14,7 @@ import numpy as np
 from ..runtime import backend
 from ..runtime.errors import SceneError
 from ..runtime.interrupt import ctrl_c_noted
+from .provenance import remember_defaults
 from .scene_rules import check_text
 from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 
@@ -59,6 +60,7 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
         path = _path_of(scene)
         folder, parse = path.resolve().parent, _parser_of_file(path, parameters)
     config = mi.parser.ParserConfig(mi.variant())
+    config.merge_meshes = False  # shapes keep their ids, and rectangles their bounding boxes
     resolver = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(resolver))
     mi.file_resolver().prepend(str(folder))
@@ -74,7 +76,17 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
         mi.set_file_resolver(resolver)
     loaded = loaded[0] if isinstance(loaded, list) else loaded
     probe_beside(loaded)
+    remember_defaults(loaded, _values(scene, parameters))
     return loaded
+
+
+def _values(scene: object, parameters: Mapping[str, object]) -> dict[str, str]:
+    """Texts of all `<default>` parameters of a scene as `load` takes it, with these values given."""
+    if isinstance(scene, Mapping):
+        return {}
+    given = _texts(parameters)
+    xml = read_text(str(scene), given) if is_text(scene) else read_xml(_path_of(scene), given)
+    return xml.defaults | given
 
 
 def _path_of(scene: object) -> Path:

@@ -36,6 +36,10 @@ class DetectorError(FsptError):
     """A detector parameter, or a parameter of an exposure, outside its range."""
 
 
+class TransportError(FsptError):
+    """A transport matrix that cannot be made, stored, read, or applied to what is given."""
+
+
 @contextmanager
 def named(thing: str) -> Iterator[None]:
     """Context manager: puts `thing: ` before the message of an FsptError that its block raises."""

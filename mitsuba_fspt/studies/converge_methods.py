@@ -96,11 +96,15 @@ def _surfaces_and_pupil(scene: mi.Scene, lens: mi.Sensor) -> tuple[bool, str]:
     """Whether light can be traced from the surfaces to the pupil, and if not, why."""
     import mitsuba as mi
 
+    from ..integral.specular import Specular
+
     if lens.optics.model.name == "pinhole":
         return False, "a pinhole is no disc that light from the surface could meet"
     for emitter in scene.emitters():
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
             return False, f"the emitter {emitter.class_name()} has no surface"
+    if specular := Specular.of(scene, lens):
+        return False, f"light reaches the lens through or off specular shapes: {', '.join(specular.names)}"
     return True, ""
 
 
@@ -167,7 +171,7 @@ def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float
     from ..emission.face_probe import probe_beside
 
     probe_beside(scene)
-    integrator, seed = tracer(kind), itertools.count(1)
+    integrator, seed = tracer(kind, scene, lens), itertools.count(1)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
 
     def prepare(spp: float) -> Callable[[], Picture]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     import mitsuba as mi
 
+    from ..integral.left_out import LeftOut
     from ..integral.quadrature import Quadrature
     from ..integral.solution import Solution
 
@@ -101,6 +102,8 @@ def explain(
         without = replace(quadrature, shortcuts_off=quadrature.shortcuts_off | {finding.name})
         saved = _saved(solve, quadrature, without) if finding.taken else ()
         rows.append(_row(finding, *saved))
+    if (left_out := integrator.light_left_out(scene, lens, quadrature)) is not None:
+        rows.append(_scattered(left_out))
     return rows + _never_done(scene, variant)
 
 
@@ -123,6 +126,13 @@ def _saved(
 
 def _row(finding: Finding, *saved: float) -> Explanation:
     return Explanation(SHORTCUTS[finding.name], finding.taken, finding.why, *saved)
+
+
+def _scattered(left_out: LeftOut) -> Explanation:
+    """Row for the light that Eq. 9 has no term for."""
+    share, error = 100 * left_out.share, 100 * left_out.error
+    why = f"about {share:.2g} % (± {error:.1g} %) of the power, from {', '.join(left_out.bodies) or 'points and beams'}"
+    return Explanation("light after a scattering reflection", True, why)
 
 
 def _never_done(scene: mi.Scene, variant: str) -> list[Explanation]:

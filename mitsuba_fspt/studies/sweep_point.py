@@ -74,16 +74,20 @@ def points(
         value that is no number where the scene needs one, a scene that cannot be read.
     OpticsError : a lens that cannot exist.
     """
-    texts = {name: _texts(name, given) for name, given in values.items()}
+    texts = {name: texts_of(name, given, "sweep") for name, given in values.items()}
     if not texts:
         raise SceneError(f"sweep: no parameter to vary over {scene}. Give one, for example -D f_number=2.8,5.6.")
     every = [dict(zip(texts, one, strict=True)) for one in itertools.product(*texts.values())]
     digests: dict[Path, str] = {}
-    return [_point(scene, parameters, digests, dict(settings), suffix) for parameters in every]
+    return [point_of(scene, parameters, digests, dict(settings), suffix) for parameters in every]
 
 
-def _point(
-    scene: Path, parameters: dict[str, str], digests: dict[Path, str], settings: dict[str, Setting], suffix: str
+def point_of(
+    scene: Path,
+    parameters: dict[str, str],
+    digests: dict[Path, str],
+    settings: dict[str, Setting],
+    suffix: str = ".exr",
 ) -> SweepPoint:
     """The point of these parameters, checked; `digests` as of `SceneSource`."""
     check_parameters(scene, parameters)
@@ -99,16 +103,19 @@ def _point(
     return SweepPoint(str(path), path.absolute(), parameters, lens, settings, geometry, fingerprint, suffix)
 
 
-def _texts(name: str, given: object) -> list[str]:
-    """Values of a parameter as text in a scene file; `given` is a list of them or one value."""
+def texts_of(name: str, given: object, verb: str) -> list[str]:
+    """Values of a parameter as text in a scene file; `given` is a list of them or one value.
+
+    Raises SceneError, in the name of `verb`, for no value, an empty one or one given twice.
+    """
     several = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and getattr(given, "ndim", 1) > 0
     values = list(given) if several else [given]  # type: ignore[call-overload]
     texts = [parameter_text(value).strip() for value in values]
     if not texts or "" in texts:
-        raise SceneError(f"sweep: parameter '{name}' has an empty value. Give values between commas: -D {name}=1,2.")
+        raise SceneError(f"{verb}: parameter '{name}' has an empty value. Give values between commas: -D {name}=1,2.")
     twice = [text for text in texts if texts.count(text) > 1]
     if twice:
-        raise SceneError(f"sweep: parameter '{name}' has the value '{twice[0]}' twice. Leave one out.")
+        raise SceneError(f"{verb}: parameter '{name}' has the value '{twice[0]}' twice. Leave one out.")
     return texts
 
 

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
@@ -56,7 +56,7 @@ def ctrl_c_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _lost_workers(point: SweepPoint) -> BackendError:
+def _lost_workers(point: Any) -> BackendError:
     """The error of a point that ended every process which rendered it."""
     return BackendError(
         f"sweep: {TRIES} worker processes died at {point.label}. Give it more memory, or fewer jobs at a time."
@@ -172,12 +172,20 @@ def _end_with_parent() -> None:
 def images_of_cluster(
     points: list[SweepPoint], scheduler: str, jobs: int | None
 ) -> Iterator[tuple[SweepPoint, Image | FsptError]]:
-    """Points and their images in the order they are finished, from the workers of the scheduler at this address.
+    """Points and their images in the order they are finished; parameters and errors as of `results_of_cluster`."""
+    yield from results_of_cluster(points, scheduler, jobs, _image)
+
+
+def results_of_cluster(
+    points: list[Any], scheduler: str, jobs: int | None, work: Callable[[Any, int | None], Any]
+) -> Iterator[tuple[Any, Any]]:
+    """Points and what `work` makes of each, in the order they are finished, by workers of the scheduler at an address.
 
     'local' starts a scheduler and `jobs` workers on this machine. When a worker ends, its points are tried again.
+    `work` takes a point, which has a `label`, and a number of threads, None for that of the worker.
 
-    Instead of an image: the FsptError that the rendering raised, or BackendError where the point ended every worker
-    that tried it.
+    Instead of a result: the FsptError that `work` returned, or BackendError where the point ended every worker that
+    tried it.
 
     Raises
     ------
@@ -187,19 +195,19 @@ def images_of_cluster(
     from distributed import KilledWorker, as_completed
 
     with _local(jobs or os.cpu_count() or 1) if scheduler == "local" else _remote(scheduler) as (client, threads):
-        futures = {client.submit(_image, point, threads, pure=False): point for point in points}
+        futures = {client.submit(work, point, threads, pure=False): point for point in points}
         for future in as_completed(list(futures)):
             point = futures.pop(future)
             try:
-                image = future.result()
+                result = future.result()
             except KilledWorker:
-                image = _lost_workers(point)
+                result = _lost_workers(point)
             except CancelledError as error:
                 raise BackendError(
                     f"sweep: the scheduler '{scheduler}' has gone. Start it and its workers again, and then the sweep."
                 ) from error
             future.release()
-            yield point, image
+            yield point, result
 
 
 def require_dask() -> None:

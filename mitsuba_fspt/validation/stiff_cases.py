@@ -7,7 +7,9 @@ brightest pixel.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from .stability import Case
 from .stiff_scenes import (
@@ -28,9 +30,11 @@ from .stiff_scenes import (
     mesh,
     moved,
     moved_cone_error,
+    pane,
     pinhole_limit_error,
     pinhole_vertex_error,
     pixel_grid,
+    plate,
     rotation_error,
     scaled_exitance_error,
     sliver_error,
@@ -63,6 +67,7 @@ def cases() -> list[Case]:
         *exitance_cases(),
         *mesh_cases(),
         *object_cases(),
+        *specular_cases(),
         *pose_cases(),
         *film_cases(),
     ]
@@ -183,6 +188,32 @@ def object_cases() -> list[Case]:
         Case("two coincident surfaces", REFUSAL, lambda: cone_error(one, two), None),
         Case("a surface 0.01 mm before another", CONE, lambda: cone_error(before, one), EXACT),
         Case("body smaller than its blur", "overlap of two circles", small_disk_error, 3e-3),
+    ]
+
+
+def specular_cases() -> list[Case]:
+    """Panes, plates, mirrors between lens and surface: at an index of 1 or a reflectance of 1 they change nothing."""
+    null, mirror = {"type": "null"}, {"type": "conductor", "material": "none"}
+    mask = {"type": "mask", "opacity": 0.75, "nested": {"type": "diffuse"}}
+    beside = disk(80, 600, x=300, tilt=90)  # its mirror image faces the lens
+
+    def behind(*bodies: Any, **settings: Any) -> Callable[[], float]:
+        return lambda: cone_error(disk(FOCUS, 200), *bodies, **settings)
+
+    return [
+        *(
+            Case(f"null surface {gap:g} mm before the surface", CONE, behind(pane(FOCUS - gap, null)), EXACT)
+            for gap in (1e-3, 1.0, 160.0)
+        ),
+        Case("six null surfaces", CONE, behind(*(pane(20.0 + 20 * k, null, tilt=8 * k) for k in range(6))), EXACT),
+        Case("mask that lets a quarter through", CONE, behind(pane(80, mask), share=0.25), EXACT),
+        Case("null surface at grazing incidence", CONE, behind(pane(80, null, tilt=85)), EXACT),
+        *(
+            Case(f"plate of index 1, {thickness:g} mm thick", CONE, behind(plate(80, thickness, 1.0)), EXACT)
+            for thickness in (1e-2, 10.0)
+        ),
+        Case("mirror at 45°", CONE, lambda: cone_error(beside, pane(80, mirror, tilt=45)), EXACT),
+        Case("lens inside a chamber of index 1", CONE, behind(plate(-50, 150, 1.0)), EXACT),
     ]
 
 

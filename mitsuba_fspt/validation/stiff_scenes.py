@@ -92,6 +92,35 @@ def sphere(z: float, radius: float, x: float = 0.0, y: float = 0.0, exitance: fl
     return shape_at
 
 
+def pane(z: float, bsdf: dict[str, Any], tilt: float = 0.0, size: float = 400.0) -> SceneObject:
+    """Square without J_n around (0, 0, z) that faces the lens, rotated about the vertical by `tilt` degrees."""
+
+    def shape_at(pose: mi.ScalarTransform4f) -> dict[str, Any]:
+        import mitsuba as mi
+
+        own = mi.ScalarTransform4f().translate([0, 0, z]).rotate([0, 1, 0], 180 - tilt).scale(size)
+        return {"type": "rectangle", "to_world": pose @ own, "bsdf": bsdf}
+
+    return shape_at
+
+
+def plate(z: float, thickness: float, index: float) -> SceneObject:
+    """Plate of glass whose front lies at depth z."""
+
+    def shape_at(pose: mi.ScalarTransform4f) -> dict[str, Any]:
+        import mitsuba as mi
+
+        half = thickness / 2
+        own = mi.ScalarTransform4f().translate([0, 0, z + half]).scale([400, 400, half])
+        return {
+            "type": "cube",
+            "to_world": pose @ own,
+            "bsdf": {"type": "dielectric", "int_ior": index, "ext_ior": 1.0},
+        }
+
+    return shape_at
+
+
 def mesh(vertices: ArrayLike, faces: ArrayLike, exitance: float | Plane = 1.0) -> SceneObject:
     """Triangles with vertices (V, 3) and faces (F, 3); `exitance` is one number, or of shape (V,) or (F,)."""
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.uint32)
@@ -237,13 +266,15 @@ def pixel_error(picture: Plane, truth: Plane) -> float:
     return float(error.max())
 
 
-def cone_error(*objects: SceneObject, nodes: int = 4, film: tuple[int, int] | None = None, **lens: float) -> float:
-    """Pixel error of a picture in which 1 W/mm² fills every cone, against the closed form."""
+def cone_error(
+    *objects: SceneObject, nodes: int = 4, film: tuple[int, int] | None = None, share: float = 1.0, **lens: float
+) -> float:
+    """Pixel error of a picture in which 1 W/mm² fills every cone, against `share` times the closed form."""
     focal, stop = lens.get("focal_length", FOCAL), lens.get("f_number", F_NUMBER)
     t = lens.get("magnification") or focal / (lens.get("focus_distance", FOCUS) - focal)
     side, focus = lens.get("pixel_pitch", PITCH) / t, focal * (1 + 1 / t)
     picture = power(scene(*objects, film=film or (WIDTH, HEIGHT), **lens), rtol=EXACT)
-    return pixel_error(picture, filled_cones(focus, side, focal / stop / 2, nodes, film))
+    return pixel_error(picture, share * filled_cones(focus, side, focal / stop / 2, nodes, film))
 
 
 def balance_error(z: float, radius: float, domain: str = "pupil", rtol: float = 10 * EXACT, **lens: float) -> float:

@@ -208,7 +208,7 @@ def test_a_transect_is_split_where_it_enters_one_body_leaves_it_for_another_and_
 
     s = (np.tile(np.arange(points), number) + 0.5) / points * 2 - 1
     position, pupil, density = curves(points).at(mi.Float(s))
-    light = np.array(view.integrand(position, pupil)[0] * density, np.float64)
+    light = np.array(view.integrand(position, pupil).integrand * density, np.float64)
     expected = 2 * light.reshape(number, points).mean(axis=1)
     along = node_rules.AlongTransect(scan=24, bisections=16, nodes=6)
     phase = mi.Float(node_rules.transects(24).phase[:number])

@@ -19,9 +19,11 @@ class ExitLaw:
     """Base class of the exit laws. `profile` is L/J_n [1/sr], with ∫ L cosθ dΩ = J_n over the outward hemisphere.
 
     isotropic : the radiance is equal in all outward directions, so that J_n alone determines it
+    linear : the profile is known without J_n and the fluence, so that the radiance is linear in J_n
     """
 
     isotropic: ClassVar[bool] = False
+    linear: ClassVar[bool] = True
 
     @classmethod
     def of(cls, props: mi.Properties) -> ExitLaw:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +30,8 @@ class LastFlight(ExitLaw):
     ------
     FluxError : a number of the medium is out of its range.
     """
+
+    linear: ClassVar[bool] = False
 
     def __init__(self, medium: Medium, fluence: mi.Volume) -> None:
         self.medium, self.fluence = medium, fluence

@@ -1,0 +1,126 @@
+"""`fspt matrix`: the transport matrix of a scene for several views."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from ..runtime.backend import quiet_mitsuba
+from ..runtime.errors import TransportError
+from .options import SceneFile, require_picture, require_writable, value_lists
+from .terminal import Interrupted, progress_bar
+
+if TYPE_CHECKING:
+    from ..inverse.transport_matrix import TransportMatrix
+
+
+def matrix(
+    scene: SceneFile,
+    define: Annotated[
+        list[str] | None,
+        typer.Option(
+            "-D",
+            "--define",
+            metavar="NAME=V1,V2,...",
+            help="Values for a <default> of the scene, or start:stop:step with stop left out; repeatable.",
+        ),
+    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write, .npz.")] = None,
+    on: Annotated[str, typer.Option(help="vertex (J_n linear on faces) or face.")] = "vertex",
+    rtol: Annotated[float, typer.Option(help="Error of T @ J relative to the brightest pixel.")] = 1e-3,
+    sensor: Annotated[str | None, typer.Option(metavar="0,1,...", help="Sensors of the scene, a view each.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    png: Annotated[bool, typer.Option("--png", help="Also a picture of the sensitivity in the views.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+) -> None:
+    """Write the matrix from J_n on a mesh [W/mm2] to the power on the pixels of all views [W].
+
+    Lists of values are multiplied out to views, the last one fastest. Run
+    again after an interrupt, it goes on with the next view.
+    """
+    from ..inverse.transport import transport
+
+    file = output or Path(f"{scene.stem}.npz")
+    require_writable(file, ".npz", TransportError)
+    picture = file.with_suffix(".png")
+    if png:
+        require_picture(picture)
+    start = time.perf_counter()
+    with _resumable(file), progress_bar() as progress:
+        quiet_mitsuba()
+        found = transport(
+            scene,
+            on=on,
+            rtol=rtol,
+            sensor=None if sensor is None else _numbers(sensor),
+            file=file,
+            scheduler=scheduler,
+            progress=progress,
+            **value_lists(define),
+        )
+    summary = _summary(found, file, time.perf_counter() - start)
+    if png:
+        from ..inverse.sensitivity_picture import write_sensitivity
+
+        write_sensitivity(found, picture)
+        summary["picture"] = str(picture)
+    if not quiet:
+        typer.echo(json.dumps(summary) if as_json else _text(summary))
+
+
+@contextmanager
+def _resumable(file: Path) -> Iterator[None]:
+    """Ctrl-C in the block raises `Interrupted`, which says that the same command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt as cause:
+        raise Interrupted(
+            f"interrupted; finished views stay in {file}.views, the same command goes on from there."
+        ) from cause
+
+
+def _numbers(text: str) -> list[int]:
+    """Whole numbers between commas; TransportError for anything else."""
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError as cause:
+        raise TransportError(f"--sensor {text}: must be whole numbers, for example 0,1.") from cause
+
+
+def _summary(matrix: TransportMatrix, file: Path, seconds: float) -> dict[str, Any]:
+    """Numbers about a matrix and its making."""
+    per_area = np.divide(matrix.sensitivity, matrix.areas, out=np.zeros_like(matrix.areas), where=matrix.areas > 0)
+    seen = matrix.seen
+    return {
+        "file": str(file),
+        "shape": list(matrix.shape),
+        "image_shape": list(matrix.image_shape),
+        "views": matrix.views,
+        "entries": matrix.entries,
+        "bytes": file.stat().st_size,
+        "seconds": round(seconds, 3),
+        # Power on the pixels over that which leaves a vertex or face.
+        "sensitivity": [float(per_area[seen].min()), float(per_area[seen].max())],
+        "seen": float(matrix.areas[seen].sum() / matrix.areas.sum()),
+    }
+
+
+def _text(summary: dict[str, Any]) -> str:
+    """The summary in two lines."""
+    views, height, width = summary["image_shape"]
+    low, high = summary["sensitivity"]
+    return (
+        f"{summary['file']}: {views} views of {width} x {height} pixels, {summary['shape'][1]} columns, "
+        f"{summary['entries']} entries, {summary['bytes'] / 1e6:.3g} MB in {summary['seconds']:.3g} s\n"
+        f"{100 * summary['seen']:.3g} % of the surface is seen; {low:.2e} to {high:.2e} of its light arrives"
+    )

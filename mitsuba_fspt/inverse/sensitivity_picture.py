@@ -1,0 +1,47 @@
+"""Picture of how sensitive all views together are to the surface, drawn in each view."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..images.picture import empty_figure, require_png
+from ..runtime.atomic_files import atomic_path
+from ..runtime.errors import ImageError
+
+if TYPE_CHECKING:
+    from .transport_matrix import TransportMatrix
+
+MOST_COLUMNS = 4
+
+
+def sensitivity_images(matrix: TransportMatrix) -> NDArray[np.float64]:
+    """Share of the light of the surface that arrives on the pixels of all views, as each pixel sees it.
+
+    (views, height, width); the mean over the pixel's lines of sight, NaN where it sees nothing.
+    """
+    per_area = np.divide(matrix.sensitivity, matrix.areas, out=np.zeros_like(matrix.areas), where=matrix.areas > 0)
+    light, weight = matrix.forward(per_area), matrix.forward(np.ones_like(per_area))
+    return np.divide(light, weight, out=np.full_like(light, np.nan), where=weight > 0)
+
+
+def write_sensitivity(matrix: TransportMatrix, path: str | os.PathLike[str]) -> None:
+    """Write `sensitivity_images` side by side to a PNG file; ImageError or BackendError where that is not possible."""
+    file = require_png(path)
+    images = sensitivity_images(matrix)
+    columns = min(len(images), MOST_COLUMNS)
+    rows = -(-len(images) // columns)
+    figure = empty_figure(width=1.2 + 2.6 * columns, height=0.5 + 2.8 * rows)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    most = np.nanmax(images)
+    for ax in axes:
+        ax.axis("off")
+    for ax, image, view in zip(axes, images, matrix.views, strict=False):
+        drawn = ax.imshow(image, vmin=0, vmax=most, cmap="viridis")
+        ax.set_title("  ".join(f"{name}={value}" for name, value in view.items()), fontsize="small")
+    figure.colorbar(drawn, ax=list(axes), label="power on all pixels / power that leaves the surface", shrink=0.8)
+    with atomic_path(file, ImageError) as temporary:
+        figure.savefig(temporary, dpi=130)

@@ -1,0 +1,190 @@
+"""Files of transport matrices: npz, not compressed, with the arrays of each view apart, so that one can be read alone.
+
+Members: `meta` (JSON: format, views, lenses, parts, …), `areas` and `sensitivity` (n,), and for view k
+`view_k/values`, `columns`, `starts`, `change`, `row_error` as in `Block`. While a matrix is made, finished views stand
+in a folder beside the file, so that an interrupted run goes on with the next one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.atomic_files import atomic_path
+from ..runtime.errors import TransportError
+from ..runtime.memory import available_memory
+from .view_block import Block
+
+if TYPE_CHECKING:
+    from .transport_matrix import TransportMatrix
+
+FORMAT = "fspt transport matrix 1"
+ARRAYS = ("values", "columns", "starts", "change", "row_error")
+KEPT_SHARE = 0.25  # of the free memory: a matrix up to that size stays in memory once it is read
+DAMAGED = (zipfile.BadZipFile, KeyError, ValueError, EOFError, OSError, json.JSONDecodeError)
+
+
+def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
+    """The matrix of a file of `TransportMatrix.save`, `transport(file=…)` or `fspt matrix`.
+
+    Views are read when they are needed; those of a matrix larger than a quarter of the free memory are read again each
+    time, one at a time.
+
+    Raises
+    ------
+    TransportError : the file does not exist, is truncated or of another format.
+    """
+    from .transport_matrix import TransportMatrix
+
+    path = Path(path)
+    if not path.is_file():
+        raise TransportError(f"transport matrix '{path}' does not exist. Check the name.")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            meta = json.loads(str(file["meta"]))
+            if meta.get("format") != FORMAT:
+                raise TransportError(
+                    f"transport matrix '{path}' has the format {meta.get('format')!r}, this version reads '{FORMAT}'. "
+                    "Make it again with 'fspt matrix'."
+                )
+            areas, sensitivity = file["areas"], file["sensitivity"]
+            missing = [f"{_name(k, a)}" for k in range(len(meta["views"])) for a in ARRAYS if _name(k, a) not in file]
+    except DAMAGED as cause:
+        if isinstance(cause, TransportError):
+            raise
+        raise _damaged(path, cause) from cause
+    if missing:
+        raise _damaged(path, KeyError(missing[0]))
+    return TransportMatrix(FileBlocks(path, meta), meta, areas, sensitivity)
+
+
+def _damaged(path: Path, cause: Exception) -> TransportError:
+    text = " ".join(str(cause).split()) or type(cause).__name__
+    return TransportError(
+        f"transport matrix '{path}' is truncated or no file of 'fspt matrix' ({text}). Make it again with that."
+    )
+
+
+class FileBlocks(Sequence[Block]):
+    """The views of a file, each read when it is needed and, if all fit well into memory, kept."""
+
+    def __init__(self, path: Path, meta: Mapping[str, Any]) -> None:
+        self._path, self._meta = path, meta
+        free = available_memory()
+        # In double precision with its columns, twice the size of the file.
+        self._kept: dict[int, Block] | None = (
+            {} if free is None or 2 * path.stat().st_size < KEPT_SHARE * free else None
+        )
+
+    def __len__(self) -> int:
+        return len(self._meta["views"])
+
+    def __getitem__(self, number: int) -> Block:  # type: ignore[override]  # no slices
+        number = range(len(self))[number]
+        if self._kept is not None and number in self._kept:
+            return self._kept[number]
+        try:
+            with np.load(self._path, allow_pickle=False) as file:
+                arrays = {name: file[_name(number, name)] for name in ARRAYS}
+        except DAMAGED as cause:
+            raise _damaged(self._path, cause) from cause
+        _, height, width = self._meta["image_shape"]
+        block = Block((height, width), int(self._meta["columns"]), **arrays)
+        if self._kept is not None:
+            self._kept[number] = block
+        return block
+
+
+def write(matrix: TransportMatrix, path: str | os.PathLike[str]) -> None:
+    """Write a matrix to an npz file, a view at a time; TransportError where it cannot be written."""
+    _write(_npz(path), matrix.blocks, matrix.metadata, matrix.areas, matrix.sensitivity)
+
+
+def _write(
+    path: Path, blocks: Sequence[Block], meta: Mapping[str, Any], areas: NDArray[Any], sensitivity: NDArray[Any]
+) -> None:
+    with atomic_path(path, TransportError) as temporary, zipfile.ZipFile(temporary, "w", allowZip64=True) as file:
+        _add(file, "meta", np.array(json.dumps(dict(meta))))
+        _add(file, "areas", areas)
+        _add(file, "sensitivity", sensitivity)
+        for number, block in enumerate(blocks):
+            for name in ARRAYS:
+                _add(file, _name(number, name), getattr(block, name))
+
+
+def _add(file: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
+    with file.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
+
+
+def _name(number: int, array: str) -> str:
+    return f"view_{number}/{array}"
+
+
+def _npz(path: str | os.PathLike[str]) -> Path:
+    """`path` with its suffix .npz checked."""
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise TransportError(f"transport: the file '{path}' must end in .npz. Give a name such as T.npz.")
+    return path
+
+
+class PartialFile(Sequence[Block]):
+    """A matrix file in the making: finished views in the folder `T.npz.views`, joined by `finish`."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        from ..runtime.atomic_files import require_place
+
+        self.path = _npz(path)
+        require_place(self.path, TransportError)
+        self.folder = self.path.with_name(self.path.name + ".views")
+        self.views = 0
+
+    def has(self, number: int, fingerprint: str) -> bool:
+        """True if a view of this fingerprint is there, whole."""
+        try:
+            with np.load(self._view(number), allow_pickle=False) as file:
+                return str(file["fingerprint"]) == fingerprint and all(name in file for name in (*ARRAYS, "shape"))
+        except DAMAGED:
+            return False
+
+    def put(self, number: int, block: Block, fingerprint: str) -> None:
+        """Keep a finished view."""
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as cause:
+            raise TransportError(
+                f"transport: the folder '{self.folder}' cannot be made: {cause.strerror}. Give another file."
+            ) from cause
+        arrays = {name: getattr(block, name) for name in ARRAYS}
+        with atomic_path(self._view(number), TransportError) as temporary, temporary.open("wb") as file:
+            np.savez(file, fingerprint=fingerprint, shape=[*block.shape, block.count], **arrays)
+
+    def __len__(self) -> int:
+        return self.views
+
+    def __getitem__(self, number: int) -> Block:  # type: ignore[override]  # no slices
+        if not 0 <= number < self.views:
+            raise IndexError(number)
+        with np.load(self._view(number), allow_pickle=False) as file:
+            height, width, count = (int(n) for n in file["shape"])
+            return Block((height, width), count, **{name: file[name] for name in ARRAYS})
+
+    def __iter__(self) -> Iterator[Block]:
+        return (self[number] for number in range(self.views))
+
+    def finish(self, meta: Mapping[str, Any], areas: NDArray[Any], sensitivity: NDArray[Any]) -> None:
+        """Join the views into the file and remove their folder."""
+        _write(self.path, self, meta, areas, sensitivity)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _view(self, number: int) -> Path:
+        return self.folder / f"view_{number}.npz"

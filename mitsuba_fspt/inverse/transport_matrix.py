@@ -1,0 +1,221 @@
+"""The transport matrix T of several views: P = T J_n, its transpose and its error, as a SciPy LinearOperator."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array, vstack
+from scipy.sparse.linalg import LinearOperator
+
+from ..images.image import Image
+from ..rendering.provenance import same_mesh
+from ..runtime.errors import TransportError
+from .view_block import Block
+
+Array = NDArray[np.float64]
+LOG = logging.getLogger("mitsuba_fspt")
+PITCH_TOLERANCE = 1e-6  # relative: of the pixel pitch, which files may hold in single precision
+
+
+class TransportMatrix(LinearOperator):
+    """Linear map from J_n [W/mm²] on the vertices or faces of meshes to the power [W] on the pixels of several views.
+
+    `T[i, j]` [mm²] is the mean over pixel i and the pupil of étendue · cos⁴θ · (law)/π · φ_j where the line of sight
+    meets the surface (Eq. M.19 of docs/model.md). Rows: views, pixel rows from the top, pixels, in C order; dark ones
+    are kept. Columns: vertices or faces of the meshes in the order of their files, one mesh after the other.
+
+    Attributes
+    ----------
+    shape : (views · height · width, n);  image_shape : (views, height, width)
+    views : one dict a view of the parameter values it was made with
+    parts : shape id → slice of columns
+    on : 'vertex' (J_n linear on every face) or 'face'
+    areas : (n,) ∫ φ_j dS [mm²], so that `areas @ J` is the total power of the surface
+    sensitivity : (n,) column sums [mm²];  seen : (n,) bool, sensitivity > 0
+    metadata : scene, rtol, versions, lens of each view, exit law and digest of each mesh
+    """
+
+    def __init__(self, blocks: Sequence[Block], metadata: Mapping[str, Any], areas: Array, sensitivity: Array) -> None:
+        self.metadata = dict(metadata)
+        self.image_shape: tuple[int, int, int] = tuple(self.metadata["image_shape"])
+        self.views: list[dict[str, Any]] = [dict(view) for view in self.metadata["views"]]
+        self.on = str(self.metadata["on"])
+        self.parts = {name: slice(*ends) for name, ends in self.metadata["parts"].items()}
+        self.areas, self.sensitivity = areas, sensitivity
+        self.blocks = blocks
+        views, height, width = self.image_shape
+        super().__init__(np.dtype(np.float64), (views * height * width, len(areas)))
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """True (n,) for vertices or faces of which light reaches a pixel."""
+        return self.sensitivity > 0
+
+    @cached_property
+    def matrix(self) -> csr_array:
+        """All views as one sparse matrix, (views · height · width, n)."""
+        return csr_array(vstack([block.matrix for block in self.blocks], format="csr"))
+
+    @property
+    def entries(self) -> int:
+        """Number of entries that are not 0."""
+        return sum(int(block.starts[-1]) for block in self.blocks)
+
+    def forward(self, exitance: ArrayLike) -> Array:
+        """Power on the pixels, (views, height, width) [W], of J_n (n,) [W/mm²]; TransportError for other input."""
+        return self._matvec(self._exitance(exitance)).reshape(self.image_shape)
+
+    def backward(self, images: ArrayLike | Sequence[Image]) -> Array:
+        """The transpose of images, (views, height, width) or one Image a view, (n,): Σ_i T[i, j] P[i].
+
+        No adjoint in the sense of areas: divide by `areas` for that. Raises TransportError for images of another size,
+        pixel pitch or unit, or in another order, as far as their metadata tell.
+        """
+        return self._rmatvec(self.images(images).ravel())
+
+    def error(self, exitance: ArrayLike) -> Array:
+        """Estimated absolute error of `forward(exitance)`, (views, height, width) [W]."""
+        given = self._exitance(exitance)
+        return np.stack([block.error(given) for block in self.blocks])
+
+    def images(self, images: ArrayLike | Sequence[Image]) -> Array:
+        """Power (views, height, width) [W] of an array, or of one Image a view after the checks of `backward`.
+
+        What differs otherwise, such as the mesh, is said in one line on stderr: real cameras know nothing of meshes.
+        """
+        if isinstance(images, Image):
+            images = [images]
+        if isinstance(images, (list, tuple)) and any(isinstance(image, Image) for image in images):
+            self._check_images(images)
+        try:
+            power = np.asarray(
+                [np.asarray(i, np.float64) for i in images] if isinstance(images, (list, tuple)) else images
+            )
+            power = power.astype(np.float64)
+        except (TypeError, ValueError) as cause:
+            raise TransportError(f"transport: images must be numbers of shape {self.image_shape}: {cause}.") from cause
+        if power.shape != self.image_shape and not (len(self.views) == 1 and power.shape == self.image_shape[1:]):
+            raise TransportError(
+                f"transport: images must have the shape {self.image_shape} (views, height, width), got {power.shape}. "
+                "Give one image a view, of the film that the matrix was made for."
+            )
+        return _finite("images", power).reshape(self.image_shape)
+
+    def _check_images(self, images: Sequence[object]) -> None:
+        """Raise TransportError where metadata of images contradict the views; say on stderr what else differs."""
+        if len(images) != len(self.views):
+            raise TransportError(
+                f"transport: {len(images)} images for {len(self.views)} views. Give one image a view, in their order."
+            )
+        notes = []
+        for number, (image, view, lens) in enumerate(zip(images, self.views, self.metadata["lenses"], strict=True)):
+            if not isinstance(image, Image):
+                continue
+            if image.shape != self.image_shape[1:]:
+                raise TransportError(
+                    f"transport: image {number} has {image.shape[1]} x {image.shape[0]} pixels, the matrix "
+                    f"{self.image_shape[2]} x {self.image_shape[1]}. Give images of the same film."
+                )
+            notes += _differences(number, image.metadata, view, lens, self)
+        for note in notes[:1]:
+            LOG.warning("fspt: %s", note)  # one line on stderr, unless a program handles it
+
+    def _exitance(self, exitance: ArrayLike) -> Array:
+        """J_n as an array (n,) of finite numbers; TransportError for anything else."""
+        try:
+            given = np.asarray(exitance, dtype=np.float64)
+        except (TypeError, ValueError) as cause:
+            raise TransportError(f"transport: J must be numbers of shape ({self.shape[1]},): {cause}.") from cause
+        if given.shape != (self.shape[1],):
+            kind = "vertices" if self.on == "vertex" else "faces"
+            raise TransportError(
+                f"transport: J must have the shape ({self.shape[1]},), one value of W/mm² for each of the {kind}, got "
+                f"{given.shape}. Columns: {', '.join(f'{k} {s.start}:{s.stop}' for k, s in self.parts.items())}."
+            )
+        return _finite("J", given)
+
+    # ------------------------------------------------------------------ SciPy's interface
+
+    def _matvec(self, x: Array) -> Array:
+        x = self._exitance(np.ravel(x))
+        return np.concatenate([block.matrix @ x for block in self.blocks])
+
+    def _rmatvec(self, x: Array) -> Array:
+        parts = np.asarray(_finite("images", np.asarray(x, np.float64))).reshape(len(self.views), -1)
+        total = np.zeros(self.shape[1])
+        for block, part in zip(self.blocks, parts, strict=True):
+            total += block.matrix.T @ part
+        return total
+
+    def _matmat(self, x: Array) -> Array:
+        return np.concatenate([block.matrix @ np.asarray(x, np.float64) for block in self.blocks])
+
+    def _rmatmat(self, x: Array) -> Array:
+        parts = np.asarray(x, np.float64).reshape(len(self.views), -1, np.shape(x)[1])
+        total = np.zeros((self.shape[1], np.shape(x)[1]))
+        for block, part in zip(self.blocks, parts, strict=True):
+            total += block.matrix.T @ part
+        return total
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an npz file, blocks a view, which `read_transport` reads; TransportError where it cannot be written."""
+        from .transport_file import write
+
+        write(self, path)
+
+    def __repr__(self) -> str:
+        views, height, width = self.image_shape
+        return f"TransportMatrix({views} views of {width} x {height} pixels, {self.shape[1]} columns on {self.on})"
+
+
+def _finite(name: str, values: Array) -> Array:
+    finite = np.isfinite(values)
+    if not finite.all():
+        raise TransportError(
+            f"transport: {name} has {int(np.sum(~finite))} values that are NaN or infinite. Replace or mask them first."
+        )
+    return values
+
+
+def _differences(
+    number: int, metadata: Mapping[str, Any], view: Mapping[str, Any], lens: Mapping[str, Any], matrix: TransportMatrix
+) -> list[str]:
+    """What differs between the metadata of an image and its view; TransportError for pixel pitch and order."""
+    pitch = metadata.get("pixel_pitch")
+    if pitch is not None and abs(float(pitch) - lens["pixel_pitch"]) > PITCH_TOLERANCE * lens["pixel_pitch"]:
+        raise TransportError(
+            f"transport: image {number} has a pixel pitch of {float(pitch):g} mm, the matrix {lens['pixel_pitch']:g} "
+            "mm. Give images of the same film."
+        )
+    notes = []
+    try:
+        made = {"sensor": metadata.get("sensor"), **json.loads(str(metadata.get("parameters", "{}")))}
+    except ValueError:
+        made = {}
+    other = {name: made[name] for name in view if made.get(name) is not None and made[name] != view[name]}
+    if other:
+        for place, one in enumerate(matrix.views):
+            if place != number and all(made.get(name) == value for name, value in one.items()):
+                raise TransportError(
+                    f"transport: image {number} was made for view {place}, {_text(one)}, not for {_text(view)}. Give "
+                    "the images in the order of the views."
+                )
+        notes.append(f"image {number} was made with {_text(other)}, its view of the matrix has {_text(view)}.")
+    digest = metadata.get("mesh_digest")
+    if digest is not None and not same_mesh(str(digest), str(matrix.metadata["mesh_digest"])):
+        notes.append(f"image {number} shows another mesh than the one of the matrix.")
+    for name in ("focal_length", "f_number", "magnification", "model"):
+        if name in metadata and name in lens and metadata[name] != lens[name] and name not in other:
+            notes.append(f"image {number} has {name} = {metadata[name]}, its view of the matrix {lens[name]}.")
+    return notes
+
+
+def _text(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in values.items())

@@ -1,0 +1,369 @@
+"""Rows of the transport matrix of one view: sparse entries, what is uncertain of them, and how they are computed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.sparse import csr_array
+
+from ..integral.quadrature import Quadrature
+from ..runtime.errors import SceneError, TransportError, named
+from ..runtime.memory import available_memory
+from ..runtime.plugin_types import is_surface
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+ON = ("vertex", "face")
+CERTAIN = 0.35  # of its estimated error: what the picture of J_n = 1 is wrong by at the most, as a rule
+ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further from it are computed by lines of sight
+ROW_LINES = 4096  # of these pixels at rtol 1e-3
+LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
+SAFETY = 2.0  # half the cells and pieces change an entry by some three times what is left; neighbours may err alike
+NEIGHBOURS = 3  # pixels across that share their errors
+BYTES = 4 + 4 + 2  # an entry: value, column, change
+WORK = 1 << 30  # bytes beside the entries
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Columns of one glowing mesh: id of its shape, their number, and the digest of the mesh in its own frame."""
+
+    name: str
+    count: int
+    digest: str
+    law: str
+    areas: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows of one view, (h · w, n), row by row from the top left pixel.
+
+    values : entries [mm²], float32
+    columns, starts : their columns, and the first entry of each row, as in a csr_array
+    change : by how much half the cells and pieces change each entry, over the entry, float16
+    row_error : error of each row's sum [mm²], (h · w), float32
+    """
+
+    shape: tuple[int, int]
+    count: int
+    values: NDArray[np.float32]
+    columns: NDArray[np.int32]
+    starts: NDArray[np.integer]
+    change: NDArray[np.float16]
+    row_error: NDArray[np.float32]
+
+    @cached_property
+    def matrix(self) -> csr_array:
+        """The rows in double precision."""
+        return self._csr(self.values.astype(np.float64))
+
+    def error(self, exitance: Array) -> Array:
+        """Estimated error (h, w) [W] of `matrix @ exitance` (n,) [W/mm²]."""
+        power = self.matrix @ exitance
+        changed = self._csr(self.values * self.change.astype(np.float64)) @ exitance
+        light, sums = self.matrix @ np.abs(exitance), self.matrix.sum(axis=1)
+        mean = self._spread(np.divide(light, sums, out=np.zeros_like(light), where=sums > 0))
+        least = self.least_error * np.abs(power).max(initial=0.0) * (self._spread(np.abs(power)) > 0)
+        return np.maximum(SAFETY * self._spread(np.abs(changed)) + self.row_error * mean, least).reshape(self.shape)
+
+    @property
+    def least_error(self) -> float:
+        """Smallest error that is stated, over the brightest pixel: the rounding of float32."""
+        return 2e-7
+
+    def _spread(self, values: Array) -> Array:
+        """The largest value of each pixel and its neighbours, (h · w)."""
+        return maximum_filter(values.reshape(self.shape), NEIGHBOURS).ravel()
+
+    def _csr(self, values: Array) -> csr_array:
+        return csr_array((values, self.columns, self.starts), shape=(len(self.starts) - 1, self.count))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return sum(value.nbytes for field in fields(self) if isinstance(value := getattr(self, field.name), np.ndarray))
+
+
+def glowing_meshes(scene: mi.Scene) -> list[mi.Emitter]:
+    """The emitters of a scene, all of them meshes whose radiance is linear in J_n.
+
+    Raises
+    ------
+    TransportError : nothing glows, an emitter is no `fspt_surface`, its shape no mesh, J_n a bitmap, or the exit law
+        depends on more than J_n; the message names the way out.
+    """
+    if not scene.emitters():
+        raise TransportError("transport: nothing glows. Give a mesh an emitter of type 'fspt_surface'.")
+    for emitter in scene.emitters():
+        if not is_surface(emitter):
+            raise TransportError(
+                f"transport: emitter {emitter.class_name()} is no fspt_surface, whose J_n the matrix takes. Leave it "
+                "out."
+            )
+        shape = emitter.get_shape()
+        if not shape.is_mesh():
+            raise TransportError(
+                f"transport: shape '{shape.id()}' is a {shape.class_name().lower()}, J_n needs the vertices or faces "
+                "of a mesh. Give a PLY, for example of trimesh.creation."
+            )
+        if emitter.exitance.class_name().startswith("Bitmap"):
+            raise TransportError(
+                f"transport: 'exitance' of shape '{shape.id()}' is a bitmap, the columns are vertices or faces. Give "
+                "J_n as a mesh attribute or a number."
+            )
+        if not emitter.law.linear:
+            raise TransportError(
+                f"transport: emission '{emitter.law.name}' of shape '{shape.id()}' depends on the fluence, not on J_n "
+                "alone. Give 'lambert' or 'fresnel'."
+            )
+    return scene.emitters()
+
+
+def parts_of(scene: mi.Scene, on: str) -> list[Part]:
+    """The columns of each glowing mesh of a scene, in the order of its emitters."""
+    from ..jit.mesh_buffers import triangles
+    from ..rendering.provenance import digest_of
+
+    found = []
+    for emitter in glowing_meshes(scene):
+        mesh = emitter.get_shape()
+        positions, faces = (buffer.numpy() for buffer in triangles(mesh))
+        vertices, corners = positions.reshape(-1, 3).astype(np.float64), faces.reshape(-1, 3)
+        a, b, c = (vertices[corners[:, k]] for k in range(3))
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        if on == "vertex":
+            area = np.bincount(corners.ravel(), np.repeat(area / 3, 3), minlength=len(vertices))
+        found.append(Part(mesh.id(), len(area), digest_of(emitter, mesh), str(emitter.law), area))
+    return found
+
+
+def block_of(
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    on: str,
+    rtol: float,
+    progress: Callable[[float], None] | None = None,
+    *,
+    most_bytes: int | None = None,
+) -> Block:
+    """Rows of one view of a scene, whatever J_n it has.
+
+    The columns come from the surface form, which conserves the light of each. Their sums over a row are then made those
+    of the picture of J_n = 1, an independent computation by the pupil form that finds silhouettes and occluders, as far
+    as the two differ by more than the picture's own error.
+
+    Raises
+    ------
+    TransportError : as `glowing_meshes`, or the memory does not suffice.
+    SceneError, OpticsError, ExitanceError : as `render`.
+    """
+    import drjit as dr
+
+    from ..integral.column_form import ColumnRule
+    from ..integral.occlusion import hides_nothing
+    from ..integral.specular import Specular
+    from ..jit.recording import recording
+    from ..rendering.render import integrator_of
+
+    emitters = glowing_meshes(scene)
+    if specular := Specular.of(scene, lens):
+        raise TransportError(
+            f"transport: light reaches the lens through or off the specular shapes {', '.join(specular.names)}, which "
+            "the matrix does not follow. Leave them out."
+        )
+    with ExitStack() as stack:
+        for emitter in emitters:
+            stack.enter_context(emitter.shining(1.0))
+        with named("fspt_integral"):
+            quadrature = Quadrature(rtol=rtol)
+        solution = integrator_of(scene, "integral").solve(scene, lens, quadrature)
+        with recording(), dr.suspend_grad():
+            alone = hides_nothing(scene)
+            counts, columns = [], []
+            for number, emitter in enumerate(emitters):
+                report = None
+                if progress:
+
+                    def report(share: float, first: float = number / len(emitters)) -> None:
+                        progress(first + share / len(emitters))
+
+                part = _columns(scene, lens, emitter, on, ColumnRule.of(rtol), alone, report, most_bytes)
+                counts.append(len(part.counts))
+                columns.append(part)
+            entries = _Entries.of(columns)
+            rough = _rough(scene, lens, entries, solution, rtol)
+            if rough.size:
+                entries = entries.with_rows(_rows(scene, lens, emitters, counts, rough, on, rtol), rough)
+    return _block(entries, sum(counts), solution, lens.etendue)
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """Entries of one view in any order: pixel, column, light over that of a filled pixel, and its change."""
+
+    pixels: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    light: Array
+    change: Array
+
+    @classmethod
+    def of(cls, parts: list[Any]) -> _Entries:
+        """Those of the columns of several meshes, one after the other."""
+        counts = np.concatenate([part.counts for part in parts])
+        pixels, light, change = (np.concatenate([getattr(p, n) for p in parts]) for n in ("pixels", "light", "change"))
+        return cls(pixels, np.repeat(np.arange(len(counts)), counts), light, change)
+
+    def with_rows(self, rows: _Entries, pixels: NDArray[np.int64]) -> _Entries:
+        """The same with the rows of these pixels replaced."""
+        replaced = np.zeros(int(max(self.pixels.max(initial=0), pixels.max())) + 1, bool)
+        replaced[pixels] = True
+        kept = ~replaced[self.pixels]
+        mine, theirs = ((e.pixels, e.columns, e.light, e.change) for e in (self, rows))
+        return _Entries(*(np.concatenate([a[kept], b]) for a, b in zip(mine, theirs, strict=True)))
+
+
+def _rough(scene: mi.Scene, lens: mi.Sensor, entries: _Entries, solution: Any, rtol: float) -> NDArray[np.int64]:
+    """Pixels whose row the surface form gives wrongly: cut by the image-plane stop, or far from the picture."""
+    from ..integral.window import visible_window
+
+    window = visible_window(scene, lens, everywhere=True)
+    _, cut = window.field_stop(lens)
+    cut = window.expand(cut.astype(np.float64)).ravel() > 0
+    picture = solution.power.ravel() / lens.etendue
+    sums = np.bincount(entries.pixels, entries.light, minlength=picture.size)
+    return np.flatnonzero((cut & (picture > 0)) | (np.abs(picture - sums) > ROUGH * rtol * picture.max()))
+
+
+def _rows(
+    scene: mi.Scene, lens: mi.Sensor, emitters: Any, counts: list[int], pixels: NDArray[np.int64], on: str, rtol: float
+) -> _Entries:
+    """Rows of these pixels by lines of sight; the change is what half of the lines make of them."""
+    from ..integral.row_form import rows_of
+    from ..jit.mesh_buffers import triangles
+
+    lines = int(min(ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
+    found: list[tuple[Any, ...]] = []
+    first = 0
+    for emitter, count, row in zip(emitters, counts, rows_of(scene, lens, emitters, pixels, lines), strict=True):
+        light, half = row.light / lines, np.where(row.line < lines // 2, 2 * row.light / lines, 0)
+        if on == "face":
+            found.append((row.place, first + row.face, light, half))
+        else:
+            corners = triangles(emitter.get_shape())[1].numpy().reshape(-1, 3)[row.face]
+            found += [
+                (row.place, first + corners[:, k].astype(np.int64), light * row.corners[:, k], half * row.corners[:, k])
+                for k in range(3)
+            ]
+        first += count
+    place, column, light, half = (np.concatenate(values) for values in zip(*found, strict=True))
+    whole, halves = (csr_array((v, (place, column)), shape=(len(pixels), first)) for v in (light, half))
+    whole.eliminate_zeros()
+    entries = whole.tocoo()
+    of_half = np.asarray(halves[entries.coords[0], entries.coords[1]]).ravel()
+    return _Entries(pixels[entries.coords[0]], entries.coords[1], entries.data, entries.data - of_half)
+
+
+def _columns(
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    emitter: mi.Emitter,
+    on: str,
+    rule: Any,
+    alone: bool,
+    progress: Callable[[float], None] | None,
+    most_bytes: int | None,
+) -> Any:
+    """Columns of one mesh on the crop window."""
+    from ..integral.column_form import FaceLight, column_windows, columns_of
+    from ..jit.mesh_buffers import triangles
+
+    film = lens.film()
+    shape = (int(film.crop_size()[1]), int(film.crop_size()[0]))
+    offset = (int(film.crop_offset()[0]), int(film.crop_offset()[1]))
+    faces = FaceLight.seen(emitter, lens, offset, shape)
+    if not alone:
+        faces = faces.behind(scene, lens)
+    positions, corners = triangles(emitter.get_shape())
+    windows = column_windows(faces, len(positions if on == "vertex" else corners) // 3, on, shape)
+    _require_memory(int(windows.areas.sum()), most_bytes)
+    return columns_of(scene, lens, faces, windows, on, rule, progress)
+
+
+def _require_memory(entries: int, most_bytes: int | None) -> None:
+    """Raise TransportError where the entries of one view, at the most so many, do not fit into memory."""
+    # Beside the result the values in double precision of both computations and their places.
+    needed = entries * (BYTES + 32) + WORK
+    free = available_memory() if most_bytes is None else most_bytes
+    if free is not None and needed > free:
+        raise TransportError(
+            f"transport: one view has up to {entries} entries and needs {needed} bytes ({needed / 2**30:.1f} GiB) of "
+            f"memory, {free} are free. Give fewer pixels, a crop window, a smaller aperture or a coarser mesh."
+        )
+
+
+def _block(found: _Entries, count: int, solution: Any, etendue: float) -> Block:
+    """The rows of one view from its entries and the picture of J_n = 1."""
+    shape = solution.power.shape
+    pixels, fine, change = found.pixels, found.light * etendue, found.change * etendue
+    picture, error = solution.power.ravel(), solution.error.ravel()
+    sums, coarse_sums = (np.bincount(pixels, values, minlength=len(picture)) for values in (fine, fine - change))
+    off = picture - sums
+    sure = np.where(np.abs(off) > CERTAIN * error, off, 0)
+    factor = np.clip(1 + np.divide(sure, sums, out=np.zeros_like(sums), where=sums > 0), 0, LARGEST_FACTOR)
+    left = np.maximum(np.abs(picture - factor * sums), error)
+    coarse_factor = np.divide(factor * sums, coarse_sums, out=factor.copy(), where=coarse_sums > 0)
+    entries = fine * factor[pixels]
+    change = entries - (fine - change) * np.minimum(coarse_factor, LARGEST_FACTOR)[pixels]
+    numbers = np.arange(1, len(pixels) + 1)
+    whole = csr_array((numbers, (pixels, found.columns)), shape=(len(picture), count))
+    order = whole.data - 1
+    entries, change = entries[order], change[order]
+    relative = np.divide(change, entries, out=np.zeros_like(entries), where=entries > 0)
+    return _without_zeros(
+        Block(
+            shape,
+            count,
+            entries.astype(np.float32),
+            whole.indices.astype(np.int32),
+            whole.indptr,
+            np.clip(relative, -6e4, 6e4).astype(np.float16),
+            left.astype(np.float32),
+        )
+    )
+
+
+def _without_zeros(block: Block) -> Block:
+    """The same without entries that are 0, as behind an image-plane stop."""
+    kept = block.values > 0
+    if kept.all():
+        return block
+    starts = np.concatenate([[0], np.cumsum(kept)])[block.starts].astype(block.starts.dtype)
+    return replace(
+        block, values=block.values[kept], columns=block.columns[kept], change=block.change[kept], starts=starts
+    )
+
+
+def required_on(on: object) -> str:
+    """`on` as one of `ON`; TransportError for anything else."""
+    if on not in ON:
+        raise TransportError(f"transport: 'on' must be 'vertex' or 'face', got {on!r}.")
+    return str(on)
+
+
+def required_rtol(rtol: object) -> float:
+    """`rtol` as a float in the range of `Quadrature`; TransportError for anything else."""
+    try:
+        return Quadrature(rtol=rtol).rtol  # type: ignore[arg-type]
+    except SceneError as error:
+        raise TransportError(f"transport: {error}") from error

@@ -1,0 +1,109 @@
+"""What a scene was made from: values of its `<default>` parameters, and digests of its glowing meshes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from base64 import b64decode, b64encode
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.plugin_types import is_lens, is_surface
+from .scene_rules import is_number
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+BLOCKS = 15  # sums of weighted lengths of edges, each over as many edges in a row
+TOLERANCE = 2e-5  # relative: by which float32 may change such a sum when a mesh is moved
+
+
+def remember_defaults(scene: mi.Scene, values: Mapping[str, str]) -> None:
+    """Keep the values of a scene's `<default>` parameters with its lenses."""
+    for sensor in scene.sensors():
+        if is_lens(sensor):
+            sensor.defaults = dict(values)
+
+
+def defaults_of(sensor: mi.Sensor) -> dict[str, float | str]:
+    """Values of the `<default>` parameters of the scene of this lens: numbers where they are; empty if none are known.
+
+    `load` records them; a scene from Mitsuba's own loader has none.
+    """
+    return {name: value_of(text) for name, text in getattr(sensor, "defaults", {}).items()}
+
+
+def value_of(text: str) -> float | str:
+    """The number that a text stands for, whole where it is written so; any other text unchanged."""
+    if not is_number(text):
+        return text
+    number = float(text)
+    return int(number) if number.is_integer() and text.strip().lstrip("+-").isdigit() else number
+
+
+def origin_of(scene: mi.Scene, sensor: mi.Sensor) -> dict[str, str]:
+    """Metadata of an image: `parameters`, JSON of the scene's `<default>` values, and `mesh_digest`."""
+    found = {}
+    if defaults := defaults_of(sensor):
+        found["parameters"] = json.dumps(defaults)
+    if digest := scene_digest(scene):
+        found["mesh_digest"] = digest
+    return found
+
+
+def scene_digest(scene: mi.Scene) -> str:
+    """Digests of all glowing meshes of a scene, in the order of its emitters; empty if there is none."""
+    shapes = [(emitter, emitter.get_shape()) for emitter in scene.emitters()]
+    return " ".join(digest_of(emitter, shape) for emitter, shape in shapes if shape is not None and shape.is_mesh())
+
+
+def digest_of(emitter: Any, mesh: mi.Shape) -> str:
+    """Digest of the mesh of an emitter, computed once for each state of the mesh."""
+    from ..jit.mesh_buffers import triangles
+
+    buffers = triangles(mesh)
+    known = getattr(emitter, "digest", None)
+    if known and [buffer.index for buffer in known[0]] == [buffer.index for buffer in buffers]:
+        return known[1]
+    positions, faces = (buffer.numpy() for buffer in buffers)
+    digest = mesh_digest(positions.reshape(-1, 3), faces.reshape(-1, 3))
+    if is_surface(emitter):
+        emitter.digest = buffers, digest
+    return digest
+
+
+def mesh_digest(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> str:
+    """Digest of a mesh that no rigid motion changes but for rounding; `same_mesh` compares two of them.
+
+    A hash of the faces (F, 3), then float32 numbers: sums of the lengths of edges with weights 1 … 2, and the volume
+    that the faces enclose with their middle, whose sign a mirror image changes.
+    """
+    corners = vertices.astype(np.float64)[faces]
+    edges = corners - np.roll(corners, 1, axis=1)
+    lengths = np.sqrt((edges * edges).sum(axis=-1)).ravel()
+    weights = 1 + np.random.default_rng(1).random(len(lengths))
+    sums = np.array([part.sum() for part in np.array_split(weights * lengths, BLOCKS)])
+    corners = corners - corners.reshape(-1, 3).mean(axis=0)
+    volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    numbers = np.append(sums, volume).astype("<f4")
+    hashed = hashlib.sha256(np.ascontiguousarray(faces, "<u4").tobytes()).hexdigest()[:16]
+    return f"{hashed}:{b64encode(numbers.tobytes()).decode()}"
+
+
+def same_mesh(one: str, other: str) -> bool:
+    """True if two texts of digests are those of the same meshes in the same order, each moved as a rigid body."""
+    first, second = one.split(), other.split()
+    return len(first) == len(second) and all(map(_alike, first, second))
+
+
+def _alike(one: str, other: str) -> bool:
+    (hash_a, _, text_a), (hash_b, _, text_b) = one.partition(":"), other.partition(":")
+    if hash_a != hash_b:
+        return False
+    a, b = (np.frombuffer(b64decode(text), "<f4").astype(np.float64) for text in (text_a, text_b))
+    # Of a flat or open mesh the volume may be anything small: judged against the cube of the mean edge sum.
+    scale = np.append(np.abs(a[:-1]), max(abs(a[-1]), 1e-3 * np.abs(a[:-1]).max() ** 3 / max(len(a), 1) ** 3))
+    return bool((np.abs(a - b) <= TOLERANCE * scale).all())

@@ -1,0 +1,222 @@
+"""Windows, mirrors, masks and glass between phantom and lens: closed forms, mirrored phantoms, Mitsuba's `path`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from small_scenes import FOCUS, HEIGHT, SIDE, WIDTH, camera_scene, disk, glow, mi, power, sphere, write_ply
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.runtime.errors import SceneError
+
+N, THICK = 1.5, 10.0  # refractive index and thickness [mm] of a window
+THROUGH = 2 * N / (N * N + 1)  # of a pane, all internal reflections counted, at normal incidence
+PERFECT = {"type": "conductor", "material": "none"}
+PANE = {"type": "thindielectric", "int_ior": N}
+PEAK_MISS = 2e-3  # of the brightest pixel: what is not first order in the angles to the axis
+
+
+def place(z, size=200.0, x=0.0, tilt=0.0):
+    """A square's transform: centre at (x, 0, z) [mm], turned about the vertical from facing the lens by `tilt` [°]."""
+    return mi.ScalarTransform4f().translate([x, 0, z]).rotate([0, 1, 0], 180 - tilt).scale(size)
+
+
+def pane(z, bsdf, **where):
+    """A rectangle that does not glow."""
+    return {"type": "rectangle", "to_world": place(z, **where), "bsdf": bsdf}
+
+
+def slab(z, thickness=THICK, n=N, size=200.0):
+    """A plate of glass whose middle lies at depth z [mm]."""
+    to_world = mi.ScalarTransform4f().translate([0, 0, z]).scale([size, size, thickness / 2])
+    return {"type": "cube", "to_world": to_world, "bsdf": {"type": "dielectric", "int_ior": n, "ext_ior": 1.0}}
+
+
+def mirrored(point, z, tilt):
+    """A point's mirror image in a pane at depth z [mm] and this tilt [°]."""
+    turn = np.radians(tilt)
+    normal, centre = np.array([np.sin(turn), 0, -np.cos(turn)]), np.array([0, 0, z])
+    return point - 2 * (point - centre) @ normal * normal
+
+
+def agrees_with_path(scene, spp=1024, seed=3, **settings):
+    """The p-value of the integral's picture beside Mitsuba's path tracer."""
+    image = fspt.render(scene, method="integral", rtol=1e-3, **settings)
+    return fspt.compare(image, fspt.render(scene, method="path", spp=spp, seed=seed)).z_test.p_value
+
+
+@pytest.mark.parametrize("window", [pane(80, PANE), slab(80)], ids=["thin", "solid"])
+def test_a_window_lets_through_what_fresnel_says(window):
+    far = disk(FOCUS)
+    bare, seen = (power(camera_scene(far, bodies=bodies, f_number=16), rtol=1e-4) for bodies in ((), (window,)))
+    middle = slice(HEIGHT // 2 - 2, HEIGHT // 2 + 2), slice(WIDTH // 2 - 2, WIDTH // 2 + 2)
+    assert seen[middle] / bare[middle] == pytest.approx(THROUGH, rel=3e-4)
+
+
+def test_a_plate_of_glass_moves_the_focus():
+    """What lies z behind a plate is seen at z - d (1 - 1/n); without the shift the blurred edge is off by 3 %."""
+    depth, nearer = 190.0, THICK * (1 - 1 / N)
+    behind = power(camera_scene(disk(depth, radius=6.0), bodies=(slab(80),), f_number=4), rtol=1e-4)
+    in_air = power(camera_scene(disk(depth - nearer, radius=6.0), f_number=4), rtol=1e-4)
+    unmoved = power(camera_scene(disk(depth, radius=6.0), f_number=4), rtol=1e-4)
+    assert abs(behind - THROUGH * in_air).max() < PEAK_MISS * behind.max()
+    assert abs(behind - THROUGH * unmoved).max() > 5 * PEAK_MISS * behind.max()
+
+
+@pytest.mark.parametrize("window", [pane(80, PANE, tilt=20), slab(80)], ids=["thin", "solid"])
+def test_a_window_agrees_with_the_path_tracer(window):
+    assert agrees_with_path(camera_scene(sphere(150, 9, x=3), bodies=(window,))) > 1e-3
+
+
+@pytest.mark.parametrize("bsdf", [PERFECT, {"type": "roughconductor", "alpha": 0.0, "material": "none"}])
+@pytest.mark.parametrize("depth", [FOCUS, 150.0])
+def test_a_mirror_shows_the_mirrored_phantom(bsdf, depth):
+    """Two spheres, one of them off the axis, so that a picture the wrong way round would be seen."""
+    share, seen = 0.9, [(np.array([0.0, 3.0, depth]), 5.0), (np.array([7.0, -2.0, depth - 4]), 2.0)]
+    mirror = pane(80, bsdf | {"specular_reflectance": share}, tilt=45)
+    real = [{"type": "sphere", "center": mirrored(p, 80, 45).tolist(), "radius": r} for p, r in seen]
+    image = fspt.render(camera_scene(*real, bodies=(mirror,)), rtol=1e-3)
+    direct = fspt.render(camera_scene(*({"type": "sphere", "center": p.tolist(), "radius": r} for p, r in seen)))
+    assert (abs(image.power - share * direct.power) <= image.error + direct.error).mean() > 0.995
+    assert abs(image.power - share * direct.power).max() < 2e-3 * direct.power.max()
+    assert image.coverage == pytest.approx(direct.coverage, abs=2e-2)
+
+
+@pytest.mark.parametrize("z", [FOCUS - 20, 60.0], ids=["near the focus", "out of focus"])
+def test_a_mirror_whose_edge_cuts_the_field(z):
+    """A small mirror at 45° hides half of a sphere and shows another one beside it."""
+    mirror = pane(z, PERFECT, size=4.0, x=-3.0, tilt=45)
+    scene = camera_scene(sphere(170, 8), sphere(z, 6, x=30), bodies=(mirror,))
+    assert agrees_with_path(scene) > 1e-3
+
+
+def test_two_mirrors_in_turn():
+    """A periscope: two parallel mirrors at 45° shift the line of sight sideways by 40 mm."""
+    mirrors = (pane(70, PERFECT, size=[18, 18, 1], tilt=45), pane(70, PERFECT, size=[25, 25, 1], x=40, tilt=225))
+    shifted = fspt.render(camera_scene(sphere(125, 6, x=40), bodies=mirrors), rtol=1e-3)
+    direct = fspt.render(camera_scene(sphere(FOCUS, 6)), rtol=1e-3)
+    assert abs(shifted.power - direct.power).max() < 2e-3 * direct.power.max()
+
+
+def test_a_mask_of_even_opacity_scales_the_picture():
+    far, mask = sphere(150, 9), pane(80, {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}})
+    seen, bare = (fspt.render(camera_scene(far, bodies=b), rtol=1e-3) for b in ((mask,), ()))
+    assert abs(seen.power - 0.7 * bare.power).max() < 1e-3 * bare.power.max()
+    assert seen.coverage == pytest.approx(bare.coverage, abs=1e-3)
+
+
+def test_a_mask_as_a_graded_filter():
+    """Opacity linear across it: its mean over pixel and pupil is that on the pixel's axis."""
+    texels, half, z = 64, 20.0, 90.0
+    data = mi.TensorXf(np.linspace(0.1, 0.9, texels, dtype=np.float32)[None, :, None].repeat(2, 0))
+    opacity = {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
+    mask = pane(z, {"type": "mask", "opacity": opacity, "nested": {"type": "diffuse"}}, size=half)
+    seen, bare = (power(camera_scene(disk(FOCUS), bodies=b, f_number=8), rtol=1e-4) for b in ((mask,), ()))
+    x = (WIDTH / 2 - np.arange(WIDTH) - 0.5) * SIDE * z / FOCUS
+    # The rectangle is turned by 180° about the vertical: its u runs from +x to -x.
+    share = 0.5 - x / (2 * half)
+    expected = 1 - (0.1 + 0.8 * (share * texels - 0.5) / (texels - 1))
+    assert seen[HEIGHT // 2] / bare[HEIGHT // 2] == pytest.approx(expected, abs=1e-3)
+
+
+def test_total_reflection_in_a_prism(tmp_path):
+    """A right-angled prism turns the line of sight by 90°; Fresnel's loss is that of two faces."""
+    n, half = 1.7, 16.0
+    corners = np.array([(x, y, z) for y in (-half, half) for x, z in ((-half, -half), (half, -half), (half, half))])
+    hull = trimesh.convex.convex_hull(corners + np.array([0, 0, 90.0]))
+    mesh = write_ply(tmp_path / "prism.ply", hull.vertices, hull.faces)
+    prism = {"type": "ply", "filename": str(mesh)} | {
+        "face_normals": True,
+        "bsdf": {"type": "dielectric", "int_ior": n, "ext_ior": 1.0},
+    }
+    scene = camera_scene(sphere(90, 5, x=80), bodies=(prism,), f_number=8)
+    assert agrees_with_path(scene) > 1e-3
+    assert power(scene, rtol=1e-3).max() > 0
+
+
+def test_a_beam_splitter_shows_both_phantoms():
+    """Its reflection is no ghost that may be left out."""
+    splitter = pane(80, PANE, size=40, tilt=45)
+    assert agrees_with_path(camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,))) > 1e-3
+
+
+def test_what_is_cut_off_is_in_the_error():
+    """Between two facing mirrors the light goes to and fro; one reflection misses the images of two."""
+    mirrors = tuple(pane(200, PERFECT, size=95, x=x, tilt=tilt) for x, tilt in ((8, -90), (-8, 90)))
+    scene = camera_scene(sphere(300, 3, x=2), bodies=mirrors, magnification=0.2)
+    few, many = (fspt.render(scene, rtol=1e-3, max_specular=most) for most in (1, 12))
+    missing = abs(many.power - few.power)
+    assert missing.max() > 0.1 * many.power.max()
+    assert (missing <= few.error + many.error).all()
+
+
+def test_coverage_counts_what_glows_through_what_lets_light_pass():
+    plate = {"type": "rectangle", "to_world": place(100, size=2.0), "bsdf": {"type": "diffuse"}}
+    cases = {"bare": (), "pane": (pane(80, PANE),), "plate": (plate,), "both": (plate, pane(80, PANE))}
+    total = {k: fspt.render(camera_scene(disk(FOCUS, 6), bodies=b), rtol=1e-3).coverage.sum() for k, b in cases.items()}
+    assert total["pane"] == pytest.approx(total["bare"], rel=1e-3)
+    assert total["both"] == pytest.approx(total["plate"], rel=1e-3)
+    assert total["plate"] < 0.99 * total["bare"]
+
+
+def test_narrow_light_behind_a_window():
+    """A sphere of 0.06 pixels takes the surface form, through a window, too."""
+    tiny = sphere(150, 0.05, x=3.1, y=1.3)
+    bare, seen = (fspt.render(camera_scene(tiny, bodies=b), rtol=1e-3) for b in ((), (pane(80, PANE),)))
+    assert seen.power.sum() / bare.power.sum() == pytest.approx(THROUGH, rel=2e-3)
+
+
+def test_narrow_light_in_a_mirror_is_in_the_error():
+    where = mirrored(np.array([0.0, 1.0, 160.0]), 80, 45)
+    tiny = {"type": "sphere", "center": where.tolist(), "radius": 0.05}
+    scene = camera_scene(tiny, disk(300, 3.0, x=60), bodies=(pane(80, PERFECT, tilt=45),))
+    direct = fspt.render(camera_scene(sphere(160, 0.05, y=1.0)), rtol=1e-3)
+    image = fspt.render(scene, rtol=1e-3)
+    assert (abs(image.power - direct.power) <= image.error + direct.error).all()
+
+
+def test_the_surface_form_goes_through_panes_alone():
+    scene = camera_scene(sphere(150, 9), bodies=(pane(80, PANE),))
+    pupil, surface = (fspt.render(scene, rtol=1e-3, domain=domain) for domain in ("pupil", "surface"))
+    assert abs(pupil.power - surface.power).max() <= 2e-3 * pupil.power.max()
+    with pytest.raises(SceneError, match=r"'domain' = surface .* Set it to pupil"):
+        fspt.render(camera_scene(sphere(150, 9), bodies=(pane(200, PERFECT),)), domain="surface")
+
+
+def test_a_scene_without_specular_shapes_ends_lines_of_sight_at_the_first_surface():
+    scene = camera_scene(sphere(150, 9), bodies=(pane(80, {"type": "diffuse"}, size=3.0),))
+    image, other = (fspt.render(scene, shortcuts=shortcuts) for shortcuts in (True, False))
+    assert "lines of sight beyond the first surface: left out" in image.metadata["left_out"]
+    assert abs(image.power - other.power).max() <= 1e-3 * image.power.max()
+
+
+def test_panes_merged_by_mitsuba_are_not_passed_by():
+    """Merged rectangles have no bounding box; lines of sight began behind them, and the phantom shone through."""
+    plates = {f"p{k}": pane(100 + k, {"type": "diffuse", "reflectance": 0.0}, size=5.0, x=7.0 * k) for k in range(2)}
+    scene = camera_scene(sphere(150, 9), bodies=tuple(plates.values()))
+    parts = {"type": "scene", "s": sphere(150, 9) | {"emitter": glow(1.0)}, **plates}
+    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "luminance"}
+    lens = {"type": "fspt_lens", "focal_length": 55.0, "f_number": 2.8, "pixel_pitch": 0.4, "magnification": 0.5}
+    merged = mi.load_dict(parts | {"sensor": lens | {"film": film}})
+    assert len(merged.shapes()) < len(scene.shapes())
+    assert abs(power(merged) - power(scene)).max() < 2e-3 * power(scene).max()
+
+
+def test_a_lens_in_a_glass_chamber_is_not_inside_the_phantom():
+    chamber = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(60), "bsdf": {"type": "thindielectric"}}
+    assert power(camera_scene(sphere(150, 9), bodies=(chamber,))).max() > 0
+
+
+def test_monte_carlo_gets_the_depth_that_it_needs():
+    window = camera_scene(sphere(150, 9), bodies=(pane(80, PANE),))
+    assert fspt.render(window, method="path", spp=16).power.max() > 0
+    with pytest.raises(SceneError, match=r"ptracer cannot connect .* Give method path"):
+        fspt.render(window, method="ptracer")
+    for depth in (0, 1.5, True):
+        with pytest.raises(SceneError, match="'max_depth'"):
+            fspt.render(window, method="path", max_depth=depth)
+    with pytest.raises(SceneError, match="'max_depth' = 3 has no meaning"):
+        fspt.render(window, max_depth=3)
+    with pytest.raises(SceneError, match=r"'max_specular' must be in 0 … 64"):
+        fspt.render(window, max_specular=65)
