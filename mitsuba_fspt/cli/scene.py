@@ -25,7 +25,9 @@ def scene() -> None:
 def new(
     name: Annotated[
         str,
-        typer.Argument(metavar="cylinder|mouse", help="What it shows.", autocompletion=lambda: ["cylinder", "mouse"]),
+        typer.Argument(
+            metavar="cylinder|mouse|rig", help="What it shows.", autocompletion=lambda: ["cylinder", "mouse", "rig"]
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Scene to write, .xml, which must not exist.")],
     phantom: Annotated[Path | None, typer.Option(metavar="PHANTOM.ply", help="Phantom with J_n, for mouse.")] = None,
@@ -43,6 +45,7 @@ def new(
 
     cylinder glows evenly. mouse is PHANTOM.ply as 'fspt flux' writes it. The
     camera sees all of it from every side, as with 'fspt render PHANTOM.ply'.
+    rig is the cylinder before two mirrors, three views in one picture.
     """
     from ..phantom.framed_scene import camera_lens
     from ..phantom.starter_scenes import starter_scene

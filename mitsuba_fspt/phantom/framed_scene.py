@@ -66,6 +66,8 @@ Units     mm; exitance in W/mm^2, so a pixel holds W.
 World     z up, origin in the centre of the phantom's bounding box, which is {size} mm large; the camera
           stands on the +x axis, +y is to the right of the picture.
 view      turns the phantom about the z axis by so many degrees, counterclockwise seen from above.
+{notes}"""
+FOCUSED = """\
 Camera    magnification puts the virtual detector plane on the front of the phantom, which stands with its axis at
           distance from the lens. With another magnification t give distance = focal_length (1 + 1/t) + {radius:.6g}."""
 
@@ -161,12 +163,14 @@ def framed_text(
     rtol: float = 1e-3,
     view: float = 0.0,
     parameters: Mapping[str, float] | None = None,
+    notes: str = FOCUSED,
     **lens: float | str,
 ) -> str:
     """Text of a scene that shows shapes with this `outline`, about the origin; other arguments as of `scene_xml`.
 
     title : what is shown, the beginning of the comment
     shapes : their XML, which may use $view and the `parameters`, further `<default>`s
+    notes : end of the comment, on the camera and whatever else the scene has
     """
     numbers = _numbers(focal_length=focal_length, f_number=f_number, pixel_pitch=pixel_pitch, rtol=rtol, view=view)
     film = {"width": _pixels("width", width), "height": _pixels("height", height)}
@@ -182,7 +186,7 @@ def framed_text(
     camera = {"focal_length": values["focal_length"], "f_number": values["f_number"]}
     names = (*ORDER, *(parameters or ()))
     return SCENE.format(
-        comment=COMMENT.format(title=title, size=size, radius=outline.radius, **camera),
+        comment=COMMENT.format(title=title, size=size, notes=notes.format(radius=outline.radius), **camera),
         defaults="\n".join(f'    <default name="{name}" value="{values[name]:.10g}"/>' for name in names),
         borders="".join(_property(name, value) for name, value in lens.items() if name not in FOCUS),
         shapes=shapes,

@@ -72,6 +72,19 @@ def test_the_cylinder_renders_as_it_is(run):
         assert lit[16, 16] > 0, end
 
 
+def test_the_rig_shows_three_views(run):
+    """Both mirrored images have the direct one's radiance times the reflectance. Seen to fail with one mirror."""
+    assert run("scene", "new", "rig", "-o", "my.xml", "--quiet") == (0, "", "")
+    assert run("render", "my.xml", "--rtol", "1e-2", "--quiet")[:2] == (0, "")
+    radiance = fspt.read("my.exr").to_radiance(660).values
+    direct = radiance[64, 192]
+    assert direct == pytest.approx(1e-4 / math.pi * 100 * 660e-9 / (6.62607015e-34 * 299792458.0), rel=0.01)
+    for half in (radiance[64, :128], radiance[64, 256:]):
+        assert half.max() == pytest.approx(0.95 * direct, rel=0.01)
+        assert (half > 0.9 * direct).sum() > 20
+    assert not radiance[64, [0, 140, 244, 383]].any()
+
+
 def test_a_mouse_is_the_phantom_that_render_frames(run):
     words = ("scene", "new", "mouse", "--phantom", "phantom.ply", "-o", "my.xml", *FILM)
     code, out, err = run(*words, "--json")
@@ -99,7 +112,7 @@ def test_the_camera_of_a_file_wherever_a_lens_is_made(run, folder, name):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("rat", "-o", "my.xml"), "the name must be one of cylinder, mouse"),
+        (("rat", "-o", "my.xml"), "the name must be one of cylinder, mouse, rig"),
         (("mouse", "-o", "my.xml"), "mouse frames a phantom, whose PLY is missing. Give --phantom"),
         (("mouse", "-o", "my.xml", "--phantom", "gone.ply"), "gone.ply"),
         (("cylinder", "-o", "my.xml", "--phantom", "phantom.ply"), "cylinder has no place for 'phantom.ply'"),
@@ -146,8 +159,9 @@ def test_the_shell_completes_verbs_options_and_words():
     assert completions("fspt scene new m") == ["mouse"]
 
 
-def test_the_starter_scenes_are_well_formed(run):
-    assert run("scene", "new", "cylinder", "-o", "my.xml", "--quiet") == (0, "", "")
+@pytest.mark.parametrize("name", ["cylinder", "rig"])
+def test_the_starter_scenes_are_well_formed(run, name):
+    assert run("scene", "new", name, "-o", "my.xml", "--quiet") == (0, "", "")
     root = ElementTree.parse("my.xml").getroot()
     defaults = {node.get("name") for node in root.iter("default")}
     used = {text[1:] for node in root.iter() for text in node.attrib.values() if text.startswith("$")}
