@@ -19,7 +19,7 @@ NAMES = [str(path.relative_to(PACKAGE)) for path in FILES]
 ARROWS = {
     "runtime": set(),
     "optics": {"runtime"},
-    "images": {"runtime"},
+    "images": {"runtime", "optics"},
     "phantom": {"runtime", "optics"},
     "tissue": {"runtime", "optics", "phantom"},
     "jit": set(),

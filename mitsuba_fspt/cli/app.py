@@ -16,9 +16,10 @@ from ..runtime.interrupt import ctrl_c_noted, terminated_as_by_ctrl_c
 from .checks import doctor, explain, stability
 from .converge import converge
 from .flux import app as flux
-from .images import compare, expose, plot
+from .images import compare, expose, plot, roi
 from .matrix import matrix
 from .render import render
+from .scene import app as scene
 from .sweep import sweep
 from .terminal import Interrupted
 
@@ -26,13 +27,13 @@ app = typer.Typer(
     name="fspt",
     help="Calibrated CCD images of glowing phantoms, in watts per pixel.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
-for verb in (render, plot, compare, expose, doctor, stability, explain, sweep, converge, matrix):
+for verb in (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge, matrix):
     app.command()(verb)
 app.add_typer(flux, name="flux")
+app.add_typer(scene, name="scene")
 
 INTERRUPTED = 130  # exit code after Ctrl-C or SIGTERM
 

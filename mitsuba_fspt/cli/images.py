@@ -1,23 +1,32 @@
-"""`fspt plot`, `fspt compare` and `fspt expose`: pictures of images, two against each other, a detector's response."""
+"""`fspt plot`, `compare`, `roi` and `expose`: pictures of images, comparison, regions, a detector's response."""
 
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from ..runtime.atomic_files import require_apart
+from ..runtime.atomic_files import atomic_path, require_apart
 from ..runtime.errors import ImageError
-from .options import AsJson, Quiet, SourcePower, require_picture
+from .options import (
+    AsJson,
+    Quiet,
+    Rows,
+    SourcePower,
+    WavelengthNm,
+    require_image,
+    require_picture,
+    require_writable,
+)
 from .terminal import print_result
 
 
 def compare(
-    calculated: Annotated[Path, typer.Argument(metavar="CALCULATED.exr")],
-    standard: Annotated[Path, typer.Argument(metavar="STANDARD.exr")],
+    calculated: Annotated[Path, typer.Argument(metavar="CALCULATED")],
+    standard: Annotated[Path, typer.Argument(metavar="STANDARD")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, profiles included.")] = False,
     quiet: Quiet = False,
     png: Annotated[Path | None, typer.Option(help="Also draw both images and their difference.")] = None,
@@ -36,7 +45,7 @@ def compare(
 
 
 def plot(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE.exr...", help="Images, a panel each.")],
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Images, a panel each.")],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Picture to write, .png; IMAGE.png, or plot.png for several.")
     ] = None,
@@ -67,6 +76,47 @@ def plot(
     print_result(text, record, as_json=as_json, quiet=quiet)
 
 
+def roi(
+    images: Annotated[
+        list[Path], typer.Argument(metavar="IMAGE...", help="Power images, as 'fspt render' writes them.")
+    ],
+    region: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--roi",
+            metavar="X,Y,W,H|circle:X,Y,R|25%|MASK.tif",
+            help="Region in pixels from the upper left corner, or of the brightest pixel; repeatable; else all pixels.",
+        ),
+    ] = None,
+    wavelength_nm: WavelengthNm = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Table to write, .csv.")] = None,
+    as_json: Rows = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure regions: total flux, mean and largest radiance with error, area, as imaging programs print them.
+
+    Prints a CSV with a row for each image and region. What the columns mean,
+    beside those of other programs: docs/units.md.
+    """
+    from ..images.image import read
+    from ..images.regions import csv_table, measure
+
+    if output:
+        require_writable(output, ".csv")
+        require_apart(output, images, error=ImageError)
+    regions: list[str | None] = [*region] if region else [None]
+    rows = []
+    for path in images:
+        image = read(path)
+        rows += [(str(path), name or "all", measure(image, name, wavelength_nm)) for name in regions]
+    table = csv_table(rows)
+    if output:
+        with atomic_path(output, ImageError) as temporary:
+            temporary.write_text(table, encoding="utf-8")
+    record = [{"image": image, "region": name} | asdict(found) for image, name, found in rows]
+    print_result(f"{output}: {len(rows)} rows" if output else table.rstrip("\n"), record, as_json=as_json, quiet=quiet)
+
+
 def _range(text: str) -> tuple[float, float]:
     """Two numbers from the text A,B; ImageError for another text."""
     try:
@@ -77,8 +127,8 @@ def _range(text: str) -> tuple[float, float]:
 
 
 def expose(
-    image: Annotated[Path, typer.Argument(metavar="IMAGE.exr", help="Power image, as 'fspt render' writes it.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Electrons to write, .exr.")],
+    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Power image, as 'fspt render' writes it.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Electrons to write: .exr, .tif, .h5, .npz or .fits.")],
     exposure_time: Annotated[float, typer.Option(help="Exposure time [s].")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
     source_power: SourcePower = None,
@@ -108,6 +158,7 @@ def expose(
     from ..images.detector import Detector
     from ..images.image import read
 
+    require_image(output)
     require_apart(output, [image], error=ImageError)
     numbers: dict[str, Any] = {
         "quantum_efficiency": quantum_efficiency,

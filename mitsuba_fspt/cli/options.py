@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from ..rendering.scene_rules import is_number
 from ..runtime.atomic_files import require_place
 from ..runtime.errors import FsptError, ImageError, SceneError
 
@@ -18,9 +20,18 @@ Parameters = Annotated[
     list[str] | None,
     typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
 ]
-Method = Annotated[str | None, typer.Option(help="integral, path or ptracer; the scene's own if left out.")]
+Method = Annotated[
+    str | None,
+    typer.Option(
+        help="integral, path or ptracer; the scene's own if left out.",
+        autocompletion=lambda: ["integral", "path", "ptracer"],
+    ),
+]
 Rtol = Annotated[float | None, typer.Option(help="Error of the integral relative to the brightest pixel.")]
-Domain = Annotated[str | None, typer.Option(help="pupil or surface; the scene's own if left out.")]
+Domain = Annotated[
+    str | None,
+    typer.Option(help="pupil or surface; the scene's own if left out.", autocompletion=lambda: ["pupil", "surface"]),
+]
 Spp = Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")]
 MaxDepth = Annotated[
     int | None, typer.Option(metavar="N", help="Legs of light that path and ptracer follow; what the scene needs.")
@@ -33,8 +44,9 @@ SourcePower = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rows = Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print no results and no progress; warnings stay.")]
+WavelengthNm = Annotated[float | None, typer.Option(help="Of the light [nm], for units of photons.")]
 MOST = 100_000  # values of a range
-NAMES = {".exr": "image", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
+NAMES = {".xml": "scene", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
 
 
 def definitions(define: list[str] | None) -> dict[str, str]:
@@ -48,6 +60,11 @@ def definitions(define: list[str] | None) -> dict[str, str]:
             raise SceneError(f"-D {text}: {name} is {pairs[name]} already. Give each name once.")
         pairs[name] = value
     return pairs
+
+
+def typed(values: Mapping[str, str]) -> dict[str, float | str]:
+    """The values that are numbers as such, others as text."""
+    return {name: float(text) if is_number(text) else text for name, text in values.items()}
 
 
 def value_lists(define: list[str] | None) -> dict[str, list[str]]:
@@ -100,6 +117,14 @@ def require_writable(path: Path, suffix: str | None = None, error: type[FsptErro
     require_place(path, error)
     if not os.access(path.parent, os.W_OK):
         raise error(f"output file '{path}': the folder '{path.parent}' is not writable. Write elsewhere with -o.")
+
+
+def require_image(path: Path) -> None:
+    """Raise ImageError for an image that cannot be written, BackendError where its format needs a missing package."""
+    from ..images.formats import format_of
+
+    format_of(path)
+    require_writable(path)
 
 
 def require_picture(path: Path) -> None:

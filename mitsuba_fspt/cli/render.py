@@ -27,10 +27,12 @@ from .options import (
     Sensor,
     SourcePower,
     Spp,
+    WavelengthNm,
     definitions,
+    require_image,
     require_picture,
-    require_writable,
     several,
+    typed,
 )
 from .terminal import Interrupted, print_result, progress_bar
 
@@ -53,11 +55,38 @@ class Shot(NamedTuple):
     origin: str | None = None
 
 
+class Output(NamedTuple):
+    """How images are written.
+
+    source_power : of the light source [W], None for images as they are
+    unit, wavelength_nm : of the values, see `images.radiometry`
+    png : a picture beside each image
+    """
+
+    source_power: float | None
+    unit: str
+    wavelength_nm: float | None
+    png: bool
+
+    def write(self, image: Image, output: Path, picture: Path | None) -> None:
+        """Write the image and, if `picture` is given, its PNG: both files or none."""
+        from ..images.picture import png_file
+        from ..images.radiometry import in_unit
+
+        with png_file(image, picture) if picture else nullcontext():
+            if self.unit == "W":
+                image.write(output)
+            else:
+                in_unit(image, self.unit, self.wavelength_nm).write(output, image)
+
+
 def render(
     scene: Annotated[
         Path, typer.Argument(metavar="SCENE.xml|PHANTOM.ply", help="Mitsuba scene with an fspt_lens, or a phantom.")
     ],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Image to write, .exr.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Image to write: .exr, .tif, .h5, .npz or .fits.")
+    ] = None,
     view: Annotated[
         str | None, typer.Option(metavar="0,90,...", help="Of a phantom: turns about +z [degrees], an image each.")
     ] = None,
@@ -74,13 +103,17 @@ def render(
     seed: Seed = None,
     sensor: Sensor = 0,
     source_power: SourcePower = None,
+    unit: Annotated[
+        str, typer.Option(metavar="W|photons/s|p/s/cm2/sr", help="Of the values written: power or radiance.")
+    ] = "W",
+    wavelength_nm: WavelengthNm = None,
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a scene to an EXR with the power [W], its error and the coverage of every pixel.
+    """Render a scene to an image with the power [W], its error and the coverage of every pixel.
 
     Of PHANTOM.ply, as 'fspt flux' writes it, the camera stands on the +x
     axis, is focused on the front and sees the whole phantom, up is +z. The
@@ -90,18 +123,18 @@ def render(
     framing = {"view": view, "focal_length": focal_length, "f_number": f_number, "camera": camera}
     shots = _shots(scene, output, definitions(define), {name: v for name, v in framing.items() if v is not None})
     _check_outputs(shots, [scene, camera] if camera else [scene], png)
-    if source_power is not None:
-        _require_source_power(source_power)
-    images: list[Image] = []
-    with _kept(shots, images), progress_bar(quiet) as progress:
-        quiet_mitsuba()
-        settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
-        for shot in shots:
-            image = _rendered(shot, settings | {"max_depth": max_depth, "sensor": sensor, "progress": progress})
-            image = image if source_power is None else image.scaled(source_power)
-            _write(image, shot.output, _picture(shot, png))
-            images.append(image)
-    summaries = [_summary(image, shot.output, _picture(shot, png)) for shot, image in zip(shots, images, strict=True)]
+    require_scaling(source_power, unit, wavelength_nm)
+    settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
+    images = _rendered(
+        shots,
+        settings | {"max_depth": max_depth, "sensor": sensor},
+        Output(source_power, unit, wavelength_nm, png),
+        quiet,
+    )
+    summaries = [
+        _summary(image, shot.output, _picture(shot, png), unit, wavelength_nm)
+        for shot, image in zip(shots, images, strict=True)
+    ]
     text = "\n".join(map(_summary_text, summaries))
     print_result(text, {"images": summaries}, as_json=as_json, quiet=quiet)
     for summary in summaries:
@@ -109,20 +142,32 @@ def render(
             typer.echo(f"fspt: {summary['output']}: {summary['warnings']}.", err=True)
 
 
-def _rendered(shot: Shot, settings: dict[str, Any]) -> Image:
-    """Image of a shot with these settings of `render`."""
-    from ..rendering.render import render
-    from ..rendering.scene import load
+def _rendered(shots: list[Shot], settings: dict[str, Any], output: Output, quiet: bool) -> list[Image]:
+    """Images of all shots, each written as soon as it is there; `settings` as of `rendering.render`."""
+    images: list[Image] = []
+    with _kept(shots, images), progress_bar(quiet) as progress:
+        from ..rendering.render import render
+        from ..rendering.scene import load
 
-    image = render(load(shot.scene, **shot.parameters), **settings)
-    return replace(image, metadata=image.metadata | {"scene": shot.origin}) if shot.origin else image
+        quiet_mitsuba()
+        for shot in shots:
+            image = render(load(shot.scene, **shot.parameters), progress=progress, **settings)
+            image = image if output.source_power is None else image.scaled(output.source_power)
+            if shot.origin:
+                image = replace(image, metadata=image.metadata | {"scene": shot.origin})
+            output.write(image, shot.output, _picture(shot, output.png))
+            images.append(image)
+    return images
 
 
-def _require_source_power(watts: float) -> None:
-    """Raise ImageError, before the work, for a source power that no image can be scaled by."""
+def require_scaling(source_power: float | None, unit: str, wavelength_nm: float | None) -> None:
+    """Raise ImageError, before the work, for a source power or a unit that no image can have."""
     from ..images.image import required_source_power
+    from ..images.radiometry import require_unit
 
-    required_source_power(watts)
+    if source_power is not None:
+        required_source_power(source_power)
+    require_unit(unit, wavelength_nm)
 
 
 def _shots(scene: Path, output: Path | None, parameters: dict[str, str], framing: dict[str, Any]) -> list[Shot]:
@@ -145,7 +190,7 @@ def _views(phantom: Path, output: Path, parameters: dict[str, str], framing: dic
     if twice := set(parameters) & set(framing):
         name = min(twice)
         raise SceneError(f"-D {name}={parameters[name]}: --{name.replace('_', '-')} gives it already. Give it once.")
-    numbers = {name: float(text) if is_number(text) else text for name, text in parameters.items() if name != "view"}
+    numbers = typed({name: text for name, text in parameters.items() if name != "view"})
     lens = camera_lens(framing.pop("camera")) if "camera" in framing else {}
     views = several("view", framing.pop("view", parameters.get("view", "0")))
     if wrong := [view for view in views if not is_number(view) or views.count(view) > 1]:
@@ -168,7 +213,7 @@ def _picture(shot: Shot, png: bool) -> Path | None:
 def _check_outputs(shots: list[Shot], inputs: list[Path], png: bool) -> None:
     """Raise ImageError for an image or picture that cannot be written, or that would overwrite what is read."""
     for shot in shots:
-        require_writable(shot.output, ".exr")
+        require_image(shot.output)
         picture = _picture(shot, png)
         if picture:
             require_picture(picture)
@@ -189,18 +234,15 @@ def _kept(shots: list[Shot], images: list[Image]) -> Iterator[None]:
         raise Interrupted(f"interrupted; {len(images)} of {len(shots)} images are written: {names}.") from cause
 
 
-def _write(image: Image, output: Path, picture: Path | None) -> None:
-    """Write the image and, if `picture` is given, its PNG: both files or none."""
-    from ..images.picture import png_file
+def _summary(
+    image: Image, output: Path, picture: Path | None, unit: str, wavelength_nm: float | None
+) -> dict[str, Any]:
+    """The files, the total power [W], the brightest pixel [unit], the time [s], and what the metadata warn of."""
+    from ..images.radiometry import in_unit
 
-    with png_file(image, picture) if picture else nullcontext():
-        image.write(output)
-
-
-def _summary(image: Image, output: Path, picture: Path | None) -> dict[str, Any]:
-    """The files, the total power and the brightest pixel [W], the time [s], and what the metadata warn of."""
+    shown = in_unit(image, unit, wavelength_nm)
     summary: dict[str, Any] = {"output": str(output), "total_power": float(image.power.sum(dtype="float64"))}
-    summary |= {"peak": float(image.power.max()), "wall_time": image.metadata["wall_time"]}
+    summary |= {"peak": float(shown.values.max()), "unit": shown.unit, "wall_time": image.metadata["wall_time"]}
     if picture:
         summary["picture"] = str(picture)
     return summary | {key: image.metadata[key] for key in ("warnings",) if key in image.metadata}
@@ -208,6 +250,6 @@ def _summary(image: Image, output: Path, picture: Path | None) -> dict[str, Any]
 
 def _summary_text(summary: dict[str, Any]) -> str:
     """A line for each file of an image."""
-    numbers = f"total {summary['total_power']:.6g} W, brightest pixel {summary['peak']:.6g} W"
+    numbers = f"total {summary['total_power']:.6g} W, brightest pixel {summary['peak']:.6g} {summary['unit']}"
     line = f"{summary['output']}: {numbers}, {summary['wall_time']:.3g} s"
     return f"{line}\n{summary['picture']}: the same to look at" if "picture" in summary else line

@@ -39,6 +39,7 @@ def sweep(
     seed: Seed = None,
     sensor: Sensor = 0,
     source_power: SourcePower = None,
+    format: Annotated[str, typer.Option(help="Of the images: exr, tif, h5, npz or fits.")] = "exr",
     jobs: Annotated[int | None, typer.Option(help="Processes on this machine.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
@@ -46,7 +47,7 @@ def sweep(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render all combinations of values: an EXR each, index.csv and a contact sheet.
+    """Render all combinations of values: an image each, index.csv and a contact sheet.
 
     Run again, it renders only what is missing or was made from something
     else: another scene, data file, value, setting or version.
@@ -62,6 +63,7 @@ def sweep(
             settings |= {
                 "sensor": sensor,
                 "source_power": source_power,
+                "format": format,
                 "jobs": jobs,
                 "scheduler": scheduler,
                 "progress": progress,

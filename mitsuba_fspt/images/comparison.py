@@ -74,6 +74,18 @@ class Comparison:
             lines.append(f"beyond {self.beyond}   pixels that differ by more than both integrals' errors together")
         return "\n".join(lines)
 
+    def _repr_png_(self) -> bytes | None:
+        """Profiles for notebooks; None without matplotlib."""
+        from .notebook import comparison_png
+
+        return comparison_png(self)
+
+    def _repr_html_(self) -> str:
+        """Numbers and profiles for notebooks."""
+        from .notebook import comparison_html
+
+        return comparison_html(self)
+
     def to_dict(self) -> dict[str, Any]:
         """Comparison as numbers, text, lists and dicts, ready for JSON."""
         numbers = {name: getattr(self, name) for name in ("me", "cf", "max_error", "rms", "ratio")}

@@ -24,8 +24,10 @@ from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
-from .exr import Metadata, write_exr
+from .formats import Metadata, write_planes
 from .image import Image
+from .pixel_axes import CROP
+from .radiometry import PLANCK_TIMES_LIGHT, wavelength_of
 
 # Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
 # `pixel_pitch` is that of the pixels read out.
@@ -41,8 +43,6 @@ EXAMPLES = {
 }
 TABLES = ("detector", "lens")  # of a camera's TOML file; the lens is for other readers
 RECORDED = {name: name for name in EXAMPLES} | {"pixel_pitch": "detector_pixel_pitch"}
-
-PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +62,11 @@ class Exposure:
     metadata: Metadata
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the electrons to an EXR file: channel `Y`, the metadata under `fspt:`.
+        """Write the electrons and the metadata; the suffix chooses the format, in an EXR the channel is `Y`.
 
-        Raises ImageError if the suffix is not .exr or the file cannot be written.
+        Raises ImageError and BackendError as `Image.write`.
         """
-        write_exr(path, {"Y": self.electrons}, self.metadata)
+        write_planes(path, {"electrons": self.electrons}, self.metadata)
 
     def write_counts(self, path: str | os.PathLike[str]) -> None:
         """Write the counts, unscaled, to a 16-bit greyscale PNG or TIFF; metadata as JSON in its description.
@@ -230,6 +230,7 @@ class Detector:
         Parameters and errors as for `expose`.
         """
         exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
+        wavelength_of(image, wavelength_nm)
         if (darkest := image.power.min()) < 0:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
         energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
@@ -256,6 +257,7 @@ class Detector:
         Raises
         ------
         DetectorError : a parameter is outside its range, or the binning does not divide the image.
+        ImageError : the image was rendered for another wavelength.
         """
         exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
         seed, binning = _whole("seed", seed), _whole("binning", binning)
@@ -284,6 +286,8 @@ class Detector:
         metadata |= {key: getattr(self, name) for name, key in RECORDED.items() if getattr(self, name) is not None}
         if "pixel_pitch" in image.metadata:
             metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
+        if binning > 1:  # of a crop window, in pixels of the read-out
+            metadata |= {key: float(image.metadata[key]) / binning for key in CROP if key in image.metadata}
         return Exposure(electrons, counts.astype(np.uint16), metadata)
 
 

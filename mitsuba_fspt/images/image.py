@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
-from .exr import Metadata, read_exr, write_exr
+from .formats import Metadata, read_planes, write_planes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from xarray import DataArray, Dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +91,87 @@ class Image:
         """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
         return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
 
-    def write(self, path: str | os.PathLike[str]) -> None:
-        """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y` (float32), metadata under `fspt:`.
+    def to_radiance(self, wavelength_nm: float | None = None) -> DataArray:
+        """Apparent radiance [photons/s/cm²/sr] of what lies in focus, dimensions y and x as of `to_xarray`.
 
+        P/(τ G ⟨cos⁴θ⟩) of every pixel, with its étendue and the transmittance τ of the lens (Eq. M.6); 0 where no light
+        passes. Its `error` and `coverage` are coordinates.
+
+        wavelength_nm : of the light [nm]; None: that of the lens's filter, if the image has one
+
+        Raises ImageError if the metadata lack the lens or the wavelength, BackendError if xarray is not installed.
+        """
+        from .labelled import radiance_array
+
+        return radiance_array(self, wavelength_nm)
+
+    def to_xarray(self) -> Dataset:
+        """Dataset of `power`, `error` and `coverage`, dimensions (y, x), with `units` and the metadata as attributes.
+
+        Coordinates are the pixels' centres [mm] on the virtual detector plane, x to the right and y up: the first row
+        has the largest y. Raises BackendError if xarray is not installed.
+        """
+        from .labelled import dataset
+
+        return dataset(self)
+
+    def plot(
+        self,
+        axes: Axes | None = None,
+        *,
+        log: bool = False,
+        limits: tuple[float, float] | None = None,
+        outline: bool = False,
+    ) -> Axes:
+        """Draw the picture that `--png` writes, with colour bar and axes in mm; returns matplotlib's axes.
+
+        axes : to draw into; None: those of a new figure of pyplot
+        log, limits : of the colour scale [W/pixel], see `ColourScale.over`
+        outline : draw the silhouette of the phantom, where the coverage is 1/2
+
+        Raises ImageError for limits that are no range and for an outline without coverage, BackendError without
+        matplotlib.
+        """
+        from .picture import plot_image
+
+        return plot_image(self, axes, log=log, limits=limits, outline=outline)
+
+    def plot_profile(self, row: int | None = None, column: int | None = None, axes: Axes | None = None) -> Axes:
+        """Draw the power along a row or a column, with a band of ± error; returns matplotlib's axes.
+
+        row, column : number of one of them, from 0 at the top or left; None: the row through the brightest pixel
+        axes : to draw into; None: those of a new figure of pyplot
+
+        Raises ImageError if both are given or it does not exist, BackendError without matplotlib.
+        """
+        from .picture import plot_profile
+
+        return plot_profile(self, row, column, axes)
+
+    def _repr_png_(self) -> bytes | None:
+        """Picture for notebooks; None without matplotlib."""
+        from .notebook import image_png
+
+        return image_png(self)
+
+    def _repr_html_(self) -> str:
+        """Numbers and picture for notebooks."""
+        from .notebook import image_html
+
+        return image_html(self)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write a file of float32 planes and all metadata; its suffix chooses the format, see docs/images.md.
+
+        .exr has the channels `Y`, `error.Y`, `coverage.Y` and metadata under `fspt:`; .tif, .h5, .npz and .fits hold
+        the same.
         The file is written completely or not at all. Pixels below float32's 1e-38 may become 0; an image whose
         brightest pixel lies below that is refused.
 
         Raises
         ------
-        ImageError : the suffix is not .exr, a value does not fit into float32, or the file cannot be written.
+        ImageError : no format has the suffix, a value does not fit into float32, or the file cannot be written.
+        BackendError : the format needs a package that is not installed.
         """
         peak = max(self.power.max(), -self.power.min())
         if 0 < peak < np.finfo(np.float32).tiny:
@@ -102,28 +179,30 @@ class Image:
                 f"image: the brightest pixel has {peak:g} W, below what the file can hold (1.2e-38 W). "
                 "Scale the exitance up."
             )
-        planes = {"Y": self.power, "error.Y": self.error, "coverage.Y": self.coverage}
-        write_exr(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
+        planes = {"power": self.power, "error": self.error, "coverage": self.coverage}
+        write_planes(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
 
 
 def read(path: str | os.PathLike[str]) -> Image:
-    """Image of an EXR file with a channel `Y`, whose values count as power [W] on a pixel.
+    """Image of a file that `Image.write` wrote, or of any EXR file with a channel `Y`, which counts as power [W].
 
-    `error` and `coverage` are None if the file has no channel `error.Y`, `coverage.Y`.
+    `error` and `coverage` are None if the file does not have them.
 
     Raises
     ------
-    ImageError : the file does not exist, is no EXR file or damaged, has no channel `Y`, or holds values that are
-        not finite or, by its metadata, no power.
+    ImageError : the file does not exist, has the suffix of no format, is damaged, is that of another program, has no
+        power, or holds values that are not finite or, by its metadata, no power.
+    BackendError : the format needs a package that is not installed.
     """
-    channels, metadata = read_exr(path)
-    if "Y" not in channels:
+    planes, metadata = read_planes(path)
+    quantity = str(metadata.get("quantity", "power"))
+    if quantity not in planes:
         raise ImageError(
-            f"image file '{path}' has no channel 'Y' (power in W), its channels are {', '.join(channels)}. "
-            "Give a file that fspt wrote."
+            f"image file '{path}' has no plane of power in W ('Y' in an EXR), it has {', '.join(planes)}. Give a file "
+            "that fspt wrote."
         )
     try:
-        return Image(channels["Y"], channels.get("error.Y"), channels.get("coverage.Y"), metadata)
+        return Image(planes[quantity], planes.get("error"), planes.get("coverage"), metadata)
     except ImageError as cause:
         raise ImageError(f"image file '{path}': {cause}") from cause
 

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, ImageError
+from ..runtime.numbers import whole
 from .colour_scale import ColourScale
 from .colour_scale import scale_and_unit as scale_and_unit
 from .comparison import Comparison, Profile, compare
 from .image import Image
+from .pixel_axes import PixelAxes
 from .z_test import differences, error_bound
 
 if TYPE_CHECKING:
@@ -102,6 +104,62 @@ def title(image: Image, name: str = "") -> str:
     parts = [name] if name else []
     parts += [f"view {view[1]}°"] if view else []
     return ", ".join([*parts, f"total {image.power.sum(dtype=np.float64):.4g} W"])
+
+
+def plot_image(
+    image: Image,
+    axes: Axes | None,
+    *,
+    log: bool = False,
+    limits: tuple[float, float] | None = None,
+    outline: bool = False,
+) -> Axes:
+    """As `Image.plot`."""
+    scale = ColourScale.over([image.power], log=log, limits=limits)
+    axes = _own_axes(axes)
+    draw_image(axes, image, scale, outline=outline)
+    axes.set_title("\n".join(filter(None, [title(image), caption(image)])), fontsize="medium")
+    return axes
+
+
+def plot_profile(image: Image, row: int | None, column: int | None, axes: Axes | None) -> Axes:
+    """As `Image.plot_profile`."""
+    if row is not None and column is not None:
+        raise ImageError(f"picture: row {row} and column {column} exclude each other. Give one of them.")
+    if column is None:
+        along, given, count = "row", image.power.max(axis=1).argmax() if row is None else row, image.shape[0]
+    else:
+        along, given, count = "column", column, image.shape[1]
+    index = whole(f"picture: the number of a {along}", given, ImageError, "0")
+    if not 0 <= index < count:
+        raise ImageError(f"picture: {along} {index} does not exist. Give one in 0 … {count - 1}.")
+    power = (image.power[index] if along == "row" else image.power[:, index]).astype(np.float64)
+    axes = _own_axes(axes)
+    _draw_profile(axes, image, Profile(along, index, power, power), [(image, power, "power", "C3", 1.2)])
+    return axes
+
+
+def draw_comparison_profiles(comparison: Comparison) -> Figure:
+    """Figure of the profiles of both images, power [W/pixel] over the number of the pixel."""
+    count = len(comparison.profiles)
+    figure = empty_figure(width=5.0 * count, height=3.2)
+    for axes, profile in zip(figure.subplots(1, count, squeeze=False).flat, comparison.profiles, strict=True):
+        factor, unit = scale_and_unit(np.maximum(profile.calculated, profile.standard))
+        axes.plot(profile.standard / factor, color="0.65", linewidth=4.0, label="standard")
+        axes.plot(profile.calculated / factor, color="C3", linewidth=1.2, label="calculated")
+        axes.set(xlabel="pixel", ylabel=f"power [{unit}]", ylim=(0, None), title=f"{profile.line} {profile.index}")
+        axes.legend(frameon=False)
+    return figure
+
+
+def _own_axes(axes: Axes | None) -> Axes:
+    """`axes`, or those of a new figure of pyplot, which a notebook or `pyplot.show` shows."""
+    require_matplotlib()
+    if axes is not None:
+        return axes
+    from matplotlib import pyplot
+
+    return pyplot.subplots(layout="constrained")[1]
 
 
 def draw_panels(
@@ -190,8 +248,8 @@ def draw_outline(axes: Axes, image: Image) -> None:
             "picture: an image without coverage has no outline. Leave it out, or give one that 'fspt render' wrote."
         )
     if image.coverage.min() < 0.5 < image.coverage.max() and min(image.shape) > 1:
-        x, y = _centres(image)
-        axes.contour(x, y, image.coverage, levels=[0.5], colors=OUTLINE, linewidths=1.0)
+        place = _axes_of(image)
+        axes.contour(place.x, place.y, image.coverage, levels=[0.5], colors=OUTLINE, linewidths=1.0)
 
 
 def draw_scale_bar(axes: Axes, left: float, bottom: float, width: float, side: float) -> None:
@@ -249,26 +307,41 @@ def _show_deviation(axes: Axes, calculated: Image, standard: Image, comparison: 
 
 def _show_profile(axes: Axes, profile: Profile, calculated: Image, standard: Image, scale: ColourScale) -> None:
     """Draw the power along a row or column of both images, the calculated one as a thin line on a wide one."""
-    row = profile.line == "row"
-    x = _centres(standard)[0 if row else 1]
-    pairs = (
+    pairs = [
         (standard, profile.standard, "standard", "0.65", 4.0),
         (calculated, profile.calculated, "calculated", "C3", 1.2),
-    )
-    for image, power, name, colour, width in pairs:
+    ]
+    _draw_profile(axes, standard, profile, pairs, scale)
+    axes.set_box_aspect(_aspect(standard))
+    axes.legend(frameon=False)
+
+
+def _draw_profile(
+    axes: Axes,
+    frame: Image,
+    profile: Profile,
+    curves: Sequence[tuple[Image, NDArray, str, str, float]],
+    scale: ColourScale | None = None,
+) -> None:
+    """Draw curves (image, power along the profile, name, colour, line width) with bands of ± error, in mm of `frame`.
+
+    scale : of the power; None: that of the curves
+    """
+    row = profile.line == "row"
+    x = _axes_of(frame).x if row else _axes_of(frame).y
+    scale = scale or ColourScale.over([power for _, power, *_ in curves])
+    for image, power, name, colour, width in curves:
         axes.plot(x, power / scale.factor, color=colour, label=name, linewidth=width)
         if image.error is not None:
             error = (image.error[profile.index] if row else image.error[:, profile.index]) / scale.factor
             low, high = power / scale.factor - error, power / scale.factor + error
             axes.fill_between(x, low, high, color=colour, alpha=0.3, linewidth=0)
-    left, right, bottom, top = _extent(standard)[0]
-    axes.set(xlabel=_extent(standard)[1], xlim=(left, right) if row else sorted((bottom, top)))
+    left, right, bottom, top = _extent(frame)[0]
+    axes.set(xlabel=_extent(frame)[1], xlim=(left, right) if row else sorted((bottom, top)))
     axes.set(ylabel=scale.label, ylim=(0, None))
     axes.set_title(
         f"{profile.line} {profile.index}, " + ("left to right" if row else "vertical position"), fontsize="medium"
     )
-    axes.set_box_aspect(_aspect(standard))
-    axes.legend(frameon=False)
 
 
 def _extend(images: Sequence[Image], scale: ColourScale) -> Literal["neither", "min", "max", "both"]:
@@ -280,28 +353,14 @@ def _extend(images: Sequence[Image], scale: ColourScale) -> Literal["neither", "
 
 def _extent(image: Image) -> tuple[tuple[float, float, float, float], str]:
     """(left, right, bottom, top) of the picture [mm or pixels], and the axis label with unit and plane."""
-    height, width = image.shape
-    side = virtual_pitch(image)
-    if not side:
-        return (-0.5, width - 0.5, height - 0.5, -0.5), "pixel"
-    x, y = side * width / 2, side * height / 2
-    plane = "virtual detector plane" if image.metadata.get("magnification") else "detector"
-    return (-x, x, -y, y), f"mm on the {plane}"
+    axes = _axes_of(image)
+    across, down = axes.step / 2, axes.down / 2
+    ends = (axes.x[0] - across, axes.x[-1] + across, axes.y[-1] + down, axes.y[0] - down)
+    return tuple(map(float, ends)), axes.label  # type: ignore[return-value]
 
 
-def virtual_pitch(image: Image) -> float | None:
-    """Side of a pixel [mm] on the virtual detector plane, on the detector without a magnification; None if unknown."""
-    pitch, magnification = (image.metadata.get(key) for key in ("pixel_pitch", "magnification"))
-    return float(pitch) / float(magnification or 1.0) if pitch else None
-
-
-def _centres(image: Image) -> tuple[NDArray, NDArray]:
-    """Positions of the columns, shape (w,), and of the rows, shape (h,), in the unit of `_extent`."""
-    (left, right, bottom, top), _ = _extent(image)
-    height, width = image.shape
-    x = left + (np.arange(width) + 0.5) * (right - left) / width
-    y = top + (np.arange(height) + 0.5) * (bottom - top) / height
-    return x, y
+def _axes_of(image: Image) -> PixelAxes:
+    return PixelAxes.of(image.shape, image.metadata)
 
 
 def _aspect(image: Image) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..optics.thin_lens import FOCUS, Lens, number_names
+from ..optics.transmittance import NUMBERS as LIGHT
 from ..runtime.errors import OpticsError, SceneError
 from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
@@ -23,16 +25,9 @@ LEAST, MOST = 1e-6, 1e6  # magnifications among which the one that fills the fil
 CURVE = "transmittance_curve"
 DIGITS = 3  # of the magnification that is found
 
-TEMPLATE = """<?xml version="1.0" encoding="utf-8"?>
+SCENE = """<?xml version="1.0" encoding="utf-8"?>
 <!--
-The phantom {title} through a {focal_length:g} mm lens at f/{f_number:g}.
-
-Units     mm; exitance in W/mm^2, so a pixel holds W.
-World     z up, origin in the centre of the phantom's bounding box, which is {size} mm large; the camera
-          stands on the +x axis, +y is to the right of the picture.
-view      turns the phantom about the z axis by so many degrees, counterclockwise seen from above.
-Camera    magnification puts the virtual detector plane on the front of the phantom, which stands with its axis at
-          distance from the lens. With another magnification t give distance = focal_length (1 + 1/t) + {radius:.6g}.
+{comment}
 -->
 <scene version="3.0.0">
 {defaults}
@@ -61,7 +56,22 @@ Camera    magnification puts the virtual detector plane on the front of the phan
         </film>
     </sensor>
 
-    <shape type="ply" id="phantom">
+{shapes}
+</scene>
+"""
+
+COMMENT = """{title} through a {focal_length:g} mm lens at f/{f_number:g}.
+
+Units     mm; exitance in W/mm^2, so a pixel holds W.
+World     z up, origin in the centre of the phantom's bounding box, which is {size} mm large; the camera
+          stands on the +x axis, +y is to the right of the picture.
+view      turns the phantom about the z axis by so many degrees, counterclockwise seen from above.
+{notes}"""
+FOCUSED = """\
+Camera    magnification puts the virtual detector plane on the front of the phantom, which stands with its axis at
+          distance from the lens. With another magnification t give distance = focal_length (1 + 1/t) + {radius:.6g}."""
+
+PLY = """    <shape type="ply" id="phantom">
         <string name="filename" value={filename}/>
         <!-- The outward side is that of the flat face, at the rim too. -->
         <boolean name="face_normals" value="true"/>
@@ -74,9 +84,8 @@ Camera    magnification puts the virtual detector plane on the front of the phan
                 <string name="name" value="{attribute}"/>
             </texture>
         </emitter>
-    </shape>
-</scene>
-"""
+    </shape>"""
+ORDER = ("f_number", "view", "rtol", "focal_length", "magnification", "distance", "width", "height", "pixel_pitch")
 
 
 def scene_xml(
@@ -127,30 +136,60 @@ def scene_xml(
     path = Path(phantom)
     if "$" in str(path.absolute()):
         raise SceneError(f"scene: '{path}' has a $ in its path, which marks a parameter in a scene file. Rename it.")
+    mesh = Phantom.read(path)
+    camera = {"focal_length": focal_length, "f_number": f_number, "magnification": magnification, "distance": distance}
+    film = {"pixel_pitch": pixel_pitch, "width": width, "height": height}
+    shape = PLY.format(
+        filename=quoteattr(str(path.absolute())),
+        shift=tuple(-float(c) + 0.0 for c in (mesh.bounds[0] + mesh.bounds[1]) / 2),
+        attribute=f"{mesh.per}_{mesh.attribute}",
+    )
+    title = f"The phantom {path.name.replace('--', '- -')}"
+    return framed_text(Outline.of(mesh), title, shape, **camera, **film, rtol=rtol, view=view, **lens)  # type: ignore[arg-type]
+
+
+def framed_text(
+    outline: Outline,
+    title: str,
+    shapes: str,
+    *,
+    focal_length: float = 50.0,
+    f_number: float = 1.8,
+    magnification: float | None = None,
+    distance: float | None = None,
+    pixel_pitch: float = 0.108,
+    width: int = 256,
+    height: int = 256,
+    rtol: float = 1e-3,
+    view: float = 0.0,
+    parameters: Mapping[str, float] | None = None,
+    notes: str = FOCUSED,
+    **lens: float | str,
+) -> str:
+    """Text of a scene that shows shapes with this `outline`, about the origin; other arguments as of `scene_xml`.
+
+    title : what is shown, the beginning of the comment
+    shapes : their XML, which may use $view and the `parameters`, further `<default>`s
+    notes : end of the comment, on the camera and whatever else the scene has
+    """
     numbers = _numbers(focal_length=focal_length, f_number=f_number, pixel_pitch=pixel_pitch, rtol=rtol, view=view)
     film = {"width": _pixels("width", width), "height": _pixels("height", height)}
-    mesh = Phantom.read(path)
+    known = ("model", *number_names(), *LIGHT, CURVE)
+    if unknown := [name for name in lens if name not in known]:
+        raise SceneError(f"scene: 'fspt_lens' has no parameter {unknown[0]}. Leave it out, or give {', '.join(known)}.")
     if isinstance(curve := lens.get(CURVE), str):  # the text may be saved anywhere
         lens[CURVE] = str(Path(curve).absolute())
-    frame = Frame(Outline.of(mesh), focal_length, f_number, numbers["pixel_pitch"], film, lens)
+    frame = Frame(outline, focal_length, f_number, numbers["pixel_pitch"], film, lens)
     found = dict(zip(("magnification", "distance"), frame.placed(magnification, distance), strict=True))
-    return _filled_in(path, f"{mesh.per}_{mesh.attribute}", frame, numbers | found | film)
-
-
-def _filled_in(path: Path, attribute: str, frame: Frame, values: dict[str, float]) -> str:
-    """The template with these values of its `<default>` parameters."""
-    order = ("f_number", "view", "rtol", "focal_length", "magnification", "distance", "width", "height", "pixel_pitch")
-    return TEMPLATE.format(
-        title=path.name.replace("--", "- -"),
-        focal_length=values["focal_length"],
-        f_number=values["f_number"],
-        size=" x ".join(f"{side:.4g}" for side in frame.outline.size),
-        radius=frame.outline.radius,
-        defaults="\n".join(f'    <default name="{name}" value="{values[name]:.10g}"/>' for name in order),
-        borders="".join(_property(name, value) for name, value in frame.lens.items() if name not in FOCUS),
-        filename=quoteattr(str(path.absolute())),
-        shift=tuple(-float(c) + 0.0 for c in frame.outline.centre),
-        attribute=attribute,
+    values = numbers | found | film | dict(parameters or {})
+    size = " x ".join(f"{side:.4g}" for side in outline.size)
+    camera = {"focal_length": values["focal_length"], "f_number": values["f_number"]}
+    names = (*ORDER, *(parameters or ()))
+    return SCENE.format(
+        comment=COMMENT.format(title=title, size=size, notes=notes.format(radius=outline.radius), **camera),
+        defaults="\n".join(f'    <default name="{name}" value="{values[name]:.10g}"/>' for name in names),
+        borders="".join(_property(name, value) for name, value in lens.items() if name not in FOCUS),
+        shapes=shapes,
     )
 
 

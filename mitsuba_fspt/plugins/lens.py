@@ -146,13 +146,22 @@ class FsptLens(mi.Sensor):
         farthest = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
         self.rounding = EPSILON * (farthest + self.optics.focus_distance) / self.virtual_pitch
 
-    def numbers(self) -> dict[str, float | str]:
+    def numbers(self) -> dict[str, float | int | str]:
         """Numbers of the lens and its pixels for an image's metadata: lengths in mm, wavelength in nm."""
-        light: dict[str, float | str] = {"transmittance": self.transmittance}
+        light: dict[str, float | int | str] = {"transmittance": self.transmittance}
         light["t_stop"] = transmittance.t_stop(self.optics.f_number, self.transmittance)
         if self._curve:
             light |= {"transmittance_curve": self._curve.file, "wavelength_nm": self._wavelength}
-        return self.optics.numbers() | light | {"pixel_pitch": self.pixel_pitch}
+        return self.optics.numbers() | light | {"pixel_pitch": self.pixel_pitch} | self._crop()
+
+    def _crop(self) -> dict[str, int]:
+        """Size of the film and first pixel of its crop window, if it has one."""
+        film = self.film()
+        size, offset, crop = ([int(n) for n in of] for of in (film.size(), film.crop_offset(), film.crop_size()))
+        if crop == size:
+            return {}
+        names = ("film_width", "film_height", "crop_offset_x", "crop_offset_y")
+        return dict(zip(names, (*size, *offset), strict=True))
 
     # ------------------------------------------------------------------ lines of sight
 

@@ -204,7 +204,7 @@ def _backends(trials: dict[str, dict[str, float] | str]) -> Iterator[ReportLine]
 
 
 def _optional() -> Iterator[ReportLine]:
-    for package in EXTRAS:
+    for package in {one.distribution: one for one in reversed(EXTRAS)}.values():  # the first extra that brings it
         missing = f"not installed: pip install 'mitsuba-fspt[{package.extra}]'"
         yield ReportLine("extras", package.distribution, _version(package.distribution) or missing)
 

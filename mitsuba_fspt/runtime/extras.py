@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
+
+from .errors import BackendError
 
 
 @dataclass(frozen=True)
@@ -17,8 +20,23 @@ class Extra:
 EXTRAS = (
     Extra("matplotlib", "matplotlib", "plot"),
     Extra("meshio", "meshio", "mesh"),
+    Extra("tifffile", "tifffile", "formats"),
+    Extra("h5py", "h5py", "formats"),
+    Extra("astropy", "astropy", "formats"),
     Extra("h5py", "h5py", "mesh"),
+    Extra("xarray", "xarray", "notebook"),
     Extra("scikit-fem", "skfem", "tissue"),
     Extra("pytetwild", "pytetwild", "mesher"),
     Extra("dask", "distributed", "cluster"),
 )
+
+
+def require(module: str, thing: str) -> None:
+    """Import an optional package of `EXTRAS`; BackendError, which names the `thing` and the extra, if it is missing."""
+    extra = next(extra for extra in EXTRAS if extra.module == module)
+    try:
+        import_module(module)
+    except ImportError as cause:
+        raise BackendError(
+            f"{thing} needs {extra.distribution}, which is not installed. pip install 'mitsuba-fspt[{extra.extra}]'."
+        ) from cause

@@ -15,7 +15,9 @@ import numpy as np
 
 from ..images import picture
 from ..images.colour_scale import ColourScale
+from ..images.formats import format_of, suffixes
 from ..images.image import Image, read, required_source_power
+from ..images.pixel_axes import virtual_pitch
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.atomic_files import atomic_path
@@ -69,6 +71,7 @@ def sweep(
     seed: int | None = None,
     sensor: int = 0,
     source_power: float | None = None,
+    format: str = "exr",
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
@@ -77,7 +80,7 @@ def sweep(
 
         fspt.sweep("scenes/nylon_cylinder.xml", {"f_number": [2.8, 5.6], "view": [0, 90]}, "nylon")
 
-    Writes an EXR file for each row into `folder`, and `index.csv`. An image that is there already and was made from the
+    Writes an image for each row into `folder`, and `index.csv`. An image that is there already and was made from the
     same scene, data, values, settings and versions is not rendered again, so that a second call continues an
     interrupted sweep. The scene is loaded once for all points that differ only in numbers of the lens. The pixels do
     not depend on `jobs` or `scheduler`, to the last bit, except with `ptracer`, whose sums depend on the order of the
@@ -90,6 +93,7 @@ def sweep(
     folder : folder of the images; created if its parent exists
     method, rtol, spp, seed, sensor : as in `render`
     source_power : power of the light source [W], for a scene that is per 1 W of it, as in `Image.scaled`
+    format : of the images, by its suffix: exr, tif, h5, npz or fits
     jobs : number of processes, >= 1; None renders in this one (with scheduler 'local': one process a core). Each
         imports the script that calls: keep the call behind `if __name__ == "__main__":`
     scheduler : address of a dask.distributed scheduler, for example 'tcp://10.0.0.1:8786', or 'local' to start one
@@ -106,7 +110,12 @@ def sweep(
     folder = Path(folder)
     jobs = None if jobs is None else whole("sweep: 'jobs'", jobs, SceneError, "2")
     _check_jobs(jobs, scheduler)
-    wanted = points(_path_of(scene), parameters, _settings(method, rtol, spp, seed, sensor, source_power))
+    if f".{format}" not in suffixes():
+        known = ", ".join(suffix[1:] for suffix in suffixes())
+        raise ImageError(f"sweep: 'format' must be one of {known}, got '{format}'. Give for example exr.")
+    format_of(f"sweep.{format}")
+    settings = _settings(method, rtol, spp, seed, sensor, source_power)
+    wanted = points(_path_of(scene), parameters, settings, f".{format}")
     _check_names(wanted)
     _check_folder(folder)
     return _completed(wanted, folder, jobs, scheduler, progress)
@@ -309,7 +318,7 @@ def write_contact_sheet(rows: Sequence[SweepRow], path: str | os.PathLike[str]) 
     images = [read(row.file) for row in rows]
     powers = [image.power for image in images]
     scale = ColourScale.over(powers)
-    pitches = [picture.virtual_pitch(image) for image in images]
+    pitches = [virtual_pitch(image.metadata) for image in images]
     height, width = (max(power.shape[side] for power in powers) for side in (0, 1))
     varied, same = _parameters(rows)
     columns = len(varied[-1][1]) if len(varied) > 1 else min(len(rows), MAX_COLUMNS)

@@ -38,6 +38,7 @@ class SweepPoint:
     settings : method, rtol, spp, seed, sensor as `render` takes them, and source_power [W]
     geometry : hash of the scene without its lens; points of equal `geometry` can use the same loaded scene
     fingerprint : hash of the scene's files, the parameters, the settings and the versions
+    suffix : of the image's file, which chooses its format
     """
 
     scene: str
@@ -47,6 +48,7 @@ class SweepPoint:
     settings: dict[str, Setting]
     geometry: str
     fingerprint: str
+    suffix: str = ".exr"
 
     @property
     def label(self) -> str:
@@ -58,10 +60,12 @@ class SweepPoint:
         """Name of the image, 'nylon_cylinder_f_number=2.8_view=90.exr'."""
         values = (f"{name}={_in_a_name(value)}" for name, value in self.parameters.items())
         name = "_".join([self.path.stem, *values])
-        return (name if len(os.fsencode(name)) <= MAX_BYTES else _shortened(name)) + ".exr"
+        return (name if len(os.fsencode(name)) <= MAX_BYTES else _shortened(name)) + self.suffix
 
 
-def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Setting]) -> list[SweepPoint]:
+def points(
+    scene: Path, values: Mapping[str, object], settings: Mapping[str, Setting], suffix: str = ".exr"
+) -> list[SweepPoint]:
     """One point for every combination of the values, the last parameter changing fastest.
 
     Raises
@@ -75,11 +79,15 @@ def points(scene: Path, values: Mapping[str, object], settings: Mapping[str, Set
         raise SceneError(f"sweep: no parameter to vary over {scene}. Give one, for example -D f_number=2.8,5.6.")
     every = [dict(zip(texts, one, strict=True)) for one in itertools.product(*texts.values())]
     digests: dict[Path, str] = {}
-    return [point_of(scene, parameters, digests, dict(settings)) for parameters in every]
+    return [point_of(scene, parameters, digests, dict(settings), suffix) for parameters in every]
 
 
 def point_of(
-    scene: Path, parameters: dict[str, str], digests: dict[Path, str], settings: dict[str, Setting]
+    scene: Path,
+    parameters: dict[str, str],
+    digests: dict[Path, str],
+    settings: dict[str, Setting],
+    suffix: str = ".exr",
 ) -> SweepPoint:
     """The point of these parameters, checked; `digests` as of `SceneSource`."""
     check_parameters(scene, parameters)
@@ -92,7 +100,7 @@ def point_of(
     geometry = _hash(versions, source.digests(), others)
     fingerprint = _hash(geometry, {name: parameters[name] for name in lens}, settings)
     path = source.path
-    return SweepPoint(str(path), path.absolute(), parameters, lens, settings, geometry, fingerprint)
+    return SweepPoint(str(path), path.absolute(), parameters, lens, settings, geometry, fingerprint, suffix)
 
 
 def texts_of(name: str, given: object, verb: str) -> list[str]:

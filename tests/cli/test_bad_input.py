@@ -364,7 +364,7 @@ COMMANDS = {
     ),
     "include of nothing": (("render", "include.xml"), 'included file "gone.xml" not found'),
     "compare: no file": (("compare", "gone.exr", "gone.exr"), "image file 'gone.exr' does not exist"),
-    "compare: no image": (("compare", "broken.xml", "broken.xml"), "no readable OpenEXR file"),
+    "compare: no image": (("compare", "broken.xml", "broken.xml"), "must end in .exr, .fits, .h5, .npz or .tif"),
     "expose: no file": (EXPOSE, "image file 'gone.exr' does not exist"),
     "flux: no mesh": (("flux", "import", "gone.ply", "-o", "p.ply"), "mesh 'gone.ply' does not exist"),
     # Before any work, which for a tissue takes minutes: the description is not even read.
@@ -433,11 +433,11 @@ import resource, signal, sys
 from mitsuba_fspt import cli
 from mitsuba_fspt.images import image
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-write = image.write_exr
+write = image.write_planes
 def write_to_full_disk(*arguments):
     resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
     write(*arguments)
-image.write_exr = write_to_full_disk
+image.write_planes = write_to_full_disk
 sys.exit(cli.run(["render", "s.xml", "-o", "o.exr"]))
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)

@@ -87,11 +87,11 @@ def test_a_camera_file_options_and_a_range(run):
         (["phantom.ply", "--camera", "none.toml"], "'none.toml' cannot be read"),
         (["phantom.ply", "-D", "colour=3"], "'fspt_lens' has no parameter colour"),
         (["phantom.ply", "-D", "width=wide"], "'width' must be a whole number, got 'wide'"),
-        (["phantom.ply", "-o", "x.tif"], "must end in .exr"),
+        (["phantom.ply", "-o", "x.jpg"], "must end in .exr, .fits"),
         (["phantom.ply", "-o", "no/x.exr"], "the folder 'no' does not exist"),
         (["phantom.ply", "--sensor", "1"], "sensor 1 does not exist"),
         (["none.ply"], "no such file"),
-        ([SCENES / "l_shape.ply"], "must have one property 'exitance_x'"),
+        ([SCENES / "l_shape.ply"], "must have one property with J_n"),
         ([SCENES / "l_shape.xml", "--view", "90"], "--view goes with PHANTOM.ply"),
         ([SCENES / "l_shape.xml", "--focal-length", "50"], "--focal-length goes with PHANTOM.ply"),
     ],
@@ -104,14 +104,14 @@ def test_what_is_refused(run, arguments, message):
 
 
 def test_ctrl_c_tells_which_views_are_written(run, monkeypatch):
-    write = verb._write
+    write = verb.Output.write
 
-    def interrupted(image, output, picture):
+    def interrupted(self, image, output, picture):
         if output.name == "phantom_view90.exr":
             raise KeyboardInterrupt
-        write(image, output, picture)
+        write(self, image, output, picture)
 
-    monkeypatch.setattr(verb, "_write", interrupted)
+    monkeypatch.setattr(verb.Output, "write", interrupted)
     code, _, err = run("render", "phantom.ply", "--view", "0,90", *FEW)
     assert (code, files()) == (130, ["phantom_view0.exr"])
     assert "interrupted; 1 of 2 images are written: phantom_view0.exr." in err

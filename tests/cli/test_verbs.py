@@ -181,6 +181,7 @@ def test_render_as_json_and_quiet(run, tmp_path):
         "picture": "s.png",
         "total_power": pytest.approx(image.power.sum(dtype=float)),
         "peak": pytest.approx(image.power.max()),
+        "unit": "W",
         "wall_time": image.metadata["wall_time"],
     }
     code, out, err = run("render", "dark.xml", "--quiet")
@@ -241,6 +242,34 @@ def test_expose_writes_electrons_and_counts(run, two_images, tmp_path):
     assert run("expose", "a.exr", "-o", "e.exr", *options, "--quiet") == (0, "", "")
 
 
+@pytest.mark.parametrize("suffix", [".exr", ".fits", ".h5", ".npz", ".tif"])
+def test_every_verb_takes_every_format(run, tmp_path, suffix):
+    """The same image in each; seen to fail with .exr as the only suffix."""
+    write_scene(tmp_path / "s.xml")
+    assert run("render", "s.xml", "--rtol", "1e-2", "-o", f"a{suffix}", "--quiet") == (0, "", "")
+    assert run("render", "s.xml", "--rtol", "1e-2", "-o", "b.exr", "--quiet") == (0, "", "")
+    np.testing.assert_array_equal(fspt.read(f"a{suffix}").power, fspt.read("b.exr").power)
+    code, out, err = run("compare", f"a{suffix}", "b.exr", "--json")
+    assert (code, err, json.loads(out)["max_error"]) == (0, "", 0)
+    options = ["--exposure-time", "1", "--wavelength-nm", "600"]
+    assert run("expose", f"a{suffix}", "-o", f"e{suffix}", *options, "--quiet") == (0, "", "")
+    assert run("plot", f"a{suffix}", "--quiet") == (0, "", "")
+    words = ("sweep", "s.xml", "-D", "f_number=4,8", "--rtol", "1e-2", "--format", suffix[1:], "--json")
+    for reused in (False, True):
+        points = json.loads(run(*words)[1])["points"]
+        assert [point["file"] for point in points] == [f"s_sweep/s_f_number={n}{suffix}" for n in (4, 8)]
+        assert all(point["reused"] is reused for point in points)
+    assert {f"a{suffix}", f"e{suffix}", "a.png"} < set(os.listdir(tmp_path))
+
+
+def test_a_format_that_is_none(run, tmp_path):
+    write_scene(tmp_path / "s.xml")
+    code, out, err = run("sweep", "s.xml", "-D", "f_number=4", "--format", "jpg")
+    assert (code, out) == (2, "")
+    assert err == "fspt: sweep: 'format' must be one of exr, fits, h5, npz, tif, got 'jpg'. Give for example exr.\n"
+    assert os.listdir(tmp_path) == ["s.xml"]
+
+
 def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
     code, out, err = run("plot", "a.exr")
     assert (code, out, err) == (0, "a.png: 1 image\n", "")
@@ -259,7 +288,7 @@ def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
         (("--range", "2,1"), "picture: the range must be A < B in W/pixel, got 2,1. Give 0,1e-9."),
         (("--outline",), "picture: an image without coverage has no outline. Leave it out, or give one that"),
         (("-o", "a.jpg"), "output file 'a.jpg' must end in .png. Give a name such as picture.png."),
-        (("none.exr",), "image file 'none.exr' does not exist. Give the path of an EXR file."),
+        (("none.exr",), "image file 'none.exr' does not exist. Give the path of an image that fspt wrote."),
     ],
 )
 def test_plots_that_cannot_be_drawn(run, two_images, tmp_path, options, message):
@@ -380,7 +409,7 @@ def test_expose_does_not_overwrite_the_power(run, two_images):
 def test_render_wants_a_name_for_its_image(run, tmp_path, output):
     code, _, err = run("render", write_scene(tmp_path / "s.xml"), "-o", output)
     assert code == 2
-    assert err.endswith("must end in .exr. Give a name such as image.exr.\n")
+    assert err.endswith("must end in .exr, .fits, .h5, .npz or .tif. Give a name such as image.exr.\n")
 
 
 def test_flux_import_makes_a_phantom_that_renders(run, tmp_path):

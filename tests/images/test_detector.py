@@ -11,8 +11,9 @@ import pytest
 from PIL import Image as Picture
 
 from mitsuba_fspt.images.detector import EXAMPLES, Detector
-from mitsuba_fspt.images.exr import read_exr
+from mitsuba_fspt.images.formats import read_planes
 from mitsuba_fspt.images.image import Image
+from mitsuba_fspt.images.pixel_axes import PixelAxes
 from mitsuba_fspt.runtime.errors import BackendError, DetectorError, ImageError
 
 CCD = Detector.typical_ccd()
@@ -167,13 +168,29 @@ def test_seed():
     assert (first.electrons != other.electrons).any()
 
 
+def test_binned_pixels_of_a_crop_window_keep_their_places():
+    """Centres of 2 × 2 pixels are the means of theirs, and the axis is the film's. Fails with unbinned numbers."""
+    crop = {"film_width": 40, "film_height": 32, "crop_offset_x": 6, "crop_offset_y": 20}
+    image = flat(100.0, 8, pixel_pitch=0.4, magnification=0.5, **crop)
+    fine, coarse = (
+        PixelAxes.of(shape, metadata)
+        for shape, metadata in (
+            ((8, 8), image.metadata),
+            ((4, 4), CCD.expose(image, 1.0, WAVELENGTH_NM, binning=2).metadata),
+        )
+    )
+    assert fine.x[0] == pytest.approx(0.8 * (6.5 - 20))
+    np.testing.assert_allclose(coarse.x, fine.x.reshape(-1, 2).mean(axis=1))
+    np.testing.assert_allclose(coarse.y, fine.y.reshape(-1, 2).mean(axis=1))
+
+
 def test_exr(tmp_path):
     """Electrons in the channel; in the header the image's metadata and all that makes the exposure again."""
     image = flat(100.0, 16, pixel_pitch=0.0135, f_number=2.8, seed=77)
     exposure = CCD.expose(image, 30.0, WAVELENGTH_NM, binning=4, seed=12)
     exposure.write(tmp_path / "e.exr")
-    channels, metadata = read_exr(tmp_path / "e.exr")
-    np.testing.assert_array_equal(channels["Y"], exposure.electrons)
+    planes, metadata = read_planes(tmp_path / "e.exr")
+    np.testing.assert_array_equal(planes["electrons"], exposure.electrons)
     expected = {"quantity": "electrons", "unit": "e-", "f_number": 2.8, "seed": 77, "detector_seed": 12}
     expected |= {"exposure_time": 30.0, "wavelength_nm": 650.0, "binning": 4, "pixel_pitch": 0.054}
     expected |= {"quantum_efficiency": 0.85, "dark_current": 1e-3, "read_noise": 3.5, "full_well": 1e5}

@@ -8,7 +8,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from mitsuba_fspt.images.exr import read_exr, write_exr
+from mitsuba_fspt.images.formats import read_planes, write_planes
 from mitsuba_fspt.images.image import Image, read
 from mitsuba_fspt.runtime.atomic_files import atomic_path
 from mitsuba_fspt.runtime.errors import FsptError, ImageError
@@ -147,8 +147,8 @@ def test_what_is_no_image(arguments, message):
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (Image([[1e39, 0]]), "'Y' is 1e.39 at row 0, column 0.*Scale the exitance down"),
-        (Image([[1.0, 0]], [[0, 1e300]]), "'error.Y' is 1e.300 at row 0, column 1"),
+        (Image([[1e39, 0]]), "'power' is 1e.39 at row 0, column 0.*Scale the exitance down"),
+        (Image([[1.0, 0]], [[0, 1e300]]), "'error' is 1e.300 at row 0, column 1"),
         (Image([[1e-39, 0]]), "brightest pixel has 1e-39 W.*Scale the exitance up"),
         (Image([[1.0]], metadata={"seed": 2**60}), "'seed' = 1152921504606846976 is too large"),
         (Image([[1.0]], metadata={"lens": (1, 2)}), "'lens' must be text or a number, got tuple"),
@@ -170,7 +170,7 @@ def test_dark_pixels_may_vanish_and_dark_images_be_written(tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("a.png", "Give a name that ends in .exr"),
+        ("a.png", r"must end in \.exr, \.fits, \.h5, \.npz or \.tif\. Give a name"),
         ("none/a.exr", "folder '.*none' does not exist. Create it first"),
         ("folder.exr", "is a folder"),
         ("x" * 300 + ".exr", "cannot be written: File name too long"),
@@ -276,9 +276,9 @@ def test_files_without_power(tmp_path):
     with pytest.raises(ImageError, match=r"none\.exr' does not exist"):
         read(tmp_path / "none.exr")
     OpenEXR.File({}, {"RGB": np.zeros((2, 2, 3), np.float32)}).write(str(tmp_path / "rgb.exr"))
-    with pytest.raises(ImageError, match=r"no channel 'Y'.*its channels are B, G, R"):
+    with pytest.raises(ImageError, match=r"no plane of power in W \('Y' in an EXR\), it has B, G, R\."):
         read(tmp_path / "rgb.exr")
-    write_exr(tmp_path / "e.exr", {"Y": np.ones((2, 2))}, {"quantity": "electrons", "unit": "e-"})
+    write_planes(tmp_path / "e.exr", {"electrons": np.ones((2, 2))}, {"quantity": "electrons", "unit": "e-"})
     with pytest.raises(ImageError, match=r"e\.exr': image: the values are electrons in e-, not power"):
         read(tmp_path / "e.exr")
 
@@ -290,9 +290,9 @@ def test_values_of_a_foreign_file_must_be_finite(tmp_path):
 
 
 def test_channels_of_any_quantity(tmp_path):
-    write_exr(tmp_path / "e.exr", {"Y": np.eye(3)}, {"quantity": "electrons", "unit": "e-"})
-    channels, metadata = read_exr(tmp_path / "e.exr")
-    np.testing.assert_array_equal(channels["Y"], np.eye(3))
+    write_planes(tmp_path / "e.exr", {"electrons": np.eye(3)}, {"quantity": "electrons", "unit": "e-"})
+    planes, metadata = read_planes(tmp_path / "e.exr")
+    np.testing.assert_array_equal(planes["electrons"], np.eye(3))
     assert metadata == {"quantity": "electrons", "unit": "e-"}
 
 

@@ -1,0 +1,48 @@
+"""Images as xarray's arrays: planes with coordinates in mm and units."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..runtime.extras import require
+from .formats import units
+from .image import Image
+from .pixel_axes import PixelAxes
+from .radiometry import in_unit
+
+if TYPE_CHECKING:
+    from xarray import DataArray, Dataset
+
+DIMENSIONS = ("y", "x")
+
+
+def dataset(image: Image) -> Dataset:
+    """As `Image.to_xarray`."""
+    require("xarray", "image: to_xarray")
+    import xarray as xr
+
+    given = {name: getattr(image, name) for name in ("power", "error", "coverage")}
+    planes = {name: plane for name, plane in given.items() if plane is not None}
+    arrays = {name: (DIMENSIONS, planes[name], {"units": unit}) for name, unit in units(planes, image.metadata).items()}
+    return xr.Dataset(arrays, coords=_coordinates(image), attrs=dict(image.metadata))
+
+
+def radiance_array(image: Image, wavelength_nm: float | None) -> DataArray:
+    """As `Image.to_radiance`."""
+    require("xarray", "image: to_radiance")
+    import xarray as xr
+
+    found = in_unit(image, "p/s/cm2/sr", wavelength_nm)
+    beside = {"error": (found.error, found.unit), "coverage": (image.coverage, "1")}
+    coordinates = {
+        name: (DIMENSIONS, plane, {"units": unit}) for name, (plane, unit) in beside.items() if plane is not None
+    }
+    told = {"units": found.unit, "wavelength_nm": found.wavelength_nm}
+    return xr.DataArray(found.values, {**_coordinates(image), **coordinates}, DIMENSIONS, found.quantity, told)
+
+
+def _coordinates(image: Image) -> dict[str, tuple]:
+    """x and y of the pixels' centres, with their unit and plane."""
+    axes = PixelAxes.of(image.shape, image.metadata)
+    told = {"units": axes.unit, "long_name": axes.label}
+    return {"y": ("y", axes.y, {**told}), "x": ("x", axes.x, {**told})}

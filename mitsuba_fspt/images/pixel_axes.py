@@ -1,0 +1,70 @@
+"""Positions of an image's columns and rows: mm on the virtual detector plane where its metadata hold the lens."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+CROP = ("film_width", "film_height", "crop_offset_x", "crop_offset_y")  # [pixels], of an image that is no whole film
+
+
+@dataclass(frozen=True, eq=False)
+class PixelAxes:
+    """Centres of the pixels, x to the right and y up, 0 on the optical axis: in the middle of the image.
+
+    Of a crop window the metadata `film_width`, `film_height`, `crop_offset_x` and `crop_offset_y` [pixels] are needed.
+
+    x, y : of the columns (w,) and of the rows (h,), the top one first [`unit`]
+    side : of a pixel [mm]; None if it is unknown, then x and y count columns and rows from 0
+    unit : 'mm' or 'pixel'
+    label : unit and plane, for axes of pictures
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    side: float | None
+    unit: str
+    label: str
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], metadata: Mapping[str, object]) -> PixelAxes:
+        """Axes of an image of `shape` (h, w)."""
+        height, width = shape
+        side = virtual_pitch(metadata)
+        if not side:
+            return cls(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64), None, "pixel", "pixel")
+        plane = "virtual detector plane" if metadata.get("magnification") else "detector"
+        x, y = (
+            np.float64(side) * (np.arange(count) + 0.5 + _first(metadata, axis) - _film(metadata, name, count) / 2)
+            for count, axis, name in ((width, "x", "film_width"), (height, "y", "film_height"))
+        )
+        return cls(x, -y, side, "mm", f"mm on the {plane}")
+
+    @property
+    def step(self) -> float:
+        """From a column to the next one [`unit`]."""
+        return self.side or 1.0
+
+    @property
+    def down(self) -> float:
+        """From a row to the one below [`unit`]; < 0 where y points up."""
+        return -self.side if self.side else 1.0
+
+
+def _first(metadata: Mapping[str, object], axis: str) -> float:
+    """Pixels of the film before the first one of the image."""
+    return float(metadata.get(f"crop_offset_{axis}", 0))  # type: ignore[arg-type]
+
+
+def _film(metadata: Mapping[str, object], name: str, count: int) -> float:
+    """Pixels of the film along an axis, those of the image if it is whole."""
+    return float(metadata.get(name, count))  # type: ignore[arg-type]
+
+
+def virtual_pitch(metadata: Mapping[str, object]) -> float | None:
+    """Side of a pixel [mm] on the virtual detector plane, on the detector without a magnification; None if unknown."""
+    pitch, magnification = (metadata.get(key) for key in ("pixel_pitch", "magnification"))
+    return float(pitch) / float(magnification or 1.0) if pitch else None  # type: ignore[arg-type]

@@ -1,0 +1,128 @@
+"""Units of images: watts, photons a second, and the apparent radiance of what lies in focus."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..optics.pixel_etendue import pixel_etendues
+from ..optics.thin_lens import Lens, number_names
+from ..runtime.errors import ImageError, OpticsError
+from ..runtime.numbers import number
+from .formats import Metadata, write_planes
+from .image import Image
+from .pixel_axes import PixelAxes
+
+PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
+UNITS = {"W": "power", "photons/s": "photon_rate", "p/s/cm2/sr": "radiance"}  # with the quantity of each
+RADIANCE = "photons/s/cm²/sr"
+SQUARE_MM_PER_CM = 100.0
+DERIVED = ("focal_length", "magnification", "image_distance", "diaphragm_diameter")  # follow from other numbers
+Plane = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Converted:
+    """An image in another unit.
+
+    values, error : shape (h, w) [unit]; error None if the image has none
+    quantity, unit : 'power' in 'W', 'photon_rate' in 'photons/s' or 'radiance' in 'photons/s/cm²/sr'
+    wavelength_nm : None for watts
+    """
+
+    values: Plane
+    error: Plane | None
+    quantity: str
+    unit: str
+    wavelength_nm: float | None
+
+    def write(self, path: str | os.PathLike[str], image: Image) -> None:
+        """Write values, error and the coverage and metadata of `image`, which this is made of, as `Image.write` does.
+
+        The metadata state quantity, unit and wavelength. Raises as `Image.write`.
+        """
+        planes = {self.quantity: self.values, "error": self.error, "coverage": image.coverage}
+        told: Metadata = {"quantity": self.quantity, "unit": self.unit}
+        told |= {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
+        write_planes(path, {name: p for name, p in planes.items() if p is not None}, image.metadata | told)
+
+
+def require_unit(unit: str, wavelength_nm: float | None) -> None:
+    """Raise ImageError for a unit that does not exist, and for a wavelength with watts."""
+    if unit not in UNITS:
+        raise ImageError(f"image: 'unit' must be one of {', '.join(UNITS)}, got '{unit}'. Give one of these.")
+    if unit == "W" and wavelength_nm is not None:
+        raise ImageError(f"image: 'wavelength_nm' = {wavelength_nm:g} has no meaning for watts. Leave it out.")
+
+
+def in_unit(image: Image, unit: str, wavelength_nm: float | None = None) -> Converted:
+    """Image in a unit of `UNITS`: W, photons/s or p/s/cm2/sr.
+
+    The radiance is that of a surface in focus: P/(τ G ⟨cos⁴θ⟩), with the étendue of each pixel (Eq. M.6); 0 on pixels
+    that no light can reach.
+
+    Raises
+    ------
+    ImageError : there is no such unit; the wavelength is missing, not > 0, not the one that the image was rendered for,
+        or given for watts; the metadata do not describe the lens.
+    """
+    require_unit(unit, wavelength_nm)
+    if unit == "W":
+        error = None if image.error is None else image.error.astype(np.float64)
+        return Converted(image.power.astype(np.float64), error, UNITS[unit], unit, None)
+    wavelength = wavelength_of(image, wavelength_nm)
+    factor: Plane | float = wavelength * 1e-9 / PLANCK_TIMES_LIGHT  # photons per joule
+    if unit != "photons/s":
+        etendues = etendue(image)
+        inverse = np.divide(SQUARE_MM_PER_CM, etendues, out=np.zeros_like(etendues), where=etendues > 0)
+        factor, unit = factor * inverse, RADIANCE
+    quantity = "radiance" if unit == RADIANCE else UNITS[unit]
+    error = None if image.error is None else (image.error * factor).astype(np.float64)
+    return Converted((image.power * factor).astype(np.float64), error, quantity, unit, wavelength)
+
+
+def wavelength_of(image: Image, wavelength_nm: float | None) -> float:
+    """Wavelength [nm], given or that of the image's filter.
+
+    Raises
+    ------
+    ImageError : there is none, it is not in 1e-3 … 1e9 nm, or the given one is not that of the filter.
+    """
+    own = image.metadata.get("wavelength_nm")
+    if wavelength_nm is None:
+        if own is None:
+            raise ImageError("image: photons need a wavelength, the image has none. Give wavelength_nm, say 660.")
+        return float(own)
+    found = number("image: 'wavelength_nm'", wavelength_nm, ImageError, "660")
+    if not 1e-3 <= found <= 1e9:
+        raise ImageError(f"image: 'wavelength_nm' must be in 1e-3 … 1e9 nm, got {found:g}. Give for example 660.")
+    if own is not None and found != float(own):
+        raise ImageError(
+            f"image: 'wavelength_nm' = {found:g}, but the image was rendered for {float(own):g} nm, by its filter's "
+            "curve. Leave it out, or render at that wavelength."
+        )
+    return found
+
+
+def etendue(image: Image) -> Plane:
+    """Étendue τ G ⟨cos⁴θ⟩ of every pixel, shape (h, w) [mm² sr]; ImageError if the metadata lack the lens."""
+    known = image.metadata
+    if missing := [name for name in ("focal_length", "f_number", "focus_distance", "pixel_pitch") if name not in known]:
+        raise ImageError(
+            f"image: its metadata have no '{missing[0]}', so that the étendue of its pixels is unknown. Give an image "
+            "as fspt rendered it."
+        )
+    names = [name for name in number_names() if name in known and name not in DERIVED]
+    try:
+        lens = Lens.focused(
+            float(known["focal_length"]),
+            model=str(known.get("model", "diaphragm")),
+            **{name: float(known[name]) for name in names},  # type: ignore[arg-type]
+        )
+    except (OpticsError, ValueError) as cause:
+        raise ImageError(f"image: its metadata describe no lens: {cause}") from cause
+    axes = PixelAxes.of(image.shape, known | {"magnification": lens.magnification})
+    return pixel_etendues(lens, axes.step, axes.x, axes.y, float(known.get("transmittance", 1.0)))

@@ -1,0 +1,185 @@
+"""Regions of interest: which pixels, and what light comes from them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.errors import ImageError
+from ..runtime.extras import require
+from .image import Image
+from .pixel_axes import PixelAxes
+from .radiometry import SQUARE_MM_PER_CM, in_unit
+from .z_test import is_deterministic
+
+Mask = NDArray[np.bool_]
+FORMS = "x,y,width,height, circle:x,y,radius, 25% or mask.tif"
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Light of a region, in the columns that imaging programs print.
+
+    total_flux, total_flux_error : photons/s that a Lambertian surface in focus emits there, π Σ L ΔA over its pixels
+    mean_radiance, mean_radiance_error, sd_radiance, min_radiance, max_radiance : photons/s/cm²/sr; sd of the pixels
+    area : cm² on the virtual detector plane
+    pixels : number of pixels
+    power : W on the pixels
+
+    The errors are None for an image without errors. Those of the integral are bounds and add up; standard errors of
+    Monte Carlo add up in squares.
+    """
+
+    total_flux: float
+    total_flux_error: float | None
+    mean_radiance: float
+    mean_radiance_error: float | None
+    sd_radiance: float
+    min_radiance: float
+    max_radiance: float
+    area: float
+    pixels: int
+    power: float
+
+
+HEADINGS = {
+    "total_flux": "total_flux [photons/s]",
+    "total_flux_error": "total_flux_error [photons/s]",
+    "mean_radiance": "mean_radiance [photons/s/cm^2/sr]",
+    "mean_radiance_error": "mean_radiance_error [photons/s/cm^2/sr]",
+    "sd_radiance": "sd_radiance [photons/s/cm^2/sr]",
+    "min_radiance": "min_radiance [photons/s/cm^2/sr]",
+    "max_radiance": "max_radiance [photons/s/cm^2/sr]",
+    "area": "area [cm^2]",
+    "pixels": "pixels",
+    "power": "power [W]",
+}
+
+
+def measure(image: Image, region: str | Mask | None = None, wavelength_nm: float | None = None) -> Measurement:
+    """Light of a region of an image; None: of all pixels.
+
+    Parameters
+    ----------
+    image : power [W]
+    region : mask (h, w), or text as of `region_mask`
+    wavelength_nm : of the light [nm]; None: that of the image's filter
+
+    Raises
+    ------
+    ImageError : no such region, no pixel in it, or as in `in_unit`.
+    """
+    mask = region_mask(image, region) if isinstance(region, str) else region
+    mask = np.ones(image.shape, bool) if mask is None else mask
+    _check_mask(image, mask, "region")
+    converted = in_unit(image, "p/s/cm2/sr", wavelength_nm)
+    side = PixelAxes.of(image.shape, image.metadata).step
+    area = side**2 / SQUARE_MM_PER_CM  # of a pixel
+    values, count = converted.values[mask], int(mask.sum())
+    error = None
+    if converted.error is not None:
+        errors = converted.error[mask]
+        error = float(errors.sum() if is_deterministic(image) else math.sqrt(np.square(errors).sum()))
+    return Measurement(
+        total_flux=math.pi * area * float(values.sum()),
+        total_flux_error=None if error is None else math.pi * area * error,
+        mean_radiance=float(values.mean()),
+        mean_radiance_error=None if error is None else error / count,
+        sd_radiance=float(values.std()),
+        min_radiance=float(values.min()),
+        max_radiance=float(values.max()),
+        area=area * count,
+        pixels=count,
+        power=float(image.power[mask].sum(dtype=np.float64)),
+    )
+
+
+def region_mask(image: Image, text: str) -> Mask:
+    """Pixels (h, w) of a region described by text; pixels count from the upper left corner.
+
+    'x,y,width,height' a rectangle; 'circle:x,y,radius' the pixels whose centres lie in it, x and y of its centre from
+    the image's corner; '25%' the pixels with at least so much of the brightest pixel's power; the name of a TIFF file
+    of that size, its values other than 0.
+
+    Raises
+    ------
+    ImageError : the text is none of these, or no pixel lies in the region.
+    BackendError : tifffile, which reads masks, is not installed.
+    """
+    if Path(text).suffix.lower() in (".tif", ".tiff"):
+        mask = _mask_of_file(text)
+    elif text.endswith("%"):
+        (share,) = _numbers(text[:-1], text, 1)
+        if not 0 < share <= 100:
+            raise ImageError(f"region '{text}': a threshold is above 0% and at most 100%. Give for example 25%.")
+        mask = image.power >= share / 100 * image.power.max() if image.power.max() > 0 else np.zeros(image.shape, bool)
+    elif text.startswith("circle:"):
+        x, y, radius = _numbers(text.removeprefix("circle:"), text, 3)
+        rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
+        mask = np.hypot(columns + 0.5 - x, rows + 0.5 - y) <= radius
+    else:
+        x, y, width, height = _numbers(text, text, 4)
+        if any(value != int(value) for value in (x, y, width, height)) or min(x, y) < 0 or min(width, height) < 1:
+            raise ImageError(
+                f"region '{text}': a rectangle has whole pixels, x and y from 0. Give for example 10,20,8,8."
+            )
+        if x + width > image.shape[1] or y + height > image.shape[0]:
+            size = " x ".join(map(str, image.shape[::-1]))
+            raise ImageError(f"region '{text}': reaches beyond the image of {size} pixels. Give a smaller one.")
+        mask = np.zeros(image.shape, bool)
+        mask[int(y) : int(y + height), int(x) : int(x + width)] = True
+    _check_mask(image, mask, f"region '{text}'")
+    return mask
+
+
+def _mask_of_file(name: str) -> Mask:
+    """Pixels of a TIFF file that are not 0."""
+    if not os.path.isfile(name):
+        raise ImageError(f"region '{name}': there is no such file. Give a mask, or {FORMS}.")
+    require("tifffile", f"region '{name}'")
+    import tifffile
+
+    try:
+        return np.asarray(tifffile.imread(name)) != 0
+    except Exception as cause:  # whatever a damaged file makes tifffile raise
+        raise ImageError(f"region '{name}' is damaged, or no TIFF file. Save it again.") from cause
+
+
+def _check_mask(image: Image, mask: Mask, what: str) -> None:
+    """Raise ImageError for a mask of another size, or without a pixel."""
+    if mask.shape != image.shape or mask.dtype != bool:
+        size = " x ".join(map(str, image.shape[::-1]))
+        raise ImageError(
+            f"{what}: a mask of shape {mask.shape} does not fit the image of {size} pixels. Give one of it."
+        )
+    if not mask.any():
+        raise ImageError(f"{what}: no pixel of the image lies in it. Give another one.")
+
+
+def _numbers(text: str, region: str, count: int) -> list[float]:
+    """So many finite numbers between commas; ImageError for another text."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ImageError(f"region '{region}': must be {FORMS}, in pixels. Give for example 10,20,8,8.")
+    return found
+
+
+def csv_table(rows: list[tuple[str, str, Measurement]]) -> str:
+    """CSV text of measurements, each with the names of its image and of its region; columns state their units."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["image", "region", *(HEADINGS[field.name] for field in fields(Measurement))])
+    for image, region, found in rows:
+        numbers = (f"{value:.6g}" if isinstance(value, float) else value for value in asdict(found).values())
+        writer.writerow([image, region, *numbers])
+    return text.getvalue()

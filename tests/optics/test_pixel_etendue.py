@@ -1,0 +1,77 @@
+"""Étendue of single pixels against closed forms and against sums over many points of the pupil."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mitsuba_fspt.optics.pixel_etendue import mean_cos4, pixel_etendues
+from mitsuba_fspt.optics.thin_lens import Lens, configuration_factor
+
+RADII = np.array([0.0, 1.0, 12.5, 40.0, 110.0])  # of virtual points off the axis [mm]
+BORDERS = {
+    "diaphragm behind": {"f_number": 4.0, "lens_diameter": 22.0, "diaphragm_distance": 20.0},
+    "diaphragm in front": {"f_number": 4.0, "lens_diameter": 22.0, "diaphragm_distance": -25.0},
+    "wide lens": {"f_number": 8.0, "lens_diameter": 60.0, "diaphragm_distance": 5.0},
+    "cone": {"f_number": 2.8, "model": "ripoll", "numerical_aperture": 0.05},
+}
+
+
+def lens(**settings):
+    numbers = {"focal_length": 55.0, "f_number": 2.8, "magnification": 0.5} | settings
+    return Lens.focused(numbers.pop("focal_length"), numbers.pop("f_number"), **numbers)
+
+
+@pytest.mark.parametrize("f_number", [0.5, 2.8, 100.0])
+def test_mean_over_a_disc_is_the_configuration_factor(f_number):
+    """π (R/u)² ⟨cos⁴θ⟩ = π f of a disc parallel to a point's plane. Seen to fail with cos³θ."""
+    of = lens(f_number=f_number)
+    found = mean_cos4(of, RADII) * (of.pupil_radius / of.focus_distance) ** 2
+    expected = [configuration_factor(of.pupil_radius, of.focus_distance, radius) for radius in RADII]
+    np.testing.assert_allclose(found, expected, rtol=2e-6)
+
+
+def test_a_pinhole_has_the_cosine_of_its_one_line():
+    of = lens(model="pinhole")
+    cosine = of.focus_distance / np.hypot(of.focus_distance, RADII)
+    np.testing.assert_allclose(mean_cos4(of, RADII), cosine**4, rtol=1e-14)
+
+
+@pytest.mark.parametrize("settings", BORDERS.values(), ids=BORDERS)
+def test_two_borders_against_a_sum_over_points(settings):
+    """A million points of the first disc, those that pass both. Seen to fail with the second disc left out."""
+    of = lens(**settings)
+    number = np.arange(1_000_000) + 0.5
+    rho = np.sqrt(number / len(number)) * np.exp(1j * number * np.pi * (3 - math.sqrt(5)))
+    first, *others = of.discs
+    for radius, found in zip(RADII, mean_cos4(of, RADII), strict=True):
+        a = first.shift * radius + of.pupil_radius * rho
+        cos4 = (1 + np.abs(radius - a) ** 2 / of.focus_distance**2) ** -2.0
+        for other in others:
+            cos4 *= np.abs(a - other.shift * radius) <= other.radius
+        assert found == pytest.approx(cos4.mean(), abs=3e-5)
+
+
+def test_pixels_of_a_film():
+    """τ A_vd π (R/u)² ⟨cos⁴θ⟩, averaged over large pixels by a hundred points of each."""
+    of, side = lens(), 20.0
+    x, y = side * (np.arange(5) - 2.0), side * (1.0 - np.arange(3))
+    fine = side * ((np.arange(10) + 0.5) / 10 - 0.5)
+    radius = np.hypot((x[:, None] + fine).ravel()[None, :], (y[:, None] + fine).ravel()[:, None])
+    factor = np.vectorize(lambda r: configuration_factor(of.pupil_radius, of.focus_distance, r))(radius)
+    expected = 0.5 * side**2 * math.pi * factor.reshape(3, 10, 5, 10).mean(axis=(1, 3))
+    np.testing.assert_allclose(pixel_etendues(of, side, x, y, 0.5), expected, rtol=2e-3)
+
+
+def test_an_image_stop_leaves_the_share_inside():
+    """The sum over all pixels is that of the stop's disc, about the axis of a lens far away (cosθ = 1)."""
+    of = lens(f_number=50.0, image_stop_diameter=0.5)
+    side, count = 0.05, 24
+    x = side * (np.arange(count) + 0.5 - count / 2)
+    found = pixel_etendues(of, side, x, -x)
+    whole = math.pi * (of.pupil_radius / of.focus_distance) ** 2
+    assert found.sum() == pytest.approx(whole * math.pi * of.seen_field**2, rel=1e-3)
+    assert found[0, 0] == 0
+    assert found.max() == pytest.approx(whole * side**2, rel=1e-4)
