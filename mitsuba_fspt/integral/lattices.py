@@ -34,7 +34,7 @@ def settle_by_lattices(draft: Draft) -> None:
         unmet = dr.opaque(mi.Float64, UNMET / (points * SHIFTS)) * draft.near_edge(draft.value)
         where = draft.open & draft.shown & ~draft.outside & (draft.error > dr.maximum(draft.tolerance, unmet))
         if draft.quadrature.max_nodes < points * SHIFTS or not dr.any(where):
-            return
+            continue
         found = apply_lattice(draft, where, points)
         error = dr.maximum(found.error, unmet)
         better = where & (error < draft.error)
