@@ -36,6 +36,7 @@ RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
 SPECK, LEAST_AREA = 2.0**-4, 2.0**-20  # half a side of the square [pixels] that stands for a smaller image [pixels²]
 LEAST_HEIGHT = 2.0**-5  # pixels: over a flatter image the density is taken as constant
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
+GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
 MOST_WORK = 1 << 25  # entries of windows that are accumulated at a time
 
@@ -54,6 +55,7 @@ class ColumnRule:
         offsets; fitted for r = 0.3 … 4, M = 2 … 16
     fewest, most : least and largest M
     partial : least M where a face turns away from part of the pupil, or a second border cuts the pupil
+    mixed : least M where one surface may hide another
     cells : M where the cells are laid; their étendue is constant in each
     point : largest piece [pixels] that may be taken as a point then; it misplaces light by its square
     piece : largest piece [pixels], over which étendue and exit law are linear
@@ -67,7 +69,8 @@ class ColumnRule:
     edge_factor: float = 0.13
     fewest: int = 4
     most: int = 64
-    partial: int = 16
+    partial: int = 12
+    mixed: int = 16
     cells: int = 6
     point: float = 0.5
     piece: float = 8.0
@@ -86,6 +89,7 @@ class ColumnRule:
             edge,
             cells=cells,
             partial=partial,
+            mixed=2 * math.ceil(8 / math.sqrt(finer)),
             point=0.5 * finer,
             shadow=0.7 * finer,
             perspective=0.3 * rtol,
@@ -187,7 +191,7 @@ class FaceLight:
     def plan(self, rule: ColumnRule) -> Plan:
         """How the faces are divided: the cheaper of nodes with images of pieces and pieces with images of cells."""
         sides = np.minimum(self.sides, LONGEST)
-        fewest = np.where(self.partial, rule.partial, np.where(self.mixed, 2 * rule.fewest, rule.fewest))
+        fewest = np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
         nodes = np.sqrt(rule.edge_factor * self.blur**1.2 / rule.edge)
         nodes = np.maximum(nodes, 2 * self.blur / np.maximum(sides, 1e-3))  # their images overlap
         nodes = (2 * np.ceil(nodes / 2)).clip(fewest, None)
@@ -343,8 +347,8 @@ def _kept(
     some = some[fine[some] > rule.drop * brightest[column[some]]]
     y, x = windows.rows_of_film()[some], windows.columns_of_film()[some]
     offset = lens.film().crop_offset()
-    centres = mi.Point2f(mi.Float(x + (float(offset[0]) + 0.5)), mi.Float(y + (float(offset[1]) + 0.5)))
-    even = falloff(lens, centres).numpy()
+    left, top = mi.Float(x + float(offset[0])), mi.Float(y + float(offset[1]))
+    even = np.mean([falloff(lens, mi.Point2f(left + a, top + b)).numpy() for a in GAUSS for b in GAUSS], axis=0)
     return column[some], y * shape[1] + x, even * fine[some], even * (fine - coarse)[some]
 
 

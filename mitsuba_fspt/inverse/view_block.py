@@ -199,7 +199,7 @@ def block_of(
                 counts.append(len(part.counts))
                 columns.append(part)
             entries = _Entries.of(columns)
-            rough, outside = _rough(scene, lens, entries, solution, rtol)
+            rough, cut, outside = _rough(scene, lens, entries, solution, rtol)
             bound = np.concatenate([part.exact for part in columns])
             bound[entries.columns[outside[entries.pixels]]] = False
             sums = np.bincount(entries.columns, entries.light, minlength=len(bound))
@@ -207,7 +207,7 @@ def block_of(
             entries = entries.where(~outside[entries.pixels])
             if rough.any():
                 pixels = np.flatnonzero(rough)
-                entries = entries.refined(_rows(scene, lens, emitters, counts, pixels, on, rtol), rough)
+                entries = entries.refined(_rows(scene, lens, emitters, counts, pixels, on, rtol), rough, cut)
     least = quadrature.least_error * float(solution.power.max(initial=0.0))
     return _block(entries, sums, solution.power.ravel(), np.maximum(solution.error, least), lens.etendue)
 
@@ -232,15 +232,18 @@ class _Entries:
         """Some of the entries."""
         return _Entries(self.pixels[kept], self.columns[kept], self.light[kept], self.change[kept])
 
-    def refined(self, rows: _Rows, rough: NDArray[np.bool_]) -> _Entries:
-        """The same with entries of rough pixels as lines of sight find them, where enough of these meet the column."""
-        threshold = FEWEST_HITS / (math.pi * rows.lines)
+    def refined(self, rows: _Rows, rough: NDArray[np.bool_], cut: NDArray[np.bool_]) -> _Entries:
+        """The same with entries of rough pixels as lines of sight find them, where enough of these meet the column.
+
+        On pixels that a stop has `cut` in any case, for there the surface form does not know where.
+        """
+        threshold = np.where(cut, 0, FEWEST_HITS / (math.pi * rows.lines))
         here = self.where(rough[self.pixels])
         count = int(max(here.columns.max(initial=0), rows.entries.columns.max(initial=0))) + 1
         keys = [e.pixels.astype(np.int64) * count + e.columns for e in (here, rows.entries)]
-        many = rows.entries.light >= threshold
+        many = rows.entries.light >= threshold[rows.entries.pixels]
         # Kept from the surface form: faint columns, but for those that the lines have found to be bright.
-        kept = (here.light < threshold) & ~np.isin(keys[0], keys[1][many])
+        kept = (here.light < threshold[here.pixels]) & ~np.isin(keys[0], keys[1][many])
         parts = (self.where(~rough[self.pixels]), here.where(kept), rows.entries.where(many))
         return _Entries(
             *(np.concatenate([getattr(p, name) for p in parts]) for name in ("pixels", "columns", "light", "change"))
@@ -257,10 +260,10 @@ class _Rows:
 
 def _rough(
     scene: mi.Scene, lens: mi.Sensor, entries: _Entries, solution: Any, rtol: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pixels (h · w) whose row the surface form gives wrongly, and those beyond the image-plane stop.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels (h · w) whose row the surface form gives wrongly, those that the stop cuts, and those beyond it.
 
-    The first are cut by the stop, or their sum is far from the picture.
+    The first include the second, and those whose sum is far from the picture.
     """
     from ..integral.window import visible_window
 
@@ -270,7 +273,8 @@ def _rough(
     picture = solution.power.ravel() / lens.etendue
     sums = np.bincount(entries.pixels, entries.light, minlength=picture.size)
     far = inside & (np.abs(picture - sums) > ROUGH * rtol * picture.max(initial=0.0))
-    return far | (cut & (picture > 0)), ~(inside | cut)
+    cut &= ~inside
+    return far | (cut & (picture > 0)), cut, ~(inside | cut)
 
 
 def _rows(
