@@ -174,6 +174,8 @@ class FaceLight:
     def behind(self, scene: mi.Scene, lens: mi.Sensor) -> FaceLight:
         """The same in a scene where one surface may hide another: faces that none of their lines shows are dark."""
         bright = np.flatnonzero(self.bright)
+        if not bright.size:
+            return self
         share = np.zeros(len(self.corners))
         share[bright] = _open_share(scene, lens, self.elements, bright)
         count = int(self.corners.max(initial=-1)) + 1
@@ -345,6 +347,8 @@ def _kept(
     if filled.any():
         brightest[filled] = np.maximum.reduceat(fine, starts[filled])
     some = some[fine[some] > rule.drop * brightest[column[some]]]
+    if not some.size:
+        return column[some], some, fine[some], coarse[some]
     y, x = windows.rows_of_film()[some], windows.columns_of_film()[some]
     offset = lens.film().crop_offset()
     left, top = mi.Float(x + float(offset[0])), mi.Float(y + float(offset[1]))

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 ON = ("vertex", "face")
 CERTAIN = 0.35  # of its estimated error: what the picture of J_n = 1 is wrong by at the most, as a rule
 ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further from it are computed by lines of sight
-ROW_LINES = 4096  # of these pixels at rtol 1e-3
+UNREACHED = 0.5  # likewise, where the picture itself did not reach rtol
+ROW_LINES = 4096  # of these pixels at rtol 1e-3, more where they are few
 FEWEST_HITS = 64  # of them, on a column whose entry they determine better than the surface form does
 TURNS = 6  # in which rows and columns are scaled to their sums
 LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
@@ -263,7 +264,7 @@ def _rough(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
     """Pixels (h · w) whose row the surface form gives wrongly, those that the stop cuts, and those beyond it.
 
-    The first include the second, and those whose sum is far from the picture.
+    The first include the second, and those whose sum is far from the picture, or off where that is uncertain.
     """
     from ..integral.window import visible_window
 
@@ -272,7 +273,9 @@ def _rough(
     inside |= math.isinf(lens.optics.seen_field)
     picture = solution.power.ravel() / lens.etendue
     sums = np.bincount(entries.pixels, entries.light, minlength=picture.size)
-    far = inside & (np.abs(picture - sums) > ROUGH * rtol * picture.max(initial=0.0))
+    off, uncertain = np.abs(picture - sums), solution.error.ravel() / lens.etendue
+    unit = rtol * picture.max(initial=0.0)
+    far = inside & ((off > ROUGH * unit) | (off > UNREACHED * unit) & (uncertain > unit))
     cut &= ~inside
     return far | (cut & (picture > 0)), cut, ~(inside | cut)
 
@@ -282,9 +285,10 @@ def _rows(
 ) -> _Rows:
     """Rows of these pixels by lines of sight; the change is what half of the lines make of them."""
     from ..integral.row_form import rows_of
+    from ..jit.batches import BATCH
     from ..jit.mesh_buffers import triangles
 
-    lines = int(min(ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
+    lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
     found: list[tuple[Any, ...]] = []
     first = 0
     for emitter, count, row in zip(emitters, counts, rows_of(scene, lens, emitters, pixels, lines), strict=True):

@@ -45,8 +45,8 @@ def value_of(text: str) -> float | str:
 
 
 def origin_of(scene: mi.Scene, sensor: mi.Sensor) -> dict[str, str]:
-    """Metadata of an image: `parameters`, JSON of the scene's `<default>` values, and `mesh_digest`."""
-    found = {}
+    """Metadata of an image: `scene`, `parameters` (JSON of the scene's `<default>` values) and `mesh_digest`."""
+    found = {"scene": scene.id()}
     if defaults := defaults_of(sensor):
         found["parameters"] = json.dumps(defaults)
     if digest := scene_digest(scene):

@@ -99,8 +99,7 @@ def render(
             *planes, how = _sample(scene, lens, integrator, spp, seed, report)
         check_interrupt()
     how |= {"wall_time": time.perf_counter() - start} | ({} if planes[0].any() else {"warnings": DARK})
-    origin = {"scene": scene.id(), "sensor": sensor, **origin_of(scene, lens)}
-    return Image(*planes, {**origin, **how, **_lens_numbers(lens), **_versions()})
+    return Image(*planes, {**origin_of(scene, lens), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
 
 
 def _integrate(
