@@ -59,8 +59,8 @@ class ColumnRule:
     cells : M where the cells are laid; their étendue is constant in each
     point : largest piece [pixels] that may be taken as a point then; it misplaces light by its square
     piece : largest piece [pixels], over which étendue and exit law are linear
-    perspective : J_n that perspective misplaces within a piece, over its change along the face: pieces along a side of
-        a face of relative depth δ are √(δ/(8 · perspective))
+    perspective : J_n that perspective, corrected on average, misplaces within a piece, over its change along the face:
+        pieces along a side of a face of relative depth δ are √(δ/(8 · perspective))
     shadow : largest piece [pixels] where one surface may hide another: lines of sight through a piece are sampled
     drop : entries below this share of a column's brightest are left out
     """
@@ -74,7 +74,7 @@ class ColumnRule:
     cells: int = 6
     point: float = 0.5
     piece: float = 8.0
-    perspective: float = 3e-4
+    perspective: float = 2e-3
     shadow: float = 0.7
     drop: float = 1e-5
 
@@ -92,7 +92,7 @@ class ColumnRule:
             mixed=2 * math.ceil(8 / math.sqrt(finer)),
             point=0.5 * finer,
             shadow=0.7 * finer,
-            perspective=0.3 * rtol,
+            perspective=2 * rtol,
             drop=1e-2 * rtol,
         )
 

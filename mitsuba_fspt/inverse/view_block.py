@@ -365,7 +365,7 @@ def _balanced(found: _Entries, rows: Array, columns: Array) -> Array:
 
 def _factor(wanted: Array, sums: Array) -> Array:
     """By what sums are to be multiplied, at most so much."""
-    return np.clip(np.divide(wanted, sums, out=np.ones_like(sums), where=sums > 0), 0, LARGEST_FACTOR)
+    return np.clip(np.divide(wanted, sums, out=np.ones(len(sums)), where=sums > 0), 0, LARGEST_FACTOR)
 
 
 def _block(found: _Entries, columns: Array, power: Array, error: Array, etendue: float) -> Block:
