@@ -1,4 +1,4 @@
-"""J_n of the nylon cylinder from four pictures by PyLops (`pip install pylops`): a TransportMatrix is a SciPy operator."""
+"""J_n of the nylon cylinder from four pictures: a TransportMatrix is an operator for PyLops, `pip install pylops`."""
 
 import numpy as np
 import pylops
