@@ -196,7 +196,7 @@ def block_of(
                     def report(share: float, first: float = number / len(emitters)) -> None:
                         progress(first + share / len(emitters))
 
-                part = _columns(scene, lens, emitter, on, ColumnRule.of(rtol), alone, report, most_bytes)
+                part = _columns(scene, lens, emitter, on, ColumnRule.of(rtol, on), alone, report, most_bytes)
                 counts.append(len(part.counts))
                 columns.append(part)
             entries = _Entries.of(columns)
