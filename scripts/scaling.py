@@ -1,11 +1,12 @@
 """Cost of the integral against the number of pixels and of triangles.
 
-    python scripts/scaling.py [--out docs] [--rounds 5] [--rtol 1e-2]
+    python scripts/scaling.py [--out docs] [--rounds 5] [--rtol 1e-2] [--only all|integral|matrix]
 
 A ball with a smooth J_n, its front in focus, f/2.8. First the same field on ever more pixels, 128 x 128 to 2048 x 2048;
 then the same ball in ever more triangles, 10 thousand to 3 million, on 256 x 256 pixels, where at last every line of
 sight meets a triangle of its own, and on 2048 x 2048. Beside each what Embree alone takes for four lines of sight a
-pixel. Warm, in one process; medians. Writes scaling.csv and scaling.png and prints the tables.
+pixel. Then the transport matrix of one view at rtol 1e-3, over pixels, triangles and f-number: time, entries, bytes.
+Warm, in one process; medians. Writes scaling.csv, scaling.png and scaling_matrix.csv and prints the tables.
 """
 
 from __future__ import annotations
@@ -30,6 +31,12 @@ from mitsuba_fspt.studies.converge_methods import raw_rate
 SIDES = (128, 256, 512, 1024, 2048)
 TRIANGLES = (10_000, 100_000, 1_000_000, 3_000_000)
 FEW_AND_MANY = (256, 2048)  # pixels a side on which triangles are counted
+# Of the matrix: pixels a side, triangles, f-number.
+MATRICES = (
+    *((side, 40_000, 2.8) for side in (64, 128, 256, 512)),
+    *((256, triangles, 2.8) for triangles in (10_000, 160_000)),
+    *((256, 40_000, f_number) for f_number in (1.4, 5.6, 11.0)),
+)
 FIELD, RADIUS = 27.648, 15.0  # mm: the detector's width, the ball's radius
 
 
@@ -60,13 +67,22 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs"))
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--rtol", type=float, default=1e-2)
+    parser.add_argument("--only", choices=("all", "integral", "matrix"), default="all")
     arguments = parser.parse_args()
+    arguments.out.mkdir(exist_ok=True)
+    if arguments.only != "integral":
+        measure_matrices(arguments.out / "scaling_matrix.csv", arguments.rounds)
+    if arguments.only != "matrix":
+        measure_integral(arguments)
+
+
+def measure_integral(arguments: argparse.Namespace) -> None:
+    """Measure the integral, write its files, print its tables."""
     by_pixels = [Setting(side, TRIANGLES[1]) for side in SIDES]
     by_triangles = [[Setting(side, triangles) for triangles in TRIANGLES] for side in FEW_AND_MANY]
     with tempfile.TemporaryDirectory() as folder:
         for settings in (by_pixels, *by_triangles):
             measure(settings, Path(folder), arguments.rounds, arguments.rtol)
-    arguments.out.mkdir(exist_ok=True)
     write_csv([*by_pixels, *itertools.chain(*by_triangles)], arguments.out / "scaling.csv")
     draw(by_pixels, by_triangles, arguments.out / "scaling.png")
     report(by_pixels, by_triangles)
@@ -83,7 +99,33 @@ def ball(triangles: int, path: Path) -> None:
     fspt.Phantom(RADIUS * normal, faces, 1e-3 * np.exp(2 * normal[:, 0]), "vertex").write(path)
 
 
-def scene(setting: Setting, folder: Path) -> object:
+def measure_matrices(path: Path, rounds: int) -> None:
+    """Time the matrices of `MATRICES`, write a row each, print them as a Markdown table."""
+    head = ("side", "triangles", "f_number", "seconds_median", "seconds_min", "seconds_max", "entries", "bytes")
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for side, triangles, f_number in MATRICES:
+            of = scene(Setting(side, triangles), Path(folder), f_number)
+            fspt.transport(of)  # compiles
+            seconds = []
+            for _ in range(rounds):
+                start = time.perf_counter()
+                matrix = fspt.transport(of)
+                seconds.append(time.perf_counter() - start)
+            matrix.save(Path(folder) / "T.npz")
+            times = (f"{f(seconds):.4f}" for f in (np.median, min, max))
+            size = (Path(folder) / "T.npz").stat().st_size
+            rows.append((side, triangles, f_number, *times, matrix.entries, size))
+            del of, matrix
+    with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([head, *rows])
+    print("| pixels | triangles | f-number | time | entries | MB |")
+    print("|---|---|---|---|---|---|")
+    for side, triangles, f_number, median, _, _, entries, size in rows:
+        print(f"| {side}² | {triangles} | {f_number:g} | {float(median):.3g} s | {entries} | {size / 1e6:.3g} |")
+
+
+def scene(setting: Setting, folder: Path, f_number: float = 2.8) -> object:
     """The ball of a setting before its film, in the camera of the nylon cylinder."""
     import mitsuba as mi
 
@@ -98,7 +140,7 @@ def scene(setting: Setting, folder: Path) -> object:
             "camera": {
                 "type": "fspt_lens",
                 "focal_length": 55.0,
-                "f_number": 2.8,
+                "f_number": f_number,
                 "magnification": 0.5,
                 "pixel_pitch": FIELD / setting.side,
                 "to_world": mi.ScalarTransform4f().look_at([180, 0, 0], [0, 0, 0], [0, 0, 1]),

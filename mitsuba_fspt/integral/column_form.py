@@ -36,6 +36,8 @@ RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
 SPECK, LEAST_AREA = 2.0**-4, 2.0**-20  # half a side of the square [pixels] that stands for a smaller image [pixels²]
 LEAST_HEIGHT = 2.0**-5  # pixels: over a flatter image the density is taken as constant
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
+GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
+LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
 MOST_WORK = 1 << 25  # entries of windows that are accumulated at a time
 
 Array = NDArray[np.float64]
@@ -53,11 +55,12 @@ class ColumnRule:
         offsets; fitted for r = 0.3 … 4, M = 2 … 16
     fewest, most : least and largest M
     partial : least M where a face turns away from part of the pupil, or a second border cuts the pupil
+    mixed : least M where one surface may hide another
     cells : M where the cells are laid; their étendue is constant in each
-    point : largest piece [pixels] that is taken as a point then; it misplaces light by its square
+    point : largest piece [pixels] that may be taken as a point then; it misplaces light by its square
     piece : largest piece [pixels], over which étendue and exit law are linear
-    perspective : J_n that perspective misplaces within a piece, over its change along the face: pieces along a side of
-        a face of relative depth δ are √(δ/(8 · perspective))
+    perspective : J_n that perspective, corrected on average, misplaces within a piece, over its change along the face:
+        pieces along a side of a face of relative depth δ are √(δ/(8 · perspective))
     shadow : largest piece [pixels] where one surface may hide another: lines of sight through a piece are sampled
     drop : entries below this share of a column's brightest are left out
     """
@@ -66,18 +69,22 @@ class ColumnRule:
     edge_factor: float = 0.13
     fewest: int = 4
     most: int = 64
-    partial: int = 16
+    partial: int = 12
+    mixed: int = 16
     cells: int = 6
     point: float = 0.5
     piece: float = 8.0
-    perspective: float = 3e-4
+    perspective: float = 2e-3
     shadow: float = 0.7
     drop: float = 1e-5
 
     @classmethod
-    def of(cls, rtol: float) -> ColumnRule:
-        """The rule for a tolerance relative to the brightest pixel: columns are right to some ten times that."""
-        edge = 3 * rtol
+    def of(cls, rtol: float, on: str) -> ColumnRule:
+        """The rule for a tolerance relative to the brightest pixel: columns are right to some ten times that.
+
+        Between neighbouring vertices J_n is continuous, between faces it steps.
+        """
+        edge = {"vertex": 3.0, "face": 1.5}[on] * rtol
         finer = math.sqrt(min(rtol / 1e-3, 1))
         cells = 2 * math.ceil(3 / math.sqrt(finer))
         partial = 2 * math.ceil(6 / math.sqrt(finer))
@@ -85,9 +92,10 @@ class ColumnRule:
             edge,
             cells=cells,
             partial=partial,
+            mixed=2 * math.ceil(8 / math.sqrt(finer)),
             point=0.5 * finer,
             shadow=0.7 * finer,
-            perspective=0.3 * rtol,
+            perspective=2 * rtol,
             drop=1e-2 * rtol,
         )
 
@@ -169,6 +177,8 @@ class FaceLight:
     def behind(self, scene: mi.Scene, lens: mi.Sensor) -> FaceLight:
         """The same in a scene where one surface may hide another: faces that none of their lines shows are dark."""
         bright = np.flatnonzero(self.bright)
+        if not bright.size:
+            return self
         share = np.zeros(len(self.corners))
         share[bright] = _open_share(scene, lens, self.elements, bright)
         count = int(self.corners.max(initial=-1)) + 1
@@ -185,24 +195,22 @@ class FaceLight:
 
     def plan(self, rule: ColumnRule) -> Plan:
         """How the faces are divided: the cheaper of nodes with images of pieces and pieces with images of cells."""
-        largest = np.where(self.mixed, rule.shadow, rule.piece)
-        most = max(math.isqrt(BATCH) // rule.most, 1)
-        pieces = np.ceil(np.minimum(self.sides, 1e6) / largest)
-        # Within a pixel nothing is misplaced.
-        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant / (8 * rule.perspective)), self.sides))
-        pieces = np.clip(np.ceil(pieces), 1, most).astype(np.int64)
-        side = np.minimum(self.sides, 1e6) / pieces
+        sides = np.minimum(self.sides, LONGEST)
+        fewest = np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
         nodes = np.sqrt(rule.edge_factor * self.blur**1.2 / rule.edge)
-        nodes = np.maximum(nodes, 2 * self.blur / np.maximum(self.sides, 1e-3))  # their images overlap
-        fewest = np.where(self.partial, rule.partial, np.where(self.mixed, 2 * rule.fewest, rule.fewest))
+        nodes = np.maximum(nodes, 2 * self.blur / np.maximum(sides, 1e-3))  # their images overlap
         nodes = (2 * np.ceil(nodes / 2)).clip(fewest, None)
+        pieces = np.ceil(sides / np.where(self.mixed, rule.shadow, rule.piece))
+        # Within a pixel perspective misplaces nothing.
+        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant / (8 * rule.perspective)), sides))
+        pieces = np.maximum(np.ceil(pieces), 1)
         cells = np.where(self.partial, rule.partial, rule.cells)
-        points = np.clip(np.ceil(np.minimum(self.sides, 1e6) / rule.point), pieces, most).astype(np.int64)
-        by_nodes = (nodes * pieces) ** 2 * (1 + side)
-        by_cells = (cells * points) ** 2 * (1 + 2 * self.blur / cells)
-        as_points = by_cells < by_nodes
-        nodes = np.minimum(nodes, rule.most).astype(np.int64)
-        return Plan(np.where(as_points, cells, nodes), np.where(as_points, points, pieces), as_points)
+        by_nodes = (nodes * pieces) ** 2 * (1 + sides / pieces)
+        by_cells = (cells * pieces) ** 2 * (1 + 2 * self.blur / cells)
+        as_points = (sides <= rule.point * pieces) & (by_cells < by_nodes)
+        cells = np.where(as_points, cells, np.minimum(nodes, rule.most)).astype(np.int64)
+        pieces = np.minimum(pieces.astype(np.int64), math.isqrt(BATCH) // cells)
+        return Plan(cells, pieces, as_points)
 
 
 def _scales(mesh: mi.Shape, lens: mi.Sensor) -> Array:
@@ -259,13 +267,15 @@ class Columns:
     row from the first of the crop window, the light, and by how much half the cells and pieces change it.
 
     Light is over that of a pixel whose pupil is filled by 1 W/mm²/sr, for J_n = 1 W/mm²: 1/π at the most for Lambert's
-    law; times the pixel's étendue it is an entry of T [mm²].
+    law; times the pixel's étendue it is an entry of T [mm²]. `exact` (n,): columns of which no face is hidden in part,
+    whose sums are those of form factors.
     """
 
     counts: Index
-    pixels: NDArray[np.int32]
+    pixels: Index
     light: Array
     change: Array
+    exact: Mask
 
 
 def column_windows(faces: FaceLight, count: int, on: str, shape: tuple[int, int]) -> Windows:
@@ -302,10 +312,14 @@ def columns_of(
         inside = group if on == "face" else group[faces.corners].any(axis=1)
         index = np.flatnonzero(faces.bright & inside)
         fine, coarse = (_laid(scene, lens, faces, index, p, some, on, shape) for p in (plan, plan.halved()))
-        parts.append(_kept(some, fine, coarse, rule, shape[1]))
+        parts.append(_kept(some, fine, coarse, rule, lens, shape))
     order = np.argsort(np.concatenate([part[0] for part in parts]), kind="stable") if len(parts) > 1 else slice(None)
     column, pixels, light, change = (np.concatenate(some)[order] for some in zip(*parts, strict=True))
-    return Columns(np.bincount(column, minlength=len(windows.left)), pixels, light, change)
+    exact = ~faces.mixed
+    if on == "vertex":
+        exact = np.ones(len(windows.left), bool)
+        exact[faces.corners[faces.mixed].ravel()] = False
+    return Columns(np.bincount(column, minlength=len(windows.left)), pixels, light, change, exact)
 
 
 def _groups(windows: Windows) -> Iterator[Mask]:
@@ -324,7 +338,9 @@ def _groups(windows: Windows) -> Iterator[Mask]:
         yield group
 
 
-def _kept(windows: Windows, fine: Array, coarse: Array, rule: ColumnRule, width: int) -> tuple:
+def _kept(
+    windows: Windows, fine: Array, coarse: Array, rule: ColumnRule, lens: mi.Sensor, shape: tuple[int, int]
+) -> tuple:
     """Column, pixel, light and change of the entries that count, in the order of the columns."""
     column = windows.columns()
     some = np.flatnonzero((fine > 0) & windows.inside())
@@ -334,8 +350,13 @@ def _kept(windows: Windows, fine: Array, coarse: Array, rule: ColumnRule, width:
     if filled.any():
         brightest[filled] = np.maximum.reduceat(fine, starts[filled])
     some = some[fine[some] > rule.drop * brightest[column[some]]]
-    pixels = (windows.rows_of_film()[some] * width + windows.columns_of_film()[some]).astype(np.int32)
-    return column[some], pixels, fine[some], fine[some] - coarse[some]
+    if not some.size:
+        return column[some], some, fine[some], coarse[some]
+    y, x = windows.rows_of_film()[some], windows.columns_of_film()[some]
+    offset = lens.film().crop_offset()
+    left, top = mi.Float(x + float(offset[0])), mi.Float(y + float(offset[1]))
+    even = np.mean([falloff(lens, mi.Point2f(left + a, top + b)).numpy() for a in GAUSS for b in GAUSS], axis=0)
+    return column[some], y * shape[1] + x, even * fine[some], even * (fine - coarse)[some]
 
 
 def _laid(
@@ -418,9 +439,18 @@ class _Lines:
         turn = _cross(images[1] - images[0], images[2] - images[0])
         large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
-        values = [etendue / (light_area * mean) * value for value in values]
+        # The falloff over the film, which is not linear over a large piece, is put back pixel by pixel.
+        even = [falloff(lens, mi.Point2f(image) + origin) for image in images]
+        values = [etendue / (light_area * mean * f) * value for f, value in zip(even, values, strict=True)]
         weights = [values] if on == "face" else _weights(values, shares, depths)
         return [_plane(images, w, turn, self.points | flat) for w in weights], ring, count, active
+
+
+def falloff(lens: mi.Sensor, position: mi.Point2f) -> mi.Float64:
+    """cos⁴θ of the line of sight from the middle of the pupil to a film position [pixels]."""
+    x = mi.Point2d(lens.virtual_point(position)) * (1 - lens.optics.discs[0].shift)
+    squared = dr.square(dr.opaque(mi.Float64, lens.optics.focus_distance))
+    return dr.square(squared / (squared + dr.squared_norm(x)))
 
 
 def _weights(

@@ -112,9 +112,12 @@ def transport(
             if progress:
                 progress(what, share)
 
-        results = _results(tasks, partial, scheduler, report)
-        matrix = _joined(tasks, results, partial)
-    return matrix
+        try:
+            return _joined(tasks, _results(tasks, partial, scheduler, report), partial)
+        except FsptError:  # no later call could go on from there
+            if partial is not None:
+                partial.discard()
+            raise
 
 
 def _tasks(

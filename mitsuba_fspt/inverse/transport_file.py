@@ -12,6 +12,7 @@ import os
 import shutil
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +49,7 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
     if not path.is_file():
         raise TransportError(f"transport matrix '{path}' does not exist. Check the name.")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with opened(path) as file:
             meta = json.loads(str(file["meta"]))
             if meta.get("format") != FORMAT:
                 raise TransportError(
@@ -64,6 +65,13 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
     if missing:
         raise _damaged(path, KeyError(missing[0]))
     return TransportMatrix(FileBlocks(path, meta), meta, areas, sensitivity)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Context manager that yields the arrays of an npz file by name, and closes it, damaged or not."""
+    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        yield file
 
 
 def _damaged(path: Path, cause: Exception) -> TransportError:
@@ -92,7 +100,7 @@ class FileBlocks(Sequence[Block]):
         if self._kept is not None and number in self._kept:
             return self._kept[number]
         try:
-            with np.load(self._path, allow_pickle=False) as file:
+            with opened(self._path) as file:
                 arrays = {name: file[_name(number, name)] for name in ARRAYS}
         except DAMAGED as cause:
             raise _damaged(self._path, cause) from cause
@@ -151,7 +159,7 @@ class PartialFile(Sequence[Block]):
     def has(self, number: int, fingerprint: str) -> bool:
         """True if a view of this fingerprint is there, whole."""
         try:
-            with np.load(self._view(number), allow_pickle=False) as file:
+            with opened(self._view(number)) as file:
                 return str(file["fingerprint"]) == fingerprint and all(name in file for name in (*ARRAYS, "shape"))
         except DAMAGED:
             return False
@@ -174,7 +182,7 @@ class PartialFile(Sequence[Block]):
     def __getitem__(self, number: int) -> Block:  # type: ignore[override]  # no slices
         if not 0 <= number < self.views:
             raise IndexError(number)
-        with np.load(self._view(number), allow_pickle=False) as file:
+        with opened(self._view(number)) as file:
             height, width, count = (int(n) for n in file["shape"])
             return Block((height, width), count, **{name: file[name] for name in ARRAYS})
 
@@ -184,6 +192,10 @@ class PartialFile(Sequence[Block]):
     def finish(self, meta: Mapping[str, Any], areas: NDArray[Any], sensitivity: NDArray[Any]) -> None:
         """Join the views into the file and remove their folder."""
         _write(self.path, self, meta, areas, sensitivity)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def discard(self) -> None:
+        """Remove the finished views."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _view(self, number: int) -> Path:

@@ -28,7 +28,7 @@ class TransportMatrix(LinearOperator):
     """Linear map from J_n [W/mm²] on the vertices or faces of meshes to the power [W] on the pixels of several views.
 
     `T[i, j]` [mm²] is the mean over pixel i and the pupil of étendue · cos⁴θ · (law)/π · φ_j where the line of sight
-    meets the surface (Eq. M.19 of docs/model.md). Rows: views, pixel rows from the top, pixels, in C order; dark ones
+    meets the surface (Eq. M.20 of docs/model.md). Rows: views, pixel rows from the top, pixels, in C order; dark ones
     are kept. Columns: vertices or faces of the meshes in the order of their files, one mesh after the other.
 
     Attributes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
@@ -24,7 +25,10 @@ if TYPE_CHECKING:
 ON = ("vertex", "face")
 CERTAIN = 0.35  # of its estimated error: what the picture of J_n = 1 is wrong by at the most, as a rule
 ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further from it are computed by lines of sight
-ROW_LINES = 4096  # of these pixels at rtol 1e-3
+UNREACHED = 0.5  # likewise, where the picture itself did not reach rtol
+ROW_LINES = 4096  # of these pixels at rtol 1e-3, more where they are few
+FEWEST_HITS = 64  # of them, on a column whose entry they determine better than the surface form does
+TURNS = 6  # in which rows and columns are scaled to their sums
 LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
 SAFETY = 2.0  # half the cells and pieces change an entry by some three times what is left; neighbours may err alike
 NEIGHBOURS = 3  # pixels across that share their errors
@@ -198,14 +202,21 @@ def block_of(
                     def report(share: float, first: float = number / len(emitters)) -> None:
                         progress(first + share / len(emitters))
 
-                part = _columns(scene, lens, emitter, on, ColumnRule.of(rtol), alone, report, most_bytes)
+                part = _columns(scene, lens, emitter, on, ColumnRule.of(rtol, on), alone, report, most_bytes)
                 counts.append(len(part.counts))
                 columns.append(part)
             entries = _Entries.of(columns)
-            rough = _rough(scene, lens, entries, solution, rtol)
-            if rough.size:
-                entries = entries.with_rows(_rows(scene, lens, emitters, counts, rough, on, rtol), rough)
-    return _block(entries, sum(counts), solution, lens.etendue)
+            rough, cut, outside = _rough(scene, lens, entries, solution, rtol)
+            bound = np.concatenate([part.exact for part in columns])
+            bound[entries.columns[outside[entries.pixels]]] = False
+            sums = np.bincount(entries.columns, entries.light, minlength=len(bound))
+            sums = np.where(bound, sums, np.nan)
+            entries = entries.where(~outside[entries.pixels])
+            if rough.any():
+                pixels = np.flatnonzero(rough)
+                entries = entries.refined(_rows(scene, lens, emitters, counts, pixels, on, rtol), rough, cut)
+    least = quadrature.least_error * float(solution.power.max(initial=0.0))
+    return _block(entries, sums, solution.power.ravel(), np.maximum(solution.error, least), lens.etendue)
 
 
 @dataclass(frozen=True)
@@ -224,35 +235,66 @@ class _Entries:
         pixels, light, change = (np.concatenate([getattr(p, n) for p in parts]) for n in ("pixels", "light", "change"))
         return cls(pixels, np.repeat(np.arange(len(counts)), counts), light, change)
 
-    def with_rows(self, rows: _Entries, pixels: NDArray[np.int64]) -> _Entries:
-        """The same with the rows of these pixels replaced."""
-        replaced = np.zeros(int(max(self.pixels.max(initial=0), pixels.max())) + 1, bool)
-        replaced[pixels] = True
-        kept = ~replaced[self.pixels]
-        mine, theirs = ((e.pixels, e.columns, e.light, e.change) for e in (self, rows))
-        return _Entries(*(np.concatenate([a[kept], b]) for a, b in zip(mine, theirs, strict=True)))
+    def where(self, kept: NDArray[np.bool_]) -> _Entries:
+        """Some of the entries."""
+        return _Entries(self.pixels[kept], self.columns[kept], self.light[kept], self.change[kept])
+
+    def refined(self, rows: _Rows, rough: NDArray[np.bool_], cut: NDArray[np.bool_]) -> _Entries:
+        """The same with entries of rough pixels as lines of sight find them, where enough of these meet the column.
+
+        On pixels that a stop has `cut` in any case, for there the surface form does not know where.
+        """
+        threshold = np.where(cut, 0, FEWEST_HITS / (math.pi * rows.lines))
+        here = self.where(rough[self.pixels])
+        count = int(max(here.columns.max(initial=0), rows.entries.columns.max(initial=0))) + 1
+        keys = [e.pixels.astype(np.int64) * count + e.columns for e in (here, rows.entries)]
+        many = rows.entries.light >= threshold[rows.entries.pixels]
+        # Kept from the surface form: faint columns, but for those that the lines have found to be bright.
+        kept = (here.light < threshold[here.pixels]) & ~np.isin(keys[0], keys[1][many])
+        parts = (self.where(~rough[self.pixels]), here.where(kept), rows.entries.where(many))
+        return _Entries(
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in ("pixels", "columns", "light", "change"))
+        )
 
 
-def _rough(scene: mi.Scene, lens: mi.Sensor, entries: _Entries, solution: Any, rtol: float) -> NDArray[np.int64]:
-    """Pixels whose row the surface form gives wrongly: cut by the image-plane stop, or far from the picture."""
+@dataclass(frozen=True)
+class _Rows:
+    """Entries of some pixels by so many lines of sight each."""
+
+    entries: _Entries
+    lines: int
+
+
+def _rough(
+    scene: mi.Scene, lens: mi.Sensor, entries: _Entries, solution: Any, rtol: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels (h · w) whose row the surface form gives wrongly, those that the stop cuts, and those beyond it.
+
+    The first include the second, and those whose sum is far from the picture, or off where that is uncertain.
+    """
     from ..integral.window import visible_window
 
     window = visible_window(scene, lens, everywhere=True)
-    _, cut = window.field_stop(lens)
-    cut = window.expand(cut.astype(np.float64)).ravel() > 0
+    inside, cut = (window.expand(flags.astype(np.float64)).ravel() > 0 for flags in window.field_stop(lens))
+    inside |= math.isinf(lens.optics.seen_field)
     picture = solution.power.ravel() / lens.etendue
     sums = np.bincount(entries.pixels, entries.light, minlength=picture.size)
-    return np.flatnonzero((cut & (picture > 0)) | (np.abs(picture - sums) > ROUGH * rtol * picture.max()))
+    off, uncertain = np.abs(picture - sums), solution.error.ravel() / lens.etendue
+    unit = rtol * picture.max(initial=0.0)
+    far = inside & ((off > ROUGH * unit) | (off > UNREACHED * unit) & (uncertain > unit))
+    cut &= ~inside
+    return far | (cut & (picture > 0)), cut, ~(inside | cut)
 
 
 def _rows(
     scene: mi.Scene, lens: mi.Sensor, emitters: Any, counts: list[int], pixels: NDArray[np.int64], on: str, rtol: float
-) -> _Entries:
+) -> _Rows:
     """Rows of these pixels by lines of sight; the change is what half of the lines make of them."""
     from ..integral.row_form import rows_of
+    from ..jit.batches import BATCH
     from ..jit.mesh_buffers import triangles
 
-    lines = int(min(ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
+    lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
     found: list[tuple[Any, ...]] = []
     first = 0
     for emitter, count, row in zip(emitters, counts, rows_of(scene, lens, emitters, pixels, lines), strict=True):
@@ -271,7 +313,8 @@ def _rows(
     whole.eliminate_zeros()
     entries = whole.tocoo()
     of_half = np.asarray(halves[entries.coords[0], entries.coords[1]]).ravel()
-    return _Entries(pixels[entries.coords[0]], entries.coords[1], entries.data, entries.data - of_half)
+    found_entries = _Entries(pixels[entries.coords[0]], entries.coords[1], entries.data, entries.data - of_half)
+    return _Rows(found_entries, lines)
 
 
 def _columns(
@@ -312,21 +355,42 @@ def _require_memory(entries: int, most_bytes: int | None) -> None:
         )
 
 
-def _block(found: _Entries, count: int, solution: Any, etendue: float) -> Block:
-    """The rows of one view from its entries and the picture of J_n = 1."""
-    shape = solution.power.shape
-    pixels, fine, change = found.pixels, found.light * etendue, found.change * etendue
-    picture, error = solution.power.ravel(), solution.error.ravel()
-    sums, coarse_sums = (np.bincount(pixels, values, minlength=len(picture)) for values in (fine, fine - change))
-    off = picture - sums
-    sure = np.where(np.abs(off) > CERTAIN * error, off, 0)
-    factor = np.clip(1 + np.divide(sure, sums, out=np.zeros_like(sums), where=sums > 0), 0, LARGEST_FACTOR)
-    left = np.maximum(np.abs(picture - factor * sums), error)
-    coarse_factor = np.divide(factor * sums, coarse_sums, out=factor.copy(), where=coarse_sums > 0)
-    entries = fine * factor[pixels]
-    change = entries - (fine - change) * np.minimum(coarse_factor, LARGEST_FACTOR)[pixels]
-    numbers = np.arange(1, len(pixels) + 1)
-    whole = csr_array((numbers, (pixels, found.columns)), shape=(len(picture), count))
+def _balanced(found: _Entries, rows: Array, columns: Array) -> Array:
+    """Light of the entries, scaled to these sums of the rows and of the columns, where they are not NaN.
+
+    By turns, rows last: both sums are those of one matrix, so that the turns converge.
+    """
+    light = found.light
+    for turn in range(TURNS):
+        light = light * _factor(rows, np.bincount(found.pixels, light, minlength=len(rows)))[found.pixels]
+        if turn < TURNS - 1:
+            factor = _factor(columns, np.bincount(found.columns, light, minlength=len(columns)))
+            light *= np.where(np.isnan(columns), 1, factor)[found.columns]
+    return light
+
+
+def _factor(wanted: Array, sums: Array) -> Array:
+    """By what sums are to be multiplied, at most so much."""
+    return np.clip(np.divide(wanted, sums, out=np.ones(len(sums)), where=sums > 0), 0, LARGEST_FACTOR)
+
+
+def _block(found: _Entries, columns: Array, power: Array, error: Array, etendue: float) -> Block:
+    """The rows of one view: from its entries, sums of its columns (NaN: not known) and the picture of J_n = 1.
+
+    power (h · w) and error (h, w) [W] of that picture.
+    """
+    shape, count = error.shape, len(columns)
+    picture, uncertain = power / etendue, error.ravel() / etendue
+    before = np.bincount(found.pixels, found.light, minlength=len(picture))
+    rows = np.where(np.abs(picture - before) > CERTAIN * uncertain, picture, before)
+    light = _balanced(found, rows, columns)
+    sums = np.bincount(found.pixels, light, minlength=len(picture))
+    left = np.maximum(np.abs(picture - sums), uncertain) * etendue
+    coarse = found.light - found.change
+    coarse = coarse * _factor(sums, np.bincount(found.pixels, coarse, minlength=len(picture)))[found.pixels]
+    entries, change = light * etendue, (light - coarse) * etendue
+    numbers = np.arange(1, len(entries) + 1)
+    whole = csr_array((numbers, (found.pixels, found.columns)), shape=(len(picture), count))
     order = whole.data - 1
     entries, change = entries[order], change[order]
     relative = np.divide(change, entries, out=np.zeros_like(entries), where=entries > 0)

@@ -22,10 +22,10 @@ TOLERANCE = 2e-5  # relative: by which float32 may change such a sum when a mesh
 
 
 def remember_defaults(scene: mi.Scene, values: Mapping[str, str]) -> None:
-    """Keep the values of a scene's `<default>` parameters with its lenses."""
+    """Keep values of a scene's `<default>` parameters with its lenses, in place of those kept before."""
     for sensor in scene.sensors():
         if is_lens(sensor):
-            sensor.defaults = dict(values)
+            sensor.defaults = getattr(sensor, "defaults", {}) | dict(values)
 
 
 def defaults_of(sensor: mi.Sensor) -> dict[str, float | str]:
@@ -45,8 +45,8 @@ def value_of(text: str) -> float | str:
 
 
 def origin_of(scene: mi.Scene, sensor: mi.Sensor) -> dict[str, str]:
-    """Metadata of an image: `parameters`, JSON of the scene's `<default>` values, and `mesh_digest`."""
-    found = {}
+    """Metadata of an image: `scene`, `parameters` (JSON of the scene's `<default>` values) and `mesh_digest`."""
+    found = {"scene": scene.id()}
     if defaults := defaults_of(sensor):
         found["parameters"] = json.dumps(defaults)
     if digest := scene_digest(scene):

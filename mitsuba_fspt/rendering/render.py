@@ -97,8 +97,7 @@ def render(
     how |= {"wall_time": time.perf_counter() - start}
     if not planes[0].any():
         how["warnings"] = DARK
-    origin = {"scene": scene.id(), "sensor": sensor, **origin_of(scene, lens)}
-    return Image(*planes, {**origin, **how, **lens.numbers(), **_versions()})
+    return Image(*planes, {**origin_of(scene, lens), "sensor": sensor, **how, **lens.numbers(), **_versions()})
 
 
 def _reporting(progress: Progress | None, check_interrupt: Callable[[], None]) -> Progress:

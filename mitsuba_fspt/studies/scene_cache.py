@@ -7,6 +7,7 @@ from threading import Lock
 from typing import TYPE_CHECKING
 
 from ..images.image import Image
+from ..rendering.provenance import remember_defaults
 from ..rendering.render import render
 from ..rendering.scene import load
 from ..runtime.backend import ensure_variant
@@ -90,3 +91,4 @@ def _set_lens(scene: mi.Scene, point: SweepPoint) -> None:
         for name in names:
             numbers[name] = float(point.parameters[parameter])
     numbers.update()
+    remember_defaults(scene, point.parameters)

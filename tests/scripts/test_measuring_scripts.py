@@ -34,6 +34,7 @@ def test_scaling_measures_every_setting(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(scaling, "SIDES", (8, 16))
     monkeypatch.setattr(scaling, "TRIANGLES", (200, 800))
     monkeypatch.setattr(scaling, "FEW_AND_MANY", (8, 16))
+    monkeypatch.setattr(scaling, "MATRICES", ((8, 200, 2.8), (16, 200, 8.0)))
     monkeypatch.setattr(sys, "argv", ["scaling.py", "--out", str(tmp_path), "--rounds", "1"])
     scaling.main()
     with open(tmp_path / "scaling.csv", newline="") as file:
@@ -44,6 +45,10 @@ def test_scaling_measures_every_setting(tmp_path, monkeypatch, capsys):
     ]
     assert all(float(row["seconds_median"]) > 0 for row in rows)
     assert all(float(row["bare_seconds"]) > 0 for row in rows)
+    with open(tmp_path / "scaling_matrix.csv", newline="") as file:
+        matrices = list(csv.DictReader(file))
+    assert [(row["side"], row["f_number"]) for row in matrices] == [("8", "2.8"), ("16", "8.0")]
+    assert all(int(row["entries"]) > 0 and int(row["bytes"]) > 0 for row in matrices)
     assert (tmp_path / "scaling.png").stat().st_size > 0
     assert capsys.readouterr().out.count("the logarithm") == 2
 

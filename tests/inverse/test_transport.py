@@ -1,0 +1,226 @@
+"""The transport matrix against closed forms, quadrature in double precision, and renders by the pupil form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from small_scenes import (
+    F_NUMBER,
+    FOCUS,
+    HEIGHT,
+    PITCH,
+    RADIUS,
+    WIDTH,
+    attribute,
+    filled,
+    glow,
+    lens,
+    world_scene,
+    write_ply,
+)
+
+import mitsuba_fspt as fspt
+
+pytestmark = pytest.mark.usefixtures("mono")
+
+RTOL = 1e-3
+BODY = trimesh.creation.icosphere(3, radius=8.0)  # 642 vertices, 1280 faces; a face covers a pixel
+TURN = trimesh.transformations.rotation_matrix(0.4, [1, 2, 0.5])[:3, :3]
+
+
+def body_scene(folder, on="vertex", depth=FOCUS, mesh=None, extra=(), emission=None, **optics):
+    """Scene of a mesh about the origin, this far in front of a lens on the +x axis that is focused to 165 mm.
+
+    It has the attribute `vertex_exitance` or `face_exitance`. `extra`: further shapes; `emission`: of the exit law.
+    """
+    vertices, faces = mesh or (BODY.vertices @ TURN.T, BODY.faces)
+    count = len(vertices) if on == "vertex" else len(faces)
+    path = write_ply(folder / f"body_{on}.ply", vertices, faces, **{on: np.ones(count)})
+    emitter = glow(attribute(f"{on}_exitance")) | (emission or {})
+    body = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": emitter}
+    sensor = lens((WIDTH, HEIGHT), PITCH, depth, **{"f_number": F_NUMBER} | optics)
+    return world_scene(body, *extra, sensor=sensor)
+
+
+def before_the_lens(vertices, depth):
+    """Vertices of `body_scene` in a frame with the lens at the origin and its axis along +z."""
+    return np.stack([vertices[:, 2], vertices[:, 1], depth - vertices[:, 0]], axis=1)
+
+
+def shine(scene, on, exitance):
+    """Give the only glowing mesh of a scene this J_n."""
+    import mitsuba as mi
+
+    mesh = next(shape for shape in scene.shapes() if shape.emitter() is not None)
+    values = mi.traverse(mesh)
+    values[f"{on}_exitance"] = mi.Float(np.asarray(exitance, np.float32))
+    values.update()
+
+
+def exitances(on):
+    """Smooth J_n, one over four decades, and one as of a Monte Carlo with zeros, on the body."""
+    centres = (BODY.vertices @ TURN.T)[BODY.faces].mean(axis=1) if on == "face" else BODY.vertices @ TURN.T
+    smooth = np.exp(-((centres - [8, 2, 1]) ** 2).sum(axis=1) / 50)
+    decades = 10 ** (-4 * (centres[:, 1] - centres[:, 1].min()) / np.ptp(centres[:, 1]))
+    noisy = np.random.default_rng(1).poisson(100 * smooth) / 100
+    return {"smooth": smooth, "decades": decades, "noisy": noisy}
+
+
+def disc_nodes(radius, rings=24, spokes=64):
+    """Points (n, 2) of a disc and their areas (n,)."""
+    node, weight = np.polynomial.legendre.leggauss(rings)
+    rho, turn = radius * np.sqrt((node + 1) / 2), (np.arange(spokes) + 0.5) * 2 * np.pi / spokes
+    points = np.stack([np.outer(rho, np.cos(turn)), np.outer(rho, np.sin(turn))], -1).reshape(-1, 2)
+    return points, np.repeat(weight / 2, spokes) / spokes * np.pi * radius**2
+
+
+def collected_by_vertices(vertices, faces, cut=4):
+    """∫ φ_j f_S→pupil dS [mm²] of every vertex of a convex body: midpoints of cut² parts of a face × the pupil."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    normal = cross / (2 * area[:, None])
+    points, weights = disc_nodes(RADIUS)
+    pupil = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+    total = np.zeros(len(vertices))
+    for i in range(cut):
+        for j in range(cut - i):
+            for up in (True, False)[: 2 if i + j < cut - 1 else 1]:
+                third = 1 / 3 if up else 2 / 3
+                shares = np.array([0, (i + third) / cut, (j + third) / cut])
+                shares[0] = 1 - shares.sum()
+                r = shares[0] * a + shares[1] * b + shares[2] * c
+                way = pupil[None] - r[:, None]
+                squared = (way**2).sum(axis=-1)
+                cosines = np.maximum(np.einsum("fpi,fi->fp", way, normal), 0) * -way[..., 2]
+                factor = (cosines / squared**2 / np.pi) @ weights
+                for k in range(3):
+                    total += np.bincount(faces[:, k], shares[k] * factor * area / cut**2, minlength=len(vertices))
+    return total
+
+
+@pytest.mark.parametrize(("rtol", "depth"), [(1e-3, 165.0), (1e-3, 185.0), (1e-4, 150.0)])
+def test_sums_of_columns_are_form_factors_whatever_the_focus(tmp_path, rtol, depth):
+    """Expected: ∫ φ_j f_S→pupil dS, to 3e-3 at rtol 1e-3 and 1e-3 at 1e-4 of each column that sends light.
+
+    A column seen by a rim of the pupil alone has so little light that it is compared with a percent of the largest.
+    Seen to fail with cos⁴θ dropped from either form, 1/π twice, u² of another focus, and two columns swapped.
+    """
+    matrix = fspt.transport(body_scene(tmp_path, depth=depth), rtol=rtol)
+    expected = collected_by_vertices(before_the_lens(BODY.vertices @ TURN.T, depth), BODY.faces)
+    bound = 3e-3 if rtol == 1e-3 else 1e-3
+    np.testing.assert_allclose(matrix.sensitivity, expected, rtol=bound, atol=bound * 0.01 * expected.max())
+    assert expected.max() > 1e-3
+    assert not matrix.sensitivity[expected == 0].any()
+
+
+def test_sums_of_rows_are_the_picture_of_one_in_closed_form(tmp_path):
+    """A plane that fills every cone: A_vd times the configuration factor, to 1e-5; out of focus too.
+
+    Seen to fail with cos⁴θ, 1/π or 1/u² dropped.
+    """
+    corners = 200.0 * np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]])
+    scene = body_scene(tmp_path, depth=175.0, mesh=(corners, np.array([[0, 1, 2], [0, 2, 3]])))
+    matrix = fspt.transport(scene, rtol=RTOL)
+    np.testing.assert_allclose(matrix.forward(np.ones(4))[0], filled(nodes=4), rtol=1e-5)
+    assert matrix.areas.sum() == pytest.approx(400.0**2)
+
+
+@pytest.mark.parametrize("on", ["vertex", "face"])
+@pytest.mark.parametrize("depth", [165.0, 185.0])
+def test_products_are_the_pictures_of_renders(tmp_path, on, depth):
+    """Expected: rtol of the brightest pixel beside the error of a render ten times finer; within `error` on 99 %.
+
+    Seen to fail with two columns swapped, and with half the cells of the pupil on noisy J_n.
+    """
+    scene = body_scene(tmp_path, on, depth)
+    matrix = fspt.transport(scene, on=on, rtol=RTOL)
+    for name, exitance in exitances(on).items():
+        shine(scene, on, exitance)
+        image = fspt.render(scene, method="integral", rtol=RTOL / 10)
+        off = np.abs(matrix.forward(exitance)[0] - image.power)
+        beyond = off - image.error
+        assert beyond.max() <= RTOL * image.power.max(), name
+        assert (off <= matrix.error(exitance)[0] + image.error).mean() > 0.99, name
+        assert matrix.error(exitance).max() < 30 * RTOL * image.power.max()
+
+
+@pytest.mark.parametrize("distance", [8.5, 40.0])
+def test_an_occluder_hides_what_it_hides_in_a_render(tmp_path, distance):
+    """A dark wall before half the body, in focus and not. Expected: as without it, on smooth J_n.
+
+    Seen to fail without rows by lines of sight, and without shadow rays and the picture of J_n = 1.
+    """
+    import mitsuba as mi
+
+    place = mi.ScalarTransform4f().translate([distance, 5, 0]).rotate([0, 1, 0], 90).scale([20, 5, 1])
+    scene = body_scene(tmp_path, extra=[{"type": "rectangle", "to_world": place}])
+    matrix, exitance = fspt.transport(scene, rtol=RTOL), exitances("vertex")["smooth"]
+    shine(scene, "vertex", exitance)
+    image = fspt.render(scene, method="integral", rtol=RTOL / 10)
+    off = np.abs(matrix.forward(exitance)[0] - image.power)
+    assert (off - image.error).max() <= RTOL * image.power.max()
+    assert matrix.sensitivity.sum() < 0.8 * fspt.transport(body_scene(tmp_path), rtol=RTOL).sensitivity.sum()
+
+
+@pytest.mark.parametrize(("rtol", "bound"), [(1e-3, 0.1), (1e-4, 0.01)])
+@pytest.mark.parametrize("depth", [165.0, 200.0])
+def test_a_column_alone_is_the_picture_of_one_vertex(tmp_path, rtol, bound, depth):
+    """Vertices in the middle, at the limb and of faces far below a pixel, each rendered alone.
+
+    Expected: 10 % of the column's own brightest entry at rtol 1e-3, 1 % at 1e-4.
+    """
+    small = trimesh.creation.icosphere(1, radius=0.2)
+    fine = np.concatenate([BODY.vertices @ TURN.T, small.vertices + np.array([9.0, 0.0, 0.0])])
+    scene = body_scene(
+        tmp_path, depth=depth, mesh=(fine, np.concatenate([BODY.faces, small.faces + len(BODY.vertices)]))
+    )
+    matrix = fspt.transport(scene, rtol=rtol)
+    middle, limb = np.argmax(fine[:642, 0]), np.argmin(np.abs(fine[:642, 0] - 0.8))
+    tip = 642 + np.argmax(small.vertices[:, 0])
+    for vertex in (middle, limb, tip):
+        exitance = np.zeros(len(fine))
+        exitance[vertex] = 1
+        shine(scene, "vertex", exitance)
+        image = fspt.render(scene, method="integral", rtol=1e-3, domain="surface", max_nodes=1 << 16)
+        column = matrix.forward(exitance)[0]
+        peak = image.power.max()
+        assert peak > 0
+        assert (np.abs(column - image.power) - image.error).max() <= bound * peak, vertex
+
+
+@pytest.mark.parametrize(
+    "optics",
+    [
+        {"model": "pinhole"},
+        {"model": "hrrt", "lens_diameter": 25.0},
+        {"model": "ripoll", "numerical_aperture": 0.05},
+        {"image_stop_diameter": 6.0},
+        {"lens_diameter": 22.0, "diaphragm_distance": 15.0, "f_number": 4.0},
+        {"emission": {"emission": "fresnel", "int_ior": 1.37}},
+    ],
+    ids=str,
+)
+def test_every_lens_and_exit_law(tmp_path, optics):
+    """Expected: as of a render. Seen to fail, by 4e-2, with rows of the image-plane stop's border scaled only."""
+    scene = body_scene(tmp_path, **optics)
+    matrix, exitance = fspt.transport(scene, rtol=RTOL), exitances("vertex")["decades"]
+    shine(scene, "vertex", exitance)
+    image = fspt.render(scene, method="integral", rtol=RTOL / 10)
+    off = np.abs(matrix.forward(exitance)[0] - image.power)
+    assert (off - image.error).max() <= RTOL * image.power.max()
+
+
+def test_a_crop_window_is_a_part_of_the_film(tmp_path):
+    """Expected: the rows of these pixels, to rtol, whatever lies beyond."""
+    import mitsuba as mi
+
+    scene, exitance = body_scene(tmp_path), exitances("vertex")["smooth"]
+    whole = fspt.transport(scene).forward(exitance)[0]
+    film = mi.traverse(scene.sensors()[0].film())
+    film["crop_offset"], film["crop_size"] = [5, 7], [20, 11]
+    film.update()
+    matrix = fspt.transport(scene)
+    assert matrix.image_shape == (1, 11, 20)
+    np.testing.assert_allclose(matrix.forward(exitance)[0], whole[7:18, 5:25], atol=RTOL * whole.max())

@@ -1,0 +1,286 @@
+"""The transport matrix as an object, a file and a verb: transpose, views, resumption, refusals."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import numpy as np
+import pytest
+import trimesh
+from small_scenes import SCENES, attribute, ball, glow, lens, load_scene, world_scene, write_ply
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.inverse import transport as module
+from mitsuba_fspt.rendering.provenance import mesh_digest, same_mesh
+from mitsuba_fspt.runtime.errors import SceneError, TransportError
+
+pytestmark = pytest.mark.usefixtures("mono")
+
+BODY = trimesh.creation.icosphere(2, radius=5.0)
+SMALL = {"width": 16, "height": 12, "pixel_pitch": 1.7}
+
+XML = """<scene version="3.0.0">
+    <default name="view" value="0"/>
+    <default name="f_number" value="4"/>
+    <default name="size" value="1"/>
+    <integrator type="fspt_integral"/>
+    <sensor type="fspt_lens">
+        <float name="focal_length" value="55"/><float name="f_number" value="$f_number"/>
+        <float name="magnification" value="0.5"/><float name="pixel_pitch" value="0.5"/>
+        <transform name="to_world"><lookat origin="165, 0, 0" target="0, 0, 0" up="0, 0, 1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="14"/><integer name="height" value="12"/>
+            <string name="pixel_format" value="luminance"/></film>
+    </sensor>
+    <shape type="ply" id="body">
+        <string name="filename" value="body.ply"/><boolean name="face_normals" value="true"/>
+        <transform name="to_world"><scale value="$size"/><rotate z="1" angle="$view"/></transform>
+        <emitter type="fspt_surface">
+            <texture type="mesh_attribute" name="exitance"><string name="name" value="vertex_exitance"/></texture>
+        </emitter>
+    </shape>
+</scene>
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    """A scene file with the parameters view, f_number and size."""
+    write_ply(tmp_path / "body.ply", BODY.vertices, BODY.faces, vertex=1e-3 * (2 + BODY.vertices[:, 1] / 5))
+    (tmp_path / "body.xml").write_text(XML)
+    return tmp_path / "body.xml"
+
+
+@pytest.fixture
+def matrix(scene_file):
+    return fspt.transport(scene_file, view=[0, 90, 200], f_number=2.8)
+
+
+def test_the_transpose_is_the_transpose(matrix):
+    """Dot test of each view and of all, by matvec, rmatvec, matmat and `.T`; both sides well off 0."""
+    rng = np.random.default_rng(2)
+    exitance, power = rng.random(matrix.shape[1]), rng.random(matrix.shape[0])
+    assert matrix.shape == (3 * 12 * 14, len(BODY.vertices))
+    for left, right in [
+        (power @ (matrix @ exitance), (matrix.T @ power) @ exitance),
+        *(
+            (
+                (power.reshape(3, -1)[k] @ (block.matrix @ exitance)),
+                (block.matrix.T @ power.reshape(3, -1)[k]) @ exitance,
+            )
+            for k, block in enumerate(matrix.blocks)
+        ),
+    ]:
+        assert left > 0
+        assert left == pytest.approx(right, rel=1e-12)
+    both = np.stack([exitance, 2 * exitance], 1)
+    np.testing.assert_allclose(matrix @ both, np.stack([matrix @ exitance, 2 * (matrix @ exitance)], 1), rtol=1e-12)
+    np.testing.assert_allclose(matrix.T @ np.stack([power] * 2, 1), np.stack([matrix.T @ power] * 2, 1), rtol=1e-12)
+    np.testing.assert_allclose(matrix.matrix @ exitance, matrix @ exitance, rtol=1e-12)
+    np.testing.assert_allclose(matrix.backward(power.reshape(matrix.image_shape)), matrix.T @ power, rtol=1e-12)
+
+
+def test_what_it_says_of_itself(matrix):
+    """Views as numbers, sums of columns, surface areas, the seen part; J_n of the scene has no say."""
+    assert matrix.views == [{"view": view, "f_number": 2.8} for view in (0, 90, 200)]
+    assert matrix.image_shape == (3, 12, 14)
+    assert matrix.parts == {"body": slice(0, len(BODY.vertices))}
+    assert matrix.areas.sum() == pytest.approx(BODY.area, rel=1e-6)
+    np.testing.assert_allclose(matrix.sensitivity, matrix.matrix.sum(axis=0), rtol=1e-6)
+    assert (matrix.matrix.data > 0).all()
+    assert matrix.seen.all()
+
+
+def test_what_no_camera_sees_has_no_entries(scene_file):
+    """Of a ball one view sees a little less than half; the columns beyond are empty."""
+    found = fspt.transport(scene_file)
+    away = BODY.vertices[:, 0] < -1.0
+    assert not found.sensitivity[away].any()
+    assert found.views == [{}]
+    assert 0.4 < found.areas[found.seen].sum() / found.areas.sum() < 0.6
+
+
+def test_several_meshes_and_sensors(tmp_path):
+    """Columns of one mesh after the other, in the order of the scene; a view a sensor, last and fastest."""
+    shapes = []
+    for k, shift in enumerate((-7, 7)):
+        path = write_ply(
+            tmp_path / f"{k}.ply", BODY.vertices + np.array([0.0, shift, 0.0]), BODY.faces, vertex=np.ones(162)
+        )
+        body = {"type": "ply", "filename": str(path), "face_normals": True}
+        shapes.append(body | {"emitter": glow(attribute("vertex_exitance"))})
+    whole = world_scene(*shapes, sensor=lens(24, 0.6))
+    found = fspt.transport(whole)
+    assert found.views == [{"sensor": 0}]
+    assert [part.stop - part.start for part in found.parts.values()] == [162, 162]
+    one = fspt.transport(world_scene(shapes[1], sensor=lens(24, 0.6)))
+    part = list(found.parts.values())[1]
+    np.testing.assert_allclose(found.sensitivity[part], one.sensitivity, rtol=5e-3, atol=1e-3 * one.sensitivity.max())
+    assert fspt.transport(whole, sensor=[0]).views == [{"sensor": 0}]
+
+
+def test_a_file_holds_the_matrix(matrix, tmp_path):
+    """The same numbers after `save` and `read_transport`; one view is read alone; float32 loses no more than 6e-8."""
+    matrix.save(tmp_path / "T.npz")
+    again = fspt.read_transport(tmp_path / "T.npz")
+    assert abs(again.matrix - matrix.matrix).max() == 0
+    assert (again.views, again.parts, again.on) == (matrix.views, matrix.parts, "vertex")
+    np.testing.assert_array_equal(again.sensitivity, matrix.sensitivity)
+    exitance = np.linspace(0, 1, matrix.shape[1])
+    np.testing.assert_array_equal(again.error(exitance), matrix.error(exitance))
+    with np.load(tmp_path / "T.npz") as file:
+        assert file["view_1/values"].dtype == np.float32
+        assert file["view_1/columns"].dtype == np.int32
+
+
+def test_an_interrupted_file_goes_on(scene_file, tmp_path, monkeypatch):
+    """Two of three views are done when it stops; the second call computes the third alone, to the same bits."""
+    calls, plain = [], module.computed
+
+    def failing(task, *rest):
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        calls.append(task.label)
+        return plain(task, *rest)
+
+    monkeypatch.setattr(module, "computed", failing)
+    file = tmp_path / "T.npz"
+    with pytest.raises(KeyboardInterrupt):
+        fspt.transport(scene_file, view=[0, 90, 200], file=file)
+    assert not file.exists()
+    calls.clear()
+    monkeypatch.setattr(module, "computed", lambda task, *rest: calls.append(task.label) or plain(task, *rest))
+    found = fspt.transport(scene_file, view=[0, 90, 200], file=file)
+    assert calls == ["view=200"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["T.npz", "body.ply", "body.xml"]
+    assert abs(found.matrix - fspt.transport(scene_file, view=[0, 90, 200]).matrix).max() == 0
+
+
+@pytest.mark.slow
+def test_a_scheduler_gives_the_same_bits(scene_file):
+    pytest.importorskip("distributed")
+    views = {"view": [0, 90], "f_number": 8}
+    there, here = fspt.transport(scene_file, scheduler="local", **views), fspt.transport(scene_file, **views)
+    assert abs(there.matrix - here.matrix).max() == 0
+
+
+def test_images_are_held_against_the_views(scene_file, matrix, caplog):
+    """Size, order and pixel pitch must agree where metadata tell; another mesh is one line."""
+    images = [fspt.render(fspt.load(scene_file, view=view, f_number=2.8)) for view in (0, 90, 200)]
+    assert matrix.backward(images).max() > 0
+    assert not caplog.records
+    with pytest.raises(TransportError, match="in the order of the views"):
+        matrix.backward(images[::-1])
+    with pytest.raises(TransportError, match="3 views"):
+        matrix.backward(images[:2])
+    with pytest.raises(TransportError, match=r"must have the shape \(3, 12, 14\)"):
+        matrix.backward(np.zeros((3, 14, 12)))
+    other = [fspt.Image(image.power, metadata=image.metadata | {"pixel_pitch": 0.6}) for image in images]
+    with pytest.raises(TransportError, match=r"pixel pitch of 0\.6 mm"):
+        matrix.backward(other)
+    strange = [fspt.Image(image.power, metadata=image.metadata | {"mesh_digest": "0:AAAA"}) for image in images]
+    with caplog.at_level(logging.WARNING):
+        matrix.backward(strange)
+    assert [record.getMessage() for record in caplog.records] == [
+        "fspt: image 0 shows another mesh than the one of the matrix."
+    ]
+
+
+def test_a_digest_knows_a_mesh_wherever_it_is():
+    """Rotation and translation in single precision keep it; a moved vertex, a mirror and other faces do not."""
+    turn = trimesh.transformations.rotation_matrix(1.1, [1, 2, 3])[:3, :3]
+    plain = mesh_digest(BODY.vertices.astype(np.float32), BODY.faces)
+    moved = (BODY.vertices @ turn.T + [100, -20, 3]).astype(np.float32)
+    bent = BODY.vertices.copy()
+    bent[7] *= 1.01
+    assert same_mesh(plain, mesh_digest(moved, BODY.faces))
+    assert not same_mesh(plain, mesh_digest(bent, BODY.faces))
+    assert not same_mesh(plain, mesh_digest(BODY.vertices * [1, 1, -1], BODY.faces))
+    assert not same_mesh(plain, mesh_digest(BODY.vertices, BODY.faces[::-1]))
+
+
+def test_vectors_that_do_not_fit_are_refused(matrix):
+    with pytest.raises(TransportError, match=r"J must have the shape \(162,\)"):
+        matrix.forward(np.ones(161))
+    with pytest.raises(TransportError, match="J has 1 values that are NaN"):
+        matrix.forward(np.where(np.arange(162) == 3, np.nan, 1))
+    with pytest.raises(TransportError, match="images has 1 values that are NaN"):
+        matrix.backward(np.where(np.arange(504).reshape(3, 12, 14) == 5, np.nan, 1))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"on": "edge"}, "'on' must be 'vertex' or 'face'"),
+        ({"rtol": 0}, r"'rtol' must be in \(0, 1\)"),
+        ({"view": [0, 0]}, "value '0' twice"),
+        ({"colour": 3}, "no parameter 'colour'"),
+        ({"size": [1, 1.1]}, "rigid motion"),
+        ({"view": 0, "f_number": "wide"}, "must be a finite number"),
+        ({"sensor": [0, 0]}, "or one twice"),
+        ({"sensor": 3}, "sensor 3 does not exist"),
+        ({"file": "T.txt"}, "must end in .npz"),
+        ({"file": "nowhere/T.npz"}, "does not exist"),
+    ],
+    ids=str,
+)
+def test_wrong_wishes_are_refused_in_one_line(scene_file, tmp_path, monkeypatch, given, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((TransportError, SceneError), match=message) as refused:
+        fspt.transport(scene_file, **given)
+    assert "\n" not in str(refused.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["body.ply", "body.xml"]
+
+
+def test_scenes_without_columns_are_refused(tmp_path):
+    import mitsuba as mi
+
+    with pytest.raises(TransportError, match="is a sphere"):
+        fspt.transport(world_scene(ball()))
+    with pytest.raises(TransportError, match="is a sphere"):
+        fspt.transport(SCENES / "textured_sphere.xml")
+    with pytest.raises(TransportError, match="loaded scene has no parameter"):
+        fspt.transport(load_scene("nylon_cylinder"), view=[0, 90])
+    path = write_ply(tmp_path / "b.ply", BODY.vertices, BODY.faces, vertex=np.ones(162))
+    body = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute())}
+    away = lens(to_world=mi.ScalarTransform4f().look_at([165, 0, 0], [300, 0, 0], [0, 0, 1]))
+    with pytest.raises(TransportError, match="sees nothing"):
+        fspt.transport(world_scene(body, sensor=away))
+
+
+def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
+    from mitsuba_fspt.inverse import view_block
+
+    monkeypatch.setattr(view_block, "available_memory", lambda: 1 << 20)
+    with pytest.raises(TransportError, match=r"needs \d+ bytes .* 1048576 are free"):
+        fspt.transport(load_scene("nylon_cylinder"))
+
+
+def test_files_that_are_none_are_refused(matrix, tmp_path):
+    with pytest.raises(TransportError, match="does not exist"):
+        fspt.read_transport(tmp_path / "none.npz")
+    whole = tmp_path / "T.npz"
+    matrix.save(whole)
+    half = tmp_path / "half.npz"
+    half.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    with pytest.raises(TransportError, match="truncated"):
+        fspt.read_transport(half)
+    np.savez(tmp_path / "other.npz", meta=np.array(json.dumps({"format": "something"})))
+    with pytest.raises(TransportError, match="has the format 'something'"):
+        fspt.read_transport(tmp_path / "other.npz")
+
+
+def test_the_verb(scene_file, tmp_path, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("matrix", scene_file, "-D", "view=0:180:90", "-D", "f_number=4", "-o", "T.npz", "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert told["shape"] == [2 * 12 * 14, 162]
+    assert told["entries"] == fspt.read_transport("T.npz").entries
+    assert 0 < told["sensitivity"][0] < told["sensitivity"][1] < 1
+    assert 0.5 < told["seen"] < 1
+    code, out, err = run("matrix", scene_file, "-D", "size=1,1.2", "-o", "U.npz")
+    assert (code, out) == (2, "")
+    assert "rigid motion" in err
+    assert len(err.splitlines()) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["T.npz", "body.ply", "body.xml"]
