@@ -152,6 +152,17 @@ def parts_of(scene: mi.Scene, on: str) -> list[Part]:
     return found
 
 
+def _refuse_specular(scene: mi.Scene, lens: mi.Sensor) -> None:
+    """Raise TransportError where light reaches the lens through or off specular shapes."""
+    from ..integral.specular import Specular
+
+    if specular := Specular.of(scene, lens):
+        raise TransportError(
+            f"transport: light reaches the lens through or off the specular shapes {', '.join(specular.names)}, which "
+            "the matrix does not follow. Leave them out."
+        )
+
+
 def block_of(
     scene: mi.Scene,
     lens: mi.Sensor,
@@ -176,16 +187,11 @@ def block_of(
 
     from ..integral.column_form import ColumnRule
     from ..integral.occlusion import hides_nothing
-    from ..integral.specular import Specular
     from ..jit.recording import recording
     from ..rendering.render import integrator_of
 
     emitters = glowing_meshes(scene)
-    if specular := Specular.of(scene, lens):
-        raise TransportError(
-            f"transport: light reaches the lens through or off the specular shapes {', '.join(specular.names)}, which "
-            "the matrix does not follow. Leave them out."
-        )
+    _refuse_specular(scene, lens)
     with ExitStack() as stack:
         for emitter in emitters:
             stack.enter_context(emitter.shining(1.0))
