@@ -37,10 +37,15 @@ def settle_by_lattices(draft: Draft) -> None:
             continue
         found = apply_lattice(draft, where, points)
         error = dr.maximum(found.error, unmet)
+        # The transects' value may be far better than its estimate: it stays where it is confirmed to the tolerance, or
+        # where lattices neither reach the tolerance nor refute it.
+        apart, enough = dr.abs(found.value - draft.value), error <= draft.tolerance
+        keep = (apart + error <= draft.tolerance) | (~enough & (apart <= error))
+        error = dr.select(keep, apart + error, error)
         better = where & (error < draft.error)
-        draft.value = dr.select(better, found.value, draft.value)
+        draft.value = dr.select(better & ~keep, found.value, draft.value)
+        draft.coverage = dr.select(better & ~keep, found.coverage, draft.coverage)
         draft.error = dr.select(better, error, draft.error)
-        draft.coverage = dr.select(better, found.coverage, draft.coverage)
         dr.eval(draft.value, draft.error, draft.coverage)
 
 

@@ -188,7 +188,7 @@ def test_a_scene_without_specular_shapes_ends_lines_of_sight_at_the_first_surfac
     scene = camera_scene(sphere(150, 9), bodies=(pane(80, {"type": "diffuse"}, size=3.0),))
     image, other = (fspt.render(scene, shortcuts=shortcuts) for shortcuts in (True, False))
     assert "lines of sight beyond the first surface: left out" in image.metadata["left_out"]
-    assert abs(image.power - other.power).max() <= 1e-3 * image.power.max()
+    assert abs(image.power - other.power).max() <= 2e-3 * image.power.max()
 
 
 def test_panes_merged_by_mitsuba_are_not_passed_by():
