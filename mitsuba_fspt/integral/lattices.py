@@ -37,10 +37,10 @@ def settle_by_lattices(draft: Draft) -> None:
             continue
         found = apply_lattice(draft, where, points)
         error = dr.maximum(found.error, unmet)
-        # The transects' value may be far better than its estimate: it stays where it is confirmed to the tolerance, or
-        # where lattices neither reach the tolerance nor refute it.
-        apart, enough = dr.abs(found.value - draft.value), error <= draft.tolerance
-        keep = (apart + error <= draft.tolerance) | (~enough & (apart <= error))
+        # The transects' value is often far better than its estimate: it stays where it is confirmed to the tolerance,
+        # and where lattices do not reach the tolerance either.
+        apart = dr.abs(found.value - draft.value)
+        keep = (apart + error <= draft.tolerance) | (error > draft.tolerance)
         error = dr.select(keep, apart + error, error)
         better = where & (error < draft.error)
         draft.value = dr.select(better & ~keep, found.value, draft.value)

@@ -57,12 +57,13 @@ def test_lattices_find_the_share_that_an_outline_leaves(looked_at):
     assert errors[1] < errors[0] / np.sqrt(8)  # better than chance
 
 
-@pytest.mark.parametrize("rtol", [1e-4, 3e-5])
-def test_a_smaller_rtol_does_not_raise_the_estimate(rtol):
+def test_a_smaller_rtol_does_not_raise_the_estimate():
     """Where J_n has kinks in a pixel, 1024 transects stated 3.7e-4 of the peak at 1e-4 and 5.3e-4 at 3e-5."""
     scene = load_scene("nylon_cylinder", crop=(14, 10, 8, 8), width=32, pixel_pitch=0.864)
-    image = fspt.render(scene, rtol=rtol)
-    assert image.error.max() <= max(rtol, 6e-5) * image.power.max()
+    images = [fspt.render(scene, rtol=rtol) for rtol in (1e-3, 1e-4, 3e-5)]
+    largest = [image.error.max() / image.power.max() for image in images]
+    assert largest[0] > largest[1] >= largest[2]
+    assert largest[1] <= 1e-4
 
 
 def test_lattices_are_the_same_every_time(looked_at):
