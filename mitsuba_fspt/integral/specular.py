@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -42,6 +43,7 @@ DELTA = {
 if TYPE_CHECKING:
     Radiance = Callable[[mi.PreliminaryIntersection3f, mi.Ray3f], mi.Float]
     Covers = Callable[[mi.UInt32], mi.Bool]
+    Note = Callable[[mi.PreliminaryIntersection3f, mi.Ray3f, mi.Float, mi.Bool], None]
 
 Box = tuple[float, ...]  # x, y, z of the lowest and of the highest corner [mm]
 
@@ -252,6 +254,12 @@ class Course:
     plain: mi.UInt32
     length: mi.UInt32
 
+    @classmethod
+    def begun(cls, ray: mi.Ray3f, start: mi.Float) -> Course:
+        """The course of a ray that begins at the depth `start` [mm]."""
+        one, number = mi.Float(1), mi.UInt32
+        return cls(mi.Point3f(ray.o), mi.Vector3f(ray.d), one, mi.Float(start), mi.Float(1), number(1), number(0))
+
     def carries(self) -> mi.Float:
         """Share of the light along the line: radiance over the squared index is what refraction leaves alone."""
         return self.weight * dr.square(self.index)
@@ -300,6 +308,7 @@ def follow(
     passes: mi.Bool,
     radiance: Radiance,
     covers: Covers,
+    note: Note | None = None,
 ) -> Found:
     """What a line of sight finds that begins with a `ray` at the depth `start` [mm].
 
@@ -307,8 +316,11 @@ def follow(
     passes : False for lines that are not followed
     radiance : of the surface at an intersection, towards its ray [W/mm²/sr]
     covers : True for the numbers of shapes with an `fspt_surface`
+    note : called at the end of every leg with the intersection, its ray, the weight of the course until there, and
+        True where the leg ends on a surface
     """
     most, least = dr.opaque(mi.UInt32, specular.most), dr.opaque(mi.Float, specular.least)
+    followed = partial(_followed, specular, most, least)
     branches = len(specular.lobes) - 1
     stack = dr.alloc_local(Course, max(1, branches * specular.most))
 
@@ -322,6 +334,8 @@ def follow(
         number = mi.UInt32(dr.reinterpret_array(mi.UInt32, pi.shape))
         depth = course.depth + dr.select(met, pi.t, 0) * cosine / course.index
         glows = met & covers(number)
+        if note:
+            note(pi, ray, course.weight, met)
         found = _noted(found, course, foremost, met, number, depth, dr.select(met, radiance(pi, ray), 0), glows)
         lobes = _lobes(specular, pi, ray, number, met)
         nexts = [_onward(course, lobe, depth) for lobe in lobes]
@@ -329,13 +343,11 @@ def follow(
         best.plain = course.plain
         # What lets light through is no end.
         found.depth = dr.select(foremost & (best.weight > 0) & ~glows, dr.inf, found.depth)
-        leads = _leads_to_light(specular, number, best)
-        on = leads & (best.carries() > least) & (best.length <= most)
-        found.lost += dr.select(leads & ~on, best.carries(), 0)
+        on, lost = followed(number, best)
+        found.lost += lost
         for other in others:
-            leads = _leads_to_light(specular, number, other)
-            push = leads & (other.carries() > least) & (other.length <= most)
-            found.lost += dr.select(leads & ~push, other.carries(), 0)
+            push, lost = followed(number, other)
+            found.lost += lost
             stack.write(other, pending, push)
             pending = pending + dr.select(push, mi.UInt32(1), 0)
         pop = ~on & (pending > 0)
@@ -344,17 +356,23 @@ def follow(
             best = dr.select(pop, stack.read(pending, pop), best)
         return best, foremost & on, found, alive & (on | pop), pending, stack
 
-    first = Course(
-        mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(1), mi.Float(start), mi.Float(1), mi.UInt32(1), mi.UInt32(0)
-    )  # fmt: skip
     none = Found(mi.Float(0), mi.Bool(False), mi.UInt32(0), *(mi.Float(dr.inf),) * 2, mi.Float(0))
-    state = (first, mi.Bool(True), none, mi.Bool(passes), mi.UInt32(0), stack)
+    state = (Course.begun(ray, start), mi.Bool(True), none, mi.Bool(passes), mi.UInt32(0), stack)
     return dr.while_loop(state, lambda course, foremost, found, alive, *_: alive, leg)[2]
 
 
 def first_met(body: mi.Float) -> mi.UInt32:
     """Number of the first surface met, 0 for none, from that of all that a line of sight met (`Sight.body`)."""
     return mi.UInt32(dr.abs(body)) & CODES
+
+
+def _followed(
+    specular: Specular, most: mi.UInt32, least: mi.Float, number: mi.UInt32, course: Course
+) -> tuple[mi.Bool, mi.Float]:
+    """True where a course that leaves a shape of this number is followed, and what it carries where it is cut off."""
+    leads = _leads_to_light(specular, number, course)
+    on = leads & (course.carries() > least) & (course.length <= most)
+    return on, dr.select(leads & ~on, course.carries(), 0)
 
 
 def _noted(

@@ -22,10 +22,13 @@ from ..runtime.plugin_types import is_surface
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from ..integral.specular import Specular
+
 ON = ("vertex", "face")
 CERTAIN = 0.35  # of its estimated error: what the picture of J_n = 1 is wrong by at the most, as a rule
 ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further from it are computed by lines of sight
 UNREACHED = 0.5  # likewise, where the picture itself did not reach rtol
+ALL_LINES = 2048  # lines of sight a pixel at rtol 1e-3 where all rows are found by them
 ROW_LINES = 4096  # of these pixels at rtol 1e-3, more where they are few
 FEWEST_HITS = 64  # of them, on a column whose entry they determine better than the surface form does
 TURNS = 6  # in which rows and columns are scaled to their sums
@@ -152,17 +155,6 @@ def parts_of(scene: mi.Scene, on: str) -> list[Part]:
     return found
 
 
-def _refuse_specular(scene: mi.Scene, lens: mi.Sensor) -> None:
-    """Raise TransportError where light reaches the lens through or off specular shapes."""
-    from ..integral.specular import Specular
-
-    if specular := Specular.of(scene, lens):
-        raise TransportError(
-            f"transport: light reaches the lens through or off the specular shapes {', '.join(specular.names)}, which "
-            "the matrix does not follow. Leave them out."
-        )
-
-
 def block_of(
     scene: mi.Scene,
     lens: mi.Sensor,
@@ -174,7 +166,8 @@ def block_of(
 ) -> Block:
     """Rows of one view of a scene, whatever J_n it has.
 
-    The columns come from the surface form, which conserves the light of each. Their sums over a row are then made those
+    Where light reaches the lens through or off specular shapes all rows are found by lines of sight. Else the columns
+    come from the surface form, which conserves the light of each. Their sums over a row are then made those
     of the picture of J_n = 1, an independent computation by the pupil form that finds silhouettes and occluders, as far
     as the two differ by more than the picture's own error.
 
@@ -185,13 +178,11 @@ def block_of(
     """
     import drjit as dr
 
-    from ..integral.column_form import ColumnRule
-    from ..integral.occlusion import hides_nothing
+    from ..integral.specular import Specular
     from ..jit.recording import recording
     from ..rendering.render import integrator_of
 
     emitters = glowing_meshes(scene)
-    _refuse_specular(scene, lens)
     with ExitStack() as stack:
         for emitter in emitters:
             stack.enter_context(emitter.shining(1.0))
@@ -199,30 +190,73 @@ def block_of(
             quadrature = Quadrature(rtol=rtol)
         solution = integrator_of(scene, "integral").solve(scene, lens, quadrature)
         with recording(), dr.suspend_grad():
-            alone = hides_nothing(scene)
-            counts, columns = [], []
-            for number, emitter in enumerate(emitters):
-                report = None
-                if progress:
-
-                    def report(share: float, first: float = number / len(emitters)) -> None:
-                        progress(first + share / len(emitters))
-
-                part = _columns(scene, lens, emitter, on, ColumnRule.of(rtol, on), alone, report, most_bytes)
-                counts.append(len(part.counts))
-                columns.append(part)
-            entries = _Entries.of(columns)
-            rough, cut, outside = _rough(scene, lens, entries, solution, rtol)
-            bound = np.concatenate([part.exact for part in columns])
-            bound[entries.columns[outside[entries.pixels]]] = False
-            sums = np.bincount(entries.columns, entries.light, minlength=len(bound))
-            sums = np.where(bound, sums, np.nan)
-            entries = entries.where(~outside[entries.pixels])
-            if rough.any():
-                pixels = np.flatnonzero(rough)
-                entries = entries.refined(_rows(scene, lens, emitters, counts, pixels, on, rtol), rough, cut)
+            specular = Specular.of(scene, lens, quadrature)
+            if specular:
+                entries, sums = _by_lines(scene, lens, emitters, solution, on, rtol, specular)
+            else:
+                entries, sums = _by_faces(scene, lens, emitters, solution, on, rtol, progress, most_bytes)
     least = quadrature.least_error * float(solution.power.max(initial=0.0))
     return _block(entries, sums, solution.power.ravel(), np.maximum(solution.error, least), lens.etendue)
+
+
+def _by_faces(
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    emitters: Any,
+    solution: Any,
+    on: str,
+    rtol: float,
+    progress: Callable[[float], None] | None,
+    most_bytes: int | None,
+) -> tuple[_Entries, Array]:
+    """Entries from the faces of the meshes and, on rough pixels, from lines of sight; sums of the columns."""
+    from ..integral.column_form import ColumnRule
+    from ..integral.occlusion import hides_nothing
+    from ..jit.batches import BATCH
+
+    alone = hides_nothing(scene)
+    counts, columns = [], []
+    for number, emitter in enumerate(emitters):
+        report = None
+        if progress:
+
+            def report(share: float, first: float = number / len(emitters)) -> None:
+                progress(first + share / len(emitters))
+
+        part = _columns(scene, lens, emitter, on, ColumnRule.of(rtol, on), alone, report, most_bytes)
+        counts.append(len(part.counts))
+        columns.append(part)
+    entries = _Entries.of(columns)
+    rough, cut, outside = _rough(scene, lens, entries, solution, rtol)
+    bound = np.concatenate([part.exact for part in columns])
+    bound[entries.columns[outside[entries.pixels]]] = False
+    sums = np.bincount(entries.columns, entries.light, minlength=len(bound))
+    sums = np.where(bound, sums, np.nan)
+    entries = entries.where(~outside[entries.pixels])
+    if rough.any():
+        pixels = np.flatnonzero(rough)
+        lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
+        entries = entries.refined(_rows(scene, lens, emitters, counts, pixels, on, lines), rough, cut)
+    return entries, sums
+
+
+def _by_lines(
+    scene: mi.Scene, lens: mi.Sensor, emitters: Any, solution: Any, on: str, rtol: float, specular: Specular
+) -> tuple[_Entries, Array]:
+    """Entries of all pixels by lines of sight; sums of the columns, which are not known: NaN."""
+    from ..jit.batches import BATCH
+
+    counts = [part.count for part in parts_of(scene, on)]
+    pixels = np.flatnonzero(solution.power.ravel() > 0)
+    lines = int(ALL_LINES * (1e-3 / rtol) ** 0.5) // 2 * 2
+    some = max(1, BATCH // lines)
+    rows = [
+        _rows(scene, lens, emitters, counts, pixels[first : first + some], on, lines, specular).entries
+        for first in range(0, len(pixels), some)
+    ]
+    names = ("pixels", "columns", "light", "change")
+    entries = _Entries(*(np.concatenate([getattr(row, name) for row in rows]) for name in names))
+    return entries, np.full(sum(counts), np.nan)
 
 
 @dataclass(frozen=True)
@@ -293,17 +327,24 @@ def _rough(
 
 
 def _rows(
-    scene: mi.Scene, lens: mi.Sensor, emitters: Any, counts: list[int], pixels: NDArray[np.int64], on: str, rtol: float
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    emitters: Any,
+    counts: list[int],
+    pixels: NDArray[np.int64],
+    on: str,
+    lines: int,
+    specular: Specular | None = None,
 ) -> _Rows:
     """Rows of these pixels by lines of sight; the change is what half of the lines make of them."""
     from ..integral.row_form import rows_of
-    from ..jit.batches import BATCH
     from ..jit.mesh_buffers import triangles
 
-    lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
     found: list[tuple[Any, ...]] = []
     first = 0
-    for emitter, count, row in zip(emitters, counts, rows_of(scene, lens, emitters, pixels, lines), strict=True):
+    for emitter, count, row in zip(
+        emitters, counts, rows_of(scene, lens, emitters, pixels, lines, specular), strict=True
+    ):
         light, half = row.light / lines, np.where(row.line < lines // 2, 2 * row.light / lines, 0)
         if on == "face":
             found.append((row.place, first + row.face, light, half))
