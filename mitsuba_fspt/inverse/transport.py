@@ -254,7 +254,7 @@ def _described(scene: mi.Scene, lens: mi.Sensor, task: ViewTask) -> ViewResult:
     glowing_meshes(scene)
     check_lens(lens)
     film = lens.film()
-    numbers = {**lens.optics.numbers(), "pixel_pitch": lens.pixel_pitch}
+    numbers = lens.numbers()
     numbers["film"] = [int(n) for n in (*film.crop_size(), *film.crop_offset(), *film.size())]
     numbers["to_world"] = [float(n) for n in lens.placement]
     return ViewResult(None, parts_of(scene, task.on), numbers, defaults_of(lens))

@@ -105,7 +105,7 @@ def test_sums_of_columns_are_form_factors_whatever_the_focus(tmp_path, rtol, dep
     """Expected: ∫ φ_j f_S→pupil dS, to 3e-3 at rtol 1e-3 and 1e-3 at 1e-4 of each column that sends light.
 
     A column seen by a rim of the pupil alone has so little light that it is compared with a percent of the largest.
-    Seen to fail with cos⁴θ dropped from either form, 1/π twice, u² of another focus, and two columns swapped.
+    Seen to fail with cos⁴θ or cosθ_s dropped from the columns, 1/π twice, and u² replaced by a constant.
     """
     matrix = fspt.transport(body_scene(tmp_path, depth=depth), rtol=rtol)
     expected = collected_by_vertices(before_the_lens(BODY.vertices @ TURN.T, depth), BODY.faces)
@@ -118,7 +118,7 @@ def test_sums_of_columns_are_form_factors_whatever_the_focus(tmp_path, rtol, dep
 def test_sums_of_rows_are_the_picture_of_one_in_closed_form(tmp_path):
     """A plane that fills every cone: A_vd times the configuration factor, to 1e-5; out of focus too.
 
-    Seen to fail with cos⁴θ, 1/π or 1/u² dropped.
+    Seen to fail with cos⁴θ dropped from the columns, 1/π twice, and u² replaced by a constant.
     """
     corners = 200.0 * np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]])
     scene = body_scene(tmp_path, depth=175.0, mesh=(corners, np.array([[0, 1, 2], [0, 2, 3]])))
@@ -132,7 +132,7 @@ def test_sums_of_rows_are_the_picture_of_one_in_closed_form(tmp_path):
 def test_products_are_the_pictures_of_renders(tmp_path, on, depth):
     """Expected: rtol of the brightest pixel beside the error of a render ten times finer; within `error` on 99 %.
 
-    Seen to fail with two columns swapped, and with half the cells of the pupil on noisy J_n.
+    Seen to fail with two columns swapped, and with cosθ_s dropped.
     """
     scene = body_scene(tmp_path, on, depth)
     matrix = fspt.transport(scene, on=on, rtol=RTOL)
@@ -242,7 +242,7 @@ SILVERED = {"type": "conductor", "material": "none", "specular_reflectance": 0.9
 
 @pytest.mark.parametrize("where", [(30, 0, 0, {"type": "thindielectric"}), (-4, 14, -50, SILVERED, 20.0)])
 def test_rows_go_on_through_windows_and_off_mirrors(tmp_path, where):
-    """Seen to fail with the weight of a course left out: 8 and 10 % too bright."""
+    """Seen to fail with lines that end at the first surface: rows of the window are dark."""
     scene = body_scene(tmp_path, extra=[square_at(*where)])
     matrix = fspt.transport(scene, rtol=RTOL)
     body = BODY.vertices @ TURN.T
