@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..emission.elements import Elements, elements_of
 from ..jit.batches import batches
 from ..jit.mesh_buffers import box_of
+from ..runtime.errors import SceneError
 from .eq9 import eq9, etendue_from_pixel
 from .specular import Specular, follow
 
@@ -66,7 +67,8 @@ def rows_of(
         pupil, open_share = lens.open_pupil(position, mi.warp.square_to_uniform_disk_concentric(mi.Point2f(x[2], x[3])))
         ray, cos_theta, passes = lens.line_of_sight(position, pupil, start)
         etendue = etendue_from_pixel(cos_theta, passes, open_share)
-        hits = _Hits(emitters, elements, dr.width(place))
+        most = MOST_HITS if specular and len(specular.lobes) > 1 else 1
+        hits = _Hits(emitters, elements, dr.width(place), most)
         if specular:
             follow(scene, specular, ray, cos_theta, start, passes, _nothing, _never, hits.note)
         else:
@@ -88,9 +90,9 @@ def rows_of(
 class _Hits:
     """Where so many `lanes`, lines of sight, meet emitting meshes; one lane may meet several."""
 
-    def __init__(self, emitters: Sequence[mi.Emitter], elements: Sequence[Elements], lanes: int) -> None:
+    def __init__(self, emitters: Sequence[mi.Emitter], elements: Sequence[Elements], lanes: int, most: int) -> None:
         self._meshes = list(zip(emitters, elements, strict=True))
-        self._lane, self._most = dr.arange(mi.UInt32, lanes), MOST_HITS * lanes
+        self._lane, self._most = dr.arange(mi.UInt32, lanes), most * lanes
         self._counts = [dr.zeros(mi.UInt32) for _ in emitters]
         self._stored = [
             [dr.zeros(kind, self._most) for kind in (mi.UInt32, mi.UInt32, mi.Float, mi.Float, mi.Float, mi.Float)]
@@ -100,9 +102,10 @@ class _Hits:
     def note(self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, weight: mi.Float, met: mi.Bool) -> None:
         """Store the intersections that lie on the outward side of an emitting mesh."""
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active=met)
-        outward = met & (dr.dot(si.n, ray.d) < 0)
+        outward, index = met & (dr.dot(si.n, ray.d) < 0), mi.UInt32(si.prim_index)
         for (emitter, own), count, stored in zip(self._meshes, self._counts, self._stored, strict=True):
             mine = outward & (si.shape == mi.ShapePtr(emitter.get_shape()))
+            si.prim_index = dr.select(mine, index, 0)  # another mesh may have more faces than this one
             radiance = weight * emitter.law.profile(si, -ray.d, mine)
             face, weights = own.weigh(si)
             kept = mine & (radiance > 0)
@@ -113,11 +116,16 @@ class _Hits:
     def stored(self) -> Iterator[tuple[mi.UInt32, mi.UInt32, list[mi.Float], mi.Float]]:
         """Of each mesh lane, face, weights of its corners and radiance of every hit, in an order that does not change.
 
-        Threads store them in any order.
+        Threads store them in any order. Raises SceneError where lines meet more surfaces than there is room for.
         """
         dr.eval(self._stored, self._counts)
         for count, stored in zip(self._counts, self._stored, strict=True):
-            number = min(int(count[0]), self._most)
+            number = int(count[0])
+            if number > self._most:
+                raise SceneError(
+                    f"transport: {dr.width(self._lane)} lines of sight meet glowing surfaces {number} times by way of "
+                    f"specular shapes, at most {MOST_HITS} each are kept. Give a larger rtol."
+                )
             keys = [array.numpy()[:number] for array in (stored[5], stored[1], stored[0])]
             order = mi.UInt32(np.lexsort(keys).astype(np.uint32))
             lane, face, a, b, c, radiance = (dr.gather(type(array), array, order) for array in stored)

@@ -255,7 +255,8 @@ def _by_lines(
         for first in range(0, len(pixels), some)
     ]
     names = ("pixels", "columns", "light", "change")
-    entries = _Entries(*(np.concatenate([getattr(row, name) for row in rows]) for name in names))
+    empty = _Entries(*(np.zeros(0, kind) for kind in (np.int64, np.int64, np.float64, np.float64)))
+    entries = _Entries(*(np.concatenate([getattr(row, name) for row in (empty, *rows)]) for name in names))
     return entries, np.full(sum(counts), np.nan)
 
 

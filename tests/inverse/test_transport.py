@@ -253,3 +253,15 @@ def test_rows_go_on_through_windows_and_off_mirrors(tmp_path, where):
     assert (off <= matrix.error(exitance)[0] + image.error).mean() > 0.995
     assert off.max() < 3 * RTOL * image.power.max()
     assert matrix.forward(exitance).sum() == pytest.approx(image.power.sum(), rel=RTOL)
+
+
+def test_lines_of_sight_tell_meshes_of_different_sizes_apart(tmp_path):
+    """Seen to end the process: faces of the larger mesh were looked up in the smaller one."""
+    small = trimesh.creation.icosphere(1, radius=1.0)
+    path = write_ply(tmp_path / "small.ply", small.vertices + np.array([12, 0, 0]), small.faces, vertex=np.ones(42))
+    extra = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute("vertex_exitance"))}
+    scene = body_scene(tmp_path, extra=[extra, square_at(30, 0, 0, {"type": "thindielectric"})])
+    matrix = fspt.transport(scene, rtol=RTOL)
+    assert matrix.seen[matrix.parts["shape_1"]].any()
+    picture = fspt.render(scene, rtol=RTOL).power
+    assert matrix.forward(np.ones(matrix.shape[1]))[0] == pytest.approx(picture, abs=2 * RTOL * picture.max())
