@@ -11,7 +11,6 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.resources import files
-from typing import Any
 
 from starlette.applications import Starlette
 from starlette.requests import Request as HttpRequest
@@ -20,9 +19,9 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn import Config, Server
 
-from ..runtime.errors import ViewerError
+from ..runtime.errors import FsptError, ViewerError
 from .answers import Answer, Answers, Request
-from .queue import RequestQueue, Superseded
+from .queue import Page, RequestQueue, Superseded
 
 ADDRESS = "127.0.0.1"
 PAGES = {
@@ -128,7 +127,7 @@ class ViewServer:
                 continue
             page, request = found
 
-            def may_go_on(page: Any = page, request: Request = request) -> None:
+            def may_go_on(page: Page = page, request: Request = request) -> None:
                 if self._end.is_set():
                     raise Superseded
                 if request.kind == "picture":
@@ -186,6 +185,12 @@ class ViewServer:
     def _hosts(self) -> tuple[str, ...]:
         return f"{ADDRESS}:{self.port}", f"localhost:{self.port}"
 
+    def _hello(self) -> Answer:
+        try:
+            return self._answers.hello()
+        except FsptError as error:
+            return Answer({"kind": "error", "slot": "a", "message": str(error)})
+
     async def _connect(self, page: WebSocket) -> None:
         """Take the requests of one page and send it the answers."""
         origins = {f"http://{host}" for host in self._hosts()}
@@ -195,7 +200,7 @@ class ViewServer:
             return
         await page.accept()
         outbox = Outbox()
-        outbox.put_from_thread(self._answers.hello())
+        outbox.put_from_thread(self._hello())
         sending = asyncio.create_task(outbox.send_all(page))
         try:
             while True:
@@ -214,7 +219,7 @@ class ViewServer:
 
 def page_text(file: str) -> str:
     """Text of a file of the page."""
-    return files(__package__).joinpath("page", file).read_text(encoding="utf-8")
+    return (files(__package__) / "page" / file).read_text(encoding="utf-8")
 
 
 def _bound(port: int) -> socket.socket:

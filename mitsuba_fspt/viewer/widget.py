@@ -15,8 +15,8 @@ from .answers import Answer, Answers, Request
 class ViewWidget(anywidget.AnyWidget):
     """Shows `answers`' scene; requests come as messages and are answered one after the other in the kernel."""
 
-    _esm = files(__package__).joinpath("page", "view.js").read_text(encoding="utf-8")
-    _css = files(__package__).joinpath("page", "view.css").read_text(encoding="utf-8")
+    _esm = (files(__package__) / "page" / "view.js").read_text(encoding="utf-8")
+    _css = (files(__package__) / "page" / "view.css").read_text(encoding="utf-8")
     scene = traitlets.Unicode().tag(sync=True)
 
     def __init__(self, answers: Answers) -> None:

@@ -32,17 +32,24 @@ function make(tag, attributes = {}, ...children) {
   return node;
 }
 
-/** 256 colours of a map, RGB bytes, linear between those of `MAPS`. */
+const palettes = new Map();
+
+/** 256 colours of a map, RGBA bytes, linear between those of `MAPS`. */
 function palette(name) {
+  if (!palettes.has(name)) palettes.set(name, newPalette(name));
+  return palettes.get(name);
+}
+
+function newPalette(name) {
   const hex = MAPS[name];
   const count = hex.length / 6;
   const colour = (k) => [0, 2, 4].map((at) => parseInt(hex.substr(6 * k + at, 2), 16));
-  const out = new Uint8ClampedArray(256 * 3);
+  const out = new Uint8ClampedArray(256 * 4).fill(255);
   for (let i = 0; i < 256; i++) {
     const place = (i / 255) * (count - 1);
     const k = Math.min(Math.floor(place), count - 2);
     const one = colour(k), next = colour(k + 1);
-    for (let c = 0; c < 3; c++) out[3 * i + c] = one[c] + (place - k) * (next[c] - one[c]);
+    for (let c = 0; c < 3; c++) out[4 * i + c] = one[c] + (place - k) * (next[c] - one[c]);
   }
   return out;
 }
@@ -212,7 +219,7 @@ class View {
     nodes.second = make("fieldset", {}, make("legend", { text: "Second lens" }));
     nodes.display = make("fieldset", {}, make("legend", { text: "Display" }));
     nodes.files = make("fieldset", {}, make("legend", { text: "Save" }));
-    nodes.pictures = make("div", { class: "pictures" });
+    nodes.pictures = make("main", { class: "pictures" });
     nodes.readout = make("p", { class: "readout", text: "Point at a pixel, or move over it with the arrow keys." });
     nodes.point = make("p", { class: "point", role: "status" });
     nodes.region = make("div", { class: "region" });
@@ -230,7 +237,8 @@ class View {
       make("div", { class: "body" },
         make("form", { "aria-label": "Parameters", onsubmit: (e) => e.preventDefault() },
           nodes.sliders, nodes.second, nodes.display, nodes.files),
-        make("main", {}, nodes.pictures, nodes.readout, nodes.point, nodes.region, nodes.profiles)),
+        nodes.pictures,
+        make("section", { class: "details", "aria-label": "Read-outs" }, nodes.readout, nodes.point, nodes.region, nodes.profiles)),
     );
     this.addPanel("a");
   }
@@ -290,7 +298,7 @@ class View {
     const bar = make("canvas", { class: "bar", role: "img" });
     const caption = make("figcaption");
     const frame = make("div", { class: "frame" }, canvas, marks);
-    const figure = make("figure", {}, caption, make("div", { class: "shown" }, frame, bar));
+    const figure = make("figure", {}, caption, make("div", { class: "shown" }, frame, make("div", { class: "side" }, bar)));
     this.panels[name] = { canvas, marks, bar, caption, figure, frame };
     this.nodes.pictures.append(figure);
     this.listen(name, frame, canvas);
@@ -361,8 +369,10 @@ class View {
       if (!this.sliders.length) this.nodes.sliders.append(make("p", { text: "The scene has no numeric <default>." }));
       this.buildSecond();
     }
-    this.ask("picture", "a");
-    if (this.second) this.ask("picture", "b");
+    for (const slot of this.second ? ["a", "b"] : ["a"]) {
+      this.draft(slot);
+      this.ask("picture", slot);
+    }
   }
 
   sliderRow(slider, slot) {
@@ -418,7 +428,7 @@ class View {
       }
     }
     delete this.pictures.b;
-    if (on) this.ask("picture", "b");
+    if (on) this.changed("b");
     this.draw();
   }
 
@@ -582,26 +592,26 @@ class View {
     const picture = this.pictures.a;
     const stage = picture.fine ? "" : ", draft";
     const rtol = picture.rtol ? `, rtol ${digits(picture.rtol)}${stage}` : stage;
-    this.nodes.state.textContent = `${picture.width} × ${picture.height}, ${picture.method}${rtol}${this.times.length > 2 ? `, ${this.times.length} pictures/s` : ""}${picture.warnings ? ` – ${picture.warnings}` : ""}`;
+    this.nodes.state.textContent = `${picture.width} × ${picture.height}, ${picture.method}${rtol}${!picture.fine && this.times.length > 2 ? `, ${this.times.length} pictures/s` : ""}${picture.warnings ? ` – ${picture.warnings}` : ""}`;
     this.nodes.command.textContent = picture.command || "No command line makes this picture: it needs a scene file, and the lens model of the scene.";
     this.drawReadouts();
   }
 
-  drawPanel(panel, picture, values, low, high, log, map) {
+  drawPanel(panel, picture, values, low, high, log, map, quantity = this.options.quantity) {
     const { canvas } = panel;
     if (canvas.width !== picture.width || canvas.height !== picture.height) Object.assign(canvas, { width: picture.width, height: picture.height });
     const context = canvas.getContext("2d");
     const pixels = context.createImageData(picture.width, picture.height);
     const colours = palette(map);
+    const words = new Uint32Array(pixels.data.buffer), colourWords = new Uint32Array(colours.buffer);
     const base = Math.log(low), span = log ? Math.log(high) - base : high - low;
     for (let i = 0; i < picture.count; i++) {
       const value = values[i];
       const share = log ? (value > 0 ? (Math.log(value) - base) / span : 0) : (value - low) / span;
-      const k = 3 * Math.max(0, Math.min(255, Math.round(255 * share)));
-      pixels.data.set([colours[k], colours[k + 1], colours[k + 2], 255], 4 * i);
+      words[i] = colourWords[share > 0 ? (share < 1 ? (255 * share + 0.5) | 0 : 255) : 0];
     }
     context.putImageData(pixels, 0, 0);
-    this.drawBar(panel.bar, low, high, log, colours);
+    this.drawBar(panel.bar, low, high, log, colours, quantity);
   }
 
   drawDifference(panel) {
@@ -611,15 +621,15 @@ class View {
     const values = Float64Array.from(one, (value, i) => value - other[i]);
     const reach = values.reduce((most, value) => Math.max(most, Math.abs(value)), 0) || 1;
     panel.values = values;
-    this.drawPanel(panel, a, values, -reach, reach, false, "difference");
+    this.drawPanel(panel, a, values, -reach, reach, false, "difference", `difference of ${this.options.quantity}`);
   }
 
-  drawBar(canvas, low, high, log, colours) {
+  drawBar(canvas, low, high, log, colours, quantity) {
     const [context, width, height] = sharp(canvas);
     const style = getComputedStyle(this.root);
     const top = 8, tall = height - 2 * top, wide = 14;
     for (let y = 0; y < tall; y++) {
-      const k = 3 * Math.round(255 * (1 - y / tall));
+      const k = 4 * Math.round(255 * (1 - y / tall));
       context.fillStyle = `rgb(${colours[k]}, ${colours[k + 1]}, ${colours[k + 2]})`;
       context.fillRect(0, top + y, wide, 1.5);
     }
@@ -636,7 +646,7 @@ class View {
     context.translate(width - 7, height / 2);
     context.rotate(-Math.PI / 2);
     context.textAlign = "center";
-    const label = `${this.options.quantity}${this.unitText() ? ` [${this.unitText()}]` : ""}${log ? ", log" : ""}`;
+    const label = `${quantity}${this.unitText() ? ` [${this.unitText()}]` : ""}${log ? ", log" : ""}`;
     context.fillText(label, 0, 0, height);
     canvas.setAttribute("aria-label", `colour bar: ${label} from ${digits(low)} to ${digits(high)}`);
     canvas.dataset.low = low;
