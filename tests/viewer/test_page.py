@@ -153,6 +153,31 @@ def test_two_pages_and_a_reload(page, browser, served):
     other.close()
 
 
+WIDGET = """async (address) => {
+    const sent = [], found = {};
+    const model = { on: (event, take) => { found.take = take; }, off: () => {}, send: (record) => sent.push(record) };
+    const root = document.body.appendChild(document.createElement("div"));
+    const module = await import(address + "view.js");
+    module.default.render({ model, el: root });
+    await new Promise((done) => setTimeout(done, 50));
+    const slider = { name: "f_number", value: 4, low: 1, high: 32, step: 0.06, scale: "stops", unit: "", lens: true };
+    found.take({ kind: "hello", scene: "box", sliders: [slider], models: [] }, []);
+    const record = { kind: "picture", slot: "a", number: sent.at(-1).number, fine: true, width: 1, height: 1,
+        planes: ["power", "error", "coverage"], side: 0.5, photons_per_joule_nm: 1, warnings: "", lens: {} };
+    const view = new DataView(new Float32Array([3, 0, 1]).buffer);
+    found.take(record, [view]);
+    await new Promise((done) => setTimeout(done, 200));
+    return [sent.map((one) => one.kind), root.querySelector("figcaption").textContent];
+}"""
+
+
+def test_the_module_is_a_widget_too(page, served):
+    """anywidget calls `render` with a model that carries messages, planes as DataViews."""
+    kinds, caption = page.evaluate(WIDGET, served[1])
+    assert kinds == ["hello", "picture", "picture"]
+    assert "total 3 W" in caption
+
+
 def test_an_error_is_a_line_and_the_last_picture_stays_then_the_server_goes(page, served):
     """Last of the file: it ends the server."""
     before = read_out(page, 24, 20)

@@ -58,6 +58,8 @@ def test_the_page_needs_its_token(address):
         assert code == 403
         assert "token" in line
     assert status_of(address + "server.py")[0] == 404
+    rebound = urllib.request.Request(address, headers={"Host": "example.org"})  # a name that points to this machine
+    assert status_of(rebound)[0] == 403
 
 
 @pytest.mark.parametrize("fault", ["token", "origin", "none"])

@@ -189,7 +189,7 @@ class View {
     this.number = 0;
     this.faults = {};
     this.second = false;
-    this.options = { quantity: "power", unit: "W", wavelength: 660, map: "inferno", log: false, decades: 3, lock: false };
+    this.options = { quantity: "power", unit: "W", wavelength: 660, map: "inferno", log: false, decades: 3, lock: false, each: false };
     this.cursor = null; // column and row under the crosshair
     this.region = null; // [column, row, columns, rows]
     this.limits = null;
@@ -412,6 +412,7 @@ class View {
     };
     this.nodes.sliders.append(models("a", "lens model"));
     this.nodes.secondRows.append(...this.sliders.filter((s) => s.lens).map((s) => this.sliderRow(s, "b")), models("b", "lens model"));
+    this.nodes.secondRows.append(this.check("each", "a colour scale for each"));
     this.nodes.second.append(make("div", {}, box, make("label", { for: id, text: " beside the first, with their difference" })), this.nodes.secondRows);
   }
 
@@ -435,7 +436,7 @@ class View {
   setOption(name, value) {
     this.options[name] = value;
     if (name === "lock") this.limits = value ? this.scale() : null;
-    else if (["quantity", "unit", "log", "wavelength", "decades"].includes(name)) this.limits = null;
+    else if (["quantity", "unit", "log", "wavelength", "decades", "each"].includes(name)) this.limits = null;
     this.nodes.wavelength.hidden = this.options.unit === "W";
     const lacks = this.options.unit === "radiance" && Object.values(this.pictures).some((p) => !p.plane.etendue);
     if (lacks) for (const slot of Object.keys(this.pictures)) this.ask("picture", slot);
@@ -563,11 +564,11 @@ class View {
     return this.pictures[slot]?.values(quantity, unit, wavelength);
   }
 
-  /** Ends of the colour scale in the shown unit, common to both lenses. */
-  scale() {
+  /** Ends of the colour scale in the shown unit, common to both lenses unless each has its own. */
+  scale(slot = "a") {
     if (this.limits) return this.limits;
     let high = 0;
-    for (const slot of Object.keys(this.pictures)) for (const value of this.shownValues(slot)) if (value > high) high = value;
+    for (const one of this.options.each ? [slot] : Object.keys(this.pictures)) for (const value of this.shownValues(one)) if (value > high) high = value;
     if (!(high > 0)) high = 1;
     return this.options.log ? [high / 10 ** this.options.decades, high] : [0, high];
   }
@@ -582,11 +583,10 @@ class View {
   }
 
   drawAll() {
-    const [low, high] = this.scale();
     const { log, map } = this.options;
     for (const [name, panel] of Object.entries(this.panels)) {
       if (name === "difference") this.drawDifference(panel);
-      else if (this.pictures[name]) this.drawPanel(panel, this.pictures[name], this.shownValues(name), low, high, log, map);
+      else if (this.pictures[name]) this.drawPanel(panel, this.pictures[name], this.shownValues(name), ...this.scale(name), log, map);
     }
     for (const [name, panel] of Object.entries(this.panels)) this.drawCaption(name, panel);
     const picture = this.pictures.a;
@@ -625,8 +625,16 @@ class View {
   }
 
   drawBar(canvas, low, high, log, colours, quantity) {
-    const [context, width, height] = sharp(canvas);
+    const label = `${quantity}${this.unitText() ? ` [${this.unitText()}]` : ""}${log ? ", log" : ""}`;
+    canvas.paint = (context, width, height) => this.paintBar(context, width, height, low, high, log, colours, label);
+    canvas.paint(...sharp(canvas));
+    canvas.setAttribute("aria-label", `colour bar: ${label} from ${digits(low)} to ${digits(high)}`);
+    Object.assign(canvas.dataset, { low, high, log });
+  }
+
+  paintBar(context, width, height, low, high, log, colours, label) {
     const style = getComputedStyle(this.root);
+    context.save();
     const top = 8, tall = height - 2 * top, wide = 14;
     for (let y = 0; y < tall; y++) {
       const k = 4 * Math.round(255 * (1 - y / tall));
@@ -646,12 +654,8 @@ class View {
     context.translate(width - 7, height / 2);
     context.rotate(-Math.PI / 2);
     context.textAlign = "center";
-    const label = `${quantity}${this.unitText() ? ` [${this.unitText()}]` : ""}${log ? ", log" : ""}`;
     context.fillText(label, 0, 0, height);
-    canvas.setAttribute("aria-label", `colour bar: ${label} from ${digits(low)} to ${digits(high)}`);
-    canvas.dataset.low = low;
-    canvas.dataset.high = high;
-    canvas.dataset.log = log;
+    context.restore();
   }
 
   drawCaption(name, panel) {
@@ -748,11 +752,11 @@ class View {
   drawProfiles() {
     const { width, height } = this.pictures.a;
     const [column, row] = this.cursor ?? [width >> 1, height >> 1];
-    const [low, high] = this.scale();
     for (const along of ["row", "column"]) {
       const [context, wide, tall] = sharp(this.nodes[along]);
       const style = getComputedStyle(this.root);
       const count = along === "row" ? width : height;
+      let [low, high] = this.scale();
       const y = (value) => {
         const share = this.options.log ? (value > 0 ? Math.log(value / low) / Math.log(high / low) : -1) : (value - low) / (high - low);
         return tall - 4 - (tall - 8) * Math.max(-0.02, Math.min(1.02, share));
@@ -765,13 +769,14 @@ class View {
         const picture = this.pictures[slot];
         if (!picture || picture.width !== width || picture.height !== height) continue;
         const values = this.shownValues(slot);
+        [low, high] = this.scale(slot);
         context.strokeStyle = colour;
         context.lineWidth = 1.5;
         context.beginPath();
         for (let k = 0; k < count; k++) context.lineTo(x(k), y(values[along === "row" ? row * width + k : k * width + column]));
         context.stroke();
       }
-      this.nodes[`${along}Title`].textContent = `Profile along ${along} ${along === "row" ? row : column}, 0 … ${digits(high)} ${this.unitText()}`.replace("0 …", `${digits(low)} …`);
+      this.nodes[`${along}Title`].textContent = `Profile along ${along} ${along === "row" ? row : column}, ${digits(low)} … ${digits(high)} ${this.unitText()}`;
     }
   }
 
@@ -779,7 +784,7 @@ class View {
   savePng() {
     if (!this.pictures.a) return;
     const { width, height } = this.pictures.a;
-    const times = Math.max(1, Math.round(512 / width)), bar = 100, gap = 12, line = 18;
+    const times = Math.max(1, Math.round(512 / width)), bar = 106, gap = 12, line = 18;
     const panels = Object.values(this.panels);
     const one = width * times + bar + gap;
     const sheet = make("canvas", { width: panels.length * one + gap, height: height * times + 2 * gap + 2 * line });
@@ -794,7 +799,10 @@ class View {
       const left = gap + k * one;
       context.fillText(panel.caption.textContent, left, gap + 12, one - gap);
       context.drawImage(panel.canvas, left, gap + line, width * times, height * times);
-      context.drawImage(panel.bar, left + width * times + 6, gap + line, bar - 6, height * times);
+      context.save();
+      context.translate(left + width * times + 6, gap + line);
+      panel.bar.paint?.(context, bar - 6, height * times);
+      context.restore();
     });
     context.fillText(this.nodes.command.textContent, gap, sheet.height - gap, sheet.width - 2 * gap);
     sheet.toBlob((blob) => save(`${this.nodes.title.textContent.split("/").pop().replace(/\.xml$/, "")}.png`, blob));
