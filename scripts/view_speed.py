@@ -25,7 +25,7 @@ AT_ONCE = 2  # requests under way, as of the page
 
 
 def measure(url: str, name: str, low: float, high: float, seconds: float) -> tuple[float, float, float]:
-    """Pictures a second, processor time of one [s], and its bytes, while `name` moves back and forth between two values."""
+    """Pictures a second, processor time of one [s], and its bytes, while `name` moves back and forth."""
     address = url.replace("http", "ws") + "socket"
     with connect(address, origin=url.split("/")[0] + "//" + url.split("/")[2], max_size=None, compression=None) as page:
         page.recv()  # the sliders

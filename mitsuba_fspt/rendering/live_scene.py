@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..images.image import Image
 from ..runtime.errors import SceneError
 from ..runtime.plugin_types import is_lens, is_surface
-from .provenance import remember_defaults
+from .provenance import remember_defaults, source_of
 from .render import Progress, integrator_of, render, sensor_of
 from .scene import load, parameter_text, parsed, values_of
 from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
@@ -64,22 +64,26 @@ class Change:
 class LiveScene:
     """A scene file or its text, and the Mitsuba scene of the last values of its parameters.
 
+    A scene that `load` has made stands for what it was loaded from, with the values given then.
+
     Numbers and placement of the lens change in place, without compilation. A rigid motion of all shapes is replaced by
     the inverse motion of the lens, which gives the same picture but for rounding; where that shall not be, and for all
     other changes, the scene is loaded again. `loads` counts that.
 
     Raises
     ------
-    SceneError : the scene cannot be read or loaded, or it has several sensors or one that is no `fspt_lens`.
+    SceneError : the scene cannot be read or loaded, was changed after it was loaded, or its first sensor is no
+        `fspt_lens`.
     """
 
-    def __init__(self, scene: str | os.PathLike[str], parameters: Mapping[str, object]) -> None:
+    def __init__(
+        self, scene: mi.Scene | str | os.PathLike[str], parameters: Mapping[str, object] | None = None
+    ) -> None:
+        parameters = parameters or {}
         if not isinstance(scene, (str, os.PathLike)):
-            raise SceneError(
-                f"scene: to change it, it must be a file or XML text, got {type(scene).__name__}. Give what `load` "
-                "takes, not what it returns."
-            )
-        self.source = scene
+            scene, before = _unchanged_source(scene)
+            parameters = before | dict(parameters)
+        self.source: str | os.PathLike[str] = scene
         self.given = {name: parameter_text(value) for name, value in parameters.items()}
         self.loads = 0
         self._scene: mi.Scene | None = None
@@ -255,6 +259,32 @@ def _apply(change: Change, lens: mi.Sensor, model: str | None) -> None:
     parameters.update()
     if lens.fault:
         raise lens.fault
+
+
+def _unchanged_source(scene: mi.Scene) -> tuple[Any, dict[str, object]]:
+    """What a scene was loaded from; SceneError if that is not known, or if the scene was changed since."""
+    import mitsuba as mi
+
+    kept = source_of(scene) if isinstance(scene, mi.Scene) else None
+    if kept is None:
+        raise SceneError(
+            f"scene: to change it, it must be a file, XML text or what `load` makes of these, got "
+            f"{type(scene).__name__}. Give one."
+        )
+    source, given = kept
+    now, then = mi.traverse(scene), mi.traverse(load(source, **given))
+    for name, _ in now:
+        if name not in then or not np.array_equal(_plain(now[name]), _plain(then[name])):
+            raise SceneError(
+                f"scene: '{name}' was changed after the scene was loaded, or its file was. Give the file's name."
+            )
+    return kept
+
+
+def _plain(value: object) -> object:
+    """Value of a parameter of Mitsuba as NumPy compares it."""
+    value = getattr(value, "matrix", value)
+    return np.array(value) if hasattr(value, "shape") else value
 
 
 def _texts(values: Mapping[str, object]) -> dict[str, str]:

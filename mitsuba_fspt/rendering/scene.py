@@ -15,7 +15,7 @@ import numpy as np
 from ..runtime import backend
 from ..runtime.errors import SceneError
 from ..runtime.interrupt import ctrl_c_noted
-from .provenance import remember_defaults
+from .provenance import remember_defaults, remember_source
 from .scene_rules import check_text
 from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 
@@ -63,6 +63,8 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
     loaded = loaded[0] if isinstance(loaded, list) else loaded
     probe_beside(loaded)
     remember_defaults(loaded, values_of(scene, parameters))
+    if not isinstance(scene, Mapping):
+        remember_source(loaded, scene, parameters)
     return loaded
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,9 @@ from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import FsptError, ViewerError
 from .sliders import sliders_of
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 SLOTS = ("a", "b")  # the lens, and a second one
 KINDS = ("picture", "point", "exr")
@@ -93,10 +96,14 @@ class Answer:
         return b"".join([struct.pack("<I", len(text)), text, *self.data])
 
 
+class Superseded(Exception):
+    """A picture that nobody waits for any more, or that has to wait for a draft."""
+
+
 class Answers:
     """Answers requests about one scene, one at a time. Raises as `LiveScene`."""
 
-    def __init__(self, scene: str | os.PathLike[str], parameters: Mapping[str, object]) -> None:
+    def __init__(self, scene: mi.Scene | str | os.PathLike[str], parameters: Mapping[str, object]) -> None:
         self._live = LiveScene(scene, parameters)
         self._live.scene({})  # bad scenes are refused before a page opens
 
@@ -117,8 +124,13 @@ class Answers:
             return getattr(self, f"_{request.kind}")(request, given, may_go_on)
         except FsptError as error:
             return Answer(given | {"kind": "error", "message": _one_line(error)})
-        except (RuntimeError, MemoryError, ArithmeticError) as error:  # of the renderer
-            return Answer(given | {"kind": "error", "message": f"{type(error).__name__}: {_one_line(error)}"})
+        except Superseded:
+            raise
+        except Exception as error:  # of the renderer, or a fault of ours: the page and its last picture stay
+            if os.environ.get("FSPT_DEBUG"):
+                raise
+            line = f"{type(error).__name__}: {_one_line(error)} (FSPT_DEBUG=1 shows where)"
+            return Answer(given | {"kind": "error", "message": line})
 
     def _picture(self, request: Request, given: Record, may_go_on: Callable[[], None]) -> Answer:
         start = time.perf_counter()

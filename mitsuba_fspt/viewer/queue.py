@@ -5,11 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Protocol
 
-from .answers import Answer, Request
-
-
-class Superseded(Exception):
-    """A picture that nobody waits for any more, or that has to wait for a draft."""
+from .answers import Answer, Request, Superseded
 
 
 class Page(Protocol):

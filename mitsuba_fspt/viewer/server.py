@@ -20,8 +20,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn import Config, Server
 
 from ..runtime.errors import FsptError, ViewerError
-from .answers import Answer, Answers, Request
-from .queue import Page, RequestQueue, Superseded
+from .answers import Answer, Answers, Request, Superseded
+from .queue import Page, RequestQueue
 
 ADDRESS = "127.0.0.1"
 PAGES = {

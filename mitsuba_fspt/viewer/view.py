@@ -5,13 +5,21 @@ from __future__ import annotations
 import os
 import webbrowser
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ..runtime.extras import require
 from .answers import Answers
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 
 def view(
-    scene: str | os.PathLike[str], *, port: int = 0, ready: Callable[[str], object] | None = None, **parameters: object
+    scene: mi.Scene | str | os.PathLike[str],
+    *,
+    port: int = 0,
+    ready: Callable[[str], object] | None = None,
+    **parameters: object,
 ) -> object:
     """Show a scene whose picture follows sliders for the numbers among its `<default>` parameters.
 
@@ -19,14 +27,14 @@ def view(
 
     Parameters
     ----------
-    scene : name of an XML file, or its text
+    scene : name of an XML file, its text, or what `load` has made of one of them
     port : of the page; 0: any free one. Without effect in a notebook
     ready : function that is called with the page's address; None opens it in the browser
     parameters : values for `<default>` parameters
 
     Raises
     ------
-    SceneError, OpticsError, ExitanceError : the scene cannot be loaded, or is a loaded one.
+    SceneError, OpticsError, ExitanceError : the scene cannot be loaded, or was changed after that.
     ViewerError : the port cannot be opened.
     BackendError : a package of the extra `view`, in a notebook of `notebook`, is not installed.
     """

@@ -32,6 +32,9 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 
 
+LENS = {"focal_length": 50.0, "f_number": 4.0, "focus_distance": 150.0, "pixel_pitch": 0.5}
+
+
 @pytest.fixture(scope="module")
 def live(mono):
     return LiveScene(SCENE, {})
@@ -100,6 +103,18 @@ def test_the_surface_point_of_a_pixel(live):
     assert live.surface_point({}, None, 0, 0) is None
 
 
-def test_an_object_of_mitsuba_is_refused(mono):
-    with pytest.raises(fspt.FsptError, match="must be a file or XML text"):
-        LiveScene(fspt.load(SCENE), {})
+def test_a_loaded_scene_is_taken_with_its_values_unless_it_was_changed(mono):
+    scene = fspt.load(SCENE, f_number=8)
+    live = LiveScene(scene)
+    assert np.array_equal(live.image({}).power, fspt.render(scene).power)
+    parameters = mono.traverse(scene)
+    parameters["box.emitter.exitance.value"] = 3.0
+    parameters.update()
+    with pytest.raises(fspt.FsptError, match=r"'box.emitter.exitance.value' was changed"):
+        LiveScene(scene)
+
+
+def test_what_was_not_loaded_from_a_file_or_text_is_refused(mono):
+    for scene in (fspt.load({"type": "scene", "lens": {"type": "fspt_lens", **LENS}}), 3):
+        with pytest.raises(fspt.FsptError, match="to change it, it must be a file"):
+            LiveScene(scene)

@@ -13,8 +13,8 @@ import pytest
 from viewed_scene import SCENE, interrupt, serve
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.viewer.answers import Answers, Request
-from mitsuba_fspt.viewer.queue import RequestQueue, Superseded
+from mitsuba_fspt.viewer.answers import Answers, Request, Superseded
+from mitsuba_fspt.viewer.queue import RequestQueue
 
 client = pytest.importorskip("websockets.sync.client", reason="the extra 'view' is not installed")
 pytest.importorskip("starlette", reason="the extra 'view' is not installed")

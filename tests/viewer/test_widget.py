@@ -43,6 +43,6 @@ def test_the_widget_answers_as_the_server_does(widget):
     assert ".fspt" in widget._css
 
 
-def test_a_loaded_scene_is_refused(mono):
-    with pytest.raises(fspt.FsptError, match="must be a file or XML text"):
-        fspt.view(fspt.load(SCENE), ready=print)
+def test_what_is_no_scene_is_refused(mono):
+    with pytest.raises(fspt.FsptError, match="to change it, it must be a file"):
+        fspt.view(3, ready=print)
