@@ -17,5 +17,6 @@ from .studies.converge import converge as converge
 from .studies.convergence import Convergence as Convergence
 from .studies.explain import explain as explain
 from .studies.sweep import sweep as sweep
+from .viewer.view import view as view
 
 __version__: str

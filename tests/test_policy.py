@@ -30,7 +30,8 @@ ARROWS = {
     "validation": {"runtime", "optics", "jit", "emission", "integral", "rendering"},
     "studies": {"runtime", "optics", "images", "jit", "emission", "integral", "rendering", "validation"},
     "inverse": {"runtime", "images", "jit", "integral", "rendering", "studies"},
-    "cli": {"runtime", "images", "phantom", "tissue", "rendering", "studies", "inverse", "validation"},
+    "viewer": {"runtime", "optics", "images", "rendering"},
+    "cli": {"runtime", "images", "phantom", "tissue", "rendering", "studies", "inverse", "validation", "viewer"},
 }
 # Beside tests, only these import the independent truths of `validation`.
 IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
@@ -57,6 +58,7 @@ PUBLIC = [
     "scene_xml",
     "sweep",
     "transport",
+    "view",
 ]
 
 

@@ -22,6 +22,7 @@ from .render import render
 from .scene import app as scene
 from .sweep import sweep
 from .terminal import Interrupted
+from .view import view
 
 app = typer.Typer(
     name="fspt",
@@ -30,7 +31,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
-for verb in (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge, matrix):
+for verb in (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge, matrix, view):
     app.command()(verb)
 app.add_typer(flux, name="flux")
 app.add_typer(scene, name="scene")

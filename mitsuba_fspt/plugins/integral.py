@@ -88,10 +88,14 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         sensor: mi.Sensor,
         quadrature: Quadrature | None = None,
         progress: Callable[[float], None] | None = None,
+        *,
+        narrow: bool = True,
     ) -> Solution:
         """Power, error and coverage of the sensor's crop window, by `quadrature` or the integrator's own.
 
         A large film is solved in tiles; `progress` is called with the share done, 0 … 1, after every level of each.
+        Without `narrow`, objects and spots that lines of sight may miss are not searched for, and not in the error: for
+        drafts of a picture that is computed in full afterwards.
 
         Raises
         ------
@@ -111,7 +115,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 traced = self._traced(scene, sensor)
                 faces = self._faces_of(traced) if quadrature.takes("record") else None
                 view = View.of(traced, sensor, window, faces, specular)
-                self._fill(mosaic, view, quadrature, Progress(progress))
+                self._fill(mosaic, view, quadrature, Progress(progress), narrow)
             # Smaller displacements are random.
             rounding = sensor.rounding if sensor.rounding >= LEAST_DISPLACEMENT else 0.0
             solution = mosaic.solution(quadrature.least_error, rounding)
@@ -135,17 +139,20 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         view: View,
         quadrature: Quadrature,
         progress: Progress,
+        narrow: bool,
     ) -> None:
         """Solve all tiles; several ones share the tolerance that follows from a lower bound of the brightest pixel."""
         tiles, window = mosaic.tiles, mosaic.window
         least_peak, points = 0.0, None
         progress(0.0)
-        if len(tiles) > 1:
+        if len(tiles) > 1 and narrow:
             points = points_on_surfaces(view.scene, view.lens, view.specular)
             least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points, window))
         for k, tile in enumerate(tiles):
-            narrow = partial(narrow_light, points, tile) if points else partial(self._narrow_light, view, tile)
-            mosaic.put(tile, self._solve_tile(tile, view, quadrature, narrow, least_peak, progress.part(k, len(tiles))))
+            light = partial(self._narrow_light, view, tile)
+            if points or not narrow:
+                light = partial(narrow_light, points, tile)
+            mosaic.put(tile, self._solve_tile(tile, view, quadrature, light, least_peak, progress.part(k, len(tiles))))
 
     def _solve_tile(
         self,

@@ -108,6 +108,10 @@ class FsptLens(mi.Sensor):
             self.fault = error  # the numbers before the update stay in use
             raise
 
+    def prepare_model(self, name: str) -> None:
+        """Change `model`, from the next update of the numbers on, which may be those that the new one needs."""
+        self._model = name
+
     def _update(self) -> None:
         """Check the numbers and derive the kernels' inputs, opaque so that a new value needs no compilation."""
         numbers = {name: float(value[0]) for name, value in self._numbers.items()}

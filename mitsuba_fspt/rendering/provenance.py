@@ -28,6 +28,19 @@ def remember_defaults(scene: mi.Scene, values: Mapping[str, str]) -> None:
             sensor.defaults = getattr(sensor, "defaults", {}) | dict(values)
 
 
+def remember_source(scene: mi.Scene, source: object, parameters: Mapping[str, object]) -> None:
+    """Keep with a scene's lenses what it was loaded from: a file's name or its text, and the given parameters."""
+    for sensor in scene.sensors():
+        if is_lens(sensor):
+            sensor.source = source, dict(parameters)
+
+
+def source_of(scene: mi.Scene) -> tuple[Any, dict[str, object]] | None:
+    """What `remember_source` has kept; None for a scene from another loader, or from a dictionary."""
+    kept = (getattr(sensor, "source", None) for sensor in scene.sensors())
+    return next((one for one in kept if one is not None), None)
+
+
 def defaults_of(sensor: mi.Sensor) -> dict[str, float | str]:
     """Values of the `<default>` parameters of the scene of this lens: numbers where they are; empty if none are known.
 

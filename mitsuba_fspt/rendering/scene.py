@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ import numpy as np
 from ..runtime import backend
 from ..runtime.errors import SceneError
 from ..runtime.interrupt import ctrl_c_noted
-from .provenance import remember_defaults
+from .provenance import remember_defaults, remember_source
 from .scene_rules import check_text
 from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 
@@ -52,35 +53,65 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
 
     from ..emission.face_probe import probe_beside
 
+    path, folder, parse = _source_of(scene, parameters)
+    with _files_of(folder):
+        config = _config()
+        state = parse(config)
+        _set_up(state, path, parameters)
+        mi.parser.transform_all(config, state)
+        loaded = mi.parser.instantiate(config, state)
+    loaded = loaded[0] if isinstance(loaded, list) else loaded
+    probe_beside(loaded)
+    remember_defaults(loaded, values_of(scene, parameters))
+    if not isinstance(scene, Mapping):
+        remember_source(loaded, scene, parameters)
+    return loaded
+
+
+def parsed(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: object) -> list[mi.parser.SceneNode]:
+    """Elements of a scene as `load` parses and checks them, before any object is made of them; raises as `load`."""
+    backend.ensure_variant()
+    _, folder, parse = _source_of(scene, parameters)
+    with _files_of(folder):
+        return list(parse(_config()).nodes)
+
+
+def _source_of(scene: object, parameters: Mapping[str, object]) -> tuple[Path, Path, Parser]:
+    """Name of a scene for messages, folder of its files, and the function that parses it."""
     if isinstance(scene, Mapping):
-        path, folder, parse = Path("dictionary"), Path(), _parser_of_dictionary(scene, parameters)
-    elif is_text(scene):
-        path, folder, parse = TEXT, Path(), _parser_of_text(str(scene), parameters)
-    else:
-        path = _path_of(scene)
-        folder, parse = path.resolve().parent, _parser_of_file(path, parameters)
+        return Path("dictionary"), Path(), _parser_of_dictionary(scene, parameters)
+    if is_text(scene):
+        return TEXT, Path(), _parser_of_text(str(scene), parameters)
+    path = _path_of(scene)
+    return path, path.resolve().parent, _parser_of_file(path, parameters)
+
+
+def _config() -> mi.parser.ParserConfig:
+    import mitsuba as mi
+
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = False  # shapes keep their ids, and rectangles their bounding boxes
+    return config
+
+
+@contextmanager
+def _files_of(folder: Path) -> Iterator[None]:
+    """Context manager in which Mitsuba finds files of `folder`, and its errors become SceneErrors of one line."""
+    import mitsuba as mi
+
     resolver = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(resolver))
     mi.file_resolver().prepend(str(folder))
     try:
         with ctrl_c_noted():
-            state = parse(config)
-            _set_up(state, path, parameters)
-            mi.parser.transform_all(config, state)
-            loaded = mi.parser.instantiate(config, state)
+            yield
     except (RuntimeError, ValueError) as error:
         raise error if isinstance(error, SceneError) else SceneError(_one_line(str(error))) from error
     finally:
         mi.set_file_resolver(resolver)
-    loaded = loaded[0] if isinstance(loaded, list) else loaded
-    probe_beside(loaded)
-    remember_defaults(loaded, _values(scene, parameters))
-    return loaded
 
 
-def _values(scene: object, parameters: Mapping[str, object]) -> dict[str, str]:
+def values_of(scene: object, parameters: Mapping[str, object]) -> dict[str, str]:
     """Texts of all `<default>` parameters of a scene as `load` takes it, with these values given."""
     if isinstance(scene, Mapping):
         return {}

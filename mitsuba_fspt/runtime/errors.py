@@ -40,6 +40,10 @@ class TransportError(FsptError):
     """A transport matrix that cannot be made, stored, read, or applied to what is given."""
 
 
+class ViewerError(FsptError):
+    """A port that cannot be opened, or a request of a page that cannot be understood."""
+
+
 @contextmanager
 def named(thing: str) -> Iterator[None]:
     """Context manager: puts `thing: ` before the message of an FsptError that its block raises."""

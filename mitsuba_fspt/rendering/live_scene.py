@@ -1,0 +1,296 @@
+"""A scene whose parameters change while one looks at it: in place where that is possible, loaded again elsewhere."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..images.image import Image
+from ..runtime.errors import SceneError
+from ..runtime.plugin_types import is_lens, is_surface
+from .provenance import remember_defaults, source_of
+from .render import Progress, integrator_of, render, sensor_of
+from .scene import load, parameter_text, parsed, values_of
+from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+DRAFT = 0.03  # rtol of a picture while a parameter moves
+RIGID = 1e-6  # by which the rows of a rotation may differ from orthonormal ones
+Matrix = NDArray[np.float64]  # (4, 4), points to points [mm]
+
+
+@dataclass(frozen=True)
+class SurfacePoint:
+    """The first surface on the line of sight through the centres of a pixel and of the pupil.
+
+    position : [mm], in world coordinates
+    shape : its id
+    exitance : J_n [W/mm²]; None where the shape has no `fspt_surface`
+    depth : distance from the lens plane along the optical axis [mm]
+    column, row, radius : centre and radius of the blur disc [pixels of the image; 0.5, 0.5 is the middle of the first]
+    """
+
+    position: tuple[float, float, float]
+    shape: str
+    exitance: float | None
+    depth: float
+    column: float
+    row: float
+    radius: float
+
+
+@dataclass(frozen=True)
+class Change:
+    """What differs between the loaded scene and a wanted one, if it can be changed in place.
+
+    lens : new numbers of the lens, by their names in the scene file
+    placement : new `to_world` of the lens
+    model : of the lens in the scene file
+    """
+
+    lens: Mapping[str, float]
+    placement: Matrix
+    model: str
+
+
+class LiveScene:
+    """A scene file or its text, and the Mitsuba scene of the last values of its parameters.
+
+    A scene that `load` has made stands for what it was loaded from, with the values given then.
+
+    Numbers and placement of the lens change in place, without compilation. A rigid motion of all shapes is replaced by
+    the inverse motion of the lens, which gives the same picture but for rounding; where that shall not be, and for all
+    other changes, the scene is loaded again. `loads` counts that.
+
+    Raises
+    ------
+    SceneError : the scene cannot be read or loaded, was changed after it was loaded, or its first sensor is no
+        `fspt_lens`.
+    """
+
+    def __init__(
+        self, scene: mi.Scene | str | os.PathLike[str], parameters: Mapping[str, object] | None = None
+    ) -> None:
+        parameters = parameters or {}
+        if not isinstance(scene, (str, os.PathLike)):
+            scene, before = _unchanged_source(scene)
+            parameters = before | dict(parameters)
+        self.source: str | os.PathLike[str] = scene
+        self.given = {name: parameter_text(value) for name, value in parameters.items()}
+        self.loads = 0
+        self._scene: mi.Scene | None = None
+        self._nodes: list[mi.parser.SceneNode] = []  # elements of the loaded scene
+
+    @property
+    def xml(self) -> SceneXml:
+        """The XML with the given values, read again."""
+        return (
+            read_text(str(self.source), self.given) if is_text(self.source) else read_xml(Path(self.source), self.given)
+        )
+
+    def image(self, values: Mapping[str, object], model: str | None = None, progress: Progress | None = None) -> Image:
+        """Image with these values of parameters, and with another lens `model` than the scene's if it is given.
+
+        The same bits as from `render` of a scene that is loaded with these values. `progress` as of `render`.
+
+        Raises what `load` and `render` raise. The scene stays usable.
+        """
+        image = render(self.scene(values, model), progress=progress)
+        taken = self.given | _texts(values)
+        scene_id = " ".join([_name(self.source), *(f"{key}={text}" for key, text in taken.items())])
+        return replace(image, metadata=image.metadata | {"scene": scene_id})
+
+    def draft(self, values: Mapping[str, object], model: str | None = None, rtol: float = DRAFT) -> Image:
+        """Quick image by the integral, to `rtol` but for spots that lines of sight may miss; parameters as of `image`.
+
+        A moved phantom is seen by the lens moved the other way. Raises as `image`.
+        """
+        scene = self.scene(values, model, exact=False)
+        lens, integrator = sensor_of(scene, 0), integrator_of(scene, "integral")
+        own = integrator.quadrature
+        quadrature = replace(own, rtol=max(own.rtol, rtol))
+        solution = integrator.solve(scene, lens, quadrature, narrow=False)
+        how = {"method": "integral", "rtol": quadrature.rtol}
+        return Image(solution.power, solution.error, solution.coverage, how | lens.numbers())
+
+    def surface_point(
+        self, values: Mapping[str, object], model: str | None, column: int, row: int
+    ) -> SurfacePoint | None:
+        """Surface point under the middle of a pixel of the image; None where the line of sight meets nothing."""
+        import drjit as dr
+        import mitsuba as mi
+
+        scene = self.scene(values, model)
+        lens = sensor_of(scene, 0)
+        offset = mi.Vector2f(lens.film().crop_offset())
+        ray, _, _ = lens.line_of_sight(mi.Point2f(column + 0.5, row + 0.5) + offset, mi.Point2f(0, 0))
+        si = scene.ray_intersect(ray)
+        if not si.is_valid()[0]:
+            return None
+        shape = next(s for s in scene.shapes() if dr.all(si.shape == mi.ShapePtr(s)))
+        emitter = shape.emitter()
+        exitance = float(emitter.exitance.eval(si)[0][0]) if is_surface(emitter) else None
+        centre, radius, _ = lens.blur_disc(si.p)
+        centre -= offset
+        position = tuple(float(c[0]) for c in si.p)
+        depth = lens.farthest_depth(np.array([position], np.float64))
+        return SurfacePoint(
+            position,  # type: ignore[arg-type]
+            shape.id(),
+            exitance,
+            depth,
+            float(centre.x[0]),
+            float(centre.y[0]),
+            abs(float(radius[0])),
+        )
+
+    def scene(self, values: Mapping[str, object], model: str | None = None, *, exact: bool = True) -> mi.Scene:
+        """The Mitsuba scene with these values of its parameters and this `model` of its lens (None: its own)."""
+        wanted = self.given | _texts(values)
+        nodes = parsed(self.source, **wanted)
+        change = None if self._scene is None else _change(self._nodes, nodes, exact)
+        if change is None:
+            self._scene = None  # memory for one scene, not two
+            self._scene, self._nodes, self.loads = load(self.source, **wanted), nodes, self.loads + 1
+            if not is_lens(sensor_of(self._scene, 0)):
+                self._scene = None
+                raise SceneError(f"{_name(self.source)}: its sensor is no fspt_lens. Give it one.")
+            change = _change(nodes, nodes, exact)
+        _apply(change, sensor_of(self._scene, 0), model)
+        remember_defaults(self._scene, values_of(self.source, wanted))
+        return self._scene
+
+
+def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], exact: bool) -> Change | None:
+    """Change of the lens that makes the scene of the elements `old` that of `new`; None if there is none."""
+    import mitsuba as mi
+
+    sensors = [node for node in new if node.type == mi.ObjectType.Sensor]
+    if len(old) != len(new) or len(sensors) != 1:
+        return None
+    motions: list[Matrix | None] = []  # of the shapes, None for those that are where they were
+    for before, after in zip(old, new, strict=True):
+        same = before.props == after.props
+        if after.type == mi.ObjectType.Shape:
+            motions.append(None if same else _motion(before.props, after.props))
+            same = same or motions[-1] is not None
+        elif after.type == mi.ObjectType.Sensor:
+            same = same or _differ_in(before.props, after.props, mi.Properties.Type.Float, mi.Properties.Type.Transform)
+        if not same:
+            return None
+    lens = sensors[0].props
+    numbers = {name: float(lens[name]) for name in lens.keys() if lens.type(name) == mi.Properties.Type.Float}
+    placement = _matrix(lens)
+    if any(motion is not None for motion in motions):
+        if exact or not _all_alike(motions) or _others_are_placed(new):
+            return None
+        placement = np.linalg.inv(motions[0]) @ placement  # type: ignore[arg-type]
+    return Change(numbers, placement, str(lens.get("model", "diaphragm")))
+
+
+def _differ_in(before: mi.Properties, after: mi.Properties, *kinds: object) -> bool:
+    """True if properties have the same names, and differ in values of these kinds alone."""
+    names = list(before.keys())
+    if before.plugin_name() != after.plugin_name() or names != list(after.keys()):
+        return False
+    for name in names:
+        if before.type(name) != after.type(name):
+            return False
+        if before.type(name) not in kinds and not _equal(before[name], after[name]):
+            return False
+    return True
+
+
+def _equal(one: object, other: object) -> bool:
+    """Equality of values of properties; references by the element that they refer to."""
+    import mitsuba as mi
+
+    reference = mi.Properties.ResolvedReference if hasattr(mi.Properties, "ResolvedReference") else ()
+    return one.index() == other.index() if isinstance(one, reference) else bool(one == other)
+
+
+def _motion(before: mi.Properties, after: mi.Properties) -> Matrix | None:
+    """Rigid motion that is the only difference between two shapes; None if it is not."""
+    import mitsuba as mi
+
+    if "to_world" not in before or not _differ_in(before, after, mi.Properties.Type.Transform):
+        return None
+    motion = _matrix(after) @ np.linalg.inv(_matrix(before))
+    axes = motion[:3, :3]
+    return motion if np.allclose(axes @ axes.T, np.eye(3), atol=RIGID) and np.linalg.det(axes) > 0 else None
+
+
+def _all_alike(motions: list[Matrix | None]) -> bool:
+    """True if all shapes make the same motion."""
+    first = motions[0]
+    return first is not None and all(motion is not None and np.allclose(motion, first) for motion in motions)
+
+
+def _others_are_placed(nodes: list[mi.parser.SceneNode]) -> bool:
+    """True if an element that is no shape and no sensor, as an emitter or a volume, has a place of its own."""
+    import mitsuba as mi
+
+    moved = (mi.ObjectType.Shape, mi.ObjectType.Sensor)
+    return any("to_world" in node.props for node in nodes if node.type not in moved)
+
+
+def _matrix(props: mi.Properties) -> Matrix:
+    """`to_world` of an element."""
+    return np.array(props["to_world"].matrix, np.float64).reshape(4, 4) if "to_world" in props else np.eye(4)
+
+
+def _apply(change: Change, lens: mi.Sensor, model: str | None) -> None:
+    """Give the lens its new numbers, placement and model; OpticsError for a lens that cannot exist."""
+    import mitsuba as mi
+
+    lens.prepare_model(model or change.model)
+    parameters = mi.traverse(lens)
+    for name, number in change.lens.items():
+        parameters[name] = number
+    parameters["to_world"] = mi.Transform4f(change.placement)
+    parameters.update()
+    if lens.fault:
+        raise lens.fault
+
+
+def _unchanged_source(scene: mi.Scene) -> tuple[Any, dict[str, object]]:
+    """What a scene was loaded from; SceneError if that is not known, or if the scene was changed since."""
+    import mitsuba as mi
+
+    kept = source_of(scene) if isinstance(scene, mi.Scene) else None
+    if kept is None:
+        raise SceneError(
+            f"scene: to change it, it must be a file, XML text or what `load` makes of these, got "
+            f"{type(scene).__name__}. Give one."
+        )
+    source, given = kept
+    now, then = mi.traverse(scene), mi.traverse(load(source, **given))
+    for name, _ in now:
+        if name not in then or not np.array_equal(_plain(now[name]), _plain(then[name])):
+            raise SceneError(
+                f"scene: '{name}' was changed after the scene was loaded, or its file was. Give the file's name."
+            )
+    return kept
+
+
+def _plain(value: object) -> object:
+    """Value of a parameter of Mitsuba as NumPy compares it."""
+    value = getattr(value, "matrix", value)
+    return np.array(value) if hasattr(value, "shape") else value
+
+
+def _texts(values: Mapping[str, object]) -> dict[str, str]:
+    return {name: parameter_text(value) for name, value in values.items()}
+
+
+def _name(source: str | os.PathLike[str]) -> str:
+    """What messages and metadata call the scene."""
+    return str(TEXT) if is_text(source) else os.fspath(source)

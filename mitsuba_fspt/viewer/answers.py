@@ -1,0 +1,215 @@
+"""Answers to what a page asks about a scene: pictures, surface points and files."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shlex
+import struct
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..images.image import Image
+from ..images.pixel_axes import virtual_pitch
+from ..images.radiometry import PLANCK_TIMES_LIGHT, etendue
+from ..optics.models import model_names
+from ..rendering.live_scene import LiveScene
+from ..rendering.scene_rules import is_number
+from ..rendering.scene_xml import is_text
+from ..runtime.errors import FsptError, ViewerError
+from .sliders import sliders_of
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+SLOTS = ("a", "b")  # the lens, and a second one
+KINDS = ("picture", "point", "exr")
+MOST_CHARACTERS = 200  # of a value
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a page asks for.
+
+    kind : of `KINDS`
+    slot : 'a', or 'b' for the second lens
+    number : counted by the page, returned with the answer
+    values : texts of the scene's parameters
+    model : of the lens; None: the scene's own
+    fine : False asks for a quick draft of the picture
+    etendue : the étendue of the pixels is wanted too
+    pixel : column and row, of a point
+    """
+
+    kind: str
+    slot: str
+    number: int
+    values: Mapping[str, str]
+    model: str | None = None
+    fine: bool = True
+    etendue: bool = False
+    pixel: tuple[int, int] = (0, 0)
+
+    @classmethod
+    def read(cls, record: object) -> Request:
+        """The request of a decoded JSON message; ViewerError if it is none."""
+        if not isinstance(record, dict):
+            raise ViewerError(
+                f"page: a request must be a JSON object, got {type(record).__name__}. Load the page anew."
+            )
+        kind, slot = record.get("kind"), record.get("slot", "a")
+        if kind not in KINDS or slot not in SLOTS:
+            raise ViewerError(f"page: no request of kind {kind!r} for the lens {slot!r} is known. Load the page anew.")
+        values, model, pixel = record.get("values", {}), record.get("model"), record.get("pixel", [0, 0])
+        texts = isinstance(values, dict) and all(
+            isinstance(v, str) and len(v) <= MOST_CHARACTERS for v in values.values()
+        )
+        pair = isinstance(pixel, list) and len(pixel) == 2 and all(isinstance(n, int) for n in pixel)
+        number = record.get("number", 0)
+        if not (texts and pair and isinstance(number, int) and (model is None or isinstance(model, str))):
+            raise ViewerError("page: the request's values must be short texts by name. Load the page anew.")
+        fine, wants = bool(record.get("fine", True)), bool(record.get("etendue", False))
+        return cls(kind, slot, number, values, model or None, fine, wants, (pixel[0], pixel[1]))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A JSON record and the binary data that it describes."""
+
+    record: Record
+    data: list[bytes] = field(default_factory=list)
+
+    def packed(self) -> bytes:
+        """One binary message: length of the JSON [uint32, little endian], the JSON filled up to 4 bytes, the data."""
+        text = json.dumps(self.record, allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        return b"".join([struct.pack("<I", len(text)), text, *self.data])
+
+
+class Superseded(Exception):
+    """A picture that nobody waits for any more, or that has to wait for a draft."""
+
+
+class Answers:
+    """Answers requests about one scene, one at a time. Raises as `LiveScene`."""
+
+    def __init__(self, scene: mi.Scene | str | os.PathLike[str], parameters: Mapping[str, object]) -> None:
+        self._live = LiveScene(scene, parameters)
+        self._live.scene({})  # bad scenes are refused before a page opens
+
+    def hello(self) -> Answer:
+        """What a page needs first: name of the scene, sliders, models of the lens."""
+        source = self._live.source
+        name = "XML text" if is_text(source) else os.fspath(source)
+        sliders = [slider.record() for slider in sliders_of(self._live.xml)]
+        return Answer({"kind": "hello", "scene": name, "sliders": sliders, "models": list(model_names())})
+
+    def answer(self, request: Request, may_go_on: Callable[[], None] = lambda: None) -> Answer:
+        """Answer to a request; an error of the scene becomes one of kind 'error', with its one line.
+
+        `may_go_on` is called from time to time while a picture is computed, and may raise to end that.
+        """
+        given = {"slot": request.slot, "number": request.number, "fine": request.fine}
+        try:
+            return getattr(self, f"_{request.kind}")(request, given, may_go_on)
+        except FsptError as error:
+            return Answer(given | {"kind": "error", "message": _one_line(error)})
+        except Superseded:
+            raise
+        except Exception as error:  # of the renderer, or a fault of ours: the page and its last picture stay
+            if os.environ.get("FSPT_DEBUG"):
+                raise
+            line = f"{type(error).__name__}: {_one_line(error)} (FSPT_DEBUG=1 shows where)"
+            return Answer(given | {"kind": "error", "message": line})
+
+    def _picture(self, request: Request, given: Record, may_go_on: Callable[[], None]) -> Answer:
+        start = time.perf_counter()
+        image = (
+            self._image(request, may_go_on) if request.fine else self._live.draft(self._changed(request), request.model)
+        )
+        planes: dict[str, NDArray] = {"power": image.power, "error": image.error, "coverage": image.coverage}  # type: ignore[dict-item]
+        known = image.metadata
+        if request.etendue:
+            with suppress(FsptError):
+                planes["etendue"] = etendue(image)
+        height, width = image.shape
+        record = given | {
+            "kind": "picture",
+            "height": height,
+            "width": width,
+            "planes": list(planes),
+            "rtol": known.get("rtol"),
+            "method": known.get("method"),
+            "side": virtual_pitch(known),
+            "wavelength_nm": known.get("wavelength_nm"),
+            "photons_per_joule_nm": 1e-9 / PLANCK_TIMES_LIGHT,
+            "warnings": known.get("warnings", ""),
+            "lens": {name: known[name] for name in ("focal_length", "f_number", "magnification") if name in known},
+            "command": self._command(request),
+            "seconds": time.perf_counter() - start,
+        }
+        return Answer(record, [np.ascontiguousarray(plane, "<f4").tobytes() for plane in planes.values()])
+
+    def _image(self, request: Request, may_go_on: Callable[[], None]) -> Image:
+        return self._live.image(self._changed(request), request.model, lambda *_: may_go_on())
+
+    def _point(self, request: Request, given: Record, _: Callable[[], None]) -> Answer:
+        point = self._live.surface_point(self._changed(request), request.model, *request.pixel)
+        found = None
+        if point is not None:
+            found = {key: _finite(value) for key, value in asdict(point).items()}
+        return Answer(given | {"kind": "point", "pixel": list(request.pixel), "point": found})
+
+    def _exr(self, request: Request, given: Record, may_go_on: Callable[[], None]) -> Answer:
+        image = self._image(request, may_go_on)
+        if request.model:
+            image = replace(image, metadata=image.metadata | {"model": request.model})
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "picture.exr"
+            image.write(path)
+            return Answer(given | {"kind": "exr", "name": self._file(request)}, [path.read_bytes()])
+
+    def _changed(self, request: Request) -> dict[str, str]:
+        """The request's values that differ from those of the scene as it was given."""
+        xml = self._live.xml
+        before = xml.defaults | dict(xml.given)
+        return {name: text for name, text in request.values.items() if not _same(text, before.get(name, ""))}
+
+    def _file(self, request: Request) -> str:
+        """Name for a file of the picture."""
+        source = self._live.source
+        stem = "scene" if is_text(source) else Path(source).stem
+        return f"{stem}{'_second' if request.slot == 'b' else ''}.exr"
+
+    def _command(self, request: Request) -> str:
+        """Command that renders the picture; empty where there is none, for a scene's text and another lens model."""
+        if is_text(self._live.source) or request.model:
+            return ""
+        words = ["fspt", "render", os.fspath(self._live.source)]
+        for name, text in (self._live.given | self._changed(request)).items():
+            words += ["-D", f"{name}={text}"]
+        return shlex.join([*words, "-o", self._file(request)])
+
+
+def _same(one: str, other: str) -> bool:
+    """True for equal texts, and for texts of equal numbers."""
+    return one == other or (is_number(one) and is_number(other) and float(one) == float(other))
+
+
+def _finite(value: object) -> object:
+    """A number as JSON can hold it: None for an infinite one."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())

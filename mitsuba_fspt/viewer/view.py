@@ -1,0 +1,61 @@
+"""`fspt.view`: the live view of a scene, as a page in the browser or as a widget of a notebook."""
+
+from __future__ import annotations
+
+import os
+import webbrowser
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from ..runtime.extras import require
+from .answers import Answers
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+def view(
+    scene: mi.Scene | str | os.PathLike[str],
+    *,
+    port: int = 0,
+    ready: Callable[[str], object] | None = None,
+    **parameters: object,
+) -> object:
+    """Show a scene whose picture follows sliders for the numbers among its `<default>` parameters.
+
+    In a notebook it returns a widget. Elsewhere it serves a page on 127.0.0.1 until Ctrl-C, and returns None.
+
+    Parameters
+    ----------
+    scene : name of an XML file, its text, or what `load` has made of one of them
+    port : of the page; 0: any free one. Without effect in a notebook
+    ready : function that is called with the page's address; None opens it in the browser
+    parameters : values for `<default>` parameters
+
+    Raises
+    ------
+    SceneError, OpticsError, ExitanceError : the scene cannot be loaded, or was changed after that.
+    ViewerError : the port cannot be opened.
+    BackendError : a package of the extra `view`, in a notebook of `notebook`, is not installed.
+    """
+    if _in_notebook() and ready is None:
+        require("anywidget", "The viewer in a notebook")
+        from .widget import widget
+
+        return widget(Answers(scene, parameters))
+    for module in ("starlette", "uvicorn", "websockets"):
+        require(module, "The viewer")
+    from .server import ViewServer
+
+    ViewServer(lambda: Answers(scene, parameters), port).run(ready or webbrowser.open)
+    return None
+
+
+def _in_notebook() -> bool:
+    """True in a Jupyter kernel."""
+    try:
+        from IPython import get_ipython
+    except ImportError:
+        return False
+    shell = get_ipython()  # type: ignore[no-untyped-call]
+    return shell is not None and "IPKernelApp" in getattr(shell, "config", {})

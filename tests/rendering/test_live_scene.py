@@ -1,0 +1,120 @@
+"""A scene that changes in place gives the pictures of scenes that are loaded."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.rendering.live_scene import LiveScene
+
+SCENE = """<scene version="3.0.0">
+    <default name="f_number" value="4"/> <default name="distance" value="160"/> <default name="turn" value="0"/>
+    <default name="aside" value="0"/>
+    <integrator type="fspt_integral"/>
+    <sensor type="fspt_lens">
+        <float name="focal_length" value="50"/> <float name="f_number" value="$f_number"/>
+        <float name="focus_distance" value="150"/> <float name="pixel_pitch" value="0.5"/>
+        <float name="lens_diameter" value="20"/>
+        <transform name="to_world"><lookat origin="$distance, 0, 0" target="0, 0, 0" up="0, 0, 1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="24"/></film>
+    </sensor>
+    <shape type="cube" id="box">
+        <transform name="to_world"><scale x="4" y="3" z="2"/><rotate z="1" angle="$turn"/></transform>
+        <emitter type="fspt_surface"><float name="exitance" value="2"/></emitter>
+    </shape>
+    <shape type="sphere" id="bead">
+        <float name="radius" value="1"/>
+        <transform name="to_world"><translate x="2" y="5"/><rotate z="1" angle="$turn"/>
+            <translate y="$aside"/></transform>
+        <emitter type="fspt_surface"><float name="exitance" value="1"/></emitter>
+    </shape>
+</scene>"""
+
+
+LENS = {"focal_length": 50.0, "f_number": 4.0, "focus_distance": 150.0, "pixel_pitch": 0.5}
+
+
+@pytest.fixture(scope="module")
+def live(mono):
+    return LiveScene(SCENE, {})
+
+
+def test_lens_numbers_and_placement_change_in_place_to_the_bit(live):
+    live.image({})
+    loads = live.loads
+    for values in ({"f_number": 2.8}, {"f_number": "8", "distance": 170}, {}):
+        image, loaded = live.image(values), fspt.render(fspt.load(SCENE, **values))
+        for plane in ("power", "error", "coverage"):
+            assert np.array_equal(getattr(image, plane), getattr(loaded, plane))
+        assert {k: image.metadata[k] for k in ("parameters", "scene", "f_number")} == {
+            k: loaded.metadata[k] for k in ("parameters", "scene", "f_number")
+        }
+    assert live.loads == loads
+
+
+def test_a_draft_of_a_turned_phantom_loads_nothing_and_the_image_is_that_of_the_loaded_scene(live):
+    """The lens that turns the other way sees the same; a turn the same way would be off by half the peak."""
+    live.image({})
+    loads, wanted = live.loads, fspt.render(fspt.load(SCENE, turn=25))
+    draft = live.draft({"turn": 25}, rtol=1e-3)
+    assert live.loads == loads
+    assert np.abs(draft.power - wanted.power).max() <= 2e-3 * wanted.power.max()
+    assert np.array_equal(live.image({"turn": 25}).power, wanted.power)
+    assert live.loads == loads + 1
+
+
+def test_a_shape_that_moves_alone_is_loaded_again(live):
+    live.image({})
+    loads, wanted = live.loads, fspt.render(fspt.load(SCENE, aside=3))
+    assert np.abs(live.draft({"aside": 3}, rtol=1e-3).power - wanted.power).max() <= 2e-3 * wanted.power.max()
+    assert live.loads == loads + 1
+
+
+def test_a_lens_that_cannot_be_leaves_a_usable_scene(live):
+    good = live.image({}).power
+    for values, model, word in (
+        ({"f_number": -1}, None, "f_number"),
+        ({}, "none", "model"),
+        ({"turn": "x"}, None, "turn"),
+    ):
+        with pytest.raises(fspt.FsptError, match=word):
+            live.image(values, model)
+        assert np.array_equal(live.image({}).power, good)
+
+
+def test_another_model_of_the_lens(live):
+    changed = SCENE.replace('"fspt_lens">', '"fspt_lens"><string name="model" value="hrrt"/>')
+    wanted = fspt.render(fspt.load(changed)).power
+    assert np.array_equal(live.image({}, "hrrt").power, wanted)
+    assert not np.array_equal(live.image({}).power, wanted)
+
+
+def test_the_surface_point_of_a_pixel(live):
+    """The line of sight on the axis meets the box at x = 4, 156 mm from the lens; focused there the disc is a point."""
+    place = live.surface_point({}, None, 16, 12)
+    assert place.shape == "box"
+    assert place.exitance == pytest.approx(2)
+    assert place.position[0] == pytest.approx(4, abs=1e-4)
+    assert place.depth == pytest.approx(156, abs=1e-3)
+    # R_b = (D/2) |u - z|/z · v/(u p) with v = 75: thin lens, f/4.
+    assert place.radius == pytest.approx(6.25 * 6 / 156 * 75 / 150 / 0.5, rel=1e-4)
+    assert (place.column, place.row) == pytest.approx((16.5, 12.5), abs=0.05)
+    assert live.surface_point({}, None, 0, 0) is None
+
+
+def test_a_loaded_scene_is_taken_with_its_values_unless_it_was_changed(mono):
+    scene = fspt.load(SCENE, f_number=8)
+    live = LiveScene(scene)
+    assert np.array_equal(live.image({}).power, fspt.render(scene).power)
+    parameters = mono.traverse(scene)
+    parameters["box.emitter.exitance.value"] = 3.0
+    parameters.update()
+    with pytest.raises(fspt.FsptError, match=r"'box.emitter.exitance.value' was changed"):
+        LiveScene(scene)
+
+
+def test_what_was_not_loaded_from_a_file_or_text_is_refused(mono):
+    for scene in (fspt.load({"type": "scene", "lens": {"type": "fspt_lens", **LENS}}), 3):
+        with pytest.raises(fspt.FsptError, match="to change it, it must be a file"):
+            LiveScene(scene)

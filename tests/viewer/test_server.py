@@ -1,0 +1,159 @@
+"""`fspt view` without a browser: who may ask, what is answered, how it ends."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from viewed_scene import SCENE, interrupt, serve
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.viewer.answers import Answers, Request, Superseded
+from mitsuba_fspt.viewer.queue import RequestQueue
+
+client = pytest.importorskip("websockets.sync.client", reason="the extra 'view' is not installed")
+pytest.importorskip("starlette", reason="the extra 'view' is not installed")
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    scene = tmp_path_factory.mktemp("view") / "box.xml"
+    scene.write_text(SCENE)
+    process, address = serve(scene, "-D", "f_number=8")
+    yield address
+    code, errors = interrupt(process)
+    assert (code, errors) == (0, "")
+
+
+def open_page(address, origin=None):
+    home = "/".join(address.split("/")[:3])
+    return client.connect(address.replace("http", "ws") + "socket", origin=origin or home, max_size=None)
+
+
+def receive(page):
+    message = page.recv()
+    length = struct.unpack_from("<I", message)[0]
+    record = json.loads(message[4 : 4 + length])
+    return record, np.frombuffer(message[4 + length :], np.float32)
+
+
+def status_of(address):
+    try:
+        return urllib.request.urlopen(address).status
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def test_the_page_needs_its_token(address):
+    assert status_of(address) == 200
+    assert status_of(address + "view.js") == 200
+    home = "/".join(address.split("/")[:3])
+    for wrong in (f"{home}/", f"{home}/view.js", f"{home}/{'x' * 24}/", f"{home}/{'x' * 24}/view.js"):
+        code, line = status_of(wrong)
+        assert code == 403
+        assert "token" in line
+    assert status_of(address + "server.py")[0] == 404
+    rebound = urllib.request.Request(address, headers={"Host": "example.org"})  # a name that points to this machine
+    assert status_of(rebound)[0] == 403
+
+
+@pytest.mark.parametrize("fault", ["token", "origin", "none"])
+def test_a_stranger_gets_no_channel(address, fault):
+    """A page of another site, which the browser names as the origin, and one that guesses."""
+    changed = address.rstrip("/")[:-3] + "xyz/" if fault == "token" else address
+    with pytest.raises(Exception, match="403") if fault != "none" else open_page(changed) as page:
+        if fault == "none":
+            assert receive(page)[0]["kind"] == "hello"
+        else:
+            open_page(changed, "http://example.org" if fault == "origin" else None)
+
+
+def test_pictures_are_those_of_render_and_requests_that_make_no_sense_are_told(address):
+    with open_page(address) as page:
+        hello, _ = receive(page)
+        assert [slider["name"] for slider in hello["sliders"]] == ["f_number", "turn"]
+        assert hello["sliders"][0]["value"] == 8
+        page.send(json.dumps({"kind": "picture", "number": 1, "values": {"f_number": "4"}, "etendue": True}))
+        record, planes = receive(page)
+        image = fspt.render(fspt.load(SCENE, f_number=4))
+        assert record["planes"] == ["power", "error", "coverage", "etendue"]
+        for plane, wanted in zip(planes.reshape(4, 40, 48), (image.power, image.error, image.coverage), strict=False):
+            assert np.array_equal(plane, wanted.astype(np.float32))
+        assert record["command"].endswith("box.xml -D f_number=4 -o box.exr")
+        for bad in (
+            '{"kind": "picture", "values": 3}',
+            "[1",
+            '{"kind": "shell"}',
+            '{"values": {"f_number": "0"}, "kind": "picture"}',
+        ):
+            page.send(bad)
+            record, _ = receive(page)
+            assert record["kind"] == "error"
+            assert "\n" not in record["message"]
+        page.send(json.dumps({"kind": "point", "number": 2, "pixel": [24, 20]}))
+        assert receive(page)[0]["point"]["exitance"] == pytest.approx(2)
+
+
+def test_a_port_in_use_is_one_line(run, tmp_path):
+    scene = tmp_path / "box.xml"
+    scene.write_text(SCENE)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        code, out, err = run("view", scene, "--no-browser", "--port", port)
+    assert (code, out) == (2, "")
+    assert err == f"fspt: port: {port} is in use on 127.0.0.1. Give another one, or 0 for any free one.\n"
+
+
+@pytest.mark.parametrize("arguments", [("missing.xml",), ("box.xml", "-D", "f_number=-1"), ("box.xml", "--port", "-1")])
+def test_bad_input_opens_no_page(run, tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "box.xml").write_text(SCENE)
+    code, out, err = run("view", "--no-browser", *arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith("fspt: ")
+    assert err.count("\n") == 1
+
+
+def test_of_requests_that_wait_the_latest_counts_and_drafts_go_first():
+    queue, one, other = RequestQueue(), object(), object()
+    draft, full = (Request("picture", "a", number, {}, fine=fine) for number, fine in ((1, False), (2, True)))
+    queue.put(one, draft)
+    queue.put(one, full)
+    assert [queue.take(0), queue.take(0), queue.take(0)] == [(one, draft), (one, full), None]
+    queue.check(one, full)  # goes on
+    queue.put(other, draft)
+    with pytest.raises(Superseded):
+        queue.check(one, full)
+    queue.put_back(one, full)
+    assert [queue.take(0), queue.take(0), queue.take(0)] == [(other, draft), (one, full), None]
+    queue.put(one, Request("picture", "a", 3, {}))
+    queue.put_back(one, full)  # a newer one waits
+    assert queue.take(0)[1].number == 3
+    queue.put(one, full)
+    queue.put(one, Request("picture", "a", 4, {}, fine=False))  # of other values: the full picture is outdated
+    assert [queue.take(0)[1].number, queue.take(0)] == [4, None]
+    queue.forget(one)
+    queue.put_back(one, full)
+    assert queue.take(0) is None
+
+
+def test_the_exr_of_the_page_is_that_of_the_command_line(mono, tmp_path):
+    """With all of its metadata but times; the command line leaves out values that are the scene's own."""
+    (tmp_path / "box.xml").write_text(SCENE)
+    answers = Answers(tmp_path / "box.xml", {})
+    answer = answers.answer(Request("exr", "a", 1, {"f_number": "8", "turn": "0.0"}))
+    (tmp_path / answer.record["name"]).write_bytes(answer.data[0])
+    saved, image = fspt.read(tmp_path / "box.exr"), fspt.render(fspt.load(tmp_path / "box.xml", f_number=8))
+    image.write(tmp_path / "other.exr")
+    other = fspt.read(tmp_path / "other.exr")
+    assert np.array_equal(saved.power, other.power)
+    assert {k: v for k, v in saved.metadata.items() if k != "wall_time"} == {
+        k: v for k, v in other.metadata.items() if k != "wall_time"
+    }
