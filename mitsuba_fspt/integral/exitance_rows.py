@@ -30,8 +30,10 @@ if TYPE_CHECKING:
 # A column, the derivative by one value behind J_n, that N lines meet is right to 1/N where J_n is continuous, and to
 # N^(-3/4) where it steps from face to face.
 FEWEST, MOST = 1 << 6, 1 << 14  # lines of a pixel
-MOST_LINES = 1 << 24  # of a picture at rtol 1e-3, some two seconds; columns smaller than a pixel's are then less right
-FINER, FINEST = 4, 1 << 12  # times as many where the lines miss the picture of J_n = 1 by rtol, up to so many
+# Lines of a picture at rtol 1e-3: columns smaller than a pixel's are less right where the most of them, some two
+# seconds, do not meet them often enough. The least of them take a twentieth of a second.
+LEAST_LINES, MOST_LINES = 1 << 19, 1 << 24
+FINER = 4  # times as many lines where they miss the picture of J_n = 1 by rtol, as often as `MOST_LINES` allow
 CERTAIN = 0.35  # of its estimated error: what that picture is wrong by at the most, as a rule
 LARGEST_FACTOR = 2.0  # on a row
 BATCH = 1 << 21  # lines of sight in one kernel: float32 adds no more of them than this to one number
@@ -70,8 +72,9 @@ class Rows:
         while len(pixels):
             sums = _sums(view, quadrature, RowGroup(lines, pixels.astype(np.uint32), np.ones(len(pixels), np.float32)))
             off = np.abs(power[pixels] - sums)
-            finer = min(FINER * lines, FINEST)
-            rough = off > tolerance if lines < finer <= quadrature.max_nodes else np.zeros(len(pixels), bool)
+            finer, rough = FINER * lines, off > tolerance
+            if finer > min(FINER * MOST, quadrature.max_nodes) or finer * np.count_nonzero(rough) > MOST_LINES // 2:
+                rough[:] = False
             wanted = np.where(off > CERTAIN * uncertain[pixels], power[pixels], sums)
             factors = np.divide(wanted, sums, out=np.ones(len(pixels)), where=sums > 0)
             settled = ~rough & (sums > 0)
@@ -133,7 +136,8 @@ def _lines_for(quadrature: Quadrature, sizes: Sizes, pixels: int) -> int:
     """Lines of sight of each of so many pixels, a power of two."""
     smooth, stepped = sizes
     hits = smooth / quadrature.rtol + stepped / quadrature.rtol ** (4 / 3)
-    wanted = min(hits, MOST_LINES * math.sqrt(1e-3 / quadrature.rtol)) / max(pixels, 1)
+    scale = math.sqrt(1e-3 / quadrature.rtol)
+    wanted = float(np.clip(hits, LEAST_LINES * scale, MOST_LINES * scale)) / max(pixels, 1)
     most = math.log2(min(MOST, max(FEWEST, quadrature.max_nodes)))
     return 1 << int(np.clip(round(math.log2(max(wanted, 1))), math.log2(FEWEST), most))
 
@@ -211,9 +215,8 @@ def _places(
     pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), row)
     step = dr.opaque(mi.UInt32, (1 << 32) // lines)
     # In units of 2⁻³², where whole numbers wrap around as a lattice does; the points are middles of their steps.
-    x, y, u, v = (
-        mi.Float((k * dr.opaque(mi.UInt32, generator) * step + (step >> 1)) >> 8) * 2.0**-24 for generator in VECTOR
-    )
+    places = (k * dr.opaque(mi.UInt32, generator) * step + (step >> 1) for generator in VECTOR)
+    x, y, u, v = (mi.Float(place >> 8) * 2.0**-24 for place in places)
     area = dr.opaque(mi.Float, float(quadrature.pixel == "area"))
     within = 0.5 + area * (mi.Point2f(x, y) - 0.5)
     position = mi.Point2f(left + mi.Float(pixel % width), top + mi.Float(pixel // width)) + mi.Vector2f(within)
