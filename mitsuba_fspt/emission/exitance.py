@@ -85,7 +85,7 @@ class ExitanceState:
     @classmethod
     def of(cls, shape: mi.Shape, texture: mi.Texture) -> ExitanceState:
         """Present data of a texture on a shape; `attribute` is None on a mesh that lacks it."""
-        name, parameters = _attribute_name(texture), mi.traverse(texture)
+        name, parameters = attribute_name(texture), mi.traverse(texture)
         on_mesh = {} if name is None else mi.traverse(shape)
         numbers = (n for key in ("value", "scale") if key in parameters for n in np.ravel(parameters[key]))
         return cls(
@@ -99,19 +99,21 @@ class ExitanceState:
         return *(values if values is None else values.index for values in (self.attribute, self.bitmap)), *self.numbers
 
 
-def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
+def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[..., mi.Float]:
     """J_n [W/mm²] on one shape, as a function of the surface interaction that calls no Dr.Jit pointer.
+
+    The function takes a surface interaction and, if not everywhere, where to evaluate.
 
     Raises
     ------
     ExitanceError : the shape lacks the mesh attribute, which would silently render black, or it has several channels.
     """
-    name = _attribute_name(texture)
+    name = attribute_name(texture)
     if name is None:
 
-        def value(si: mi.SurfaceInteraction3f) -> mi.Float:
+        def value(si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Float:
             at_one_wavelength(si)
-            return scalar(texture.eval(si))
+            return scalar(texture.eval(si, active))
 
         return value
     if not dr.all(shape.has_attribute(name)):
@@ -127,7 +129,7 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[[mi.SurfaceInt
             f"{name.partition('_')[0]}, J_n is one. Give an attribute of one channel."
         )
     scale = float(mi.traverse(texture)["scale"])
-    return lambda si: shape.eval_attribute_1(name, si) * scale
+    return lambda si, active=True: shape.eval_attribute_1(name, si, active) * scale
 
 
 def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float, mi.Float] | None:
@@ -137,7 +139,7 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
     if is_uniform(texture):
         everywhere = function_on(mesh, texture)(dr.zeros(mi.SurfaceInteraction3f)) + dr.zeros(mi.Float, count)
         return everywhere, everywhere, everywhere
-    name, values = _attribute_name(texture), ExitanceState.of(mesh, texture).attribute
+    name, values = attribute_name(texture), ExitanceState.of(mesh, texture).attribute
     if name is None or values is None or dr.width(values) != _attribute_size(mesh, name):
         return None
     values = values * float(mi.traverse(texture)["scale"])
@@ -236,7 +238,7 @@ def _attribute_size(mesh: mi.Shape, attribute: str) -> int:
     return dr.width(faces if attribute.startswith("face") else positions) // 3
 
 
-def _attribute_name(texture: mi.Texture) -> str | None:
+def attribute_name(texture: mi.Texture) -> str | None:
     """Name of the mesh attribute that a texture reads, which only its description states; None for other textures."""
     found = re.match(r'MeshAttribute\[\s*name = "([^"]*)"', str(texture))
     return found[1] if found else None

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,9 +14,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..emission.asked_gradients import shining_with_gradients
 from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
+from ..integral.exitance_rows import Rows, sizes_of
 from ..integral.left_out import LeftOut, light_left_out
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
 from ..integral.progress import Progress
@@ -30,6 +33,7 @@ from ..jit.mesh_buffers import box_of, buffers
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
 from ..runtime.errors import SceneError, named
+from ..runtime.plugin_types import is_surface
 
 MEANINGLESS = ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "timeout")
 LEAST_DISPLACEMENT = 1e-3  # pixels; larger ones occur only far from the world's origin
@@ -80,7 +84,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         # Results about the last scene; a reference to the scene, whose child this integrator is, would be a cycle.
         self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
         self._robust: RobustCopy | None = None
-        self._window, self._narrow, self._faces, self._left_out = (CachedValue() for _ in range(4))
+        self._window, self._narrow, self._faces, self._left_out, self._rows = (CachedValue() for _ in range(5))
 
     def solve(
         self,
@@ -245,9 +249,93 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         """Power on every pixel [W], shape (h, w, 1)."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
+        with dr.resume_grad():
+            asked = shining_with_gradients(scene, sensor)
+        if asked:
+            self._refuse_specular(scene, sensor)
         solution = self.solve(scene, sensor)
         self._tell_left_out(scene, sensor)
         return mi.TensorXf(solution.power[..., None].astype(np.float32))
+
+    def render_forward(
+        self,
+        scene: mi.Scene,
+        params: object,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> mi.TensorXf:
+        """Tangent of the picture [W], shape (h, w, 1), of that of the numbers behind `exitance`."""
+        with self._derivative(scene, sensor) as (rows, view, emitters):
+            tangent = rows.forward(view, self.quadrature, emitters)
+        return mi.TensorXf(tangent[..., None].astype(np.float32))
+
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: object,
+        grad_in: mi.TensorXf,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> None:
+        """Add the transpose of `render_forward` of `grad_in`, shape (h, w, 1) [1/W], to the gradients of the numbers
+        behind `exitance`."""
+        with self._derivative(scene, sensor) as (rows, view, emitters):
+            gradient = np.broadcast_to(np.array(grad_in, np.float64).reshape(-1, 1), (math.prod(rows.shape), 1))
+            rows.backward(view, self.quadrature, emitters, gradient.reshape(rows.shape))
+
+    @contextmanager
+    def _derivative(self, scene: mi.Scene, sensor: mi.Sensor | int) -> Iterator[tuple[Rows, View, list[mi.Emitter]]]:
+        """Context manager: rows of the derivative by J_n, the view that they belong to, emitters with gradients."""
+        if not isinstance(sensor, mi.Sensor):
+            sensor = scene.sensors()[sensor]
+        with dr.resume_grad():
+            emitters = shining_with_gradients(scene, sensor)
+        with dr.suspend_grad():
+            self._refuse_specular(scene, sensor)
+            rows = self._rows_of(scene, sensor, sizes_of(emitters))
+            check_scene(scene, sensor)
+            with recording():
+                yield rows, self._row_view(scene, sensor), emitters
+
+    def _row_view(self, scene: mi.Scene, sensor: mi.Sensor) -> View:
+        """The view through Mitsuba's surface records."""
+        window = self._visible_window(scene, sensor, False, ())
+        return View.of(self._traced(scene, sensor), sensor, window)
+
+    def _rows_of(self, scene: mi.Scene, sensor: mi.Sensor, sizes: tuple[int, int]) -> Rows:
+        """Rows of the derivative by J_n; cached, whatever J_n is."""
+        shapes = scene.shapes()
+        positions = tuple(buffers(shape)[0] for shape in shapes if shape.is_mesh())
+        marks = [mark_of(emitter) for emitter in scene.emitters()]
+        linear = all(is_surface(emitter) and emitter.law.linear for emitter in scene.emitters())
+        # Laws that depend on more than J_n may have changed.
+        state = (sizes, marks, [_pose(shape) for shape in shapes], _view(sensor), object() if not linear else None)
+
+        def find() -> Rows:
+            with ExitStack() as stack:
+                for emitter in scene.emitters():
+                    if is_surface(emitter):
+                        stack.enter_context(emitter.shining(1.0))
+                picture = self.solve(scene, sensor)
+                window = self._visible_window(scene, sensor, False, ())
+                seen = window.expand(np.ones(window.shape)) > 0
+                with recording(), dr.suspend_grad():
+                    found = Rows.of(self._row_view(scene, sensor), self.quadrature, picture, seen, sizes)
+                return replace(found, kept=positions)
+
+        return self._rows.recall(state, find)
+
+    def _refuse_specular(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Raise SceneError where light reaches the lens through or off specular shapes."""
+        with dr.suspend_grad():
+            specular = Specular.of(scene, sensor, self.quadrature)
+        if specular:
+            raise SceneError(
+                f"fspt_integral: light reaches the lens through or off the specular shapes {', '.join(specular.names)}"
+                ", which gradients do not follow. Leave them out, or render without gradients."
+            )
 
     def _tell_left_out(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
         """Log a warning about light that is left out, once as long as shapes and lens stay."""

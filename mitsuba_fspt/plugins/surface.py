@@ -29,7 +29,7 @@ class FsptSurface(mi.Emitter):
      * - exitance
        - |float| or |texture| [W/mm²]
        - Surface flux density J_n >= 0, finite: a number, a mesh attribute, a raw bitmap.
-         Updatable, differentiable.
+         Updatable, differentiable under `fspt_integral`.
      * - emission
        - |string|
        - How the radiance depends on the direction: lambert (Default) | fresnel | last_flight.

@@ -1,0 +1,74 @@
+"""Which parameters of a scene carry gradients, and whether the picture can be differentiated by them.
+
+P is linear in J_n, so that all numbers behind `exitance` have a derivative that lines of sight give exactly. Where a
+line of sight ends depends on lens and shapes, which would need the light along silhouettes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..runtime.errors import SceneError
+from ..runtime.plugin_types import is_surface
+from .exitance import attribute_name
+
+
+def shining_with_gradients(scene: mi.Scene, sensor: mi.Sensor) -> list[mi.Emitter]:
+    """Emitters of a scene whose J_n depends on numbers with gradients; called where gradients are not suspended.
+
+    Raises
+    ------
+    SceneError : a parameter with gradients is none of those behind `exitance`.
+    """
+    found, parameters = [], mi.traverse(scene)
+    for emitter in scene.emitters():
+        if is_surface(emitter) and any(dr.grad_enabled(value) for value in _behind_exitance(emitter)):
+            found.append(emitter)
+    _refuse_others(scene, parameters)
+    _refuse_others(scene, mi.traverse(sensor))
+    return found
+
+
+def _behind_exitance(emitter: mi.Emitter) -> Iterator[Any]:
+    """Values of the numbers behind `exitance` that may have gradients."""
+    parameters = mi.traverse(emitter.exitance)
+    yield from (parameters[key] for key in parameters.keys() if _differentiable(parameters, key))
+    name, on_shape = attribute_name(emitter.exitance), mi.traverse(emitter.get_shape())
+    if name is not None and name in on_shape:
+        yield on_shape[name]
+
+
+def _refuse_others(scene: mi.Scene, parameters: mi.SceneParameters) -> None:
+    """Raise SceneError for a parameter with gradients that is not behind `exitance`."""
+    attributes = {
+        (emitter.get_shape().id(), attribute_name(emitter.exitance))
+        for emitter in scene.emitters()
+        if is_surface(emitter)
+    }
+    for key in parameters.keys():
+        if not dr.grad_enabled(parameters[key]):
+            continue
+        node, last = parameters.properties[key][2], key.rpartition(".")[2]
+        on_mesh = isinstance(node, mi.Shape) and (node.id(), last) in attributes
+        if not (on_mesh or (_below_surface(parameters, node) and _differentiable(parameters, key))):
+            raise SceneError(
+                f"fspt_integral: parameter '{key}' has gradients enabled, but the picture is differentiated by what "
+                f"is behind 'exitance' alone. Give dr.disable_grad(params['{key}']), or take differences of pictures."
+            )
+
+
+def _differentiable(parameters: mi.SceneParameters, key: str) -> bool:
+    return not parameters.flags(key) & mi.ParamFlags.NonDifferentiable
+
+
+def _below_surface(parameters: mi.SceneParameters, node: Any) -> bool:
+    """True for an `fspt_surface` and what belongs to it."""
+    while node is not None:
+        if isinstance(node, mi.Emitter):
+            return is_surface(node)
+        node = parameters.hierarchy[node][0]
+    return False

@@ -1,0 +1,223 @@
+"""Rows of the derivative of a picture by J_n: Eq. 9 in its pupil form, by a fixed set of lines of sight for each pixel.
+
+P is linear in J_n: P_i = Σ_l w_il J_n(r_il) · profile, with one point r_il where each line of sight ends. Forward mode
+sums the tangent of J_n over the same lines whose weights reverse mode hands to the numbers behind J_n: the two are
+transposes of each other. The sum of the weights of a pixel is made that of the picture of J_n = 1 by the integral, so
+that silhouettes are as right as the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..emission.exitance import attribute_name, function_on, texels_of
+from ..jit.mesh_buffers import triangles
+from .eq9 import View, eq9, etendue_from_pixel
+from .lattices import VECTOR
+from .quadrature import Quadrature
+
+if TYPE_CHECKING:
+    from .solution import Solution
+
+# A column, the derivative by one value behind J_n, that N lines meet is right to 1/N where J_n is continuous, and to
+# N^(-3/4) where it steps from face to face.
+FEWEST, MOST = 1 << 6, 1 << 14  # lines of a pixel
+# Lines of a picture at rtol 1e-3: columns smaller than a pixel's are less right where the most of them, some two
+# seconds, do not meet them often enough. The least of them take a twentieth of a second.
+LEAST_LINES, MOST_LINES = 1 << 19, 1 << 24
+FINER = 4  # times as many lines where they miss the picture of J_n = 1 by rtol, as often as `MOST_LINES` allow
+CERTAIN = 0.35  # of its estimated error: what that picture is wrong by at the most, as a rule
+LARGEST_FACTOR = 2.0  # on a row
+BATCH = 1 << 21  # lines of sight in one kernel: float32 adds no more of them than this to one number
+
+Array = NDArray[np.float64]
+Sizes = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class RowGroup:
+    """Pixels (n,) of the crop window with equally many `lines` of sight each, and factors (n,) on their rows."""
+
+    lines: int
+    pixels: NDArray[np.uint32]
+    factors: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The rows of all pixels of a crop window that see anything; `shape` (h, w). Whatever J_n is."""
+
+    shape: tuple[int, int]
+    groups: tuple[RowGroup, ...]
+    kept: tuple[Any, ...] = ()  # whose indices tell whether the rows are still right
+
+    @classmethod
+    def of(cls, view: View, quadrature: Quadrature, picture: Solution, window: NDArray[np.bool_], sizes: Sizes) -> Rows:
+        """Rows of the pixels in `window` (h, w), from the `picture` of J_n = 1, which all surfaces must now have.
+
+        sizes : number of values behind J_n, see `sizes_of`
+        """
+        power, uncertain = (plane.ravel() / view.lens.etendue for plane in (picture.power, picture.error))
+        tolerance = quadrature.rtol * power.max(initial=0.0)
+        pixels = np.flatnonzero(window.ravel() & ((power > 0) | (uncertain > tolerance)))
+        lines, groups = _lines_for(quadrature, sizes, len(pixels)), []
+        while len(pixels):
+            sums = _sums(view, quadrature, RowGroup(lines, pixels.astype(np.uint32), np.ones(len(pixels), np.float32)))
+            off = np.abs(power[pixels] - sums)
+            finer, rough = FINER * lines, off > tolerance
+            if finer > min(FINER * MOST, quadrature.max_nodes) or finer * np.count_nonzero(rough) > MOST_LINES // 2:
+                rough[:] = False
+            wanted = np.where(off > CERTAIN * uncertain[pixels], power[pixels], sums)
+            factors = np.divide(wanted, sums, out=np.ones(len(pixels)), where=sums > 0)
+            settled = ~rough & (sums > 0)
+            groups.append(
+                RowGroup(
+                    lines,
+                    pixels[settled].astype(np.uint32),
+                    np.clip(factors[settled], 0, LARGEST_FACTOR).astype(np.float32),
+                )
+            )
+            pixels, lines = pixels[rough], finer
+        return cls(picture.power.shape, tuple(group for group in groups if len(group.pixels)))
+
+    def forward(self, view: View, quadrature: Quadrature, emitters: Sequence[mi.Emitter]) -> Array:
+        """Tangent (h, w) [W] of the picture, of that of the numbers behind J_n of these emitters."""
+        tangent = np.zeros(math.prod(self.shape))
+        for part in self._parts(view, quadrature):
+            with dr.resume_grad():
+                radiance = part.radiance(emitters)
+                if not dr.grad_enabled(radiance):
+                    continue
+                dr.forward_to(radiance, flags=dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
+                change = dr.grad(radiance)
+            light = eq9(mi.Float64(change), mi.Float64(part.etendue))
+            tangent[part.pixels] = (dr.block_sum(light, part.lines)).numpy() * part.factors
+        return tangent.reshape(self.shape) * view.lens.etendue
+
+    def backward(self, view: View, quadrature: Quadrature, emitters: Sequence[mi.Emitter], gradient: Array) -> None:
+        """Add the transpose of `forward` of a `gradient` (h, w) [1/W] to the gradients of the numbers behind J_n."""
+        for part in self._parts(view, quadrature):
+            of_row = mi.Float(gradient.ravel()[part.pixels] * part.factors * view.lens.etendue)
+            weight = eq9(dr.gather(mi.Float, of_row, part.row), part.etendue)
+            with dr.resume_grad():
+                radiance = part.radiance(emitters)
+                if dr.grad_enabled(radiance):
+                    dr.backward_from(radiance * weight)
+            dr.eval()
+
+    def _parts(self, view: View, quadrature: Quadrature) -> Iterator[_Part]:
+        for group in self.groups:
+            yield from _parts(view, quadrature, group)
+
+
+def sizes_of(emitters: Sequence[mi.Emitter]) -> Sizes:
+    """Number of values behind J_n of these emitters, between which J_n is continuous and between which it steps."""
+    smooth = stepped = 0
+    for emitter in emitters:
+        name, texture = attribute_name(emitter.exitance), emitter.exitance
+        if name is None:
+            smooth += texels_of(texture)
+        elif name.startswith("face"):
+            stepped += dr.width(triangles(emitter.get_shape())[1]) // 3
+        else:
+            smooth += dr.width(triangles(emitter.get_shape())[0]) // 3
+    return smooth, stepped
+
+
+def _lines_for(quadrature: Quadrature, sizes: Sizes, pixels: int) -> int:
+    """Lines of sight of each of so many pixels, a power of two."""
+    smooth, stepped = sizes
+    hits = smooth / quadrature.rtol + stepped / quadrature.rtol ** (4 / 3)
+    scale = math.sqrt(1e-3 / quadrature.rtol)
+    wanted = float(np.clip(hits, LEAST_LINES * scale, MOST_LINES * scale)) / max(pixels, 1)
+    most = math.log2(min(MOST, max(FEWEST, quadrature.max_nodes)))
+    return 1 << int(np.clip(round(math.log2(max(wanted, 1))), math.log2(FEWEST), most))
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Lines of sight of some pixels, those of a pixel one after the other.
+
+    pixels, factors : of the group. row : of each line, its pixel's place in `pixels`
+    etendue : of each line over that of its pixel
+    """
+
+    pixels: NDArray[np.uint32]
+    factors: NDArray[np.float32]
+    lines: int
+    row: mi.UInt32
+    etendue: mi.Float
+    si: mi.SurfaceInteraction3f
+    towards: mi.Vector3f
+
+    def radiance(self, emitters: Sequence[mi.Emitter]) -> mi.Float:
+        """Radiance [W/mm²/sr] of these emitters along each line, attached to the numbers behind their J_n."""
+        total = mi.Float(0)
+        for emitter in emitters:
+            shape = emitter.get_shape()
+            value = function_on(shape, emitter.exitance)
+            with dr.suspend_grad():
+                outward = self.si.is_valid() & (dr.dot(self.si.n, self.towards) > 0)
+                met = outward & (self.si.shape == mi.ShapePtr(shape))
+                profile = emitter.law.profile(self.si, self.towards, met)
+                # On a sliver, where interpolation in single precision fails, J_n is NaN.
+                met &= dr.isfinite(profile * value(self.si, met))
+                profile = dr.select(met, profile, 0)
+            total = total + value(self.si, met) * profile
+        return total
+
+
+def _parts(view: View, quadrature: Quadrature, group: RowGroup) -> Iterator[_Part]:
+    """The lines of sight of a group's pixels, in batches of at most `BATCH`."""
+    size = max(1, BATCH // group.lines)
+    for first in range(0, len(group.pixels), size):
+        chosen = slice(first, first + size)
+        position, pupil, row = _places(view, quadrature, group.pixels[chosen], group.lines)
+        pupil, open_share = view.lens.open_pupil(position, pupil)
+        ray, cos_theta, passes = view.lens.line_of_sight(position, pupil, view.start)
+        etendue = etendue_from_pixel(cos_theta, passes, open_share) * dr.opaque(mi.Float, 1 / group.lines)
+        si = view.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=passes)
+        yield _Part(group.pixels[chosen], group.factors[chosen], group.lines, row, etendue, si, -ray.d)
+
+
+def _sums(view: View, quadrature: Quadrature, group: RowGroup) -> Array:
+    """Mean of the integrand of Eq. 9 [W/mm²/sr] over the lines of each pixel of a group, of the present J_n."""
+    found = []
+    size = max(1, BATCH // group.lines)
+    for first in range(0, len(group.pixels), size):
+        position, pupil, _ = _places(view, quadrature, group.pixels[first : first + size], group.lines)
+        light = view.integrand(position, pupil, together=True).integrand
+        found.append(dr.block_sum(mi.Float64(light), group.lines).numpy() / group.lines)
+    return np.concatenate(found)
+
+
+def _places(
+    view: View, quadrature: Quadrature, pixels: NDArray[np.uint32], lines: int
+) -> tuple[mi.Point2f, mi.Point2f, mi.UInt32]:
+    """Film position [pixels] and pupil point [unit disc] of each line of sight, and the place of its pixel in `pixels`.
+
+    A rank-1 lattice, the same in every pixel: on the film it continues from pixel to pixel.
+    """
+    film = view.lens.film()
+    width = dr.opaque(mi.UInt32, int(film.crop_size()[0]))
+    left, top = (dr.opaque(mi.Float, float(n)) for n in film.crop_offset())
+    lane, each = dr.arange(mi.UInt32, len(pixels) * lines), dr.opaque(mi.UInt32, lines)
+    row = lane // each
+    k = lane - row * each
+    pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), row)
+    step = dr.opaque(mi.UInt32, (1 << 32) // lines)
+    # In units of 2⁻³², where whole numbers wrap around as a lattice does; the points are middles of their steps.
+    places = (k * dr.opaque(mi.UInt32, generator) * step + (step >> 1) for generator in VECTOR)
+    x, y, u, v = (mi.Float(place >> 8) * 2.0**-24 for place in places)
+    area = dr.opaque(mi.Float, float(quadrature.pixel == "area"))
+    within = 0.5 + area * (mi.Point2f(x, y) - 0.5)
+    position = mi.Point2f(left + mi.Float(pixel % width), top + mi.Float(pixel // width)) + mi.Vector2f(within)
+    return position, mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v)), row
