@@ -29,7 +29,7 @@ ARROWS = {
     "rendering": {"runtime", "images", "jit", "emission", "integral"},
     "validation": {"runtime", "optics", "jit", "emission", "integral", "rendering"},
     "studies": {"runtime", "optics", "images", "jit", "emission", "integral", "rendering", "validation"},
-    "inverse": {"runtime", "images", "jit", "integral", "rendering", "studies"},
+    "inverse": {"runtime", "images", "phantom", "jit", "integral", "rendering", "studies"},
     "cli": {"runtime", "images", "phantom", "tissue", "rendering", "studies", "inverse", "validation"},
 }
 # Beside tests, only these import the independent truths of `validation`.
@@ -44,12 +44,14 @@ PUBLIC = [
     "Exposure",
     "FsptError",
     "Image",
+    "Inversion",
     "Phantom",
     "TransportMatrix",
     "compare",
     "converge",
     "explain",
     "import_flux",
+    "invert",
     "load",
     "read",
     "read_transport",

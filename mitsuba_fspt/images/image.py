@@ -25,6 +25,7 @@ class Image:
     coverage : array, shape (h, w), unweighted share in [0, 1] of a pixel's lines of sight that reach a shape with
         `fspt_surface`, or None
     metadata : text and numbers that record the origin of the image; `quantity` and `unit` are added
+    mask : bool array, shape (h, w), True for pixels to leave out, as saturated ones, or None
 
     The arrays are stored as read-only views with at least 32-bit floats.
 
@@ -38,9 +39,12 @@ class Image:
     error: NDArray[np.floating] | None = None
     coverage: NDArray[np.floating] | None = None
     metadata: Metadata = field(default_factory=dict)
+    mask: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         shape = np.shape(self.power)
+        if self.mask is not None:
+            object.__setattr__(self, "mask", _mask_plane(self.mask, shape))
         for name in ("power", "error", "coverage"):
             values = getattr(self, name)
             if values is None and name != "power":
@@ -80,14 +84,14 @@ class Image:
             )
         error = None if self.error is None else self.error.astype(np.float64) * watt
         metadata = self.metadata | {"source_power": watt}
-        return Image(self.power.astype(np.float64) * watt, error, self.coverage, metadata)
+        return Image(self.power.astype(np.float64) * watt, error, self.coverage, metadata, self.mask)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
         """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
         return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y` (float32), metadata under `fspt:`.
+        """Write an EXR file: channels `Y`, `error.Y`, `coverage.Y`, `mask.Y` (float32), metadata under `fspt:`.
 
         The file is written completely or not at all. Pixels below float32's 1e-38 may become 0; an image whose
         brightest pixel lies below that is refused.
@@ -103,13 +107,14 @@ class Image:
                 "Scale the exitance up."
             )
         planes = {"Y": self.power, "error.Y": self.error, "coverage.Y": self.coverage}
+        planes["mask.Y"] = None if self.mask is None else self.mask.astype(np.float32)
         write_exr(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
 
 
 def read(path: str | os.PathLike[str]) -> Image:
     """Image of an EXR file with a channel `Y`, whose values count as power [W] on a pixel.
 
-    `error` and `coverage` are None if the file has no channel `error.Y`, `coverage.Y`.
+    `error`, `coverage` and `mask` are None if the file has no channel `error.Y`, `coverage.Y`, `mask.Y`.
 
     Raises
     ------
@@ -123,7 +128,8 @@ def read(path: str | os.PathLike[str]) -> Image:
             "Give a file that fspt wrote."
         )
     try:
-        return Image(channels["Y"], channels.get("error.Y"), channels.get("coverage.Y"), metadata)
+        mask = channels["mask.Y"] != 0 if "mask.Y" in channels else None
+        return Image(channels["Y"], channels.get("error.Y"), channels.get("coverage.Y"), metadata, mask)
     except ImageError as cause:
         raise ImageError(f"image file '{path}': {cause}") from cause
 
@@ -134,6 +140,19 @@ def required_source_power(watt: float) -> float:
     if not 0 < found < math.inf:
         raise ImageError(f"image: 'source_power' must be finite and > 0 W, got {found:g}. Give for example 1e-9.")
     return found
+
+
+def _mask_plane(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """`values` as a read-only array of True and False of this shape; ImageError for anything else."""
+    array = np.asarray(values)
+    if array.dtype != bool or array.shape != shape:
+        raise ImageError(
+            f"image: 'mask' must be True and False of the shape {shape} of 'power', got {array.dtype} of shape "
+            f"{array.shape}. Give True for pixels to leave out."
+        )
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:

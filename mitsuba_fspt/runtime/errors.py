@@ -40,6 +40,10 @@ class TransportError(FsptError):
     """A transport matrix that cannot be made, stored, read, or applied to what is given."""
 
 
+class InversionError(FsptError):
+    """Images from which J_n, a source or a camera's parameters cannot be inferred, or options that do not fit them."""
+
+
 @contextmanager
 def named(thing: str) -> Iterator[None]:
     """Context manager: puts `thing: ` before the message of an FsptError that its block raises."""
