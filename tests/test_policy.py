@@ -30,7 +30,7 @@ ARROWS = {
     "validation": {"runtime", "optics", "jit", "emission", "integral", "rendering"},
     "studies": {"runtime", "optics", "images", "jit", "emission", "integral", "rendering", "validation"},
     "inverse": {"runtime", "images", "phantom", "jit", "integral", "rendering", "studies"},
-    "cli": {"runtime", "images", "phantom", "tissue", "rendering", "studies", "inverse", "validation"},
+    "cli": {"runtime", "optics", "images", "phantom", "tissue", "rendering", "studies", "inverse", "validation"},
 }
 # Beside tests, only these import the independent truths of `validation`.
 IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}

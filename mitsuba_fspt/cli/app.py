@@ -17,7 +17,9 @@ from .checks import doctor, explain, stability
 from .converge import converge
 from .flux import app as flux
 from .images import compare, expose, plot
+from .invert import invert
 from .matrix import matrix
+from .reduce import reduce
 from .render import render
 from .sweep import sweep
 from .terminal import Interrupted
@@ -30,7 +32,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
-for verb in (render, plot, compare, expose, doctor, stability, explain, sweep, converge, matrix):
+for verb in (render, plot, compare, expose, doctor, stability, explain, sweep, converge, matrix, reduce, invert):
     app.command()(verb)
 app.add_typer(flux, name="flux")
 

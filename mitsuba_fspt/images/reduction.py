@@ -12,17 +12,18 @@ import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..runtime.errors import BackendError, DetectorError
+from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
-from .counts import Counts, counts_of, read_counts
+from .counts import FITS, TIFF, Counts, counts_of, read_counts
 from .detector import PLANCK_TIMES_LIGHT, RECORDED, Detector, Exposure
-from .exr import Metadata
-from .image import Image
+from .exr import Metadata, read_exr
+from .image import Image, read
 
 if TYPE_CHECKING:
     Array = NDArray[np.float64]
@@ -286,3 +287,28 @@ def _image(
     if exposed.pixel_pitch is not None:
         kept["pixel_pitch"] = exposed.pixel_pitch
     return Image(total / per_watt, error, metadata=kept, mask=mask)
+
+
+def read_measured(path: str | os.PathLike[str]) -> Image:
+    """Image in W of a file: of `fspt reduce` or a render, or electrons of `fspt expose`, reduced by their metadata.
+
+    Raises
+    ------
+    ImageError : the file cannot be read.
+    DetectorError : electrons without the numbers of their detector, or counts, which `fspt reduce` takes.
+    """
+    path = Path(path)
+    if path.suffix.lower() in (*TIFF, *FITS, ".npy", ".png") or path.is_dir():
+        raise DetectorError(f"'{path}' holds counts without their detector's numbers. Reduce it with 'fspt reduce'.")
+    channels, metadata = read_exr(path)
+    if metadata.get("quantity") != "electrons" or "Y" not in channels:
+        return read(path)
+    electrons = channels["Y"].astype(np.float32)
+    if not np.isfinite(electrons).all():
+        raise ImageError(f"image file '{path}' has electrons that are NaN or inf. Expose it again.")
+    with named(f"'{path}'"):
+        if missing := [name for name in ("gain", "bias", "bits") if name not in metadata]:
+            raise DetectorError(f"the electrons come without '{missing[0]}'. Reduce the counts with 'fspt reduce'.")
+        counts = np.rint(float(metadata["bias"]) + electrons / float(metadata["gain"]))
+        top = 2 ** int(metadata["bits"]) - 1
+        return reduced(Exposure(electrons, np.clip(counts, 0, top).astype(np.uint16), metadata))

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from scipy.optimize import nnls
 from scipy.sparse import csr_array
+from sphere_views import RADIUS, noisy, sphere_views
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.nonnegative import Accuracy, factor, minimise
@@ -16,44 +17,12 @@ from mitsuba_fspt.inverse.smoothness import Prior, Smoothness
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.runtime.errors import DetectorError, InversionError, TransportError
 
-RADIUS = 6.0
-VIEWS = [0, 90, 180, 270]
-SCENE = """<scene version="3.0.0">
-    <default name="view" value="0"/>
-    <integrator type="fspt_integral"/>
-    <sensor type="fspt_lens">
-        <float name="focal_length" value="55"/><float name="f_number" value="2.8"/>
-        <float name="magnification" value="0.5"/><float name="pixel_pitch" value="0.5"/>
-        <transform name="to_world"><lookat origin="165, 0, 0" target="0, 0, 0" up="0, 0, 1"/></transform>
-        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
-            <string name="pixel_format" value="luminance"/></film>
-    </sensor>
-    <shape type="ply">
-        <string name="filename" value="sphere.ply"/><boolean name="face_normals" value="true"/>
-        <transform name="to_world"><rotate z="1" angle="$view"/></transform>
-        <emitter type="fspt_surface"><float name="exitance" value="1e-3"/></emitter>
-    </shape>
-</scene>"""
-
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory, mono):
     """Matrix of a sphere in four views, and a smooth J_n on it [W/mm²]."""
-    folder = tmp_path_factory.mktemp("sphere")
-    trimesh.creation.icosphere(subdivisions=2, radius=RADIUS).export(folder / "sphere.ply")
-    (folder / "sphere.xml").write_text(SCENE)
-    matrix = fspt.transport(folder / "sphere.xml", view=VIEWS, rtol=1e-3)
-    z = Surface.of(matrix).vertices[:, 2]
-    return matrix, 1e-3 * (1 + 0.5 * z / RADIUS)
-
-
-def noisy(matrix, exitance, electrons, seed, read_noise=3.5, **metadata):
-    """Pictures with `electrons` on the brightest pixel, Poisson and read noise."""
-    power, rng = matrix.forward(exitance), np.random.default_rng(seed)
-    per_watt = electrons / power.max()
-    counted = rng.poisson(power * per_watt) + read_noise * rng.standard_normal(power.shape)
-    metadata = {"electrons_per_watt": per_watt, "read_noise": read_noise} | metadata
-    return [fspt.Image(plane / per_watt, metadata=metadata) for plane in counted]
+    matrix = sphere_views(tmp_path_factory.mktemp("sphere"))
+    return matrix, 1e-3 * (1 + 0.5 * Surface.of(matrix).vertices[:, 2] / RADIUS)
 
 
 # --- the operator and the solver ---
