@@ -13,7 +13,7 @@ from ..runtime.numbers import number
 from .surface import Surface
 
 Array = NDArray[np.float64]
-# Of the largest eigenvalue of the penalty: keeps J_n determined where no pixel sees a whole connected piece. The
+# Of the median diagonal of the penalty per area: keeps J_n determined where no pixel sees a whole connected piece. The
 # smoothest mode of a surface of 100 edges across has an eigenvalue of 1e-6 of it, so that no visible mode changes.
 RIDGE = 1e-10
 
@@ -67,7 +67,7 @@ class Smoothness:
         operator = surface.stiffness + diags_array(kappa**2 * mass)
         root = csr_array(diags_array(1 / (np.sqrt(mass) * relative)) @ operator)
         matrix = csr_array(root.T @ root)
-        ridge = RIDGE * float((matrix.diagonal() / mass).max())
+        ridge = RIDGE * float(np.median(matrix.diagonal() / mass))
         return cls(root, csr_array(matrix + diags_array(ridge * mass)))
 
     def energy(self, x: Array) -> float:

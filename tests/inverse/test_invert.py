@@ -170,8 +170,8 @@ def test_weight_and_chi2(case):
 def test_intervals_hold(case):
     """Truths of the penalty's own prior, 60 replicates: 90 % of the intervals of vertices hold, and of totals.
 
-    The script interval_calibration.py makes the table with 400. Seen to fail (72 %) with half of the noise in the
-    draws, and (totals 60 %) without the prior's share.
+    The script interval_calibration.py makes the table with 400. Seen to fail (vertices 79 %) with half of the noise in
+    the draws, and (72 %) without the share of the prior.
     """
     matrix, _ = case
     surface = Surface.of(matrix)
@@ -228,7 +228,7 @@ def test_exposures_and_images_in_watts_agree(case):
     meta = {"electrons_per_watt": per_watt, "read_noise": 3.5, "dark_electrons": 0.6}
     watts = [fspt.Image((e.electrons.astype(float) - 0.6) / per_watt, metadata=meta) for e in found]
     np.testing.assert_allclose(fspt.invert(matrix, watts, weight=10.0).exitance, r.exitance, rtol=1e-6)
-    assert r.total == pytest.approx(matrix.areas @ exitance * scale, rel=0.05)
+    assert r.total == pytest.approx(matrix.areas @ exitance * scale, rel=0.05, abs=0)
 
 
 def test_files(case, tmp_path):
