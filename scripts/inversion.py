@@ -1,9 +1,9 @@
 """J_n of the nylon cylinder from four noisy views, without the inverse crime: tables of error against light and stop.
 
-    python scripts/inversion.py [--spp 4096] [--samples 200] [--tables light,stop,views] [-o docs/inversion.csv]
+    python scripts/inversion.py [--spp 1024] [--samples 200] [--tables light,stop,views] [-o docs/inversion.csv]
 
 The pictures are of scenes/nylon_cylinder.ply (45,002 vertices), by Mitsuba's `path`, 96 x 96 pixels a view; counts by
-`expose`, with 3.5 electrons of read noise. The inversion uses another mesh of the same cylinder (edges of 0.8 mm) with
+`expose`, with 3.5 electrons of read noise. The inversion uses another mesh of the same cylinder (edges of 1 mm) with
 its own transport matrix. Its total is compared over what is seen, its J_n with the fine one at the nearest vertices.
 
 Columns: electrons on the brightest pixel, bias of the seen total [%], half of its 90 % interval [%], relative L2 error
@@ -139,9 +139,9 @@ def rows(tables: list[str], folder: Path, spp: int, samples: int, edge: float) -
 def main() -> None:
     """Write the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--spp", type=int, default=4096)
+    parser.add_argument("--spp", type=int, default=1024)
     parser.add_argument("--samples", type=int, default=200)
-    parser.add_argument("--edge", type=float, default=0.8)
+    parser.add_argument("--edge", type=float, default=1.0)
     parser.add_argument("--tables", default="light,stop,views")
     parser.add_argument("--folder", type=Path, default=Path("out"))
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "inversion.csv")

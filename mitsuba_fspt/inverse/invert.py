@@ -37,13 +37,14 @@ class Settings:
     """Accuracy of `invert`.
 
     accuracy : of the minimum
-    drawn : of the minima of random draws; a decrement of 0.01 widens an interval by at most 0.5 %
+    drawn : of the minima of random draws and while variances and weight are sought; a decrement of 0.01 widens an interval by at most 0.5 %
     reweighted : relative change of the standard deviations, root mean square, at which they count as converged; it
         changes χ² by as much
     rounds : most rounds of variances and weight
     weight : change of log(weight) at which it counts as converged: 1/10 of its own uncertainty for 200 determined
         unknowns
     probes : random vectors for the number of determined unknowns, whose relative error is about (2/(probes γ))^½
+    first : weight to begin with, over that at which data and penalty have the same trace
     darkest : of the reference, the least ρ of the penalty: below it J_n is no better known than its noise
     seen : of the largest sensitivity per area, the least at which a vertex counts as seen
     block : samples that are computed together
@@ -56,6 +57,7 @@ class Settings:
     rounds: int = 40
     weight: float = 0.01
     probes: int = 8
+    first: float = 100.0
     darkest: float = 0.05
     seen: float = 0.01
     block: int = 25
@@ -257,18 +259,18 @@ class Problem:
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (self.surface.unknowns, self.settings.probes))
         for turn in range(self.settings.rounds):
             report("fit", turn / self.settings.rounds)
-            before, state = state, self._improved(state, probes, weight)
+            before, state = state, self._improved(state, probes, weight, self.settings.drawn)
             drift = float(np.sqrt(np.mean((state.sigma / before.sigma - 1) ** 2)))
             changed = abs(np.log(state.weight / before.weight)) if weight is None else 0.0
             if drift < self.settings.reweighted and changed < self.settings.weight:
                 break
-        return state
+        return self._improved(state, probes, weight, self.settings.accuracy)
 
-    def _improved(self, state: Fit, probes: Array, weight: float | None) -> Fit:
+    def _improved(self, state: Fit, probes: Array, weight: float | None, accuracy: Accuracy) -> Fit:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
         normal, solve = self._normal(state.sigma, state.weight)
         right = self._right(self.measurement.power[self.rows], state.sigma, state.weight)
-        found = minimise(normal, right[:, None], state.x[:, None], self.bounded, solve, self.settings.accuracy)
+        found = minimise(normal, right[:, None], state.x[:, None], self.bounded, solve, accuracy)
         x = found.x[:, 0]
         determined = self._determined(normal, solve, state.weight, probes)
         if weight is None:  # Eq. M.23
@@ -278,9 +280,9 @@ class Problem:
         return Fit(x, sigma, numerical, weight, determined, float(found.decrement[0]))
 
     def _first_weight(self, sigma: Array) -> float:
-        """Weight at which data and penalty have the same trace."""
+        """Weight to begin with: above the one at which data and penalty have the same trace, where few J_n are 0."""
         trace = float((self.transport.multiply((1 / sigma)[:, None]) ** 2).sum())
-        return max(trace / float(self.smoothness.matrix.diagonal().sum()), 1e-300)
+        return max(self.settings.first * trace / float(self.smoothness.matrix.diagonal().sum()), 1e-300)
 
     def _determined(self, normal: csr_array, solve: Solve, weight: float, probes: Array) -> float:
         """γ, the number of unknowns that the data determine: tr((H + w Q)⁻¹ H), by random vectors."""
