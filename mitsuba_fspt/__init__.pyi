@@ -4,6 +4,8 @@ from .images.detector import Detector as Detector
 from .images.detector import Exposure as Exposure
 from .images.image import Image as Image
 from .images.image import read as read
+from .inverse.inversion import Inversion as Inversion
+from .inverse.invert import invert as invert
 from .inverse.transport import transport as transport
 from .inverse.transport_file import read_transport as read_transport
 from .inverse.transport_matrix import TransportMatrix as TransportMatrix

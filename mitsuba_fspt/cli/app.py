@@ -17,7 +17,9 @@ from .checks import doctor, explain, stability
 from .converge import converge
 from .flux import app as flux
 from .images import compare, expose, plot, roi
+from .invert import invert
 from .matrix import matrix
+from .reduce import reduce
 from .render import render
 from .scene import app as scene
 from .sweep import sweep
@@ -31,7 +33,8 @@ app = typer.Typer(
     rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
-for verb in (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge, matrix, view):
+VERBS = (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge, matrix, reduce, invert, view)
+for verb in VERBS:
     app.command()(verb)
 app.add_typer(flux, name="flux")
 app.add_typer(scene, name="scene")

@@ -16,9 +16,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, DetectorError, ImageError
@@ -42,6 +43,23 @@ EXAMPLES = {
     "pixel_pitch": "0.0135",
 }
 TABLES = ("detector", "lens")  # of a camera's TOML file; the lens is for other readers
+COMMENTS = {
+    "quantum_efficiency": "electrons per photon, η of EMVA 1288",
+    "dark_current": "e-/px/s",
+    "read_noise": "e-, temporal dark noise of EMVA 1288",
+    "full_well": "e-, saturation capacity of EMVA 1288",
+    "gain": "e-/DN, 1/K of EMVA 1288",
+    "bias": "DN",
+    "bits": "of the converter",
+    "pixel_pitch": "mm, of the pixel of the dark current",
+    "gain_error": "relative standard uncertainty common to all pixels",
+}
+# Names of EMVA 1288 that a TOML may use instead; the overall system gain K is in DN/e-.
+EMVA_1288 = {
+    "temporal_dark_noise": "read_noise",
+    "saturation_capacity": "full_well",
+    "overall_system_gain": "gain",
+}
 RECORDED = {name: name for name in EXAMPLES} | {"pixel_pitch": "detector_pixel_pitch"}
 
 
@@ -131,6 +149,7 @@ class Detector:
     pixel_pitch : [mm], > 0, of the pixel to which `dark_current` refers; for an image with another `pixel_pitch` in
         its metadata the dark current is scaled by area. None: it refers to the image's pixels, whatever their pitch
     name : label in the files
+    gain_error : relative standard uncertainty of a factor common to all pixels, in [0, 1), as of a calibration
 
     Raises
     ------
@@ -146,6 +165,7 @@ class Detector:
     bits: int
     pixel_pitch: float | None = None
     name: str = "detector"
+    gain_error: float = 0.0
 
     @classmethod
     def typical_ccd(cls) -> Detector:
@@ -193,6 +213,7 @@ class Detector:
                 f"'{path}': '{unknown[0]}' means nothing here. Put it into [detector], or leave it out."
             )
         known = {field.name: field.default for field in fields(cls)}
+        table = _own_names(table, path)
         if unknown := [key for key in table if key not in known]:
             raise DetectorError(f"'{path}' [detector]: '{unknown[0]}' means nothing here. Give {', '.join(known)}.")
         if missing := [key for key, default in known.items() if default is MISSING and key not in table]:
@@ -221,8 +242,68 @@ class Detector:
         _require("bias", self.bias, self.bias >= 0, ">= 0 DN, for example 500")
         _require("bits", bits, bits in range(1, 17), "a whole number in 1 … 16, for example 16")
         object.__setattr__(self, "bits", int(bits))
+        error = number("detector: 'gain_error'", self.gain_error, DetectorError, "0.05")
+        object.__setattr__(self, "gain_error", error)
+        _require("gain_error", error, 0 <= error < 1, "in [0, 1), for example 0.05")
         if self.pixel_pitch is not None:
             _require("pixel_pitch", self.pixel_pitch, self.pixel_pitch > 0, "> 0 mm, for example 0.0135")
+
+    def to_toml(self, path: str | os.PathLike[str]) -> None:
+        """Write a camera's TOML file with the table [detector], which `from_toml` reads.
+
+        Raises DetectorError if the file cannot be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".toml":
+            raise DetectorError(f"output file '{path}' must end in .toml. Give a name such as camera.toml.")
+        lines = ["[detector]", f"name = {json.dumps(self.name)}"]
+        for name, comment in COMMENTS.items():
+            if (value := getattr(self, name)) is not None:
+                lines.append(f"{name} = {value!r}  # {comment}")
+        with atomic_path(path, DetectorError) as temporary:
+            temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+    def reduce(
+        self,
+        counts: ArrayLike | str | os.PathLike[str],
+        *,
+        exposure_time: float,
+        wavelength_nm: float,
+        binning: int = 1,
+        pixel_pitch: float | None = None,
+        bias: ArrayLike | str | os.PathLike[str] | None = None,
+        dark: ArrayLike | str | os.PathLike[str] | None = None,
+        flat: ArrayLike | str | os.PathLike[str] | None = None,
+        cosmic_rays: bool = False,
+        metadata: Metadata | None = None,
+    ) -> Image:
+        """Image in W of raw counts, with its standard error, and the mask of saturated pixels.
+
+        Parameters
+        ----------
+        counts : (h, w) or (frames, h, w) [DN], or the name of a .tif, .fits, .npy file or of a click folder
+        exposure_time : [s] of one frame, > 0
+        wavelength_nm : of the light in vacuum [nm]
+        binning : side of the square of pixels that was read out as one
+        pixel_pitch : of the pixels read out [mm]; the image needs it to be checked against a scene
+        bias, dark, flat : frames or stacks [DN] in place of the numbers `bias` and `dark_current`; `dark` has the same
+            exposure time and contains the bias, `flat` is free of both
+        cosmic_rays : also mask pixels that cosmic rays hit
+        metadata : to be kept with the image
+
+        The image's metadata hold `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (the variance of dark
+        current, rounding and subtracted frames [e-²]) and `gain_error`: what the noise of any signal follows from.
+
+        Raises
+        ------
+        DetectorError : a parameter outside its range, a frame of another size.
+        ImageError : a file that cannot be read;  BackendError : ccdproc, tifffile or astropy is missing.
+        """
+        from .reduction import Exposed, reduce_counts
+
+        exposed = Exposed(exposure_time, wavelength_nm, binning, pixel_pitch)
+        frames = {"bias": bias, "dark": dark, "flat": flat}
+        return reduce_counts(self, counts, exposed, **frames, cosmic_rays=cosmic_rays, metadata=metadata)
 
     def expected(self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1) -> Expectation:
         """Mean and variance of the electrons that `expose` draws, before the full well limits them.
@@ -284,11 +365,29 @@ class Detector:
             "saturated_pixels": int(np.sum(full | (counts >= top))),
         }
         metadata |= {key: getattr(self, name) for name, key in RECORDED.items() if getattr(self, name) is not None}
+        if self.gain_error:
+            metadata["gain_error"] = self.gain_error
         if "pixel_pitch" in image.metadata:
             metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
         if binning > 1:  # of a crop window, in pixels of the read-out
             metadata |= {key: float(image.metadata[key]) / binning for key in CROP if key in image.metadata}
         return Exposure(electrons, counts.astype(np.uint16), metadata)
+
+
+def _own_names(table: dict[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
+    """A table [detector] with the names of EMVA 1288 replaced by ours; DetectorError for a number given twice."""
+    found = dict(table)
+    for theirs, ours in EMVA_1288.items():
+        if theirs not in found:
+            continue
+        if ours in found:
+            raise DetectorError(f"'{path}' [detector]: '{theirs}' and '{ours}' are the same. Give one of them.")
+        value = found.pop(theirs)
+        if theirs == "overall_system_gain":
+            value = number(f"'{path}' [detector]: '{theirs}'", value, DetectorError, "0.625")
+            value = 1 / value if value else math.inf
+        found[ours] = value
+    return found
 
 
 def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:

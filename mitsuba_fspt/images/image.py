@@ -30,6 +30,7 @@ class Image:
     coverage : array, shape (h, w), unweighted share in [0, 1] of a pixel's lines of sight that reach a shape with
         `fspt_surface`, or None
     metadata : text and numbers that record the origin of the image; `quantity` and `unit` are added
+    mask : bool array, shape (h, w), True for pixels to leave out, as saturated ones, or None
 
     The arrays are stored as read-only views with at least 32-bit floats.
 
@@ -43,9 +44,12 @@ class Image:
     error: NDArray[np.floating] | None = None
     coverage: NDArray[np.floating] | None = None
     metadata: Metadata = field(default_factory=dict)
+    mask: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         shape = np.shape(self.power)
+        if self.mask is not None:
+            object.__setattr__(self, "mask", _mask_plane(self.mask, shape))
         for name in ("power", "error", "coverage"):
             values = getattr(self, name)
             if values is None and name != "power":
@@ -85,7 +89,7 @@ class Image:
             )
         error = None if self.error is None else self.error.astype(np.float64) * watt
         metadata = self.metadata | {"source_power": watt}
-        return Image(self.power.astype(np.float64) * watt, error, self.coverage, metadata)
+        return Image(self.power.astype(np.float64) * watt, error, self.coverage, metadata, self.mask)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
         """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
@@ -180,13 +184,14 @@ class Image:
                 "Scale the exitance up."
             )
         planes = {"power": self.power, "error": self.error, "coverage": self.coverage}
+        planes["mask"] = None if self.mask is None else self.mask.astype(np.float32)
         write_planes(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
 
 
 def read(path: str | os.PathLike[str]) -> Image:
     """Image of a file that `Image.write` wrote, or of any EXR file with a channel `Y`, which counts as power [W].
 
-    `error` and `coverage` are None if the file does not have them.
+    `error`, `coverage` and `mask` are None if the file does not have them.
 
     Raises
     ------
@@ -202,7 +207,8 @@ def read(path: str | os.PathLike[str]) -> Image:
             "that fspt wrote."
         )
     try:
-        return Image(planes[quantity], planes.get("error"), planes.get("coverage"), metadata)
+        mask = planes["mask"] != 0 if "mask" in planes else None
+        return Image(planes[quantity], planes.get("error"), planes.get("coverage"), metadata, mask)
     except ImageError as cause:
         raise ImageError(f"image file '{path}': {cause}") from cause
 
@@ -213,6 +219,19 @@ def required_source_power(watt: float) -> float:
     if not 0 < found < math.inf:
         raise ImageError(f"image: 'source_power' must be finite and > 0 W, got {found:g}. Give for example 1e-9.")
     return found
+
+
+def _mask_plane(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """`values` as a read-only array of True and False of this shape; ImageError for anything else."""
+    array = np.asarray(values)
+    if array.dtype != bool or array.shape != shape:
+        raise ImageError(
+            f"image: 'mask' must be True and False of the shape {shape} of 'power', got {array.dtype} of shape "
+            f"{array.shape}. Give True for pixels to leave out."
+        )
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:

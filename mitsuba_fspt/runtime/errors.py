@@ -44,6 +44,10 @@ class ViewerError(FsptError):
     """A port that cannot be opened, or a request of a page that cannot be understood."""
 
 
+class InversionError(FsptError):
+    """Images from which J_n, a source or a camera's parameters cannot be inferred, or options that do not fit them."""
+
+
 @contextmanager
 def named(thing: str) -> Iterator[None]:
     """Context manager: puts `thing: ` before the message of an FsptError that its block raises."""

@@ -32,6 +32,9 @@ EXTRAS = (
     Extra("scikit-fem", "skfem", "tissue"),
     Extra("pytetwild", "pytetwild", "mesher"),
     Extra("dask", "distributed", "cluster"),
+    Extra("ccdproc", "ccdproc", "reduce"),
+    Extra("astropy", "astropy", "reduce"),
+    Extra("tifffile", "tifffile", "reduce"),
 )
 
 

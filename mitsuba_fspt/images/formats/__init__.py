@@ -126,7 +126,7 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], Metad
 
 def units(planes: Mapping[str, object], metadata: Metadata) -> dict[str, str]:
     """Unit of each plane: that of the metadata, W or e-, and '1' for the coverage."""
-    return {name: "1" if name == "coverage" else str(metadata.get("unit", "W")) for name in planes}
+    return {name: "1" if name in ("coverage", "mask") else str(metadata.get("unit", "W")) for name in planes}
 
 
 def _plain(key: str, value: object) -> str | int | float:

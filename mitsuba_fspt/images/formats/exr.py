@@ -1,4 +1,4 @@
-"""OpenEXR: 32-bit float channels `Y`, `error.Y`, `coverage.Y`, and metadata as header attributes under `fspt:`."""
+"""OpenEXR: 32-bit float channels `Y`, `error.Y`, `coverage.Y`, `mask.Y`, and metadata as header attributes under `fspt:`."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Exr(Format):
 
 
 def _channel(plane: str) -> str:
-    return f"{plane}.{VALUES}" if plane in ("error", "coverage") else VALUES
+    return f"{plane}.{VALUES}" if plane in ("error", "coverage", "mask") else VALUES
 
 
 def _plane(channel: str, quantity: str) -> str:

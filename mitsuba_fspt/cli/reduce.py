@@ -1,0 +1,130 @@
+"""`fspt reduce`: counts of a camera to power on its pixels, and the calibration by a uniform source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from ..runtime.atomic_files import require_apart
+from ..runtime.errors import DetectorError, ImageError
+from .options import AsJson, Quiet, require_writable
+from .terminal import print_result, progress_bar
+
+if TYPE_CHECKING:
+    from ..images.detector import Detector
+    from ..images.image import Image
+
+Frame = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame or stack [DN]: .tif, .fits, .npy.")]
+
+
+def reduce(
+    counts: Annotated[list[Path], typer.Argument(metavar="COUNTS...", help=".tif, .fits, .npy, or a click folder.")],
+    detector: Annotated[Path, typer.Option(metavar="CAMERA.toml", help="Camera with a table [detector].")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Image to write, .exr; of several OUT_0.exr, …")],
+    wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
+    exposure_time: Annotated[float | None, typer.Option(help="[s] of a frame; that of the file if left out.")] = None,
+    binning: Annotated[int, typer.Option(help="Side of the square of pixels read out as one.")] = 1,
+    pixel_pitch: Annotated[
+        float | None, typer.Option(help="Of the pixels read out [mm]; detector's x binning.")
+    ] = None,
+    bias: Frame = None,
+    dark: Frame = None,
+    flat: Frame = None,
+    cosmic_rays: Annotated[bool, typer.Option("--cosmic-rays", help="Mask pixels that cosmic rays hit.")] = False,
+    calibrate: Annotated[
+        bool, typer.Option("--calibrate", help="The counts show a uniform source; write CALIBRATED.toml.")
+    ] = False,
+    radiance: Annotated[float | None, typer.Option(help="Of that source [W/mm2/sr].")] = None,
+    radiance_error: Annotated[float, typer.Option(help="Relative uncertainty of it.")] = 0.0,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Reduce counts to power in W with its error; saturated pixels are masked.
+
+    With --calibrate and --radiance the counts show a uniform source, such as an
+    integrating sphere, through the lens of the table [lens]: the output is the
+    camera's TOML with the quantum efficiency, lens included, that it shows.
+    """
+    from ..images.detector import Detector
+
+    camera = Detector.from_toml(detector)
+    numbers = {"wavelength_nm": wavelength_nm, "binning": binning}
+    frames = {"bias": bias, "dark": dark, "flat": flat, "cosmic_rays": cosmic_rays}
+    require_writable(output, ".toml" if calibrate else ".exr", DetectorError if calibrate else ImageError)
+    require_apart(output, [*counts, detector, *(p for p in (bias, dark, flat) if p)], error=ImageError)
+    if pixel_pitch is None and camera.pixel_pitch is not None:
+        pixel_pitch = camera.pixel_pitch * binning
+    images: list[Image] = []
+    with progress_bar(quiet) as report:
+        for number, path in enumerate(counts):
+            report(f"reducing {path.name}", number / len(counts))
+            time = _exposure_time(path, exposure_time)
+            image = camera.reduce(path, exposure_time=time, pixel_pitch=pixel_pitch, **numbers, **frames)  # type: ignore[arg-type]
+            images.append(image)
+    if calibrate:
+        record = _calibrated(camera, images, detector, output, radiance, radiance_error)
+        text = f"{output}: quantum efficiency {record['quantum_efficiency']:.5g}, gain error {record['gain_error']:.3g}"
+        print_result(text, record, as_json=as_json, quiet=quiet)
+        return
+    names = [output] if len(images) == 1 else [output.with_stem(f"{output.stem}_{k}") for k in range(len(images))]
+    for image, name in zip(images, names, strict=True):
+        image.write(name)
+    records = [_record(image, name) for image, name in zip(images, names, strict=True)]
+    lines = [f"{r['output']}: {r['power']:.6g} W in total, {r['masked_pixels']} pixels masked" for r in records]
+    print_result("\n".join(lines), {"images": records}, as_json=as_json, quiet=quiet)
+
+
+def _exposure_time(path: Path, given: float | None) -> float:
+    """The given time [s], or that of the file; DetectorError where neither is known."""
+    from ..images.counts import read_counts
+
+    if given is not None:
+        return given
+    found = read_counts(path).exposure_time
+    if found is None:
+        raise DetectorError(f"'{path}' does not say its exposure time. Give --exposure-time, in s.")
+    return found
+
+
+def _record(image: Image, name: Path) -> dict[str, Any]:
+    """Numbers about a reduced image, ready for JSON."""
+    kept = ("electrons_per_watt", "read_noise", "gain_error", "masked_pixels")
+    error = float(np.sqrt((image.error.astype(np.float64) ** 2).sum())) if image.error is not None else 0.0
+    return {"output": str(name), "power": float(image.power.sum()), "error": error} | {
+        k: image.metadata[k] for k in kept
+    }
+
+
+def _calibrated(
+    camera: Detector, images: list[Image], toml: Path, output: Path, radiance: float | None, error: float
+) -> dict[str, Any]:
+    """Write the calibrated camera, and say what changed."""
+    from ..images.reduction import calibrated
+    from ..optics.thin_lens import Lens
+    from ..optics.uniform_source import uniform_power
+    from ..phantom.framed_scene import camera_lens
+
+    if radiance is None or not 0 < radiance < np.inf:
+        raise DetectorError(f"--calibrate needs --radiance > 0 [W/mm2/sr] of the uniform source, got {radiance}.")
+    if not 0 <= error < 1:
+        raise DetectorError(f"--radiance-error must be in [0, 1), got {error:g}. Give for example 0.02.")
+    if len(images) != 1 or "pixel_pitch" not in images[0].metadata:
+        raise DetectorError(
+            f"--calibrate takes one file of counts and needs 'pixel_pitch', got {len(images)}. Give a stack of frames."
+        )
+    numbers = {k: v for k, v in camera_lens(toml).items() if k in ("focal_length", "f_number", "magnification",
+               "focus_distance", "image_distance")}  # fmt: skip
+    lens = Lens.focused(**numbers)  # type: ignore[arg-type]
+    image = images[0]
+    power = uniform_power(lens, radiance, float(image.metadata["pixel_pitch"]), image.shape)
+    found = calibrated(camera, image, power, error)
+    found.to_toml(output)
+    return {
+        "output": str(output),
+        "quantum_efficiency": found.quantum_efficiency,
+        "gain_error": found.gain_error,
+        "masked_pixels": image.metadata["masked_pixels"],
+    }

@@ -1,0 +1,128 @@
+"""Files of raw counts [DN]: TIFF and stacks of it, FITS, NPY, and click folders of IVIS cameras."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.errors import BackendError, ImageError
+
+TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
+CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """Raw counts (h, w) [DN], the mean of `frames` frames, and what comes with them.
+
+    highest : (h, w) the largest count of the frames, None for a single one
+    bias, background : frames (h, w) [DN] of a click folder, or None
+    exposure_time : [s], None where the file does not say
+    info : `Key: value` lines of a click folder
+    """
+
+    values: NDArray[np.float64]
+    frames: int = 1
+    bias: NDArray[np.float64] | None = None
+    background: NDArray[np.float64] | None = None
+    exposure_time: float | None = None
+    info: dict[str, str] = field(default_factory=dict)
+    highest: NDArray[np.float64] | None = None
+
+
+def read_counts(path: str | os.PathLike[str]) -> Counts:
+    """Counts of a TIFF, FITS or NPY file, or of a click folder.
+
+    Raises
+    ------
+    ImageError : the file cannot be read, or holds no picture of real numbers, or NaN.
+    BackendError : tifffile or astropy, which read TIFF and FITS, is not installed.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _click(path)
+    if not path.is_file():
+        raise ImageError(f"counts '{path}' do not exist. Check the name.")
+    suffix = path.suffix.lower()
+    exposure_time = None
+    if suffix in TIFF:
+        array = _tiff(path)
+    elif suffix in FITS:
+        array, exposure_time = _fits(path)
+    elif suffix == ".npy":
+        try:
+            array = np.load(path, allow_pickle=False)
+        except (ValueError, OSError, EOFError) as cause:
+            raise ImageError(f"counts '{path}' are no NPY file of numbers: {_line(cause)}. Save them again.") from cause
+    else:
+        raise ImageError(f"counts '{path}': '{suffix}' is not read. Give .tif, .fits, .npy or a click folder.")
+    found = counts_of(array, str(path))
+    return Counts(found.values, found.frames, exposure_time=exposure_time, highest=found.highest)
+
+
+def counts_of(array: Any, name: str) -> Counts:
+    """Counts of an array (h, w) or (frames, h, w), a file or argument `name`; ImageError for any other."""
+    array = np.asarray(array)
+    if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or array.size == 0:
+        raise ImageError(
+            f"counts '{name}' must be real numbers of shape (h, w) or (frames, h, w), got {array.dtype} of shape "
+            f"{array.shape}. Save one channel of grey values."
+        )
+    stack = array.astype(np.float64)
+    if not np.isfinite(stack).all():
+        raise ImageError(f"counts '{name}' hold {int(np.sum(~np.isfinite(stack)))} NaN or inf. Mask or replace them.")
+    return Counts(stack) if stack.ndim == 2 else Counts(stack.mean(axis=0), len(stack), highest=stack.max(axis=0))
+
+
+def _tiff(path: Path) -> NDArray[Any]:
+    try:
+        import tifffile
+    except ImportError as cause:
+        raise BackendError(f"counts '{path}': tifffile is missing. pip install 'mitsuba-fspt[reduce]'.") from cause
+    try:
+        return tifffile.imread(path)
+    except Exception as cause:  # a damaged file raises anything
+        raise ImageError(f"counts '{path}' are no readable TIFF: {_line(cause)}. Copy the file again.") from cause
+
+
+def _fits(path: Path) -> tuple[NDArray[Any], float | None]:
+    try:
+        from astropy.io import fits
+    except ImportError as cause:
+        raise BackendError(f"counts '{path}': astropy is missing. pip install 'mitsuba-fspt[reduce]'.") from cause
+    try:
+        with fits.open(path, memmap=False) as file:
+            unit = next(unit for unit in file if unit.data is not None)
+            time = unit.header.get("EXPTIME", file[0].header.get("EXPTIME"))
+            return np.asarray(unit.data), None if time is None else float(time)
+    except Exception as cause:
+        raise ImageError(f"counts '{path}' are no readable FITS: {_line(cause)}. Copy the file again.") from cause
+
+
+def _click(folder: Path) -> Counts:
+    """Counts of a click folder: luminescent.TIF, with readbiasonly, background and ClickInfo.txt where they are."""
+    files = {file.stem.lower(): file for file in sorted(folder.iterdir()) if file.is_file()}
+    if CLICK not in files:
+        raise ImageError(f"folder '{folder}' holds no luminescent.TIF. Give a click folder of an IVIS camera.")
+    found = {n: counts_of(_tiff(files[n]), str(files[n])).values for n in (BIAS, BACKGROUND) if n in files}
+    light = counts_of(_tiff(files[CLICK]), str(files[CLICK]))
+    info: dict[str, str] = {}
+    if INFO in files:
+        for line in files[INFO].read_text("utf-8", "replace").splitlines():
+            key, colon, value = line.partition(":")
+            if colon:
+                info.setdefault(key.strip(), value.strip())
+    times = [v for k, v in info.items() if "exposure" in k.lower() and NUMBER.search(v)]
+    time = float(NUMBER.search(times[0])[0]) if times else None  # type: ignore[index]
+    return Counts(light.values, light.frames, found.get(BIAS), found.get(BACKGROUND), time, info, light.highest)
+
+
+def _line(cause: BaseException) -> str:
+    return " ".join(str(cause).split())[:200].rstrip(".") or type(cause).__name__

@@ -1,0 +1,314 @@
+"""Counts of a detector to power [W]: bias, dark, flat, cosmic rays, quantum efficiency, and the noise that remains.
+
+    electrons = gain (DN − bias) − dark,   P = electrons / (flat · k),   k = η t λ / (h c) [electrons per watt]
+    error² = (max(electrons, 0) + σ_read² + dark) / k²
+
+with the variance of the dark current and of the rounding in `dark_electrons`. Frames are corrected by ccdproc.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..runtime.errors import BackendError, DetectorError, ImageError, named
+from ..runtime.numbers import number, whole
+from .counts import FITS, TIFF, Counts, counts_of, read_counts
+from .detector import PLANCK_TIMES_LIGHT, RECORDED, Detector, Exposure
+from .exr import Metadata, read_exr
+from .image import Image, read
+
+if TYPE_CHECKING:
+    Array = NDArray[np.float64]
+
+Frame = ArrayLike | str | os.PathLike[str]
+LEAST_FLAT = 0.05  # of the mean: pixels of a flat field darker than that are masked, their error is 20 times as large
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """Circumstances of an exposure: time [s], wavelength [nm], binning, pitch of the pixels read out [mm] or None."""
+
+    exposure_time: float
+    wavelength_nm: float
+    binning: int = 1
+    pixel_pitch: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, example, least, most in (("exposure_time", "60", 0, 1e12), ("wavelength_nm", "650", 1e-3, 1e9)):
+            value = number(f"reduce: '{name}'", getattr(self, name), DetectorError, example)
+            object.__setattr__(self, name, value)
+            if not (least <= value <= most and value > 0):
+                raise DetectorError(
+                    f"reduce: '{name}' must be > 0 and at most {most:g}, got {value:g}. Give {example}."
+                )
+        object.__setattr__(self, "binning", whole("reduce: 'binning'", self.binning, DetectorError, "1"))
+        if self.binning < 1:
+            raise DetectorError(f"reduce: 'binning' must be >= 1, got {self.binning}. Give for example 1.")
+        if self.pixel_pitch is not None:
+            pitch = number("reduce: 'pixel_pitch'", self.pixel_pitch, DetectorError, "0.108")
+            object.__setattr__(self, "pixel_pitch", pitch)
+            if not 0 < pitch < np.inf:
+                raise DetectorError(f"reduce: 'pixel_pitch' must be > 0 mm, got {pitch:g}. Give for example 0.108.")
+
+    def per_watt(self, quantum_efficiency: float) -> float:
+        """k, electrons per watt on a pixel."""
+        return quantum_efficiency * self.exposure_time * self.wavelength_nm * 1e-9 / PLANCK_TIMES_LIGHT
+
+    def dark(self, dark_current: float, own_pitch: float | None) -> float:
+        """Electrons of the dark current in a pixel read out."""
+        if self.pixel_pitch is None or own_pitch is None:
+            area = float(self.binning**2)
+        else:
+            area = (self.pixel_pitch / own_pitch) ** 2
+        return dark_current * self.exposure_time * area
+
+
+def reduce_counts(
+    detector: Detector,
+    counts: Frame | Counts,
+    exposed: Exposed,
+    *,
+    bias: Frame | None = None,
+    dark: Frame | None = None,
+    flat: Frame | None = None,
+    cosmic_rays: bool = False,
+    metadata: Mapping[str, Any] | None = None,
+) -> Image:
+    """Image in W of raw counts; see `Detector.reduce`."""
+    raw = counts if isinstance(counts, Counts) else _frame(counts, "counts")
+    full = saturated(detector, raw.values if raw.highest is None else raw.highest)
+    values, rays = _cleaned(detector, raw.values, full) if cosmic_rays else (raw.values, np.zeros_like(full))
+    level, charge, added = _background(detector, raw, exposed, bias, dark)
+    response, weak = _response(flat, values.shape)
+    electrons = _corrected(values, level, response) * detector.gain
+    independent = charge + detector.gain**2 / 12 + raw.frames * added  # the second is that of the rounding
+    return _image(detector, electrons, independent, raw.frames, full | rays | weak, exposed, metadata)
+
+
+def reduced(exposure: Exposure) -> Image:
+    """Image in W of an exposure, by the numbers of its detector in its metadata.
+
+    Raises
+    ------
+    DetectorError : the metadata lack a number.
+    """
+    found = exposure.metadata
+    needed = [key for name, key in RECORDED.items() if name != "pixel_pitch"]
+    if missing := [key for key in (*needed, "exposure_time", "wavelength_nm") if key not in found]:
+        raise DetectorError(
+            f"reduce: the electrons come without '{missing[0]}'. Reduce the counts with the numbers of their detector."
+        )
+    numbers: dict[str, Any] = {name: found[key] for name, key in RECORDED.items() if key in found}
+    detector = Detector(**numbers, name=str(found.get("detector", "detector")))
+    pitch = found.get("pixel_pitch")
+    exposed = Exposed(
+        found["exposure_time"],  # type: ignore[arg-type]
+        found["wavelength_nm"],  # type: ignore[arg-type]
+        int(found.get("binning", 1)),
+        None if pitch is None else float(pitch),
+    )
+    detector = replace(detector, gain_error=float(found.get("gain_error", 0.0)))
+    dark = exposed.dark(detector.dark_current, detector.pixel_pitch)
+    electrons = exposure.electrons.astype(np.float64)
+    full = (electrons >= detector.full_well) | saturated(detector, exposure.counts.astype(np.float64))
+    return _image(detector, electrons - dark, dark, 1, full, exposed, found)
+
+
+def saturated(detector: Detector, counts: Array) -> NDArray[np.bool_]:
+    """True (h, w) where a count is at the end of the converter or at the full well."""
+    top = 2**detector.bits - 1
+    return (counts >= top) | (counts >= detector.bias + detector.full_well / detector.gain - 0.5)
+
+
+def calibrated(detector: Detector, image: Image, power: Array, error: float) -> Detector:
+    """The detector with the quantum efficiency that a source of known `power` (h, w) [W] on the pixels shows.
+
+    Parameters
+    ----------
+    detector : whose numbers made `image` from counts
+    image : of the source, reduced with them
+    power : what the source sends to the pixels [W]
+    error : relative uncertainty of `power`, which becomes the `gain_error`
+
+    Raises
+    ------
+    DetectorError : no light, another shape, or a quantum efficiency that comes out above 1.
+    """
+    good = np.ones(image.shape, bool) if image.mask is None else ~image.mask
+    if power.shape != image.shape or not good.any() or not power[good].sum() > 0:
+        raise DetectorError(
+            f"calibrate: the source's power has the shape {power.shape}, the counts {image.shape}, "
+            f"{int(good.sum())} pixels are not saturated. Give an unsaturated frame of the same film."
+        )
+    share = float(image.power[good].sum() / power[good].sum())
+    efficiency = detector.quantum_efficiency * share
+    if not 0 < efficiency <= 1:
+        raise DetectorError(
+            f"calibrate: the source shows a quantum efficiency of {efficiency:.4g}, which must be in (0, 1]. Check the "
+            "radiance, the exposure time and 'gain' [e-/DN]."
+        )
+    noise = 0.0
+    if image.error is not None:
+        noise = float(np.sqrt((image.error[good].astype(np.float64) ** 2).sum()) / image.power[good].sum())
+    return replace(detector, quantum_efficiency=efficiency, gain_error=float(np.hypot(error, noise)))
+
+
+def _frame(given: Any, name: str) -> Counts:
+    """Counts of a file or an array."""
+    if isinstance(given, (str, os.PathLike)):
+        return read_counts(given)
+    return counts_of(given, name)
+
+
+def _background(
+    detector: Detector, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | None
+) -> tuple[Array | float, float, float]:
+    """What is subtracted [DN], a number or a frame; the dark charge [e-]; the variance [e-²] that the frame adds.
+
+    A dark frame, of the same exposure time, holds the bias as well.
+    """
+    charge = exposed.dark(detector.dark_current, detector.pixel_pitch)
+    rounding = detector.gain**2 / 12
+    frame = raw.background if dark is None and raw.background is not None else dark
+    if frame is not None:
+        found = _like(frame, "dark", raw.values.shape)
+        return found.values, charge, (charge + detector.read_noise**2 + rounding) / found.frames
+    frame = raw.bias if bias is None and raw.bias is not None else bias
+    if frame is not None:
+        found = _like(frame, "bias", raw.values.shape)
+        return found.values + charge / detector.gain, charge, (detector.read_noise**2 + rounding) / found.frames
+    return detector.bias + charge / detector.gain, charge, 0.0
+
+
+def _response(flat: Frame | None, shape: tuple[int, ...]) -> tuple[Array | None, NDArray[np.bool_]]:
+    """Flat field over its mean, or None, and the pixels that it leaves too dark."""
+    if flat is None:
+        return None, np.zeros(shape, bool)
+    found = _like(flat, "flat", shape).values
+    if not found.mean() > 0:
+        raise DetectorError(f"reduce: the flat field has the mean {found.mean():g}, it must be > 0. Give another one.")
+    relative = found / found.mean()
+    weak = relative < LEAST_FLAT
+    return np.where(weak, 1.0, relative), weak
+
+
+def _like(frame: Any, name: str, shape: tuple[int, ...]) -> Counts:
+    """Counts of a frame of this shape; DetectorError for another one."""
+    found = _frame(frame, name)
+    if found.values.shape != shape:
+        raise DetectorError(
+            f"reduce: '{name}' has the shape {found.values.shape}, the counts {shape}. Give a frame of the same film."
+        )
+    return found
+
+
+def _corrected(values: Array, level: Array | float, response: Array | None) -> Array:
+    """Counts less the level, over the response: by ccdproc where frames are given."""
+    if response is None and np.ndim(level) == 0:
+        return values - level
+    ccdproc, data_of = _ccdproc()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        frame = data_of(values, unit="adu")
+        frame = ccdproc.subtract_bias(frame, data_of(np.broadcast_to(level, values.shape).copy(), unit="adu"))
+        if response is not None:
+            frame = ccdproc.flat_correct(frame, data_of(response, unit=""), norm_value=1.0)
+    return np.asarray(frame.data, np.float64)
+
+
+def _cleaned(detector: Detector, values: Array, full: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+    """Counts, and the pixels that cosmic rays hit, by the Laplacian edge detection of ccdproc."""
+    ccdproc, data_of = _ccdproc()
+    electrons = data_of((values - detector.bias) * detector.gain, unit="electron", mask=full)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = ccdproc.cosmicray_lacosmic(
+            electrons, readnoise=detector.read_noise, gain_apply=False, satlevel=detector.full_well, sigclip=6.0
+        )
+    hit = np.asarray(found.mask, bool) & ~full
+    return values, hit
+
+
+def _ccdproc() -> tuple[Any, Any]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import ccdproc
+            from astropy.nddata import CCDData
+    except ImportError as cause:
+        raise BackendError(
+            f"reduce: ccdproc, which corrects frames, is not installed ({cause}). pip install 'mitsuba-fspt[reduce]'."
+        ) from cause
+    return ccdproc, CCDData
+
+
+def _image(
+    detector: Detector,
+    electrons: Array,
+    dark: float,
+    frames: int,
+    mask: NDArray[np.bool_],
+    exposed: Exposed,
+    metadata: Mapping[str, Any] | None,
+) -> Image:
+    """Image in W of the mean electrons of so many frames; `dark`: variance [e-²] of one beside shot and read noise.
+
+    The metadata keep the numbers of the sum of the frames, whose shot noise is that of all its electrons.
+    """
+    per_watt = exposed.per_watt(detector.quantum_efficiency) * frames
+    read = detector.read_noise * frames**0.5
+    total = np.where(mask, 0, electrons) * frames
+    independent = dark * frames
+    error = np.sqrt(np.maximum(total, 0) + read**2 + independent) / per_watt
+    kept: Metadata = dict(metadata or {})
+    for name in ("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"):
+        kept.pop(name, None)
+    kept |= {
+        "quantity": "power",
+        "unit": "W",
+        "detector": detector.name,
+        "exposure_time": exposed.exposure_time,
+        "wavelength_nm": exposed.wavelength_nm,
+        "binning": exposed.binning,
+        "electrons_per_watt": per_watt,
+        "read_noise": read,
+        "dark_electrons": float(independent),
+        "gain_error": detector.gain_error,
+        "masked_pixels": int(mask.sum()),
+    }
+    if exposed.pixel_pitch is not None:
+        kept["pixel_pitch"] = exposed.pixel_pitch
+    return Image(total / per_watt, error, metadata=kept, mask=mask)
+
+
+def read_measured(path: str | os.PathLike[str]) -> Image:
+    """Image in W of a file: of `fspt reduce` or a render, or electrons of `fspt expose`, reduced by their metadata.
+
+    Raises
+    ------
+    ImageError : the file cannot be read.
+    DetectorError : electrons without the numbers of their detector, or counts, which `fspt reduce` takes.
+    """
+    path = Path(path)
+    if path.suffix.lower() in (*TIFF, *FITS, ".npy", ".png") or path.is_dir():
+        raise DetectorError(f"'{path}' holds counts without their detector's numbers. Reduce it with 'fspt reduce'.")
+    channels, metadata = read_exr(path)
+    if metadata.get("quantity") != "electrons" or "Y" not in channels:
+        return read(path)
+    electrons = channels["Y"].astype(np.float32)
+    if not np.isfinite(electrons).all():
+        raise ImageError(f"image file '{path}' has electrons that are NaN or inf. Expose it again.")
+    with named(f"'{path}'"):
+        if missing := [name for name in ("gain", "bias", "bits") if name not in metadata]:
+            raise DetectorError(f"the electrons come without '{missing[0]}'. Reduce the counts with 'fspt reduce'.")
+        counts = np.rint(float(metadata["bias"]) + electrons / float(metadata["gain"]))
+        top = 2 ** int(metadata["bits"]) - 1
+        return reduced(Exposure(electrons, np.clip(counts, 0, top).astype(np.uint16), metadata))

@@ -1,0 +1,392 @@
+"""`invert`: the surface flux density J_n from pictures of several views, with intervals.
+
+The power on pixel i is T J, its noise normal with the variance of Eq. M.24 of docs/model.md, taken from the fitted
+signal. J >= 0 minimises half of χ² and the penalty of Eq. M.23. Samples are such minima for data and penalty with
+noise added (randomise then optimise: J. M. Bardsley et al., SIAM J. Sci. Comput. 36, A1895, 2014).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array, diags_array
+
+from ..images.detector import Exposure
+from ..images.image import Image
+from ..runtime.errors import InversionError
+from ..runtime.interrupt import ctrl_c_noted
+from ..runtime.numbers import number, whole
+from .inversion import Inversion
+from .measurement import Measurement
+from .nonnegative import Accuracy, Solve, factor, minimise
+from .smoothness import Prior, Smoothness
+from .surface import Surface
+from .transport_matrix import TransportMatrix
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Accuracy of `invert`.
+
+    accuracy : of the minimum
+    drawn : of the minima of random draws and while variances and weight are sought; a decrement of 0.01 widens an interval by at most 0.5 %
+    reweighted : relative change of the standard deviations, root mean square, at which they count as converged; it
+        changes χ² by as much
+    rounds : most rounds of variances and weight
+    weight : change of log(weight) at which it counts as converged: 1/10 of its own uncertainty for 200 determined
+        unknowns
+    probes : random vectors for the number of determined unknowns, whose relative error is about (2/(probes γ))^½
+    first : weight to begin with, over that at which data and penalty have the same trace
+    darkest : of the reference, the least ρ of the penalty: below it J_n is no better known than its noise
+    seen : of the largest sensitivity per area, the least at which a vertex counts as seen
+    block : samples that are computed together
+    threads : blocks that are computed at the same time
+    """
+
+    accuracy: Accuracy = field(default_factory=Accuracy)
+    drawn: Accuracy = field(default_factory=lambda: Accuracy(decrement=0.01, inner=0.1))
+    reweighted: float = 1e-3
+    rounds: int = 40
+    weight: float = 0.01
+    probes: int = 8
+    first: float = 100.0
+    darkest: float = 0.05
+    seen: float = 0.01
+    block: int = 25
+    threads: int = 2
+
+
+def invert(
+    matrix: TransportMatrix,
+    images: ArrayLike | Sequence[Image | Exposure] | Image | Exposure,
+    /,
+    *,
+    error: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    weight: float | None = None,
+    prior: Prior | None = None,
+    gain_error: float | None = None,
+    samples: int = 0,
+    seed: int = 0,
+    confidence: float = 0.9,
+    scene: object = None,
+    progress: Progress | None = None,
+    settings: Settings | None = None,
+) -> Inversion:
+    """Surface flux density J_n >= 0 that explains the pictures of all views of a transport matrix.
+
+        R = fspt.invert(T, images, samples=200, seed=1)
+
+    Parameters
+    ----------
+    matrix : of `transport` or `read_transport`
+    images : one Image or Exposure a view, in the order of the views, or powers (views, h, w) [W] with `error`
+    error : standard error of the power [W], a number or (views, h, w); None: what the images say of themselves
+    mask : (views, h, w), True for pixels to leave out, beside those that the images leave out
+    weight : of the penalty on roughness [mm²], >= 0; None: the one that the roughness found agrees with (Eq. M.25)
+    prior : what else the penalty says; None: only that J_n is smooth relative to itself
+    gain_error : relative uncertainty of a factor common to all pixels, in [0, 1); None: that of the images, else 0
+    samples : number of random draws, from which the intervals follow; 0: no intervals
+    seed : of the draws, 0 … 2⁵³
+    confidence : of the intervals, in (0, 1)
+    scene : scene with the meshes of the matrix, where its own cannot be read any more
+    progress : called with what is being done and the share done
+    settings : accuracy
+
+    Raises
+    ------
+    InversionError : an option outside its range, images without light, without an error or with all pixels masked,
+        fewer pixels than J_n needs without a penalty, meshes that are not those of the matrix.
+    TransportError, DetectorError : images that do not fit the matrix, counts without the numbers of their detector.
+    """
+    if not isinstance(matrix, TransportMatrix):
+        raise InversionError(
+            f"invert: the first argument must be a transport matrix, got {type(matrix).__name__}. Make one with "
+            "fspt.transport, or read one with fspt.read_transport."
+        )
+    options = Options(weight, samples, seed, confidence)
+    measurement = Measurement.of(matrix, images, error, mask, gain_error)
+    problem = Problem.of(matrix, measurement, Surface.of(matrix, scene), prior or Prior(), settings or Settings())
+    with ctrl_c_noted() as check_interrupt:
+
+        def report(what: str, share: float) -> None:
+            check_interrupt()
+            if progress:
+                progress(what, share)
+
+        return problem.solved(options, report)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Checked arguments of `invert`; InversionError for one outside its range."""
+
+    weight: float | None
+    samples: int
+    seed: int
+    confidence: float
+
+    def __post_init__(self) -> None:
+        if self.weight is not None:
+            weight = number("invert: 'weight'", self.weight, InversionError, "1.0")
+            if not 0 <= weight < np.inf:
+                raise InversionError(
+                    f"invert: 'weight' must be finite and >= 0 mm², got {weight:g}. Give 1.0, or None."
+                )
+            object.__setattr__(self, "weight", weight)
+        confidence = number("invert: 'confidence'", self.confidence, InversionError, "0.9")
+        if not 0 < confidence < 1:
+            raise InversionError(f"invert: 'confidence' must be in (0, 1), got {confidence:g}. Give for example 0.9.")
+        object.__setattr__(self, "confidence", confidence)
+        for name, most in (("samples", 1_000_000), ("seed", 1 << 53)):
+            value = whole(f"invert: '{name}'", getattr(self, name), InversionError, "200")
+            if not 0 <= value <= most:
+                raise InversionError(f"invert: '{name}' must be in 0 … {most}, got {value}. Give for example 200.")
+            object.__setattr__(self, name, value)
+        if self.samples == 1:
+            raise InversionError("invert: 'samples' = 1 gives no interval. Give for example 200, or 0 for none.")
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """State of the fit: x = J_n/reference (m,), standard deviations (N,) [W], the weight, determined unknowns γ."""
+
+    x: Array
+    sigma: Array
+    numerical: Array
+    weight: float
+    determined: float
+    decrement: float
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Data and penalty on the unknowns x = J_n/reference, over the pixels that see the surface and are not masked.
+
+    rows : numbers of these pixels;  transport : (N, m) [W], the power of x = 1;  data : those pixels of `measurement`
+    """
+
+    matrix: TransportMatrix
+    surface: Surface
+    measurement: Measurement
+    rows: NDArray[np.int64]
+    transport: csr_array
+    smoothness: Smoothness
+    reference: float
+    prior: Prior
+    settings: Settings
+
+    @classmethod
+    def of(
+        cls,
+        matrix: TransportMatrix,
+        measurement: Measurement,
+        surface: Surface,
+        prior: Prior,
+        settings: Settings,
+    ) -> Problem:
+        whole_matrix = csr_array(matrix.matrix @ surface.spread)
+        rows = np.flatnonzero((np.diff(whole_matrix.indptr) > 0) & ~measurement.mask)
+        if not len(rows):
+            raise InversionError("invert: all pixels that see the surface are masked. Expose for a shorter time.")
+        part = csr_array(whole_matrix[rows])
+        light = float(measurement.power[rows].sum())
+        reference = prior.reference or light / float(part.sum())
+        if not reference > 0:
+            raise InversionError(
+                f"invert: the pixels that see the surface hold {light:.3g} W in total, no light. Check the images, "
+                "their background and the order of the views."
+            )
+        smooth = Smoothness.of(surface, prior.correlation_length)
+        part = csr_array(part * reference)
+        return cls(matrix, surface, measurement, rows, part, smooth, reference, prior, settings)
+
+    def solved(self, options: Options, report: Progress) -> Inversion:
+        """Fit and draws. Unless the prior has a reference, the penalty is relative to a first fit."""
+        problem, first = self, None
+        if options.weight == 0:
+            self._require_pixels()
+        elif self.prior.reference is None:
+            first = self.fit(None, report)
+            problem = self.relative_to(first.x)
+        fit = problem.fit(options.weight, report, first)
+        draws = problem.draws(fit, options.samples, options.seed, report)
+        return problem.result(fit, draws, options)
+
+    def _require_pixels(self) -> None:
+        """Raise InversionError where fewer pixels than unknowns leave J_n undetermined without a penalty."""
+        if (unknowns := int(self.bounded.sum())) > len(self.rows):
+            raise InversionError(
+                f"invert: 'weight' = 0 with {len(self.rows)} pixels for {unknowns} unknowns determines nothing. Give "
+                "more views or pixels, a coarser mesh, or a weight > 0."
+            )
+
+    @property
+    def mean(self) -> float:
+        """Mean of the prior over the reference."""
+        return self.prior.mean / self.reference
+
+    @cached_property
+    def bounded(self) -> NDArray[np.bool_]:
+        """(m,) unknowns that some pixel sees: J_n >= 0 holds there, the others only continue them."""
+        return self.transport.sum(axis=0) > 0
+
+    def relative_to(self, x: Array) -> Problem:
+        """The same problem with a penalty relative to a first fit x: ρ = J_n, at least a share of the reference."""
+        light = np.maximum(x, self.settings.darkest)
+        relative = np.where(self.bounded, light, 1.0)
+        return replace(self, smoothness=Smoothness.of(self.surface, self.prior.correlation_length, relative))
+
+    def fit(self, weight: float | None, report: Progress, start: Fit | None = None) -> Fit:
+        """Minimum with variances from its own signal and, where `weight` is None, the weight of Eq. M.25."""
+        power = self.measurement.power[self.rows]
+        numerical = np.zeros_like(power)
+        # A start that no bright or dark pixel leads astray: the same noise on all of them.
+        sigma = self._sigma(np.full_like(power, np.maximum(power, 0).mean()), numerical)
+        state = Fit(np.ones(self.surface.unknowns), sigma, numerical, weight or 0.0, np.nan, np.nan)
+        if start is not None:
+            state = replace(start, weight=state.weight)
+        if weight is None:
+            state = replace(state, weight=self._first_weight(sigma))
+        probes = np.random.default_rng(0).choice([-1.0, 1.0], (self.surface.unknowns, self.settings.probes))
+        for turn in range(self.settings.rounds):
+            report("fit", turn / self.settings.rounds)
+            before, state = state, self._improved(state, probes, weight, self.settings.drawn)
+            drift = float(np.sqrt(np.mean((state.sigma / before.sigma - 1) ** 2)))
+            changed = abs(np.log(state.weight / before.weight)) if weight is None else 0.0
+            if drift < self.settings.reweighted and changed < self.settings.weight:
+                break
+        return self._improved(state, probes, weight, self.settings.accuracy)
+
+    def _improved(self, state: Fit, probes: Array, weight: float | None, accuracy: Accuracy) -> Fit:
+        """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
+        normal, solve = self._normal(state.sigma, state.weight)
+        right = self._right(self.measurement.power[self.rows], state.sigma, state.weight)
+        found = minimise(normal, right[:, None], state.x[:, None], self.bounded, solve, accuracy)
+        x = found.x[:, 0]
+        determined = self._determined(normal, solve, state.weight, probes)
+        if weight is None:  # Eq. M.25
+            weight = determined / max(self.smoothness.energy(x - self.mean), 1e-300)
+        numerical = self._numerical(x)
+        sigma = self._sigma(self.transport @ x, numerical)
+        return Fit(x, sigma, numerical, weight, determined, float(found.decrement[0]))
+
+    def _first_weight(self, sigma: Array) -> float:
+        """Weight to begin with: above the one at which data and penalty have the same trace, where few J_n are 0."""
+        trace = float((self.transport.multiply((1 / sigma)[:, None]) ** 2).sum())
+        return max(self.settings.first * trace / float(self.smoothness.matrix.diagonal().sum()), 1e-300)
+
+    def _determined(self, normal: csr_array, solve: Solve, weight: float, probes: Array) -> float:
+        """γ, the number of unknowns that the data determine: tr((H + w Q)⁻¹ H), by random vectors."""
+        data = normal @ probes - weight * (self.smoothness.matrix @ probes)
+        return float(np.einsum("mk,mk->", probes, solve(data)) / probes.shape[1])
+
+    def _normal(self, sigma: Array, weight: float) -> tuple[csr_array, Solve]:
+        """H + w Q with H = TᵀT/σ², and what solves it."""
+        scaled = csr_array(diags_array(1 / sigma) @ self.transport)
+        normal = csr_array(scaled.T @ scaled + weight * self.smoothness.matrix)
+        if weight == 0:
+            ridge = 1e-12 * normal.diagonal().max()
+            normal = csr_array(normal + ridge * diags_array(np.ones(normal.shape[0])))
+        return normal, factor(normal)
+
+    def _right(self, power: Array, sigma: Array, weight: float) -> Array:
+        """Tᵀ P/σ² + w Q mean for power (N,) or (N, k)."""
+        over = power / sigma**2 if power.ndim == 1 else power / sigma[:, None] ** 2
+        flat = weight * self.mean * (self.smoothness.matrix @ np.ones(self.surface.unknowns))
+        return self.transport.T @ over + (flat if power.ndim == 1 else flat[:, None])
+
+    def _sigma(self, signal: Array, numerical: Array) -> Array:
+        """Standard deviation of each pixel [W] for a fitted signal (Eq. M.24)."""
+        m = self.measurement
+        variance = m.shot[self.rows] * np.maximum(signal, 0) + m.other[self.rows] + numerical**2
+        if not (variance > 0).all():
+            count = int(np.sum(~(variance > 0)))
+            raise InversionError(
+                f"invert: {count} pixels that see the surface have no noise, σ = 0. Give error= > 0 there, a read "
+                "noise, or mask them."
+            )
+        return np.sqrt(variance)
+
+    def _numerical(self, x: Array) -> Array:
+        """Numerical error of T J [W] on the pixels."""
+        exitance = self.surface.spread @ (x * self.reference)
+        return self.matrix.error(exitance).ravel()[self.rows]
+
+    def draws(self, fit: Fit, count: int, seed: int, report: Progress) -> Array:
+        """x of `count` random draws, (m, count)."""
+        if not count:
+            return np.empty((self.surface.unknowns, 0))
+        normal, solve = self._normal(fit.sigma, fit.weight)
+        sizes = [min(self.settings.block, count - k) for k in range(0, count, self.settings.block)]
+        seeds = np.random.SeedSequence(seed).spawn(len(sizes))
+
+        def block(size: int, sequence: np.random.SeedSequence) -> Array:
+            right, factors = self._drawn(fit, size, np.random.default_rng(sequence))
+            start = solve(right)
+            found = minimise(normal, right, start, self.bounded, solve, self.settings.drawn)
+            return found.x * factors
+
+        found = []
+        with ThreadPoolExecutor(self.settings.threads) as pool:
+            futures = [pool.submit(block, *job) for job in zip(sizes, seeds, strict=True)]
+            try:
+                for k, future in enumerate(futures):
+                    report("samples", k / len(futures))
+                    found.append(future.result())
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+        return np.concatenate(found, axis=1)
+
+    def _drawn(self, fit: Fit, size: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Right-hand sides (m, size) with noise on data and penalty, and factors of gain (size,).
+
+        The numerical error of a view has one sign: it does not average out over pixels.
+        """
+        power = self.measurement.power[self.rows]
+        noise = np.sqrt(np.maximum(fit.sigma**2 - fit.numerical**2, 0))[:, None]
+        views, height, width = self.matrix.image_shape
+        common = rng.standard_normal((views, size))[self.rows // (height * width)]
+        data = power[:, None] + noise * rng.standard_normal((len(power), size)) + fit.numerical[:, None] * common
+        right = self._right(data, fit.sigma, fit.weight)
+        rough = self.smoothness.root.T @ rng.standard_normal((self.surface.unknowns, size))
+        return right + np.sqrt(fit.weight) * rough, 1 + self.measurement.gain_error * rng.standard_normal(size)
+
+    def result(self, fit: Fit, draws: Array, options: Options) -> Inversion:
+        """What the fit and the draws say, on the columns of the matrix."""
+        columns = self.surface.number
+        areas = np.where(self.surface.areas > 0, self.surface.areas, np.inf)
+        per_area = self.transport.sum(axis=0) / areas
+        seen = per_area >= self.settings.seen * per_area.max()
+        fitted = (self.matrix @ (fit.x * self.reference)[columns]).reshape(self.matrix.image_shape)
+        residual = (self.measurement.power[self.rows] - self.transport @ fit.x) / fit.sigma
+        sigma = np.full(self.matrix.shape[0], np.nan)
+        sigma[self.rows] = fit.sigma
+        views = self.matrix.image_shape
+        return Inversion(
+            matrix=self.matrix,
+            surface=self.surface,
+            solution=(fit.x * self.reference)[columns],
+            draws=draws[columns] * self.reference,
+            seen=seen[columns] & self.matrix.seen,
+            confidence=options.confidence,
+            weight=fit.weight,
+            reference=self.reference,
+            determined=fit.determined,
+            pixels=len(self.rows),
+            decrement=fit.decrement,
+            gain_error=self.measurement.gain_error,
+            chi2_sum=float(residual @ residual),
+            measured=np.where(self.measurement.mask, np.nan, self.measurement.power).reshape(views),
+            fitted=fitted,
+            sigma=sigma.reshape(views),
+        )

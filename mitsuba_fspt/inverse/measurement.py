@@ -1,0 +1,164 @@
+"""What the pictures of all views say: power, its noise as a function of the signal, and the pixels that count."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..images.detector import Exposure
+from ..images.image import Image
+from ..images.reduction import reduced
+from ..runtime.errors import InversionError
+from ..runtime.numbers import number
+from .transport_matrix import TransportMatrix
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Images of all views, pixel by pixel in the order of the rows of the matrix, (N,).
+
+    power : [W], 0 where masked
+    shot : [W], variance of the shot noise over the power: 1/(electrons per watt), 0 where `other` holds all the noise
+    other : [W²], variance that does not depend on the signal: read-out, dark current, a given error
+    mask : True where a pixel is left out
+    gain_error : relative standard deviation of a factor common to all pixels
+    """
+
+    power: Array
+    shot: Array
+    other: Array
+    mask: NDArray[np.bool_]
+    gain_error: float
+
+    @classmethod
+    def of(
+        cls,
+        matrix: TransportMatrix,
+        images: ArrayLike | Sequence[Image | Exposure] | Image | Exposure,
+        error: ArrayLike | None,
+        mask: ArrayLike | None,
+        gain_error: float | None,
+    ) -> Measurement:
+        """Measurement from images as `invert` takes them.
+
+        Raises
+        ------
+        InversionError : no error is known, it is not > 0, or nothing is left to fit.
+        TransportError : the images do not fit the matrix.
+        DetectorError : an Exposure without the numbers of its detector.
+        """
+        if isinstance(images, (Image, Exposure)):
+            images = [images]
+        listed = isinstance(images, (list, tuple))
+        planes: Any = (
+            [reduced(i) if isinstance(i, Exposure) else i for i in images]  # type: ignore[union-attr]
+            if listed
+            else images
+        )
+        masks = _mask(matrix, planes if listed else [], mask)
+        if not listed:
+            planes = np.where(masks, 0.0, _numbers(planes, masks.shape))
+        power = matrix.images(planes)
+        shot, other = _variances(matrix, planes if listed else [], error, masks)
+        found = (
+            float("nan") if gain_error is None else number("invert: 'gain_error'", gain_error, InversionError, "0.05")
+        )
+        if gain_error is None:
+            found = max(
+                (float(i.metadata.get("gain_error", 0.0)) for i in planes if isinstance(i, Image)) if listed else [0.0],
+                default=0.0,
+            )
+        if not 0 <= found < 1:
+            raise InversionError(f"invert: 'gain_error' must be in [0, 1), got {found:g}. Give for example 0.05.")
+        if masks.all():
+            raise InversionError("invert: every pixel is masked or saturated. Expose for a shorter time.")
+        return cls(np.where(masks, 0, power).ravel(), shot.ravel(), other.ravel(), masks.ravel(), found)
+
+
+def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
+    """`values` as an array of this shape where it has it up to the axis of views, else unchanged for a later check."""
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as cause:
+        raise InversionError(
+            f"invert: images must be numbers of shape {shape}, or one Image a view: {cause}."
+        ) from cause
+    if array.shape != shape and array.shape != shape[1:]:
+        raise InversionError(
+            f"invert: images must have the shape {shape} (views, height, width), got {array.shape}. Give one image a "
+            "view, of the film that the matrix was made for."
+        )
+    return array.reshape(shape) if array.size == np.prod(shape) else array
+
+
+def _mask(matrix: TransportMatrix, images: Sequence[Any], mask: ArrayLike | None) -> NDArray[np.bool_]:
+    """(views, height, width), True where the given mask or that of an image leaves a pixel out."""
+    shape = matrix.image_shape
+    whole = np.zeros(shape, bool)
+    if mask is not None:
+        given = np.asarray(mask)
+        if given.dtype != bool or given.shape not in (shape, shape[1:]):
+            raise InversionError(
+                f"invert: 'mask' must be True and False of shape {shape}, got {given.dtype} of shape {given.shape}. "
+                "Give True for pixels to leave out."
+            )
+        whole |= given
+    if len(images) == shape[0]:
+        for number_, image in enumerate(images):
+            if isinstance(image, Image) and image.mask is not None and image.shape == shape[1:]:
+                whole[number_] |= image.mask
+    return whole
+
+
+def _variances(
+    matrix: TransportMatrix, images: Sequence[Any], error: ArrayLike | None, mask: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """`shot` and `other` (views, height, width) of a Measurement."""
+    shape = matrix.image_shape
+    shot, other = np.zeros(shape), np.zeros(shape)
+    if error is not None:
+        try:
+            given = np.asarray(error, np.float64)
+            other[...] = given**2
+        except (TypeError, ValueError) as cause:
+            raise InversionError(
+                f"invert: 'error' must be a number or of shape {shape}, got {np.shape(error)}. Give W a pixel."
+            ) from cause
+        if not (np.isfinite(given).all() and (given >= 0).all()):
+            raise InversionError("invert: 'error' has values that are negative, NaN or infinite. Give W, >= 0.")
+        return shot, other
+    if not images:
+        raise InversionError(
+            "invert: an array of power says nothing of its noise. Give error=, its standard error [W], or images of "
+            "'fspt reduce'."
+        )
+    for k, image in enumerate(images):
+        if not isinstance(image, Image):
+            raise InversionError(
+                f"invert: image {k} says nothing of its noise. Give error= [W], or images of 'fspt reduce'."
+            )
+        if "electrons_per_watt" in image.metadata:
+            per_watt, read, dark = (
+                number(f"invert: image {k}, '{name}'", image.metadata.get(name, 0.0), InversionError, "1e15")
+                for name in ("electrons_per_watt", "read_noise", "dark_electrons")
+            )
+            if not (0 < per_watt < np.inf and 0 <= read < np.inf and 0 <= dark < np.inf):
+                raise InversionError(
+                    f"invert: image {k} has {per_watt:g} electrons a watt and {read:g} electrons of read noise. Reduce "
+                    "it again from its counts."
+                )
+            shot[k], other[k] = 1 / per_watt, (read**2 + dark) / per_watt**2
+        elif image.error is not None:
+            other[k] = image.error.astype(np.float64) ** 2
+        else:
+            raise InversionError(
+                f"invert: image {k} has neither 'electrons_per_watt' nor an error. Give error= [W], or reduce it from "
+                "its counts."
+            )
+    return np.where(mask, 0, shot), other

@@ -1,0 +1,188 @@
+"""The surface that the columns of a transport matrix stand for: its mesh, and its Laplace-Beltrami operator."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags_array
+
+from ..phantom.surface_mesh import face_areas, merge
+from ..rendering.provenance import same_mesh, scene_digest
+from ..rendering.scene import load
+from ..rendering.scene_xml import is_text
+from ..runtime.errors import InversionError, SceneError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from .transport_matrix import TransportMatrix
+
+Array = NDArray[np.float64]
+SLIVER = 1e-6  # least sine of an angle: a triangle flatter than that counts as if it had this one
+AREA_TOLERANCE = 1e-3  # relative: float32 positions may change an area of the mesh by so much
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of all glowing meshes of a transport matrix, one after the other, in the order of its columns.
+
+    vertices : (V, 3) [mm], in the frame of the scene;  faces : (F, 3), indices of vertices
+    parts : shape id → slice of columns;  on : 'vertex' or 'face', what a column is
+    number : (n,) the unknown of each column: coincident vertices of one mesh share an unknown
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    parts: Mapping[str, slice]
+    on: str
+    number: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, matrix: TransportMatrix, scene: object = None) -> Surface:
+        """Surface of a matrix, from `scene` or, where that is None, from the scene that the matrix was made from.
+
+        Parameters
+        ----------
+        matrix : transport matrix
+        scene : Mitsuba scene, name of a scene file, text or dictionary, with the same meshes up to a rigid motion; or
+            a Surface that was made so
+
+        Raises
+        ------
+        InversionError : the scene cannot be found any more, or its meshes are not those of the matrix.
+        """
+        from ..jit.mesh_buffers import triangles
+
+        if isinstance(scene, Surface):
+            scene._require_areas(matrix.areas)
+            return scene
+        loaded = _scene_of(matrix, scene)
+        vertices, faces, number = [], [], []
+        first = unknowns = 0
+        for emitter in loaded.emitters():
+            positions, corners = (buffer.numpy() for buffer in triangles(emitter.get_shape()))
+            points, corner = positions.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3).astype(np.int64)
+            own = np.arange(len(corner)) if matrix.on == "face" else _joined(points)
+            vertices.append(points)
+            faces.append(corner + first)
+            number.append(own + unknowns)
+            first, unknowns = first + len(points), unknowns + int(own.max()) + 1
+        found = cls(np.concatenate(vertices), np.concatenate(faces), matrix.parts, matrix.on, np.concatenate(number))
+        found._require_areas(matrix.areas)
+        return found
+
+    @property
+    def unknowns(self) -> int:
+        """Number m of unknowns."""
+        return int(self.number.max()) + 1
+
+    @cached_property
+    def spread(self) -> csr_array:
+        """(n, m): J_n of the columns from the unknowns, one entry 1 in every row."""
+        n = len(self.number)
+        return csr_array((np.ones(n), (np.arange(n), self.number)), shape=(n, self.unknowns))
+
+    @cached_property
+    def areas(self) -> Array:
+        """(m,) ∫ φ dS of each unknown [mm²], the lumped mass."""
+        area = face_areas(self.vertices, self.faces)
+        if self.on == "face":
+            return area
+        return np.bincount(self._corners.ravel(), np.repeat(area / 3, 3), self.unknowns).astype(np.float64)
+
+    @cached_property
+    def stiffness(self) -> csr_array:
+        """(m, m) of −Δ: ∫ ∇φ_i · ∇φ_j dS for vertices (Eq. M.22); over faces, lengths of edges over distances."""
+        return self._of_faces() if self.on == "face" else self._of_vertices()
+
+    @property
+    def _corners(self) -> NDArray[np.int64]:
+        """(F, 3) unknowns of the corners of each face, on vertices."""
+        return self.number[self.faces]
+
+    def _of_vertices(self) -> csr_array:
+        """Cotangents of the angles opposite to each edge, halved (Eq. M.22)."""
+        points = self.vertices[self.faces]
+        rows, columns, values = [], [], []
+        for k in range(3):
+            one, other = points[:, (k + 1) % 3] - points[:, k], points[:, (k + 2) % 3] - points[:, k]
+            sine = np.linalg.norm(np.cross(one, other), axis=1)
+            lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+            floor = np.maximum(SLIVER * lengths, np.finfo(float).tiny)
+            rows.append(self._corners[:, (k + 1) % 3])
+            columns.append(self._corners[:, (k + 2) % 3])
+            values.append(0.5 * np.einsum("fi,fi->f", one, other) / np.maximum(sine, floor))
+        return _laplacian(np.concatenate(rows), np.concatenate(columns), np.concatenate(values), self.unknowns)
+
+    def _of_faces(self) -> csr_array:
+        """For the two faces of an edge: its length over the way from centre to centre by the middle of the edge."""
+        _, corners = merge(self.vertices, self.faces)
+        points = self.vertices[self.faces]
+        centre = points.mean(axis=1)
+        edges = np.sort(np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+        ends = np.concatenate([points[:, [k, (k + 1) % 3]] for k in range(3)])
+        owner = np.tile(np.arange(len(corners)), 3)
+        order = np.lexsort(edges.T)
+        same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+        one, other = order[:-1][same], order[1:][same]
+        middle, length = ends[one].mean(axis=1), np.linalg.norm(ends[one, 1] - ends[one, 0], axis=1)
+        way = sum(np.linalg.norm(centre[owner[k]] - middle, axis=1) for k in (one, other))
+        return _laplacian(owner[one], owner[other], length / np.maximum(way, 1e-30), self.unknowns)
+
+    def _require_areas(self, areas: Array) -> None:
+        """Raise InversionError where the areas of the columns differ from those that the matrix was made with."""
+        own = np.bincount(self.number, areas, self.unknowns)
+        if len(areas) != len(self.number) or np.abs(own - self.areas).max() > AREA_TOLERANCE * self.areas.max():
+            raise InversionError(
+                "invert: the meshes of the scene have other areas than those of the matrix. Give 'scene', the scene "
+                "that the matrix was made from, or make the matrix again."
+            )
+
+
+def _laplacian(rows: NDArray[np.int64], columns: NDArray[np.int64], values: Array, size: int) -> csr_array:
+    """Symmetric matrix with −`values` beside the diagonal and rows that sum to 0."""
+    beside = coo_array((values, (rows, columns)), shape=(size, size)).tocsr()
+    beside = beside + beside.T
+    return csr_array(diags_array(np.asarray(beside.sum(axis=1)).ravel()) - beside)
+
+
+def _joined(points: Array) -> NDArray[np.int64]:
+    """(V,) number of each vertex, the same for vertices at the same position."""
+    _, number = np.unique(points, axis=0, return_inverse=True)
+    return number.ravel().astype(np.int64)
+
+
+def _scene_of(matrix: TransportMatrix, scene: object) -> mi.Scene:
+    """Scene with the meshes of the matrix, as its defaults place them."""
+    name = str(matrix.metadata["scene"])
+    digest = str(matrix.metadata["mesh_digest"])
+    if scene is not None:
+        whole: Any = load(scene) if isinstance(scene, (str, os.PathLike, Mapping)) else scene
+        if not same_mesh(scene_digest(whole), digest):
+            raise InversionError(
+                "invert: 'scene' has other meshes than the matrix. Give the scene that the matrix was made from."
+            )
+        return whole
+    if is_text(name) or not Path(name).is_file():
+        raise InversionError(
+            f"invert: the meshes of the matrix stood in the scene '{name}', which cannot be read again. Give it as "
+            "'scene', a file or a loaded scene."
+        )
+    given: list[dict[str, Any]] = [{}, {k: v for k, v in matrix.views[0].items() if k != "sensor"}]
+    for parameters in given:  # the scene's own placement where its defaults show the same mesh
+        try:
+            whole = load(name, **parameters)
+        except SceneError as error:
+            raise InversionError(f"invert: the matrix was made from a scene that fails: {error}") from error
+        if same_mesh(scene_digest(whole), digest):
+            return whole
+    raise InversionError(
+        f"invert: the meshes of '{name}' have changed since the matrix was made. Make it again with 'fspt matrix'."
+    )

@@ -1,0 +1,43 @@
+"""A sphere in four views for the tests of inversion: its scene file, its transport matrix, noisy pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+import mitsuba_fspt as fspt
+
+RADIUS = 6.0
+VIEWS = [0, 90, 180, 270]
+SCENE = """<scene version="3.0.0">
+    <default name="view" value="0"/>
+    <integrator type="fspt_integral"/>
+    <sensor type="fspt_lens">
+        <float name="focal_length" value="55"/><float name="f_number" value="2.8"/>
+        <float name="magnification" value="0.5"/><float name="pixel_pitch" value="0.5"/>
+        <transform name="to_world"><lookat origin="165, 0, 0" target="0, 0, 0" up="0, 0, 1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
+            <string name="pixel_format" value="luminance"/></film>
+    </sensor>
+    <shape type="ply">
+        <string name="filename" value="sphere.ply"/><boolean name="face_normals" value="true"/>
+        <transform name="to_world"><rotate z="1" angle="$view"/></transform>
+        <emitter type="fspt_surface"><float name="exitance" value="1e-3"/></emitter>
+    </shape>
+</scene>"""
+
+
+def sphere_views(folder, **options):
+    """Transport matrix of the sphere of 162 vertices, whose scene `sphere.xml` is written into the folder."""
+    trimesh.creation.icosphere(subdivisions=2, radius=RADIUS).export(folder / "sphere.ply")
+    (folder / "sphere.xml").write_text(SCENE)
+    return fspt.transport(folder / "sphere.xml", view=VIEWS, **{"rtol": 1e-3} | options)
+
+
+def noisy(matrix, exitance, electrons, seed, read_noise=3.5, **metadata):
+    """Pictures with `electrons` on the brightest pixel, Poisson and read noise."""
+    power, rng = matrix.forward(exitance), np.random.default_rng(seed)
+    per_watt = electrons / power.max()
+    counted = rng.poisson(power * per_watt) + read_noise * rng.standard_normal(power.shape)
+    metadata = {"electrons_per_watt": per_watt, "read_noise": read_noise} | metadata
+    return [fspt.Image(plane / per_watt, metadata=metadata) for plane in counted]
