@@ -84,7 +84,7 @@ def test_reverse_mode_is_the_transpose_of_the_transport_matrix(on, tmp_path):
     T = fspt.transport(scene, on=on, rtol=1e-4)
     expected = T.T @ WAVE.ravel()
     found = backward(scene, f"shape_0.{on}_exitance")
-    # A face is a fifth of a pixel here, and the lines that meet it are counted.
+    # A face is an eighth of a pixel here: 2000 lines of sight meet it.
     share = {"vertex": 1.5, "face": 6.0}[on]
     assert np.linalg.norm(found - expected) <= share * RTOL * np.linalg.norm(expected)
     assert np.abs(found - expected).max() <= 1.5 * share * RTOL * np.abs(expected).max()
@@ -151,7 +151,7 @@ def test_forward_and_reverse_mode_are_transposes(tmp_path, monkeypatch):
 
 
 def test_latent_numbers_and_several_batches(tmp_path, monkeypatch):
-    """J_n = s · J with a factor s: the chain from s to the picture stands through all batches, in both modes."""
+    """J_n = s · J with a factor s: the chain from s to the picture stands through all batches of reverse mode."""
     monkeypatch.setattr(exitance_rows, "BATCH", 1 << 15)
     scene, key = mesh_scene(tmp_path, "vertex"), "shape_0.vertex_exitance"
     parameters, factor = mi.traverse(scene), mi.Float(2.0)
