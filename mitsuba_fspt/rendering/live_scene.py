@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..images.image import Image
 from ..runtime.errors import SceneError
-from ..runtime.plugin_types import is_lens, is_surface
+from ..runtime.plugin_types import is_integral, is_lens, is_surface
 from .provenance import remember_defaults, source_of
 from .render import Progress, integrator_of, render, sensor_of
 from .scene import load, parameter_text, parsed, values_of
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 DRAFT = 0.03  # rtol of a picture while a parameter moves
+DRAFT_SAMPLES = 8  # a pixel, of such a picture by Monte Carlo
 RIGID = 1e-6  # by which the rows of a rotation may differ from orthonormal ones
 Matrix = NDArray[np.float64]  # (4, 4), points to points [mm]
 
@@ -111,10 +112,13 @@ class LiveScene:
     def draft(self, values: Mapping[str, object], model: str | None = None, rtol: float = DRAFT) -> Image:
         """Quick image by the integral, to `rtol` but for spots that lines of sight may miss; parameters as of `image`.
 
+        Where the scene has another integrator, that takes few samples instead: the integral may leave out its light.
         A moved phantom is seen by the lens moved the other way. Raises as `image`.
         """
         scene = self.scene(values, model, exact=False)
-        lens, integrator = sensor_of(scene, 0), integrator_of(scene, "integral")
+        lens, integrator = sensor_of(scene, 0), integrator_of(scene, None)
+        if not is_integral(integrator):
+            return render(scene, spp=DRAFT_SAMPLES)
         own = integrator.quadrature
         quadrature = replace(own, rtol=max(own.rtol, rtol))
         solution = integrator.solve(scene, lens, quadrature, narrow=False)

@@ -64,6 +64,14 @@ def test_a_draft_of_a_turned_phantom_loads_nothing_and_the_image_is_that_of_the_
     assert live.loads == loads + 1
 
 
+def test_the_draft_of_a_monte_carlo_is_one_of_few_samples(mono):
+    live = LiveScene(SCENE.replace('"fspt_integral"', '"path"'))
+    draft, image = live.draft({}), live.image({})
+    assert [draft.metadata["method"], image.metadata["method"]] == ["path", "path"]
+    assert draft.metadata["spp"] < image.metadata["spp"] / 10
+    assert draft.power.sum() == pytest.approx(image.power.sum(), rel=0.05)
+
+
 def test_a_shape_that_moves_alone_is_loaded_again(live):
     live.image({})
     loads, wanted = live.loads, fspt.render(fspt.load(SCENE, aside=3))
