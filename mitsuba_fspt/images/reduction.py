@@ -22,7 +22,7 @@ from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from .counts import FITS, TIFF, Counts, counts_of, read_counts
 from .detector import PLANCK_TIMES_LIGHT, RECORDED, Detector, Exposure
-from .exr import Metadata, read_exr
+from .formats import Metadata, read_planes
 from .image import Image, read
 
 if TYPE_CHECKING:
@@ -298,12 +298,18 @@ def read_measured(path: str | os.PathLike[str]) -> Image:
     DetectorError : electrons without the numbers of their detector, or counts, which `fspt reduce` takes.
     """
     path = Path(path)
-    if path.suffix.lower() in (*TIFF, *FITS, ".npy", ".png") or path.is_dir():
-        raise DetectorError(f"'{path}' holds counts without their detector's numbers. Reduce it with 'fspt reduce'.")
-    channels, metadata = read_exr(path)
-    if metadata.get("quantity") != "electrons" or "Y" not in channels:
+    counts_alone = f"'{path}' holds counts without their detector's numbers. Reduce it with 'fspt reduce'."
+    if path.suffix.lower() in (".npy", ".png") or path.is_dir():
+        raise DetectorError(counts_alone)
+    try:
+        planes, metadata = read_planes(path)
+    except ImageError as cause:
+        if path.suffix.lower() in (*TIFF, *FITS):  # of another program
+            raise DetectorError(counts_alone) from cause
+        raise
+    if "electrons" not in planes:
         return read(path)
-    electrons = channels["Y"].astype(np.float32)
+    electrons = planes["electrons"].astype(np.float32)
     if not np.isfinite(electrons).all():
         raise ImageError(f"image file '{path}' has electrons that are NaN or inf. Expose it again.")
     with named(f"'{path}'"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from small_scenes import FOCUS, HEIGHT, SIDE, WIDTH, camera_scene, disk, glow, mi, power, sphere, write_ply
+from small_scenes import FOCUS, HEIGHT, SCENES, SIDE, WIDTH, camera_scene, disk, glow, mi, power, sphere, write_ply
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.runtime.errors import SceneError
@@ -91,6 +91,13 @@ def test_a_mirror_whose_edge_cuts_the_field(z):
     assert agrees_with_path(scene) > 1e-3
 
 
+def test_three_views_on_one_detector():
+    scene = fspt.load(SCENES / "mirror_rig.xml", width=96, height=32, pixel_pitch=0.27)
+    assert agrees_with_path(scene, spp=256) > 1e-3
+    views = fspt.render(scene).coverage.sum(axis=0) > 0
+    assert np.count_nonzero(np.diff(views.astype(int)) == 1) == 3
+
+
 def test_two_mirrors_in_turn():
     """A periscope: two parallel mirrors at 45° shift the line of sight sideways by 40 mm."""
     mirrors = (pane(70, PERFECT, size=[18, 18, 1], tilt=45), pane(70, PERFECT, size=[25, 25, 1], x=40, tilt=225))
@@ -154,7 +161,8 @@ def test_what_is_cut_off_is_in_the_error():
 def test_coverage_counts_what_glows_through_what_lets_light_pass():
     plate = {"type": "rectangle", "to_world": place(100, size=2.0), "bsdf": {"type": "diffuse"}}
     cases = {"bare": (), "pane": (pane(80, PANE),), "plate": (plate,), "both": (plate, pane(80, PANE))}
-    total = {k: fspt.render(camera_scene(disk(FOCUS, 6), bodies=b), rtol=1e-3).coverage.sum() for k, b in cases.items()}
+    scenes = {k: camera_scene(disk(FOCUS, 6), bodies=b, crop=(16, 12, 14, 12)) for k, b in cases.items()}
+    total = {k: fspt.render(scene, rtol=1e-2).coverage.sum() for k, scene in scenes.items()}
     assert total["pane"] == pytest.approx(total["bare"], rel=1e-3)
     assert total["both"] == pytest.approx(total["plate"], rel=1e-3)
     assert total["plate"] < 0.99 * total["bare"]
@@ -177,15 +185,16 @@ def test_narrow_light_in_a_mirror_is_in_the_error():
 
 
 def test_the_surface_form_goes_through_panes_alone():
-    scene = camera_scene(sphere(150, 9), bodies=(pane(80, PANE),))
-    pupil, surface = (fspt.render(scene, rtol=1e-3, domain=domain) for domain in ("pupil", "surface"))
-    assert abs(pupil.power - surface.power).max() <= 2e-3 * pupil.power.max()
+    scene = camera_scene(sphere(150, 9), bodies=(pane(80, PANE),), crop=(4, 4, 12, 12))
+    pupil, surface = (fspt.render(scene, rtol=1e-2, domain=domain) for domain in ("pupil", "surface"))
+    assert abs(pupil.power - surface.power).max() <= 2e-2 * pupil.power.max()
+    assert pupil.power.sum() == pytest.approx(surface.power.sum(), rel=2e-3)
     with pytest.raises(SceneError, match=r"'domain' = surface .* Set it to pupil"):
         fspt.render(camera_scene(sphere(150, 9), bodies=(pane(200, PERFECT),)), domain="surface")
 
 
 def test_a_scene_without_specular_shapes_ends_lines_of_sight_at_the_first_surface():
-    scene = camera_scene(sphere(150, 9), bodies=(pane(80, {"type": "diffuse"}, size=3.0),))
+    scene = camera_scene(sphere(150, 9), bodies=(pane(80, {"type": "diffuse"}, size=3.0),), crop=(12, 10, 10, 8))
     image, other = (fspt.render(scene, shortcuts=shortcuts) for shortcuts in (True, False))
     assert "lines of sight beyond the first surface: left out" in image.metadata["left_out"]
     assert abs(image.power - other.power).max() <= 2e-3 * image.power.max()

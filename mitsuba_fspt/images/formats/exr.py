@@ -1,4 +1,4 @@
-"""OpenEXR: 32-bit float channels `Y`, `error.Y`, `coverage.Y`, `mask.Y`, and metadata as header attributes under `fspt:`."""
+"""OpenEXR: 32-bit float channels `Y`, `error.Y`, `coverage.Y`, `mask.Y`, metadata as attributes under `fspt:`."""
 
 from __future__ import annotations
 
