@@ -46,7 +46,15 @@ Rows = Annotated[bool, typer.Option("--json", help="Print one JSON array of all 
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print no results and no progress; warnings stay.")]
 WavelengthNm = Annotated[float | None, typer.Option(help="Of the light [nm], for units of photons.")]
 MOST = 100_000  # values of a range
-NAMES = {".xml": "scene", ".png": "picture", ".csv": "table", ".ply": "phantom", ".vol": "fluence"}
+NAMES = {
+    ".xml": "scene",
+    ".png": "picture",
+    ".csv": "table",
+    ".ply": "phantom",
+    ".vol": "fluence",
+    ".npz": "T",
+    ".toml": "camera",
+}
 
 
 def definitions(define: list[str] | None) -> dict[str, str]:

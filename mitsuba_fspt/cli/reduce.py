@@ -10,7 +10,7 @@ import typer
 
 from ..runtime.atomic_files import require_apart
 from ..runtime.errors import DetectorError, ImageError
-from .options import AsJson, Quiet, require_writable
+from .options import AsJson, Quiet, require_image, require_writable
 from .terminal import print_result, progress_bar
 
 if TYPE_CHECKING:
@@ -53,7 +53,10 @@ def reduce(
     camera = Detector.from_toml(detector)
     numbers = {"wavelength_nm": wavelength_nm, "binning": binning}
     frames = {"bias": bias, "dark": dark, "flat": flat, "cosmic_rays": cosmic_rays}
-    require_writable(output, ".toml" if calibrate else ".exr", DetectorError if calibrate else ImageError)
+    if calibrate:
+        require_writable(output, ".toml", DetectorError)
+    else:
+        require_image(output)
     require_apart(output, [*counts, detector, *(p for p in (bias, dark, flat) if p)], error=ImageError)
     if pixel_pitch is None and camera.pixel_pitch is not None:
         pixel_pitch = camera.pixel_pitch * binning

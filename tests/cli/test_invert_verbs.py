@@ -119,7 +119,7 @@ def test_bad_input_of_reduce(run, folder, monkeypatch, tmp_path):
     for arguments, words in (
         (("counts_0.npy", "--detector", "camera.toml", "-o", "x.exr", "--wavelength-nm", 650), "exposure time"),
         (("none.tif", "--detector", "camera.toml", *SETTINGS, "-o", "x.exr"), "do not exist"),
-        (("counts_0.npy", "--detector", "camera.toml", *SETTINGS, "-o", "x.png"), "must end in .exr"),
+        (("counts_0.npy", "--detector", "camera.toml", *SETTINGS, "-o", "x.png"), "must end in"),
         (("counts_0.npy", "--detector", "none.toml", *SETTINGS, "-o", "x.exr"), "none.toml"),
     ):
         code, out, err = run("reduce", *arguments)
