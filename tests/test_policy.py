@@ -38,6 +38,7 @@ IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
 DRJIT_ROOMS = {"jit", "emission", "integral", "plugins"}
 IMPORTS_MITSUBA = {"runtime", "rendering", "validation", "studies", "inverse"}
 PUBLIC = [
+    "Calibration",
     "Comparison",
     "Convergence",
     "Detector",
@@ -47,8 +48,10 @@ PUBLIC = [
     "Inversion",
     "Phantom",
     "TransportMatrix",
+    "calibrate",
     "compare",
     "converge",
+    "derivatives",
     "explain",
     "import_flux",
     "invert",
