@@ -4,6 +4,9 @@ from .images.detector import Detector as Detector
 from .images.detector import Exposure as Exposure
 from .images.image import Image as Image
 from .images.image import read as read
+from .inverse.calibrate import Calibration as Calibration
+from .inverse.calibrate import calibrate as calibrate
+from .inverse.derivatives import derivatives as derivatives
 from .inverse.inversion import Inversion as Inversion
 from .inverse.invert import invert as invert
 from .inverse.transport import transport as transport

@@ -50,6 +50,7 @@ IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
 DRJIT_ROOMS = {"jit", "emission", "integral", "plugins"}
 IMPORTS_MITSUBA = {"runtime", "rendering", "validation", "studies", "inverse"}
 PUBLIC = [
+    "Calibration",
     "Comparison",
     "Convergence",
     "Detector",
@@ -59,8 +60,10 @@ PUBLIC = [
     "Inversion",
     "Phantom",
     "TransportMatrix",
+    "calibrate",
     "compare",
     "converge",
+    "derivatives",
     "explain",
     "import_flux",
     "invert",

@@ -37,7 +37,7 @@ class Settings:
     """Accuracy of `invert`.
 
     accuracy : of the minimum
-    drawn : of the minima of random draws and while variances and weight are sought; a decrement of 0.01 widens an
+    drawn : of the minima of random draws, and while variances and weight are sought; a decrement of 0.01 widens an
         interval by at most 0.5 %
     reweighted : relative change of the standard deviations, root mean square, at which they count as converged; it
         changes χ² by as much
