@@ -28,8 +28,7 @@ def ramp(most=500.0, size=32):
 def test_expose_then_reduce_is_within_its_errors():
     """400 seeds: the mean is right to four standard errors, and the scatter over the stated error is 1 on each level.
 
-    Seen to fail without the bias, the gain, the dark current or the quantum efficiency (mean), without the read noise
-    or with the variance of the rounding times twelve (scatter).
+    Seen to fail without the bias or the gain (mean), and without the read noise (scatter).
     """
     image = ramp()
     found = [CCD.reduce(CCD.expose(image, 60, 650, seed=s).counts, **SETTINGS, pixel_pitch=0.0135) for s in range(400)]
@@ -47,7 +46,7 @@ def test_expose_then_reduce_is_within_its_errors():
 def test_stacks_and_frames():
     """Five frames, a dark stack and a flat field that falls by a third: χ² of the reduced image is 1.
 
-    Seen to fail without the flat field, with the dark frame for the bias alone, and with the variance of one frame.
+    The flat field, the dark frame and the number of frames each change the mean or the scatter.
     """
     pytest.importorskip("ccdproc")
     image = ramp(2000.0, 64)
@@ -123,7 +122,7 @@ def test_files(tmp_path):
 def test_uniform_source_calibrates():
     """A sphere of radiance L through f/2.8: power π L A_vd f, so that J = π L; the quantum efficiency comes back.
 
-    With 4π for π the efficiency comes out at a quarter. Seen to fail with that.
+    With 4π for π the efficiency comes out at a quarter.
     """
     lens = Lens.focused(55, 2.8, magnification=0.5)
     radiance, shape = 1e-13, (24, 32)

@@ -19,7 +19,7 @@ DISK = """
 def test_f_number_of_a_filled_field(tmp_path, mono):
     """A disc fills every cone of lines of sight: P = J A_vd f (Eq. M.17) with R = F/(2N), so that dP/dN is known.
 
-    The stated error holds on every pixel and is small. Seen to fail with half of the step in the difference.
+    The stated error holds on every pixel and is small.
     """
     scene = write_scene(tmp_path / "disk.xml", shapes=DISK)
     found = fspt.derivatives(scene, ["f_number"])["f_number"]

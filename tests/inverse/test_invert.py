@@ -37,7 +37,7 @@ def surface_of(vertices, faces, on="vertex", joined=None):
 def test_laplace_beltrami_of_a_sphere(on):
     """−Δ z = 2 z/R² on a sphere: for vertices to 1 %, for faces of unequal triangles to 3 % (Rayleigh quotient).
 
-    Seen to fail without the half of the cotangents, and with the mass of faces at their vertices.
+    Seen to fail without the half of the cotangents.
     """
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     found = surface_of(sphere.vertices, sphere.faces, on)
