@@ -19,7 +19,7 @@ from .window import Window
 if TYPE_CHECKING:
     from ..jit.pixel_grid import Mask, PixelArray
 
-FULL = 1e-6  # of all lines of sight hit but for so many, as far as a sum of float32 weights knows
+FULL = 1e-6  # share of lines of sight that may miss where all hit: rounding of a sum of float32 weights
 # A straight silhouette makes a rule wrong by at most this share of the light, sharp or blurred, where it parts the
 # nodes and where it passes through the rule's gap at the rim of the pupil.
 CUT = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
@@ -140,7 +140,7 @@ class Draft:
         self.coverage, self.outline = coverage, self.grid.outline(coverage)
 
     def grown(self, rough: Mask) -> Mask:
-        """`rough` and the surroundings in which what makes it rough may hide; of a silhouette `cut_off` knows."""
+        """`rough` and the pixels around in which its cause may lie; silhouettes are counted by `cut_off`."""
         source = rough & (self.error > self.tolerance) & ~self.outline
         return rough | self.grid.grow(source, *self.reach(self.nodes))
 

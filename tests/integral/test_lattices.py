@@ -42,7 +42,7 @@ def looked_at():
 
 
 def test_lattices_find_the_share_that_an_outline_leaves(looked_at):
-    """Seen to fail with the tent left out of one coordinate, which counts half of the pixel twice."""
+    """Seen to fail with points that are not folded back into the pixel."""
     draft, cut = looked_at
     expected = draft.window.cut(covered_shares())[cut]
     errors = []
