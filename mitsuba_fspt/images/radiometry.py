@@ -33,8 +33,8 @@ class Converted:
     wavelength_nm : None for watts
     """
 
-    values: Plane
-    error: Plane | None
+    values: NDArray[np.floating]
+    error: NDArray[np.floating] | None
     quantity: str
     unit: str
     wavelength_nm: float | None
@@ -70,9 +70,8 @@ def in_unit(image: Image, unit: str, wavelength_nm: float | None = None) -> Conv
         or given for watts; the metadata do not describe the lens.
     """
     require_unit(unit, wavelength_nm)
-    if unit == "W":
-        error = None if image.error is None else image.error.astype(np.float64)
-        return Converted(image.power.astype(np.float64), error, UNITS[unit], unit, None)
+    if unit == "W":  # no copies: a large picture hardly fits
+        return Converted(image.power, image.error, UNITS[unit], unit, None)
     wavelength = wavelength_of(image, wavelength_nm)
     factor: Plane | float = wavelength * 1e-9 / PLANCK_TIMES_LIGHT  # photons per joule
     if unit != "photons/s":
