@@ -11,7 +11,7 @@ counts as error.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -359,6 +359,32 @@ def follow(
     none = Found(mi.Float(0), mi.Bool(False), mi.UInt32(0), *(mi.Float(dr.inf),) * 2, mi.Float(0))
     state = (Course.begun(ray, start), mi.Bool(True), none, mi.Bool(passes), mi.UInt32(0), stack)
     return dr.while_loop(state, lambda course, foremost, found, alive, *_: alive, leg)[2]
+
+
+def strongest_course(
+    scene: mi.Scene, specular: Specular, ray: mi.Ray3f, cosine: mi.Float, start: mi.Float
+) -> Iterator[tuple[mi.SurfaceInteraction3f, mi.Float]]:
+    """Surfaces on the course of the strongest lobes of one line of sight, and the depth [mm] at which each is seen.
+
+    Parameters as of `follow`, for one line. The last one is where the line ends, unless it leaves that for a place
+    where it meets nothing.
+    """
+    course = Course.begun(ray, start)
+    most, least = mi.UInt32(specular.most), mi.Float(specular.least)
+    while True:
+        ray = mi.Ray3f(course.origin, course.direction)
+        at_one_wavelength(ray)
+        pi = scene.ray_intersect_preliminary(ray)
+        met = pi.is_valid()
+        if not met[0]:
+            return
+        depth = course.depth + pi.t * cosine / course.index
+        yield pi.compute_surface_interaction(ray), depth
+        number = mi.UInt32(dr.reinterpret_array(mi.UInt32, pi.shape))
+        nexts = [_onward(course, lobe, depth) for lobe in _lobes(specular, pi, ray, number, met)]
+        course, _ = _strongest_first(nexts)
+        if not _followed(specular, most, least, number, course)[0][0]:
+            return
 
 
 def first_met(body: mi.Float) -> mi.UInt32:

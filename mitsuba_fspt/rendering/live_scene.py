@@ -30,13 +30,16 @@ Matrix = NDArray[np.float64]  # (4, 4), points to points [mm]
 
 @dataclass(frozen=True)
 class SurfacePoint:
-    """The first surface on the line of sight through the centres of a pixel and of the pupil.
+    """The surface on the line of sight through the centres of a pixel and of the pupil.
+
+    It is the first one that glows, or else the last one that the line meets; windows and mirrors lead the line on.
 
     position : [mm], in world coordinates
     shape : its id
     exitance : J_n [W/mm²]; None where the shape has no `fspt_surface`
-    depth : distance from the lens plane along the optical axis [mm]
+    depth : distance from the lens plane along the optical axis [mm] at which the point is seen
     column, row, radius : centre and radius of the blur disc [pixels of the image; 0.5, 0.5 is the middle of the first]
+    by_way_of : ids of the windows and mirrors before it, in the order in which the line meets them
     """
 
     position: tuple[float, float, float]
@@ -46,6 +49,7 @@ class SurfacePoint:
     column: float
     row: float
     radius: float
+    by_way_of: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -129,31 +133,30 @@ class LiveScene:
         self, values: Mapping[str, object], model: str | None, column: int, row: int
     ) -> SurfacePoint | None:
         """Surface point under the middle of a pixel of the image; None where the line of sight meets nothing."""
-        import drjit as dr
         import mitsuba as mi
 
         scene = self.scene(values, model)
         lens = sensor_of(scene, 0)
         offset = mi.Vector2f(lens.film().crop_offset())
-        ray, _, _ = lens.line_of_sight(mi.Point2f(column + 0.5, row + 0.5) + offset, mi.Point2f(0, 0))
-        si = scene.ray_intersect(ray)
-        if not si.is_valid()[0]:
+        ray, cosine, _ = lens.line_of_sight(mi.Point2f(column + 0.5, row + 0.5) + offset, mi.Point2f(0, 0))
+        met = _surfaces(scene, lens, ray, cosine)
+        if not met:
             return None
-        shape = next(s for s in scene.shapes() if dr.all(si.shape == mi.ShapePtr(s)))
+        shapes = [shape for shape, _, _ in met]
+        shape, si, depth = met[-1]
         emitter = shape.emitter()
         exitance = float(emitter.exitance.eval(si)[0][0]) if is_surface(emitter) else None
-        centre, radius, _ = lens.blur_disc(si.p)
+        centre, radius, _ = lens.blur_disc(ray(depth / cosine))
         centre -= offset
-        position = tuple(float(c[0]) for c in si.p)
-        depth = lens.farthest_depth(np.array([position], np.float64))
         return SurfacePoint(
-            position,  # type: ignore[arg-type]
+            tuple(float(c[0]) for c in si.p),  # type: ignore[arg-type]
             shape.id(),
             exitance,
-            depth,
+            float(depth[0]),
             float(centre.x[0]),
             float(centre.y[0]),
             abs(float(radius[0])),
+            tuple(shape.id() for shape in shapes[:-1]),
         )
 
     def scene(self, values: Mapping[str, object], model: str | None = None, *, exact: bool = True) -> mi.Scene:
@@ -171,6 +174,25 @@ class LiveScene:
         _apply(change, sensor_of(self._scene, 0), model)
         remember_defaults(self._scene, values_of(self.source, wanted))
         return self._scene
+
+
+def _surfaces(
+    scene: mi.Scene, lens: mi.Sensor, ray: mi.Ray3f, cosine: mi.Float
+) -> list[tuple[mi.Shape, mi.SurfaceInteraction3f, mi.Float]]:
+    """Shapes on a line of sight up to the first that glows, their points and the depths [mm] at which they are seen."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from ..integral.specular import Specular, strongest_course
+
+    specular = Specular.of(scene, lens, even_if_none=True)
+    found = []
+    for si, depth in strongest_course(scene, specular, ray, cosine, mi.Float(0)):  # type: ignore[arg-type]
+        shape = next(s for s in scene.shapes() if dr.all(si.shape == mi.ShapePtr(s)))
+        found.append((shape, si, depth))
+        if is_surface(shape.emitter()):
+            break
+    return found
 
 
 def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], exact: bool) -> Change | None:

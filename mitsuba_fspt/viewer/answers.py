@@ -10,7 +10,6 @@ import struct
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -139,15 +138,19 @@ class Answers:
         )
         planes: dict[str, NDArray] = {"power": image.power, "error": image.error, "coverage": image.coverage}  # type: ignore[dict-item]
         known = image.metadata
+        lacks = ""
         if request.etendue:
-            with suppress(FsptError):
+            try:
                 planes["etendue"] = etendue(image)
+            except FsptError as error:
+                lacks = _one_line(error)
         height, width = image.shape
         record = given | {
             "kind": "picture",
             "height": height,
             "width": width,
             "planes": list(planes),
+            "lacks": lacks,
             "rtol": known.get("rtol"),
             "method": known.get("method"),
             "side": virtual_pitch(known),

@@ -111,6 +111,27 @@ def test_the_surface_point_of_a_pixel(live):
     assert live.surface_point({}, None, 0, 0) is None
 
 
+def test_the_surface_point_behind_a_mirror_and_a_pane(mono):
+    """Mirror on the axis at x = 100, at 45 degrees; box with its face at y = 36: seen at 60 + 36 mm from x = 160."""
+    before = SCENE.replace(
+        '<shape type="cube" id="box">',
+        """<shape type="rectangle" id="mirror"><bsdf type="twosided"><bsdf type="conductor"/></bsdf>
+            <transform name="to_world"><lookat origin="100, 0, 0" target="110, 10, 0" up="0, 0, 1"/></transform></shape>
+        <shape type="rectangle" id="pane"><bsdf type="thindielectric"/>
+            <transform name="to_world"><scale value="20"/><rotate x="1" angle="90"/>
+            <translate x="100" y="20"/></transform></shape>
+        <shape type="cube" id="box">""",
+    )
+    turned = before.replace('z="2"/><rotate z="1" angle="$turn"/>', 'z="2"/><translate x="100" y="39"/>')
+    place = LiveScene(turned).surface_point({}, None, 16, 12)
+    assert (place.shape, place.by_way_of, place.exitance) == ("box", ("mirror", "pane"), pytest.approx(2))
+    assert place.position[1] == pytest.approx(36, abs=1e-4)
+    assert place.depth == pytest.approx(96, abs=1e-3)
+    # The disc of a point of the sharp plane that the straight line of sight would meet at this depth.
+    assert place.radius == pytest.approx(6.25 * 54 / 96 * 75 / 150 / 0.5, rel=1e-4)
+    assert (place.column, place.row) == pytest.approx((16.5, 12.5), abs=0.05)
+
+
 def test_a_loaded_scene_is_taken_with_its_values_unless_it_was_changed(mono):
     scene = fspt.load(SCENE, f_number=8)
     live = LiveScene(scene)

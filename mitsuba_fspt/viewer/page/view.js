@@ -123,6 +123,20 @@ class Picture {
     return out;
   }
 
+  /** Error of a sum: errors of the integral add up at most, standard errors of Monte Carlo are independent. */
+  get together() { return this.method === "integral" ? (sum, error) => sum + error : Math.hypot; }
+
+  /** Total power of the picture and its error [W]. */
+  total() {
+    const { power, error } = this.plane, { together } = this;
+    let sum = 0, whole = 0;
+    for (let i = 0; i < this.count; i++) {
+      sum += power[i];
+      whole = together(whole, error[i]);
+    }
+    return [sum, whole];
+  }
+
   /** Middle of a pixel [mm] on the virtual detector plane, x to the right and y up; null if its side is unknown. */
   place(column, row) {
     if (!this.side) return null;
@@ -238,7 +252,8 @@ class View {
         make("form", { "aria-label": "Parameters", onsubmit: (e) => e.preventDefault() },
           nodes.sliders, nodes.second, nodes.display, nodes.files),
         nodes.pictures,
-        make("section", { class: "details", "aria-label": "Read-outs" }, nodes.readout, nodes.point, nodes.region, nodes.profiles)),
+        make("section", { class: "readouts", "aria-label": "Read-outs" }, nodes.readout, nodes.point, nodes.region),
+        make("section", { class: "details", "aria-label": "Profiles" }, nodes.profiles)),
     );
     this.addPanel("a");
   }
@@ -534,7 +549,7 @@ class View {
       const at = found.position.map((x) => digits(x, 5)).join(", ");
       const glow = found.exitance === null ? "does not glow" : `J_n = ${digits(found.exitance, 5)} W/mm²`;
       const blur = found.radius === null ? "unbounded" : `${digits(found.radius, 3)} pixels`;
-      this.tell(`Pixel ${column}, ${row}: surface point (${at}) mm on '${found.shape}', ${glow}, depth ${digits(found.depth, 5)} mm, blur disc of radius ${blur}.`);
+      this.tell(`Pixel ${column}, ${row}: surface point (${at}) mm on '${found.shape}'${found.by_way_of.length ? ` by way of ${found.by_way_of.join(", ")}` : ""}, ${glow}, depth ${digits(found.depth, 5)} mm, blur disc of radius ${blur}.`);
     }
     this.drawMarks();
   }
@@ -582,8 +597,17 @@ class View {
     });
   }
 
+  /** True where the shown unit needs étendue that a picture does not have yet; one that never will is told of. */
+  waits() {
+    const pictures = this.options.unit === "radiance" ? Object.values(this.pictures).filter((p) => !p.plane.etendue) : [];
+    this.setFault("unit", pictures.find((p) => p.lacks)?.lacks ?? "");
+    return pictures.some((p) => !p.lacks);
+  }
+
   drawAll() {
+    if (this.waits()) return;
     const { log, map } = this.options;
+    this.nodes.pictures.style.setProperty("--least", this.pictures.a.width > 2 * this.pictures.a.height ? "34em" : "17em");
     for (const [name, panel] of Object.entries(this.panels)) {
       if (name === "difference") this.drawDifference(panel);
       else if (this.pictures[name]) this.drawPanel(panel, this.pictures[name], this.shownValues(name), ...this.scale(name), log, map);
@@ -663,10 +687,9 @@ class View {
     if (!picture) return;
     if (name === "difference") panel.caption.textContent = PANELS.difference;
     else {
-      let total = 0;
-      for (const value of picture.plane.power) total += value;
+      const [total, error] = picture.total();
       const { f_number: stop, focal_length: focal, magnification: t } = picture.lens;
-      panel.caption.textContent = `${name === "b" ? "Second lens" : "Lens"}${this.models[name] ? ` (${this.models[name]})` : ""}: F = ${digits(focal)} mm, f/${digits(stop)}, magnification ${digits(t)}, total ${digits(total)} W`;
+      panel.caption.textContent = `${name === "b" ? "Second lens" : "Lens"}${this.models[name] ? ` (${this.models[name]})` : ""}: F = ${digits(focal)} mm, f/${digits(stop)}, magnification ${digits(t)}, total ${digits(total)} ± ${digits(error, 2)} W`;
     }
   }
 
@@ -700,8 +723,7 @@ class View {
     const heads = ["region", "pixels", `total [${unit === "radiance" ? "W" : UNITS[unit].replace("/pixel", "")}]`, "± error", "mean", "max", `sd [${UNITS[unit]}]`, "area [mm²]"];
     const table = make("table", {}, make("tr", {}, ...heads.map((text) => make("th", { scope: "col", text }))));
     for (const [slot, picture] of Object.entries(this.pictures)) {
-      // Errors of the integral add up at most; standard errors of Monte Carlo are independent.
-      const together = picture.method === "integral" ? (sum, e) => sum + e : Math.hypot;
+      const { together } = picture;
       let total = 0, error = 0, sum = 0, squares = 0, most = -Infinity, count = 0;
       for (let row = top; row < Math.min(top + rows, picture.height); row++) {
         for (let column = left; column < Math.min(left + columns, picture.width); column++) {
