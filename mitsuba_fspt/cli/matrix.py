@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from ..runtime.backend import quiet_mitsuba
@@ -99,20 +98,8 @@ def _numbers(text: str) -> list[int]:
 
 def _summary(matrix: TransportMatrix, file: Path, seconds: float) -> dict[str, Any]:
     """Numbers about a matrix and its making."""
-    per_area = np.divide(matrix.sensitivity, matrix.areas, out=np.zeros_like(matrix.areas), where=matrix.areas > 0)
-    seen = matrix.seen
-    return {
-        "file": str(file),
-        "shape": list(matrix.shape),
-        "image_shape": list(matrix.image_shape),
-        "views": matrix.views,
-        "entries": matrix.entries,
-        "bytes": file.stat().st_size,
-        "seconds": round(seconds, 3),
-        # Power on the pixels over that which leaves a vertex or face.
-        "sensitivity": [float(per_area[seen].min()), float(per_area[seen].max())],
-        "seen": float(matrix.areas[seen].sum() / matrix.areas.sum()),
-    }
+    made = {"bytes": file.stat().st_size, "seconds": round(seconds, 3)}
+    return {"file": str(file)} | matrix.summary() | made
 
 
 def _text(summary: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""How images and comparisons show themselves in a notebook: the numbers that matter, and a picture."""
+"""How results show themselves in a notebook: a table of the numbers that matter, and a picture."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ LENS = (
 
 def image_png(image: Image) -> bytes | None:
     """PNG of the picture that `--png` writes; None without matplotlib."""
-    return _png(lambda: draw_panels([image]))
+    return png_of(lambda: draw_panels([image]))
 
 
 def comparison_png(comparison: Comparison) -> bytes | None:
     """PNG of the profiles of both images; None without matplotlib or without profiles."""
-    return _png(lambda: draw_comparison_profiles(comparison)) if comparison.profiles else None
+    return png_of(lambda: draw_comparison_profiles(comparison)) if comparison.profiles else None
 
 
 def image_html(image: Image) -> str:
@@ -52,7 +52,7 @@ def image_html(image: Image) -> str:
     rows += [("lens", lens)] if lens else []
     rows += [(key, f"{known['source_power']:g} W") for key in ("source_power",) if key in known]
     rows += [("warning", str(known["warnings"]))] if "warnings" in known else []
-    return _html("Image", rows, image_png(image))
+    return html_of("Image", rows, image_png(image))
 
 
 def comparison_html(comparison: Comparison) -> str:
@@ -61,10 +61,10 @@ def comparison_html(comparison: Comparison) -> str:
     for line in comparison.render_text().splitlines():
         name, _, value = line.partition(" ")
         rows.append((name, value.strip()))
-    return _html("Comparison", rows, comparison_png(comparison))
+    return html_of("Comparison", rows, comparison_png(comparison))
 
 
-def _png(draw: Callable[[], Figure]) -> bytes | None:
+def png_of(draw: Callable[[], Figure]) -> bytes | None:
     """PNG file of a figure as bytes; None where matplotlib is missing."""
     try:
         figure = draw()
@@ -75,7 +75,7 @@ def _png(draw: Callable[[], Figure]) -> bytes | None:
     return file.getvalue()
 
 
-def _html(title: str, rows: list[tuple[str, str]], png: bytes | None) -> str:
+def html_of(title: str, rows: list[tuple[str, str]], png: bytes | None) -> str:
     """A table of names and values, and a picture below it whose text alternative is the table's title."""
     lines = [
         f'<tr><th scope="row" style="text-align:left">{escape(name)}</th>'

@@ -207,6 +207,18 @@ class Inversion:
         """(views, height, width), (measured − fitted)/σ; NaN where masked, or outside the surface."""
         return (self.measured - self.fitted) / self.sigma
 
+    def _repr_png_(self) -> bytes | None:
+        """Picture of `report` for notebooks; None without matplotlib."""
+        from .notebook import inversion_png
+
+        return inversion_png(self)
+
+    def _repr_html_(self) -> str:
+        """Numbers and picture for notebooks."""
+        from .notebook import inversion_html
+
+        return inversion_html(self)
+
     def __repr__(self) -> str:
         return (
             f"Inversion({self.total:.5g} W from {100 * self.summary()['seen']:.3g} % of the surface, "

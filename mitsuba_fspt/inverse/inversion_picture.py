@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..images.picture import empty_figure, require_png
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import ImageError
+from .sensitivity_picture import view_labels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,6 +34,7 @@ def draw(inversion: Inversion) -> Figure:
     views = len(inversion.measured)
     figure = empty_figure(width=12.5, height=0.8 + 2.9 * views)
     axes = figure.subplots(views, 4, squeeze=False)
+    labels = view_labels(inversion.matrix)
     peak = float(np.nanmax(inversion.fitted)) or 1.0
     flux = exitance_images(inversion)
     highest = float(np.nanmax(flux))
@@ -51,8 +53,7 @@ def draw(inversion: Inversion) -> Figure:
             if row == 0:
                 ax.set_title(title, fontsize="small")
             if column == 0:
-                view = inversion.matrix.views[row]
-                ax.set_ylabel("  ".join(f"{k}={v}" for k, v in view.items()), fontsize="x-small")
+                ax.set_ylabel(labels[row], fontsize="small")
         figure.colorbar(drawn, ax=list(axes[:, column]), shrink=0.8)
     return figure
 

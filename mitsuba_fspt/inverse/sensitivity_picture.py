@@ -13,6 +13,8 @@ from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import ImageError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from .transport_matrix import TransportMatrix
 
 MOST_COLUMNS = 4
@@ -28,9 +30,15 @@ def sensitivity_images(matrix: TransportMatrix) -> NDArray[np.float64]:
     return np.divide(light, weight, out=np.full_like(light, np.nan), where=weight > 0)
 
 
-def write_sensitivity(matrix: TransportMatrix, path: str | os.PathLike[str]) -> None:
-    """Write `sensitivity_images` side by side to a PNG file; ImageError or BackendError where that is not possible."""
-    file = require_png(path)
+def view_labels(matrix: TransportMatrix) -> list[str]:
+    """Parameter values of each view, without those that all of several views share."""
+    first, *others = matrix.views
+    shared = {name for name, value in first.items() if others and all(view.get(name) == value for view in others)}
+    return ["  ".join(f"{name}={value}" for name, value in view.items() if name not in shared) for view in matrix.views]
+
+
+def draw_sensitivity(matrix: TransportMatrix) -> Figure:
+    """Figure of `sensitivity_images`, side by side; BackendError without matplotlib."""
     images = sensitivity_images(matrix)
     columns = min(len(images), MOST_COLUMNS)
     rows = -(-len(images) // columns)
@@ -39,9 +47,17 @@ def write_sensitivity(matrix: TransportMatrix, path: str | os.PathLike[str]) -> 
     most = np.nanmax(images)
     for ax in axes:
         ax.axis("off")
-    for ax, image, view in zip(axes, images, matrix.views, strict=False):
+    for ax, image, label in zip(axes, images, view_labels(matrix), strict=False):
         drawn = ax.imshow(image, vmin=0, vmax=most, cmap="viridis")
-        ax.set_title("  ".join(f"{name}={value}" for name, value in view.items()), fontsize="small")
-    figure.colorbar(drawn, ax=list(axes), label="power on all pixels / power that leaves the surface", shrink=0.8)
+        ax.set_title(label, fontsize="small")
+    bar = figure.colorbar(drawn, ax=list(axes), shrink=0.8)
+    bar.set_label("share of the light of a surface point\nthat arrives on the pixels of all views", fontsize="small")
+    return figure
+
+
+def write_sensitivity(matrix: TransportMatrix, path: str | os.PathLike[str]) -> None:
+    """Write the figure to a PNG file; ImageError or BackendError where that is not possible."""
+    file = require_png(path)
+    figure = draw_sensitivity(matrix)
     with atomic_path(file, ImageError) as temporary:
         figure.savefig(temporary, dpi=130)

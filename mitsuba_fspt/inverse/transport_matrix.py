@@ -170,6 +170,35 @@ class TransportMatrix(LinearOperator):
 
         write(self, path)
 
+    def summary(self) -> dict[str, Any]:
+        """Numbers about the matrix by name, ready for JSON.
+
+        `sensitivity`: least and largest share of the light that leaves a seen vertex or face which arrives on the
+        pixels of all views. `seen`: share of the surface.
+        """
+        seen = self.seen
+        per_area = self.sensitivity[seen] / self.areas[seen]
+        return {
+            "shape": list(self.shape),
+            "image_shape": list(self.image_shape),
+            "views": self.views,
+            "entries": self.entries,
+            "sensitivity": [float(per_area.min()), float(per_area.max())] if seen.any() else [0.0, 0.0],
+            "seen": float(self.areas[seen].sum() / self.areas.sum()),
+        }
+
+    def _repr_png_(self) -> bytes | None:
+        """Picture of the sensitivity for notebooks; None without matplotlib."""
+        from .notebook import matrix_png
+
+        return matrix_png(self)
+
+    def _repr_html_(self) -> str:
+        """Numbers and picture for notebooks."""
+        from .notebook import matrix_html
+
+        return matrix_html(self)
+
     def __repr__(self) -> str:
         views, height, width = self.image_shape
         return f"TransportMatrix({views} views of {width} x {height} pixels, {self.shape[1]} columns on {self.on})"
