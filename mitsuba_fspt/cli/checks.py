@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 
 from ..runtime.backend import quiet_mitsuba
+from ..runtime.progress_bar import progress_bar
 from .options import AsJson, Domain, Parameters, Quiet, Rows, Rtol, SceneFile, Sensor, definitions
-from .terminal import print_result, progress_bar
+from .terminal import print_result
 
 
 def doctor(as_json: AsJson = False, quiet: Quiet = False) -> None:

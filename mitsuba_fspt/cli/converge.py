@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from ..runtime.backend import quiet_mitsuba
+from ..runtime.progress_bar import progress_bar
 from .options import AsJson, Parameters, Quiet, SceneFile, definitions, require_writable
-from .terminal import print_result, progress_bar
+from .terminal import print_result
 
 
 def converge(

@@ -13,8 +13,9 @@ import typer
 
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import TransportError
+from ..runtime.progress_bar import progress_bar
 from .options import SceneFile, require_picture, require_writable, value_lists
-from .terminal import Interrupted, progress_bar
+from .terminal import Interrupted
 
 if TYPE_CHECKING:
     from ..inverse.transport_matrix import TransportMatrix

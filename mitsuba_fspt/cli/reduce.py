@@ -10,8 +10,9 @@ import typer
 
 from ..runtime.atomic_files import require_apart
 from ..runtime.errors import DetectorError, ImageError
+from ..runtime.progress_bar import progress_bar
 from .options import AsJson, Quiet, require_image, require_writable
-from .terminal import print_result, progress_bar
+from .terminal import print_result
 
 if TYPE_CHECKING:
     from ..images.detector import Detector

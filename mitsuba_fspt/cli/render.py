@@ -15,6 +15,7 @@ from ..rendering.scene_xml import read_text, read_xml
 from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import ImageError, SceneError
+from ..runtime.progress_bar import progress_bar
 from .options import (
     AsJson,
     Domain,
@@ -34,7 +35,7 @@ from .options import (
     several,
     typed,
 )
-from .terminal import Interrupted, print_result, progress_bar
+from .terminal import Interrupted, print_result
 
 if TYPE_CHECKING:
     from ..images.image import Image

@@ -12,8 +12,9 @@ import typer
 
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import BackendError
+from ..runtime.progress_bar import progress_bar
 from .options import AsJson, Method, Quiet, Rtol, SceneFile, Seed, Sensor, SourcePower, Spp, value_lists
-from .terminal import Interrupted, print_result, progress_bar
+from .terminal import Interrupted, print_result
 
 if TYPE_CHECKING:
     from ..studies.sweep import SweepRow

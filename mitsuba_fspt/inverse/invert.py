@@ -7,7 +7,7 @@ noise added (randomise then optimise: J. M. Bardsley et al., SIAM J. Sci. Comput
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,8 +19,8 @@ from scipy.sparse import csr_array, diags_array
 from ..images.detector import Exposure
 from ..images.image import Image
 from ..runtime.errors import InversionError
-from ..runtime.interrupt import ctrl_c_noted
 from ..runtime.numbers import number, whole
+from ..runtime.progress_bar import Progress, reported
 from .inversion import Inversion
 from .measurement import Measurement
 from .nonnegative import Accuracy, Solve, factor, minimise
@@ -29,7 +29,6 @@ from .surface import Surface
 from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def invert(
     seed : of the draws, 0 … 2⁵³
     confidence : of the intervals, in (0, 1)
     scene : scene with the meshes of the matrix, where its own cannot be read any more
-    progress : called with what is being done and the share done
+    progress : called with what is being done and the share done; without it a notebook shows a bar
     settings : accuracy
 
     Raises
@@ -116,13 +115,7 @@ def invert(
     options = Options(weight, samples, seed, confidence)
     measurement = Measurement.of(matrix, images, error, mask, gain_error)
     problem = Problem.of(matrix, measurement, Surface.of(matrix, scene), prior or Prior(), settings or Settings())
-    with ctrl_c_noted() as check_interrupt:
-
-        def report(what: str, share: float) -> None:
-            check_interrupt()
-            if progress:
-                progress(what, share)
-
+    with reported(progress) as report:
         return problem.solved(options, report)
 
 

@@ -20,8 +20,9 @@ from ..rendering.scene import load
 from ..rendering.scene_xml import is_text
 from ..runtime import backend
 from ..runtime.errors import FsptError, SceneError, TransportError
-from ..runtime.interrupt import ctrl_c_held, ctrl_c_noted
+from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import whole
+from ..runtime.progress_bar import Progress, reported
 from ..studies.sweep_point import SceneSource, point_of, texts_of
 from .transport_file import FORMAT, PartialFile, read_transport
 from .transport_matrix import TransportMatrix
@@ -29,8 +30,6 @@ from .view_block import Block, Part, block_of, glowing_meshes, parts_of, require
 
 if TYPE_CHECKING:
     import mitsuba as mi
-
-    Progress = Callable[[str, float], None]
 
 DARK = "sees nothing of the meshes"
 
@@ -92,7 +91,7 @@ def transport(
     sensor : number of the sensor, or several, one view each
     file : npz file to which the views are written one at a time; a second call goes on where the first was interrupted
     scheduler : address of a dask.distributed scheduler or 'local', as in `sweep`; the scene must be a file
-    progress : called with what is being done and the share done
+    progress : called with what is being done and the share done; without it a notebook shows a bar
     parameters : values for `<default>` parameters of the scene; lists are multiplied out, the last one fastest
 
     Raises
@@ -105,13 +104,7 @@ def transport(
     on, rtol = required_on(on), required_rtol(rtol)
     tasks = _tasks(scene, parameters, sensor, on, rtol)
     partial = None if file is None else PartialFile(file)
-    with ctrl_c_noted() as check_interrupt:
-
-        def report(what: str, share: float) -> None:
-            check_interrupt()
-            if progress:
-                progress(what, share)
-
+    with reported(progress) as report:
         try:
             return _joined(tasks, _results(tasks, partial, scheduler, report), partial)
         except FsptError:  # no later call could go on from there

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from ..images.image import Image
 from ..runtime.errors import SceneError
 from ..runtime.plugin_types import is_integral, is_lens, is_surface
+from ..runtime.progress_bar import Progress
 from .provenance import remember_defaults, source_of
-from .render import Progress, integrator_of, render, sensor_of
+from .render import integrator_of, render, sensor_of
 from .scene import load, parameter_text, parsed, values_of
 from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 

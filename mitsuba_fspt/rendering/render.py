@@ -6,7 +6,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
@@ -20,9 +20,9 @@ from ..integral.quadrature import Quadrature
 from ..integral.shortcuts import SHORTCUTS
 from ..runtime import backend
 from ..runtime.errors import SceneError, named
-from ..runtime.interrupt import ctrl_c_noted
 from ..runtime.numbers import whole
 from ..runtime.plugin_types import is_integral
+from ..runtime.progress_bar import Progress, reported
 from . import monte_carlo
 from .provenance import origin_of
 from .scene import loaded
@@ -37,7 +37,6 @@ DARK = (
     "the picture is dark, no light reaches the lens. Check the lens's 'to_world', that 'exitance' is not 0 everywhere, "
     "and that the faces' normals point outwards"
 )
-Progress = Callable[[str, float], None]
 
 
 def render(
@@ -86,29 +85,16 @@ def render(
     accuracy["shortcuts_off"] = None if shortcuts else frozenset(SHORTCUTS)
     integrator = _integrator(scene, lens, method, accuracy, {"spp": spp, "seed": seed}, max_depth)
     start = time.perf_counter()
-    with ctrl_c_noted() as check_interrupt:
-        report = _reporting(progress, check_interrupt)
+    with reported(progress) as report:
         if is_integral(integrator):
             *planes, how = _integrate(scene, lens, integrator, accuracy, report)
         else:
             spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
             *planes, how = _sample(scene, lens, integrator, spp, seed, report)
-        check_interrupt()
     how |= {"wall_time": time.perf_counter() - start}
     if not planes[0].any():
         how["warnings"] = DARK
     return Image(*planes, {**origin_of(scene, lens), "sensor": sensor, **how, **lens.numbers(), **_versions()})
-
-
-def _reporting(progress: Progress | None, check_interrupt: Callable[[], None]) -> Progress:
-    """Function that reports to `progress`, if there is one, and ends the work after Ctrl-C."""
-
-    def report(stage: str, share: float) -> None:
-        check_interrupt()
-        if progress:
-            progress(stage, share)
-
-    return report
 
 
 def _integrator(

@@ -33,7 +33,7 @@ from .convergence import Convergence, Measurement
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from ..rendering.render import Progress
+    from ..runtime.progress_bar import Progress
 
 BUDGET, ROUNDS = 2.0, 5
 REFERENCE_TIME = 15.0  # times the budget: run time of the reference picture

@@ -9,7 +9,6 @@ from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,10 +23,8 @@ from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import FsptError, ImageError, SceneError
 from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import number, whole
+from ..runtime.progress_bar import Progress, reported
 from .sweep_point import Setting, SweepPoint, points
-
-if TYPE_CHECKING:
-    from ..rendering.render import Progress
 
 INDEX = "index.csv"
 MAX_NAMED = 5  # failed points that an error message names, beside the first of them
@@ -98,7 +95,7 @@ def sweep(
         imports the script that calls: keep the call behind `if __name__ == "__main__":`
     scheduler : address of a dask.distributed scheduler, for example 'tcp://10.0.0.1:8786', or 'local' to start one
         on this machine; needs the extra `cluster`. Workers must find the scene under the same path.
-    progress : called with what is being done and the share done
+    progress : called with what is being done and the share done; without it a notebook shows a bar
 
     Raises
     ------
@@ -118,7 +115,8 @@ def sweep(
     wanted = points(_path_of(scene), parameters, settings, f".{format}")
     _check_names(wanted)
     _check_folder(folder)
-    return _completed(wanted, folder, jobs, scheduler, progress)
+    with reported(progress) as report:
+        return _completed(wanted, folder, jobs, scheduler, report)
 
 
 def _path_of(scene: object) -> Path:
@@ -154,7 +152,7 @@ def _settings(
 
 
 def _completed(
-    wanted: list[SweepPoint], folder: Path, jobs: int | None, scheduler: str | None, progress: Progress | None
+    wanted: list[SweepPoint], folder: Path, jobs: int | None, scheduler: str | None, progress: Progress
 ) -> list[SweepRow]:
     """Rows of all points; renders those whose image is missing, and writes the index, after an interrupt too."""
     rows = {point.file: row for point in wanted if (row := _finished(point, folder)) is not None}
@@ -162,9 +160,8 @@ def _completed(
     failed: dict[str, FsptError] = {}
 
     def report() -> None:
-        if progress:
-            done = len(rows) + len(failed)
-            progress(f"{done} of {len(wanted)} points", done / len(wanted))
+        done = len(rows) + len(failed)
+        progress(f"{done} of {len(wanted)} points", done / len(wanted))
 
     report()
     try:

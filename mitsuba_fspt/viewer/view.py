@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..runtime.extras import require
+from ..runtime.progress_bar import in_notebook
 from .answers import Answers
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def view(
     ViewerError : the port cannot be opened.
     BackendError : a package of the extra `view`, in a notebook of `notebook`, is not installed.
     """
-    if _in_notebook() and ready is None:
+    if in_notebook() and ready is None:
         require("anywidget", "The viewer in a notebook")
         from .widget import widget
 
@@ -49,13 +50,3 @@ def view(
 
     ViewServer(lambda: Answers(scene, parameters), port).run(ready or webbrowser.open)
     return None
-
-
-def _in_notebook() -> bool:
-    """True in a Jupyter kernel."""
-    try:
-        from IPython import get_ipython
-    except ImportError:
-        return False
-    shell = get_ipython()  # type: ignore[no-untyped-call]
-    return shell is not None and "IPKernelApp" in getattr(shell, "config", {})
