@@ -16,6 +16,7 @@ from .options import (
     Quiet,
     Rows,
     SourcePower,
+    Unit,
     WavelengthNm,
     require_image,
     require_picture,
@@ -51,10 +52,12 @@ def plot(
     ] = None,
     log: Annotated[bool, typer.Option("--log", help="Logarithmic colour scale.")] = False,
     limits: Annotated[
-        str | None, typer.Option("--range", metavar="A,B", help="Ends of the colour scale [W/pixel].")
+        str | None, typer.Option("--range", metavar="A,B", help="Ends of the colour scale [unit, W/pixel if left out].")
     ] = None,
     per_panel: Annotated[bool, typer.Option("--per-panel", help="A colour scale for each image.")] = False,
     outline: Annotated[bool, typer.Option("--outline", help="Draw the outline of the phantom.")] = False,
+    unit: Unit = "W",
+    wavelength_nm: WavelengthNm = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -68,7 +71,16 @@ def plot(
     pictures = [read(path) for path in images]
     ends = _range(limits) if limits is not None else None
     names = [path.stem for path in images]
-    figure = draw_panels(pictures, names, log=log, limits=ends, per_panel=per_panel, outline=outline)
+    figure = draw_panels(
+        pictures,
+        names,
+        log=log,
+        limits=ends,
+        per_panel=per_panel,
+        outline=outline,
+        unit=unit,
+        wavelength_nm=wavelength_nm,
+    )
     save_figure(figure, output)
     totals = [float(image.power.sum(dtype="float64")) for image in pictures]
     record = {"output": str(output), "images": [*map(str, images)], "total_power": totals}

@@ -28,6 +28,7 @@ from .options import (
     Sensor,
     SourcePower,
     Spp,
+    Unit,
     WavelengthNm,
     definitions,
     require_image,
@@ -74,7 +75,7 @@ class Output(NamedTuple):
         from ..images.picture import png_file
         from ..images.radiometry import in_unit
 
-        with png_file(image, picture) if picture else nullcontext():
+        with png_file(image, picture, self.unit, self.wavelength_nm) if picture else nullcontext():
             if self.unit == "W":
                 image.write(output)
             else:
@@ -104,9 +105,7 @@ def render(
     seed: Seed = None,
     sensor: Sensor = 0,
     source_power: SourcePower = None,
-    unit: Annotated[
-        str, typer.Option(metavar="W|photons/s|p/s/cm2/sr", help="Of the values written: power or radiance.")
-    ] = "W",
+    unit: Unit = "W",
     wavelength_nm: WavelengthNm = None,
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,

@@ -126,19 +126,22 @@ class Image:
         log: bool = False,
         limits: tuple[float, float] | None = None,
         outline: bool = False,
+        unit: str = "W",
+        wavelength_nm: float | None = None,
     ) -> Axes:
         """Draw the picture that `--png` writes, with colour bar and axes in mm; returns matplotlib's axes.
 
         axes : to draw into; None: those of a new figure of pyplot
-        log, limits : of the colour scale [W/pixel], see `ColourScale.over`
+        log, limits : of the colour scale, in the unit that is shown; see `ColourScale.over`
         outline : draw the silhouette of the phantom, where the coverage is 1/2
+        unit, wavelength_nm : 'W', 'photons/s' or 'p/s/cm2/sr', as of `--unit`
 
-        Raises ImageError for limits that are no range and for an outline without coverage, BackendError without
-        matplotlib.
+        Raises ImageError for limits that are no range, an outline without coverage and a unit that the image cannot
+        be shown in, BackendError without matplotlib.
         """
         from .picture import plot_image
 
-        return plot_image(self, axes, log=log, limits=limits, outline=outline)
+        return plot_image(self, axes, log=log, limits=limits, outline=outline, unit=unit, wavelength_nm=wavelength_nm)
 
     def plot_profile(self, row: int | None = None, column: int | None = None, axes: Axes | None = None) -> Axes:
         """Draw the power along a row or a column, with a band of ± error; returns matplotlib's axes.

@@ -22,6 +22,7 @@ from .colour_scale import scale_and_unit as scale_and_unit
 from .comparison import Comparison, Profile, compare
 from .image import Image
 from .pixel_axes import PixelAxes
+from .radiometry import Converted, in_unit
 from .z_test import differences, error_bound
 
 if TYPE_CHECKING:
@@ -34,28 +35,31 @@ OUTLINE = "deepskyblue"  # a colour that the map of powers does not have
 COLUMNS = 4  # panels in a row
 
 
-def write_png(image: Image, path: str | os.PathLike[str]) -> None:
-    """Write a picture of `image` [W/pixel] to a PNG file, with view, total power, method and lens as its title.
+def write_png(image: Image, path: str | os.PathLike[str], unit: str = "W", wavelength_nm: float | None = None) -> None:
+    """Write a picture of `image` to a PNG file, with view, total power, method and lens as its title.
 
     Axes are in mm from the centre: on the virtual detector plane if the metadata hold `pixel_pitch` and
     `magnification`, on the detector if they hold the pitch alone. Without a pitch they count rows and columns.
 
     Raises
     ------
-    ImageError : the suffix is not .png or the file cannot be written.
+    ImageError : the suffix is not .png, the file cannot be written, or the image cannot be shown in this `unit`, see
+        `radiometry.in_unit`.
     BackendError : matplotlib is not installed.
     """
-    with png_file(image, path):
+    with png_file(image, path, unit, wavelength_nm):
         pass
 
 
-def png_file(image: Image, path: str | os.PathLike[str]) -> AbstractContextManager[None]:
+def png_file(
+    image: Image, path: str | os.PathLike[str], unit: str = "W", wavelength_nm: float | None = None
+) -> AbstractContextManager[None]:
     """Context manager that writes the file of `write_png` before its block and renames it to `path` after it.
 
     An exception in the block leaves `path` unchanged. Raises as `write_png`.
     """
     path = require_png(path)
-    return figure_file(draw_panels([image]), path)
+    return figure_file(draw_panels([image], unit=unit, wavelength_nm=wavelength_nm), path)
 
 
 def write_comparison_png(calculated: Image, standard: Image, path: str | os.PathLike[str]) -> None:
@@ -113,11 +117,14 @@ def plot_image(
     log: bool = False,
     limits: tuple[float, float] | None = None,
     outline: bool = False,
+    unit: str = "W",
+    wavelength_nm: float | None = None,
 ) -> Axes:
     """As `Image.plot`."""
-    scale = ColourScale.over([image.power], log=log, limits=limits)
+    shown = in_unit(image, unit, wavelength_nm)
+    scale = _scale([shown], log=log, limits=limits)
     axes = _own_axes(axes)
-    draw_image(axes, image, scale, outline=outline)
+    draw_image(axes, image, scale, shown.values, outline=outline)
     axes.set_title("\n".join(filter(None, [title(image), caption(image)])), fontsize="medium")
     return axes
 
@@ -170,6 +177,8 @@ def draw_panels(
     limits: tuple[float, float] | None = None,
     per_panel: bool = False,
     outline: bool = False,
+    unit: str = "W",
+    wavelength_nm: float | None = None,
 ) -> Figure:
     """Figure with a panel for each image, up to `COLUMNS` in a row.
 
@@ -177,22 +186,25 @@ def draw_panels(
     ----------
     images : power [W]; their titles state the view and the total power
     names : of the images, for the titles; none if left out
-    log, limits : of the colour scale, limits in W/pixel; see `ColourScale.over`
+    log, limits : of the colour scale, limits in the unit that is shown; see `ColourScale.over`
     per_panel : a colour scale for each image; False: one for all
     outline : draw the outline of the phantom, where the coverage is 1/2
+    unit, wavelength_nm : what is shown, see `radiometry.in_unit`; totals in titles are in W
 
     Raises
     ------
-    ImageError : no images, limits that are no range or given with `per_panel`, an outline without coverage.
+    ImageError : no images, limits that are no range or given with `per_panel`, an outline without coverage, an image
+        that cannot be shown in this unit.
     BackendError : matplotlib is not installed.
     """
     if not images:
         raise ImageError("picture: no images to draw. Give one or more.")
     if per_panel and limits is not None:
         raise ImageError("picture: one range for all panels and a scale for each exclude each other. Leave one out.")
-    scales = [ColourScale.over([image.power], log=log) for image in images]
+    shown = [in_unit(image, unit, wavelength_nm) for image in images]
+    scales = [_scale([one], log=log) for one in shown]
     if not per_panel:
-        scales = [ColourScale.over([image.power for image in images], log=log, limits=limits)] * len(images)
+        scales = [_scale(shown, log=log, limits=limits)] * len(images)
     figure, grid = _panel_grid(images, wide=per_panel)
     rows, columns = grid.shape
     common = len(images) > 1 and len(set(map(caption, images))) == 1
@@ -203,7 +215,7 @@ def draw_panels(
             axes.axis("off")
             continue
         image, name = images[place], names[place] if names else ""
-        draw_image(axes, image, scales[place], outline=outline, bar=own_bar)
+        draw_image(axes, image, scales[place], shown[place].values, outline=outline, bar=own_bar)
         lines = [*textwrap.wrap(name, 44), title(image)] if len(images) > 1 else [title(image, name)]
         lines += [] if common else [caption(image)]
         axes.set_title("\n".join(filter(None, lines)), fontsize="medium" if columns == 1 else "small")
@@ -213,9 +225,9 @@ def draw_panels(
             axes.set(xlabel="", xticklabels=[])
     figure.suptitle(caption(images[0]) if common else "", fontsize="medium")
     if not own_bar:
-        shown = grid.flat[0].get_images()[0]
-        ends, shrink = _extend(images, scales[0]), 0.9 if rows == 1 else min(1.0, 2 / rows)
-        figure.colorbar(shown, ax=grid, label=scales[0].label, shrink=shrink, aspect=25, extend=ends)
+        drawn = grid.flat[0].get_images()[0]
+        ends, shrink = _extend([one.values for one in shown], scales[0]), 0.9 if rows == 1 else min(1.0, 2 / rows)
+        figure.colorbar(drawn, ax=grid, label=scales[0].label, shrink=shrink, aspect=25, extend=ends)
     return figure
 
 
@@ -229,14 +241,33 @@ def _panel_grid(images: Sequence[Image], wide: bool) -> tuple[Figure, NDArray[np
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def draw_image(axes: Axes, image: Image, scale: ColourScale, *, outline: bool = False, bar: bool = True) -> None:
-    """Draw the power of `image` on a colour scale, with its colour bar if `bar`, and the `outline` of the phantom."""
+def _scale(shown: Sequence[Converted], *, log: bool = False, limits: tuple[float, float] | None = None) -> ColourScale:
+    """Colour scale over images in one unit."""
+    unit = shown[0].unit + ("" if shown[0].quantity == "radiance" else "/pixel")
+    values, quantity = [one.values for one in shown], shown[0].quantity.replace("_", " ")
+    return ColourScale.over(values, log=log, limits=limits, quantity=quantity, unit=unit)
+
+
+def draw_image(
+    axes: Axes,
+    image: Image,
+    scale: ColourScale,
+    values: NDArray | None = None,
+    *,
+    outline: bool = False,
+    bar: bool = True,
+) -> None:
+    """Draw an image on a colour scale, with its colour bar if `bar`, and the `outline` of the phantom.
+
+    values : (h, w) in the scale's unit; None: the image's power
+    """
+    values = image.power if values is None else values
     extent, axis_label = _extent(image)
-    shown = axes.imshow(scale.values(image.power), cmap=COLOURS, norm=scale.norm(), extent=extent)
+    shown = axes.imshow(scale.values(values), cmap=COLOURS, norm=scale.norm(), extent=extent)
     axes.set(xlabel=axis_label, ylabel=axis_label)
     if bar:
         side = axes.inset_axes((1.03, 0.0, 0.05, 1.0))
-        side.figure.colorbar(shown, cax=side, label=scale.label, extend=_extend([image], scale))
+        side.figure.colorbar(shown, cax=side, label=scale.label, extend=_extend([values], scale))
     if outline:
         draw_outline(axes, image)
 
@@ -344,10 +375,10 @@ def _draw_profile(
     )
 
 
-def _extend(images: Sequence[Image], scale: ColourScale) -> Literal["neither", "min", "max", "both"]:
+def _extend(planes: Sequence[NDArray], scale: ColourScale) -> Literal["neither", "min", "max", "both"]:
     """Ends of the colour bar beyond which there is light."""
-    below = any(bool(np.any((image.power > 0) & (image.power < scale.low))) for image in images)
-    above = any(float(image.power.max()) > scale.high for image in images)
+    below = any(bool(np.any((plane > 0) & (plane < scale.low))) for plane in planes)
+    above = any(float(plane.max()) > scale.high for plane in planes)
     return "both" if below and above else "min" if below else "max" if above else "neither"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from small_scenes import HEIGHT, WIDTH, camera_scene, disk
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.images.formats import read_planes
+from mitsuba_fspt.images.picture import draw_panels
 from mitsuba_fspt.images.radiometry import RADIANCE, etendue, in_unit
 from mitsuba_fspt.runtime.errors import BackendError, DetectorError, ImageError
 
@@ -55,6 +57,22 @@ def test_photons_and_watts():
     assert photons.error[0, 0] == pytest.approx(1e-12 * PER_JOULE, rel=1e-12)
     assert (photons.quantity, photons.unit) == ("photon_rate", "photons/s")
     np.testing.assert_array_equal(in_unit(image, "W").values, image.power)
+
+
+@pytest.mark.parametrize(
+    ("unit", "label"),
+    [("photons/s", "photon rate [$10^{9}$ photons/s/pixel]"), ("p/s/cm2/sr", f"radiance [$10^{{15}}$ {RADIANCE}]")],
+)
+def test_a_picture_in_photons_shows_their_numbers_beside_its_colours(unit, label):
+    image = fspt.render(camera_scene(disk(165, 400.0), exitance=2.0), method="integral")
+    figure = draw_panels([image], unit=unit, wavelength_nm=660)
+    (axes,) = figure.axes
+    (bar,) = axes.child_axes
+    values = in_unit(image, unit, 660).values
+    factor = 10.0 ** int(re.search(r"\{(\d+)\}", label)[1])
+    np.testing.assert_allclose(axes.get_images()[0].get_array(), values / factor)
+    assert bar.get_ylabel() == label
+    assert axes.get_images()[0].norm.vmax == pytest.approx(values.max() / factor)
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".fits", ".h5", ".npz", ".tif"])
