@@ -61,7 +61,7 @@ def test_photons_and_watts():
 
 @pytest.mark.parametrize(
     ("unit", "label"),
-    [("photons/s", "photon rate [$10^{9}$ photons/s/pixel]"), ("p/s/cm2/sr", f"radiance [$10^{{15}}$ {RADIANCE}]")],
+    [("photons/s", "photon rate [$10^{15}$ photons/s/pixel]"), ("p/s/cm2/sr", f"radiance [$10^{{18}}$ {RADIANCE}]")],
 )
 def test_a_picture_in_photons_shows_their_numbers_beside_its_colours(unit, label):
     image = fspt.render(camera_scene(disk(165, 400.0), exitance=2.0), method="integral")
