@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from ..runtime.backend import quiet_mitsuba
-from .options import AsJson, Parameters, Quiet, SceneFile, definitions
+from .options import AsJson, Parameters, Quiet, SceneFile, Sensor, definitions
 from .terminal import print_result
 
 
 def view(
     scene: SceneFile,
     define: Parameters = None,
+    sensor: Sensor = 0,
     port: Annotated[int, typer.Option(help="Of the page on 127.0.0.1; 0: any free one.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     as_json: AsJson = False,
@@ -34,4 +35,4 @@ def view(
             webbrowser.open(address)
 
     quiet_mitsuba()
-    show(scene, port=port, ready=ready, **definitions(define))
+    show(scene, sensor=sensor, port=port, ready=ready, **definitions(define))

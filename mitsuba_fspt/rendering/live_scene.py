@@ -72,18 +72,22 @@ class LiveScene:
 
     A scene that `load` has made stands for what it was loaded from, with the values given then.
 
-    Numbers and placement of the lens change in place, without compilation. A rigid motion of all shapes is replaced by
-    the inverse motion of the lens, which gives the same picture but for rounding; where that shall not be, and for all
-    other changes, the scene is loaded again. `loads` counts that.
+    The picture is that of the sensor with the number `sensor`. Numbers and placement of that lens change in place,
+    without compilation. A rigid motion of all shapes is replaced by the inverse motion of the lens, which gives the
+    same picture but for rounding; where that shall not be, and for all other changes, the scene is loaded again.
+    `loads` counts that.
 
     Raises
     ------
-    SceneError : the scene cannot be read or loaded, was changed after it was loaded, or its first sensor is no
-        `fspt_lens`.
+    SceneError : the scene cannot be read or loaded, was changed after it was loaded, the sensor does not exist
+        or is no `fspt_lens`.
     """
 
     def __init__(
-        self, scene: mi.Scene | str | os.PathLike[str], parameters: Mapping[str, object] | None = None
+        self,
+        scene: mi.Scene | str | os.PathLike[str],
+        parameters: Mapping[str, object] | None = None,
+        sensor: int = 0,
     ) -> None:
         parameters = parameters or {}
         if not isinstance(scene, (str, os.PathLike)):
@@ -91,6 +95,7 @@ class LiveScene:
             parameters = before | dict(parameters)
         self.source: str | os.PathLike[str] = scene
         self.given = {name: parameter_text(value) for name, value in parameters.items()}
+        self.sensor = sensor
         self.loads = 0
         self._scene: mi.Scene | None = None
         self._nodes: list[mi.parser.SceneNode] = []  # elements of the loaded scene
@@ -109,7 +114,7 @@ class LiveScene:
 
         Raises what `load` and `render` raise. The scene stays usable.
         """
-        image = render(self.scene(values, model), progress=progress)
+        image = render(self.scene(values, model), sensor=self.sensor, progress=progress)
         taken = self.given | _texts(values)
         scene_id = " ".join([_name(self.source), *(f"{key}={text}" for key, text in taken.items())])
         return replace(image, metadata=image.metadata | {"scene": scene_id})
@@ -121,9 +126,9 @@ class LiveScene:
         A moved phantom is seen by the lens moved the other way. Raises as `image`.
         """
         scene = self.scene(values, model, exact=False)
-        lens, integrator = sensor_of(scene, 0), integrator_of(scene, None)
+        lens, integrator = sensor_of(scene, self.sensor), integrator_of(scene, None)
         if not is_integral(integrator):
-            return render(scene, spp=DRAFT_SAMPLES)
+            return render(scene, sensor=self.sensor, spp=DRAFT_SAMPLES)
         own = integrator.quadrature
         quadrature = replace(own, rtol=max(own.rtol, rtol))
         solution = integrator.solve(scene, lens, quadrature, narrow=False)
@@ -137,7 +142,7 @@ class LiveScene:
         import mitsuba as mi
 
         scene = self.scene(values, model)
-        lens = sensor_of(scene, 0)
+        lens = sensor_of(scene, self.sensor)
         offset = mi.Vector2f(lens.film().crop_offset())
         ray, cosine, _ = lens.line_of_sight(mi.Point2f(column + 0.5, row + 0.5) + offset, mi.Point2f(0, 0))
         met = _surfaces(scene, lens, ray, cosine)
@@ -164,15 +169,19 @@ class LiveScene:
         """The Mitsuba scene with these values of its parameters and this `model` of its lens (None: its own)."""
         wanted = self.given | _texts(values)
         nodes = parsed(self.source, **wanted)
-        change = None if self._scene is None else _change(self._nodes, nodes, exact)
+        change = None if self._scene is None else _change(self._nodes, nodes, self.sensor, exact)
         if change is None:
             self._scene = None  # memory for one scene, not two
             self._scene, self._nodes, self.loads = load(self.source, **wanted), nodes, self.loads + 1
-            if not is_lens(sensor_of(self._scene, 0)):
+            try:
+                lens = sensor_of(self._scene, self.sensor)
+                if not is_lens(lens):
+                    raise SceneError(f"{_name(self.source)}: sensor {self.sensor} is no fspt_lens. Give one that is.")
+            except SceneError:
                 self._scene = None
-                raise SceneError(f"{_name(self.source)}: its sensor is no fspt_lens. Give it one.")
-            change = _change(nodes, nodes, exact)
-        _apply(change, sensor_of(self._scene, 0), model)
+                raise
+            change = _change(nodes, nodes, self.sensor, exact)
+        _apply(change, sensor_of(self._scene, self.sensor), model)
         remember_defaults(self._scene, values_of(self.source, wanted))
         return self._scene
 
@@ -196,12 +205,15 @@ def _surfaces(
     return found
 
 
-def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], exact: bool) -> Change | None:
-    """Change of the lens that makes the scene of the elements `old` that of `new`; None if there is none."""
+def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], sensor: int, exact: bool) -> Change | None:
+    """Change of the lens, that with the number `sensor`, that makes the picture of the elements `old` that of `new`.
+
+    None if there is none.
+    """
     import mitsuba as mi
 
     sensors = [node for node in new if node.type == mi.ObjectType.Sensor]
-    if len(old) != len(new) or len(sensors) != 1:
+    if len(old) != len(new):
         return None
     motions: list[Matrix | None] = []  # of the shapes, None for those that are where they were
     for before, after in zip(old, new, strict=True):
@@ -213,7 +225,7 @@ def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], exac
             same = same or _differ_in(before.props, after.props, mi.Properties.Type.Float, mi.Properties.Type.Transform)
         if not same:
             return None
-    lens = sensors[0].props
+    lens = sensors[sensor].props
     numbers = {name: float(lens[name]) for name in lens.keys() if lens.type(name) == mi.Properties.Type.Float}
     placement = _matrix(lens)
     if any(motion is not None for motion in motions):

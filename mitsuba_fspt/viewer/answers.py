@@ -100,10 +100,12 @@ class Superseded(Exception):
 
 
 class Answers:
-    """Answers requests about one scene, one at a time. Raises as `LiveScene`."""
+    """Answers requests about one scene through its lens `sensor`, one at a time. Raises as `LiveScene`."""
 
-    def __init__(self, scene: mi.Scene | str | os.PathLike[str], parameters: Mapping[str, object]) -> None:
-        self._live = LiveScene(scene, parameters)
+    def __init__(
+        self, scene: mi.Scene | str | os.PathLike[str], parameters: Mapping[str, object], sensor: int = 0
+    ) -> None:
+        self._live = LiveScene(scene, parameters, sensor)
         self._live.scene({})  # bad scenes are refused before a page opens
 
     def hello(self) -> Answer:
@@ -199,6 +201,7 @@ class Answers:
         if is_text(self._live.source) or request.model:
             return ""
         words = ["fspt", "render", os.fspath(self._live.source)]
+        words += ["--sensor", str(self._live.sensor)] if self._live.sensor else []
         for name, text in (self._live.given | self._changed(request)).items():
             words += ["-D", f"{name}={text}"]
         return shlex.join([*words, "-o", self._file(request)])

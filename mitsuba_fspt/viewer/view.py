@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 def view(
     scene: mi.Scene | str | os.PathLike[str],
     *,
+    sensor: int = 0,
     port: int = 0,
     ready: Callable[[str], object] | None = None,
     **parameters: object,
@@ -29,6 +30,7 @@ def view(
     Parameters
     ----------
     scene : name of an XML file, its text, or what `load` has made of one of them
+    sensor : number of the lens, in a scene with several
     port : of the page; 0: any free one. Without effect in a notebook
     ready : function that is called with the page's address; None opens it in the browser
     parameters : values for `<default>` parameters
@@ -43,10 +45,10 @@ def view(
         require("anywidget", "The viewer in a notebook")
         from .widget import widget
 
-        return widget(Answers(scene, parameters))
+        return widget(Answers(scene, parameters, sensor))
     for module in ("starlette", "uvicorn", "websockets"):
         require(module, "The viewer")
     from .server import ViewServer
 
-    ViewServer(lambda: Answers(scene, parameters), port).run(ready or webbrowser.open)
+    ViewServer(lambda: Answers(scene, parameters, sensor), port).run(ready or webbrowser.open)
     return None

@@ -132,6 +132,22 @@ def test_the_surface_point_behind_a_mirror_and_a_pane(mono):
     assert (place.column, place.row) == pytest.approx((16.5, 12.5), abs=0.05)
 
 
+def test_the_second_of_two_lenses(mono):
+    """Each lens changes in place, as if it were the only one."""
+    first = SCENE[SCENE.index("    <sensor") : SCENE.index("    <shape")]
+    other = first.replace('"50"', '"35"').replace("$distance, 0, 0", "0, $distance, 0").replace('"32"', '"20"')
+    two = SCENE.replace(first, first + other)
+    live = LiveScene(two, sensor=1)
+    for values in ({}, {"f_number": 8, "distance": 170}):
+        wanted = fspt.render(fspt.load(two, **values), sensor=1)
+        assert np.array_equal(live.image(values).power, wanted.power)
+        assert live.draft(values).power.sum() == pytest.approx(wanted.power.sum(), rel=0.05, abs=0)
+    assert live.loads == 1
+    assert live.surface_point({}, None, 10, 12).position[1] == pytest.approx(3, abs=1e-3)
+    with pytest.raises(fspt.FsptError, match="sensor 2 does not exist, the scene has 2"):
+        LiveScene(two, sensor=2).image({})
+
+
 def test_a_loaded_scene_is_taken_with_its_values_unless_it_was_changed(mono):
     scene = fspt.load(SCENE, f_number=8)
     live = LiveScene(scene)
