@@ -249,9 +249,9 @@ def test_scenes_without_columns_are_refused(tmp_path):
 
 
 def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
-    from mitsuba_fspt.inverse import view_block
+    from mitsuba_fspt.integral import sparse_rows
 
-    monkeypatch.setattr(view_block, "available_memory", lambda: 1 << 20)
+    monkeypatch.setattr(sparse_rows, "available_memory", lambda: 1 << 20)
     with pytest.raises(TransportError, match=r"needs \d+ bytes .* 1048576 are free"):
         fspt.transport(load_scene("nylon_cylinder"))
 
