@@ -22,7 +22,7 @@ from scipy.sparse import coo_array, csr_array
 
 from ..jit.batches import BATCH
 from ..jit.mesh_buffers import triangles
-from ..runtime.errors import TransportError
+from ..runtime.errors import TransportError, named
 from ..runtime.memory import available_memory
 from .column_form import MOST_CHANGE, Columns, column_windows, columns_of
 from .face_light import ColumnRule, FaceLight
@@ -87,6 +87,7 @@ def sparse_rows(
     quadrature: Quadrature,
     progress: Progress | None = None,
     most_bytes: int | None = None,
+    name: str = "transport",
 ) -> SparseRows:
     """Rows of one view of a scene whose emitters are meshes, each with J_n = 1 now.
 
@@ -96,6 +97,7 @@ def sparse_rows(
     on : of each emitter, 'vertex' or 'face'
     progress : called with the share done
     most_bytes : that may be allocated; None for what the system says
+    name : of what needs them, for messages
 
     Raises
     ------
@@ -106,7 +108,8 @@ def sparse_rows(
         entries = _by_lines(scene, lens, picture, on, quadrature.rtol, specular)
         sums = np.full(entries.count, np.nan)
     else:
-        entries, sums = _by_faces(scene, lens, picture, on, quadrature.rtol, progress, most_bytes)
+        with named(name):
+            entries, sums = _by_faces(scene, lens, picture, on, quadrature.rtol, progress, most_bytes)
     least = quadrature.least_error * float(picture.power.max(initial=0.0))
     return _balanced(entries, sums, picture, np.maximum(picture.error, least), lens.etendue)
 
@@ -235,11 +238,12 @@ def _by_lines(
 ) -> _Entries:
     """Entries of all pixels by lines of sight."""
     pixels = np.flatnonzero(picture.power.ravel() > 0)
+    count = sum(columns_on(emitter.get_shape(), kind) for emitter, kind in zip(scene.emitters(), on, strict=True))
     lines = int(ALL_LINES * (1e-3 / rtol) ** 0.5) // 2 * 2
-    places = np.array_split(pixels, max(1, -(-len(pixels) * lines // BATCH)))
+    places = np.array_split(pixels, -(-len(pixels) * lines // BATCH)) if pixels.size else []
     rows = [_rows(scene, lens, some, on, lines, specular) for some in places]
     none = np.zeros(picture.power.size + 1, np.int64)
-    empty = _Entries(rows[0].count, none, *(np.zeros(0, kind) for kind in (np.int32, np.float32, np.float16)))
+    empty = _Entries(count, none, *(np.zeros(0, kind) for kind in (np.int32, np.float32, np.float16)))
     return empty.joined(rows, places)
 
 
@@ -328,7 +332,7 @@ def _require_memory(entries: int, most_bytes: int | None) -> None:
     free = available_memory() if most_bytes is None else most_bytes
     if free is not None and needed > free:
         raise TransportError(
-            f"transport: one view has up to {entries} entries and needs {needed} bytes ({needed / 2**30:.1f} GiB) of "
+            f"one view has up to {entries} entries and needs {needed} bytes ({needed / 2**30:.1f} GiB) of "
             f"memory, {free} are free. Give fewer pixels, a crop window, a smaller aperture or a coarser mesh."
         )
 
