@@ -132,6 +132,19 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[..., mi.Float]
     return lambda si, active=True: shape.eval_attribute_1(name, si, active) * scale
 
 
+def values_on(mesh: mi.Shape, texture: mi.Texture) -> mi.Float:
+    """J_n [W/mm²] of each vertex or face of a mesh, as its attribute has it, or of each vertex where it is a number.
+
+    They carry the gradients of what is behind J_n.
+
+    Raises ExitanceError as `function_on`.
+    """
+    value = function_on(mesh, texture)
+    if is_uniform(texture):
+        return value(dr.zeros(mi.SurfaceInteraction3f)) + dr.zeros(mi.Float, dr.width(triangles(mesh)[0]) // 3)
+    return ExitanceState.of(mesh, texture).attribute * float(mi.traverse(texture)["scale"])
+
+
 def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float, mi.Float] | None:
     """J_n [W/mm²] at the three corners of every face, each of shape (F,), if it is linear between them; else None."""
     faces = triangles(mesh)[1]

@@ -52,6 +52,11 @@ class Windows:
         return cls(first[:, 0], first[:, 1], np.where(none, 0, width), np.where(none, 0, height))
 
     @property
+    def pixels(self) -> int:
+        """Pixels of all windows together, more than can have light."""
+        return int((self.width * self.height).sum())
+
+    @property
     def areas(self) -> Index:
         """Pixels of each window (n,), and one more a row, which takes what would lie beyond."""
         return (self.width + 1) * self.height * (self.width > 0)
@@ -92,7 +97,9 @@ class ColumnCanvas:
         self._level, self._slope = (dr.zeros(mi.UInt64, total) for _ in range(2))
         # Of each column its window, and where it starts in the buffer.
         fields = (windows.left, windows.top, windows.width, windows.height, self._starts[:-1])
-        self._table = mi.UInt32(np.stack([*fields, *[0 * windows.left] * 3], -1).ravel().astype(np.uint32))
+        table = np.stack([*fields, *[0 * windows.left] * 3], -1)
+        self._table = mi.UInt32(np.append(table, np.zeros(8)).astype(np.uint32))
+        self.none = dr.opaque(mi.UInt32, len(table))  # a column without window
         self._size = tuple(dr.opaque(mi.Float64, side) for side in shape[::-1])
         dr.eval(self._table, self._level, self._slope)
 

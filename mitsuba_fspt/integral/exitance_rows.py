@@ -1,16 +1,20 @@
-"""Rows of the derivative of a picture by J_n: Eq. 9 in its pupil form, by a fixed set of lines of sight for each pixel.
+"""Rows of the derivative of a picture by J_n, whatever J_n is: P is linear in it.
 
-P is linear in J_n: P_i = Σ_l w_il J_n(r_il) · profile, with one point r_il where each line of sight ends. Forward mode
-sums the tangent of J_n over the same lines whose weights reverse mode hands to the numbers behind J_n: the two are
-transposes of each other. The sum of the weights of a pixel is made that of the picture of J_n = 1 by the integral, so
-that silhouettes are as right as the picture.
+Where all that glows are meshes and J_n is a number or an attribute, the rows are those of the transport matrix
+(`sparse_rows`): forward mode is its product with the tangent of J_n, reverse mode that of its transpose.
+
+Else they are a fixed set of lines of sight for each pixel: P_i = Σ_l w_il J_n(r_il) · profile, with one point r_il
+where each line of sight ends. Forward mode sums the tangent of J_n over the same lines whose weights reverse mode hands
+to the numbers behind J_n: the two are transposes of each other. The sum of the weights of a pixel is made that of the
+picture of J_n = 1 by the integral, so that silhouettes are as right as the picture.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -18,11 +22,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..emission.exitance import attribute_name, function_on, texels_of
+from ..emission.exitance import attribute_name, function_on, is_uniform, texels_of, values_on
 from ..jit.mesh_buffers import triangles
+from ..runtime.plugin_types import is_surface
 from .eq9 import View, eq9, etendue_from_pixel
 from .lattices import VECTOR
 from .quadrature import Quadrature
+from .sparse_rows import SparseRows, columns_on, sparse_rows
 
 if TYPE_CHECKING:
     from .solution import Solution
@@ -40,6 +46,7 @@ BATCH = 1 << 21  # lines of sight in one kernel: float32 adds no more of them th
 
 Array = NDArray[np.float64]
 Sizes = tuple[int, int]
+Kinds = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +60,37 @@ class RowGroup:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The rows of all pixels of a crop window that see anything; `shape` (h, w). Whatever J_n is."""
+    """The rows of all pixels of a crop window that see anything; `shape` (h, w).
+
+    groups : by lines of sight. matrix : of the transport matrix, with the columns of each emitter by its mark
+    kept : arrays whose indices tell whether the rows are still right
+    """
 
     shape: tuple[int, int]
-    groups: tuple[RowGroup, ...]
-    kept: tuple[Any, ...] = ()  # whose indices tell whether the rows are still right
+    groups: tuple[RowGroup, ...] = ()
+    matrix: SparseRows | None = None
+    columns: Mapping[object, slice] = field(default_factory=dict)
+    kept: tuple[Any, ...] = ()
 
     @classmethod
-    def of(cls, view: View, quadrature: Quadrature, picture: Solution, window: NDArray[np.bool_], sizes: Sizes) -> Rows:
+    def on_meshes(
+        cls, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, picture: Solution, kinds: Kinds
+    ) -> Rows:
+        """Rows of the transport matrix for columns of these `kinds_of`, from the `picture` of J_n = 1, as it must be.
+
+        Raises TransportError where the memory does not suffice.
+        """
+        emitters = scene.emitters()
+        counts = [columns_on(emitter.get_shape(), kind) for emitter, kind in zip(emitters, kinds, strict=True)]
+        ends = itertools.pairwise(itertools.accumulate(counts, initial=0))
+        columns = {emitter.mark: slice(*pair) for emitter, pair in zip(emitters, ends, strict=True)}
+        found = sparse_rows(scene, lens, picture, kinds, quadrature, name="fspt_integral")
+        return cls(picture.power.shape, matrix=found, columns=columns)
+
+    @classmethod
+    def by_lines(
+        cls, view: View, quadrature: Quadrature, picture: Solution, window: NDArray[np.bool_], sizes: Sizes
+    ) -> Rows:
         """Rows of the pixels in `window` (h, w), from the `picture` of J_n = 1, which all surfaces must now have.
 
         sizes : number of values behind J_n, see `sizes_of`
@@ -90,6 +120,14 @@ class Rows:
 
     def forward(self, view: View, quadrature: Quadrature, emitters: Sequence[mi.Emitter]) -> Array:
         """Tangent (h, w) [W] of the picture, of that of the numbers behind J_n of these emitters."""
+        if self.matrix is not None:
+            change = np.zeros(self.matrix.count)
+            with dr.resume_grad():
+                for emitter in emitters:
+                    values = values_on(emitter.get_shape(), emitter.exitance)
+                    dr.forward_to(values, flags=dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
+                    change[self.columns[emitter.mark]] = dr.grad(values).numpy()
+            return (self.matrix.matrix @ change).reshape(self.shape)
         tangent = np.zeros(math.prod(self.shape))
         for part in self._parts(view, quadrature):
             with dr.resume_grad():
@@ -104,6 +142,14 @@ class Rows:
 
     def backward(self, view: View, quadrature: Quadrature, emitters: Sequence[mi.Emitter], gradient: Array) -> None:
         """Add the transpose of `forward` of a `gradient` (h, w) [1/W] to the gradients of the numbers behind J_n."""
+        if self.matrix is not None:
+            weights = self.matrix.matrix.T @ gradient.ravel()
+            with dr.resume_grad():
+                for emitter in emitters:
+                    values = values_on(emitter.get_shape(), emitter.exitance)
+                    dr.backward_from(values * mi.Float(weights[self.columns[emitter.mark]].astype(np.float32)))
+            dr.eval()
+            return
         for part in self._parts(view, quadrature):
             of_row = mi.Float(gradient.ravel()[part.pixels] * part.factors * view.lens.etendue)
             weight = eq9(dr.gather(mi.Float, of_row, part.row), part.etendue)
@@ -116,6 +162,20 @@ class Rows:
     def _parts(self, view: View, quadrature: Quadrature) -> Iterator[_Part]:
         for group in self.groups:
             yield from _parts(view, quadrature, group)
+
+
+def kinds_of(scene: mi.Scene, asked: Sequence[mi.Emitter], quadrature: Quadrature) -> Kinds | None:
+    """Of each emitter of a scene 'vertex' or 'face', the columns on which its J_n is linear; None where rows of the
+    transport matrix do not give the derivative by the numbers behind J_n of the emitters that are `asked` for."""
+    marks, kinds = {emitter.mark for emitter in asked}, []
+    for emitter in scene.emitters():
+        if not (is_surface(emitter) and emitter.law.linear and emitter.get_shape().is_mesh()):
+            return None
+        name = attribute_name(emitter.exitance)
+        if name is None and emitter.mark in marks and not is_uniform(emitter.exitance):
+            return None
+        kinds.append("face" if (name or "").startswith("face") else "vertex")
+    return tuple(kinds) if quadrature.pixel == "area" else None
 
 
 def sizes_of(emitters: Sequence[mi.Emitter]) -> Sizes:

@@ -19,7 +19,7 @@ from ..rendering.render import sensor_of
 from ..rendering.scene import load
 from ..rendering.scene_xml import is_text
 from ..runtime import backend
-from ..runtime.errors import FsptError, SceneError, TransportError
+from ..runtime.errors import BackendError, FsptError, SceneError, TransportError
 from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import whole
 from ..runtime.progress_bar import Progress, reported
@@ -107,6 +107,8 @@ def transport(
     with reported(progress) as report:
         try:
             return _joined(tasks, _results(tasks, partial, scheduler, report), partial)
+        except BackendError:  # the scheduler is gone: a later call goes on with the views that are missing
+            raise
         except FsptError:  # no later call could go on from there
             if partial is not None:
                 partial.discard()
@@ -190,7 +192,10 @@ def _computed(
     if missing and (not isinstance(tasks[0].scene, (str, os.PathLike)) or is_text(tasks[0].scene)):
         raise TransportError("transport: 'scheduler' needs a scene file, which its workers load. Give its name.")
     numbers = {tasks[k].fingerprint: k for k in missing}
-    for task, result in results_of_cluster([_absolute(tasks[k]) for k in missing], scheduler, None, computed_on_worker):
+    if not missing:
+        return
+    waiting = [_absolute(tasks[k]) for k in missing]
+    for task, result in results_of_cluster(waiting, scheduler, None, computed_on_worker, "transport"):
         if isinstance(result, FsptError):
             raise result
         yield numbers[task.fingerprint], result
@@ -203,12 +208,14 @@ def _absolute(task: ViewTask) -> ViewTask:
 
 
 def computed_on_worker(task: ViewTask, threads: int | None) -> ViewResult | FsptError:
-    """The view of a task, or the FsptError that it raises, in a worker process with so many threads."""
+    """The view of a task, or the FsptError that it raises, on a worker with so many threads, None for its own."""
+    from distributed import get_worker
+
     backend.ensure_variant()
+    backend.quiet_mitsuba()
     import drjit as dr
 
-    if threads is not None:
-        dr.set_thread_count(threads)
+    dr.set_thread_count(get_worker().state.nthreads if threads is None else threads)
     try:
         return computed(task)
     except FsptError as error:

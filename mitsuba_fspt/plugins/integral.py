@@ -18,7 +18,7 @@ from ..emission.asked_gradients import shining_with_gradients
 from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
 from ..integral import pupil_form, surface_form
 from ..integral.eq9 import View
-from ..integral.exitance_rows import Rows, sizes_of
+from ..integral.exitance_rows import Rows, kinds_of, sizes_of
 from ..integral.left_out import LeftOut, light_left_out
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
 from ..integral.progress import Progress
@@ -251,7 +251,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             sensor = scene.sensors()[sensor]
         with dr.resume_grad():
             asked = shining_with_gradients(scene, sensor)
-        if asked:
+        if asked and kinds_of(scene, asked, self.quadrature) is None:
             self._refuse_specular(scene, sensor)
         solution = self.solve(scene, sensor)
         self._tell_left_out(scene, sensor)
@@ -293,8 +293,10 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         with dr.resume_grad():
             emitters = shining_with_gradients(scene, sensor)
         with dr.suspend_grad():
-            self._refuse_specular(scene, sensor)
-            rows = self._rows_of(scene, sensor, sizes_of(emitters))
+            kinds = kinds_of(scene, emitters, self.quadrature)
+            if kinds is None:
+                self._refuse_specular(scene, sensor)
+            rows = self._rows_of(scene, sensor, kinds, sizes_of(emitters))
             check_scene(scene, sensor)
             with recording():
                 yield rows, self._row_view(scene, sensor), emitters
@@ -304,14 +306,17 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         window = self._visible_window(scene, sensor, False, ())
         return View.of(self._traced(scene, sensor), sensor, window)
 
-    def _rows_of(self, scene: mi.Scene, sensor: mi.Sensor, sizes: tuple[int, int]) -> Rows:
+    def _rows_of(
+        self, scene: mi.Scene, sensor: mi.Sensor, kinds: tuple[str, ...] | None, sizes: tuple[int, int]
+    ) -> Rows:
         """Rows of the derivative by J_n; cached, whatever J_n is."""
         shapes = scene.shapes()
         positions = tuple(buffers(shape)[0] for shape in shapes if shape.is_mesh())
         marks = [mark_of(emitter) for emitter in scene.emitters()]
         linear = all(is_surface(emitter) and emitter.law.linear for emitter in scene.emitters())
         # Laws that depend on more than J_n may have changed.
-        state = (sizes, marks, [_pose(shape) for shape in shapes], _view(sensor), object() if not linear else None)
+        poses = [_pose(shape) for shape in shapes]
+        state = (kinds or sizes, marks, poses, _view(sensor), object() if not linear else None)
 
         def find() -> Rows:
             with ExitStack() as stack:
@@ -322,7 +327,10 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 window = self._visible_window(scene, sensor, False, ())
                 seen = window.expand(np.ones(window.shape)) > 0
                 with recording(), dr.suspend_grad():
-                    found = Rows.of(self._row_view(scene, sensor), self.quadrature, picture, seen, sizes)
+                    if kinds is None:
+                        found = Rows.by_lines(self._row_view(scene, sensor), self.quadrature, picture, seen, sizes)
+                    else:
+                        found = Rows.on_meshes(scene, sensor, self.quadrature, picture, kinds)
                 return replace(found, kept=positions)
 
         return self._rows.recall(state, find)

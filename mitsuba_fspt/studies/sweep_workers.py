@@ -56,10 +56,10 @@ def ctrl_c_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _lost_workers(point: Any) -> BackendError:
+def _lost_workers(point: Any, verb: str = "sweep") -> BackendError:
     """The error of a point that ended every process which rendered it."""
     return BackendError(
-        f"sweep: {TRIES} worker processes died at {point.label}. Give it more memory, or fewer jobs at a time."
+        f"{verb}: {TRIES} worker processes died at {point.label}. Give it more memory, or fewer jobs at a time."
     )
 
 
@@ -177,12 +177,13 @@ def images_of_cluster(
 
 
 def results_of_cluster(
-    points: list[Any], scheduler: str, jobs: int | None, work: Callable[[Any, int | None], Any]
+    points: list[Any], scheduler: str, jobs: int | None, work: Callable[[Any, int | None], Any], verb: str = "sweep"
 ) -> Iterator[tuple[Any, Any]]:
     """Points and what `work` makes of each, in the order they are finished, by workers of the scheduler at an address.
 
     'local' starts a scheduler and `jobs` workers on this machine. When a worker ends, its points are tried again.
-    `work` takes a point, which has a `label`, and a number of threads, None for that of the worker.
+    `work` takes a point, which has a `label`, and a number of threads, None for that of the worker. Messages begin with
+    `verb`.
 
     Instead of a result: the FsptError that `work` returned, or BackendError where the point ended every worker that
     tried it.
@@ -191,32 +192,33 @@ def results_of_cluster(
     ------
     BackendError : dask.distributed is not installed, the scheduler does not answer or has no workers.
     """
-    require_dask()
+    require_dask(verb)
     from distributed import KilledWorker, as_completed
 
-    with _local(jobs or os.cpu_count() or 1) if scheduler == "local" else _remote(scheduler) as (client, threads):
+    with _local(jobs or os.cpu_count() or 1) if scheduler == "local" else _remote(scheduler, verb) as (client, threads):
         futures = {client.submit(work, point, threads, pure=False): point for point in points}
         for future in as_completed(list(futures)):
             point = futures.pop(future)
             try:
                 result = future.result()
             except KilledWorker:
-                result = _lost_workers(point)
+                result = _lost_workers(point, verb)
             except CancelledError as error:
                 raise BackendError(
-                    f"sweep: the scheduler '{scheduler}' has gone. Start it and its workers again, and then the sweep."
+                    f"{verb}: the scheduler '{scheduler}' has gone. Start it and its workers again, and then the same "
+                    "command: it goes on with what is missing."
                 ) from error
             future.release()
             yield point, result
 
 
-def require_dask() -> None:
+def require_dask(verb: str = "sweep") -> None:
     """Raise BackendError where dask.distributed is missing."""
     try:
         import distributed  # noqa: F401
     except ImportError as cause:
         raise BackendError(
-            "sweep: a scheduler needs dask.distributed, which is not installed. pip install 'mitsuba-fspt[cluster]'."
+            f"{verb}: a scheduler needs dask.distributed, which is not installed. pip install 'mitsuba-fspt[cluster]'."
         ) from cause
 
 
@@ -232,7 +234,7 @@ def _local(jobs: int) -> Iterator[tuple[Client, int | None]]:
 
 
 @contextmanager
-def _remote(address: str) -> Iterator[tuple[Client, None]]:
+def _remote(address: str, verb: str) -> Iterator[tuple[Client, None]]:
     """A client of the scheduler at this address; each worker renders with the threads that it was started with."""
     from distributed import Client
 
@@ -240,7 +242,7 @@ def _remote(address: str) -> Iterator[tuple[Client, None]]:
         client = Client(address, timeout=SCHEDULER_TIMEOUT)
     except (OSError, ValueError) as cause:
         raise BackendError(
-            f"sweep: no dask scheduler answers at '{address}'. Start one with 'dask scheduler', or give "
+            f"{verb}: no dask scheduler answers at '{address}'. Start one with 'dask scheduler', or give "
             "--scheduler local."
         ) from cause
     with client, _quiet("distributed.client"):  # a lost connection is reported once, by our error
@@ -248,7 +250,7 @@ def _remote(address: str) -> Iterator[tuple[Client, None]]:
             client.wait_for_workers(1, timeout=SCHEDULER_TIMEOUT)
         except TimeoutError as cause:
             raise BackendError(
-                f"sweep: the scheduler '{address}' has no workers. Start some with 'dask worker {address}'."
+                f"{verb}: the scheduler '{address}' has no workers. Start some with 'dask worker {address}'."
             ) from cause
         yield client, None
 
