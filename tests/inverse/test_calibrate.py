@@ -56,7 +56,7 @@ def test_bad_input(scene):
         (image, [], "names nothing"),
         (image, ["colour"], "no parameter 'colour'"),
         ([image, image], ["distance"], "2 images for 1 views"),
-        (fspt.Image(image.power), ["distance"], "has no error"),
+        (fspt.Image(image.power), ["distance"], "nor an error"),
         (fspt.Image(image.power[1:], image.error[1:]), ["distance"], "has the shape"),
     ):
         with pytest.raises(InversionError, match=words):
