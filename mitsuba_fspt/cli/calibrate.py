@@ -37,7 +37,9 @@ def calibrate(
             help="Values for another <default> of the scene, a view each, or start:stop:step; repeatable.",
         ),
     ] = None,
-    rtol: Annotated[float, typer.Option(help="Error of the integrals relative to the brightest pixel.")] = 1e-4,
+    rtol: Annotated[
+        float | None, typer.Option(help="Error of the integrals over the brightest pixel; from the noise if left out.")
+    ] = None,
     sensor: Sensor = 0,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -53,8 +55,8 @@ def calibrate(
     from ..inverse.calibration_fit import CalibrationSettings, UndeterminedError
 
     names = [name.strip() for name in free.split(",")]
-    if not rtol > 0:
-        raise InversionError(f"--rtol must be > 0, got {rtol:g}. Give for example 1e-4.")
+    if rtol is not None and not 0 < rtol < 1:
+        raise InversionError(f"--rtol must be in (0, 1), got {rtol:g}. Give for example 1e-4.")
     if output is not None:
         require_writable(output, ".xml", InversionError)
         require_own_defaults(scene, [name for name in names if name != GAIN])

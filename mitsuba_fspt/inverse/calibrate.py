@@ -119,6 +119,7 @@ def calibrate(
     start = _start(scene, names, views)
     given = [images] if isinstance(images, (Image, Exposure)) else list(images)
     found = [reduced(image) if isinstance(image, Exposure) else image for image in given]
+    settings = settings.for_noise(_noise(found))
     with ctrl_c_noted() as check_interrupt:
 
         def report(what: str, share: float) -> None:
@@ -126,9 +127,9 @@ def calibrate(
             if progress:
                 progress(what, share)
 
-        pictures = _Pictures(scene, names, views, sensor, settings.rtol, report)
+        pictures = _Pictures(scene, names, views, sensor, settings.rtol or 1e-4, report)
         pictures(start)
-        measured = _measured(found, views, pictures.first, len(names))
+        measured = measured_of(found, views, pictures.first, len(names))
         fitted = CalibrationFit(names, start, measured, pictures, settings).solved()
     pixels = int(measured.used.sum())
     return Calibration(
@@ -158,8 +159,16 @@ def _start(scene: str | os.PathLike[str], names: tuple[str, ...], views: Sequenc
         raise InversionError(str(error).replace("derivatives:", "calibrate:", 1)) from error
 
 
+def _noise(images: Sequence[Image]) -> float:
+    """Median of the errors that are > 0 over the brightest pixel; 0 where no image has an error."""
+    errors = [image.error[image.error > 0] for image in images if image.error is not None]
+    if not errors or not (values := np.concatenate(errors)).size:
+        return 0.0
+    return float(np.median(values) / max(max(float(image.power.max()) for image in images), 1e-300))
+
+
 class _Pictures:
-    """Power and numerical error [W] of all views, (N,), as a function of the values of the free parameters.
+    """Power and numerical error [W] of all views, (views, h, w), as a function of the values of the free parameters.
 
     first : the pictures of the first call
     """
@@ -195,14 +204,13 @@ class _Pictures:
             ]
         self.first = self.first or images
         power, error = (
-            gain * np.concatenate([np.asarray(getattr(i, n), np.float64).ravel() for i in images])
-            for n in ("power", "error")
+            gain * np.stack([np.asarray(getattr(i, n), np.float64) for i in images]) for n in ("power", "error")
         )
         self._last = key, (power, error)
         return self._last[1]
 
 
-def _measured(
+def measured_of(
     images: Sequence[Image], views: Sequence[Mapping[str, str]], pictures: Sequence[Image], parameters: int
 ) -> Measured:
     """Pixels of the images, after checks against the views and the scene's pictures."""
@@ -232,9 +240,9 @@ def _measured(
             "more, or expose for a shorter time."
         )
     power = np.stack([image.power for image in images]).astype(np.float64)
-    passes = min(int(image.metadata.get("passes", 0)) for image in images)
+    sampled = all("passes" in image.metadata for image in images)
     gain_error = max(float(image.metadata.get("gain_error", 0.0)) for image in images)
-    return Measured(power.ravel(), shot.ravel(), other.ravel(), used.ravel(), passes, gain_error)
+    return Measured(power, shot, other, used, sampled, gain_error)
 
 
 def _require_order(images: Sequence[Image], views: Sequence[Mapping[str, str]]) -> None:

@@ -9,11 +9,12 @@ of docs/model.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.ndimage import maximum_filter
+from scipy.optimize import least_squares, nnls
 
 from ..runtime.errors import InversionError
 
@@ -25,29 +26,39 @@ Pictures = Callable[[Array], tuple[Array, Array]]
 class CalibrationSettings:
     """Accuracy of `calibrate`.
 
-    rtol : of the integrals; its error is a tenth of the noise of a pixel with 0.1 %
-    change : of the picture by a step of the differences, root mean square over that of the picture. At 0.005 the slopes
-        of pictures of rtol 1e-4 are right to about 0.5 %, half of it from the pictures and half from the step.
+    rtol : of the integrals; None: a tenth of the median noise over the brightest pixel, in `rtols`
+    rtols : least and largest rtol that the noise chooses
+    change : of the picture by a step of the differences, root mean square over that of the picture, for an rtol of
+        1e-4, and in proportion to rtol^½. The slopes are then right to about 0.5 %, half of it from the pictures and
+        half from the step; at an rtol of 1e-3 to 3 %.
     chi2 : change of Σ (residual/σ)² at which the fit ends: 1e-3 leaves parameters within 0.03 of their sd
     reweighted : relative change of the standard deviations, root mean square, at which they count as converged
     nearby : steps of the differences within which slopes are taken again; they then belong to a picture that differs by
         less than half of `change`
     rounds : most rounds of standard deviations;  evaluations : most pictures of a round beside those of slopes
+    reach : of the first step of the fit, in steps of the differences: 20 of them change a picture by a tenth
     condition : of the Jacobian with columns of length 1, above which parameters count as not determined separately: the
         combination that is least determined then has a standard deviation so many times that of each parameter alone
     doubtful : share of its slope by which a combination's slope may change with a doubled step. Above it the standard
         deviation of this combination would be wrong by as much, and it counts as not determined.
     """
 
-    rtol: float = 1e-4
+    rtol: float | None = None
+    rtols: tuple[float, float] = (1e-4, 1e-3)
     change: float = 5e-3
     chi2: float = 1e-3
     reweighted: float = 1e-3
     nearby: float = 0.5
     rounds: int = 8
     evaluations: int = 40
+    reach: float = 20.0
     condition: float = 1e3
     doubtful: float = 0.3
+
+    def for_noise(self, noise: float) -> CalibrationSettings:
+        """The same with the rtol for images with this median `noise` over their brightest pixel, and its `change`."""
+        rtol = float(np.clip(0.1 * noise, *self.rtols)) if self.rtol is None else self.rtol
+        return replace(self, rtol=rtol, change=self.change * (rtol / 1e-4) ** 0.5)
 
 
 class UndeterminedError(InversionError):
@@ -69,9 +80,9 @@ class UndeterminedError(InversionError):
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Pixels of all views (N,): power [W], variances `shot` [W] · signal + `other` [W²], and which ones count.
+    """Pixels of all views (views, h, w): power [W], variances `shot` [W] · signal + `other` [W²], which ones count.
 
-    passes : of Monte Carlo images, whose standard errors come from the scatter of so few; 0: errors that are known
+    sampled : images of Monte Carlo, whose `other` is the square of a standard error from the scatter of few passes
     gain_error : relative standard deviation of a factor common to all pixels
     """
 
@@ -79,23 +90,39 @@ class Measured:
     shot: Array
     other: Array
     used: NDArray[np.bool_]
-    passes: int
+    sampled: bool
     gain_error: float
 
     def sigma(self, signal: Array, numerical: Array) -> Array:
         """Standard deviation of the pixels [W], for a fitted signal (Eq. M.24); 1 where they do not count.
 
-        A pixel of shot noise has at least that of one electron. A standard error s from n passes enters as
-        s ((n − 1)/(n − 3))^½, as 1/s² is too large by that factor on the average.
+        A pixel has at least the shot noise of one electron. Of Monte Carlo the pixels' own standard errors are not
+        taken one by one: on a silhouette a pixel that too few samples reached has too small a one, and would count
+        more.
         """
-        few = (self.passes - 1) / (self.passes - 3) if self.passes > 5 else 1.0
-        variance = self.shot * np.maximum(signal, self.shot) + few * self.other + numerical**2
+        other = sampling_variance(signal, self.other, self.used) if self.sampled else self.other
+        variance = np.maximum(self.shot * np.maximum(signal, 0) + other, self.shot**2) + numerical**2
         return np.where(self.used, np.sqrt(variance), 1.0)
 
-    @property
-    def scatter(self) -> float:
-        """Factor of the covariance: weights 1/s² that scatter with n passes make it (n − 3)/(n − 5) times as large."""
-        return (self.passes - 3) / (self.passes - 5) if self.passes > 5 else 1.0
+
+def sampling_variance(signal: Array, squares: Array, used: NDArray[np.bool_]) -> Array:
+    """Variance [W²] of Monte Carlo pixels, (views, h, w), as a function of the fitted signal P (Eq. M.27).
+
+        s² = a P (v − P) + b P² + c,    v the largest P of the 3 × 3 neighbourhood
+
+    The first term is that of samples which meet the surface or not, the second that of radiance and cos⁴θ over the
+    pixel. a, b, c >= 0 fit the `squares` of the standard errors, whose own errors are in proportion to them.
+    """
+    light = np.maximum(signal, 0)
+    brightest = maximum_filter(light, (1, 3, 3), mode="nearest")
+    scale = float(light.max()) or 1.0
+    terms = np.stack([light * (brightest - light), light**2, np.full_like(light, 1e-6 * scale**2)], axis=-1)
+    features, goal = terms[used] / scale**2, squares[used] / scale**2
+    model = np.full_like(goal, goal.mean())
+    for _ in range(10):
+        factors, _ = nnls(features / model[:, None], goal / model)
+        model = np.maximum(features @ factors, 1e-3 * goal.mean())
+    return np.maximum(terms @ factors, 1e-3 * scale**2 * goal.mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +138,7 @@ class Fitted:
 class CalibrationFit:
     """Fit of parameters `names` to what was `measured`.
 
-    pictures : values (p,) → power and numerical error (N,) [W];  start : (p,) values
+    pictures : values (p,) → power and numerical error, (views, h, w) [W];  start : (p,) values
 
     Inside, y (p,) are the distances from the start in units of the steps of the differences.
     """
@@ -144,10 +171,10 @@ class CalibrationFit:
                 break
         slopes, condition = self._require_determined(y, sigma)
         used = self.measured.used
+        residual = ((picture - self.measured.power) / sigma)[used]
         inverse = np.linalg.inv(slopes.T @ slopes)
         factor = inverse @ (slopes.T @ (picture / sigma)[used])  # Eq. M.26
-        covariance = self.measured.scatter * inverse + self.measured.gain_error**2 * np.outer(factor, factor)
-        residual = ((picture - self.measured.power) / sigma)[used]
+        covariance = inverse + self.measured.gain_error**2 * np.outer(factor, factor)
         scale = np.outer(self._steps, self._steps)
         return Fitted(self._values(y), covariance * scale, float(residual @ residual), condition)
 
@@ -160,7 +187,7 @@ class CalibrationFit:
             lambda x: ((self._power(x) - self.measured.power) / sigma)[self.measured.used],
             y,
             lambda x: self._slopes(x, sigma),
-            x_scale="jac",
+            x_scale=self.settings.reach,
             ftol=self.settings.chi2 / max(int(self.measured.used.sum()), 1),
             xtol=1e-6,
             gtol=None,
@@ -181,11 +208,11 @@ class CalibrationFit:
     def _slopes(self, y: Array, sigma: Array) -> Array:
         """(pixels that count, p) of residuals: differences a step to both sides; those of a point nearby if there."""
         if self._kept is None or np.abs(self._kept[0] - y).max() > self.settings.nearby:
-            self._kept = y.copy(), np.stack([self._slope(y, one) for one in np.eye(len(y))], axis=1)
-        return (self._kept[1] / sigma[:, None])[self.measured.used]
+            self._kept = y.copy(), np.stack([self._slope(y, one) for one in np.eye(len(y))], axis=-1)
+        return (self._kept[1] / sigma[..., None])[self.measured.used]
 
     def _slope(self, y: Array, way: Array, length: float = 1.0) -> Array:
-        """(N,) change of the pictures [W] along a way."""
+        """Change of the pictures [W] along a way."""
         return (self._power(y + length * way) - self._power(y - length * way)) / (2 * length)
 
     def _chosen_steps(self, first: Array) -> Array:
