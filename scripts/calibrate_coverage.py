@@ -65,7 +65,7 @@ def measured(case: str, seed: int) -> fspt.Image:
 
 @cache
 def expansion() -> tuple[Array, Array, Array]:
-    """Steps (p,), slopes (p, 1, h, w) and second derivatives (p, p, 1, h, w) of the pictures about the true values, by differences.
+    """Steps (p,), and first (p, 1, h, w) and second differences (p, p, 1, h, w) of the pictures about the true values.
 
     A step changes the picture by about 3 %.
     """

@@ -185,29 +185,28 @@ class _Pictures:
         self.scene, self.names, self.views, self.sensor = scene, names, views, sensor
         self.rtol, self.report = rtol, report
         self.first: list[Image] = []
-        self._last: tuple[bytes, tuple[Array, Array]] | None = None
+        self._last: tuple[dict[str, float], tuple[Array, Array]] | None = None
         self._count = 0
 
     def __call__(self, values: Array) -> tuple[Array, Array]:
-        key = values.tobytes()
-        if self._last is not None and self._last[0] == key:
-            return self._last[1]
+        found = dict(zip(self.names, map(float, values), strict=True))
+        gain = found.pop(GAIN, 1.0)
+        if self._last is None or self._last[0] != found:
+            self._last = found, self._rendered(found)
+        power, error = self._last[1]
+        return gain * power, gain * error
+
+    def _rendered(self, found: Mapping[str, float]) -> tuple[Array, Array]:
         self._count += 1
         self.report("calibrating", 1 - 1 / (1 + self._count / 20))  # how many it will be is not known
-        found = dict(zip(self.names, map(float, values), strict=True))
-        shown = ", ".join(f"{name} = {value:.6g}" for name, value in found.items())
-        gain = found.pop(GAIN, 1.0)
-        with named(f"calibrate, at {shown}"):
+        with named(f"calibrate, at {', '.join(f'{name} = {value:.6g}' for name, value in found.items())}"):
             images = [
                 render(load(self.scene, **{**view, **found}), method="integral", sensor=self.sensor, rtol=self.rtol)
                 for view in self.views
             ]
         self.first = self.first or images
-        power, error = (
-            gain * np.stack([np.asarray(getattr(i, n), np.float64) for i in images]) for n in ("power", "error")
-        )
-        self._last = key, (power, error)
-        return self._last[1]
+        power, error = (np.stack([np.asarray(getattr(i, n), np.float64) for i in images]) for n in ("power", "error"))
+        return power, error
 
 
 def measured_of(
