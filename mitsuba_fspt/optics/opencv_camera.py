@@ -122,7 +122,7 @@ def camera_from_opencv(K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, wid
     if deviation > TOLERANCE:
         raise OpticsError(
             f"camera_from_opencv: f_x = {matrix[0, 0]:g}, f_y = {matrix[1, 1]:g} and skew {matrix[0, 1]:g} move a "
-            f"corner of the image by {deviation:.2g} pixels from square pixels, at most {TOLERANCE:g} are left out. Calibrate "
+            f"corner of the image by {deviation:.2g} pixels from square pixels, more than {TOLERANCE:g}. Calibrate "
             "with CALIB_FIX_ASPECT_RATIO, or resample the images."
         )
     rotation = Rotation.from_rotvec(turn).as_matrix()
