@@ -12,6 +12,7 @@ from .inverse.invert import invert as invert
 from .inverse.transport import transport as transport
 from .inverse.transport_file import read_transport as read_transport
 from .inverse.transport_matrix import TransportMatrix as TransportMatrix
+from .optics.opencv_camera import camera_from_opencv as camera_from_opencv
 from .phantom.flux_import import import_flux as import_flux
 from .phantom.framed_scene import scene_xml as scene_xml
 from .phantom.phantom import Phantom as Phantom

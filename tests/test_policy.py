@@ -61,6 +61,7 @@ PUBLIC = [
     "Phantom",
     "TransportMatrix",
     "calibrate",
+    "camera_from_opencv",
     "compare",
     "converge",
     "derivatives",

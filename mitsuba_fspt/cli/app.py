@@ -13,6 +13,7 @@ from typer.exceptions import TyperException
 
 from ..runtime.errors import FsptError
 from ..runtime.interrupt import ctrl_c_noted, terminated_as_by_ctrl_c
+from .calibrate import calibrate
 from .checks import doctor, explain, stability
 from .converge import converge
 from .flux import app as flux
@@ -33,7 +34,10 @@ app = typer.Typer(
     rich_markup_mode=None,  # rich would take units in brackets for markup and leave them out
     pretty_exceptions_enable=False,
 )
-VERBS = (render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge, matrix, reduce, invert, view)
+VERBS = (
+    *(render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge),
+    *(matrix, reduce, invert, calibrate, view),
+)
 for verb in VERBS:
     app.command()(verb)
 app.add_typer(flux, name="flux")

@@ -3,51 +3,45 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
+from ..images.detector import Exposure
 from ..images.image import Image
+from ..images.reduction import reduced
 from ..rendering.render import render
 from ..rendering.scene import load
-from ..runtime.errors import InversionError
+from ..rendering.scene_rules import is_number
+from ..rendering.scene_xml import is_text
+from ..runtime.errors import InversionError, named
 from ..runtime.interrupt import ctrl_c_noted
 from ..studies.sweep_point import texts_of
+from .calibrated_scene import write_calibrated
+from .calibration_fit import CalibrationFit, CalibrationSettings, Measured
 from .derivatives import scene_text, varied_value
+from .measurement import variances
 
 Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
 GAIN = "gain"  # reserved name: a factor on all powers
-
-
-@dataclass(frozen=True)
-class CalibrationSettings:
-    """Accuracy of `calibrate`.
-
-    rtol : of the integrals; its error is a tenth of the noise of a pixel with 1 %
-    step : of the central differences, over the parameter (or 1 where it is 0)
-    tolerance : relative change of parameters and χ² at which the fit ends
-    condition : of the Jacobian with columns of length 1, above which parameters count as degenerate: the combination
-        that is least determined then has a standard deviation so many times that of each parameter alone
-    """
-
-    rtol: float = 1e-4
-    step: float = 2e-3
-    tolerance: float = 1e-6
-    condition: float = 1e3
+PITCH_TOLERANCE = 1e-6  # relative: of the pixel pitch, which files may hold in single precision
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Fitted parameters.
 
-    free : names;  values, sd : by name;  covariance : in the order of `free`, of the images' own errors
-    chi2 : Σ (residual/σ)² over (pixels − parameters);  pixels : number of them
+    free : names;  values, sd : by name;  covariance : (p, p) in the order of `free`, from the images' own errors
+    chi2 : Σ (residual/σ)² over (pixels − parameters), about 1 where scene and errors are right
+    pixels : number of them
     condition : of the Jacobian with columns of length 1
+    scene : name or text of the scene file
     """
 
     free: tuple[str, ...]
@@ -57,127 +51,211 @@ class Calibration:
     chi2: float
     pixels: int
     condition: float
+    scene: str
+
+    def summary(self) -> dict[str, Any]:
+        """Numbers about the result by name, ready for JSON."""
+        return {
+            "free": list(self.free),
+            "values": self.values,
+            "sd": self.sd,
+            "covariance": self.covariance.tolist(),
+            "chi2": self.chi2,
+            "pixels": self.pixels,
+            "condition": self.condition,
+        }
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the scene file with the fitted `<default>` values, all else byte for byte; a `gain` is not in it.
+
+        Raises
+        ------
+        InversionError : the scene was given as text, a value is set in an included file, or the file cannot be written.
+        """
+        if is_text(self.scene):
+            raise InversionError("calibrate: the scene was given as text, not as a file. Replace its values yourself.")
+        write_calibrated(self.scene, {n: v for n, v in self.values.items() if n != GAIN}, path)
 
 
 def calibrate(
     scene: str | os.PathLike[str],
-    images: Image | Sequence[Image],
+    images: Image | Exposure | Sequence[Image | Exposure],
     /,
     *,
     free: Sequence[str],
     sensor: int = 0,
     settings: CalibrationSettings | None = None,
+    progress: Progress | None = None,
     **parameters: object,
 ) -> Calibration:
-    """Values of `<default>` parameters for which a scene gives the images, with their covariance.
+    """Values of `<default>` parameters for which a scene gives the images, with their covariance (Eq. M.26).
 
         C = fspt.calibrate("scene.xml", image, free=["view", "magnification"])
+        C.values["view"], C.sd["view"]   # degrees, where the scene turns by degrees
+
+    The scene's own values are the start: its picture must overlap that of the images.
 
     Parameters
     ----------
-    scene : name or text of a scene file, whose own values are the start
-    images : one Image a view with its standard error, in the order of the views; masked pixels are left out
+    scene : name or text of a scene file
+    images : one a view, in the order of the views: Image with its standard error, as of `reduce` or of Monte Carlo, or
+        Exposure; masked pixels are left out
     free : names of parameters, common to all views, or `gain`, a factor on all powers
     sensor : number of the sensor
     settings : accuracy
+    progress : called with what is being done and the share done
     parameters : values of other `<default>` parameters; lists are multiplied out to views, the last one fastest
 
     Raises
     ------
-    InversionError : a name that cannot be fitted, images without errors or of another size, parameters that the
-        images do not determine separately; the message names their combination.
+    InversionError : a name that cannot be fitted, images without errors or of another size or order; UndeterminedError,
+        one of them, for parameters that the images do not determine separately, with the combination.
+    SceneError, OpticsError, ExitanceError : as `render`.
     """
     settings = settings or CalibrationSettings()
     names = tuple([free] if isinstance(free, str) else free)
-    if not names or len(set(names)) < len(names):
-        raise InversionError(f"calibrate: 'free' = {list(names)} names nothing, or a parameter twice. Give each once.")
     texts = {name: texts_of(name, given, "calibrate") for name, given in parameters.items()}
     views = [dict(zip(texts, one, strict=True)) for one in itertools.product(*texts.values())]
-    if both := set(names) & set(parameters):
-        raise InversionError(f"calibrate: '{both.pop()}' is free and given. Leave one of them out.")
-    xml = scene_text(scene, views[0])
-    start = np.array([1.0 if name == GAIN else varied_value(xml, name) for name in names])
-    given = [images] if isinstance(images, Image) else list(images)
-    if len(given) != len(views):
-        raise InversionError(f"calibrate: {len(given)} images for {len(views)} views. Give one a view, in their order.")
+    start = _start(scene, names, views)
+    given = [images] if isinstance(images, (Image, Exposure)) else list(images)
+    found = [reduced(image) if isinstance(image, Exposure) else image for image in given]
+    settings = settings.for_noise(_noise(found))
+    with ctrl_c_noted() as check_interrupt:
 
-    def pictures(values: Array) -> Array:
-        found = dict(zip(names, values, strict=True))
-        gain = found.pop(GAIN, 1.0)
-        planes = [
-            render(load(scene, **{**view, **found}), method="integral", sensor=sensor, rtol=settings.rtol).power
-            for view in views
-        ]
-        return gain * np.stack(planes).astype(np.float64)
+        def report(what: str, share: float) -> None:
+            check_interrupt()
+            if progress:
+                progress(what, share)
 
-    with ctrl_c_noted():
-        return _fitted(names, start, given, pictures, settings)
-
-
-def _fitted(
-    names: tuple[str, ...], start: Array, images: list[Image], pictures: Any, settings: CalibrationSettings
-) -> Calibration:
-    """Least squares over the pixels that have an error and no mask."""
-    first = pictures(start)
-    for number, image in enumerate(images):
-        if image.error is None:
-            raise InversionError(f"calibrate: image {number} has no error. Give one of Monte Carlo or 'fspt reduce'.")
-        if image.shape != first.shape[1:]:
-            raise InversionError(
-                f"calibrate: image {number} has the shape {image.shape}, the scene's film {first.shape[1:]}. Give "
-                "images of the same film."
-            )
-    power = np.stack([image.power for image in images]).astype(np.float64)
-    sigma = np.stack([np.asarray(image.error, np.float64) for image in images])
-    masks = np.stack([np.zeros(i.shape, bool) if i.mask is None else i.mask for i in images])
-    used = (sigma > 0) & ~masks
-    if used.sum() <= len(names):
-        raise InversionError(
-            f"calibrate: {int(used.sum())} pixels have an error > 0 and no mask, for {len(names)} "
-            "parameters. Give more."
-        )
-    scale = np.where(start == 0, 1.0, np.abs(start))
-
-    def residuals(x: Array) -> Array:
-        return ((pictures(start + scale * x) - power) / np.where(used, sigma, 1.0))[used]
-
-    def jacobian(x: Array) -> Array:
-        steps = settings.step * np.eye(len(x))
-        return np.stack([(residuals(x + s) - residuals(x - s)) / (2 * settings.step) for s in steps], axis=1)
-
-    _require_determined(names, jacobian(np.zeros(len(names))), settings)
-    found = least_squares(
-        residuals, np.zeros(len(names)), jacobian, xtol=settings.tolerance, ftol=settings.tolerance, x_scale="jac"
-    )
-    slopes = jacobian(found.x)
-    condition = _require_determined(names, slopes, settings)
-    covariance = np.linalg.inv(slopes.T @ slopes) * np.outer(scale, scale)
-    values, deviations = start + scale * found.x, np.sqrt(np.diag(covariance))
-    pixels = int(used.sum())
+        pictures = _Pictures(scene, names, views, sensor, settings.rtol or 1e-4, report)
+        pictures(start)
+        measured = measured_of(found, views, pictures.first, len(names))
+        fitted = CalibrationFit(names, start, measured, pictures, settings).solved()
+    pixels = int(measured.used.sum())
     return Calibration(
         names,
-        {name: float(value) for name, value in zip(names, values, strict=True)},
-        {name: float(value) for name, value in zip(names, deviations, strict=True)},
-        covariance,
-        float(found.fun @ found.fun) / (pixels - len(names)),
+        dict(zip(names, map(float, fitted.values), strict=True)),
+        dict(zip(names, map(float, np.sqrt(np.diag(fitted.covariance))), strict=True)),
+        fitted.covariance,
+        fitted.chi2_sum / (pixels - len(names)),
         pixels,
-        condition,
+        fitted.condition,
+        os.fspath(scene),
     )
 
 
-def _require_determined(names: tuple[str, ...], slopes: Array, settings: CalibrationSettings) -> float:
-    """Condition number of the Jacobian; InversionError with the combination that it leaves undetermined."""
-    lengths = np.linalg.norm(slopes, axis=0)
-    for name, length in zip(names, lengths, strict=True):
-        if not length > 0:
-            raise InversionError(f"calibrate: no pixel depends on '{name}'. Leave it out of 'free'.")
-    _, singular, directions = np.linalg.svd(slopes / lengths, full_matrices=False)
-    condition = float(singular[0] / max(singular[-1], 1e-300))
-    if condition > settings.condition:
-        weakest = directions[-1]
-        combination = " ".join(f"{share:+.2f} {name}" for share, name in zip(weakest, names, strict=True))
+def _start(scene: str | os.PathLike[str], names: tuple[str, ...], views: Sequence[Mapping[str, str]]) -> Array:
+    """(p,) values of the scene's own; InversionError for names that cannot be fitted."""
+    if not names or len(set(names)) < len(names):
+        raise InversionError(f"calibrate: 'free' = {list(names)} names nothing, or a parameter twice. Give each once.")
+    if both := set(names) & set(views[0]):
+        raise InversionError(f"calibrate: '{both.pop()}' is free and given. Leave one of them out.")
+    xml = scene_text(scene, views[0])
+    if GAIN in names and GAIN in xml.defaults:
+        raise InversionError("calibrate: 'gain' is a factor on all powers, and a <default>. Rename that in the scene.")
+    try:
+        return np.array([1.0 if name == GAIN else varied_value(xml, name) for name in names])
+    except InversionError as error:
+        raise InversionError(str(error).replace("derivatives:", "calibrate:", 1)) from error
+
+
+def _noise(images: Sequence[Image]) -> float:
+    """Median of the errors that are > 0 over the brightest pixel; 0 where no image has an error."""
+    errors = [image.error[image.error > 0] for image in images if image.error is not None]
+    if not errors or not (values := np.concatenate(errors)).size:
+        return 0.0
+    return float(np.median(values) / max(max(float(image.power.max()) for image in images), 1e-300))
+
+
+class _Pictures:
+    """Power and numerical error [W] of all views, (views, h, w), as a function of the values of the free parameters.
+
+    first : the pictures of the first call
+    """
+
+    def __init__(
+        self,
+        scene: str | os.PathLike[str],
+        names: tuple[str, ...],
+        views: Sequence[Mapping[str, str]],
+        sensor: int,
+        rtol: float,
+        report: Progress,
+    ) -> None:
+        self.scene, self.names, self.views, self.sensor = scene, names, views, sensor
+        self.rtol, self.report = rtol, report
+        self.first: list[Image] = []
+        self._last: tuple[dict[str, float], tuple[Array, Array]] | None = None
+        self._count = 0
+
+    def __call__(self, values: Array) -> tuple[Array, Array]:
+        found = dict(zip(self.names, map(float, values), strict=True))
+        gain = found.pop(GAIN, 1.0)
+        if self._last is None or self._last[0] != found:
+            self._last = found, self._rendered(found)
+        power, error = self._last[1]
+        return gain * power, gain * error
+
+    def _rendered(self, found: Mapping[str, float]) -> tuple[Array, Array]:
+        self._count += 1
+        self.report("calibrating", 1 - 1 / (1 + self._count / 20))  # how many it will be is not known
+        with named(f"calibrate, at {', '.join(f'{name} = {value:.6g}' for name, value in found.items())}"):
+            images = [
+                render(load(self.scene, **{**view, **found}), method="integral", sensor=self.sensor, rtol=self.rtol)
+                for view in self.views
+            ]
+        self.first = self.first or images
+        power, error = (np.stack([np.asarray(getattr(i, n), np.float64) for i in images]) for n in ("power", "error"))
+        return power, error
+
+
+def measured_of(
+    images: Sequence[Image], views: Sequence[Mapping[str, str]], pictures: Sequence[Image], parameters: int
+) -> Measured:
+    """Pixels of the images, after checks against the views and the scene's pictures."""
+    if len(images) != len(views):
         raise InversionError(
-            f"calibrate: the images do not determine {', '.join(names)} separately (condition number {condition:.3g}): "
-            f"{combination}, each in units of its own standard deviation, is free. Fix one of them, or add views."
+            f"calibrate: {len(images)} images for {len(views)} views. Give one a view, in their order."
         )
-    return condition
+    for number, (image, picture) in enumerate(zip(images, pictures, strict=True)):
+        if image.shape != picture.shape:
+            raise InversionError(
+                f"calibrate: image {number} has the shape {image.shape}, the scene's film {picture.shape}. Give "
+                "images of the same film."
+            )
+        pitch, own = (float(i.metadata.get("pixel_pitch", np.nan)) for i in (image, picture))
+        if abs(pitch - own) > PITCH_TOLERANCE * own:
+            raise InversionError(
+                f"calibrate: image {number} has a pixel pitch of {pitch:g} mm, the scene {own:g} mm. Give images of "
+                "the same film."
+            )
+    _require_order(images, views)
+    shot, other = variances((len(images), *pictures[0].shape), images, verb="calibrate")
+    masks = np.stack([np.zeros(i.shape, bool) if i.mask is None else i.mask for i in images])
+    used = (shot + other > 0) & ~masks
+    if used.sum() <= parameters:
+        raise InversionError(
+            f"calibrate: {int(used.sum())} pixels have an error > 0 and no mask, for {parameters} parameters. Give "
+            "more, or expose for a shorter time."
+        )
+    power = np.stack([image.power for image in images]).astype(np.float64)
+    sampled = all("passes" in image.metadata for image in images)
+    gain_error = max(float(image.metadata.get("gain_error", 0.0)) for image in images)
+    return Measured(power, shot, other, used, sampled, gain_error)
+
+
+def _require_order(images: Sequence[Image], views: Sequence[Mapping[str, str]]) -> None:
+    """Raise InversionError for an image whose metadata name the values of another view."""
+    numbers = [{n: float(t) for n, t in view.items() if is_number(t)} for view in views]
+    for number, (image, view) in enumerate(zip(images, numbers, strict=True)):
+        try:
+            made = json.loads(str(image.metadata.get("parameters", "{}")))
+        except ValueError:
+            continue
+        own = {n: float(made[n]) for n in view if is_number(str(made.get(n)))}
+        for place, other in enumerate(numbers):
+            if own and own == other and other != view:
+                raise InversionError(
+                    f"calibrate: image {number} was made for view {place}, {other}, not for {view}. Give the images "
+                    "in the order of the views."
+                )

@@ -65,7 +65,8 @@ class Measurement:
         if not listed:
             planes = np.where(masks, 0.0, _numbers(planes, masks.shape))
         power = matrix.images(planes)
-        shot, other = _variances(matrix, planes if listed else [], error, masks)
+        shot, other = variances(matrix.image_shape, planes if listed else [], error)
+        shot = np.where(masks, 0, shot)
         found = (
             float("nan") if gain_error is None else number("invert: 'gain_error'", gain_error, InversionError, "0.05")
         )
@@ -116,11 +117,13 @@ def _mask(matrix: TransportMatrix, images: Sequence[Any], mask: ArrayLike | None
     return whole
 
 
-def _variances(
-    matrix: TransportMatrix, images: Sequence[Any], error: ArrayLike | None, mask: NDArray[np.bool_]
+def variances(
+    shape: tuple[int, int, int], images: Sequence[Any], error: ArrayLike | None = None, verb: str = "invert"
 ) -> tuple[Array, Array]:
-    """`shot` and `other` (views, height, width) of a Measurement."""
-    shape = matrix.image_shape
+    """`shot` [W] and `other` [W²], (views, height, width), of a Measurement: σ² = shot · signal + other.
+
+    Raises InversionError, in the name of `verb`, for images without an error, or numbers outside their range.
+    """
     shot, other = np.zeros(shape), np.zeros(shape)
     if error is not None:
         try:
@@ -128,29 +131,30 @@ def _variances(
             other[...] = given**2
         except (TypeError, ValueError) as cause:
             raise InversionError(
-                f"invert: 'error' must be a number or of shape {shape}, got {np.shape(error)}. Give W a pixel."
+                f"{verb}: 'error' must be a number or of shape {shape}, got {np.shape(error)}. Give W a pixel."
             ) from cause
         if not (np.isfinite(given).all() and (given >= 0).all()):
-            raise InversionError("invert: 'error' has values that are negative, NaN or infinite. Give W, >= 0.")
+            raise InversionError(f"{verb}: 'error' has values that are negative, NaN or infinite. Give W, >= 0.")
         return shot, other
     if not images:
         raise InversionError(
-            "invert: an array of power says nothing of its noise. Give error=, its standard error [W], or images of "
+            f"{verb}: an array of power says nothing of its noise. Give error=, its standard error [W], or images of "
             "'fspt reduce'."
         )
     for k, image in enumerate(images):
         if not isinstance(image, Image):
             raise InversionError(
-                f"invert: image {k} says nothing of its noise. Give error= [W], or images of 'fspt reduce'."
+                f"{verb}: image {k} says nothing of its noise. Give images of 'fspt reduce'"
+                f"{', or error= [W]' if verb == 'invert' else ''}."
             )
         if "electrons_per_watt" in image.metadata:
             per_watt, read, dark = (
-                number(f"invert: image {k}, '{name}'", image.metadata.get(name, 0.0), InversionError, "1e15")
+                number(f"{verb}: image {k}, '{name}'", image.metadata.get(name, 0.0), InversionError, "1e15")
                 for name in ("electrons_per_watt", "read_noise", "dark_electrons")
             )
             if not (0 < per_watt < np.inf and 0 <= read < np.inf and 0 <= dark < np.inf):
                 raise InversionError(
-                    f"invert: image {k} has {per_watt:g} electrons a watt and {read:g} electrons of read noise. Reduce "
+                    f"{verb}: image {k} has {per_watt:g} electrons a watt and {read:g} electrons of read noise. Reduce "
                     "it again from its counts."
                 )
             shot[k], other[k] = 1 / per_watt, (read**2 + dark) / per_watt**2
@@ -158,7 +162,7 @@ def _variances(
             other[k] = image.error.astype(np.float64) ** 2
         else:
             raise InversionError(
-                f"invert: image {k} has neither 'electrons_per_watt' nor an error. Give error= [W], or reduce it from "
-                "its counts."
+                f"{verb}: image {k} has neither 'electrons_per_watt' nor an error. Reduce it from its counts"
+                f"{', or give error= [W]' if verb == 'invert' else ''}."
             )
-    return np.where(mask, 0, shot), other
+    return shot, other

@@ -1,0 +1,256 @@
+"""Least squares of `calibrate`: parameters, their covariance, and what the pictures do not determine.
+
+    σ_i² = P_i/k + σ_other² + e_i² (Eq. M.24, P the fitted picture),   C = (Jᵀ J)⁻¹ + g² b bᵀ,   J = ∂(P/σ)/∂p
+
+with b = (Jᵀ J)⁻¹ Jᵀ P/σ, the change of the parameters by a common factor of the powers, and g its uncertainty: Eq. M.26
+of docs/model.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import least_squares, nnls
+
+from ..runtime.errors import InversionError
+
+Array = NDArray[np.float64]
+Pictures = Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """Accuracy of `calibrate`.
+
+    rtol : of the integrals; None: a tenth of the median noise over the brightest pixel, in `rtols`
+    rtols : least and largest rtol that the noise chooses
+    change : of the picture by a step of the differences, root mean square over that of the picture, for an rtol of
+        1e-4, and in proportion to rtol^½. The slopes are then right to about 0.5 %, half of it from the pictures and
+        half from the step; at an rtol of 1e-3 to 3 %.
+    chi2 : change of Σ (residual/σ)² at which the fit ends: 1e-3 leaves parameters within 0.03 of their sd
+    reweighted : relative change of the standard deviations, root mean square, at which they count as converged
+    nearby : steps of the differences within which slopes are taken again; they then belong to a picture that differs by
+        less than half of `change`
+    rounds : most rounds of standard deviations;  evaluations : most pictures of a round beside those of slopes
+    reach : of the first step of the fit, in steps of the differences: 20 of them change a picture by a tenth
+    condition : of the Jacobian with columns of length 1, above which parameters count as not determined separately: the
+        combination that is least determined then has a standard deviation so many times that of each parameter alone
+    doubtful : share of its slope by which a combination's slope may change with a doubled step. Above it the standard
+        deviation of this combination would be wrong by as much, and it counts as not determined.
+    """
+
+    rtol: float | None = None
+    rtols: tuple[float, float] = (1e-4, 1e-3)
+    change: float = 5e-3
+    chi2: float = 1e-3
+    reweighted: float = 1e-3
+    nearby: float = 0.5
+    rounds: int = 8
+    evaluations: int = 40
+    reach: float = 20.0
+    condition: float = 1e3
+    doubtful: float = 0.3
+
+    def for_noise(self, noise: float) -> CalibrationSettings:
+        """The same with the rtol for images with this median `noise` over their brightest pixel, and its `change`."""
+        rtol = float(np.clip(0.1 * noise, *self.rtols)) if self.rtol is None else self.rtol
+        return replace(self, rtol=rtol, change=self.change * (rtol / 1e-4) ** 0.5)
+
+
+class UndeterminedError(InversionError):
+    """Parameters that the images do not determine separately.
+
+    condition : number of the Jacobian with columns of length 1
+    combinations : one dict for each combination that stays free, name → share in units of that parameter's own sd
+    """
+
+    def __init__(self, names: tuple[str, ...], condition: float, directions: Array) -> None:
+        self.condition = condition
+        self.combinations = [{n: float(s) for n, s in zip(names, v, strict=True)} for v in directions]
+        texts = [" ".join(f"{share:+.2f} {name}" for name, share in one.items()) for one in self.combinations]
+        super().__init__(
+            f"calibrate: the images do not determine {', '.join(names)} separately (condition number {condition:.3g}): "
+            f"{'; '.join(texts)}, each in units of its own standard deviation, is free. Fix one of them, or add views."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Pixels of all views (views, h, w): power [W], variances `shot` [W] · signal + `other` [W²], which ones count.
+
+    sampled : images of Monte Carlo, whose `other` is the square of a standard error from the scatter of few passes
+    gain_error : relative standard deviation of a factor common to all pixels
+    """
+
+    power: Array
+    shot: Array
+    other: Array
+    used: NDArray[np.bool_]
+    sampled: bool
+    gain_error: float
+
+    def sigma(self, signal: Array, numerical: Array) -> Array:
+        """Standard deviation of the pixels [W], for a fitted signal (Eq. M.24); 1 where they do not count.
+
+        A pixel has at least the shot noise of one electron. Of Monte Carlo the pixels' own standard errors are not
+        taken one by one: on a silhouette a pixel that too few samples reached has too small a one, and would count
+        more.
+        """
+        other = sampling_variance(signal, self.other, self.used) if self.sampled else self.other
+        variance = np.maximum(self.shot * np.maximum(signal, 0) + other, self.shot**2) + numerical**2
+        return np.where(self.used, np.sqrt(variance), 1.0)
+
+
+def sampling_variance(signal: Array, squares: Array, used: NDArray[np.bool_]) -> Array:
+    """Variance [W²] of Monte Carlo pixels, (views, h, w), as a function of the fitted signal P (Eq. M.27).
+
+        s² = a P (v − P) + b P² + c,    v the largest P of the 3 × 3 neighbourhood
+
+    The first term is that of samples which meet the surface or not, the second that of radiance and cos⁴θ over the
+    pixel. a, b, c >= 0 fit the `squares` of the standard errors, whose own errors are in proportion to them.
+    """
+    light = np.maximum(signal, 0)
+    brightest = maximum_filter(light, (1, 3, 3), mode="nearest")
+    scale = float(light.max()) or 1.0
+    terms = np.stack([light * (brightest - light), light**2, np.full_like(light, 1e-6 * scale**2)], axis=-1)
+    features, goal = terms[used] / scale**2, squares[used] / scale**2
+    model = np.full_like(goal, goal.mean())
+    for _ in range(10):
+        factors, _ = nnls(features / model[:, None], goal / model)
+        model = np.maximum(features @ factors, 1e-3 * goal.mean())
+    return np.maximum(terms @ factors, 1e-3 * scale**2 * goal.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Values (p,), covariance (p, p), Σ (residual/σ)² and condition number."""
+
+    values: Array
+    covariance: Array
+    chi2_sum: float
+    condition: float
+
+
+class CalibrationFit:
+    """Fit of parameters `names` to what was `measured`.
+
+    pictures : values (p,) → power and numerical error, (views, h, w) [W];  start : (p,) values
+
+    Inside, y (p,) are the distances from the start in units of the steps of the differences.
+    """
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        start: Array,
+        measured: Measured,
+        pictures: Pictures,
+        settings: CalibrationSettings,
+    ) -> None:
+        self.names, self.start, self.measured, self.settings = names, start, measured, settings
+        self._pictures = pictures
+        self._steps = np.ones(len(start))
+        self._kept: tuple[Array, Array] | None = None  # y of the last slopes, and these
+
+    def solved(self) -> Fitted:
+        """Minimum of Σ (residual/σ)², with σ of its own picture."""
+        y = np.zeros(len(self.start))
+        picture, numerical = self._pictures(self.start)
+        self._steps = self._chosen_steps(picture)
+        sigma = self.measured.sigma(picture, numerical)
+        self._require_determined(y, sigma)
+        for _ in range(self.settings.rounds):
+            y = self._minimum(y, sigma)
+            picture, numerical = self._pictures(self._values(y))
+            before, sigma = sigma, self.measured.sigma(picture, numerical)
+            if np.sqrt(np.mean((sigma / before - 1) ** 2)) < self.settings.reweighted:
+                break
+        slopes, condition = self._require_determined(y, sigma)
+        used = self.measured.used
+        residual = ((picture - self.measured.power) / sigma)[used]
+        inverse = np.linalg.inv(slopes.T @ slopes)
+        factor = inverse @ (slopes.T @ (picture / sigma)[used])  # Eq. M.26
+        covariance = inverse + self.measured.gain_error**2 * np.outer(factor, factor)
+        scale = np.outer(self._steps, self._steps)
+        return Fitted(self._values(y), covariance * scale, float(residual @ residual), condition)
+
+    def _values(self, y: Array) -> Array:
+        return self.start + self._steps * y
+
+    def _minimum(self, y: Array, sigma: Array) -> Array:
+        """y (p,) of the minimum for these standard deviations."""
+        found = least_squares(
+            lambda x: ((self._power(x) - self.measured.power) / sigma)[self.measured.used],
+            y,
+            lambda x: self._slopes(x, sigma),
+            x_scale=self.settings.reach,
+            ftol=self.settings.chi2 / max(int(self.measured.used.sum()), 1),
+            xtol=1e-6,
+            gtol=None,
+            max_nfev=self.settings.evaluations,
+        )
+        if found.status == 0:
+            values = zip(self.names, self._values(found.x), strict=True)
+            shown = ", ".join(f"{name} = {value:.6g}" for name, value in values)
+            raise InversionError(
+                f"calibrate: the fit has not ended after {self.settings.evaluations} pictures, at {shown}. Start "
+                "nearer, with other <default> values."
+            )
+        return np.asarray(found.x, np.float64)
+
+    def _power(self, y: Array) -> Array:
+        return self._pictures(self._values(y))[0]
+
+    def _slopes(self, y: Array, sigma: Array) -> Array:
+        """(pixels that count, p) of residuals: differences a step to both sides; those of a point nearby if there."""
+        if self._kept is None or np.abs(self._kept[0] - y).max() > self.settings.nearby:
+            self._kept = y.copy(), np.stack([self._slope(y, one) for one in np.eye(len(y))], axis=-1)
+        return (self._kept[1] / sigma[..., None])[self.measured.used]
+
+    def _slope(self, y: Array, way: Array, length: float = 1.0) -> Array:
+        """Change of the pictures [W] along a way."""
+        return (self._power(y + length * way) - self._power(y - length * way)) / (2 * length)
+
+    def _chosen_steps(self, first: Array) -> Array:
+        """Step of each parameter that changes the picture by `CalibrationSettings.change`, to a factor of 3."""
+        used, goal = self.measured.used, self.settings.change
+        light = np.linalg.norm(first[used])
+        if not light > 0:
+            raise InversionError("calibrate: the scene's picture is dark where the images are not masked. Check both.")
+        steps = np.empty(len(self.start))
+        for k, (name, value) in enumerate(zip(self.names, self.start, strict=True)):
+            step, change = 3e-3 * (abs(value) or 1.0), 0.0
+            while step < 100 * max(abs(value), 10.0):
+                moved = self.start + step * (np.arange(len(self.start)) == k)
+                change = float(np.linalg.norm((self._pictures(moved)[0] - first)[used]) / light)
+                if goal / 3 <= change <= 3 * goal:
+                    break
+                step *= float(np.clip(goal / max(change, 1e-300), 0.02, 30))
+            if change < goal / 30:
+                raise InversionError(f"calibrate: no pixel depends on '{name}'. Leave it out of 'free'.")
+            steps[k] = step
+        return steps
+
+    def _require_determined(self, y: Array, sigma: Array) -> tuple[Array, float]:
+        """Slopes and condition number of the Jacobian; UndeterminedError with the combinations that stay free."""
+        slopes = self._slopes(y, sigma)
+        lengths = np.linalg.norm(slopes, axis=0)
+        for name, length in zip(self.names, lengths, strict=True):
+            if not length > 0:
+                raise InversionError(f"calibrate: no pixel depends on '{name}'. Leave it out of 'free'.")
+        _, singular, directions = np.linalg.svd(slopes / lengths, full_matrices=False)
+        condition = float(singular[0] / max(singular[-1], 1e-300))
+        free = singular * self.settings.condition < singular[0]
+        if not free.any() and len(self.names) > 1:
+            way = directions[-1] / lengths
+            way /= np.abs(way).max()
+            one = slopes @ way
+            two = (self._slope(y, way, 2.0) / sigma)[self.measured.used]
+            free[-1] = np.linalg.norm(two - one) > self.settings.doubtful * np.linalg.norm(one)
+        if free.any():
+            raise UndeterminedError(self.names, condition, directions[free])
+        return slopes, condition

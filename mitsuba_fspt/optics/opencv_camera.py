@@ -1,0 +1,162 @@
+"""Camera of OpenCV's calibration (K, rvec, tvec) as pose and pixel pitch of an `fspt_lens`.
+
+OpenCV: X_c = R X + t with x to the right, y down and z forward, and the pixel (f_x x/z + s y/z + c_x, f_y y/z + c_y),
+whose whole numbers are centres of pixels. The lens looks along its +z with x to the left and y up, so that
+to_world = [Rᵀ diag(−1, −1, 1) | −Rᵀ t]. A pinhole has f_x = v/p: the pixel pitch is p = v/f_x for a lens focused at the
+image distance v.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from ..runtime.errors import OpticsError
+from ..runtime.numbers import whole
+from .thin_lens import FOCUS, Lens
+
+Array = NDArray[np.float64]
+TOLERANCE = 0.5  # pixels: a corner of the image may move by as much by what a lens with square pixels does not have
+WIDEST = 3.0  # of a film whose middle is the principal point, over the image: beyond, it is no camera's
+
+
+@dataclass(frozen=True, eq=False)
+class OpenCVCamera:
+    """Pose and film of a camera; neither aperture nor focus, which OpenCV's numbers do not contain.
+
+    to_world : (4, 4), from the lens at the origin to the world [mm]
+    focal_pixels : image distance over pixel pitch, (f_x + f_y)/2
+    width, height : of the film whose middle is the principal point;  crop : (x, y, width, height) of the image in it
+    deviation : pixels that a corner of the image moves by what is left out: skew, f_x ≠ f_y, the rest of the principal
+        point beyond half pixels
+    """
+
+    to_world: Array
+    focal_pixels: float
+    width: int
+    height: int
+    crop: tuple[int, int, int, int]
+    deviation: float
+
+    def pixel_pitch(self, image_distance: float) -> float:
+        """Pixel pitch p = v/f [mm] of a lens at the `image_distance` v [mm] from the detector."""
+        return image_distance / self.focal_pixels
+
+    def sensor_xml(self, *, focal_length: float, f_number: float, **focus: float) -> str:
+        """Text of the `<sensor>` for a scene file, with the lens's own numbers.
+
+        Parameters
+        ----------
+        focal_length : F [mm];  f_number : f_num = F/D
+        focus : exactly one of focus_distance [mm], magnification, image_distance [mm]
+
+        Raises
+        ------
+        OpticsError : a lens that cannot exist.
+        """
+        if unknown := set(focus) - set(FOCUS):
+            raise OpticsError(f"camera_from_opencv: '{unknown.pop()}' sets no focus. Give one of {', '.join(FOCUS)}.")
+        lens = Lens.focused(focal_length, f_number, **focus)  # type: ignore[arg-type]
+        numbers = {"focal_length": lens.focal_length, "f_number": lens.f_number, **focus}
+        numbers["pixel_pitch"] = self.pixel_pitch(lens.image_distance)
+        floats = "".join(f'    <float name="{name}" value="{float(value)!r}"/>\n' for name, value in numbers.items())
+        crop = dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), self.crop, strict=True))
+        sides = {"width": self.width, "height": self.height} | crop
+        film = "".join(f'        <integer name="{name}" value="{value}"/>\n' for name, value in sides.items())
+        matrix = " ".join(f"{value!r}" for value in self.to_world.ravel().tolist())
+        return (
+            f'<sensor type="fspt_lens">\n{floats}'
+            f'    <transform name="to_world"><matrix value="{matrix}"/></transform>\n'
+            f'    <film type="hdrfilm">\n{film}'
+            '        <string name="component_format" value="float32"/>\n'
+            '        <string name="pixel_format" value="luminance"/>\n'
+            '        <rfilter type="box"/>\n    </film>\n</sensor>\n'
+        )
+
+
+def camera_from_opencv(K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, width: int, height: int) -> OpenCVCamera:
+    """Camera of `cv2.calibrateCamera` or `cv2.solvePnP`, for images whose distortion has been removed.
+
+        camera = fspt.camera_from_opencv(K, rvec, tvec, width=512, height=512)
+        camera.to_world, camera.pixel_pitch(image_distance=82.5)
+        camera.sensor_xml(focal_length=55, f_number=2.8, magnification=0.5)   # for a scene file
+
+    A principal point beside the middle of the image becomes a crop of a larger film, to half a pixel.
+
+    Parameters
+    ----------
+    K : (3, 3) [pixels], ((f_x, s, c_x), (0, f_y, c_y), (0, 0, 1))
+    rvec : 3 numbers, the rotation from the world to the camera as axis times angle [rad]
+    tvec : 3 numbers, its translation [mm]: the calibration target's squares must have been given in mm
+    width, height : of the image [pixels]
+
+    Raises
+    ------
+    OpticsError : numbers of another form, f <= 0, or a skew, f_x ≠ f_y or principal point that move a corner of the
+        image by more than half a pixel from where a thin lens with square pixels puts it.
+    """
+    width, height = (
+        whole(f"camera_from_opencv: '{name}'", value, OpticsError, "512")
+        for name, value in (("width", width), ("height", height))
+    )
+    if min(width, height) < 1:
+        raise OpticsError(f"camera_from_opencv: width x height = {width} x {height} must be >= 1. Give the image's.")
+    matrix = _numbers("K", K, (3, 3))
+    turn, shift = _numbers("rvec", rvec, (3,)), _numbers("tvec", tvec, (3,))
+    if not np.array_equal(matrix[[1, 2, 2], [0, 0, 1]], [0, 0, 0]) or matrix[2, 2] != 1:
+        raise OpticsError("camera_from_opencv: 'K' must be ((f_x, s, c_x), (0, f_y, c_y), (0, 0, 1)). Give OpenCV's.")
+    if not min(matrix[0, 0], matrix[1, 1]) > 0:
+        raise OpticsError(
+            f"camera_from_opencv: f_x = {matrix[0, 0]:g} and f_y = {matrix[1, 1]:g} must be > 0. Give OpenCV's K."
+        )
+    focal = float(matrix[0, 0] + matrix[1, 1]) / 2
+    first, wide, rest_x = _film(float(matrix[0, 2]), width)
+    upper, high, rest_y = _film(float(matrix[1, 2]), height)
+    # A corner at the slopes (x, y) of its line of sight is moved by (f_x − f) x + s y and (f_y − f) y.
+    slope = max(width, wide) / 2 / focal, max(height, high) / 2 / focal
+    along = abs(matrix[0, 0] - focal) * slope[0] + abs(matrix[0, 1]) * slope[1] + abs(rest_x)
+    deviation = float(np.hypot(along, abs(matrix[1, 1] - focal) * slope[1] + abs(rest_y)))
+    if deviation > TOLERANCE:
+        raise OpticsError(
+            f"camera_from_opencv: f_x = {matrix[0, 0]:g}, f_y = {matrix[1, 1]:g} and skew {matrix[0, 1]:g} move a "
+            f"corner of the image by {deviation:.2g} pixels from square pixels, more than {TOLERANCE:g}. Calibrate "
+            "with CALIB_FIX_ASPECT_RATIO, or resample the images."
+        )
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    to_world = np.eye(4)
+    to_world[:3, :3] = rotation.T @ np.diag([-1.0, -1.0, 1.0])
+    to_world[:3, 3] = -rotation.T @ shift
+    return OpenCVCamera(to_world, focal, wide, high, (first, upper, width, height), deviation)
+
+
+def _film(centre: float, size: int) -> tuple[int, int, float]:
+    """First pixel of the image on a film whose middle is at the pixel `centre`, that film's size, what is left over.
+
+    The middle of the image is the pixel (size − 1)/2; a film that is larger by n pixels moves it by n/2.
+    """
+    off = 2 * (centre - (size - 1) / 2)
+    if abs(off) > (WIDEST - 1) * size:
+        raise OpticsError(
+            f"camera_from_opencv: the principal point at {centre:g} is {abs(off) / 2:.4g} pixels from the middle of an "
+            f"image of {size}. Give the K of these images."
+        )
+    more = round(off)
+    return max(0, -more), size + abs(more), (off - more) / 2
+
+
+def _numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """`values` as finite numbers of this shape, axes of length 1 apart; OpticsError for anything else."""
+    try:
+        array = np.asarray(values, np.float64)
+        array = array if array.shape == shape else array.reshape(shape) if 1 in array.shape else array
+    except (TypeError, ValueError) as cause:
+        raise OpticsError(f"camera_from_opencv: '{name}' must be numbers of shape {shape}: {cause}.") from cause
+    if array.shape != shape or not np.isfinite(array).all():
+        raise OpticsError(
+            f"camera_from_opencv: '{name}' must be finite numbers of shape {shape}, got shape {array.shape}. Give "
+            "OpenCV's."
+        )
+    return array
