@@ -22,6 +22,7 @@ from .reference_shapes import Array, dot, unit_disc
 
 SHIFTS = 16
 CERTAIN = 4.1  # standard errors of the mean of 16 shifts that 999 of 1000 stay within (Student's t)
+FEW, UNMET = 16, 6.9  # fans with light that say how much they scatter; −ln of one case of 1000
 LINES = (32, 128, 512, 2048, 8192)  # of a lattice: fans a shift
 GAUSS = 8  # nodes on a piece between two edges
 SHORTEST = 1e-13  # piece of a fan that is left out, of the fan's length
@@ -106,8 +107,10 @@ class FanReference:
             if lines > most:
                 break
             for way in ways:
-                means = self._means(bodies, centre, way, lines, random.random((SHIFTS, 3)))
+                means, lit = self._means(bodies, centre, way, lines, random.random((SHIFTS, 3)))
                 error = CERTAIN * float(np.std(means, ddof=1)) / math.sqrt(SHIFTS)
+                if lit < FEW:  # all of a part of pixel × pupil may be passed by
+                    error = max(error, UNMET / (SHIFTS * lines) * self._most(bodies))
                 if best is None or error < best[1] or way == best[2]:
                     best = (float(np.mean(means)), error, way)
             if best is not None and best[1] < goal:
@@ -115,8 +118,16 @@ class FanReference:
             ways = [best[2]] if best and best[1] > 0 else ways
         return best[:2] if best else (0.0, 0.0)
 
-    def _means(self, bodies: Sequence[Body], centre: Array, way: tuple[bool, int], lines: int, shifts: Array) -> Array:
-        """Power [W] by each shift's lattice of fans.
+    def _most(self, bodies: Sequence[Body]) -> float:
+        """Upper bound of the power on a pixel [W]: all of its lines of sight meet the brightest of what glows."""
+        stops = self.stops
+        size = self.camera.pixel_side * stops.pupil_radius / (self.camera.focus_distance - stops.pupil_depth)
+        return size**2 * max((body.most for body in bodies), default=0.0)
+
+    def _means(
+        self, bodies: Sequence[Body], centre: Array, way: tuple[bool, int], lines: int, shifts: Array
+    ) -> tuple[Array, int]:
+        """Power [W] by each shift's lattice of fans, and the number of fans that meet light.
 
         way : whether fans cover a chord of the pupil, or of the pixel, and along which axis. Edges along the fans,
             or across what hardly matters, spoil all but one of the four.
@@ -143,7 +154,8 @@ class FanReference:
             step[:, axis] = -2 * stops.pupil_radius * half
         along = self._along(bodies, Fan(apex, start, step, behind))
         means = (along * share).reshape(len(shifts), lines).mean(axis=1)
-        return side**2 * math.pi * (stops.pupil_radius / (u - depth)) ** 2 * means
+        etendue = side**2 * math.pi * (stops.pupil_radius / (u - depth)) ** 2
+        return etendue * means, int(np.count_nonzero(along))
 
     def _along(self, bodies: Sequence[Body], fan: Fan) -> Array:
         """Mean of cos⁴θ times radiance over each fan, (n,)."""

@@ -124,7 +124,7 @@ class _Maker:
             self.add(what, Body(shape))
             return
         level = self.exitance()
-        self.add(what, Body(shape, lambda p, f: np.full(len(p), level), self.index), level)
+        self.add(what, Body(shape, lambda p, f: np.full(len(p), level), self.index, most=level), level)
 
     # ------------------------------------------------------------------ bodies
 
@@ -161,7 +161,7 @@ class _Maker:
         ends = [centre - height / 2 * axis, centre + height / 2 * axis]
         tube = {"type": "cylinder", "p0": ends[0].tolist(), "p1": ends[1].tolist(), "radius": float(radius)}
         shape = Simple(Cylinder(centre, axis, float(radius), float(height)))
-        self.add(tube, Body(shape, lambda p, f: np.full(len(p), level), self.index), level)
+        self.add(tube, Body(shape, lambda p, f: np.full(len(p), level), self.index, most=level), level)
         for k, end in enumerate(ends):
             cap = _matrix(turn * np.array([1, 1 if k else -1, 1 if k else -1]) * radius, end)
             law = {} if self.index is None else {"emission": "fresnel", "int_ior": self.index}
@@ -190,7 +190,7 @@ class _Maker:
         level = level.astype(np.float32).astype(np.float64)
         shape = Triangles(vertices, faces, np.arange(len(faces)))
         built = mesh(vertices, faces, level)(mi.ScalarTransform4f())
-        self.add(built, Body(shape, _linear_on(vertices, faces, level)))
+        self.add(built, Body(shape, _linear_on(vertices, faces, level), most=float(level.max())))
 
     def bitmap(self) -> None:
         """A plate with random texels, nearest or bilinear."""
@@ -217,7 +217,8 @@ class _Maker:
         def borders(fan: Fan) -> Array:
             return rectangle_lines(fan, plate, across, along)
 
-        body = Body(Simple(plate), _texels_on(plate, texels, nearest), self.index, texture=borders)
+        most = float(texels.max())
+        body = Body(Simple(plate), _texels_on(plate, texels, nearest), self.index, texture=borders, most=most)
         self.add({"type": "rectangle", "to_world": _matrix(turn * [*half, 1], centre)}, body, texture)
 
     def pane(self, mirror: bool) -> None:

@@ -54,6 +54,7 @@ class Body:
     shape : of `BodyShape`
     exitance : (points (n, 3), face (n,)) -> J_n (n,) [W/mm²]; None: dark
     index : n of Fresnel's exit law (Eq. M.15); None: Lambert's
+    most : largest J_n [W/mm²]
     role : 'opaque'; 'mirror' (reflects all on the side of the normal); 'pane' (thin, of refractive index `glass`)
     texture : (fan) -> where fans cross the borders of texels, (n, k); None: nowhere
     """
@@ -64,6 +65,7 @@ class Body:
     role: Literal["opaque", "mirror", "pane"] = "opaque"
     glass: float = 1.5
     texture: Callable[[Fan], Array] | None = None
+    most: float = 0.0
 
     def edges(self, fan: Fan) -> Array:
         """Parameters s at which fans meet an edge, (n, k); nan or beyond [0, 1] where they do not."""
