@@ -1,11 +1,11 @@
 """Errors of the integral on random scenes, against an independent float64 reference.
 
-    python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--out docs]
+    python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
 
 Scenes of every family of `validation/random_scenes.py`, each rendered by `fspt_integral`. On 24 pixels of each,
 `fan_reference` gives the power with its own error: 16 where errors are likely (large stated errors, edges, curved
-pictures) and 8 at random. A pixel counts as beyond a limit only by more than the reference's error. Writes audit.csv, one
-line a scene, and prints the table by family; with --out docs the one of docs/model.md, too.
+pictures) and 8 at random. A pixel counts as beyond a limit only by more than the reference's error. Writes audit.csv,
+one line a scene, and prints the table by family.
 """
 
 from __future__ import annotations
@@ -80,13 +80,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first scene of a family")
     parser.add_argument("--family", default=",".join(FAMILIES))
     parser.add_argument("--rtol", type=float, default=1e-3)
+    parser.add_argument("--finer", type=int, default=1, help="times as many pixels along each side of the film")
     parser.add_argument("--out", type=Path, default=Path("docs"))
     parser.add_argument("--readme", type=Path, help="file whose table 'audit' is replaced")
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.scenes)
     audits = []
     for family in arguments.family.split(","):
-        audits += [audited(family, seed, arguments.rtol) for seed in seeds]
+        audits += [audited(family, seed, arguments.rtol, finer=arguments.finer) for seed in seeds]
         print(_row(family, [audit for audit in audits if audit.family == family], arguments.rtol), flush=True)
     arguments.out.mkdir(exist_ok=True)
     with atomic_path(arguments.out / "audit.csv") as temporary, open(temporary, "w", newline="") as file:
@@ -99,19 +100,19 @@ def main() -> None:
         markdown_tables.write(arguments.readme, "audit", text)
 
 
-def audited(family: str, seed: int, rtol: float, likely: int = LIKELY, random: int = RANDOM) -> Audit:
-    """One scene of a family, rendered and compared."""
+def audited(family: str, seed: int, rtol: float, likely: int = LIKELY, random: int = RANDOM, finer: int = 1) -> Audit:
+    """One scene of a family, rendered on a film of `finer` times as many pixels a side, and compared."""
     backend.ensure_variant()
     import mitsuba as mi
 
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:
-        made = random_scene(family, seed)
+        made = random_scene(family, seed, finer)
         image, seconds = _rendered(made, rtol)
     finally:
         mi.set_log_level(level)
-    pixels, stated, difference, reference = _compared(made, image, rtol, likely, random)
+    stated, difference, reference = _compared(made, image, rtol, likely, random)
     beyond = difference - reference > rtol
     missed = difference - reference > stated
     wide = stated > WIDE * rtol
@@ -153,16 +154,17 @@ def _rendered(made: RandomScene, rtol: float) -> tuple[fspt.Image, float]:
 
 def _compared(
     made: RandomScene, image: fspt.Image, rtol: float, likely: int, random: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (n, 2) on the film; stated error, difference and error of the reference, over the brightest pixel."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """On chosen pixels stated error, difference and error of the reference, over the brightest pixel, each (n,)."""
     left, top, width, _ = made.crop
     peak = image.power.max() or 1.0
     generator = np.random.default_rng(1)
     picked = [*_likely(image, likely, generator), *generator.integers(0, image.power.size, random)]
-    pixels = np.stack(np.divmod(picked, width), axis=1) + [top, left]
+    row, column = np.divmod(picked, width)
+    pixels = np.stack([row + top, column + left], axis=1)
     stated = image.error.ravel()[picked] / peak
     power, error = made.reference.power(pixels, peak * np.maximum(GOAL * stated, LEAST_GOAL))
-    return pixels, stated, np.abs(image.power.ravel()[picked] - power) / peak, error / peak
+    return stated, np.abs(image.power.ravel()[picked] - power) / peak, error / peak
 
 
 def _likely(image: fspt.Image, count: int, generator: np.random.Generator) -> np.ndarray:

@@ -38,10 +38,13 @@ SIDES, FEWEST = ((8, 3e-3), (4, 0.0)), 96
 MARGIN = 2  # blocks around those that are wanted, from which the polynomials of these follow
 REFINED = 0.5  # of rtol: asked of blocks; what is left is for what lies between them
 BLURRED = 1.5  # blocks: blur radius from which on no edge is narrower than a block
+AROUND = 2  # blocks around those that are solved by pixels
+LEVELS = 4  # of transects on blocks; where more are needed pixels take them
 SMALL = 4.0  # blocks: a body that is smaller may have its edges within single blocks
-# Of the change from three blocks to five: at the rim of a blur disc, where the picture of an edge has a vertical tangent
-# in its slope, 2.2 times as much is left, whatever the blur.
-BEND_GAIN = 2.5
+# Of the change from polynomials over three blocks to those over five, on a block and its neighbours: on blurred edges
+# and corners, whose pictures have kinks at the rim of the blur disc, up to 3.1 times as much is left for blur radii
+# from 1.5 to 16 blocks.
+BEND_GAIN = 3.2
 MOST = 0.5  # of the blocks: where more are to be solved by pixels all are
 STREAM = 0x9E3779B9  # of the random pixels that are tried
 
@@ -195,11 +198,12 @@ class _Picture:
         side, etendue = self.blocks.side, self.view.lens.etendue
         count = int(np.count_nonzero(rough))
         why = f"{rough.size - count} of {rough.size} blocks of {side}² pixels are smooth"
-        value = np.maximum(_interpolated(self.value * etendue, side), 0)
+        weights = _weights(side, MARGIN)
+        value = np.maximum(_interpolated(self.value * etendue, weights), 0)
         inside = (self.coverage > COVERAGE_ROUNDING) & (self.coverage < 1 - COVERAGE_ROUNDING) & ~rough
         coverage = _repeated(self.coverage, side)
         if inside.any():
-            coverage = np.clip(_interpolated(self.coverage, side), 0, 1)
+            coverage = np.clip(_interpolated(self.coverage, weights), 0, 1)
         least = np.where(_spread(self.coverage, MARGIN) > 0, self.quadrature.least_error * self.peak, 0)
         error = _repeated(np.maximum(self._left(), least) * etendue, side)
         planes = (value, error, coverage)
@@ -207,13 +211,15 @@ class _Picture:
         findings = [Finding("smooth blocks", True, why)]
         rays = self.rays
         if count:
-            grid = BlockGrid(rough, side)
-            draft = Draft(
-                self.view, self.blocks.fine, self.quadrature, None, self.peak, self.progress.part(1, 2), grid
-            )
+            # Blocks around show which way an edge runs and whether one passes near by; their values stay.
+            grid = BlockGrid(_spread(rough, AROUND), side)
+            progress = self.progress.part(1, 2)
+            draft = Draft(self.view, self.blocks.fine, self.quadrature, None, self.peak, progress, grid)
+            own = _repeated(rough, side)
+            draft.open, draft.known = grid.flat(own), grid.flat(value / etendue)
             refine(draft, np.broadcast_to(0.0, grid.shape))
             for plane, image in zip(planes, draft.images(), strict=True):
-                grid.lay(image, plane)
+                grid.lay(dr.select(draft.open, image, grid.flat(plane)), plane)
             rays, levels = rays + draft.rays, levels + draft.levels
             findings += draft.findings
         else:
@@ -229,7 +235,7 @@ def _refine_blurred(draft: Draft) -> mi.Bool:
     least = draft.grid.spread_max(-draft.least_blur)
     blurred = -least >= dr.opaque(mi.Float64, BLURRED)
     quadrature = draft.quadrature
-    levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
+    levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)[:LEVELS]
     rough = twelve_nodes(draft, rough, transects_follow=bool(levels)) & blurred
     if levels and dr.any(rough):
         integrate_by_transects(draft, rough, levels)
@@ -258,26 +264,24 @@ def _small_bodies(view: View, window: Window) -> Marks:
 
 
 def _weights(side: int, reach: int) -> Plane:
-    """Means over the parts of the middle of 2 reach + 1 cells, (side, cells), of the polynomial with these cells' means.
+    """Means over parts of the middle of 2 reach + 1 cells, (side, cells), of the polynomial with these cells' means.
 
     The integral of the polynomial interpolates the sums of the cells at their ends.
     """
     ends = np.arange(2 * reach + 2) - reach - 0.5
     parts = np.arange(side + 1) / side - 0.5
     # Lagrange's polynomials of the ends, at the ends of the parts.
-    factor = [
-        np.prod([(parts - other) / (end - other) for other in ends if other != end], axis=0) for end in ends
-    ]
+    factor = [np.prod([(parts - other) / (end - other) for other in ends if other != end], axis=0) for end in ends]
     lagrange = np.array(factor).T  # (side + 1, ends)
     sums = np.tril(np.ones((2 * reach + 2, 2 * reach + 1)), -1)
     return np.diff(lagrange @ sums, axis=0) * side
 
 
-def _interpolated(cells: Plane, side: int) -> Plane:
-    """Means of parts of cells (h, w), `side` along each axis: (side h, side w)."""
-    weights = _weights(side, MARGIN)
+def _interpolated(cells: Plane, weights: Plane) -> Plane:
+    """Means of parts of cells (h, w) by `weights` (parts, cells) along each axis: (parts h, parts w)."""
+    reach = weights.shape[1] // 2
     for _ in range(2):  # along the columns of the transposed, then of the original
-        around = sliding_window_view(np.pad(cells.T, ((0, 0), (MARGIN, MARGIN)), mode="edge").T, 2 * MARGIN + 1, axis=0)
+        around = sliding_window_view(np.pad(cells.T, ((0, 0), (reach, reach)), mode="edge").T, 2 * reach + 1, axis=0)
         cells = np.einsum("sk,hwk->hsw", weights, around, optimize=True).reshape(-1, cells.shape[1]).T
     return np.ascontiguousarray(cells)
 
@@ -293,19 +297,12 @@ def _propagated(errors: Plane, side: int) -> Plane:
 
 
 def _bend(cells: Plane, side: int) -> Plane:
-    """By how much a part of each cell differs between the polynomials of five cells and of three, (h, w)."""
-    more = _weights(side, MARGIN)
-    more[:, 1:-1] -= _weights(side, MARGIN - 1)
-    bend = np.zeros(cells.shape)
-    for image, result in ((cells, bend), (cells.T, bend.T)):
-        padded = np.pad(image, ((MARGIN, MARGIN), (0, 0)), mode="edge")
-        around = [padded[k : k + len(image)] for k in range(2 * MARGIN + 1)]
-        largest = np.zeros(image.shape)
-        for row in more[: (side + 1) // 2 + side // 2]:
-            part = sum(weight * column for weight, column in zip(row, around, strict=True))
-            np.maximum(largest, np.abs(part), out=largest)
-        result += largest
-    return bend
+    """Largest change of a part of each cell and its neighbours from polynomials over three cells to five, (h, w)."""
+    parts = [0, side // 2, side - 1]  # corners, where it is largest, and the middle
+    five, three = (_interpolated(cells, _weights(side, reach)[parts]) for reach in (MARGIN, MARGIN - 1))
+    height, width = cells.shape
+    change = np.abs(five - three).reshape(height, len(parts), width, len(parts)).max(axis=(1, 3))
+    return _spread(change, 1)
 
 
 def _spread(image: NDArray, reach: int) -> NDArray:

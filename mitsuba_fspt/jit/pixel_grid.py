@@ -205,7 +205,7 @@ class Grid:
         return dr.select(self._width > 2, along_x, 0), dr.select(self._height > 2, along_y, 0)
 
     def principal_axis(self, x: PixelArray, y: PixelArray, radius: int) -> tuple[PixelArray, PixelArray]:
-        """Angle [rad] of the principal axis of the vectors (x, y) within `radius` pixels, and how far they lie along it.
+        """Angle [rad] of the principal axis of the vectors (x, y) within `radius` pixels, how far they lie along it.
 
         From the structure tensor: 1 where all are parallel, 0 where no direction prevails, or all vectors are 0.
         """

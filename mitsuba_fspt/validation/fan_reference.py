@@ -14,12 +14,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .reference import Camera, lattice
 from .reference_bodies import Body, Fan, reflected, roots, seen_along
 from .reference_shapes import Array, dot, unit_disc
 
+Indices = NDArray[np.int64]
 SHIFTS = 16
 CERTAIN = 4.1  # standard errors of the mean of 16 shifts that 999 of 1000 stay within (Student's t)
 FEW, UNMET = 16, 6.9  # fans with light that say how much they scatter; −ln of one case of 1000
@@ -76,9 +77,7 @@ class FanReference:
     bodies: Sequence[Body]
     pixel: Literal["area", "centre"] = "area"
 
-    def power(
-        self, pixels: ArrayLike, goal: ArrayLike, seed: int = 0, most: int = LINES[-1]
-    ) -> tuple[Array, Array]:
+    def power(self, pixels: ArrayLike, goal: ArrayLike, seed: int = 0, most: int = LINES[-1]) -> tuple[Array, Array]:
         """Power on pixels (n, 2), given as (row, column), and its error, each (n,) [W].
 
         Lattices grow until the error, 4.1 standard errors of 16 shifts, is below `goal` [W], one number or (n,), or
@@ -87,7 +86,7 @@ class FanReference:
         pixels = np.asarray(pixels, int)
         goals = np.broadcast_to(np.asarray(goal, np.float64), len(pixels))
         # A pixel is some 10⁵ lines of sight, so that this loop costs nothing.
-        found = [self._on_pixel(*pixel, own, seed, most) for pixel, own in zip(pixels.tolist(), goals, strict=True)]
+        found = [self._on_pixel(int(r), int(c), own, seed, most) for (r, c), own in zip(pixels, goals, strict=True)]
         return np.array([value for value, _ in found]), np.array([error for _, error in found])
 
     def _on_pixel(self, row: int, column: int, goal: float, seed: int, most: int) -> tuple[float, float]:
@@ -178,9 +177,9 @@ class FanReference:
         share = (high - low)[:, None] * (weight * slope)
         row = np.repeat(fan_of, GAUSS)
         value = self._integrand(bodies, fan, row, s.ravel()) * share.ravel()
-        return np.bincount(row, value, minlength=count)
+        return np.bincount(row, value, minlength=count).astype(np.float64)
 
-    def _integrand(self, bodies: Sequence[Body], fan: Fan, row: Array, s: Array) -> Array:
+    def _integrand(self, bodies: Sequence[Body], fan: Fan, row: Indices, s: Array) -> Array:
         """cos⁴θ times radiance [W/mm²/sr] on single lines of fans, (n,); 0 where a stop holds a line back."""
         stops, u = self.stops, self.camera.focus_distance
         direction = fan.start[row] + s[:, None] * fan.step[row]

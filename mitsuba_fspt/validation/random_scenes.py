@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .fan_reference import FanReference, Stops
 from .reference import Camera
@@ -23,6 +24,7 @@ from .stiff_scenes import mesh
 if TYPE_CHECKING:
     import mitsuba as mi
 
+Indices = NDArray[np.int64]
 DARK = {"type": "diffuse"}
 APART = 1.02  # of the sum of two bodies' radii: centres are farther apart, so that bodies do not intersect
 FRESNEL_INDEX = 1.37
@@ -71,7 +73,7 @@ class _Maker:
         focal, focus = float(r.choice([25, 50, 85])), float(r.uniform(160, 350))
         self.lens = {"focal_length": focal, "f_number": float(np.exp(r.uniform(np.log(0.9), np.log(32))))}
         self.lens["focus_distance"] = focus
-        self.size = tuple(int(n) for n in r.integers(24, 65, 2))
+        self.size = int(r.integers(24, 65)), int(r.integers(24, 65))
         self.field_width = float(r.uniform(30, 60))
         side = self.field_width / max(self.size)
         self.lens["pixel_pitch"] = side * focal / (focus - focal)
@@ -206,7 +208,7 @@ class _Maker:
         plate = Rectangle(centre, turn[:, 0] * half[0], turn[:, 1] * half[1])
         texture = {
             "type": "bitmap",
-            "data": mi.TensorXf(texels[..., None]),
+            "bitmap": mi.Bitmap(texels[..., None]),
             "raw": True,
             "filter_type": "nearest" if nearest else "bilinear",
             "wrap_mode": "clamp",
@@ -215,7 +217,7 @@ class _Maker:
         across, along = (2 * (np.arange(n + 1) + offset) / n - 1 for n in (columns, rows))
 
         def borders(fan: Fan) -> Array:
-            return rectangle_lines(fan, plate, across, along)
+            return rectangle_lines(fan, plate, across.tolist(), along.tolist())
 
         most = float(texels.max())
         body = Body(Simple(plate), _texels_on(plate, texels, nearest), self.index, texture=borders, most=most)
@@ -232,7 +234,7 @@ class _Maker:
         centre = np.array([*self.random.uniform(-15, 15, 2), z])
         shape = Simple(Rectangle(centre, turn[:, 0] * half[0], turn[:, 1] * half[1]))
         index = float(self.random.uniform(1.3, 1.8))
-        bsdf = {"type": "conductor", "material": "none"}
+        bsdf: dict[str, Any] = {"type": "conductor", "material": "none"}
         if not mirror:
             bsdf = {"type": "thindielectric", "int_ior": index, "ext_ior": 1.0}
         self.add(
@@ -330,10 +332,12 @@ FAMILIES: dict[str, Callable[[_Maker], None]] = {
 }
 
 
-def random_scene(family: str, seed: int) -> RandomScene:
-    """The scene of a family of `FAMILIES` with this seed."""
+def random_scene(family: str, seed: int, finer: int = 1) -> RandomScene:
+    """The scene of a family of `FAMILIES` with this seed, on a film of `finer` times as many pixels along each side."""
     for attempt in itertools.count():
         maker = _Maker(np.random.default_rng([seed, list(FAMILIES).index(family), attempt]))
+        maker.size = finer * maker.size[0], finer * maker.size[1]
+        maker.lens["pixel_pitch"] /= finer
         FAMILIES[family](maker)
         if any(body.exitance is not None for body in maker.bodies):
             return maker.finish(f"{family} {seed}")
@@ -345,13 +349,13 @@ def _matrix(linear: Array, centre: Array) -> mi.ScalarTransform4f:
 
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, centre
-    return mi.ScalarTransform4f(matrix)
+    return mi.ScalarTransform4f(matrix.tolist())
 
 
-def _linear_on(vertices: Array, faces: Array, level: Array) -> Callable[[Array, Array], Array]:
+def _linear_on(vertices: Array, faces: Indices, level: Array) -> Callable[[Array, Indices], Array]:
     """J_n that is linear on faces between its values `level` on vertices."""
 
-    def exitance(points: Array, face: Array) -> Array:
+    def exitance(points: Array, face: Indices) -> Array:
         a, b, c = (vertices[faces[face, k]] for k in range(3))
         e1, e2, w = b - a, c - a, points - a
         g11, g12, g22 = (np.einsum("nk,nk->n", x, y) for x, y in ((e1, e1), (e1, e2), (e2, e2)))
@@ -364,12 +368,12 @@ def _linear_on(vertices: Array, faces: Array, level: Array) -> Callable[[Array, 
     return exitance
 
 
-def _texels_on(plate: Rectangle, texels: Array, nearest: bool) -> Callable[[Array, Array], Array]:
+def _texels_on(plate: Rectangle, texels: NDArray[np.float32], nearest: bool) -> Callable[[Array, Indices], Array]:
     """J_n of texels (rows, columns) spread over a rectangle; row 0 at -half_height."""
     a, b = np.asarray(plate.half_width), np.asarray(plate.half_height)
     rows, columns = texels.shape
 
-    def exitance(points: Array, face: Array) -> Array:
+    def exitance(points: Array, face: Indices) -> Array:
         w = points - np.asarray(plate.centre)
         x, y = ((w @ axis / (axis @ axis) + 1) / 2 for axis in (a, b))
         x, y = x * columns, y * rows

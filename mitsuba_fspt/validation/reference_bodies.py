@@ -9,6 +9,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .reference_shapes import Array, Cylinder, Disc, Rectangle, Sphere, dot
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from .fan_reference import Stops
     from .reference import Camera
 
+Indices = NDArray[np.int64]
 MOST_SPECULAR = 6  # mirrors and panes one after the other
 BEYOND = 1e-9  # of a line's length: what begins nearer than this is the surface that it comes from
 
@@ -36,9 +38,9 @@ class Fan:
 class BodyShape(Protocol):
     """What a body's shape gives: first positive parameter on lines and the face met; normal; edges of fans."""
 
-    def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]: ...
+    def meet(self, origin: Array, direction: Array) -> tuple[Array, Indices]: ...
 
-    def outward(self, points: Array, face: Array) -> Array: ...
+    def outward(self, points: Array, face: Indices) -> Array: ...
 
     def edges(self, fan: Fan) -> Array: ...
 
@@ -60,7 +62,7 @@ class Body:
     """
 
     shape: BodyShape
-    exitance: Callable[[Array, Array], Array] | None = None
+    exitance: Callable[[Array, Indices], Array] | None = None
     index: float | None = None
     role: Literal["opaque", "mirror", "pane"] = "opaque"
     glass: float = 1.5
@@ -72,7 +74,7 @@ class Body:
         own = self.shape.edges(fan)
         return own if self.texture is None else np.concatenate([own, self.texture(fan)], axis=1)
 
-    def radiance(self, points: Array, direction: Array, face: Array) -> Array:
+    def radiance(self, points: Array, direction: Array, face: Indices) -> Array:
         """L [W/mm²/sr] from points against the direction of lines of sight, (n,); 0 from the inward side."""
         if self.exitance is None:
             return np.zeros(len(points))
@@ -205,9 +207,7 @@ def _limb(w: Array, start: Array, step: Array, radius: float) -> Array:
     """Where lines from w, seen from the centre or projected along an axis, touch the distance `radius`, (n, 2)."""
     out = dot(w, w) - radius**2
     p, q = dot(w, start), dot(w, step)
-    return roots(
-        out * dot(step, step) - q * q, 2 * (out * dot(start, step) - p * q), out * dot(start, start) - p * p
-    )
+    return roots(out * dot(step, step) - q * q, 2 * (out * dot(start, step) - p * q), out * dot(start, start) - p * p)
 
 
 @dataclass(frozen=True)
@@ -216,11 +216,11 @@ class Simple:
 
     shape: Sphere | Disc | Rectangle | Cylinder
 
-    def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+    def meet(self, origin: Array, direction: Array) -> tuple[Array, Indices]:
         """First positive parameters (n,), inf for none; the face is always 0."""
         return self.shape.meet(origin, direction), np.zeros(len(origin), int)
 
-    def outward(self, points: Array, face: Array) -> Array:
+    def outward(self, points: Array, face: Indices) -> Array:
         """Unit normals, (n, 3)."""
         return self.shape.outward(points)
 
@@ -280,11 +280,11 @@ class Triangles:
     """
 
     vertices: Array
-    faces: Array
-    number: Array
+    faces: Indices
+    number: Indices
     closed: bool = True
 
-    def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+    def meet(self, origin: Array, direction: Array) -> tuple[Array, Indices]:
         """First positive parameters (n,), inf for none, and numbers of the faces in the whole mesh."""
         best, face = np.full(len(origin), np.inf), np.zeros(len(origin), int)
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
@@ -301,7 +301,7 @@ class Triangles:
             best[hit], face[hit] = s[hit], self.number[k]
         return best, face
 
-    def outward(self, points: Array, face: Array) -> Array:
+    def outward(self, points: Array, face: Indices) -> Array:
         """Unit normals, (n, 3); `face` in the whole mesh."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
