@@ -10,8 +10,9 @@ import typer
 from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import InversionError
+from ..runtime.progress_bar import progress_bar
 from .options import AsJson, Quiet, SceneFile, Sensor, require_writable, value_lists
-from .terminal import print_result, progress_bar
+from .terminal import print_result
 
 if TYPE_CHECKING:
     from ..inverse.calibrate import Calibration

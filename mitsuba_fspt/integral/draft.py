@@ -36,6 +36,7 @@ class Draft:
     roughness : how far four nodes and twelve differ near by, silhouettes left out
     nearest : depth of what is nearest [mm], inf where nothing is met
     blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
+    least_blur : the smallest one between what is nearest and farthest on a pixel, inf where nothing is met [pixels]
     sharp : True where the least one is small
     outline : True within a pixel of both a hit and a miss
     shown : False on the rim, True everywhere where there is none
@@ -43,6 +44,7 @@ class Draft:
     open, known : False where the value is known from elsewhere, and that value
     least_peak : lower bound of the brightest pixel, of a picture that this one is a tile of [W/mm²/sr]
     progress : called after each step with the share of the steps that is done
+    grid : the pixels that are computed; all of the window unless another grid is given
     """
 
     def __init__(
@@ -53,18 +55,22 @@ class Draft:
         known: Solution | None,
         least_peak: float = 0.0,
         progress: Progress = SILENT,
+        grid: Grid | None = None,
     ) -> None:
         self.view, self.lens, self.window, self.quadrature = view, view.lens, window, quadrature
         self.least_peak, self.progress = least_peak, progress
         self.area = quadrature.pixel == "area"
-        self.grid = grid = Grid(window.shape)
+        self.grid = grid = grid or Grid(window.shape)
         self.value, self.error, self.coverage, self.blur = (grid.full(mi.Float64, 0) for _ in range(4))
+        self.least_blur = grid.full(mi.Float64, dr.inf)
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
         self.roughness, self.lost = (grid.full(mi.Float64, 0) for _ in range(2))
-        self.shown = grid.flat(window.shown()) if window.count < len(grid) else mi.Bool(True)
-        inside, cut = window.field_stop(view.lens)
-        self.clipped, self.outside = grid.flat(cut & self.area), grid.flat(~(inside | cut))
+        self.shown = grid.flat(window.shown()) if window.count < math.prod(window.shape) else mi.Bool(True)
+        self.clipped, self.outside = (grid.full(mi.Bool, False) for _ in range(2))
+        if math.isfinite(view.lens.optics.seen_field):
+            inside, cut = window.field_stop(view.lens)
+            self.clipped, self.outside = grid.flat(cut & self.area), grid.flat(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
         self.open, self.known = grid.full(mi.Bool, True), grid.full(mi.Float64, 0)
         if known is not None:
@@ -92,8 +98,12 @@ class Draft:
         """The error asked for [W/mm²/sr], one lane."""
         return dr.opaque(mi.Float64, self.quadrature.rtol) * self.peak
 
-    def solution(self) -> Solution:
-        """The picture as it is, on the crop window."""
+    def centres(self, number: mi.UInt32) -> mi.Point2f:
+        """Film positions [pixels] of the centres of the grid's pixels of so much `number`."""
+        return self.window.centres(self.grid.place(number))
+
+    def images(self) -> tuple[PixelArray, PixelArray, PixelArray]:
+        """Power [W], error [W] and coverage on the pixels of the grid."""
         least = dr.opaque(mi.Float64, self.quadrature.least_error) * self.peak
         error = dr.select(self.coverage == 0, self.error, dr.maximum(self.error, least))
         if self.view.specular:
@@ -105,7 +115,11 @@ class Draft:
         power, error = etendue * self.value, etendue * dr.select(self.outside, 0, error)
         images = (power, error, coverage * open_share(self.lens, self.window, self.grid))
         dr.eval(images)
-        arrays = (self.window.expand(self.grid.array(image)) for image in images)
+        return images
+
+    def solution(self) -> Solution:
+        """The picture as it is, on the crop window."""
+        arrays = (self.window.expand(self.grid.array(image)) for image in self.images())
         return Solution(*arrays, self.rays, tuple(self.levels), findings=tuple(self.findings))
 
     def count(self, what: str, pixels_touched: int, rays: int) -> None:
@@ -121,11 +135,14 @@ class Draft:
         `front`: depth of what is nearest, mirrors and panes too.
         """
         seen = dr.isfinite(self.nearest)
-        front, back = (dr.abs(self.lens.blur_radius(depth)) for depth in (front, farthest))
+        front, back = (self.lens.blur_radius(depth) for depth in (front, farthest))
+        through = (front > 0) & (back < 0)  # the sharp plane lies between
+        front, back = dr.abs(front), dr.abs(back)
+        self.least_blur = dr.select(seen, dr.select(through, 0, dr.minimum(front, back)), dr.inf)
         most = dr.opaque(mi.Float64, max(self.grid.shape))
         blur = dr.select(seen, dr.minimum(dr.maximum(front, back), most), 0)
         sharp = seen & (dr.minimum(front, back) < IN_FOCUS)
-        dr.eval(blur, sharp)
+        dr.eval(blur, sharp, self.least_blur)
         self.most_blur = float(dr.max(blur)[0])
         self.blur, near = self.grid.spread_all((blur, sharp))
         self.sharp = self.grid.dilate(near, math.ceil(IN_FOCUS))
@@ -185,4 +202,4 @@ class Draft:
 
 def open_share(lens: mi.Sensor, window: Window, grid: Grid) -> PixelArray:
     """Share of the pupil that a second border of the lens leaves open to the centre of each pixel."""
-    return mi.Float64(lens.open_pupil(window.centres(grid.number), mi.Point2f(0))[1])
+    return mi.Float64(lens.open_pupil(window.centres(grid.place(grid.number)), mi.Point2f(0))[1])

@@ -79,7 +79,7 @@ def _means(draft: Draft, pixels: mi.UInt32, points: int) -> tuple[PixelArray, Pi
     """Mean integrand and coverage of each shift of each pixel, the shifts of a pixel one after the other."""
     lane = dr.arange(mi.UInt32, dr.width(pixels) * SHIFTS)
     pixel = dr.gather(mi.UInt32, pixels, lane // SHIFTS)
-    centre, area = draft.window.centres(pixel), dr.opaque(mi.Float, float(draft.area))
+    centre, area = draft.centres(pixel), dr.opaque(mi.Float, float(draft.area))
     shifts = [mi.sample_tea_32(pixel, SHIFTS * k + lane % SHIFTS)[0] for k in range(len(VECTOR))]
     count, step = dr.opaque(mi.UInt32, points), dr.opaque(mi.UInt32, (1 << 32) // points)
 

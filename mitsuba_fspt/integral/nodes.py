@@ -72,7 +72,7 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     dr.eval(draft.error, rough)
     if (neighbours and min(grid.shape) < 3) or not draft.quadrature.takes("smooth"):
         rough = grid.full(mi.Bool, True)
-    return (rough | _dark(draft)) & draft.open
+    return (rough | grid.border() | _dark(draft)) & draft.open  # neighbours that are left out tell nothing
 
 
 def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
@@ -160,7 +160,7 @@ def apply_nodes(draft: Draft, rule: node_rules.Rule, where: Mask | None = None) 
         images = Sums(*(draft.grid.full(mi.Float64, fill) for fill in NOTHING_SEEN))
     names = [name for name in vars(images) if draft.view.specular or name not in BY_SPECULAR_SURFACES]
     for part in batches(index):
-        seen = apply_rule(draft.view, draft.window.centres(part), rule)
+        seen = apply_rule(draft.view, draft.centres(part), rule)
         for name in names:
             dr.scatter(getattr(images, name), mi.Float64(getattr(seen, name)), part)
         dr.eval([getattr(images, name) for name in names])

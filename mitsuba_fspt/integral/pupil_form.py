@@ -56,6 +56,13 @@ def solve(
     brightest pixel's mean radiance on film [W/mm²/sr]. `progress` is called after every level.
     """
     draft = Draft(view, window, quadrature, known, least_peak, progress)
+    refine(draft, light)
+    return draft.solution()
+
+
+def refine(draft: Draft, light: NDArray[np.float64]) -> None:
+    """All steps of the refinement on the pixels of a draft; `light` as of `solve`."""
+    quadrature, progress = draft.quadrature, draft.progress
     rough = first_nodes(draft, light)
     levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
     progress(1 / (2 + len(levels)))
@@ -68,7 +75,6 @@ def solve(
         integrate_by_transects(draft, rough, levels)
         settle_by_lattices(draft)
     progress(1.0)
-    return draft.solution()
 
 
 def peak_of_few(view: View, window: Window, quadrature: Quadrature) -> float:

@@ -67,7 +67,10 @@ class Mosaic:
     def put(self, tile: Window, part: Solution) -> None:
         """Lay the solution of a tile at its place."""
         here = self._place(tile)
-        self.power[here], self.error[here], self.coverage[here] = part.power, part.error, part.coverage
+        if part.power.shape == self.power.shape and part.power.dtype == self.power.dtype:
+            self.power, self.error, self.coverage = part.power, part.error, part.coverage
+        else:
+            self.power[here], self.error[here], self.coverage[here] = part.power, part.error, part.coverage
         self._rays += part.rays
         self._levels += part.levels
         self._findings += part.findings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..rendering.scene import load
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, named
-from ..runtime.interrupt import ctrl_c_noted
+from ..runtime.progress_bar import Progress, reported
 from ..studies.sweep_point import texts_of
 from .calibrated_scene import write_calibrated
 from .calibration_fit import CalibrationFit, CalibrationSettings, Measured
@@ -28,7 +28,6 @@ from .derivatives import scene_text, varied_value
 from .measurement import variances
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 GAIN = "gain"  # reserved name: a factor on all powers
 PITCH_TOLERANCE = 1e-6  # relative: of the pixel pitch, which files may hold in single precision
 
@@ -120,13 +119,7 @@ def calibrate(
     given = [images] if isinstance(images, (Image, Exposure)) else list(images)
     found = [reduced(image) if isinstance(image, Exposure) else image for image in given]
     settings = settings.for_noise(_noise(found))
-    with ctrl_c_noted() as check_interrupt:
-
-        def report(what: str, share: float) -> None:
-            check_interrupt()
-            if progress:
-                progress(what, share)
-
+    with reported(progress) as report:
         pictures = _Pictures(scene, names, views, sensor, settings.rtol or 1e-4, report)
         pictures(start)
         measured = measured_of(found, views, pictures.first, len(names))

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from ..emission.asked_gradients import shining_with_gradients
 from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
-from ..integral import pupil_form, surface_form
+from ..integral import interpolated, pupil_form, surface_form
 from ..integral.eq9 import View
 from ..integral.exitance_rows import Rows, kinds_of, sizes_of
+from ..integral.interpolated import Blocks
 from ..integral.left_out import LeftOut, light_left_out
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
 from ..integral.progress import Progress
@@ -85,6 +86,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
         self._robust: RobustCopy | None = None
         self._window, self._narrow, self._faces, self._left_out, self._rows = (CachedValue() for _ in range(5))
+        self._grid_of_blocks = CachedValue()
 
     def solve(
         self,
@@ -178,6 +180,9 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if everywhere and not cut.any():
             known = surface_form.solve(scene, lens, window, quadrature, None, least_peak, progress, specular)
             return _with_dark_coverage(known, view, window)
+        blocks = self._blocks(view, window, quadrature)
+        if blocks and (solution := self._by_blocks(view, blocks, quadrature, least_peak, progress)):
+            return solution
         narrow = narrow_light()
         where, peak = inside, least_peak
         if not everywhere:
@@ -198,6 +203,26 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             there = window.seen_in(specular.bending, lens)
             missed = np.maximum(missed, window.expand(there * UNCERTAINTY * narrow.on_pixels.max() * lens.etendue))
         return replace(solution, error=np.maximum(solution.error, missed))
+
+    def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> Blocks | None:
+        """Blocks of pixels between which the picture may be interpolated; None where that is not to be done."""
+        plain = quadrature.domain == "pupil" and quadrature.pixel == "area" and not view.specular
+        stop = math.isfinite(view.lens.optics.seen_field)
+        if not plain or stop or not quadrature.takes("smooth blocks"):
+            return None
+        state = (window, _view(view.lens), quadrature.rtol)
+        return self._grid_of_blocks.recall(state, lambda: Blocks.of(window, view.lens, quadrature.rtol))
+
+    def _by_blocks(
+        self, view: View, blocks: Blocks, quadrature: Quadrature, least_peak: float, progress: Progress
+    ) -> Solution | None:
+        """Solution with values interpolated between blocks; None where that saves nothing."""
+        # What is narrow for a pixel is narrow for a block.
+        narrow = self._narrow_light(replace(view, lens=blocks.lens), blocks.coarse)
+        spots = narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)
+        if spots.any():
+            return None
+        return interpolated.solve(view, blocks, quadrature, spots, least_peak, progress)
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or a robust copy if it loses rays; tested once, and again if the geometry of a copy changes."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -149,6 +151,18 @@ class FsptLens(mi.Sensor):
         # Largest displacement of a line of sight by float32 on the virtual detector plane [virtual pixels].
         farthest = np.abs(np.array(self.m_to_world.translation(), np.float64)).max()
         self.rounding = EPSILON * (farthest + self.optics.focus_distance) / self.virtual_pitch
+
+    def coarser(self, side: int) -> FsptLens:
+        """The same lens, without losses, before a film whose pixels are blocks of `side`² of its own.
+
+        The film is an even number of blocks wide and high, so that the optical axis meets a corner of pixels of both.
+        """
+        own = {name: float(value[0]) for name, value in self._numbers.items() if name not in transmittance.NUMBERS}
+        own["pixel_pitch"] *= side
+        width, height = (2 * math.ceil(int(n) / (2 * side)) for n in self.film().size())
+        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "luminance"}
+        place = mi.ScalarTransform4f(np.array(self.placement).reshape(4, 4))
+        return mi.load_dict({"type": "fspt_lens", "model": self._model, "to_world": place, "film": film, **own})
 
     def numbers(self) -> dict[str, float | int | str]:
         """Numbers of the lens and its pixels for an image's metadata: lengths in mm, wavelength in nm."""

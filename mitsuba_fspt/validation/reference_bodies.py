@@ -1,0 +1,339 @@
+"""Bodies of `fan_reference`: where lines of sight meet them, what they radiate, and where fans of lines meet edges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .reference_shapes import Array, Cylinder, Disc, Rectangle, Sphere, dot
+
+if TYPE_CHECKING:
+    from .fan_reference import Stops
+    from .reference import Camera
+
+Indices = NDArray[np.int64]
+MOST_SPECULAR = 6  # mirrors and panes one after the other
+BEYOND = 1e-9  # of a line's length: what begins nearer than this is the surface that it comes from
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Fans of lines apex + τ (start + s · step), s in [0, 1]; columns (n, 3).
+
+    behind : lines of sight begin so many directions before the apex
+    """
+
+    apex: Array
+    start: Array
+    step: Array
+    behind: float = 0.0
+
+
+class BodyShape(Protocol):
+    """What a body's shape gives: first positive parameter on lines and the face met; normal; edges of fans."""
+
+    def meet(self, origin: Array, direction: Array) -> tuple[Array, Indices]: ...
+
+    def outward(self, points: Array, face: Indices) -> Array: ...
+
+    def edges(self, fan: Fan) -> Array: ...
+
+    def corners(self) -> Array: ...
+
+
+@dataclass(frozen=True)
+class Body:
+    """A surface.
+
+    Parameters
+    ----------
+    shape : of `BodyShape`
+    exitance : (points (n, 3), face (n,)) -> J_n (n,) [W/mm²]; None: dark
+    index : n of Fresnel's exit law (Eq. M.15); None: Lambert's
+    most : largest J_n [W/mm²]
+    role : 'opaque'; 'mirror' (reflects all on the side of the normal); 'pane' (thin, of refractive index `glass`)
+    texture : (fan) -> where fans cross the borders of texels, (n, k); None: nowhere
+    """
+
+    shape: BodyShape
+    exitance: Callable[[Array, Indices], Array] | None = None
+    index: float | None = None
+    role: Literal["opaque", "mirror", "pane"] = "opaque"
+    glass: float = 1.5
+    texture: Callable[[Fan], Array] | None = None
+    most: float = 0.0
+
+    def edges(self, fan: Fan) -> Array:
+        """Parameters s at which fans meet an edge, (n, k); nan or beyond [0, 1] where they do not."""
+        own = self.shape.edges(fan)
+        return own if self.texture is None else np.concatenate([own, self.texture(fan)], axis=1)
+
+    def radiance(self, points: Array, direction: Array, face: Indices) -> Array:
+        """L [W/mm²/sr] from points against the direction of lines of sight, (n,); 0 from the inward side."""
+        if self.exitance is None:
+            return np.zeros(len(points))
+        cosine = -dot(self.shape.outward(points, face), direction) / np.sqrt(dot(direction, direction))
+        exitance = self.exitance(points, face)
+        profile = 1 / math.pi if self.index is None else fresnel_profile(np.maximum(cosine, 0), self.index)
+        return np.where(cosine > 0, exitance * profile, 0.0)
+
+    def near(self, camera: Camera, stops: Stops, centre: Array) -> Body | None:
+        """The body's part that lines of sight of the pixel about `centre` [mm] may meet; None if there is none.
+
+        The lines of a pixel lie between cones about the line from the middle of the pupil.
+        """
+        u, depth = camera.focus_distance, stops.pupil_depth
+        corners = self.shape.corners()
+        along = (u - corners[:, 2]) / (u - depth)
+        width = stops.pupil_radius * np.abs(along) + camera.pixel_side * np.abs(1 - along)
+        low = (corners[:, :2] - centre * (1 - along)[:, None] - width[:, None]).min(axis=0)
+        high = (corners[:, :2] - centre * (1 - along)[:, None] + width[:, None]).max(axis=0)
+        if (low > 0).any() or (high < 0).any():
+            return None
+        if isinstance(self.shape, Triangles):
+            part = self.shape.near(centre, u, depth, stops.pupil_radius, camera.pixel_side)
+            return replace(self, shape=part) if len(part.faces) else None
+        return self
+
+
+def seen_along(bodies: Sequence[Body], origin: Array, direction: Array, specular: int = MOST_SPECULAR) -> Array:
+    """Radiance [W/mm²/sr] along lines of sight (n,), through panes and off mirrors (Eq. M.19)."""
+    value = np.zeros(len(origin))
+    if not len(origin):
+        return value
+    met = [body.shape.meet(origin, direction) for body in bodies]
+    nearest = np.stack([s for s, _ in met])
+    first = np.argmin(nearest, axis=0)
+    first[~np.isfinite(nearest.min(axis=0))] = -1
+    for number, body in enumerate(bodies):
+        (mine,) = np.nonzero(first == number)
+        if not len(mine) or (body.role == "opaque" and body.exitance is None):
+            continue
+        way, face = direction[mine], met[number][1][mine]
+        points = origin[mine] + nearest[number, mine, None] * way
+        if body.role == "opaque":
+            value[mine] = body.radiance(points, way, face)
+            continue
+        if not specular:
+            continue
+        normal = body.shape.outward(points, face)
+        cosine = -dot(normal, way) / np.sqrt(dot(way, way))
+        back = way - 2 * dot(way, normal)[:, None] * normal
+        if body.role == "mirror":
+            mine, points, back = mine[cosine > 0], points[cosine > 0], back[cosine > 0]
+            value[mine] = seen_along(bodies, points + BEYOND * back, back, specular - 1)
+        else:
+            reflectance = fresnel_reflectance(np.abs(cosine), body.glass)
+            through = seen_along(bodies, points + BEYOND * way, way, specular - 1)
+            off = seen_along(bodies, points + BEYOND * back, back, specular - 1)
+            value[mine] = ((1 - reflectance) * through + 2 * reflectance * off) / (1 + reflectance)
+    return value
+
+
+def fresnel_reflectance(cosine: Array, index: float) -> Array:
+    """Unpolarised reflectance of a border that light meets from outside at an angle of this `cosine`."""
+    inside = np.sqrt(1 - (1 - cosine**2) / index**2)
+    s = (cosine - index * inside) / (cosine + index * inside)
+    p = (index * cosine - inside) / (index * cosine + inside)
+    return 0.5 * (s**2 + p**2)
+
+
+def fresnel_profile(cosine: Array, index: float) -> Array:
+    """L/J_n [1/sr] of Eq. M.15."""
+    inside = np.sqrt(1 - (1 - cosine**2) / index**2)
+    passed = 1 - fresnel_reflectance(cosine, index)
+    return (2 * _boundary_factor(index) + 3 * inside) * passed / (4 * math.pi * index**2)
+
+
+@cache
+def _boundary_factor(index: float) -> float:
+    """A = (1 + R_J)/(1 − R_φ), with the moments of the reflectance inside, total reflection included."""
+    critical = math.sqrt(1 - 1 / index**2)
+    node, weight = np.polynomial.legendre.leggauss(200)
+    inside = critical + (1 - critical) * ((node + 1) / 2) ** 2  # R has a root at the critical angle
+    share = (1 - critical) * (node + 1) / 2 * weight
+    outside = np.sqrt(np.maximum(1 - index**2 * (1 - inside**2), 0))
+    reflected = fresnel_reflectance(outside, index)
+    phi = critical**2 + float(share @ (2 * inside * reflected))
+    current = critical**3 + float(share @ (3 * inside**2 * reflected))
+    return (1 + current) / (1 - phi)
+
+
+# ---------------------------------------------------------------------- edges of fans
+
+
+def roots(a: Array, b: Array, c: Array) -> Array:
+    """Real roots of a s² + b s + c, (n, 2); nan where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = -0.5 * (b + np.copysign(np.sqrt(b * b - 4 * a * c), b))
+        return np.stack([q / a, c / q], axis=1)
+
+
+def reflected(fan: Fan, shape: BodyShape) -> Fan:
+    """The fan in the plane of a flat `shape`: what it meets off a mirror it meets straight on."""
+    point = shape.corners()[0]
+    normal = shape.outward(point[None], np.zeros(1, int))[0]
+
+    def turned(vector: Array) -> Array:
+        return vector - 2 * (vector @ normal)[:, None] * normal
+
+    return Fan(turned(fan.apex - point) + point, turned(fan.start), turned(fan.step), fan.behind)
+
+
+def _crossing(fan: Fan, normal: Array) -> Array:
+    """Where the directions of fans lie across a normal, (n, 1)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (-dot(fan.start, normal) / dot(fan.step, normal))[:, None]
+
+
+def _circle(fan: Fan, centre: Array, normal: Array, radius: float) -> Array:
+    """Where fans pass the rim of a disc, and where they lie in its plane, (n, 3)."""
+    w = fan.apex - centre
+    height = (w @ normal)[:, None]
+    at, along = (w * (d @ normal)[:, None] - d * height for d in (fan.start, fan.step))
+    n0, n1 = fan.start @ normal, fan.step @ normal
+    a, b, c = dot(along, along), 2 * dot(at, along), dot(at, at)
+    rim = roots(a - (radius * n1) ** 2, b - 2 * radius**2 * n0 * n1, c - (radius * n0) ** 2)
+    return np.concatenate([rim, _crossing(fan, normal)], axis=1)
+
+
+def _limb(w: Array, start: Array, step: Array, radius: float) -> Array:
+    """Where lines from w, seen from the centre or projected along an axis, touch the distance `radius`, (n, 2)."""
+    out = dot(w, w) - radius**2
+    p, q = dot(w, start), dot(w, step)
+    return roots(out * dot(step, step) - q * q, 2 * (out * dot(start, step) - p * q), out * dot(start, start) - p * p)
+
+
+@dataclass(frozen=True)
+class Simple:
+    """A sphere, disc, rectangle or closed cylinder of `reference_shapes`."""
+
+    shape: Sphere | Disc | Rectangle | Cylinder
+
+    def meet(self, origin: Array, direction: Array) -> tuple[Array, Indices]:
+        """First positive parameters (n,), inf for none; the face is always 0."""
+        return self.shape.meet(origin, direction), np.zeros(len(origin), int)
+
+    def outward(self, points: Array, face: Indices) -> Array:
+        """Unit normals, (n, 3)."""
+        return self.shape.outward(points)
+
+    def edges(self, fan: Fan) -> Array:
+        """Where fans meet an edge, (n, k)."""
+        shape = self.shape
+        if isinstance(shape, Sphere):
+            return _limb(fan.apex - np.asarray(shape.centre), fan.start, fan.step, shape.radius)
+        if isinstance(shape, Disc):
+            return _circle(fan, np.asarray(shape.centre), _unit(shape.normal), shape.radius)
+        if isinstance(shape, Rectangle):
+            return rectangle_lines(fan, shape, (-1.0, 1.0), (-1.0, 1.0))
+        axis, centre = _unit(shape.axis), np.asarray(shape.centre)
+        w, start, step = (
+            vector - (vector @ axis)[:, None] * axis for vector in (fan.apex - centre, fan.start, fan.step)
+        )
+        caps = [_circle(fan, centre + k * shape.height / 2 * axis, axis, shape.radius) for k in (-1, 1)]
+        return np.concatenate([_limb(w, start, step, shape.radius), *caps], axis=1)
+
+    def corners(self) -> Array:
+        """Points whose convex hull holds the shape, (n, 3)."""
+        shape = self.shape
+        centre = np.asarray(shape.centre, np.float64)
+        if isinstance(shape, Rectangle):
+            a, b = np.asarray(shape.half_width), np.asarray(shape.half_height)
+            return centre + np.array([a + b, a - b, -a + b, -a - b])
+        size = shape.radius + (shape.height / 2 if isinstance(shape, Cylinder) else 0)
+        return centre + size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+
+def rectangle_lines(fan: Fan, shape: Rectangle, columns: Sequence[float], rows: Sequence[float]) -> Array:
+    """Where fans cross lines at these shares of the half width and half height of a rectangle, or lie in its plane."""
+    a, b = np.asarray(shape.half_width, np.float64), np.asarray(shape.half_height, np.float64)
+    normal = _unit(np.cross(a, b))
+    w = fan.apex - np.asarray(shape.centre)
+    height = (w @ normal)[:, None]
+    at, along = (w * (d @ normal)[:, None] - d * height for d in (fan.start, fan.step))
+    n0, n1 = fan.start @ normal, fan.step @ normal
+    found = [_crossing(fan, normal)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis, shares in ((a, columns), (b, rows)):
+            far = (axis @ axis) * np.asarray(shares)
+            found.append(-((at @ axis)[:, None] - far * n0[:, None]) / ((along @ axis)[:, None] - far * n1[:, None]))
+    return np.concatenate(found, axis=1)
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """Opaque triangles, corners anticlockwise when seen from outside.
+
+    Parameters
+    ----------
+    vertices : (V, 3) [mm]
+    faces : (F, 3) vertex numbers
+    number : (F,) of each face in the whole mesh
+    closed : backs are never seen
+    """
+
+    vertices: Array
+    faces: Indices
+    number: Indices
+    closed: bool = True
+
+    def meet(self, origin: Array, direction: Array) -> tuple[Array, Indices]:
+        """First positive parameters (n,), inf for none, and numbers of the faces in the whole mesh."""
+        best, face = np.full(len(origin), np.inf), np.zeros(len(origin), int)
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        for k in range(len(self.faces)):  # few, and each is met by some 10⁵ lines
+            e1, e2 = b[k] - a[k], c[k] - a[k]
+            normal = np.cross(e1, e2)
+            slope = direction @ normal
+            w = origin - a[k]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                s = -(w @ normal) / slope
+                turn = np.cross(w, direction)
+                p, q = -(turn @ e2) / slope, (turn @ e1) / slope
+            hit = (s > 0) & (s < best) & (p >= 0) & (q >= 0) & (p + q <= 1)
+            best[hit], face[hit] = s[hit], self.number[k]
+        return best, face
+
+    def outward(self, points: Array, face: Indices) -> Array:
+        """Unit normals, (n, 3); `face` in the whole mesh."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        return normal[np.searchsorted(self.number, face)]
+
+    def edges(self, fan: Fan) -> Array:
+        """Where fans meet the sides of triangles, (n, k)."""
+        sides = np.unique(np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+        p, q = self.vertices[sides[:, 0]], self.vertices[sides[:, 1]]
+        normal = np.cross(p - fan.apex[:, None], q - fan.apex[:, None])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return -np.einsum("nkc,nc->nk", normal, fan.start) / np.einsum("nkc,nc->nk", normal, fan.step)
+
+    def corners(self) -> Array:
+        """All vertices of the faces, (n, 3)."""
+        return self.vertices[np.unique(self.faces)]
+
+    def near(self, centre: Array, u: float, depth: float, radius: float, side: float) -> Triangles:
+        """The triangles that lines of sight of a pixel may meet first."""
+        corners = self.vertices[self.faces]
+        along = (u - corners[..., 2]) / (u - depth)
+        width = (radius * np.abs(along) + side * np.abs(1 - along))[..., None]
+        off = corners[..., :2] - centre * (1 - along)[..., None]
+        met = ((off - width).min(axis=1) <= 0).all(axis=1) & ((off + width).max(axis=1) >= 0).all(axis=1)
+        if self.closed:
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            size = np.linalg.norm(normal, axis=1)
+            met &= dot(normal, corners[:, 0] - np.array([0, 0, depth])) < radius * size
+        return replace(self, faces=self.faces[met], number=self.number[met])
+
+
+def _unit(vector: object) -> Array:
+    vector = np.asarray(vector, dtype=np.float64)
+    return vector / np.linalg.norm(vector)

@@ -1,0 +1,217 @@
+"""Errors of the integral on random scenes, against an independent float64 reference.
+
+    python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
+
+Scenes of every family of `validation/random_scenes.py`, each rendered by `fspt_integral`. On 24 pixels of each,
+`fan_reference` gives the power with its own error: 16 where errors are likely (large stated errors, edges, curved
+pictures) and 8 at random. A pixel counts as beyond a limit only by more than the reference's error. Writes audit.csv,
+one line a scene, and prints the table by family.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import markdown_tables
+import numpy as np
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.runtime import backend
+from mitsuba_fspt.runtime.atomic_files import atomic_path
+from mitsuba_fspt.validation.random_scenes import FAMILIES, RandomScene, random_scene
+
+LIKELY, RANDOM = 16, 8  # pixels of each scene
+SLOW = 2.0  # s: rendered once more, as kernels may have been compiled
+GOAL, LEAST_GOAL = 0.15, 1e-5  # error of the reference: over the stated error, and over the brightest pixel
+WIDE = 0.1  # of rtol: stated errors from which on their width counts
+HEAD = (
+    "scenes",
+    "beyond rtol, likely",
+    "beyond rtol, random",
+    "beyond 5 rtol",
+    "beyond error",
+    "silent",
+    "error / true",
+    "scenes with error > rtol",
+    "slowest [s]",
+)
+
+
+@dataclass(frozen=True)
+class Audit:
+    """One scene. Shares of pixels are counts here; powers over the brightest pixel.
+
+    beyond_likely, beyond_random, beyond_5 : checked pixels beyond rtol, and beyond 5 rtol
+    beyond_error, silent : beyond the stated error; of these beyond rtol where less than rtol was stated
+    largest : difference to the reference
+    width : median of stated over true error where more than rtol/10 is stated, nan without any
+    stated : pixels of the whole picture that state more than rtol
+    reference : largest error of the reference
+    """
+
+    family: str
+    seed: int
+    f_number: float
+    width_pixels: int
+    height_pixels: int
+    likely: int
+    random: int
+    beyond_likely: int
+    beyond_random: int
+    beyond_5: int
+    beyond_error: int
+    silent: int
+    largest: float
+    width: float
+    stated: int
+    reference: float
+    seconds: float
+
+
+def main() -> None:
+    """Measure, write the file, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=10, help="of each family")
+    parser.add_argument("--seed", type=int, default=0, help="of the first scene of a family")
+    parser.add_argument("--family", default=",".join(FAMILIES))
+    parser.add_argument("--rtol", type=float, default=1e-3)
+    parser.add_argument("--finer", type=int, default=1, help="times as many pixels along each side of the film")
+    parser.add_argument("--out", type=Path, default=Path("docs"))
+    parser.add_argument("--readme", type=Path, help="file whose table 'audit' is replaced")
+    arguments = parser.parse_args()
+    seeds = range(arguments.seed, arguments.seed + arguments.scenes)
+    audits = []
+    for family in arguments.family.split(","):
+        audits += [audited(family, seed, arguments.rtol, finer=arguments.finer) for seed in seeds]
+        print(_row(family, [audit for audit in audits if audit.family == family], arguments.rtol), flush=True)
+    arguments.out.mkdir(exist_ok=True)
+    with atomic_path(arguments.out / "audit.csv") as temporary, open(temporary, "w", newline="") as file:
+        sheet = csv.DictWriter(file, list(asdict(audits[0])))
+        sheet.writeheader()
+        sheet.writerows({name: _text(value) for name, value in asdict(audit).items()} for audit in audits)
+    text = table(audits, arguments.rtol)
+    print(f"\n{text}")
+    if arguments.readme:
+        markdown_tables.write(arguments.readme, "audit", text)
+
+
+def audited(family: str, seed: int, rtol: float, likely: int = LIKELY, random: int = RANDOM, finer: int = 1) -> Audit:
+    """One scene of a family, rendered on a film of `finer` times as many pixels a side, and compared."""
+    backend.ensure_variant()
+    import mitsuba as mi
+
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        made = random_scene(family, seed, finer)
+        image, seconds = _rendered(made, rtol)
+    finally:
+        mi.set_log_level(level)
+    stated, difference, reference = _compared(made, image, rtol, likely, random)
+    beyond = difference - reference > rtol
+    missed = difference - reference > stated
+    wide = stated > WIDE * rtol
+    true = np.maximum(difference, reference)[wide]
+    _, _, width, height = made.crop
+    power = image.power.max()
+    return Audit(
+        family,
+        seed,
+        made.reference.camera.f_number,
+        width,
+        height,
+        likely,
+        random,
+        int(beyond[:likely].sum()),
+        int(beyond[likely:].sum()),
+        int((difference - reference > 5 * rtol).sum()),
+        int(missed.sum()),
+        int((missed & beyond & (stated <= rtol)).sum()),
+        float(difference.max()),
+        float(np.median(stated[wide] / true)) if wide.any() else float("nan"),
+        int((image.error > rtol * power).sum()),
+        float(reference.max()),
+        seconds,
+    )
+
+
+def _rendered(made: RandomScene, rtol: float) -> tuple[fspt.Image, float]:
+    """The image of a scene, and the seconds that it took with compiled kernels."""
+    scene, seconds = made.scene(), np.inf
+    for _ in range(2):
+        began = time.perf_counter()
+        image = fspt.render(scene, method="integral", rtol=rtol, pixel=made.reference.pixel)
+        seconds = min(seconds, time.perf_counter() - began)
+        if seconds < SLOW:
+            break
+    return image, seconds
+
+
+def _compared(
+    made: RandomScene, image: fspt.Image, rtol: float, likely: int, random: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """On chosen pixels stated error, difference and error of the reference, over the brightest pixel, each (n,)."""
+    left, top, width, _ = made.crop
+    peak = image.power.max() or 1.0
+    generator = np.random.default_rng(1)
+    picked = [*_likely(image, likely, generator), *generator.integers(0, image.power.size, random)]
+    row, column = np.divmod(picked, width)
+    pixels = np.stack([row + top, column + left], axis=1)
+    stated = image.error.ravel()[picked] / peak
+    power, error = made.reference.power(pixels, peak * np.maximum(GOAL * stated, LEAST_GOAL))
+    return stated, np.abs(image.power.ravel()[picked] - power) / peak, error / peak
+
+
+def _likely(image: fspt.Image, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Numbers of pixels where errors are likely: half state the largest errors, half are random ones of edges."""
+    power = image.power
+    bend = sum(np.abs(np.gradient(np.gradient(power, axis=k), axis=k)) for k in (0, 1) if power.shape[k] > 2)
+    edges = (bend > 0.02 * power.max()) | ((image.coverage > 0) & (image.coverage < 1))
+    worst = np.argsort(-image.error.ravel(), kind="stable")[: count // 2]
+    other = np.setdiff1d(np.flatnonzero(edges), worst)
+    if len(other) < count - len(worst):
+        other = np.setdiff1d(np.arange(power.size), worst)
+    return np.concatenate([worst, generator.choice(other, count - len(worst), replace=False)])
+
+
+def table(audits: Sequence[Audit], rtol: float) -> str:
+    """The table by family, as Markdown."""
+    families = list(dict.fromkeys(audit.family for audit in audits))
+    rows = [_row(family, [audit for audit in audits if audit.family == family], rtol) for family in families]
+    head = f"| rtol {rtol:g} | {' | '.join(HEAD)} |\n|---|{'---|' * len(HEAD)}"
+    return "\n".join([head, *rows, _row("all", audits, rtol)])
+
+
+def _row(name: str, audits: Sequence[Audit], rtol: float) -> str:
+    def share(column: str, *of: str) -> str:
+        pixels = sum(getattr(audit, number) for audit in audits for number in of)
+        return f"{100 * sum(getattr(audit, column) for audit in audits) / pixels:.2f} %"
+
+    checked = ("likely", "random")
+    widths = [audit.width for audit in audits if np.isfinite(audit.width)]
+    beyond = sum(audit.stated > 0 for audit in audits)
+    cells = (
+        str(len(audits)),
+        share("beyond_likely", "likely"),
+        share("beyond_random", "random"),
+        str(sum(audit.beyond_5 for audit in audits)),
+        share("beyond_error", *checked),
+        share("silent", *checked),
+        f"{np.median(widths):.0f}" if widths else "–",
+        f"{100 * beyond / len(audits):.0f} %",
+        f"{max(audit.seconds for audit in audits):.1f}",
+    )
+    return f"| {name} | {' | '.join(cells)} |"
+
+
+def _text(value: object) -> object:
+    return f"{value:.3g}" if isinstance(value, float) else value
+
+
+if __name__ == "__main__":
+    main()
