@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from test_policy import ARROWS
+
+import mitsuba_fspt as fspt
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -23,6 +27,22 @@ def cells(page, heading, column):
     section = text_of(page).split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
     rows = [line for line in section.splitlines() if line.startswith("| ")]
     return [re.split(r"(?<!\\)\|", row)[column].strip() for row in rows[1:]]
+
+
+def test_the_site_builds_without_warnings(tmp_path):
+    """All pages in its tree, every public name with a docstring that Sphinx can read."""
+    pytest.importorskip("sphinx", reason="sphinx is not installed")
+    call = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(tmp_path)]
+    built = subprocess.run(call, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    names = (tmp_path / "python.html").read_text(encoding="utf-8")
+    assert [name for name in fspt.__all__ if f'id="mitsuba_fspt.{name}"' not in names] == []
+
+
+def test_every_example_has_its_place_on_the_site():
+    page = (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
+    named = re.findall(r"literalinclude\} \.\./examples/(\w+\.py)", page)
+    assert sorted(named) == sorted(path.name for path in (ROOT / "examples").glob("*.py"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -102,7 +102,7 @@ def scene_xml(
     view: float = 0.0,
     **lens: float | str,
 ) -> str:
-    """Text of a scene file that shows a phantom, for `load` or to be saved; its `<default>`s have these values.
+    """Text of a scene file that shows a phantom, for `load` or to be saved, with these values of its parameters.
 
         scene = fspt.load(fspt.scene_xml("phantom.ply", focal_length=50, f_number=1.8), view=90)
 

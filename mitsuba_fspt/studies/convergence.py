@@ -62,6 +62,8 @@ class Measurement:
 class Convergence:
     """Error against run time of all methods on one scene.
 
+    Attributes
+    ----------
     scene : its name and parameters; machine : the machine and the variant; shape : (h, w)
     reference, check : names of the reference picture and of the picture that it was checked against, with the result
     stated, stated_largest : RMS and largest error that the reference states of itself, relative to its brightest pixel
