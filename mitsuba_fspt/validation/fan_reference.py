@@ -24,7 +24,8 @@ Indices = NDArray[np.int64]
 SHIFTS = 16
 CERTAIN = 4.1  # standard errors of the mean of 16 shifts that 999 of 1000 stay within (Student's t)
 FEW, UNMET = 16, 6.9  # fans with light that say how much they scatter; −ln of one case of 1000
-LINES = (32, 128, 512, 2048, 8192)  # of a lattice: fans a shift
+LINES = (32, 128, 512, 2048, 8192, 32768)  # of a lattice: fans a shift
+MOST_LINES = 8192  # unless more are asked for
 GAUSS = 8  # nodes on a piece between two edges
 SHORTEST = 1e-13  # piece of a fan that is left out, of the fan's length
 
@@ -77,7 +78,7 @@ class FanReference:
     bodies: Sequence[Body]
     pixel: Literal["area", "centre"] = "area"
 
-    def power(self, pixels: ArrayLike, goal: ArrayLike, seed: int = 0, most: int = LINES[-1]) -> tuple[Array, Array]:
+    def power(self, pixels: ArrayLike, goal: ArrayLike, seed: int = 0, most: int = MOST_LINES) -> tuple[Array, Array]:
         """Power on pixels (n, 2), given as (row, column), and its error, each (n,) [W].
 
         Lattices grow until the error, 4.1 standard errors of 16 shifts, is below `goal` [W], one number or (n,), or
