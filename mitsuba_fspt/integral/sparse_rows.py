@@ -224,10 +224,10 @@ def _by_faces(
     del columns, laid
     rough, cut, outside = _rough(scene, lens, entries, picture, rtol)
     sums = np.where(exact, entries.column_sums(), np.nan)
-    if outside.any():
-        beyond = np.repeat(outside, np.diff(entries.starts))
-        sums[entries.columns[beyond]] = np.nan
-        entries = entries.where(~beyond)
+    if outside.any() or cut.any():
+        sizes = np.diff(entries.starts)
+        sums[entries.columns[np.repeat(outside | cut, sizes)]] = np.nan  # the stop takes some of their light
+        entries = entries.where(~np.repeat(outside, sizes))
     if rough.any():
         entries = _refined(scene, lens, entries, on, rough, cut, rtol)
     return entries, sums
