@@ -33,7 +33,7 @@ TRIANGLES = (10_000, 100_000, 1_000_000, 3_000_000)
 FEW_AND_MANY = (256, 2048)  # pixels a side on which triangles are counted
 # Of the matrix: pixels a side, triangles, f-number.
 MATRICES = (
-    *((side, 40_000, 2.8) for side in (64, 128, 256, 512, 1024, 2048)),
+    *((side, 40_000, 2.8) for side in (64, 128, 256, 512, 1024)),
     *((256, triangles, 2.8) for triangles in (10_000, 160_000)),
     *((256, 40_000, f_number) for f_number in (1.4, 5.6, 11.0)),
 )

@@ -219,7 +219,7 @@ def _by_faces(
             def report(share: float, first: float = number / len(emitters)) -> None:
                 progress(first + share / len(emitters))
 
-        columns.append(columns_of(scene, lens, faces, windows, kind, ColumnRule.of(rtol, kind), report))
+        columns.append(columns_of(scene, lens, faces, windows, kind, ColumnRule.of(rtol), report))
     exact = np.concatenate([part.exact for part in columns])
     entries = _Entries.of(columns, math.prod(shape))
     del columns, laid
