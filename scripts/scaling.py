@@ -127,6 +127,7 @@ def measure_matrices(path: Path, rounds: int) -> None:
 
 def scene(setting: Setting, folder: Path, f_number: float = 2.8) -> object:
     """The ball of a setting before its film, in the camera of the nylon cylinder."""
+    backend.ensure_variant()
     import mitsuba as mi
 
     path = folder / f"ball_{setting.triangles}.ply"
