@@ -111,8 +111,9 @@ class ColumnCanvas:
         return level * QUANTUM
 
     def evaluate(self) -> None:
-        """Run what has been laid."""
+        """Run what has been laid, to its end: arrays of launches that wait would fill the memory."""
         dr.eval(self._level, self._slope)
+        dr.sync_thread()
 
     def lay(
         self,

@@ -25,7 +25,8 @@ CORNERS = ((0, 0), (1, 0), (0, 1))  # of a face, in the square that `Elements.pl
 MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for float32, and of the blur radius, for cells
 RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
-LEVELS = (4, 6, 8, 10, 12, 16, 20, 26, 32, 40, 50, 64)  # M of columns of several faces: neighbours mostly take the same
+# M of columns of several faces: neighbours mostly take the same.
+LEVELS = (4, 6, 8, 10, 12, 16, 20, 24, 28, 32, 36, 40, 44, 50, 56, 64)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -72,12 +73,9 @@ class ColumnRule:
     drop: float = 1e-5
 
     @classmethod
-    def of(cls, rtol: float, on: str) -> ColumnRule:
-        """The rule for a tolerance relative to the brightest pixel: columns are right to some ten times that.
-
-        Between neighbouring vertices J_n is continuous, between faces it steps.
-        """
-        edge = {"vertex": 3.0, "face": 1.5}[on] * rtol
+    def of(cls, rtol: float) -> ColumnRule:
+        """The rule for a tolerance relative to the brightest pixel: columns are right to some ten times that."""
+        edge = 1.5 * rtol
         finer = math.sqrt(min(rtol / 1e-3, 1))
         cells = 2 * math.ceil(3 / math.sqrt(finer))
         partial = 2 * math.ceil(6 / math.sqrt(finer))

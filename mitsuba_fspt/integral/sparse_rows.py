@@ -44,6 +44,7 @@ LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
 ENTRY = 36  # bytes of an entry while columns become rows
 WORK = 3 << 29  # bytes beside the entries
 SOME = 1 << 22  # entries in double precision at a time
+LINES = 1 << 20  # of sight at a time
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -218,16 +219,16 @@ def _by_faces(
             def report(share: float, first: float = number / len(emitters)) -> None:
                 progress(first + share / len(emitters))
 
-        columns.append(columns_of(scene, lens, faces, windows, kind, ColumnRule.of(rtol, kind), report))
+        columns.append(columns_of(scene, lens, faces, windows, kind, ColumnRule.of(rtol), report))
     exact = np.concatenate([part.exact for part in columns])
     entries = _Entries.of(columns, math.prod(shape))
     del columns, laid
     rough, cut, outside = _rough(scene, lens, entries, picture, rtol)
     sums = np.where(exact, entries.column_sums(), np.nan)
-    if outside.any():
-        beyond = np.repeat(outside, np.diff(entries.starts))
-        sums[entries.columns[beyond]] = np.nan
-        entries = entries.where(~beyond)
+    if outside.any() or cut.any():
+        sizes = np.diff(entries.starts)
+        sums[entries.columns[np.repeat(outside | cut, sizes)]] = np.nan  # the stop takes some of their light
+        entries = entries.where(~np.repeat(outside, sizes))
     if rough.any():
         entries = _refined(scene, lens, entries, on, rough, cut, rtol)
     return entries, sums
@@ -240,7 +241,7 @@ def _by_lines(
     pixels = np.flatnonzero(picture.power.ravel() > 0)
     count = sum(columns_on(emitter.get_shape(), kind) for emitter, kind in zip(scene.emitters(), on, strict=True))
     lines = int(ALL_LINES * (1e-3 / rtol) ** 0.5) // 2 * 2
-    places = np.array_split(pixels, -(-len(pixels) * lines // BATCH)) if pixels.size else []
+    places = np.array_split(pixels, -(-len(pixels) * lines // LINES)) if pixels.size else []
     rows = [_rows(scene, lens, some, on, lines, specular) for some in places]
     none = np.zeros(picture.power.size + 1, np.int64)
     empty = _Entries(count, none, *(np.zeros(0, kind) for kind in (np.int32, np.float32, np.float16)))
@@ -256,7 +257,7 @@ def _refined(
     """
     pixels = np.flatnonzero(rough)
     lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
-    places = np.array_split(pixels, max(1, -(-len(pixels) * lines // BATCH)))
+    places = np.array_split(pixels, max(1, -(-len(pixels) * lines // LINES)))
     kept, found = np.ones(len(entries.light), bool), []
     for some in places:
         rows = _rows(scene, lens, some, on, lines)
