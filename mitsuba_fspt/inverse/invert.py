@@ -23,6 +23,7 @@ from ..runtime.interrupt import ctrl_c_noted
 from ..runtime.numbers import number, whole
 from .inversion import Inversion
 from .measurement import Measurement
+from .multipliers import Multipliers
 from .nonnegative import Accuracy, Solve, factor, minimise
 from .smoothness import Prior, Smoothness
 from .surface import Surface
@@ -271,7 +272,8 @@ class Problem:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
         normal, solve = self._normal(state.sigma, state.weight)
         right = self._right(self.measurement.power[self.rows], state.sigma, state.weight)
-        found = minimise(normal, right[:, None], state.x[:, None], self.bounded, solve, accuracy)
+        start = Multipliers(solve, self.bounded).start(right[:, None])
+        found = minimise(normal, right[:, None], start, self.bounded, solve, accuracy)
         x = found.x[:, 0]
         determined = self._determined(normal, solve, state.weight, probes)
         if weight is None:  # Eq. M.25
@@ -327,13 +329,13 @@ class Problem:
         if not count:
             return np.empty((self.surface.unknowns, 0))
         normal, solve = self._normal(fit.sigma, fit.weight)
+        multipliers = Multipliers(solve, self.bounded)
         sizes = [min(self.settings.block, count - k) for k in range(0, count, self.settings.block)]
         seeds = np.random.SeedSequence(seed).spawn(len(sizes))
 
         def block(size: int, sequence: np.random.SeedSequence) -> Array:
             right, factors = self._drawn(fit, size, np.random.default_rng(sequence))
-            start = solve(right)
-            found = minimise(normal, right, start, self.bounded, solve, self.settings.drawn)
+            found = minimise(normal, right, multipliers.start(right), self.bounded, solve, self.settings.drawn)
             return found.x * factors
 
         found = []

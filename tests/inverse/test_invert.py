@@ -7,11 +7,12 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 from scipy.sparse import csr_array
 from sphere_views import RADIUS, noisy, sphere_views
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.inverse import multipliers
 from mitsuba_fspt.inverse.nonnegative import Accuracy, factor, minimise
 from mitsuba_fspt.inverse.smoothness import Prior, Smoothness
 from mitsuba_fspt.inverse.surface import Surface
@@ -81,6 +82,31 @@ def test_minimum_is_that_of_nnls():
     np.testing.assert_allclose(found.x, expected, atol=1e-6)
     free = minimise(normal, dense.T @ data, np.zeros((40, 3)), ~everywhere, factor(normal), Accuracy(decrement=1e-20))
     np.testing.assert_allclose(free.x, np.linalg.lstsq(dense, data)[0], atol=1e-8)
+
+
+def test_multipliers_give_the_minimum(monkeypatch):
+    """Active sets with shared columns of the inverse agree with SciPy's to rounding, bounds on half of the unknowns too.
+
+    Where the columns may take no memory the start is the minimum without bounds, cut off at 0.
+    """
+    rng = np.random.default_rng(4)
+    dense = rng.standard_normal((90, 40))
+    data = rng.standard_normal((90, 5)) + dense @ np.maximum(rng.standard_normal((40, 5)), 0)
+    solve, right = factor(csr_array(dense.T @ dense)), dense.T @ data
+    expected = np.stack([nnls(dense, column)[0] for column in data.T], axis=1)
+    assert (expected == 0).sum() > 40
+    found = multipliers.Multipliers(solve, np.ones(40, bool)).start(right)
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+    assert ((found == 0) == (expected == 0)).all()
+    half = np.arange(40) < 20
+    found = multipliers.Multipliers(solve, half).start(right)
+    least = np.where(half, 0, -np.inf)
+    expected = [lsq_linear(dense, column, (least, np.inf), method="bvls").x for column in data.T]
+    np.testing.assert_allclose(found, np.transpose(expected), atol=1e-8)
+    assert (found[20:] < 0).any()
+    monkeypatch.setattr(multipliers, "MOST", 0)
+    cut = multipliers.Multipliers(solve, np.ones(40, bool)).start(right)
+    np.testing.assert_allclose(cut, np.maximum(solve(right), 0))
 
 
 # --- recovery ---
