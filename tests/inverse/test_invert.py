@@ -85,7 +85,7 @@ def test_minimum_is_that_of_nnls():
 
 
 def test_multipliers_give_the_minimum(monkeypatch):
-    """Active sets with shared columns of the inverse agree with SciPy's to rounding, bounds on half of the unknowns too.
+    """Shared columns of the inverse give the minimum of SciPy to rounding, with bounds on half of the unknowns too.
 
     Where the columns may take no memory the start is the minimum without bounds, cut off at 0.
     """
