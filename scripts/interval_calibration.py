@@ -34,6 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 MEAN, LENGTH, DEVIATION = 1e-3, 3.0, 0.15  # [W/mm²], [mm], relative
 RADIUS = 6.0
 READ_NOISE, GAIN_ERROR = 3.5, 0.001
+TRUTHS = ("prior", "spot", "two spots", "gradient")
 LEVELS = (30.0, 300.0, 3000.0)  # electrons on the brightest pixel
 
 SCENE = """<scene version="3.0.0">
@@ -126,11 +127,13 @@ def replicate(truth: str, electrons: float, seed: int, samples: int) -> tuple[fl
     return inside, octants, bool(low <= total <= high), r.total / total - 1, (high - low) / 2 / total
 
 
-def table(replicates: int, fixed_replicates: int, samples: int, workers: int) -> list[dict[str, object]]:
+def table(
+    truths: list[str], replicates: int, fixed_replicates: int, samples: int, workers: int
+) -> list[dict[str, object]]:
     """One row for each truth and level of light."""
     rows = []
     with ProcessPoolExecutor(workers) as pool:
-        for truth in ("prior", "spot", "two spots", "gradient"):
+        for truth in truths:
             count = replicates if truth == "prior" else fixed_replicates
             for electrons in LEVELS:
                 jobs = [(truth, electrons, seed, samples) for seed in range(count)]
@@ -156,13 +159,20 @@ def main() -> None:
     """Write the table as CSV and print it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--replicates", type=int, default=400)
+    parser.add_argument("--truths", default=",".join(TRUTHS), help="Rows of the others are kept.")
     parser.add_argument("--fixed", type=int, default=500)
     parser.add_argument("--samples", type=int, default=200)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "interval_calibration.csv")
     arguments = parser.parse_args()
-    rows = table(arguments.replicates, arguments.fixed, arguments.samples, arguments.workers)
-    with arguments.output.open("w", newline="") as file:
+    truths = arguments.truths.split(",")
+    kept: list[dict[str, object]] = []
+    if arguments.output.exists():
+        with arguments.output.open(encoding="utf-8") as file:
+            kept = [dict(row) for row in csv.DictReader(file) if row["truth"] not in truths]
+    rows = kept + table(truths, arguments.replicates, arguments.fixed, arguments.samples, arguments.workers)
+    rows.sort(key=lambda row: TRUTHS.index(str(row["truth"])))
+    with arguments.output.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

@@ -151,7 +151,7 @@ CASES = (
 )
 
 
-def numbers_of(case: Case, scene: Path, spp: int, samples: int, seeds: int) -> dict[str, object]:
+def numbers_of(case: Case, scene: Path, spp: int, samples: int, seeds: int, report: Path | None) -> dict[str, object]:
     """One row of a table, means over the seeds of the counts."""
     images = pictures(case.f_number, case.views, spp, case.law)
     if case.electrons is None:
@@ -159,6 +159,8 @@ def numbers_of(case: Case, scene: Path, spp: int, samples: int, seeds: int) -> d
     else:
         watt = source_power(images, case.electrons)
     matrix = matrix_of(scene, case.f_number, tuple(view + case.turned for view in case.views), 1e-3)
+    if report and case == Case("light"):
+        fspt.invert(matrix, counted(images, watt, 17, 1.0, 0.0)).report(report)
     each = [
         row(matrix, counted(images, watt, 17 + 100 * seed, case.gain, case.gain_error), watt, samples)
         for seed in range(seeds)
@@ -178,13 +180,14 @@ def main() -> None:
     parser.add_argument("--edge", type=float, default=1.0)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--tables", default="light", help="Among light, stop, views, gain, pose, law.")
+    parser.add_argument("--report", type=Path, help="Picture of the row of 1e3 electrons of `light`, .png.")
     parser.add_argument("--folder", type=Path, default=Path("out"))
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "inversion.csv")
     arguments = parser.parse_args()
     arguments.folder.mkdir(exist_ok=True)
     scene, table = coarse_scene(arguments.folder, arguments.edge), []
     for case in (case for case in CASES if case.table in arguments.tables.split(",")):
-        table.append(numbers_of(case, scene, arguments.spp, arguments.samples, arguments.seeds))
+        table.append(numbers_of(case, scene, arguments.spp, arguments.samples, arguments.seeds, arguments.report))
         print(table[-1], flush=True)
     with arguments.output.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table[0], lineterminator="\n")

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from scipy.optimize import lsq_linear, nnls
+from scipy.optimize import lsq_linear, minimize, nnls
 from scipy.sparse import csr_array
 from sphere_views import RADIUS, noisy, sphere_views
 
@@ -188,6 +188,34 @@ def test_weight_and_chi2(case):
     np.testing.assert_allclose(again.exitance, found.exitance, rtol=0.05)
     for factor_ in (1e-3, 1e3):
         assert distance(fspt.invert(matrix, images, weight=found.weight * factor_)) > distance(found)
+
+
+def test_mlem(case):
+    """The likelihood of MLEM is within its stated gap of the maximum by L-BFGS-B; its total is that of the light.
+
+    Seen to fail without the background.
+    """
+    matrix, exitance = case
+    images = noisy(matrix, exitance, 1000, 5)
+    found = fspt.invert(matrix, images, method="mlem")
+    assert found.decrement <= 1.0
+    assert found.total == pytest.approx(matrix.areas @ exitance, rel=0.01, abs=0)
+    k = images[0].metadata["electrons_per_watt"]
+    system, y = k * matrix.matrix * 1e-3, np.maximum(k * np.array([i.power for i in images]).ravel() + 3.5**2, 0)
+
+    def minus(x):
+        model = system @ x + 3.5**2
+        return model.sum() - y @ np.log(model), system.T @ (1 - y / model)
+
+    best = minimize(minus, np.ones(matrix.shape[1]), jac=True, bounds=[(0, None)] * matrix.shape[1], method="L-BFGS-B",
+                    options={"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14, "gtol": 1e-8})  # fmt: skip
+    assert -1e-3 < minus(found.solution / 1e-3)[0] - best.fun < found.decrement / 2
+    with pytest.raises(InversionError, match="no weight and no intervals"):
+        fspt.invert(matrix, images, method="mlem", samples=20)
+    with pytest.raises(InversionError, match="'method' must be"):
+        fspt.invert(matrix, images, method="art")
+    with pytest.raises(InversionError, match="needs electrons"):
+        fspt.invert(matrix, matrix.forward(exitance), error=1e-12, method="mlem")
 
 
 # --- intervals ---
