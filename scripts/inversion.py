@@ -1,14 +1,17 @@
 """J_n of the nylon cylinder from four noisy views, without the inverse crime: tables of error against light and stop.
 
-    python scripts/inversion.py [--spp 1024] [--samples 200] [--tables light,stop,views] [-o docs/inversion.csv]
+    python scripts/inversion.py [--spp 1024] [--samples 200] [--seeds 3] [--tables light,stop] [-o docs/inversion.csv]
 
 The pictures are of scenes/nylon_cylinder.ply (45,002 vertices), by Mitsuba's `path`, 96 x 96 pixels a view; counts by
 `expose`, with 3.5 electrons of read noise. The inversion uses another mesh of the same cylinder (edges of 1 mm) with
 its own transport matrix. Its total is compared over what is seen, its J_n with the fine one at the nearest vertices.
 
-Columns: electrons on the brightest pixel, bias of the seen total [%], half of its 90 % interval [%], relative L2 error
-of J_n [%], chi2, seconds without and with samples. *light*: 100, 1e3, 1e4 electrons at f/2.8. *stop*: f/1.4 … f/16 at
-the exposure time of 1e3 electrons at f/2.8. *views*: 1, 2, 4, 8 of them at 1e3 electrons.
+Columns: electrons on the brightest pixel, bias of the seen total [%], half of its 90 % interval [%], share of the
+intervals that hold the total, relative L2 error of J_n [%], chi2, seconds without and with samples; means over the
+seeds of the counts. *light*: 100, 1e3, 1e4 electrons at f/2.8. *stop*: f/1.4 … f/16 at the exposure time of 1e3
+electrons at f/2.8. *views*: 1, 2, 4, 8 of them. *gain*: counts that are too high by 1 and 3 %, without and with that
+as `gain_error`. *pose*: a matrix of views turned by 0.1, 0.3 and 1 degrees from the true ones. *law*: pictures by
+Fresnel's exit law, a matrix by Lambert's. The last four at 1e3 electrons and f/2.8.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from __future__ import annotations
 import argparse
 import csv
 import time
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -49,29 +52,39 @@ def coarse_scene(folder: Path, edge: float) -> Path:
 
 
 @cache
-def pictures(f_number: float, views: tuple[int, ...], spp: int) -> tuple[fspt.Image, ...]:
+def pictures(f_number: float, views: tuple[int, ...], spp: int, law: str = "lambert") -> tuple[fspt.Image, ...]:
     """Views of the fine mesh by Monte Carlo [W per W of source]."""
+    text = FINE.read_text(encoding="utf-8").replace("nylon_cylinder.ply", str(FINE.with_suffix(".ply")))
+    lines = f'<emitter type="fspt_surface"> <string name="emission" value="{law}"/>'
+    text = text.replace(
+        '<emitter type="fspt_surface">', lines + ' <float name="int_ior" value="1.37"/>' * (law != "lambert")
+    )
     found = []
     for view in views:
-        scene = fspt.load(FINE, f_number=f_number, view=view, **FILM)
+        scene = fspt.load(text, f_number=f_number, view=view, **FILM)
         image = fspt.render(scene, method="path", spp=spp, seed=1000 + view)
         found.append(fspt.Image(image.power, metadata={"pixel_pitch": FILM["pixel_pitch"]}))
     return tuple(found)
 
 
 @cache
-def matrix_of(scene: Path, f_number: float, views: tuple[int, ...], rtol: float) -> fspt.TransportMatrix:
+def matrix_of(scene: Path, f_number: float, views: tuple[float, ...], rtol: float) -> fspt.TransportMatrix:
     """Transport matrix of the coarse mesh."""
     return fspt.transport(scene, view=list(views), f_number=f_number, rtol=rtol, **FILM)
 
 
-def counted(images: tuple[fspt.Image, ...], watt: float, seed: int) -> list[fspt.Image]:
-    """Exposures of one second to the images of a source of so many watts, reduced from their counts."""
+def counted(images: tuple[fspt.Image, ...], watt: float, seed: int, gain: float, error: float) -> list[fspt.Image]:
+    """Exposures of one second to the images of a source of so many watts, reduced from their counts.
+
+    The powers are `gain` times too large; `error` is the gain error that they state.
+    """
     found = []
     for k, image in enumerate(images):
         exposure = CCD.expose(image.scaled(watt), 1.0, WAVELENGTH_NM, seed=seed + k)
         settings = {"exposure_time": 1.0, "wavelength_nm": WAVELENGTH_NM, "pixel_pitch": FILM["pixel_pitch"]}
-        found.append(CCD.reduce(exposure.counts, **settings))
+        reduced = CCD.reduce(exposure.counts, **settings)
+        metadata = reduced.metadata | {"electrons_per_watt": reduced.metadata["electrons_per_watt"] / gain}
+        found.append(fspt.Image(gain * reduced.power, metadata=metadata | {"gain_error": error}, mask=reduced.mask))
     return found
 
 
@@ -110,30 +123,53 @@ def row(matrix: fspt.TransportMatrix, images: list[fspt.Image], watt: float, sam
     }
 
 
-def rows(tables: list[str], folder: Path, spp: int, samples: int, edge: float) -> list[dict[str, object]]:
-    """Rows of the chosen tables."""
-    scene = coarse_scene(folder, edge)
-    four = (0, 90, 180, 270)
-    cases: list[tuple[str, float, tuple[int, ...], float]] = []
-    if "light" in tables:
-        cases += [("light", 2.8, four, electrons) for electrons in (1e2, 1e3, 1e4)]
-    if "stop" in tables:
-        cases += [("stop", f_number, four, np.nan) for f_number in (1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0)]
-    if "views" in tables:
-        cases += [("views", 2.8, tuple(range(0, 360, 360 // n)), 1e3) for n in (1, 2, 4, 8)]
-    found: list[dict[str, object]] = []
-    for table, f_number, views, electrons in cases:
-        images = pictures(f_number, views, spp)
-        watt = source_power(images, electrons) if table != "stop" else source_power(pictures(2.8, four, spp), 1e3)
-        peak = watt / source_power(images, 1.0)
-        matrix = matrix_of(scene, f_number, views, 1e-3)
-        numbers = row(matrix, counted(images, watt, 17), watt, samples)
-        found.append(
-            {"table": table, "f_number": f_number, "views": len(views), "electrons": round(peak)}
-            | {name: float(f"{value:.4g}") for name, value in numbers.items()}
-        )
-        print(found[-1], flush=True)
-    return found
+@dataclass(frozen=True)
+class Case:
+    """One row: views and matrix, light, and what is wrong about them.
+
+    electrons : on the brightest pixel; None: at the exposure time of 1e3 electrons at f/2.8
+    turned : degrees by which the views of the matrix differ;  gain : factor on the powers, `gain_error` stated for it
+    """
+
+    table: str
+    f_number: float = 2.8
+    views: tuple[int, ...] = (0, 90, 180, 270)
+    electrons: float | None = 1e3
+    turned: float = 0.0
+    gain: float = 1.0
+    gain_error: float = 0.0
+    law: str = "lambert"
+
+
+CASES = (
+    *(Case("light", electrons=electrons) for electrons in (1e2, 1e3, 1e4)),
+    *(Case("stop", f_number=f_number, electrons=None) for f_number in (1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0)),
+    *(Case("views", views=tuple(range(0, 360, 360 // n))) for n in (1, 2, 4, 8)),
+    *(Case("gain", gain=1 + wrong, gain_error=stated) for wrong in (0.01, 0.03) for stated in (0.0, wrong)),
+    *(Case("pose", turned=turned) for turned in (0.0, 0.1, 0.3, 1.0)),
+    *(Case("law", law=law) for law in ("lambert", "fresnel")),
+)
+
+
+def numbers_of(case: Case, scene: Path, spp: int, samples: int, seeds: int, report: Path | None) -> dict[str, object]:
+    """One row of a table, means over the seeds of the counts."""
+    images = pictures(case.f_number, case.views, spp, case.law)
+    if case.electrons is None:
+        watt = source_power(pictures(2.8, case.views, spp), 1e3)
+    else:
+        watt = source_power(images, case.electrons)
+    matrix = matrix_of(scene, case.f_number, tuple(view + case.turned for view in case.views), 1e-3)
+    if report and case == Case("light"):
+        fspt.invert(matrix, counted(images, watt, 17, 1.0, 0.0)).report(report)
+    each = [
+        row(matrix, counted(images, watt, 17 + 100 * seed, case.gain, case.gain_error), watt, samples)
+        for seed in range(seeds)
+    ]
+    numbers = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+    setting = {name: value for name, value in asdict(case).items() if name not in ("views", "electrons")}
+    peak = round(watt / source_power(images, 1.0))
+    found = setting | {"views": len(case.views), "electrons": peak, "seeds": seeds}
+    return found | {name: float(f"{value:.4g}") for name, value in numbers.items()}
 
 
 def main() -> None:
@@ -142,12 +178,17 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=1024)
     parser.add_argument("--samples", type=int, default=200)
     parser.add_argument("--edge", type=float, default=1.0)
-    parser.add_argument("--tables", default="light,stop,views")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--tables", default="light", help="Among light, stop, views, gain, pose, law.")
+    parser.add_argument("--report", type=Path, help="Picture of the row of 1e3 electrons of `light`, .png.")
     parser.add_argument("--folder", type=Path, default=Path("out"))
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "inversion.csv")
     arguments = parser.parse_args()
     arguments.folder.mkdir(exist_ok=True)
-    table = rows(arguments.tables.split(","), arguments.folder, arguments.spp, arguments.samples, arguments.edge)
+    scene, table = coarse_scene(arguments.folder, arguments.edge), []
+    for case in (case for case in CASES if case.table in arguments.tables.split(",")):
+        table.append(numbers_of(case, scene, arguments.spp, arguments.samples, arguments.seeds, arguments.report))
+        print(table[-1], flush=True)
     with arguments.output.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table[0], lineterminator="\n")
         writer.writeheader()

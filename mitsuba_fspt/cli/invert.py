@@ -31,6 +31,10 @@ def invert(
     gain_error: Annotated[
         float | None, typer.Option(help="Relative uncertainty common to all pixels; that of the images if left out.")
     ] = None,
+    method: Annotated[
+        str,
+        typer.Option(help="smooth, or mlem: without penalty and intervals.", autocompletion=lambda: ["smooth", "mlem"]),
+    ] = "smooth",
     scene: Annotated[Path | None, typer.Option(metavar="SCENE.xml", help="Scene of T.npz, where it has moved.")] = None,
     report: Annotated[Path | None, typer.Option(help="Also a picture of images, residuals and J_n, .png.")] = None,
     as_json: AsJson = False,
@@ -58,6 +62,7 @@ def invert(
             samples=samples,
             seed=seed,
             confidence=confidence,
+            method=method,
             scene=scene,
             progress=progress,
         )

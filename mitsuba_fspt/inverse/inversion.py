@@ -38,7 +38,8 @@ class Inversion:
     weight, reference : of the penalty on roughness [mm²], [W/mm²] (Eq. M.23)
     determined : number γ of unknowns that the data determine
     pixels : number of pixels fitted;  chi2_sum : Σ (residual/σ)² over them
-    decrement : bound of the squared numerical error of any weighted sum, over its variance
+    decrement : bound of the squared numerical error of any weighted sum, over its variance; of 'mlem' twice the duality
+        gap of the log-likelihood
     gain_error : relative uncertainty of a common factor, contained in the intervals
     measured, fitted, sigma : (views, height, width) [W]; NaN where masked, or outside the surface
     """

@@ -23,6 +23,8 @@ from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
 from .inversion import Inversion
 from .measurement import Measurement
+from .mlem import MlemAccuracy, mlem
+from .multipliers import Multipliers
 from .nonnegative import Accuracy, Solve, factor, minimise
 from .smoothness import Prior, Smoothness
 from .surface import Surface
@@ -36,6 +38,7 @@ class Settings:
     """Accuracy of `invert`.
 
     accuracy : of the minimum
+    mlem : of the maximum likelihood
     drawn : of the minima of random draws, and while variances and weight are sought; a decrement of 0.01 widens an
         interval by at most 0.5 %
     reweighted : relative change of the standard deviations, root mean square, at which they count as converged; it
@@ -52,6 +55,7 @@ class Settings:
     """
 
     accuracy: Accuracy = field(default_factory=Accuracy)
+    mlem: MlemAccuracy = field(default_factory=MlemAccuracy)
     drawn: Accuracy = field(default_factory=lambda: Accuracy(decrement=0.01, inner=0.1))
     reweighted: float = 1e-3
     rounds: int = 40
@@ -77,6 +81,7 @@ def invert(
     samples: int = 0,
     seed: int = 0,
     confidence: float = 0.9,
+    method: str = "smooth",
     scene: object = None,
     progress: Progress | None = None,
     settings: Settings | None = None,
@@ -97,6 +102,8 @@ def invert(
     samples : number of random draws, from which the intervals follow; 0: no intervals
     seed : of the draws, 0 … 2⁵³
     confidence : of the intervals, in (0, 1)
+    method : 'smooth', with the penalty; or 'mlem', the maximum likelihood by expectation maximisation, without penalty
+        and intervals (Eq. M.28)
     scene : scene with the meshes of the matrix, where its own cannot be read any more
     progress : called with what is being done and the share done; without it a notebook shows a bar
     settings : accuracy
@@ -112,7 +119,7 @@ def invert(
             f"invert: the first argument must be a transport matrix, got {type(matrix).__name__}. Make one with "
             "fspt.transport, or read one with fspt.read_transport."
         )
-    options = Options(weight, samples, seed, confidence)
+    options = Options(weight, samples, seed, confidence, method)
     measurement = Measurement.of(matrix, images, error, mask, gain_error)
     problem = Problem.of(matrix, measurement, Surface.of(matrix, scene), prior or Prior(), settings or Settings())
     with reported(progress) as report:
@@ -127,8 +134,13 @@ class Options:
     samples: int
     seed: int
     confidence: float
+    method: str = "smooth"
 
     def __post_init__(self) -> None:
+        if self.method not in ("smooth", "mlem"):
+            raise InversionError(f"invert: 'method' must be 'smooth' or 'mlem', got {self.method!r}. Give one of them.")
+        if self.method == "mlem" and (self.samples or self.weight):
+            raise InversionError("invert: method 'mlem' has no weight and no intervals. Leave out weight and samples.")
         if self.weight is not None:
             weight = number("invert: 'weight'", self.weight, InversionError, "1.0")
             if not 0 <= weight < np.inf:
@@ -205,6 +217,8 @@ class Problem:
 
     def solved(self, options: Options, report: Progress) -> Inversion:
         """Fit and draws. Unless the prior has a reference, the penalty is relative to a first fit."""
+        if options.method == "mlem":
+            return self.result(self.most_likely(report), np.empty((self.surface.unknowns, 0)), options)
         problem, first = self, None
         if options.weight == 0:
             self._require_pixels()
@@ -260,11 +274,25 @@ class Problem:
                 break
         return self._improved(state, probes, weight, self.settings.accuracy)
 
+    def most_likely(self, report: Progress) -> Fit:
+        """Maximum of the likelihood without a penalty."""
+        shot = self.measurement.shot[self.rows]
+        if not (shot > 0).all():
+            raise InversionError(
+                "invert: method 'mlem' needs electrons, not watts with error=. Give images of 'fspt reduce'."
+            )
+        background = self.measurement.other[self.rows] / shot**2
+        power = self.measurement.power[self.rows]
+        x, gap = mlem(self.transport, power, 1 / shot, background, self.settings.mlem, lambda s: report("fit", s))
+        numerical = self._numerical(x)
+        return Fit(x, self._sigma(self.transport @ x, numerical), numerical, 0.0, 0.0, 2 * gap)
+
     def _improved(self, state: Fit, probes: Array, weight: float | None, accuracy: Accuracy) -> Fit:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
         normal, solve = self._normal(state.sigma, state.weight)
         right = self._right(self.measurement.power[self.rows], state.sigma, state.weight)
-        found = minimise(normal, right[:, None], state.x[:, None], self.bounded, solve, accuracy)
+        start = Multipliers(solve, self.bounded).start(right[:, None])
+        found = minimise(normal, right[:, None], start, self.bounded, solve, accuracy)
         x = found.x[:, 0]
         determined = self._determined(normal, solve, state.weight, probes)
         if weight is None:  # Eq. M.25
@@ -320,13 +348,13 @@ class Problem:
         if not count:
             return np.empty((self.surface.unknowns, 0))
         normal, solve = self._normal(fit.sigma, fit.weight)
+        multipliers = Multipliers(solve, self.bounded)
         sizes = [min(self.settings.block, count - k) for k in range(0, count, self.settings.block)]
         seeds = np.random.SeedSequence(seed).spawn(len(sizes))
 
         def block(size: int, sequence: np.random.SeedSequence) -> Array:
             right, factors = self._drawn(fit, size, np.random.default_rng(sequence))
-            start = solve(right)
-            found = minimise(normal, right, start, self.bounded, solve, self.settings.drawn)
+            found = minimise(normal, right, multipliers.start(right), self.bounded, solve, self.settings.drawn)
             return found.x * factors
 
         found = []

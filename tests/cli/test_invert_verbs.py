@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 
 import numpy as np
 import pytest
 from sphere_views import sphere_views
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.inverse.invert import Problem
 
 CAMERA = """[detector]
 name = "CCD"
@@ -109,6 +112,27 @@ def test_bad_input_of_invert(run, folder, monkeypatch, arguments, words):
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
     assert words in err
+    assert files(folder) == before
+
+
+def test_ctrl_c_leaves_no_file(run, folder, monkeypatch):
+    """Ctrl-C in the middle of the fit: exit code 130, one line, neither mesh nor report."""
+    folder, _ = folder
+    monkeypatch.chdir(folder)
+    before, improved, pressed = files(folder), Problem._improved, []
+
+    def press(self, *arguments):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:  # lost, as in a callback of C++
+            pressed.append(True)
+        return improved(self, *arguments)
+
+    monkeypatch.setattr(Problem, "_improved", press)
+    images = [f"exposure_{k}.exr" for k in range(4)]
+    code, out, err = run("invert", "T.npz", *images, "-o", "out.ply", "--samples", 50, "--report", "out.png")
+    assert (code, out, err) == (130, "", "fspt: interrupted; nothing was written.\n")
+    assert len(pressed) == 1
     assert files(folder) == before
 
 

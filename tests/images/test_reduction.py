@@ -44,21 +44,44 @@ def test_expose_then_reduce_is_within_its_errors():
 
 
 def test_stacks_and_frames():
-    """Five frames, a dark stack and a flat field that falls by a third: χ² of the reduced image is 1.
+    """Five frames, a dark stack with a pattern and a flat field that falls by a third: χ² of the reduced image is 1.
 
-    The flat field, the dark frame and the number of frames each change the mean or the scatter.
+    Seen to fail without the flat field, without the dark frame, without the noise of the dark frame and without the
+    number of frames.
     """
     pytest.importorskip("ccdproc")
     image = ramp(2000.0, 64)
     flat = 1 + 0.2 * np.outer(np.ones(64), np.linspace(-1, 1, 64))
     seen = Image(image.power * flat, metadata=image.metadata)
-    stack = np.array([CCD.expose(seen, 60, 650, seed=s).counts for s in range(5)])
-    dark = np.array([CCD.expose(Image(0 * image.power), 60, 650, seed=90 + s).counts for s in range(5)])
+    pattern = (20 * np.random.default_rng(1).standard_normal((64, 64))).astype(int)  # of the bias [DN]
+    stack = pattern + np.array([CCD.expose(seen, 60, 650, seed=s).counts for s in range(5)])
+    dark = pattern + np.array([CCD.expose(Image(0 * image.power), 60, 650, seed=90 + s).counts for s in range(5)])
     found = CCD.reduce(stack, **SETTINGS, pixel_pitch=0.0135, dark=dark, flat=1e4 * flat)
     chi2 = (((found.power - image.power) / found.error) ** 2)[8:].mean()
     assert chi2 == pytest.approx(1, abs=0.08)
     one = CCD.reduce(stack[0], **SETTINGS, pixel_pitch=0.0135)
     assert found.metadata["electrons_per_watt"] == pytest.approx(5 * one.metadata["electrons_per_watt"])
+
+
+def test_dark_charge_and_frames_add_their_noise():
+    """No light: 30 electrons of dark charge, its mean subtracted or a dark frame, stacks, rounding: χ² of pixels is 1.
+
+    Seen to fail without the charge's variance, that of the dark frame, that of the rounding, and with the read noise of
+    one frame for that of four.
+    """
+    pytest.importorskip("ccdproc")
+    warm = replace(CCD, dark_current=0.5)
+    quiet = replace(CCD, dark_current=0.0, read_noise=1.0)
+    settings = SETTINGS | {"pixel_pitch": 0.0135}
+    image = Image(np.zeros((64, 64)), metadata={"pixel_pitch": 0.0135})
+    for camera, frames, given in ((warm, 1, {}), (warm, 1, {"dark": True}), (warm, 4, {}), (quiet, 4, {})):
+        counts = np.array([camera.expose(image, 60, 650, seed=s).counts for s in range(frames)])
+        if given:
+            given = {"dark": camera.expose(image, 60, 650, seed=99).counts}
+        found = camera.reduce(counts, **settings, **given)
+        per_watt, read, dark = (found.metadata[n] for n in ("electrons_per_watt", "read_noise", "dark_electrons"))
+        chi2 = ((found.power.astype(float) * per_watt) ** 2).mean() / (read**2 + dark)
+        assert chi2 == pytest.approx(1, abs=4 * (2 / 4096) ** 0.5)
 
 
 def test_saturated_pixels_are_masked_not_clipped():
@@ -135,6 +158,8 @@ def test_uniform_source_calibrates():
     assert found.quantum_efficiency == pytest.approx(0.62, rel=4 * found.gain_error)
     assert found.quantum_efficiency == pytest.approx(0.62, rel=3e-3)
     assert found.gain_error == pytest.approx(0.02, rel=0.05)
+    alone = calibrated(CCD, CCD.reduce(stack, **SETTINGS), power, 0.0).gain_error  # shot noise of all pixels and frames
+    assert 0.5 < alone * np.sqrt(10 * (power * PER_WATT).sum()) < 3
 
 
 def test_toml_both_ways(tmp_path):

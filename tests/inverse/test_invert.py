@@ -7,11 +7,12 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, minimize, nnls
 from scipy.sparse import csr_array
 from sphere_views import RADIUS, noisy, sphere_views
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.inverse import multipliers
 from mitsuba_fspt.inverse.nonnegative import Accuracy, factor, minimise
 from mitsuba_fspt.inverse.smoothness import Prior, Smoothness
 from mitsuba_fspt.inverse.surface import Surface
@@ -81,6 +82,31 @@ def test_minimum_is_that_of_nnls():
     np.testing.assert_allclose(found.x, expected, atol=1e-6)
     free = minimise(normal, dense.T @ data, np.zeros((40, 3)), ~everywhere, factor(normal), Accuracy(decrement=1e-20))
     np.testing.assert_allclose(free.x, np.linalg.lstsq(dense, data)[0], atol=1e-8)
+
+
+def test_multipliers_give_the_minimum(monkeypatch):
+    """Shared columns of the inverse give the minimum of SciPy to rounding, with bounds on half of the unknowns too.
+
+    Where the columns may take no memory the start is the minimum without bounds, cut off at 0.
+    """
+    rng = np.random.default_rng(4)
+    dense = rng.standard_normal((90, 40))
+    data = rng.standard_normal((90, 5)) + dense @ np.maximum(rng.standard_normal((40, 5)), 0)
+    solve, right = factor(csr_array(dense.T @ dense)), dense.T @ data
+    expected = np.stack([nnls(dense, column)[0] for column in data.T], axis=1)
+    assert (expected == 0).sum() > 40
+    found = multipliers.Multipliers(solve, np.ones(40, bool)).start(right)
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+    assert ((found == 0) == (expected == 0)).all()
+    half = np.arange(40) < 20
+    found = multipliers.Multipliers(solve, half).start(right)
+    least = np.where(half, 0, -np.inf)
+    expected = [lsq_linear(dense, column, (least, np.inf), method="bvls").x for column in data.T]
+    np.testing.assert_allclose(found, np.transpose(expected), atol=1e-8)
+    assert (found[20:] < 0).any()
+    monkeypatch.setattr(multipliers, "MOST", 0)
+    cut = multipliers.Multipliers(solve, np.ones(40, bool)).start(right)
+    np.testing.assert_allclose(cut, np.maximum(solve(right), 0))
 
 
 # --- recovery ---
@@ -162,6 +188,34 @@ def test_weight_and_chi2(case):
     np.testing.assert_allclose(again.exitance, found.exitance, rtol=0.05)
     for factor_ in (1e-3, 1e3):
         assert distance(fspt.invert(matrix, images, weight=found.weight * factor_)) > distance(found)
+
+
+def test_mlem(case):
+    """The likelihood of MLEM is within its stated gap of the maximum by L-BFGS-B; its total is that of the light.
+
+    Seen to fail without the background.
+    """
+    matrix, exitance = case
+    images = noisy(matrix, exitance, 1000, 5)
+    found = fspt.invert(matrix, images, method="mlem")
+    assert found.decrement <= 1.0
+    assert found.total == pytest.approx(matrix.areas @ exitance, rel=0.01, abs=0)
+    k = images[0].metadata["electrons_per_watt"]
+    system, y = k * matrix.matrix * 1e-3, np.maximum(k * np.array([i.power for i in images]).ravel() + 3.5**2, 0)
+
+    def minus(x):
+        model = system @ x + 3.5**2
+        return model.sum() - y @ np.log(model), system.T @ (1 - y / model)
+
+    best = minimize(minus, np.ones(matrix.shape[1]), jac=True, bounds=[(0, None)] * matrix.shape[1], method="L-BFGS-B",
+                    options={"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14, "gtol": 1e-8})  # fmt: skip
+    assert -1e-3 < minus(found.solution / 1e-3)[0] - best.fun < found.decrement / 2
+    with pytest.raises(InversionError, match="no weight and no intervals"):
+        fspt.invert(matrix, images, method="mlem", samples=20)
+    with pytest.raises(InversionError, match="'method' must be"):
+        fspt.invert(matrix, images, method="art")
+    with pytest.raises(InversionError, match="needs electrons"):
+        fspt.invert(matrix, matrix.forward(exitance), error=1e-12, method="mlem")
 
 
 # --- intervals ---

@@ -11,7 +11,7 @@ from mitsuba_fspt.runtime.errors import OpticsError
 WIDTH, HEIGHT = 60, 44
 K = np.array([[330.0, 0, 31.5], [0, 330.0, 18.0], [0, 0, 1]])  # the middle of the image is (29.5, 21.5)
 RVEC, TVEC = np.array([0.3, -0.5, 1.2]), np.array([4.0, -6.0, 170.0])
-POINTS = np.array([[0, 0, 0], [9, 2, 1], [-6, 7, -3], [-5, -3, 4.0]])
+POINTS = np.array([[0, 0, 0], [9, 2, 1], [-6, 7, -3], [2, 3, -5.0]])
 
 
 def projected(points):

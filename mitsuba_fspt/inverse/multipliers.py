@@ -1,0 +1,81 @@
+"""Quadratic programmes with x >= 0 by the multipliers of the bounds, many right-hand sides with one matrix.
+
+    x = A⁻¹ (r + λ),   x >= 0,   λ >= 0,   λᵀx = 0
+
+Only the few unknowns at their bound have λ > 0. With the columns of A⁻¹ that belong to them, which all right-hand sides
+share, λ is the minimum of ½ λᵀ(A⁻¹)λ + λᵀA⁻¹r for λ >= 0: a dense problem of their number, by the active sets of Lawson
+and Hanson, in place of sparse ones of all unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
+from scipy.optimize import nnls
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+ROUNDS = 40  # of active sets: they are final after some ten; what is not goes on from there in `nonnegative`
+MOST = 2**28  # bytes of columns of the inverse, 256 MB: unknowns beyond are left to `nonnegative`
+
+
+class Multipliers:
+    """Active sets of one matrix A, given by its `solve`; x >= 0 holds where `bounded` (m,) is True."""
+
+    def __init__(self, solve: Callable[[Array], Array], bounded: NDArray[np.bool_]) -> None:
+        self._solve, self._bounded = solve, bounded
+        self._place = np.full(len(bounded), -1, np.int64)  # of each unknown among the columns
+        self._columns = np.empty((len(bounded), 0), order="F")
+        self._count = 0
+        self._lock = Lock()
+
+    def start(self, right: Array) -> Array:
+        """x (m, k) >= 0 for right-hand sides (m, k): the minimum, or near it where active sets did not become final."""
+        free = self._solve(right)
+        return np.stack([self._one(column) for column in free.T], axis=1)
+
+    def _one(self, free: Array) -> Array:
+        """x (m,) from the minimum without bounds: exact on a set of unknowns that grows until no other one is < 0."""
+        x, among = free, np.empty(0, np.int64)
+        slack = 1e-12 * float(np.abs(free).max())
+        for _ in range(ROUNDS):
+            below = np.flatnonzero(self._bounded & (x < -slack))
+            grown = np.union1d(among, below)
+            if len(grown) == len(among) or (columns := self._inverse(grown)) is None:
+                break
+            among = grown
+            try:  # ½ λᵀSλ + λᵀx is ½ |Lᵀλ + L⁻¹x|² but for a constant, S = LLᵀ
+                lower = cholesky(columns[among], lower=True)
+                multipliers, _ = nnls(lower.T, -solve_triangular(lower, free[among], lower=True))
+            except (LinAlgError, RuntimeError):  # numerically singular, or nnls has not ended
+                break
+            x = free + columns @ multipliers
+            x[among[multipliers > 0]] = 0  # exactly, not to rounding
+        return np.where(self._bounded, np.maximum(x, 0), x)
+
+    def _inverse(self, unknowns: Index) -> Array | None:
+        """Columns of A⁻¹ of these unknowns, (m, n); None where they would take more than `MOST` bytes."""
+        with self._lock:
+            missing = unknowns[self._place[unknowns] < 0]
+            if 8 * len(self._place) * (self._count + len(missing)) > MOST:
+                return None
+            if len(missing):
+                unit = np.zeros((len(self._place), len(missing)))
+                unit[missing, np.arange(len(missing))] = 1
+                self._place[missing] = self._count + np.arange(len(missing))
+                self._append(self._solve(unit))
+            return self._columns[:, self._place[unknowns]]
+
+    def _append(self, found: Array) -> None:
+        """Keep columns; room for them doubles."""
+        count = self._count + found.shape[1]
+        if count > self._columns.shape[1]:
+            larger = np.empty((len(self._place), max(count, 2 * self._columns.shape[1])), order="F")
+            larger[:, : self._count] = self._columns[:, : self._count]
+            self._columns = larger
+        self._columns[:, self._count : count] = found
+        self._count = count
