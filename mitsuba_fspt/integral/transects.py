@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -33,9 +33,10 @@ BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the val
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
-# Share of the picture's gradients around along one axis, below which a pixel may hold a corner or a second edge: two
-# transects and the nodes agreed there by chance, to errors of four times what they stated.
-STRAIGHT = 0.9
+# Level whose transects cross edges slantwise where less than a share of the picture's gradients around lie along one
+# axis, as at a corner or a second edge: sets that cross an edge at one angle may agree on what they all miss, up to four
+# times what they state. The difference then counts as error.
+SLANTED, STRAIGHT = 2, 0.9
 DIM = 1e-5  # of the brightest pixel: less light says nothing of the edges of brighter bodies
 DARK_LEVELS = 3  # while no light is found anywhere
 FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
@@ -77,7 +78,7 @@ class _Ladder:
         draft, where = self.draft, self.where
         if self.means:
             self.edges.learn(draft, self.means, self.split, across=level % 2 == 0)
-        self.means = means = apply_transects(draft, where, self.edges, rule, along)
+        self.means = means = apply_transects(draft, where, self.edges.at(level), rule, along)
         # What hides light may be cut by outlines all over the pupil but where the light comes past it.
         lit = means.value > dr.opaque(mi.Float64, DIM) * draft.peak
         fresh = where & means.jumps & lit & ~self.split
@@ -123,12 +124,11 @@ class _Ladder:
     ) -> tuple[PixelArray, PixelArray]:
         """What may be left after the first transects, and what they pass by beside a jump.
 
-        That two of them and the nodes agree says enough of a straight silhouette. Of another jump, and of a corner or
-        two edges in the pixel, it says too little.
+        That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
         """
         draft = self.draft
         left = dr.maximum(FIRST_GAIN * moved, scatter)
-        left = dr.select(silhouette & self.edges.straight, left, self._unsettled(left))
+        left = dr.select(silhouette, left, self._unsettled(left))
         missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.coverage), draft.error, draft.roughness))
         # Who is known from elsewhere takes no transects, and knows of the silhouette all the same.
         return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh | (draft.outline & ~draft.open))
@@ -167,6 +167,12 @@ class Edges:
     blur: PixelArray
     sharp: Mask
     straight: Mask
+
+    def at(self, level: int) -> Edges:
+        """As the transects of a `level` cross them: those of `SLANTED` at half a right angle where no edge is straight."""
+        if level != SLANTED:
+            return self
+        return replace(self, angle=dr.select(self.straight, self.angle, self.angle + math.pi / 4))
 
     def learn(self, draft: Draft, means: Means, split: Mask, across: bool = False) -> None:
         """Blur of the edges that were met; pixels that see none are smooth, and none is sharp.
