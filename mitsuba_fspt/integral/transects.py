@@ -34,8 +34,8 @@ STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
 # Level whose transects cross edges slantwise where less than a share of the picture's gradients around lie along one
-# axis, as at a corner or a second edge: sets that cross an edge at one angle may agree on what they all miss, up to four
-# times what they state. The difference then counts as error.
+# axis, as at a corner or a second edge: sets that cross an edge at one angle may agree on what they all miss, up to
+# four times what they state. The difference then counts as error.
 SLANTED, STRAIGHT = 2, 0.9
 DIM = 1e-5  # of the brightest pixel: less light says nothing of the edges of brighter bodies
 DARK_LEVELS = 3  # while no light is found anywhere
@@ -169,7 +169,7 @@ class Edges:
     straight: Mask
 
     def at(self, level: int) -> Edges:
-        """As the transects of a `level` cross them: those of `SLANTED` at half a right angle where no edge is straight."""
+        """As transects of a `level` cross them: those of `SLANTED` at half a right angle where none is straight."""
         if level != SLANTED:
             return self
         return replace(self, angle=dr.select(self.straight, self.angle, self.angle + math.pi / 4))
