@@ -70,7 +70,7 @@ def test_a_shortcut_changes_no_pixel_by_a_tenth_of_rtol(name, tmp_path):
     """Seen to fail with `one_spread` left out, and with all but the brightest elements taken for dark."""
     build, domain = CASES[name]
     scene = build(tmp_path / "body.ply")
-    rtol = RTOL if domain == "surface" else 1e-3
+    rtol = RTOL if domain == "surface" or name == "smooth blocks" else 1e-3
     short, long = solved(scene, domain, rtol=rtol), solved(scene, domain, [name], rtol=rtol)
     assert found(short, name)
     assert not found(long, name)
