@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -33,10 +33,6 @@ BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the val
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
-# Level whose transects cross edges slantwise where less than a share of the picture's gradients around lie along one
-# axis, as at a corner or a second edge: sets that cross an edge at one angle may agree on what they all miss, up to
-# four times what they state. The difference then counts as error.
-SLANTED, STRAIGHT = 2, 0.9
 DIM = 1e-5  # of the brightest pixel: less light says nothing of the edges of brighter bodies
 DARK_LEVELS = 3  # while no light is found anywhere
 FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
@@ -78,7 +74,7 @@ class _Ladder:
         draft, where = self.draft, self.where
         if self.means:
             self.edges.learn(draft, self.means, self.split, across=level % 2 == 0)
-        self.means = means = apply_transects(draft, where, self.edges.at(level), rule, along)
+        self.means = means = apply_transects(draft, where, self.edges, rule, along)
         # What hides light may be cut by outlines all over the pupil but where the light comes past it.
         lit = means.value > dr.opaque(mi.Float64, DIM) * draft.peak
         fresh = where & means.jumps & lit & ~self.split
@@ -158,21 +154,11 @@ class _Ladder:
 
 @dataclass
 class Edges:
-    """Of the edge a pixel may see: `angle` across it, signed `blur` radius [pixels], whether it counts as `sharp`.
-
-    straight : False where the picture around changes along several directions, as at a corner or beside a second edge
-    """
+    """Of the edge a pixel may see: `angle` across it, signed `blur` radius [pixels], whether it counts as `sharp`."""
 
     angle: PixelArray
     blur: PixelArray
     sharp: Mask
-    straight: Mask
-
-    def at(self, level: int) -> Edges:
-        """As transects of a `level` cross them: those of `SLANTED` at half a right angle where none is straight."""
-        if level != SLANTED:
-            return self
-        return replace(self, angle=dr.select(self.straight, self.angle, self.angle + math.pi / 4))
 
     def learn(self, draft: Draft, means: Means, split: Mask, across: bool = False) -> None:
         """Blur of the edges that were met; pixels that see none are smooth, and none is sharp.
@@ -209,13 +195,13 @@ def edges_of(draft: Draft) -> Edges:
     The image-plane stop is sharp.
     """
     grid = draft.grid
-    angle, parallel = grid.principal_axis(*grid.gradient(draft.value), _around(draft))
+    angle = grid.principal_angle(*grid.gradient(draft.value), _around(draft))
     nearest = grid.spread_max(-draft.nearest)
     # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
     farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
     nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
     blur = dr.select(draft.clipped, 0, draft.lens.blur_radius(nearest))
-    return Edges(angle, blur, dr.abs(blur) < SHARP, parallel > dr.opaque(mi.Float64, STRAIGHT))
+    return Edges(angle, blur, dr.abs(blur) < SHARP)
 
 
 # ---------------------------------------------------------------------- many transects in one launch
