@@ -28,6 +28,7 @@ from mitsuba_fspt.validation.random_scenes import FAMILIES, RandomScene, random_
 LIKELY, RANDOM = 16, 8  # pixels of each scene
 SLOW = 2.0  # s: rendered once more, as kernels may have been compiled
 GOAL, LEAST_GOAL = 0.15, 1e-5  # error of the reference: over the stated error, and over the brightest pixel
+LEAST_TRUE = 1e-7  # of the brightest pixel: smaller errors are rounding
 WIDE = 0.1  # of rtol: stated errors from which on their width counts
 HEAD = (
     "scenes",
@@ -116,7 +117,7 @@ def audited(family: str, seed: int, rtol: float, likely: int = LIKELY, random: i
     beyond = difference - reference > rtol
     missed = difference - reference > stated
     wide = stated > WIDE * rtol
-    true = np.maximum(difference, reference)[wide]
+    true = np.maximum(np.maximum(difference, reference), LEAST_TRUE)[wide]
     _, _, width, height = made.crop
     power = image.power.max()
     return Audit(

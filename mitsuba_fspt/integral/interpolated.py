@@ -188,7 +188,7 @@ class _Picture:
         dr.eval(seen.value, seen.coverage)
         self.rays += 4 * number.size
         self.levels.append(f"4 nodes: {number.size} pixels")
-        weights = _weights(side, MARGIN)
+        weights = part_weights(side, MARGIN)
         around = sliding_window_view(np.pad(self.value, MARGIN, mode="edge"), (2 * MARGIN + 1,) * 2)[row, column]
         found = np.einsum("na,nab,nb->n", weights[i], around, weights[j], optimize=True)
         return np.abs(found - seen.value.numpy()), seen.coverage.numpy() < 1 - COVERAGE_ROUNDING
@@ -198,12 +198,12 @@ class _Picture:
         side, etendue = self.blocks.side, self.view.lens.etendue
         count = int(np.count_nonzero(rough))
         why = f"{rough.size - count} of {rough.size} blocks of {side}² pixels are smooth"
-        weights = _weights(side, MARGIN)
-        value = np.maximum(_interpolated(self.value * etendue, weights), 0)
+        weights = part_weights(side, MARGIN)
+        value = np.maximum(means_of_parts(self.value * etendue, weights), 0)
         inside = (self.coverage > COVERAGE_ROUNDING) & (self.coverage < 1 - COVERAGE_ROUNDING) & ~rough
         coverage = _repeated(self.coverage, side)
         if inside.any():
-            coverage = np.clip(_interpolated(self.coverage, weights), 0, 1)
+            coverage = np.clip(means_of_parts(self.coverage, weights), 0, 1)
         least = np.where(_spread(self.coverage, MARGIN) > 0, self.quadrature.least_error * self.peak, 0)
         error = _repeated(np.maximum(self._left(), least) * etendue, side)
         planes = (value, error, coverage)
@@ -263,7 +263,7 @@ def _small_bodies(view: View, window: Window) -> Marks:
 # ---------------------------------------------------------------------- polynomials over blocks
 
 
-def _weights(side: int, reach: int) -> Plane:
+def part_weights(side: int, reach: int) -> Plane:
     """Means over parts of the middle of 2 reach + 1 cells, (side, cells), of the polynomial with these cells' means.
 
     The integral of the polynomial interpolates the sums of the cells at their ends.
@@ -277,7 +277,7 @@ def _weights(side: int, reach: int) -> Plane:
     return np.diff(lagrange @ sums, axis=0) * side
 
 
-def _interpolated(cells: Plane, weights: Plane) -> Plane:
+def means_of_parts(cells: Plane, weights: Plane) -> Plane:
     """Means of parts of cells (h, w) by `weights` (parts, cells) along each axis: (parts h, parts w)."""
     reach = weights.shape[1] // 2
     for _ in range(2):  # along the columns of the transposed, then of the original
@@ -288,7 +288,7 @@ def _interpolated(cells: Plane, weights: Plane) -> Plane:
 
 def _propagated(errors: Plane, side: int) -> Plane:
     """Error of the parts of each cell, (h, w), that follows from independent errors of cells (h, w)."""
-    share = np.square(_weights(side, MARGIN)).max(axis=0)
+    share = np.square(part_weights(side, MARGIN)).max(axis=0)
     square = np.square(errors)
     for axis in (0, 1):
         pad = [(MARGIN, MARGIN) if k == axis else (0, 0) for k in (0, 1)]
@@ -299,7 +299,7 @@ def _propagated(errors: Plane, side: int) -> Plane:
 def _bend(cells: Plane, side: int) -> Plane:
     """Largest change of a part of each cell and its neighbours from polynomials over three cells to five, (h, w)."""
     parts = [0, side // 2, side - 1]  # corners, where it is largest, and the middle
-    five, three = (_interpolated(cells, _weights(side, reach)[parts]) for reach in (MARGIN, MARGIN - 1))
+    five, three = (means_of_parts(cells, part_weights(side, reach)[parts]) for reach in (MARGIN, MARGIN - 1))
     height, width = cells.shape
     change = np.abs(five - three).reshape(height, len(parts), width, len(parts)).max(axis=(1, 3))
     return _spread(change, 1)

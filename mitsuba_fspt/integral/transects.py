@@ -33,9 +33,6 @@ BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the val
 STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
 CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
 LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
-# Share of the picture's gradients around along one axis, below which a pixel may hold a corner or a second edge: two
-# transects and the nodes agreed there by chance, to errors of four times what they stated.
-STRAIGHT = 0.9
 DIM = 1e-5  # of the brightest pixel: less light says nothing of the edges of brighter bodies
 DARK_LEVELS = 3  # while no light is found anywhere
 FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
@@ -123,12 +120,11 @@ class _Ladder:
     ) -> tuple[PixelArray, PixelArray]:
         """What may be left after the first transects, and what they pass by beside a jump.
 
-        That two of them and the nodes agree says enough of a straight silhouette. Of another jump, and of a corner or
-        two edges in the pixel, it says too little.
+        That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
         """
         draft = self.draft
         left = dr.maximum(FIRST_GAIN * moved, scatter)
-        left = dr.select(silhouette & self.edges.straight, left, self._unsettled(left))
+        left = dr.select(silhouette, left, self._unsettled(left))
         missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.coverage), draft.error, draft.roughness))
         # Who is known from elsewhere takes no transects, and knows of the silhouette all the same.
         return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh | (draft.outline & ~draft.open))
@@ -158,15 +154,11 @@ class _Ladder:
 
 @dataclass
 class Edges:
-    """Of the edge a pixel may see: `angle` across it, signed `blur` radius [pixels], whether it counts as `sharp`.
-
-    straight : False where the picture around changes along several directions, as at a corner or beside a second edge
-    """
+    """Of the edge a pixel may see: `angle` across it, signed `blur` radius [pixels], whether it counts as `sharp`."""
 
     angle: PixelArray
     blur: PixelArray
     sharp: Mask
-    straight: Mask
 
     def learn(self, draft: Draft, means: Means, split: Mask, across: bool = False) -> None:
         """Blur of the edges that were met; pixels that see none are smooth, and none is sharp.
@@ -203,13 +195,13 @@ def edges_of(draft: Draft) -> Edges:
     The image-plane stop is sharp.
     """
     grid = draft.grid
-    angle, parallel = grid.principal_axis(*grid.gradient(draft.value), _around(draft))
+    angle = grid.principal_angle(*grid.gradient(draft.value), _around(draft))
     nearest = grid.spread_max(-draft.nearest)
     # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
     farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
     nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
     blur = dr.select(draft.clipped, 0, draft.lens.blur_radius(nearest))
-    return Edges(angle, blur, dr.abs(blur) < SHARP, parallel > dr.opaque(mi.Float64, STRAIGHT))
+    return Edges(angle, blur, dr.abs(blur) < SHARP)
 
 
 # ---------------------------------------------------------------------- many transects in one launch

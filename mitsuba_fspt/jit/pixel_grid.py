@@ -204,16 +204,12 @@ class Grid:
         along_y = self.at(image, self.x, y - 1) - 2 * self.at(image, self.x, y) + self.at(image, self.x, y + 1)
         return dr.select(self._width > 2, along_x, 0), dr.select(self._height > 2, along_y, 0)
 
-    def principal_axis(self, x: PixelArray, y: PixelArray, radius: int) -> tuple[PixelArray, PixelArray]:
-        """Angle [rad] of the principal axis of the vectors (x, y) within `radius` pixels, how far they lie along it.
-
-        From the structure tensor: 1 where all are parallel, 0 where no direction prevails, or all vectors are 0.
-        """
-        products = x * y, x * x - y * y, x * x + y * y
+    def principal_angle(self, x: PixelArray, y: PixelArray, radius: int) -> PixelArray:
+        """Angle [rad] of the principal axis of the vectors (x, y) within `radius` pixels (structure tensor)."""
+        products = x * y, x * x - y * y
         dr.eval(products)
-        cross, along, total = (self.box_sum(product, radius) for product in products)
-        length = dr.sqrt(dr.square(2 * cross) + dr.square(along))
-        return 0.5 * dr.atan2(2 * cross, along), dr.select(total > 0, length / total, 0)
+        cross, along = (self.box_sum(product, radius) for product in products)
+        return 0.5 * dr.atan2(2 * cross, along)
 
     # ------------------------------------------------------------------ silhouettes
 

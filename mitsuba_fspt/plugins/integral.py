@@ -180,9 +180,11 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if everywhere and not cut.any():
             known = surface_form.solve(scene, lens, window, quadrature, None, least_peak, progress, specular)
             return _with_dark_coverage(known, view, window)
-        blocks = self._blocks(view, window, quadrature)
-        if blocks and (solution := self._by_blocks(view, blocks, quadrature, least_peak, progress)):
-            return solution
+        blocks, why = self._blocks(view, window, quadrature)
+        if blocks:
+            if solution := self._by_blocks(view, blocks, quadrature, least_peak, progress):
+                return solution
+            why = "most blocks of pixels have an edge, or light too narrow for them"
         narrow = narrow_light()
         where, peak = inside, least_peak
         if not everywhere:
@@ -202,16 +204,20 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             # Where a mirror or glass shows a narrow spot is not known.
             there = window.seen_in(specular.bending, lens)
             missed = np.maximum(missed, window.expand(there * UNCERTAINTY * narrow.on_pixels.max() * lens.etendue))
-        return replace(solution, error=np.maximum(solution.error, missed))
+        findings = (Finding("smooth blocks", False, why), *solution.findings)
+        return replace(solution, error=np.maximum(solution.error, missed), findings=findings)
 
-    def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> Blocks | None:
-        """Blocks of pixels between which the picture may be interpolated; None where that is not to be done."""
-        plain = quadrature.domain == "pupil" and quadrature.pixel == "area" and not view.specular
-        stop = math.isfinite(view.lens.optics.seen_field)
-        if not plain or stop or not quadrature.takes("smooth blocks"):
-            return None
+    def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[Blocks | None, str]:
+        """Blocks of pixels between which the picture may be interpolated; None, and why, where that is not done."""
+        if not quadrature.takes("smooth blocks"):
+            return None, "as was wanted"
+        if quadrature.domain != "pupil" or quadrature.pixel != "area" or view.specular:
+            return None, "only lines of sight over pixels and straight to the first surface are interpolated"
+        if math.isfinite(view.lens.optics.seen_field):
+            return None, "an image-plane stop cuts blocks"
         state = (window, _view(view.lens), quadrature.rtol)
-        return self._grid_of_blocks.recall(state, lambda: Blocks.of(window, view.lens, quadrature.rtol))
+        blocks = self._grid_of_blocks.recall(state, lambda: Blocks.of(window, view.lens, quadrature.rtol))
+        return blocks, f"{' x '.join(map(str, window.shape[::-1]))} pixels are too few, or the film has an odd side"
 
     def _by_blocks(
         self, view: View, blocks: Blocks, quadrature: Quadrature, least_peak: float, progress: Progress

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..integral.eq9 import etendue_from_pixel, pixel_etendue
 from ..integral.pupil import Pupil
+from ..jit.plugin_objects import made
 from ..jit.spectra import flat_share
 from ..optics import transmittance
 from ..optics.discs import defocus
@@ -160,9 +161,9 @@ class FsptLens(mi.Sensor):
         own = {name: float(value[0]) for name, value in self._numbers.items() if name not in transmittance.NUMBERS}
         own["pixel_pitch"] *= side
         width, height = (2 * math.ceil(int(n) / (2 * side)) for n in self.film().size())
-        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "luminance"}
+        film = made("hdrfilm", width=width, height=height, pixel_format="luminance")
         place = mi.ScalarTransform4f(np.array(self.placement).reshape(4, 4))
-        return mi.load_dict({"type": "fspt_lens", "model": self._model, "to_world": place, "film": film, **own})
+        return made("fspt_lens", model=self._model, to_world=place, film=film, **own)
 
     def numbers(self) -> dict[str, float | int | str]:
         """Numbers of the lens and its pixels for an image's metadata: lengths in mm, wavelength in nm."""

@@ -24,8 +24,10 @@ Indices = NDArray[np.int64]
 SHIFTS = 16
 CERTAIN = 4.1  # standard errors of the mean of 16 shifts that 999 of 1000 stay within (Student's t)
 FEW, UNMET = 16, 6.9  # fans with light that say how much they scatter; −ln of one case of 1000
-LINES = (32, 128, 512, 2048, 8192, 32768)  # of a lattice: fans a shift
-MOST_LINES = 8192  # unless more are asked for
+# Of a lattice: fans a shift. Of the first all ways are tried; the second is taken in any case, lest all fans pass by
+# a corner in the pixel.
+LINES = (64, 512, 2048, 8192, 32768)
+MOST_LINES = 8192  # of these, unless more are asked for
 GAUSS = 8  # nodes on a piece between two edges
 SHORTEST = 1e-13  # piece of a fan that is left out, of the fan's length
 
@@ -113,7 +115,7 @@ class FanReference:
                     error = max(error, UNMET / (SHIFTS * lines) * self._most(bodies))
                 if best is None or error < best[1] or way == best[2]:
                     best = (float(np.mean(means)), error, way)
-            if best is not None and best[1] < goal:
+            if best is not None and best[1] < goal and lines > LINES[0]:
                 break
             ways = [best[2]] if best and best[1] > 0 else ways
         return best[:2] if best else (0.0, 0.0)
