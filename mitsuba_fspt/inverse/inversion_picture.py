@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,10 +52,16 @@ def draw(inversion: Inversion) -> Figure:
             if row == 0:
                 ax.set_title(title, fontsize="small")
             if column == 0:
-                view = inversion.matrix.views[row]
-                ax.set_ylabel("  ".join(f"{k}={v}" for k, v in view.items()), fontsize="x-small")
-        figure.colorbar(drawn, ax=list(axes[:, column]), shrink=0.8)
+                ax.set_ylabel(_label(inversion.matrix.views, row), fontsize="small")
+        figure.colorbar(drawn, ax=list(axes[:, column]), location="bottom", shrink=0.9, pad=0.02)
     return figure
+
+
+def _label(views: Sequence[Mapping[str, Any]], row: int) -> str:
+    """What tells a view from the others, 'view=90'."""
+    names = [name for name in views[row] if len({str(view.get(name)) for view in views}) > 1]
+    values = {name: views[row][name] for name in names}
+    return "  ".join(f"{name}={value if isinstance(value, str) else f'{value:g}'}" for name, value in values.items())
 
 
 def write(inversion: Inversion, path: str | os.PathLike[str]) -> Figure:
