@@ -18,6 +18,17 @@ if TYPE_CHECKING:
     from ..inverse.calibrate import Calibration
 
 
+Views = Annotated[
+    list[str] | None,
+    typer.Option(
+        "-D",
+        "--define",
+        metavar="NAME=V1,V2,...",
+        help="Values for another <default> of the scene, a view each, or start:stop:step; repeatable.",
+    ),
+]
+
+
 def calibrate(
     scene: SceneFile,
     images: Annotated[
@@ -29,15 +40,7 @@ def calibrate(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FITTED.xml", help="Also the scene with the values found.")
     ] = None,
-    define: Annotated[
-        list[str] | None,
-        typer.Option(
-            "-D",
-            "--define",
-            metavar="NAME=V1,V2,...",
-            help="Values for another <default> of the scene, a view each, or start:stop:step; repeatable.",
-        ),
-    ] = None,
+    define: Views = None,
     rtol: Annotated[
         float | None, typer.Option(help="Error of the integrals over the brightest pixel; from the noise if left out.")
     ] = None,

@@ -23,7 +23,7 @@ from ..runtime.errors import InversionError, named
 from ..runtime.progress_bar import Progress, reported
 from ..studies.sweep_point import texts_of
 from .calibrated_scene import write_calibrated
-from .calibration_fit import CalibrationFit, CalibrationSettings, Measured
+from .calibration_fit import CalibrationFit, CalibrationSettings, Fitted, Measured
 from .derivatives import scene_text, varied_value
 from .measurement import variances
 
@@ -124,6 +124,11 @@ def calibrate(
         pictures(start)
         measured = measured_of(found, views, pictures.first, len(names))
         fitted = CalibrationFit(names, start, measured, pictures, settings).solved()
+    return _calibration(names, measured, fitted, os.fspath(scene))
+
+
+def _calibration(names: tuple[str, ...], measured: Measured, fitted: Fitted, scene: str) -> Calibration:
+    """The fitted numbers by name."""
     pixels = int(measured.used.sum())
     return Calibration(
         names,
@@ -133,7 +138,7 @@ def calibrate(
         fitted.chi2_sum / (pixels - len(names)),
         pixels,
         fitted.condition,
-        os.fspath(scene),
+        scene,
     )
 
 

@@ -54,7 +54,7 @@ def draw(inversion: Inversion) -> Figure:
                 ax.set_title(title, fontsize="small")
             if column == 0:
                 ax.set_ylabel(labels[row], fontsize="small")
-        figure.colorbar(drawn, ax=list(axes[:, column]), shrink=0.8)
+        figure.colorbar(drawn, ax=list(axes[:, column]), location="bottom", shrink=0.9, pad=0.02)
     return figure
 
 

@@ -99,11 +99,9 @@ def invert(
     weight : of the penalty on roughness [mm²], >= 0; None: the one that the roughness found agrees with (Eq. M.25)
     prior : what else the penalty says; None: only that J_n is smooth relative to itself
     gain_error : relative uncertainty of a factor common to all pixels, in [0, 1); None: that of the images, else 0
-    samples : number of random draws, from which the intervals follow; 0: no intervals
-    seed : of the draws, 0 … 2⁵³
+    samples, seed : number of random draws, from which the intervals follow (0: none), and their seed, 0 … 2⁵³
     confidence : of the intervals, in (0, 1)
-    method : 'smooth', with the penalty; or 'mlem', the maximum likelihood by expectation maximisation, without penalty
-        and intervals (Eq. M.28)
+    method : 'smooth', with the penalty; or 'mlem', maximum likelihood without penalty and intervals (Eq. M.28)
     scene : scene with the meshes of the matrix, where its own cannot be read any more
     progress : called with what is being done and the share done; without it a notebook shows a bar
     settings : accuracy
@@ -112,7 +110,7 @@ def invert(
     ------
     InversionError : an option outside its range, images without light, without an error or with all pixels masked,
         fewer pixels than J_n needs without a penalty, meshes that are not those of the matrix.
-    TransportError, DetectorError : images that do not fit the matrix, counts without the numbers of their detector.
+    TransportError, DetectorError : images that do not fit the matrix, counts without their detector's numbers.
     """
     if not isinstance(matrix, TransportMatrix):
         raise InversionError(
