@@ -55,7 +55,7 @@ def calibrate(
     """
     from ..images.reduction import read_measured
     from ..inverse.calibrate import GAIN, calibrate
-    from ..inverse.calibrated_scene import require_own_defaults
+    from ..inverse.calibrated_scene import require_files_found, require_own_defaults
     from ..inverse.calibration_fit import CalibrationSettings, UndeterminedError
 
     names = [name.strip() for name in free.split(",")]
@@ -64,6 +64,7 @@ def calibrate(
     if output is not None:
         require_writable(output, ".xml", InversionError)
         require_own_defaults(scene, [name for name in names if name != GAIN])
+        require_files_found(scene, output)
         require_apart(output, [scene, *images], error=InversionError)
     with progress_bar(quiet) as progress:
         quiet_mitsuba()

@@ -28,15 +28,29 @@ def require_own_defaults(scene: str | os.PathLike[str], names: Sequence[str]) ->
             )
 
 
+def require_files_found(scene: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
+    """Raise InversionError if files that the scene names beside it, such as meshes, are not beside `path`, too."""
+    here, there = Path(scene).parent, Path(path).parent
+    nodes = read_xml(Path(scene), {}).nodes
+    for name in [node.get("value") for node in nodes if node.get("name") == "filename"]:
+        if name and not Path(name).is_absolute() and (here / name).exists() and not (there / name).exists():
+            raise InversionError(
+                f"output file '{path}': the scene names '{name}' beside it, which is not in '{there}'. Write it into "
+                f"'{here}'."
+            )
+
+
 def write_calibrated(scene: str | os.PathLike[str], values: Mapping[str, float], path: str | os.PathLike[str]) -> None:
     """Write the text of a scene file with these values of its `<default>` parameters, written beside, then renamed.
 
     Raises
     ------
-    InversionError : a name that is not set by one `<default>` of the file, or the output cannot be written.
+    InversionError : a name that is not set by one `<default>` of the file, files beside the scene that the output
+        would not find, or the output cannot be written.
     """
     require_apart(Path(path), [Path(scene)], error=InversionError)
     require_own_defaults(scene, list(values))
+    require_files_found(scene, path)
     text = with_defaults(Path(scene).read_bytes(), values, Path(scene))
     with atomic_path(path, InversionError) as temporary:
         temporary.write_bytes(text)

@@ -88,3 +88,16 @@ def test_bad_input(run, folder, monkeypatch, arguments, words):
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert words in err
     assert files(folder) == before
+
+
+def test_a_fitted_scene_that_would_not_find_its_mesh_is_refused(run, tmp_path):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "mesh.ply").write_text("ply\n")
+    mesh = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape>'
+    text = f'<scene version="3.0.0"><default name="distance" value="165"/>{mesh}</scene>'
+    (tmp_path / "mesh.xml").write_text(text)
+    arguments = (tmp_path / "mesh.xml", tmp_path / "none.exr", "--free", "distance")
+    code, out, err = run("calibrate", *arguments, "-o", tmp_path / "other" / "fitted.xml")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert f"names 'mesh.ply' beside it, which is not in '{tmp_path / 'other'}'" in err
+    assert not list((tmp_path / "other").iterdir())
