@@ -71,7 +71,7 @@ def test_extras_are_those_of_the_project() -> None:
     extras = project["optional-dependencies"]
     brought = {
         (re.match(r"[\w-]+", requirement)[0], extra)
-        for extra in set(extras) - {"llvm", "dev"}  # no package to look for, and those of others
+        for extra in set(extras) - {"llvm", "dev", "docs"}  # no package to look for, those of others, of no verb
         for requirement in extras[extra]
         if ";" not in requirement
     }
