@@ -1,6 +1,6 @@
 """Order of convergence on silhouettes: error against lines of sight, where one edge crosses a pixel and where two do.
 
-    python scripts/silhouettes.py [--f-number 2.8] [--pixels 300] [--out docs]
+    python scripts/silhouettes.py [--f-number 2.8] [--pixels 100] [--out docs]
 
 Two glowing spheres, the near one before the far one, as in scenes/two_spheres.xml. On the pixels whose four nodes a
 silhouette parts: four and twelve nodes, ever more transects, as many on every pixel and each looked into as for rtol
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mitsuba_fspt.integral.draft import Draft
 
 RTOL = 1e-5
-GOAL = 2e-8  # error of the reference over the brightest pixel
+GOAL = 3e-7  # error of the reference over the brightest pixel
 LATTICES = (1 << 10, 1 << 12, 1 << 14)
 SHARES = {"RMS": None, "median": 0.5, "90 %": 0.9, "99 %": 0.99}  # of the pixels that are no worse
 FITTED = ("12 nodes", "2 transects", "8 transects", "24 transects")
@@ -58,7 +58,7 @@ def main() -> None:
     """Measure, write the file, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--f-number", type=float, default=2.8)
-    parser.add_argument("--pixels", type=int, default=300)
+    parser.add_argument("--pixels", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("docs"))
     arguments = parser.parse_args()
     arguments.out.mkdir(exist_ok=True)
