@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 DRAFT = 0.03  # rtol of a picture while a parameter moves
+DRAFT_NODES = 16  # lines of sight of a pixel in it: silhouettes that twelve leave unsettled wait for the full picture
 DRAFT_SAMPLES = 8  # a pixel, of such a picture by Monte Carlo
 RIGID = 1e-6  # by which the rows of a rotation may differ from orthonormal ones
 Matrix = NDArray[np.float64]  # (4, 4), points to points [mm]
@@ -119,8 +120,16 @@ class LiveScene:
         scene_id = " ".join([_name(self.source), *(f"{key}={text}" for key, text in taken.items())])
         return replace(image, metadata=image.metadata | {"scene": scene_id})
 
-    def draft(self, values: Mapping[str, object], model: str | None = None, rtol: float = DRAFT) -> Image:
-        """Quick image by the integral, to `rtol` but for spots that lines of sight may miss; parameters as of `image`.
+    def draft(
+        self,
+        values: Mapping[str, object],
+        model: str | None = None,
+        rtol: float = DRAFT,
+        max_nodes: int = DRAFT_NODES,
+    ) -> Image:
+        """Quick image by the integral, to `rtol` or with `max_nodes` lines of sight on a pixel.
+
+        Spots that lines of sight may miss are not searched for. Parameters as of `image`.
 
         Where the scene has another integrator, that takes few samples instead: the integral may leave out its light.
         A moved phantom is seen by the lens moved the other way. Raises as `image`.
@@ -130,7 +139,7 @@ class LiveScene:
         if not is_integral(integrator):
             return render(scene, sensor=self.sensor, spp=DRAFT_SAMPLES)
         own = integrator.quadrature
-        quadrature = replace(own, rtol=max(own.rtol, rtol))
+        quadrature = replace(own, rtol=max(own.rtol, rtol), max_nodes=min(own.max_nodes, max_nodes))
         solution = integrator.solve(scene, lens, quadrature, narrow=False)
         how = {"method": "integral", "rtol": quadrature.rtol}
         return Image(solution.power, solution.error, solution.coverage, how | lens.numbers())
