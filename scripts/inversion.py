@@ -1,10 +1,12 @@
 """J_n of the nylon cylinder from four noisy views, without the inverse crime: tables of error against light and stop.
 
-    python scripts/inversion.py [--spp 1024] [--samples 200] [--seeds 3] [--tables light,stop] [-o docs/inversion.csv]
+    python scripts/inversion.py [--spp 1024] [--samples 200] [--seeds 3] [--pixels 96] [--tables light,stop]
+        [-o docs/inversion.csv]
 
-The pictures are of scenes/nylon_cylinder.ply (45,002 vertices), by Mitsuba's `path`, 96 x 96 pixels a view; counts by
-`expose`, with 3.5 electrons of read noise. The inversion uses another mesh of the same cylinder (edges of 1 mm) with
-its own transport matrix. Its total is compared over what is seen, its J_n with the fine one at the nearest vertices.
+The pictures are of scenes/nylon_cylinder.ply (45,002 vertices), by Mitsuba's `path`, 96 x 96 pixels a view unless others
+are asked for, on the same field; counts by `expose`, with 3.5 electrons of read noise. The inversion uses another mesh of
+the same cylinder (edges of 1 mm) with its own transport matrix. Its total is compared over what is seen, its J_n with the
+fine one at the nearest vertices.
 
 Columns: electrons on the brightest pixel, bias of the seen total [%], half of its 90 % interval [%], share of the
 intervals that hold the total, relative L2 error of J_n [%], chi2, seconds without and with samples; means over the
@@ -35,7 +37,8 @@ from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent
 FINE = ROOT / "scenes" / "nylon_cylinder.xml"
-FILM = {"width": 96, "height": 96, "pixel_pitch": 0.288}
+FIELD = 27.648  # mm: the detector's width
+FILM = {"width": 96, "height": 96, "pixel_pitch": FIELD / 96}
 WAVELENGTH_NM = 660.0
 CCD = replace(fspt.Detector.typical_ccd(), dark_current=0.0, full_well=1e6, bits=16)
 
@@ -179,11 +182,13 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=200)
     parser.add_argument("--edge", type=float, default=1.0)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--pixels", type=int, default=FILM["width"], help="a side")
     parser.add_argument("--tables", default="light", help="Among light, stop, views, gain, pose, law.")
     parser.add_argument("--report", type=Path, help="Picture of the row of 1e3 electrons of `light`, .png.")
     parser.add_argument("--folder", type=Path, default=Path("out"))
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "inversion.csv")
     arguments = parser.parse_args()
+    FILM.update(width=arguments.pixels, height=arguments.pixels, pixel_pitch=FIELD / arguments.pixels)
     arguments.folder.mkdir(exist_ok=True)
     scene, table = coarse_scene(arguments.folder, arguments.edge), []
     for case in (case for case in CASES if case.table in arguments.tables.split(",")):
