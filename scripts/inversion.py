@@ -3,10 +3,10 @@
     python scripts/inversion.py [--spp 1024] [--samples 200] [--seeds 3] [--pixels 96] [--tables light,stop]
         [-o docs/inversion.csv]
 
-The pictures are of scenes/nylon_cylinder.ply (45,002 vertices), by Mitsuba's `path`, 96 x 96 pixels a view unless others
-are asked for, on the same field; counts by `expose`, with 3.5 electrons of read noise. The inversion uses another mesh of
-the same cylinder (edges of 1 mm) with its own transport matrix. Its total is compared over what is seen, its J_n with the
-fine one at the nearest vertices.
+The pictures are of scenes/nylon_cylinder.ply (45,002 vertices), by Mitsuba's `path`, 96 x 96 pixels a view unless
+others are asked for, on the same field; counts by `expose`, with 3.5 electrons of read noise. The inversion uses
+another mesh of the same cylinder (edges of 1 mm) with its own transport matrix. Its total is compared over what is
+seen, its J_n with the fine one at the nearest vertices.
 
 Columns: electrons on the brightest pixel, bias of the seen total [%], half of its 90 % interval [%], share of the
 intervals that hold the total, relative L2 error of J_n [%], chi2, seconds without and with samples; means over the
