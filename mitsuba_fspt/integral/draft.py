@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
 from . import node_rules
-from .eq9 import View
+from .eq9 import View, most_radiance
 from .progress import SILENT, Progress
 from .quadrature import Quadrature
 from .solution import Solution
@@ -41,7 +41,7 @@ class Draft:
     outline : True within a pixel of both a hit and a miss
     shown : False on the rim, True everywhere where there is none
     clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
-    open, known : False where the value is known from elsewhere, and that value
+    open, known, known_error : False where the value is known from elsewhere, that value and its error
     least_peak : lower bound of the brightest pixel, of a picture that this one is a tile of [W/mm²/sr]
     progress : called after each step with the share of the steps that is done
     grid : the pixels that are computed; all of the window unless another grid is given
@@ -72,10 +72,13 @@ class Draft:
             inside, cut = window.field_stop(view.lens)
             self.clipped, self.outside = grid.flat(cut & self.area), grid.flat(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
-        self.open, self.known = grid.full(mi.Bool, True), grid.full(mi.Float64, 0)
+        self.open = grid.full(mi.Bool, True)
+        self.known, self.known_error = (grid.full(mi.Float64, 0) for _ in range(2))
         if known is not None:
             self.open = grid.flat(~window.cut(known.where))
-            self.known = grid.flat(window.cut(known.power) / view.lens.etendue)
+            self.known, self.known_error = (
+                grid.flat(window.cut(image) / view.lens.etendue) for image in (known.power, known.error)
+            )
         self.nodes = self.rays = 0
         self.levels: list[str] = []
         self.findings = view.findings()
@@ -109,7 +112,7 @@ class Draft:
         if self.view.specular:
             # The few lines of a pixel may pass by what a neighbour's meet.
             lost = self.grid.spread_max(self.lost, self.reach(self.nodes)[1])
-            error += lost * dr.opaque(mi.Float64, self.view.most_radiance())
+            error += lost * dr.opaque(mi.Float64, most_radiance(self.view.scene))
         coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))
         etendue = dr.opaque(mi.Float64, self.lens.etendue)
         power, error = etendue * self.value, etendue * dr.select(self.outside, 0, error)
@@ -121,6 +124,10 @@ class Draft:
         """The picture as it is, on the crop window."""
         arrays = (self.window.expand(self.grid.array(image)) for image in self.images())
         return Solution(*arrays, self.rays, tuple(self.levels), findings=tuple(self.findings))
+
+    def recall_known_errors(self) -> None:
+        """Errors of values that are known from elsewhere; until then those of the rules tell about their neighbours."""
+        self.error = dr.select(self.open, self.error, self.known_error)
 
     def count(self, what: str, pixels_touched: int, rays: int) -> None:
         """Note a rung of the ladder."""

@@ -165,14 +165,6 @@ class View:
             return met
         return met & (dr.gather(mi.Float, self.emitting, number, met) > 0)
 
-    def most_radiance(self) -> float:
-        """Upper bound of the radiance of any surface with an `fspt_surface` [W/mm²/sr].
-
-        J_n/π under Lambert's law; no law sends more than J_n per steradian.
-        """
-        own = [emitter for emitter in self.scene.emitters() if is_surface(emitter)]
-        return max((e.brightest / (math.pi if e.is_isotropic() else 1) for e in own), default=0.0)
-
     def findings(self) -> list[Finding]:
         """Whether lines of sight end at the first surface, and do without Mitsuba's surface records."""
         why = "what glows are meshes, J_n is linear on every face, the radiance the same in all directions"
@@ -189,6 +181,15 @@ class View:
             return self.faces.radiance(pi, ray.d)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         return scalar(si.emitter(self.scene).eval(si))
+
+
+def most_radiance(scene: mi.Scene) -> float:
+    """Upper bound of the radiance of any surface with an `fspt_surface` [W/mm²/sr].
+
+    J_n/π under Lambert's law; no law sends more than J_n per steradian.
+    """
+    own = [emitter for emitter in scene.emitters() if is_surface(emitter)]
+    return max((e.brightest / (math.pi if e.is_isotropic() else 1) for e in own), default=0.0)
 
 
 def _emitting(shapes: list[mi.Shape]) -> mi.Float | None:

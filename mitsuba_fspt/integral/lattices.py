@@ -1,12 +1,13 @@
 """Lattices over pixel × pupil, for pixels on which transects do not settle: corners, many edges, rough textures.
 
-A rank-1 lattice of n points in four dimensions is moved by a random shift. The means over several shifts are
-independent estimates without bias, and their scatter is the error, whatever the integrand.
+A rank-1 lattice in four dimensions is moved by a random shift. The means over several shifts are independent estimates
+without bias, and their scatter is the error, whatever the integrand. Points are taken in such an order that the first
+2^m of them are a lattice for every m, so that each step adds points to those of the last one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -15,89 +16,128 @@ import mitsuba as mi
 from ..jit.batches import batches
 from ..jit.loops import repeat
 from .draft import Draft
+from .eq9 import most_radiance
 
 if TYPE_CHECKING:
-    from ..jit.pixel_grid import Mask, PixelArray
+    from ..jit.pixel_grid import PixelArray
 
-# Generating vector lattice-32001-1024-1048576.3600 of R. Cools, F. Kuo, D. Nuyens (SIAM J. Sci. Comput. 28, 2006), for
-# any power of two of points from 2¹⁰ to 2²⁰; x and y of pixel and pupil.
-VECTOR = (1, 182667, 469891, 498753)
-POINTS = (1 << 10, 1 << 13)  # of the first lattice and of the second one
+# x and y of pixel and pupil. Of a million random vectors, among those none of whose two-dimensional projections has a
+# dual vector below 0.45 of the longest one possible, the one with the least error P₂ (Sloan and Joe 1994) at 2¹⁰ … 2¹⁸
+# points. With a vector that is poor at one of these sizes, more points would gain nothing there.
+VECTOR = (1, 949661, 683229, 634757)
+FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
 UNMET = 6.9  # over the number of all points: a part of pixel × pupil that they all pass by in one case of 1000
 CERTAIN = 4.1  # standard errors of the mean of 16 shifts that 999 of 1000 pixels stay within (Student's t)
+# By which the error falls at best with the number of points where the integrand jumps at a smooth edge, 1/2 + 1/(2 d):
+# an edge in focus depends on d = 2 coordinates. Lattices end where the points that are left would not do.
+ORDER = 0.75
 
 
 def settle_by_lattices(draft: Draft) -> None:
-    """Value and error of the pixels that are above the tolerance, where lattices leave less error."""
-    for points in POINTS:
-        unmet = dr.opaque(mi.Float64, UNMET / (points * SHIFTS)) * draft.near_edge(draft.value)
-        where = draft.open & draft.shown & ~draft.outside & (draft.error > dr.maximum(draft.tolerance, unmet))
-        if draft.quadrature.max_nodes < points * SHIFTS or not dr.any(where):
-            continue
-        found = apply_lattice(draft, where, points)
-        error = dr.maximum(found.error, unmet)
-        # The transects' value is often far better than its estimate: it stays where it is confirmed to the tolerance,
-        # and where lattices do not reach the tolerance either.
-        apart = dr.abs(found.value - draft.value)
-        keep = (apart + error <= draft.tolerance) | (error > draft.tolerance)
-        error = dr.select(keep, apart + error, error)
-        better = where & (error < draft.error)
-        draft.value = dr.select(better & ~keep, found.value, draft.value)
-        draft.coverage = dr.select(better & ~keep, found.coverage, draft.coverage)
-        draft.error = dr.select(better, error, draft.error)
-        dr.eval(draft.value, draft.error, draft.coverage)
+    """Value and error of the pixels above the tolerance, from ever more points until they are below it.
+
+    What is known from elsewhere is of light that may be far brighter than what lines of sight met around.
+    """
+    most = min(draft.quadrature.max_nodes // SHIFTS, MOST)
+    above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
+    if most < FIRST or not dr.any(above):
+        return
+    tolerance = draft.tolerance
+    brightest = dr.select(
+        draft.open, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
+    )
+    means, points = Means.none(draft.grid.pixels(above)), 0
+    while points < most:
+        more = min(GROWTH * points or FIRST, most)
+        means, points = means.refined(draft, points, more), more
+        unmet = dr.opaque(mi.Float64, UNMET / (points * SHIFTS)) * dr.gather(mi.Float64, brightest, means.pixels)
+        error = dr.maximum(means.error, unmet)
+        better = error < dr.gather(mi.Float64, draft.error, means.pixels)
+        for image, column in ((draft.value, means.value), (draft.coverage, means.share), (draft.error, error)):
+            dr.scatter(image, column, means.pixels, better)
+        dr.eval(draft.value, draft.coverage, draft.error)
+        share = points / most
+        reached = dr.maximum(dr.opaque(mi.Float64, share**ORDER) * means.error, dr.opaque(mi.Float64, share) * unmet)
+        left = (error > tolerance) & (reached <= tolerance)
+        if not dr.any(left):
+            break
+        means = means.of(left)
 
 
 @dataclass(frozen=True)
-class Found:
-    """Of each marked pixel mean radiance on film [W/mm²/sr], its error, and coverage; 0 elsewhere."""
+class Means:
+    """Of each of the `pixels` (n,), shift by shift (16 n,): mean `radiance` on film [W/mm²/sr] and `coverage`."""
 
-    value: PixelArray
-    error: PixelArray
+    pixels: mi.UInt32
+    radiance: PixelArray
     coverage: PixelArray
 
+    @classmethod
+    def none(cls, pixels: mi.UInt32) -> Means:
+        """Of no points yet."""
+        zero = dr.zeros(mi.Float64, dr.width(pixels) * SHIFTS)
+        return cls(pixels, zero, zero)
 
-def apply_lattice(draft: Draft, where: Mask, points: int) -> Found:
-    """Means over `SHIFTS` lattices of so many points at the marked pixels."""
-    index = draft.grid.pixels(where)
-    images = [draft.grid.full(mi.Float64, 0) for _ in range(3)]
-    for part in batches(index, SHIFTS):
-        value, coverage = _means(draft, part, points)
-        mean = dr.block_sum(value, SHIFTS) / SHIFTS
-        deviation = value - dr.repeat(mean, SHIFTS)
-        error = CERTAIN * dr.sqrt(dr.block_sum(deviation * deviation, SHIFTS) / (SHIFTS * (SHIFTS - 1)))
-        for image, column in zip(images, (mean, error, dr.block_sum(coverage, SHIFTS) / SHIFTS), strict=True):
-            dr.scatter(image, column, part)
-        dr.eval(images)
-    count = dr.width(index)
-    draft.count(f"{SHIFTS} lattices of {points}", count, count * SHIFTS * points)
-    return Found(*images)
+    @property
+    def value(self) -> PixelArray:
+        """Mean radiance on film of each pixel [W/mm²/sr]."""
+        return dr.block_sum(self.radiance, SHIFTS) / SHIFTS
+
+    @property
+    def share(self) -> PixelArray:
+        """Coverage of each pixel."""
+        return dr.block_sum(self.coverage, SHIFTS) / SHIFTS
+
+    @property
+    def error(self) -> PixelArray:
+        """Of `value` [W/mm²/sr]; 999 of 1000 are within."""
+        deviation = self.radiance - dr.repeat(self.value, SHIFTS)
+        return CERTAIN * dr.sqrt(dr.block_sum(dr.square(deviation), SHIFTS) / (SHIFTS * (SHIFTS - 1)))
+
+    def of(self, which: mi.Bool) -> Means:
+        """Those of some of the pixels."""
+        number = dr.compress(which)
+        shifts = dr.repeat(number * SHIFTS, SHIFTS) + dr.tile(dr.arange(mi.UInt32, SHIFTS), dr.width(number))
+        columns = (dr.gather(mi.Float64, column, shifts) for column in (self.radiance, self.coverage))
+        return Means(dr.gather(mi.UInt32, self.pixels, number), *columns)
+
+    def refined(self, draft: Draft, points: int, more: int) -> Means:
+        """Means over so many points `more`, powers of two, of which these are over the first `points`."""
+        sums = [dr.zeros(mi.Float64, dr.width(self.pixels) * SHIFTS) for _ in range(2)]
+        runs = (more - points) // FIRST
+        lanes = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS * runs)
+        for part in batches(lanes, FIRST):
+            shift, run = part // runs, part % runs
+            for total, column in zip(sums, _run(draft, self.pixels, shift, points + run * FIRST), strict=True):
+                dr.scatter_add(total, column, shift)
+            dr.eval(sums)
+        draft.count(f"{SHIFTS} lattices of {more}", dr.width(self.pixels), (more - points) * dr.width(sums[0]))
+        old, new = (dr.opaque(mi.Float64, share) for share in (points / more, 1 / more))
+        radiance, coverage = (
+            old * before + new * total for before, total in zip((self.radiance, self.coverage), sums, strict=True)
+        )
+        dr.eval(radiance, coverage)
+        return replace(self, radiance=radiance, coverage=coverage)
 
 
-def _means(draft: Draft, pixels: mi.UInt32, points: int) -> tuple[PixelArray, PixelArray]:
-    """Mean integrand and coverage of each shift of each pixel, the shifts of a pixel one after the other."""
-    lane = dr.arange(mi.UInt32, dr.width(pixels) * SHIFTS)
-    pixel = dr.gather(mi.UInt32, pixels, lane // SHIFTS)
+def _run(draft: Draft, pixels: mi.UInt32, shift: mi.UInt32, first: mi.UInt32) -> tuple[PixelArray, PixelArray]:
+    """Sums of integrand and coverage over `FIRST` points from the `first` on, of so many a `shift` of all pixels'."""
+    pixel = dr.gather(mi.UInt32, pixels, shift // SHIFTS)
     centre, area = draft.centres(pixel), dr.opaque(mi.Float, float(draft.area))
-    shifts = [mi.sample_tea_32(pixel, SHIFTS * k + lane % SHIFTS)[0] for k in range(len(VECTOR))]
-    count, step = dr.opaque(mi.UInt32, points), dr.opaque(mi.UInt32, (1 << 32) // points)
+    shifts = [mi.sample_tea_32(pixel, SHIFTS * k + shift % SHIFTS)[0] for k in range(len(VECTOR))]
 
     def look(k: mi.UInt32, value: mi.Float64, coverage: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
         # In units of 2⁻³², where whole numbers wrap around as a lattice does.
+        point = dr.brev(first + k)
         x, y, u, v = (
-            _folded(shift + k * dr.opaque(mi.UInt32, generator) * step)
-            for shift, generator in zip(shifts, VECTOR, strict=True)
+            _folded(start + point * dr.opaque(mi.UInt32, step)) for start, step in zip(shifts, VECTOR, strict=True)
         )
         pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
         sight = draft.view.integrand(centre + area * mi.Point2f(x - 0.5, y - 0.5), pupil)
         return value + mi.Float64(sight.integrand), coverage + dr.select(sight.covered, mi.Float64(1), 0)
 
-    value, coverage = repeat(count, look, mi.Float64(0), mi.Float64(0))
-    share = dr.opaque(mi.Float64, 1 / points)
-    value, coverage = value * share, coverage * share
-    dr.eval(value, coverage)
-    return value, coverage
+    return repeat(dr.opaque(mi.UInt32, FIRST), look, mi.Float64(0), mi.Float64(0))
 
 
 def _folded(place: mi.UInt32) -> mi.Float:

@@ -73,6 +73,8 @@ def refine(draft: Draft, light: NDArray[np.float64]) -> None:
         draft.doubt(rough)
     elif dr.any(rough):
         integrate_by_transects(draft, rough, levels)
+    draft.recall_known_errors()
+    if levels:
         settle_by_lattices(draft)
     progress(1.0)
 

@@ -24,8 +24,8 @@ class Quadrature:
     rtol : absolute error of every pixel, relative to the brightest pixel; 2e-7 <= rtol < 1 (default 1e-3)
     domain : 'pupil' (lines of sight from the pixel) or 'surface' (power spread from surface elements)
     pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
-    max_nodes : lines of sight a pixel may take at most, four in any case (domain 'surface': on average, 256 in any
-        case); bounds the time, and where it is reached the error says so
+    max_nodes : lines of sight a pixel may take at most, four in any case (default 2²²; domain 'surface': on
+        average, 256 … 65,536 in any case); bounds the time, and where it is reached the error says so
     max_specular : specular surfaces that a line of sight goes through or off at most, 0 … 64 (default 8); what is cut
         off there is in the error
     shortcuts_off : names of `SHORTCUTS` that are not taken; they change no more than the error asked for
@@ -34,13 +34,13 @@ class Quadrature:
     rtol: float = 1e-3
     domain: str = "pupil"
     pixel: str = "area"
-    max_nodes: int = 200_000
+    max_nodes: int = 1 << 22
     max_specular: int = 8
     shortcuts_off: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rtol", number("'rtol'", self.rtol, SceneError, "1e-3"))
-        nodes = whole("'max_nodes'", self.max_nodes, SceneError, "200000")
+        nodes = whole("'max_nodes'", self.max_nodes, SceneError, "4194304")
         object.__setattr__(self, "max_nodes", nodes)
         if not (math.isfinite(self.rtol) and 0 < self.rtol < 1):
             raise SceneError(f"'rtol' must be in (0, 1), got {self.rtol:g}. Give for example 1e-3.")
@@ -54,7 +54,7 @@ class Quadrature:
         if self.pixel not in PIXELS:
             raise SceneError(f"'pixel' must be one of {', '.join(PIXELS)}, got '{self.pixel}'.")
         if self.max_nodes < 1:
-            raise SceneError(f"'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 200000.")
+            raise SceneError(f"'max_nodes' must be >= 1, got {self.max_nodes}. Give for example 4194304.")
         specular = whole("'max_specular'", self.max_specular, SceneError, "8")
         object.__setattr__(self, "max_specular", specular)
         if not 0 <= specular <= MOST_SPECULAR:

@@ -36,13 +36,12 @@ class Solution:
         return int(np.count_nonzero(self.error > rtol * peak)), float(self.error.max() / peak)
 
     def completed_by(self, rest: Solution) -> Solution:
-        """This partial solution on its own pixels, `rest` elsewhere."""
-        planes = zip((self.power, self.error, self.coverage), (rest.power, rest.error, rest.coverage), strict=True)
-        power, error, coverage = (np.where(self.where, own, other) for own, other in planes)
+        """This partial solution on its own pixels, unless `rest` states a smaller error there; `rest` elsewhere."""
+        better = self.where & (self.error <= rest.error)
         return Solution(
-            power,
-            error,
-            coverage,
+            np.where(better, self.power, rest.power),
+            np.where(better, self.error, rest.error),
+            np.where(self.where, self.coverage, rest.coverage),
             self.rays + rest.rays,
             self.levels + rest.levels,
             findings=self.findings + rest.findings,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..jit.pixel_grid import Grid
 from ..jit.spectra import scalar
 from . import pupil_cells
-from .eq9 import eq9, etendue_from_surface
+from .eq9 import eq9, etendue_from_surface, most_radiance
 from .footprint import Canvas
 from .glow import CORNERS, Batch, Glow
 from .occlusion import hides_nothing
@@ -34,6 +34,9 @@ from .window import Window
 # Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second
 # level both pieces and cells are refined, or what one of them does wrong would pass for converged.
 FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
+MOST_LINES = 1 << 16  # a pixel of an image
+# The same on some pixels, if the pupil form's lattices can go on: with light up to so many times brighter than a pixel.
+HANDED_ON, SETTLED = 1 << 12, 10.0
 BLURRED = 0.5  # of the blur radius: a smaller piece of a small shape is imaged as one point
 DARK_LINES = 4096  # lines of sight a pixel before a pixel without light counts as dark: two levels may miss it
 SAFETY = 3.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
@@ -61,7 +64,8 @@ def solve(
     on the pixels marked there and 0 elsewhere. `least_peak`: lower bound of the brightest pixel's mean radiance on film
     [W/mm²/sr]. `progress` is called after every level.
 
-    `max_nodes` bounds the lines of sight a pixel of an image takes on average; two levels are run in any case.
+    `max_nodes`, but no more than `MOST_LINES`, bounds the lines of sight a pixel of an image takes on average; two
+    levels are run in any case.
     Light goes on through `specular` shapes where it stays straight. Coverage counts the lines of sight that meet a
     glowing surface, not those that meet a dark one. Raises SceneError where an emitter has no surface.
     """
@@ -87,12 +91,14 @@ class _Refinement:
         # For a few pixels shadow rays are quicker than the test that makes them unnecessary.
         self.hidden = where is not None or not self._hides_nothing()
         shown = self.window.shown()
+        partial = where is not None
         mark = where = shown if where is None else where
-        lines, most = FIRST_LINES, max(self.quadrature.max_nodes, FIRST_LINES * FIRST_GROWTH)
-        levels = 2 + math.floor(math.log(most / (FIRST_LINES * FIRST_GROWTH), GROWTH))
+        lines = FIRST_LINES
         if mark.any():
             self.value, self.coverage = (np.where(where, image, 0) for image in self._level(lines, mark))
             self.glows = [glow.finer(self._tolerance(least_peak)) for glow in self.glows]
+        most = self._most_lines(partial, least_peak)
+        levels = 2 + math.floor(math.log(most / (FIRST_LINES * FIRST_GROWTH), GROWTH))
         recent, grid = None, Grid(self.window.shape)
         while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
             progress(len(self.levels) / levels)
@@ -111,6 +117,12 @@ class _Refinement:
         known = self.window.expand(where.astype(np.float64)) > 0
         progress(1.0)
         return Solution(power, error, coverage, self.rays, tuple(self.levels), known, self._findings())
+
+    def _most_lines(self, partial: bool, least_peak: float) -> int:
+        """Lines of sight a pixel of the image at the last level; `partial`: where the pupil form goes on."""
+        bright = SETTLED * self._tolerance(least_peak) / self.quadrature.rtol
+        most = HANDED_ON if partial and most_radiance(self.scene) <= bright else MOST_LINES
+        return max(min(self.quadrature.max_nodes, most), FIRST_LINES * FIRST_GROWTH)
 
     def _tolerance(self, least_peak: float) -> float:
         """The error asked for [W/mm²/sr]."""

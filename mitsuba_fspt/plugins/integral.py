@@ -64,8 +64,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
        - area: integrate over the pixel (Default). centre: the value at its centre times its area, as in the paper.
      * - max_nodes
        - |int|
-       - Most lines of sight per pixel (Default: 200000), four in any case; domain surface: on average, and 256 in any
-         case.
+       - Most lines of sight per pixel (Default: 4194304), four in any case; domain surface: on average, 256 … 65536 in
+         any case.
      * - max_specular
        - |int|
        - Specular surfaces (null, thin and solid glass, mirrors, masks) that a line of sight goes through or off at most
