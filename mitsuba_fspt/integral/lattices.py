@@ -39,7 +39,7 @@ def settle_by_lattices(draft: Draft) -> None:
 
     What is known from elsewhere is of light that may be far brighter than what lines of sight met around.
     """
-    most = min(draft.quadrature.max_nodes // SHIFTS, MOST)
+    most = min(1 << (draft.quadrature.max_nodes // SHIFTS).bit_length() >> 1, MOST)  # a power of two
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
     if most < FIRST or not dr.any(above):
         return
