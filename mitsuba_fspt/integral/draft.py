@@ -24,7 +24,6 @@ FULL = 1e-6  # share of lines of sight that may miss where all hit: rounding of 
 # nodes and where it passes through the rule's gap at the rim of the pupil.
 CUT = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
 UNSEEN = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
-UNSEEN_BY_TRANSECTS = 0.0125
 IN_FOCUS = 0.3  # blur radius [pixels] below which an edge counts as sharp in these tables
 
 
@@ -58,6 +57,7 @@ class Draft:
         grid: Grid | None = None,
     ) -> None:
         self.view, self.lens, self.window, self.quadrature = view, view.lens, window, quadrature
+        self.estimator = quadrature.estimator
         self.least_peak, self.progress = least_peak, progress
         self.area = quadrature.pixel == "area"
         self.grid = grid = grid or Grid(window.shape)
@@ -189,7 +189,9 @@ class Draft:
     def unseen_by_transects(self, split: Mask) -> PixelArray:
         """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump."""
         reach, most = self.reach("transects")
-        return dr.select(self.grid.grow(split, reach, most), UNSEEN_BY_TRANSECTS * self._whole(most), 0)
+        return dr.select(
+            self.grid.grow(split, reach, most), dr.opaque(mi.Float64, self.estimator.unseen) * self._whole(most), 0
+        )
 
     def wanted(self) -> Mask:
         """Pixels that are shown, and of the rim those that may know of an edge which transects pass by there."""

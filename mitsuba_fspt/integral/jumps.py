@@ -17,7 +17,6 @@ from .specular import first_met
 from .transect import Transect
 
 MOST_STEPS = 2  # of jumps within a body: beside two the scan has too little left to tell a third from a slope
-STEEP = 4.0  # a jump is so many times larger than the mean of the transect's other steps
 SHIFT = 0.1  # of an interval: by which scanned points are moved, as the phase wants
 SHORTEST = 1e-6  # half of a piece, lest its moments are divided by nothing
 FLAT = 1e-4  # variance of z over nodes that lie in one place
@@ -30,13 +29,15 @@ def integrate_transect(
     along: AlongTransect,
     outline: mi.Float,
     least: mi.Float,
+    steep: float,
 ) -> tuple[mi.Float, ...]:
     """Of a transect means of integrand and coverage, number of jumps, depth of the edge at the largest, lines of sight.
 
     It is split at its `MOST_JUMPS` largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points,
     then bisected towards the larger difference; every piece that is not dark gets `along.nodes` at even distances, the
     first of them at `phase` of one; a transect without a jump is one piece. In units of the integrand an `outline`
-    counts so much as a jump of the radiance, and less than `least` does not.
+    counts so much as a jump of the radiance, and less than `least` does not. A jump within a body is `steep` times the
+    mean of the transect's other steps.
     """
     together = view.detail <= TRANSECTS_TOGETHER
 
@@ -47,7 +48,7 @@ def integrate_transect(
             return mi.Vector4f(sight.radiance, sight.body, sight.depth, sight.front)
         return mi.Point3f(sight.radiance, sight.body, sight.depth)
 
-    found = _search(look, phase, along, outline, least, mi.Vector4f(0) if view.specular else mi.Point3f(0))
+    found = _search(look, phase, along, outline, least, steep, mi.Vector4f(0) if view.specular else mi.Point3f(0))
     jumps, places = found.jumps, found.places()
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
@@ -164,6 +165,7 @@ def _search(
     along: AlongTransect,
     outline: mi.Float,
     least: mi.Float,
+    steep: float,
     nothing: Seen,
 ) -> _Search:
     """Jumps of what lines of sight `look` at; scan and bisection are one loop, so that it is compiled once.
@@ -172,8 +174,7 @@ def _search(
     """
     intervals, bisections = dr.opaque(mi.UInt32, along.scan), dr.opaque(mi.UInt32, along.bisections)
     number = mi.Float(intervals)
-    # Where edges run along pixels they would lie on points to bisect, and rounding choose the side.
-    shift = SHIFT * (phase - 0.5)
+    shift = SHIFT * (phase - 0.5)  # edges along pixels would lie on points to bisect, and rounding choose the side
 
     def scan(found: _Search, s: mi.Float, seen: Seen) -> _Search:
         new = _Jump(mi.Point2f(found.place, s), found.seen, seen)
@@ -190,7 +191,7 @@ def _search(
             rest = rest - most  # not `-=`, which would change the total with it
             jump = most >= outline
             if k < MOST_STEPS:
-                jump = jump | (most > dr.maximum(STEEP * rest / (number - (k + 1)), least))
+                jump = jump | (most > dr.maximum(steep * rest / (number - (k + 1)), least))
             large &= jump
             jumps += dr.select(large, mi.UInt32(1), 0)
         lit = dr.select(_met(seen), mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
-UNMET = 6.9  # over the number of all points: a part of pixel × pupil that they all pass by in one case of 1000
-CERTAIN = 4.1  # standard errors of the mean of 16 shifts that 999 of 1000 pixels stay within (Student's t)
 # By which the error falls at best with the number of points where the integrand jumps at a smooth edge, 1/2 + 1/(2 d):
 # an edge in focus depends on d = 2 coordinates. Lattices end where the points that are left would not do.
 ORDER = 0.75
@@ -51,14 +49,17 @@ def settle_by_lattices(draft: Draft) -> None:
     while points < most:
         more = min(GROWTH * points or FIRST, most)
         means, points = means.refined(draft, points, more), more
-        unmet = dr.opaque(mi.Float64, UNMET / (points * SHIFTS)) * dr.gather(mi.Float64, brightest, means.pixels)
-        error = dr.maximum(means.error, unmet)
+        unmet = dr.opaque(mi.Float64, draft.estimator.unmet / (points * SHIFTS)) * dr.gather(
+            mi.Float64, brightest, means.pixels
+        )
+        scatter = draft.estimator.certain * means.standard_error
+        error = dr.maximum(scatter, unmet)
         better = error < dr.gather(mi.Float64, draft.error, means.pixels)
         for image, column in ((draft.value, means.value), (draft.coverage, means.share), (draft.error, error)):
             dr.scatter(image, column, means.pixels, better)
         dr.eval(draft.value, draft.coverage, draft.error)
         share = points / most
-        reached = dr.maximum(dr.opaque(mi.Float64, share**ORDER) * means.error, dr.opaque(mi.Float64, share) * unmet)
+        reached = dr.maximum(dr.opaque(mi.Float64, share**ORDER) * scatter, dr.opaque(mi.Float64, share) * unmet)
         left = (error > tolerance) & (reached <= tolerance)
         if not dr.any(left):
             break
@@ -90,10 +91,10 @@ class Means:
         return dr.block_sum(self.coverage, SHIFTS) / SHIFTS
 
     @property
-    def error(self) -> PixelArray:
-        """Of `value` [W/mm²/sr]; 999 of 1000 are within."""
+    def standard_error(self) -> PixelArray:
+        """Of `value` [W/mm²/sr], by the scatter of the shifts."""
         deviation = self.radiance - dr.repeat(self.value, SHIFTS)
-        return CERTAIN * dr.sqrt(dr.block_sum(dr.square(deviation), SHIFTS) / (SHIFTS * (SHIFTS - 1)))
+        return dr.sqrt(dr.block_sum(dr.square(deviation), SHIFTS) / (SHIFTS * (SHIFTS - 1)))
 
     def of(self, which: mi.Bool) -> Means:
         """Those of some of the pixels."""

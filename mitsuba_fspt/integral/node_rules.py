@@ -130,7 +130,6 @@ STEPS = {2: (1, 1), 8: (3, 5), 24: (5, 11), 72: (19, 61)}
 TREND = 3  # degree across the pupil that says nothing yet of a kink
 SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
 MOST_JUMPS = 3  # that split a transect: one body before another has three outlines
-TRANSECT_ORDER = 1.5  # by which the error falls at least, whatever two levels agree on
 
 
 @dataclass(frozen=True)

@@ -21,15 +21,7 @@ if TYPE_CHECKING:
     from ..jit.pixel_grid import Mask, PixelArray
 
 BOTH = 4 + 12  # lines of sight a pixel, without which four must do
-POINT = 0.1  # of rtol: what the curvature of cos⁴θ over the pupil may make
-IN_PIXEL = 0.5  # blur radius that stays in the pixel
-SETTLED = 0.25  # of the tolerance: where the picture bends less, more nodes would change it by less than a tenth
-PASSED = 2.0  # times brighter than all lines of sight around saw is what they passed by
 TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
-MOST_GAIN = 8.0  # twelve nodes may agree with four by chance: no better than the estimate for four over this
-# No difference between four and twelve nodes promises more than to shrink to the first; where it is as large as what
-# four were thought to be wrong by, both are but samples of something rough, and may agree by chance.
-LEAST_GAIN, ROUGH_GAIN = 0.5, 2.0
 
 
 def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
@@ -68,7 +60,7 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     bend = grid.spread_max(bend)
     draft.error = dr.maximum(bend, draft.cut_off())
     tolerance = draft.tolerance
-    rough = (draft.error > tolerance) | (bend > SETTLED * tolerance)
+    rough = (draft.error > tolerance) | (bend > draft.estimator.settled * tolerance)
     dr.eval(draft.error, rough)
     if (neighbours and min(grid.shape) < 3) or not draft.quadrature.takes("smooth"):
         rough = grid.full(mi.Bool, True)
@@ -111,7 +103,7 @@ def _passed_by(draft: Draft, light: PixelArray) -> Mask:
 
     What is up to √2 pixels wide may lie between the lines.
     """
-    least = dr.maximum(PASSED * draft.grid.spread_max(draft.value), draft.tolerance)
+    least = dr.maximum(draft.estimator.passed * draft.grid.spread_max(draft.value), draft.tolerance)
     return draft.open & ~draft.outside & (light > least)
 
 
@@ -119,7 +111,8 @@ def _one_will_do(draft: Draft) -> bool:
     """True where lines of sight differ over the pupil, if at all, like the picture over the pixel."""
     lens, blur = draft.lens.optics, draft.window.blur
     curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
-    will_do = curvature <= POINT * draft.quadrature.rtol and blur <= IN_PIXEL and len(lens.discs) == 1
+    estimator, rtol = draft.estimator, draft.quadrature.rtol
+    will_do = curvature <= estimator.point * rtol and blur <= estimator.in_pixel and len(lens.discs) == 1
     bends = bool(draft.view.specular and draft.view.specular.bending)
     lambert = all(getattr(emitter, "is_isotropic", bool)() for emitter in draft.view.scene.emitters())
     taken = will_do and lambert and not bends and draft.quadrature.takes("one line")
@@ -140,11 +133,11 @@ def _refine(draft: Draft, where: Mask) -> PixelArray:
     draft.set_coverage(dr.select(where, seen.coverage, draft.coverage))
     draft.nearest = dr.minimum(draft.nearest, seen.nearest)
     draft.lost = dr.select(where, dr.maximum(draft.lost, seen.lost), draft.lost)
-    left = difference * dr.clip(gain, LEAST_GAIN, ROUGH_GAIN)
+    left = difference * dr.clip(gain, draft.estimator.converged, draft.estimator.rough)
     rough = dr.select(parted(seen.coverage), 0, dr.maximum(left, difference))
     rough, left = draft.grid.spread_all((rough, left))
     draft.roughness = dr.maximum(draft.roughness, rough)
-    error = dr.maximum(left, draft.error / MOST_GAIN)
+    error = dr.maximum(left, draft.error / draft.estimator.agreed)
     draft.error = dr.select(where, dr.maximum(error, draft.cut_off()), draft.error)
     dr.eval(draft.value, draft.error, draft.roughness, draft.nearest, draft.lost, difference)
     return difference

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..runtime.errors import SceneError
 from ..runtime.numbers import number, whole
+from .estimator import Estimator
 from .shortcuts import SHORTCUTS
 
 DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
@@ -29,6 +30,7 @@ class Quadrature:
     max_specular : specular surfaces that a line of sight goes through or off at most, 0 … 64 (default 8); what is cut
         off there is in the error
     shortcuts_off : names of `SHORTCUTS` that are not taken; they change no more than the error asked for
+    estimator : thresholds of the pupil form's error estimates
     """
 
     rtol: float = 1e-3
@@ -37,6 +39,7 @@ class Quadrature:
     max_nodes: int = 1 << 22
     max_specular: int = 8
     shortcuts_off: frozenset[str] = frozenset()
+    estimator: Estimator = field(default_factory=Estimator)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rtol", number("'rtol'", self.rtol, SceneError, "1e-3"))
@@ -61,6 +64,11 @@ class Quadrature:
             raise SceneError(f"'max_specular' must be in 0 … {MOST_SPECULAR}, got {specular}. Give for example 8.")
         if unknown := set(self.shortcuts_off) - set(SHORTCUTS):
             raise SceneError(f"'shortcuts_off' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}.")
+
+    def metadata(self) -> dict[str, str | float]:
+        """What was asked for, as an image's metadata have it."""
+        asked = {name: value for name, value in vars(self).items() if name not in ("estimator", "shortcuts_off")}
+        return asked | {"shortcuts_off": ", ".join(sorted(self.shortcuts_off)) or "nothing"}
 
     @property
     def least_error(self) -> float:

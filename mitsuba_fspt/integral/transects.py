@@ -20,23 +20,8 @@ from .transect import transect
 if TYPE_CHECKING:
     from ..jit.pixel_grid import Mask, PixelArray
 
-# Of the difference to nodes may be left in the first transects, and in nodes that no transect parts.
-FIRST_GAIN, NODES_GAIN = 0.2, 0.9
-LEAST_GAIN, MOST_GAIN = 1.0, 3.0  # of the change that a later level made may be left
-# What transects that differ may be wrong by, in units of their deviation over their number: two; more of them, what a
-# trend explains taken off, for a kink may hide between them; by a sharp edge, over the root of their number once more.
-SPREAD, KINK, SLANT = 2.0, 6.0, 2.0
-UNSETTLED = 1.5  # times the tolerance: another level is needed, but not of the neighbours that doubt half of it
-DOUBT = 0.5  # of what a neighbour may be wrong by counts, unless it is by a sharp edge or one that it alone has met
-MISLED = 3.0  # times what was thought to be left, and beyond the tolerance: who moves so far had settled by chance
-BUMPY = 1e-2  # nodes do where nothing jumps as long as they do not move the value by such a share
-STEP_GAIN = 2.0  # of the change that a step of the node rules made may be left
-CORNER = 1 / 8  # of the light, over the number of transects squared, is in a corner that none of them crosses
-LEAST_JUMP = 0.1  # of the tolerance: less is not looked for
-DIM = 1e-5  # of the brightest pixel: less light says nothing of the edges of brighter bodies
 DARK_LEVELS = 3  # while no light is found anywhere
 FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
-SHARP = 0.2  # blur radius [pixels] below which an edge leaves the pixel rather than the pupil
 
 
 def integrate_by_transects(draft: Draft, rough: Mask, levels: list[tuple[int, node_rules.AlongTransect]]) -> None:
@@ -63,6 +48,7 @@ class _Ladder:
 
     def __init__(self, draft: Draft, rough: Mask) -> None:
         self.draft, self.edges, self.wanted = draft, edges_of(draft), draft.wanted()
+        self.estimator = draft.estimator
         self.where = rough & self.wanted
         self.split, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
         self.left = draft.grid.full(mi.Float64, 0)
@@ -76,7 +62,7 @@ class _Ladder:
             self.edges.learn(draft, self.means, self.split, across=level % 2 == 0)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
         # What hides light may be cut by outlines all over the pupil but where the light comes past it.
-        lit = means.value > dr.opaque(mi.Float64, DIM) * draft.peak
+        lit = means.value > dr.opaque(mi.Float64, self.estimator.dim) * draft.peak
         fresh = where & means.jumps & lit & ~self.split
         self.split |= fresh
         self.smooth = self.smooth & where & ~self.split
@@ -89,7 +75,7 @@ class _Ladder:
             left, unseen = self._first(fresh, moved, scatter, parted(coverage))
         else:
             left, unseen = self._later(level, fresh, moved, scatter, len(rule))
-            self.smooth = self.smooth & (moved < BUMPY * value)
+            self.smooth = self.smooth & (moved < self.estimator.bumpy * value)
         # Whose neighbour meets a jump at last, or was misled, may pass the same by and be as wrong as that one was:
         # who met no jump, and who has settled.
         unseen = dr.select((self.split & where) | ~draft.open, 0, unseen)
@@ -107,12 +93,12 @@ class _Ladder:
 
     def _unsettled(self, left: PixelArray) -> PixelArray:
         """What is left, or so much that another level is needed."""
-        return dr.maximum(left, UNSETTLED * self.draft.tolerance)
+        return dr.maximum(left, self.estimator.unsettled * self.draft.tolerance)
 
     def _doubt(self, known: Mask) -> PixelArray:
         """What pixels may be wrong by for all that neighbours know; `known`: which pixels know an edge themselves."""
         near, edge = self.draft.grid.spread_all((self.left, dr.select(self.split, self.left, 0)))
-        doubt = dr.maximum(dr.opaque(mi.Float64, DOUBT) * near, dr.select(known, 0, edge))
+        doubt = dr.maximum(dr.opaque(mi.Float64, self.estimator.doubt) * near, dr.select(known, 0, edge))
         return dr.select(self.edges.sharp, near, doubt)
 
     def _first(
@@ -122,10 +108,12 @@ class _Ladder:
 
         That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
         """
-        draft = self.draft
-        left = dr.maximum(FIRST_GAIN * moved, scatter)
+        draft, estimator = self.draft, self.estimator
+        left = dr.maximum(estimator.first_gain * moved, scatter)
         left = dr.select(silhouette, left, self._unsettled(left))
-        missed = dr.maximum(NODES_GAIN * moved, dr.select(parted(draft.coverage), draft.error, draft.roughness))
+        missed = dr.maximum(
+            estimator.nodes_gain * moved, dr.select(parted(draft.coverage), draft.error, draft.roughness)
+        )
         # Who is known from elsewhere takes no transects, and knows of the silhouette all the same.
         return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh | (draft.outline & ~draft.open))
 
@@ -137,15 +125,17 @@ class _Ladder:
         The less a level moved of what was left before the less is left, but lest two wrong values agree by chance no
         less than the order of convergence grants. What was moved until now says nothing of a fresh jump.
         """
-        before = self.left
-        change = dr.maximum(moved, before * dr.opaque(mi.Float64, (self.count / count) ** node_rules.TRANSECT_ORDER))
-        gain = dr.clip(dr.select(before > 0, MOST_GAIN * change / before, MOST_GAIN), LEAST_GAIN, MOST_GAIN)
+        before, estimator = self.left, self.estimator
+        least, most = estimator.least_gain, estimator.most_gain
+        change = dr.maximum(moved, before * dr.opaque(mi.Float64, (self.count / count) ** estimator.order))
+        gain = dr.clip(dr.select(before > 0, most * change / before, most), least, most)
         left = dr.maximum(change * gain, scatter)
         if level <= node_rules.SMOOTH_LEVELS:
             # On what is smooth each step of the node rules gains more than it moves.
-            left = dr.select(self.smooth, STEP_GAIN * moved, left)
+            left = dr.select(self.smooth, estimator.step_gain * moved, left)
         left = dr.select(fresh, self._unsettled(left), left)
-        misled = self.where & (moved > dr.maximum(dr.opaque(mi.Float64, MISLED) * before, self.draft.tolerance))
+        farther = dr.maximum(dr.opaque(mi.Float64, estimator.misled) * before, self.draft.tolerance)
+        misled = self.where & (moved > farther)
         return left, self.draft.near_edge(dr.select(fresh | misled, moved, 0))
 
 
@@ -171,7 +161,7 @@ class Edges:
         ahead, behind, known, near = grid.spread_all(around)
         blur = dr.select(jumps, means.blur, _most_blurred(ahead, -behind))
         self.blur = dr.select(known & ~draft.clipped, blur, self.blur)
-        self.sharp = (dr.abs(self.blur) < SHARP) & near
+        self.sharp = (dr.abs(self.blur) < draft.estimator.sharp) & near
         x, y = grid.gradient(grid.box_sum(draft.coverage, _around(draft)))
         alike = dr.abs(x) + dr.abs(y) < COVERAGE_ROUNDING
         turn = dr.opaque(mi.Float64, math.pi / 2 if across else 0)
@@ -201,7 +191,7 @@ def edges_of(draft: Draft) -> Edges:
     farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
     nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
     blur = dr.select(draft.clipped, 0, draft.lens.blur_radius(nearest))
-    return Edges(angle, blur, dr.abs(blur) < SHARP)
+    return Edges(angle, blur, dr.abs(blur) < draft.estimator.sharp)
 
 
 # ---------------------------------------------------------------------- many transects in one launch
@@ -237,12 +227,13 @@ def apply_transects(
         rays += int(dr.sum(looks)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
     value, coverage, squares, trend, split, blur = images
-    number = dr.opaque(mi.Float64, len(rule))
+    number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = squares - value * value
-    blurred = dr.opaque(mi.Float64, KINK if len(rule) > 2 else SPREAD) * dr.safe_sqrt(variance - trend) / number
+    spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
+    blurred = spread * dr.safe_sqrt(variance - trend) / number
     # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
-    slant = SLANT * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
-    sharp = dr.maximum(slant, CORNER * value / (number * number))
+    slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
+    sharp = dr.maximum(slant, estimator.corner * value / (number * number))
     return Means(value, coverage, split > 0, dr.select(edges.sharp, sharp, blurred), blur)
 
 
@@ -266,8 +257,9 @@ def _transect_sums(
     area = dr.opaque(mi.Float, float(draft.area))
     place = dr.select(sharp, even, gauss)
     curve = transect(draft.centres(pixel), angle, blur, place, area)
-    outline, least = mi.Float(2 * draft.at_least_peak(dr.max(draft.value))), mi.Float(LEAST_JUMP * draft.tolerance)
-    found = integrate_transect(draft.view, curve, phase, along, outline, least)
+    outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
+    least = mi.Float(draft.estimator.least_jump * draft.tolerance)
+    found = integrate_transect(draft.view, curve, phase, along, outline, least, draft.estimator.steep)
     value, coverage, jumps, depth, looks = (mi.Float64(column) for column in found)
     share = mi.Float64(weight) * value
     # Of the edge of a weak reflection beside nothing the depth is not known.

@@ -7,7 +7,7 @@ import os
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.image import Image
-from ..integral.quadrature import Quadrature
 from ..integral.shortcuts import SHORTCUTS
 from ..runtime import backend
 from ..runtime.errors import SceneError, named
@@ -118,13 +117,10 @@ def _integrate(
     scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress
 ) -> tuple:
     """Power, error [W] and coverage, shape (h, w), by the deterministic integral, and metadata."""
-    own = asdict(integrator.quadrature)
-    wanted = own | {name: value for name, value in accuracy.items() if value is not None}
     with named("fspt_integral"):
-        quadrature = Quadrature(**wanted)
+        quadrature = replace(integrator.quadrature, **{k: value for k, value in accuracy.items() if value is not None})
     solution = integrator.solve(scene, lens, quadrature, partial(progress, "integrating"))
-    how = {"method": "integral", **asdict(quadrature), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
-    how["shortcuts_off"] = ", ".join(sorted(quadrature.shortcuts_off)) or "nothing"
+    how = {"method": "integral", **quadrature.metadata(), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
     how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
     warnings = []
     pixels, largest = solution.beyond(quadrature.rtol)

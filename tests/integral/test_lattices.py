@@ -62,11 +62,11 @@ def test_lattices_find_the_share_that_an_outline_leaves(looked_at):
     means = Means.none(draft.grid.pixels(draft.grid.flat(cut)))
     for before, points in ((0, FIRST), (FIRST, 8 * FIRST)):
         means = means.refined(draft, before, points)
-        value, error, coverage = (laid(draft, means, name)[cut] for name in ("value", "error", "share"))
+        value, error, coverage = (laid(draft, means, name)[cut] for name in ("value", "standard_error", "share"))
         assert coverage == pytest.approx(expected, abs=0.02)
         # Within the pixel cos⁴θ differs by 1e-3.
         off = abs(np.pi * value - expected * np.pi * value / coverage)
-        assert (off <= np.pi * error).mean() > 0.95
+        assert (off <= 4.1 * np.pi * error).mean() > 0.95
         errors.append(error.mean())
     assert errors[1] < errors[0] / np.sqrt(8)  # better than chance
 
