@@ -1,11 +1,15 @@
 """Errors of the integral on random scenes, against an independent float64 reference.
 
     python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
+    python scripts/audit.py --ablate all|doubt,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
 
 Scenes of every family of `validation/random_scenes.py`, each rendered by `fspt_integral`. On 24 pixels of each,
 `fan_reference` gives the power with its own error: 16 where errors are likely (large stated errors, edges, curved
 pictures) and 8 at random. A pixel counts as beyond a limit only by more than the reference's error. Writes audit.csv,
 one line a scene, and prints the table by family.
+
+With `--ablate` the same pixels are looked at without each threshold of `integral/estimator.py` in turn: how many are
+beyond `rtol` and beyond the stated error, and what it costs. Writes ablation.csv.
 """
 
 from __future__ import annotations
@@ -14,13 +18,15 @@ import argparse
 import csv
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import markdown_tables
 import numpy as np
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.integral.estimator import Estimator
+from mitsuba_fspt.integral.quadrature import Quadrature
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.runtime.atomic_files import atomic_path
 from mitsuba_fspt.validation.random_scenes import FAMILIES, RandomScene, random_scene
@@ -82,15 +88,22 @@ def main() -> None:
     parser.add_argument("--family", default=",".join(FAMILIES))
     parser.add_argument("--rtol", type=float, default=1e-3)
     parser.add_argument("--finer", type=int, default=1, help="times as many pixels along each side of the film")
+    parser.add_argument("--ablate", help="thresholds to do without, one by one, or all")
     parser.add_argument("--out", type=Path, default=Path("docs"))
     parser.add_argument("--readme", type=Path, help="file whose table 'audit' is replaced")
     arguments = parser.parse_args()
-    seeds = range(arguments.seed, arguments.seed + arguments.scenes)
+    seeds, names = range(arguments.seed, arguments.seed + arguments.scenes), arguments.family.split(",")
+    arguments.out.mkdir(exist_ok=True)
+    if arguments.ablate:
+        wanted = (
+            [field.name for field in fields(Estimator)] if arguments.ablate == "all" else arguments.ablate.split(",")
+        )
+        ablate([(family, seed) for family in names for seed in seeds], wanted, arguments.rtol, arguments.out)
+        return
     audits = []
-    for family in arguments.family.split(","):
+    for family in names:
         audits += [audited(family, seed, arguments.rtol, finer=arguments.finer) for seed in seeds]
         print(_row(family, [audit for audit in audits if audit.family == family], arguments.rtol), flush=True)
-    arguments.out.mkdir(exist_ok=True)
     with atomic_path(arguments.out / "audit.csv") as temporary, open(temporary, "w", newline="") as file:
         sheet = csv.DictWriter(file, list(asdict(audits[0])))
         sheet.writeheader()
@@ -157,15 +170,24 @@ def _compared(
     made: RandomScene, image: fspt.Image, rtol: float, likely: int, random: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """On chosen pixels stated error, difference and error of the reference, over the brightest pixel, each (n,)."""
-    left, top, width, _ = made.crop
     peak = image.power.max() or 1.0
-    generator = np.random.default_rng(1)
-    picked = [*_likely(image, likely, generator), *generator.integers(0, image.power.size, random)]
-    row, column = np.divmod(picked, width)
-    pixels = np.stack([row + top, column + left], axis=1)
+    picked = _picked(image, likely, random)
     stated = image.error.ravel()[picked] / peak
-    power, error = made.reference.power(pixels, peak * np.maximum(GOAL * stated, LEAST_GOAL))
+    power, error = _reference(made, picked, peak * np.maximum(GOAL * stated, LEAST_GOAL))
     return stated, np.abs(image.power.ravel()[picked] - power) / peak, error / peak
+
+
+def _picked(image: fspt.Image, likely: int, random: int) -> np.ndarray:
+    """Numbers of the pixels that are compared."""
+    generator = np.random.default_rng(1)
+    return np.array([*_likely(image, likely, generator), *generator.integers(0, image.power.size, random)])
+
+
+def _reference(made: RandomScene, picked: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Power of pixels of such numbers [W] and its error."""
+    left, top, width, _ = made.crop
+    row, column = np.divmod(picked, width)
+    return made.reference.power(np.stack([row + top, column + left], axis=1), goal)
 
 
 def _likely(image: fspt.Image, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -178,6 +200,67 @@ def _likely(image: fspt.Image, count: int, generator: np.random.Generator) -> np
     if len(other) < count - len(worst):
         other = np.setdiff1d(np.arange(power.size), worst)
     return np.concatenate([worst, generator.choice(other, count - len(worst), replace=False)])
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """What becomes of a number of scenes without one threshold; `without` nothing first.
+
+    checked : pixels; of them beyond rtol, beyond the stated error, and beyond both where less than rtol was stated
+    scenes, pixels : of the scenes and of all their pixels those that state more than rtol
+    lines : of sight, in all [million]
+    """
+
+    without: str
+    checked: int
+    beyond: int
+    beyond_error: int
+    silent: int
+    scenes: int
+    pixels: int
+    lines: float
+
+
+def ablate(scenes: Sequence[tuple[str, int]], names: Sequence[str], rtol: float, out: Path) -> None:
+    """The pixels of scenes, given by family and seed, without each of these thresholds."""
+    backend.ensure_variant()
+    import mitsuba as mi
+
+    mi.set_log_level(mi.LogLevel.Error)
+    integrator = mi.load_dict({"type": "fspt_integral"})
+    cases = []
+    for family, seed in scenes:
+        made = random_scene(family, seed)
+        image = fspt.render(made.scene(), method="integral", rtol=rtol, pixel=made.reference.pixel)
+        picked = _picked(image, LIKELY, RANDOM)
+        cases.append(
+            (
+                made,
+                made.scene(),
+                picked,
+                *_reference(made, picked, GOAL * rtol * np.full(len(picked), image.power.max())),
+            )
+        )
+    found = []
+    for name in ("nothing", *names):
+        estimator = Estimator() if name == "nothing" else Estimator().without(name)
+        rows = []
+        for made, scene, picked, power, error in cases:
+            quadrature = Quadrature(rtol=rtol, pixel=made.reference.pixel, estimator=estimator)
+            solution = integrator.solve(scene, scene.sensors()[0], quadrature)
+            off = np.abs(solution.power.ravel()[picked] - power) - error
+            stated, most = solution.error.ravel()[picked], rtol * solution.power.max()
+            silent = (off > stated) & (off > most) & (stated <= most)
+            above = int((solution.error > most).sum())
+            lines = solution.rays / 1e6
+            rows.append((len(off), (off > most).sum(), (off > stated).sum(), silent.sum(), above > 0, above, lines))
+        *counts, lines = np.sum(rows, axis=0)
+        found.append(Ablation(name, *(int(count) for count in counts), round(float(lines), 1)))
+        print(found[-1], flush=True)
+    with atomic_path(out / "ablation.csv") as temporary, open(temporary, "w", newline="") as file:
+        sheet = csv.DictWriter(file, list(asdict(found[0])))
+        sheet.writeheader()
+        sheet.writerows(asdict(one) for one in found)
 
 
 def table(audits: Sequence[Audit], rtol: float) -> str:
