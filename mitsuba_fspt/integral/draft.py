@@ -79,6 +79,7 @@ class Draft:
             self.known, self.known_error = (
                 grid.flat(window.cut(image) / view.lens.etendue) for image in (known.power, known.error)
             )
+        self._peak: tuple[PixelArray, PixelArray] | None = None  # of the value before it
         self.nodes = self.rays = 0
         self.levels: list[str] = []
         self.findings = view.findings()
@@ -86,11 +87,13 @@ class Draft:
     @property
     def peak(self) -> PixelArray:
         """The largest value that is shown [W/mm²/sr], of all if those are dark, one lane; at least `least_peak`."""
-        most = dr.max(self.value)
-        if len(self.shown) > 1:
-            shown = dr.max(dr.select(self.shown, self.value, 0))
-            most = dr.select(shown > 0, shown, most)
-        return self.at_least_peak(most)
+        if self._peak is None or self._peak[0] is not self.value:
+            most = dr.max(self.value)
+            if len(self.shown) > 1:
+                shown = dr.max(dr.select(self.shown, self.value, 0))
+                most = dr.select(shown > 0, shown, most)
+            self._peak = self.value, self.at_least_peak(most)
+        return self._peak[1]
 
     def at_least_peak(self, value: PixelArray) -> PixelArray:
         """`value`, or `least_peak` if that is larger."""

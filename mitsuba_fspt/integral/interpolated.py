@@ -184,7 +184,7 @@ class _Picture:
         i, j = (np.asarray(r.numpy() % side).astype(np.int64) for r in random)
         place = (row * side + i) * (width * side) + column * side + j
         centres = self.blocks.fine.centres(mi.UInt32(place.astype(np.uint32)))
-        seen = apply_rule(self.view, centres, node_rules.four(True))
+        seen = apply_rule(self.view, centres, node_rules.four(True), ("value", "coverage"))
         dr.eval(seen.value, seen.coverage)
         self.rays += 4 * number.size
         self.levels.append(f"4 nodes: {number.size} pixels")

@@ -30,7 +30,7 @@ def integrate_transect(
     outline: mi.Float,
     least: mi.Float,
     steep: float,
-) -> tuple[mi.Float, ...]:
+) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
     """Of a transect means of integrand and coverage, number of jumps, depth of the edge at the largest, lines of sight.
 
     It is split at its `MOST_JUMPS` largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points,
@@ -79,7 +79,7 @@ def integrate_transect(
     start = (mi.Float(-1), mi.Vector2d(0), mi.Float(0), mi.Float(0), found.looks)
     _, _, value, coverage, looks = repeat(jumps + 1, integrate, *start)
     depth = dr.select(jumps > 0, found.largest[0].depth(), 0)
-    return value, coverage, mi.Float(jumps), depth, mi.Float(looks)
+    return value, coverage, jumps, depth, looks
 
 
 # ---------------------------------------------------------------------- where it jumps

@@ -55,9 +55,11 @@ def settle_by_lattices(draft: Draft) -> None:
         scatter = draft.estimator.certain * means.standard_error
         error = dr.maximum(scatter, unmet)
         better = error < dr.gather(mi.Float64, draft.error, means.pixels)
-        for image, column in ((draft.value, means.value), (draft.coverage, means.share), (draft.error, error)):
+        images = mi.Float64(draft.value), mi.Float64(draft.coverage), mi.Float64(draft.error)
+        for image, column in zip(images, (means.value, means.share, error), strict=True):
             dr.scatter(image, column, means.pixels, better)
-        dr.eval(draft.value, draft.coverage, draft.error)
+        dr.eval(images)
+        draft.value, draft.coverage, draft.error = images
         share = points / most
         reached = dr.maximum(dr.opaque(mi.Float64, share**ORDER) * scatter, dr.opaque(mi.Float64, share) * unmet)
         left = (error > tolerance) & (reached <= tolerance)

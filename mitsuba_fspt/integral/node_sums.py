@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -41,36 +42,41 @@ class Sums:
     front: mi.Float
 
 
-NOTHING_SEEN = (0, 0, 0, 0, 0, math.inf, 0, 0, math.inf)
-BY_SPECULAR_SURFACES = ("lost", "front")  # sums that are known already where there is none
+# Columns of `Sums` as a rule sees nothing; what is not asked for, or without specular surfaces, keeps these values.
+NOTHING_SEEN = dict(zip(Sums.__annotations__, (0, 0, 0, 0, 0, math.inf, 0, 0, math.inf), strict=True))
+ALL = tuple(NOTHING_SEEN)
 
 
-def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule) -> Sums:
-    """Sums of one rule for every pixel."""
-    table = [mi.Float(column) for column in (*rule.pupil.T, *rule.pixel.T, rule.weight, rule.contrast)]
+def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule, names: Sequence[str] = ALL) -> Sums:
+    """Sums of one rule for every pixel, those of the given `names`; the others are as if nothing were seen."""
+    table, count = mi.Float(rule.table), dr.opaque(mi.UInt32, len(rule))
     together = view.detail <= NODES_TOGETHER
 
-    def node(k: mi.UInt32, sums: Sums, first: _FirstSurfaces | None) -> tuple:
-        ax, ay, dx, dy, weight, null = (dr.gather(mi.Float, column, k) for column in table)
+    # Only sums that change are states of the loop: with others Dr.Jit records its body twice.
+    def node(k: mi.UInt32, sums: dict[str, mi.Float], first: _FirstSurfaces | None) -> tuple:
+        ax, ay, dx, dy, weight, null = (dr.gather(mi.Float, table, k + n * count) for n in range(6))
         sight = view.integrand(centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay), together)
         f, hit = sight.integrand, dr.isfinite(sight.depth)
-        seen = Sums(
-            value=sums.value + weight * f,
-            contrast=sums.contrast + null * f,
-            x=sums.x + weight * f * ax,
-            y=sums.y + weight * f * ay,
-            coverage=sums.coverage + dr.select(sight.covered, weight, 0),
-            nearest=dr.select(hit, dr.minimum(sums.nearest, sight.depth), sums.nearest),
-            farthest=dr.select(hit, dr.maximum(sums.farthest, sight.depth), sums.farthest),
-            lost=sums.lost + weight * sight.lost,
-            front=sums.front,
-        )
+        more = {
+            "value": lambda total: total + weight * f,
+            "contrast": lambda total: total + null * f,
+            "x": lambda total: total + weight * f * ax,
+            "y": lambda total: total + weight * f * ay,
+            "coverage": lambda total: total + dr.select(sight.covered, weight, 0),
+            "nearest": lambda least: dr.select(hit, dr.minimum(least, sight.depth), least),
+            "farthest": lambda most: dr.select(hit, dr.maximum(most, sight.depth), most),
+            "lost": lambda total: total + weight * sight.lost,
+        }
+        seen = {name: more[name](before) for name, before in sums.items()}
         return seen, first and first.plus(sight)
 
-    first = _FirstSurfaces(mi.Float(-1), mi.Float(math.inf), mi.Bool(False)) if view.specular else None
-    sums, first = repeat(dr.opaque(mi.UInt32, len(rule)), node, Sums(*map(mi.Float, NOTHING_SEEN)), first)
-    sums.front = first.front(sums.nearest) if first else sums.nearest
-    return sums
+    follow_first = view.specular and "front" in names
+    first = _FirstSurfaces(mi.Float(-1), mi.Float(math.inf), mi.Bool(False)) if follow_first else None
+    summed = [name for name in names if name != "front" and (view.specular or name != "lost")]
+    sums, first = repeat(count, node, {name: mi.Float(NOTHING_SEEN[name]) for name in summed}, first)
+    found = Sums(**{name: sums.get(name, mi.Float(nothing)) for name, nothing in NOTHING_SEEN.items()})
+    found.front = first.front(found.nearest) if first else found.nearest
+    return found
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -11,7 +12,7 @@ from ..jit.batches import batches
 from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
 from . import node_rules
 from .draft import Draft
-from .node_sums import BY_SPECULAR_SURFACES, NOTHING_SEEN, Sums, apply_rule
+from .node_sums import ALL, NOTHING_SEEN, Sums, apply_rule
 from .shortcuts import Finding
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
     from ..jit.pixel_grid import Mask, PixelArray
 
+BY_SPECULAR_SURFACES = ("lost", "front")  # sums that are known already where there is none
+REFINED = ("value", "coverage", "nearest", "lost")  # of the sums, those that twelve nodes are for
 BOTH = 4 + 12  # lines of sight a pixel, without which four must do
 TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
 
@@ -125,7 +128,7 @@ def _one_will_do(draft: Draft) -> bool:
 
 def _refine(draft: Draft, where: Mask) -> PixelArray:
     """Twelve nodes on the marked pixels; returns how far the first ones were off there, 0 elsewhere."""
-    seen = apply_nodes(draft, node_rules.twelve(draft.area), where)
+    seen = apply_nodes(draft, node_rules.twelve(draft.area), where, REFINED)
     difference = dr.select(where, dr.abs(seen.value - draft.value), 0)
     # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
     gain = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
@@ -143,22 +146,27 @@ def _refine(draft: Draft, where: Mask) -> PixelArray:
     return difference
 
 
-def apply_nodes(draft: Draft, rule: node_rules.Rule, where: Mask | None = None) -> Sums:
-    """Images of what a rule sees from all or from the marked pixels, as if of nothing elsewhere."""
+def apply_nodes(draft: Draft, rule: node_rules.Rule, where: Mask | None = None, names: Sequence[str] = ALL) -> Sums:
+    """Images of what a rule sees from all or from the marked pixels, as if of nothing elsewhere.
+
+    Of the given `names`; those of the others are a single number each.
+    """
+    specular = draft.view.specular
+    stored = [name for name in names if specular or name not in BY_SPECULAR_SURFACES]
     if where is None:
         index = draft.grid.pixels()
-        images = Sums(*(dr.empty(mi.Float64, len(draft.grid)) for _ in NOTHING_SEEN))
+        images = {name: dr.empty(mi.Float64, len(draft.grid)) for name in stored}
     else:
         index = draft.grid.pixels(where)
-        images = Sums(*(draft.grid.full(mi.Float64, fill) for fill in NOTHING_SEEN))
-    names = [name for name in vars(images) if draft.view.specular or name not in BY_SPECULAR_SURFACES]
+        images = {name: draft.grid.full(mi.Float64, NOTHING_SEEN[name]) for name in stored}
     for part in batches(index):
-        seen = apply_rule(draft.view, draft.centres(part), rule)
-        for name in names:
-            dr.scatter(getattr(images, name), mi.Float64(getattr(seen, name)), part)
-        dr.eval([getattr(images, name) for name in names])
-    if not draft.view.specular:
-        images.front, images.lost = images.nearest, mi.Float64(0)
+        seen = apply_rule(draft.view, draft.centres(part), rule, names)
+        for name, image in images.items():
+            dr.scatter(image, mi.Float64(getattr(seen, name)), part)
+        dr.eval(images)
+    found = Sums(**{name: images.get(name, mi.Float64(nothing)) for name, nothing in NOTHING_SEEN.items()})
+    if not specular:
+        found.front = found.nearest
     count = dr.width(index)
     draft.count(f"{len(rule)} nodes", count, count * len(rule))
-    return images
+    return found

@@ -85,7 +85,7 @@ def peak_of_few(view: View, window: Window, quadrature: Quadrature) -> float:
     step = math.ceil(math.sqrt(height * width / FEW))
     y, x = (np.arange(step // 2, side, step, dtype=np.uint32) for side in window.shape)
     centres = window.centres(mi.UInt32((y[:, None] * np.uint32(width) + x).ravel()))
-    seen = apply_rule(view, centres, node_rules.twelve(quadrature.pixel == "area"))
+    seen = apply_rule(view, centres, node_rules.twelve(quadrature.pixel == "area"), ("value",))
     return MARGIN * float(dr.max(seen.value)[0])
 
 
@@ -102,6 +102,6 @@ def coverage_of(view: View, window: Window) -> NDArray[np.float64]:
     grid = Grid(window.shape)
     image = grid.full(mi.Float64, 0)
     for part in batches(grid.number):
-        coverage = apply_rule(view, window.centres(part), node_rules.twelve(True)).coverage
+        coverage = apply_rule(view, window.centres(part), node_rules.twelve(True), ("coverage",)).coverage
         dr.scatter(image, mi.Float64(coverage), part)
     return window.expand(grid.array(image * open_share(view.lens, window, grid)))

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.batches import batches
+from ..jit.loops import repeat
 from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
 from . import node_rules
 from .draft import Draft
@@ -68,7 +69,7 @@ class _Ladder:
         self.smooth = self.smooth & where & ~self.split
         value, coverage, scatter = means.value, means.coverage, means.scatter
         if 0 < level <= node_rules.SMOOTH_LEVELS and dr.any(self.smooth):
-            seen = apply_nodes(draft, node_rules.product(level, draft.area), self.smooth)
+            seen = apply_nodes(draft, node_rules.product(level, draft.area), self.smooth, ("value", "coverage"))
             value, coverage = dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.coverage, coverage)
         moved = dr.abs(value - draft.value)
         if level == 0:
@@ -216,12 +217,12 @@ def apply_transects(
     draft: Draft, where: Mask, edges: Edges, rule: node_rules.Transects, along: node_rules.AlongTransect
 ) -> Means:
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
-    index = draft.grid.pixels(where)
+    index, table = draft.grid.pixels(where), mi.Float(rule.table)
     images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
     rays = 0
     for part in batches(index, len(rule)):
-        *sums, looks = _transect_sums(draft, part, edges, rule, along)
-        for image, column in zip(images, sums, strict=True):
+        *found, looks = _along_transects(draft, part, edges, rule, table, along)
+        for image, column in zip(images, _sums(part, edges, rule, table, found), strict=True):
             dr.scatter(image, column, part)
         dr.eval(images)
         rays += int(dr.sum(looks)[0])
@@ -237,40 +238,60 @@ def apply_transects(
     return Means(value, coverage, split > 0, dr.select(edges.sharp, sharp, blurred), blur)
 
 
-def _transect_sums(
-    draft: Draft, part: mi.UInt32, edges: Edges, rule: node_rules.Transects, along: node_rules.AlongTransect
-) -> list[PixelArray]:
-    """Of each listed pixel means over its transects of value, coverage, value squared, what of that is a trend; how
-    many a jump splits, and the blur of the most blurred edge; lines of sight taken.
+def _along_transects(
+    draft: Draft,
+    part: mi.UInt32,
+    edges: Edges,
+    rule: node_rules.Transects,
+    table: mi.Float,
+    along: node_rules.AlongTransect,
+) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
+    """Of each transect of the listed pixels, those of a pixel one after the other: value, coverage, number of jumps,
+    signed blur radius of the edge at the largest, 0 without one [pixels], lines of sight taken.
     """
     count = dr.opaque(mi.UInt32, len(rule))
     lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
     pixel, number = dr.gather(mi.UInt32, part, lane // count), lane % count
     angle, blur = (mi.Float(dr.gather(mi.Float64, image, pixel)) for image in (edges.angle, edges.blur))
-    sharp = dr.gather(mi.Bool, edges.sharp, pixel)
-    even, gauss = (
-        mi.Point3f(*(dr.gather(mi.Float, mi.Float(column), number) for column in place.T))
-        for place in (rule.sharp, rule.blurred)
-    )
-    weight, phase = (dr.gather(mi.Float, mi.Float(column), number) for column in (rule.weight, rule.phase))
-    weight = dr.select(sharp, dr.opaque(mi.Float, 1 / len(rule)), weight)
-    area = dr.opaque(mi.Float, float(draft.area))
-    place = dr.select(sharp, even, gauss)
-    curve = transect(draft.centres(pixel), angle, blur, place, area)
+    first = dr.select(dr.gather(mi.Bool, edges.sharp, pixel), mi.UInt32(0), 3)
+    place = mi.Point3f(*(dr.gather(mi.Float, table, (first + k) * count + number) for k in range(3)))
+    phase = dr.gather(mi.Float, table, 7 * count + number)
+    curve = transect(draft.centres(pixel), angle, blur, place, dr.opaque(mi.Float, float(draft.area)))
     outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
-    least = mi.Float(draft.estimator.least_jump * draft.tolerance)
-    found = integrate_transect(draft.view, curve, phase, along, outline, least, draft.estimator.steep)
-    value, coverage, jumps, depth, looks = (mi.Float64(column) for column in found)
-    share = mi.Float64(weight) * value
+    least, steep = mi.Float(draft.estimator.least_jump * draft.tolerance), draft.estimator.steep
+    value, coverage, jumps, depth, looks = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
     # Of the edge of a weak reflection beside nothing the depth is not known.
     known = (jumps > 0) & dr.isfinite(depth)
-    blur = dr.select(known, draft.lens.blur_radius(dr.minimum(depth, FAR)), 0)
-    columns = [share, mi.Float64(weight) * coverage, share * value, dr.minimum(jumps, 1), looks]
-    dr.eval(columns, blur)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
-    sums = [dr.block_sum(column, len(rule)) for column in columns]
-    trend = dr.zeros(mi.Float64, dr.width(part))
-    for polynomial in rule.trend:
-        trend += dr.square(dr.block_sum(share * dr.gather(mi.Float64, mi.Float64(polynomial), number), len(rule)))
-    ahead, behind = (dr.block_reduce(end, blur, len(rule)) for end in (dr.ReduceOp.Max, dr.ReduceOp.Min))
-    *sums, split, looks = sums
-    return [*sums, trend, split, _most_blurred(ahead, behind), looks]
+    blur = mi.Float(dr.select(known, draft.lens.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
+    found = value, coverage, jumps, blur, looks
+    dr.eval(found)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
+    return found
+
+
+def _sums(
+    part: mi.UInt32, edges: Edges, rule: node_rules.Transects, table: mi.Float, found: list[mi.Float]
+) -> list[PixelArray]:
+    """Of each listed pixel means over its transects of value, coverage, value squared, what of that is a trend; how
+    many a jump splits, and the blur of the most blurred edge.
+
+    `found` as of `_along_transects`: value, coverage, jumps, blur.
+    """
+    count = dr.opaque(mi.UInt32, len(rule))
+    first = dr.arange(mi.UInt32, dr.width(part)) * count
+    sharp, even = dr.gather(mi.Bool, edges.sharp, part), dr.opaque(mi.Float, 1 / len(rule))
+
+    def add(k: mi.UInt32, sums: list[PixelArray], trends: list[PixelArray], ends: list[mi.Float]) -> tuple:
+        value, coverage, blur = (dr.gather(mi.Float, found[n], first + k) for n in (0, 1, 3))
+        weight = mi.Float64(dr.select(sharp, even, dr.gather(mi.Float, table, 6 * count + k)))
+        share, split = weight * mi.Float64(value), dr.gather(mi.UInt32, found[2], first + k) > 0
+        terms = share, weight * mi.Float64(coverage), share * mi.Float64(value), dr.select(split, mi.Float64(1), 0)
+        sums = [total + term for total, term in zip(sums, terms, strict=True)]
+        polynomials = [dr.gather(mi.Float, table, (8 + n) * count + k) for n in range(len(trends))]
+        trends = [total + share * mi.Float64(p) for total, p in zip(trends, polynomials, strict=True)]
+        return sums, trends, [dr.maximum(ends[0], blur), dr.minimum(ends[1], blur)]
+
+    nothing = [mi.Float64(0) for _ in range(4)], [mi.Float64(0) for _ in range(node_rules.TRENDS)]
+    sums, trends, (ahead, behind) = repeat(count, add, *nothing, [mi.Float(-dr.inf), mi.Float(dr.inf)])
+    value, coverage, squares, split = sums
+    trend = sum(map(dr.square, trends))
+    return [value, coverage, squares, trend, split, mi.Float64(_most_blurred(ahead, behind))]

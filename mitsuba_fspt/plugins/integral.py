@@ -199,12 +199,14 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             solution = known.completed_by(rest)
         else:
             solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, None, least_peak, progress)
+        findings = (Finding("smooth blocks", False, why), *solution.findings)
+        if not narrow.on_pixels.any():
+            return replace(solution, findings=findings)
         missed = _missed(narrow, where, cut, window, lens, solution)
-        if specular and specular.bending and narrow.on_pixels.any():
+        if specular and specular.bending:
             # Where a mirror or glass shows a narrow spot is not known.
             there = window.seen_in(specular.bending, lens)
             missed = np.maximum(missed, window.expand(there * UNCERTAINTY * narrow.on_pixels.max() * lens.etendue))
-        findings = (Finding("smooth blocks", False, why), *solution.findings)
         return replace(solution, error=np.maximum(solution.error, missed), findings=findings)
 
     def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[Blocks | None, str]:

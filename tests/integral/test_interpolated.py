@@ -84,5 +84,5 @@ def test_interpolated_pixels_are_within_their_errors(f_number):
     off = np.abs(found.power - exact.power)
     peak = found.power.max()
     assert (off <= found.error + exact.error).mean() > 1 - 1e-4
-    assert off.max() <= 1e-2 * peak
+    assert off.max() <= 2e-2 * peak  # each of the two pictures is within 1e-2
     assert found.error.max() <= 1.001e-2 * peak

@@ -237,3 +237,20 @@ def test_every_level_looks_further_along_its_transects_and_so_does_a_smaller_rto
     assert fine.nodes > coarse.nodes
     # s goes from -1 to 1, and the jump is said to be in the middle of the last interval.
     assert 1 / fine.scan * 0.5**fine.bisections <= 1e-5
+
+
+def test_nodes_of_two_transects_together_are_exact_on_a_line():
+    """Nodes at (k + φ)/n alone are off by the slope times (φ - ½)/n; seen to fail with golden phases, 0.31 and 0.93."""
+    phase, along = node_rules.transects(2).phase, node_rules.along_transect(0, 1e-3)
+    places = (np.arange(along.nodes) + phase[:, None]) / along.nodes
+    assert places.mean() == pytest.approx(0.5, abs=1e-15)
+    assert phase[0] != pytest.approx(phase[1], abs=0.1)  # else both would pass the same by
+
+
+@pytest.mark.parametrize("rtol", [0.5, 0.03, 1e-3, 1e-5])
+def test_bisections_of_the_first_transects_place_a_jump_to_rtol(rtol):
+    """Half of what is left of an interval, which has 1/scan of the measure, and 1/64 of an interval in any case."""
+    along = node_rules.along_transect(0, rtol)
+    left = 0.5**along.bisections / 2
+    assert left / along.scan <= rtol
+    assert left <= 1 / 64
