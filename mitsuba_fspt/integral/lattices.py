@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
-# By which the error falls with the number of points where the integrand jumps at a smooth edge: 1/2 + 1/(2 d), as it
-# depends on d = 4 coordinates, or 2 in focus. Lattices end where the points that are left would not do at that rate.
-ORDER = 2 / 3
+# By which the error falls at best with the number of points where the integrand jumps at a smooth edge: 1/2 + 1/(2 d)
+# where it depends on d coordinates, 2 in focus. Lattices end where the points that are left would not do at that rate.
+ORDER = 0.75
 
 
 def settle_by_lattices(draft: Draft) -> None:
