@@ -113,7 +113,7 @@ class Draft:
         least = dr.opaque(mi.Float64, self.quadrature.least_error) * self.peak
         error = dr.select(self.coverage == 0, self.error, dr.maximum(self.error, least))
         if self.view.specular:
-            # The few lines of a pixel may pass by what a neighbour's meet.
+            # The few lines of sight of a pixel may miss a surface that a neighbour's have met.
             lost = self.grid.spread_max(self.lost, self.reach(self.nodes)[1])
             error += lost * dr.opaque(mi.Float64, most_radiance(self.view.scene))
         coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))
@@ -133,16 +133,16 @@ class Draft:
         self.error = dr.select(self.open, self.error, self.known_error)
 
     def count(self, what: str, pixels_touched: int, rays: int) -> None:
-        """Note a rung of the ladder."""
+        """Record one rule: its name, the pixels that took it and their lines of sight."""
         self.rays += rays
         self.levels.append(f"{what}: {pixels_touched} pixels")
 
     # ------------------------------------------------------------------ where an edge may hide
 
     def set_blur(self, front: PixelArray, farthest: PixelArray) -> None:
-        """From depths: of what is nearest or farthest, for from the sharp plane on blur grows either way.
+        """Blur radii from depths of the nearest and the farthest surface: blur grows to both sides of the sharp plane.
 
-        `front`: depth of what is nearest, mirrors and panes too.
+        `front`: depth of the nearest surface, mirrors and panes included.
         """
         seen = dr.isfinite(self.nearest)
         front, back = (self.lens.blur_radius(depth) for depth in (front, farthest))
@@ -158,28 +158,29 @@ class Draft:
         self.sharp = self.grid.dilate(near, math.ceil(IN_FOCUS))
 
     def reach(self, rule: int | str) -> tuple[mi.Int, int]:
-        """How far from where a rule sees an edge it may hide from it, at each pixel and at most [pixels]."""
+        """How far from a pixel whose nodes show an edge others may miss it, at each pixel and at most [pixels]."""
         reach = 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, node_rules.GAP[rule]) * self.blur))
         return reach, 1 + math.ceil(node_rules.GAP[rule] * self.most_blur)
 
     def set_coverage(self, coverage: PixelArray) -> None:
-        """Shares of lines of sight that hit, and with them the outline."""
+        """Set the share of each pixel's lines of sight that hit a glowing surface, and the outline that follows."""
         self.coverage, self.outline = coverage, self.grid.outline(coverage)
 
     def grown(self, rough: Mask) -> Mask:
-        """`rough` and the pixels around in which its cause may lie; silhouettes are counted by `cut_off`."""
+        """`rough` and the pixels around that may see the same edge; silhouettes are left to `cut_off`."""
         source = rough & (self.error > self.tolerance) & ~self.outline
         return rough | self.grid.grow(source, *self.reach(self.nodes))
 
     def doubt(self, rough: Mask) -> None:
-        """Where nothing finer follows, what may hide around `rough` pixels counts as error: nodes may agree past it."""
+        """Count errors of `rough` pixels for those around that may see the same edge, where no finer rule follows."""
         around = self.grid.spread_max(dr.select(rough, self.error, 0), self.reach(self.nodes)[1])
         self.error = dr.select(self.grown(rough), dr.maximum(self.error, around), self.error)
 
     def cut_off(self) -> PixelArray:
-        """What the nodes may be wrong by where an edge crosses or hides between them and the pupil's rim.
+        """Error of nodes at silhouettes and at the image-plane stop.
 
-        A silhouette or the image-plane stop.
+        The edge passes between a pixel's nodes, or between the outermost ones and the rim of the pupil (tables `CUT`
+        and `UNSEEN`).
         """
         reach, most = self.reach(self.nodes)
         cut, unseen = (
@@ -190,24 +191,24 @@ class Draft:
         return share * self._whole(most)
 
     def unseen_by_transects(self, split: Mask) -> PixelArray:
-        """What the first transects may be wrong by near pixels they are `split` on, where they meet no jump."""
+        """Error of the first transects that met no jump, near pixels on which they did (`split`)."""
         reach, most = self.reach("transects")
         return dr.select(
             self.grid.grow(split, reach, most), dr.opaque(mi.Float64, self.estimator.unseen) * self._whole(most), 0
         )
 
     def wanted(self) -> Mask:
-        """Pixels that are shown, and of the rim those that may know of an edge which transects pass by there."""
+        """Pixels that are shown, and those of the rim with edges that may reach into them."""
         if len(self.shown) == 1:
             return self.shown
         return self.grid.dilate(self.shown, self.reach("transects")[1])
 
     def near_edge(self, image: PixelArray) -> PixelArray:
-        """Largest value around, as far as transects may pass an edge by."""
+        """Largest value around, as far as transects may miss an edge."""
         return self.grid.spread_max(image, self.reach("transects")[1])
 
     def _whole(self, reach: int) -> PixelArray:
-        """Largest value within `reach`, if no line of sight missed."""
+        """Largest value within `reach` that pixels would have if all their lines of sight hit."""
         whole = dr.select(self.coverage > COVERAGE_ROUNDING, self.value / self.coverage, 0)
         return self.grid.spread_max(whole, reach)
 

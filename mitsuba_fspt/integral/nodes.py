@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 BY_SPECULAR_SURFACES = ("lost", "front")  # sums that are known already where there is none
 REFINED = ("value", "coverage", "nearest", "lost")  # of the sums, those that twelve nodes are for
 BOTH = 4 + 12  # lines of sight a pixel, without which four must do
-TURN_REACH = 2  # pixels around over which a smooth correction is averaged, lest it add the roughness of J_n
+TURN_REACH = 2  # pixels around over which a smooth correction is averaged, so that it does not add the roughness of J_n
 
 
 def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
-    """One or four nodes over pupil and pixel everywhere; returns the pixels that they do not settle on their own.
+    """One or four nodes over pupil and pixel everywhere; returns the pixels whose estimated error asks for more.
 
-    `light`: what surfaces are known to send to each pixel if they are in focus, to a factor of two.
+    `light`: mean radiance on film that surfaces send to each pixel if they are in focus, to a factor of two.
     """
     grid = draft.grid
     rule = node_rules.one() if _one_will_do(draft) else node_rules.four(draft.area)
@@ -45,7 +45,8 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     draft.set_blur(seen.front, seen.farthest)
     draft.lost = seen.lost
     draft.value = value = dr.select(draft.open, seen.value, draft.known)
-    # Fourth order like the rule's own error: f = m exp(g·a/m) has M = g/4.
+    # An estimate of fourth order, as the rule's own error is, from the first moments M over the pupil: of an integrand
+    # m exp(g·a/m) they are g/4.
     square = 16 * (mx * mx + my * my)
     bend = dr.abs(seen.contrast) + dr.select(value > 0, square * square / (4 * value * value * value), 0)
     neighbours = draft.area or len(rule) == 1  # tell how the picture bends
@@ -67,21 +68,21 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     dr.eval(draft.error, rough)
     if (neighbours and min(grid.shape) < 3) or not draft.quadrature.takes("smooth"):
         rough = grid.full(mi.Bool, True)
-    return (rough | grid.border() | _dark(draft)) & draft.open  # neighbours that are left out tell nothing
+    return (rough | grid.border() | _dark(draft)) & draft.open  # the border lacks neighbours for an estimate
 
 
 def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
-    """Twelve nodes over pupil and pixel on the rough pixels and their surroundings, and where four mislead.
+    """Twelve nodes over pupil and pixel on the rough pixels and around them, and where four were wrong.
 
-    Returns the pixels that twelve do not settle either. Four nodes cannot see all that they miss, so a lattice of
-    pixels is probed with twelve: what four were off by there counts for the pixels around.
+    Returns the pixels whose estimated error asks for more. Four nodes can agree on a wrong value, so one pixel of
+    sixteen takes twelve in any case: the difference there counts as error of the pixels around.
     """
     rough = draft.grown(rough) & draft.open
     dr.eval(rough)
     smooth = int(dr.count(~rough & (draft.coverage > 0))[0])
     why = f"{smooth} of {len(draft.grid)} pixels looked at see the surface, smooth and no edge of it"
     draft.findings.append(Finding("smooth", smooth > 0, why))
-    # What parts four nodes parts twelve, too: transects can begin at once.
+    # An edge that passes between four nodes passes between twelve as well: transects follow at once.
     begun = parted(draft.coverage) & (draft.error > draft.tolerance) & dr.opaque(mi.Bool, transects_follow)
     probes = draft.grid.probes() & (draft.coverage > 0) & ~rough & draft.open
     draft.nodes = 12
@@ -97,21 +98,21 @@ def twelve_nodes(draft: Draft, rough: Mask, transects_follow: bool) -> Mask:
 
 
 def _dark(draft: Draft) -> Mask:
-    """True while no line of sight of any pixel has met light, one lane: what glows is on the film, or may be."""
+    """True, one lane, while no line of sight of any pixel has met light, though glowing surfaces are in the window."""
     return mi.Bool(False) if draft.least_peak else ~dr.any(draft.value > 0)
 
 
 def _passed_by(draft: Draft, light: PixelArray) -> Mask:
-    """Pixels on which surfaces shine, and far more than one line of sight saw there and around.
+    """Pixels to which surfaces send far more light than the lines of sight there and around have met.
 
-    What is up to √2 pixels wide may lie between the lines.
+    A body up to √2 pixels wide may lie between single lines of sight.
     """
     least = dr.maximum(draft.estimator.passed * draft.grid.spread_max(draft.value), draft.tolerance)
     return draft.open & ~draft.outside & (light > least)
 
 
 def _one_will_do(draft: Draft) -> bool:
-    """True where lines of sight differ over the pupil, if at all, like the picture over the pixel."""
+    """True if one line of sight a pixel does: over the pupil they differ no more than over a pixel."""
     lens, blur = draft.lens.optics, draft.window.blur
     curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
     estimator, rtol = draft.estimator, draft.quadrature.rtol
@@ -130,7 +131,7 @@ def _refine(draft: Draft, where: Mask) -> PixelArray:
     """Twelve nodes on the marked pixels; returns how far the first ones were off there, 0 elsewhere."""
     seen = apply_nodes(draft, node_rules.twelve(draft.area), where, REFINED)
     difference = dr.select(where, dr.abs(seen.value - draft.value), 0)
-    # Where the ladder converges, each rung gains as much as the last one, on a kinked J_n less, on a jump nothing.
+    # Where the rules converge, each gains as much as the one before; less where J_n has a kink, nothing at a jump.
     gain = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
     draft.value = dr.select(where, seen.value, draft.value)
     draft.set_coverage(dr.select(where, seen.coverage, draft.coverage))

@@ -1,4 +1,4 @@
-"""Transects through pixel × pupil where the line of sight jumps: more of them until no pixel around moves."""
+"""Transects through pixel × pupil where the integrand jumps, level by level until the estimated errors are small."""
 
 from __future__ import annotations
 
@@ -21,123 +21,130 @@ from .transect import transect
 if TYPE_CHECKING:
     from ..jit.pixel_grid import Mask, PixelArray
 
-DARK_LEVELS = 3  # while no light is found anywhere
+DARK_LEVELS = 3  # of transects that are taken in any case while no light has been found anywhere
 FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
 
 
 def integrate_by_transects(draft: Draft, rough: Mask, levels: list[tuple[int, node_rules.AlongTransect]]) -> None:
-    """More transects each round on the pixels that the last round still moved, or moved a neighbour of."""
-    ladder = _Ladder(draft, rough)
+    """Transects on the rough pixels: more of them at each level, where the error is still above the tolerance."""
+    refinement = _Refinement(draft, rough)
     for level, (count, along) in enumerate(levels):
-        if not dr.any(ladder.where):
+        if not dr.any(refinement.where):
             break
-        ladder.climb(level, node_rules.transects(count), along)
+        refinement.refine(level, node_rules.transects(count), along)
         draft.progress((3 + level) / (2 + len(levels)))  # after two steps of nodes
 
 
-class _Ladder:
-    """Which pixels the next transects go to, and what is known of them.
+class _Refinement:
+    """Which pixels take the next level of transects, and what is known of them.
 
-    where : pixels to look at
-    wanted : pixels that are shown, and those around that doubt them
-    edges : which way transects go
-    split : True where a transect met a jump
-    smooth : True where node rules may do as well
-    left : what the value may be wrong by, of every pixel on its own
-    count, means : of the last round, how many transects and what they found
+    where : pixels that take the next level
+    wanted : pixels that are shown, and those of the rim whose edges may reach into them
+    edges : of the edge that each pixel may see, its direction and blur
+    has_jump : True where a transect has met a jump
+    smooth : True where no transect has met one, so that node rules may converge
+    remaining : error of each pixel that follows from its own transects alone [W/mm²/sr]
+    count, means : of the last level, the number of transects and what they found
     """
 
     def __init__(self, draft: Draft, rough: Mask) -> None:
         self.draft, self.edges, self.wanted = draft, edges_of(draft), draft.wanted()
         self.estimator = draft.estimator
         self.where = rough & self.wanted
-        self.split, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
-        self.left = draft.grid.full(mi.Float64, 0)
+        self.has_jump, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
+        self.remaining = draft.grid.full(mi.Float64, 0)
         self.count = 0
         self.means: Means | None = None
 
-    def climb(self, level: int, rule: node_rules.Transects, along: node_rules.AlongTransect) -> None:
-        """One round: values, what is left of the error, and whether a neighbour knows better."""
+    def refine(self, level: int, rule: node_rules.Transects, along: node_rules.AlongTransect) -> None:
+        """One level: new values and errors, and the pixels that take the next level."""
         draft, where = self.draft, self.where
         if self.means:
-            self.edges.learn(draft, self.means, self.split, across=level % 2 == 0)
+            self.edges.learn(draft, self.means, self.has_jump, across=level % 2 == 0)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
-        # What hides light may be cut by outlines all over the pupil but where the light comes past it.
+        # The outline of a dark body counts only where light comes past it.
         lit = means.value > dr.opaque(mi.Float64, self.estimator.dim) * draft.peak
-        fresh = where & means.jumps & lit & ~self.split
-        self.split |= fresh
-        self.smooth = self.smooth & where & ~self.split
-        value, coverage, scatter = means.value, means.coverage, means.scatter
-        if 0 < level <= node_rules.SMOOTH_LEVELS and dr.any(self.smooth):
-            seen = apply_nodes(draft, node_rules.product(level, draft.area), self.smooth, ("value", "coverage"))
-            value, coverage = dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.coverage, coverage)
+        first_met = where & means.jumps & lit & ~self.has_jump
+        self.has_jump |= first_met
+        self.smooth = self.smooth & where & ~self.has_jump
+        value, coverage = self._smooth_by_nodes(level)
         moved = dr.abs(value - draft.value)
         if level == 0:
-            left, unseen = self._first(fresh, moved, scatter, parted(coverage))
+            remaining, around = self._after_first(first_met, moved, parted(coverage))
         else:
-            left, unseen = self._later(level, fresh, moved, scatter, len(rule))
+            remaining, around = self._after_later(level, first_met, moved, len(rule))
             self.smooth = self.smooth & (moved < self.estimator.bumpy * value)
-        # Whose neighbour meets a jump at last, or was misled, may pass the same by and be as wrong as that one was:
-        # who met no jump, and who has settled.
-        unseen = dr.select((self.split & where) | ~draft.open, 0, unseen)
-        self.left = dr.select(where, left, self.left)
-        better = where if level else fresh  # where the first transects meet no jump nodes are
-        draft.value = dr.select(better, value, draft.value)
-        draft.set_coverage(dr.select(better, coverage, draft.coverage))
-        known = self.split & ~fresh
-        draft.error = dr.maximum(dr.select(where, dr.maximum(self.left, self._doubt(known)), draft.error), unseen)
+        # Pixels around that have met no jump, or take no more transects, may have passed by the same edge.
+        around = dr.select((self.has_jump & where) | ~draft.open, 0, around)
+        self.remaining = dr.select(where, remaining, self.remaining)
+        replaced = where if level else first_met  # without a jump nodes do better than the first transects
+        draft.value = dr.select(replaced, value, draft.value)
+        draft.set_coverage(dr.select(replaced, coverage, draft.coverage))
+        error = dr.maximum(self.remaining, self._by_neighbours(self.has_jump & ~first_met))
+        draft.error = dr.maximum(dr.select(where, error, draft.error), around)
         tolerance = draft.tolerance
         dark = (tolerance <= 0) & dr.opaque(mi.Bool, level + 1 < DARK_LEVELS)
-        self.where = (where | (unseen > 0)) & ((draft.error > tolerance) | dark) & self.wanted
+        self.where = (where | (around > 0)) & ((draft.error > tolerance) | dark) & self.wanted
         self.count = len(rule)
-        dr.eval(draft.value, draft.error, self.split, self.smooth, self.left, self.where)
+        dr.eval(draft.value, draft.error, self.has_jump, self.smooth, self.remaining, self.where)
 
-    def _unsettled(self, left: PixelArray) -> PixelArray:
-        """What is left, or so much that another level is needed."""
-        return dr.maximum(left, self.estimator.unsettled * self.draft.tolerance)
+    def _smooth_by_nodes(self, level: int) -> tuple[PixelArray, PixelArray]:
+        """Value and coverage of the level: by a node rule on smooth pixels, by transects on the others."""
+        value, coverage = self.means.value, self.means.coverage
+        if not 0 < level <= node_rules.SMOOTH_LEVELS or not dr.any(self.smooth):
+            return value, coverage
+        rule = node_rules.product(level, self.draft.area)
+        seen = apply_nodes(self.draft, rule, self.smooth, ("value", "coverage"))
+        return dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.coverage, coverage)
 
-    def _doubt(self, known: Mask) -> PixelArray:
-        """What pixels may be wrong by for all that neighbours know; `known`: which pixels know an edge themselves."""
-        near, edge = self.draft.grid.spread_all((self.left, dr.select(self.split, self.left, 0)))
-        doubt = dr.maximum(dr.opaque(mi.Float64, self.estimator.doubt) * near, dr.select(known, 0, edge))
+    def _at_least_unsettled(self, remaining: PixelArray) -> PixelArray:
+        """The error that remains, or one above the tolerance, so that another level follows."""
+        return dr.maximum(remaining, self.estimator.unsettled * self.draft.tolerance)
+
+    def _by_neighbours(self, met_before: Mask) -> PixelArray:
+        """Error of each pixel that follows from its neighbours', whose edges may reach into it.
+
+        Half of a neighbour's counts; all of it where the edge is sharp, or where the neighbour has met a jump and the
+        pixel had not (`met_before`).
+        """
+        near, with_jump = self.draft.grid.spread_all((self.remaining, dr.select(self.has_jump, self.remaining, 0)))
+        doubt = dr.maximum(dr.opaque(mi.Float64, self.estimator.doubt) * near, dr.select(met_before, 0, with_jump))
         return dr.select(self.edges.sharp, near, doubt)
 
-    def _first(
-        self, fresh: Mask, moved: PixelArray, scatter: PixelArray, silhouette: Mask
-    ) -> tuple[PixelArray, PixelArray]:
-        """What may be left after the first transects, and what they pass by beside a jump.
+    def _after_first(self, first_met: Mask, moved: PixelArray, silhouette: Mask) -> tuple[PixelArray, PixelArray]:
+        """Error that remains after the first transects; error of pixels around a jump, which may pass it by.
 
-        That two of them and the nodes agree says enough of a silhouette, and of another jump too little.
+        Two transects that agree with nodes are evidence enough of a silhouette, which coverage shows too, but not of a
+        step of J_n.
         """
         draft, estimator = self.draft, self.estimator
-        left = dr.maximum(estimator.first_gain * moved, scatter)
-        left = dr.select(silhouette, left, self._unsettled(left))
-        missed = dr.maximum(
-            estimator.nodes_gain * moved, dr.select(parted(draft.coverage), draft.error, draft.roughness)
-        )
-        # Who is known from elsewhere takes no transects, and knows of the silhouette all the same.
-        return dr.select(fresh, left, missed), draft.unseen_by_transects(fresh | (draft.outline & ~draft.open))
+        at_jump = dr.maximum(estimator.first_gain * moved, self.means.scatter)
+        at_jump = dr.select(silhouette, at_jump, self._at_least_unsettled(at_jump))
+        elsewhere = dr.select(parted(draft.coverage), draft.error, draft.roughness)
+        elsewhere = dr.maximum(estimator.nodes_gain * moved, elsewhere)
+        # Pixels that are known from elsewhere take no transects; their outlines count as jumps here.
+        jumps = first_met | (draft.outline & ~draft.open)
+        return dr.select(first_met, at_jump, elsewhere), draft.unseen_by_transects(jumps)
 
-    def _later(
-        self, level: int, fresh: Mask, moved: PixelArray, scatter: PixelArray, count: int
-    ) -> tuple[PixelArray, PixelArray]:
-        """What may be left, and what neighbours of a jump that is met at last, or of who was misled, may be wrong by.
+    def _after_later(self, level: int, first_met: Mask, moved: PixelArray, count: int) -> tuple[PixelArray, PixelArray]:
+        """Error that remains after a later level; error of pixels around those that this level changed unexpectedly.
 
-        The less a level moved of what was left before the less is left, but lest two wrong values agree by chance no
-        less than the order of convergence grants. What was moved until now says nothing of a fresh jump.
+        The less a level moved of what remained before, the less remains; but no less than the order of convergence
+        grants, as two wrong values may agree by chance. A jump that is met for the first time takes another level: what
+        was moved before tells nothing of it.
         """
-        before, estimator = self.left, self.estimator
+        before, estimator = self.remaining, self.estimator
         least, most = estimator.least_gain, estimator.most_gain
         change = dr.maximum(moved, before * dr.opaque(mi.Float64, (self.count / count) ** estimator.order))
         gain = dr.clip(dr.select(before > 0, most * change / before, most), least, most)
-        left = dr.maximum(change * gain, scatter)
+        remaining = dr.maximum(change * gain, self.means.scatter)
         if level <= node_rules.SMOOTH_LEVELS:
-            # On what is smooth each step of the node rules gains more than it moves.
-            left = dr.select(self.smooth, estimator.step_gain * moved, left)
-        left = dr.select(fresh, self._unsettled(left), left)
-        farther = dr.maximum(dr.opaque(mi.Float64, estimator.misled) * before, self.draft.tolerance)
-        misled = self.where & (moved > farther)
-        return left, self.draft.near_edge(dr.select(fresh | misled, moved, 0))
+            # On smooth pixels the next node rule changes the value by less than this one did.
+            remaining = dr.select(self.smooth, estimator.step_gain * moved, remaining)
+        remaining = dr.select(first_met, self._at_least_unsettled(remaining), remaining)
+        expected = dr.maximum(dr.opaque(mi.Float64, estimator.misled) * before, self.draft.tolerance)
+        unexpected = self.where & (moved > expected)
+        return remaining, self.draft.near_edge(dr.select(first_met | unexpected, moved, 0))
 
 
 # ---------------------------------------------------------------------- which way transects go
@@ -151,14 +158,14 @@ class Edges:
     blur: PixelArray
     sharp: Mask
 
-    def learn(self, draft: Draft, means: Means, split: Mask, across: bool = False) -> None:
-        """Blur of the edges that were met; pixels that see none are smooth, and none is sharp.
+    def learn(self, draft: Draft, means: Means, has_jump: Mask, across: bool = False) -> None:
+        """Take the blur of the edges that the last transects met, on pixels around as well.
 
-        Whoever met none may see the tip of a neighbour's, and looks next towards where more or fewer lines hit; at
-        every other level `across` that, for what dark bodies leave of the light may lie beside all such transects.
+        A pixel that met no jump may see the tip of a neighbour's edge: its next transects go along the gradient of the
+        coverage, at every other level `across` it, as the light that a dark body leaves may lie beside all of them.
         """
         grid, jumps = draft.grid, means.jumps
-        around = (means.blur, -means.blur, jumps, split | draft.outline)
+        around = (means.blur, -means.blur, jumps, has_jump | draft.outline)
         ahead, behind, known, near = grid.spread_all(around)
         blur = dr.select(jumps, means.blur, _most_blurred(ahead, -behind))
         self.blur = dr.select(known & ~draft.clipped, blur, self.blur)
@@ -166,29 +173,29 @@ class Edges:
         x, y = grid.gradient(grid.box_sum(draft.coverage, _around(draft)))
         alike = dr.abs(x) + dr.abs(y) < COVERAGE_ROUNDING
         turn = dr.opaque(mi.Float64, math.pi / 2 if across else 0)
-        self.angle = dr.select(split | alike, self.angle, dr.atan2(y, x) + turn)
+        self.angle = dr.select(has_jump | alike, self.angle, dr.atan2(y, x) + turn)
         dr.eval(self.angle, self.blur, self.sharp)
 
 
 def _around(draft: Draft) -> int:
-    """From how far around a pixel learns which way its edge runs [pixels]."""
+    """Radius [pixels] of the square over which the gradient is taken that tells the direction of an edge."""
     return 1 + math.ceil(draft.most_blur / 2)
 
 
 def _most_blurred(ahead: PixelArray, behind: PixelArray) -> PixelArray:
-    """Of two signed blur radii the larger: between them, where neither edge is sharp, the mean may be."""
+    """Of two signed blur radii the one of larger magnitude; their mean could be 0, as of a sharp edge."""
     return dr.select(ahead > -behind, ahead, behind)
 
 
 def edges_of(draft: Draft) -> Edges:
-    """Across the change of the picture around, with the blur of what is nearest to the lens.
+    """Edges before any transect: along the gradient of the picture, with the blur of the nearest surface.
 
     The image-plane stop is sharp.
     """
     grid = draft.grid
     angle = grid.principal_angle(*grid.gradient(draft.value), _around(draft))
     nearest = grid.spread_max(-draft.nearest)
-    # Who sees no silhouette may still see a part of a blurred one that his nodes missed.
+    # A pixel without a silhouette may see a part of a blurred one that its nodes missed.
     farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
     nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
     blur = dr.select(draft.clipped, 0, draft.lens.blur_radius(nearest))
@@ -200,9 +207,9 @@ def edges_of(draft: Draft) -> Edges:
 
 @dataclass(frozen=True)
 class Means:
-    """Of each marked pixel mean radiance on film, share of coverage, whether a transect is split by a jump.
+    """Of each marked pixel mean radiance on film, share of coverage, whether a transect has met a jump.
 
-    scatter : what the value may be wrong by for all that the transects differ
+    scatter : error of the value that follows from how far the transects differ [W/mm²/sr]
     blur : signed radius of the most blurred edge that a transect met, 0 where none did [pixels]
     """
 
