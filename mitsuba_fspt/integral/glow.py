@@ -1,4 +1,4 @@
-"""Glowing shapes as the surface form sends light from them: element by element, piece by piece."""
+"""Glowing shapes of the surface form: their elements, the pieces of these, and the pixels that their light can reach."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..runtime.errors import SceneError
 from ..runtime.plugin_types import is_surface
 from .window import Window
 
-CELLS = 2.5  # balances the cells of the pupil with the size of the pieces, whatever the blur
+CELLS = 2.5  # cells along the pupil over ⁴√lines: errors of cells and of pieces are then about equal for any blur
 PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
 # Over rtol: elements of a shape that is no mesh. Below a pixel none is cut; the midpoint rule on a sphere or cylinder
 # of n elements is wrong by 0.8/n, which has to be less than the least error that is stated.
@@ -132,16 +132,16 @@ class Glow:
         sides = np.where(np.isfinite(blur), np.hypot(*axes.transpose(2, 0, 1)).max(axis=0), UNBOUNDED)
         margin = BULGE * sides[:, None]
         low, high = low - margin - window.corner, high + margin - window.corner
-        # Away for certain: between its corners a curved element may turn to the lens as far again as they differ.
+        # A curved element may turn towards the lens between its corners, by as much again as these differ.
         away = 2 * most - least <= 0
         dark = _dark(emitter, np.max(levels, axis=0)) if skip_dark else np.zeros(count, bool)
         low[away | dark], high[away | dark] = np.inf, -np.inf
         lit = ~(away | dark)
         area, extent = _area(*centres)[lit].sum(), _extent(np.concatenate([corner[lit] for corner in centres]))
         small = area < math.pi * blur.min(initial=np.inf) ** 2
-        # An element below a pixel would stay in one piece for some levels, and what that costs would not be seen to
-        # change. A piece of side s misplaces about s²/8 of a step in J_n, less of what a thick body blurs: if that is
-        # little, it may stay, unless the picture turns out to be dim beside the step.
+        # An element smaller than a pixel would stay in one piece at the first levels, which would agree on a wrong
+        # picture. A piece of side s misplaces about s²/8 of a step in J_n, less where a thick body is blurred: below the
+        # tolerance it stays in one piece, unless `finer` finds the picture dim beside the step.
         thickness = max(1, area / extent) if small and extent > 0 else 1
         sides = np.where(sides > math.sqrt(rtol * thickness / MISPLACED), np.maximum(sides, 1), sides)
         return cls(

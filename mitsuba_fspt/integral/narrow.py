@@ -1,8 +1,8 @@
-"""Light too narrow for lines of sight from the pixels: what is far below a pixel and outshines all around it.
+"""Narrow light: bodies and spots much smaller than a pixel and brighter than everything around them.
 
-Four nodes a pixel find what is as large as a pixel at the phantom, or as its blur disc where that is larger. Smaller
-bodies and spots they meet by chance or not at all, and no estimate made of them knows; the surface form starts where
-the light does.
+Four nodes a pixel find what is as large as a pixel at the phantom, or as its blur disc where that is larger. They meet
+smaller bodies and spots by chance or not at all, and error estimates that follow from the nodes do not show that. Such
+light is found from points all over the surfaces; the pixels that it reaches take the surface form.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from .node_rules import PLASTIC, twelve
 from .specular import Specular, transmission
 from .window import Window
 
-OUTSHINES = 2.0  # a point is narrow if it is so many times brighter than any square around, seen sharp
-# Transects look closely at the limb of a wide body: where it is slanted (cosine to the lens), its squares are covered
-# (a share) and it is not so many times brighter than the body around.
+OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than every square around, seen in focus
+# The limb of a wide body is no narrow light, as transects follow it: the surface is slanted (cosine to the lens), a
+# square around is covered (a share) and the point is not so many times brighter than the body around.
 SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
 WIDE, MOST_POINTS = 2.0, 1 << 12  # so thick [pixels, blur radii] no element is narrow; points of a thin one
@@ -177,9 +177,9 @@ class Points:
 
 
 def _hidden(points: Points, side: float) -> NDArray[np.bool_]:
-    """True of points that outshine the squares of a `side` [pixels] around, and are not the limb of a wide body.
+    """True of points that are narrow light among squares of a `side` [pixels], and not the limb of a wide body.
 
-    Beyond the limb lies what only a part of the pupil sees, beside what its middle does.
+    Points just beyond the limb, which only a part of the pupil sees, lie beside points that the pupil's middle sees.
     """
     cells = points.cells(side)
     grid = Grid(cells.shape)
@@ -232,7 +232,7 @@ def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor, specular: Specu
     middles = _look(emitter, elements, lens, counts)
     area, unit = middles.image.numpy(), np.maximum(middles.blur.numpy(), 1)
     reach = _reach(elements, lens) / unit
-    # A long and thin element is many points, a quarter of a unit apart; one that is wide may be wide at one.
+    # A long and thin element is represented by many points, a quarter of a unit apart, any other by one.
     long = np.isfinite(reach) & (reach > MOST_POINTS)  # points all along would be too far apart to tell
     thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
@@ -243,15 +243,15 @@ def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor, specular: Specu
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
     radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
-    # What is half as thick as a unit covers half of some square by itself.
+    # An element half as thick as a unit covers half of some square by itself: its points are not narrow.
     apart = np.repeat(np.where(area < unit**2 * reach, reach / counts, np.inf), counts)
     return Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
 
 
 @dataclass
 class _Look:
-    """At points of elements: `radiance` to where the lens sees most of them, area of the element's `image` from there
-    [pixels²]; cosine, front, blur and `centre` on film as in `Points`; `place` in the world.
+    """At points of elements: `radiance` towards the point of the pupil that sees most of them, area of the element's
+    `image` from there [pixels²]; cosine, front, blur and `centre` on film as in `Points`; `place` in the world.
     """
 
     radiance: mi.Float
