@@ -1,4 +1,4 @@
-"""Glowing shapes of the surface form: their elements, the pieces of these, and the pixels that their light can reach."""
+"""Glowing shapes of the surface form: their elements, pieces of these, and the pixels that their light can reach."""
 
 from __future__ import annotations
 
@@ -140,8 +140,8 @@ class Glow:
         area, extent = _area(*centres)[lit].sum(), _extent(np.concatenate([corner[lit] for corner in centres]))
         small = area < math.pi * blur.min(initial=np.inf) ** 2
         # An element smaller than a pixel would stay in one piece at the first levels, which would agree on a wrong
-        # picture. A piece of side s misplaces about s²/8 of a step in J_n, less where a thick body is blurred: below the
-        # tolerance it stays in one piece, unless `finer` finds the picture dim beside the step.
+        # picture. A piece of side s misplaces about s²/8 of a step in J_n, less where a thick body is blurred. Where
+        # that is below the tolerance it stays in one piece, unless `finer` finds the picture dim beside the step.
         thickness = max(1, area / extent) if small and extent > 0 else 1
         sides = np.where(sides > math.sqrt(rtol * thickness / MISPLACED), np.maximum(sides, 1), sides)
         return cls(
