@@ -2,8 +2,8 @@
 
 The pupil form gives the power on square blocks of pixels, as on a film of larger pixels. Where it is smooth over five
 blocks a polynomial of fourth degree along each axis has their powers as its integrals, so that the power on a block is
-kept, and gives that on its quarters. Blocks with an edge, those on which the polynomial bends too much and those on
-which single pixels contradict are halved along both axes, down to pixels.
+kept, and gives that on its parts. Blocks with an edge, those on which the polynomial bends too much and those on which
+single pixels contradict are parted into smaller ones, down to pixels.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from ..jit.block_grid import BlockGrid
@@ -39,14 +40,17 @@ REACH = 2  # blocks on either side of one from which the polynomial on it follow
 MARGIN = 3  # blocks around those that are wanted, from which the polynomials of these follow
 REFINED = 0.5  # of rtol: asked of blocks; what is left is for what lies between them
 BLURRED = 1.5  # blocks: blur radius from which on no edge is narrower than a block
-AROUND = 2  # blocks around those that are halved, on which lines of sight look for edges
-LEVELS = 4  # of transects on blocks; where more are needed smaller ones take them
+LEVELS = 4  # of transects on blocks; where more are needed smaller blocks take them
 SMALL = 4.0  # blocks: a body that is smaller may have its edges within single blocks
-# Of the change from polynomials over three blocks to those over five, on a block and its neighbours: on blurred edges
-# and corners, whose pictures have kinks at the rim of the blur disc, up to 3.1 times as much is left for blur radii
+# Of the change from polynomials over five blocks to those over seven, on a block and its neighbours: on blurred edges
+# and corners, whose pictures have kinks at the rim of the blur disc, up to 8.6 times as much is left for blur radii
 # from 1.5 to 16 blocks.
 BEND_GAIN = 8.6
-MOST = 0.5  # of the largest blocks: where more are to be halved all pixels are computed
+MOST = 0.5  # of blocks: where more of the largest are to be parted, or of their parts again, pixels are computed
+RIM_ORDER = 1.5  # by which the error of the interpolation falls at the rim of a blur disc
+# Of the largest difference found on nine pixels, one of a block and of each neighbour: independent normal ones are
+# larger on one pixel of 600.
+TRIED_GAIN = 2.5
 STREAM = 0x9E3779B9  # of the random pixels that are tried
 
 Plane = NDArray[np.float64]
@@ -64,6 +68,9 @@ class Blocks:
     side: int
     lens: mi.Sensor
     window: Window
+
+    def __str__(self) -> str:
+        return f"blocks of {self.side}² pixels" if self.side > 1 else "pixels"
 
 
 def blocks_of(window: Window, lens: mi.Sensor) -> tuple[Blocks, ...]:
@@ -99,87 +106,87 @@ def solve(
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
-    """As `pupil_form.solve`, with values between blocks interpolated; None where most blocks are to be halved."""
-    picture = _Picture(view, quadrature, least_peak, blocks[0].window, blocks[-1].window)
-    for k, size in enumerate(blocks):
-        rough = picture.own
-        if rough.any():
-            picture.compute(size, progress.part(k, len(blocks)))
-            if size.side > 1:
-                rough = picture.rough()
-        if k == 0 and np.count_nonzero(rough) > MOST * rough.size:
+    """As `pupil_form.solve`, with values between blocks interpolated; None where most blocks are to be parted."""
+    picture = _Picture(view, blocks, quadrature, least_peak)
+    while picture.own.any():
+        picture.compute(progress)
+        if picture.blocks.side == 1:
+            break
+        rough = picture.rough()
+        if picture.own.all() and np.count_nonzero(rough) > MOST * rough.size:
             return None
-        if size.side > 1:
-            picture.halve(rough)
+        picture.part(rough)
     progress(1.0)
     return picture.solution()
 
 
 class _Picture:
-    """The picture on `blocks` (h, w): `value` [W/mm²/sr], `error`, `coverage`.
+    """The picture on blocks (h, w): `value` [W/mm²/sr], its `error` and `coverage`.
 
-    own : blocks that are computed, True, and those that are interpolated between larger ones
+    blocks, own : of the present size; True where they are computed, False where larger ones gave them
     edge : blocks on which the picture may jump
-    bent : what parts of a block may be wrong by as they are interpolated
-    tolerance, peak : the error asked for; the brightest block, or what was known to be as bright
+    bent : what pixels of a block may be wrong by as they are interpolated [W/mm²/sr]
+    peak, tolerance : the brightest block, or what was known to be as bright; the error asked for [W/mm²/sr]
     """
 
-    def __init__(self, view: View, quadrature: Quadrature, least_peak: float, window: Window, fine: Window) -> None:
-        shape, self.fine = window.shape, fine
-        self.view, self.quadrature, self.peak = view, quadrature, least_peak
+    def __init__(self, view: View, sizes: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float) -> None:
+        self.view, self.sizes, self.quadrature, self.peak = view, sizes, quadrature, least_peak
+        self.blocks, shape = sizes[0], sizes[0].window.shape
+        self.grid, self.own = Grid(shape), np.ones(shape, bool)
         self.value, self.error, self.coverage = (np.zeros(shape) for _ in range(3))
-        self.own = np.ones(shape, bool)
-        self.grid = Grid(shape)
         self.rays, self.levels, self.shares = 0, [], []
+        self.findings: list[Finding] = []
 
-    def compute(self, blocks: Blocks, progress: Progress) -> None:
-        """Lines of sight to the blocks that are not interpolated."""
-        self.blocks, side = blocks, blocks.side
-        quadrature = self.quadrature
-        if side > 1:
-            quadrature = replace(quadrature, rtol=max(REFINED * quadrature.rtol, FLOAT32_FLOOR))
-        self.seen = replace(self.view, lens=blocks.lens, detail=self.view.detail * side**2)
-        draft = Draft(self.seen, blocks.window, quadrature, None, self.peak, progress, self.grid)
-        draft.open, draft.known = self.grid.flat(self.own), self.grid.flat(self.value)
-        if side > 1:
-            edge = ~_refine_blurred(draft) & (draft.outline | parted(draft.coverage))
-            self.edge = np.zeros(self.own.shape, bool)
-            self.grid.lay(edge, self.edge)
+    def compute(self, progress: Progress) -> None:
+        """Take lines of sight to the blocks that larger ones did not give."""
+        blocks, grid = self.blocks, self.grid
+        draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
+        draft.open, draft.known = grid.flat(self.own), grid.flat(self.value)
+        self.edge = np.zeros(self.own.shape, bool)
+        if blocks.side > 1:
+            grid.lay(~_refine_blurred(draft) & (draft.outline | parted(draft.coverage)), self.edge)
         else:
-            refine(draft, np.broadcast_to(0.0, self.grid.shape))
+            refine(draft, np.broadcast_to(0.0, grid.shape))
         power, error, coverage = draft.images()
-        for plane, image in ((self.value, draft.value), (self.error, error / blocks.lens.etendue), (self.coverage, coverage)):
-            self.grid.lay(dr.select(draft.open, image, self.grid.flat(plane)), plane)
-        if len(self.levels) == 0:
-            self.peak = max(float(draft.peak[0]), self.peak)
+        images = (power / blocks.lens.etendue, error / blocks.lens.etendue, coverage)
+        for plane, image in zip((self.value, self.error, self.coverage), images, strict=True):
+            grid.lay(dr.select(draft.open, image, grid.flat(plane)), plane)
+        if self.own.all():
+            self.peak = float(draft.peak[0])
             self.tolerance = self.quadrature.rtol * self.peak
-        name = f"blocks of {side}² pixels" if side > 1 else "pixels"
-        self.shares.append(f"{np.count_nonzero(self.own)} {name}")
+        self.shares.append(f"{np.count_nonzero(self.own)} {blocks}")
         self.rays += draft.rays
-        self.levels += [f"{name}, {level}" if side > 1 else level for level in draft.levels]
+        self.levels += [f"{blocks}, {level}" for level in draft.levels]
         self.findings = draft.findings
 
+    def _seen(self) -> View:
+        """What the lens sees before a film of such blocks."""
+        return replace(self.view, lens=self.blocks.lens, detail=self.view.detail * self.blocks.side**2)
+
+    def _quadrature(self) -> Quadrature:
+        """The accuracy asked of blocks, or of pixels."""
+        if self.blocks.side == 1:
+            return self.quadrature
+        return replace(self.quadrature, rtol=max(REFINED * self.quadrature.rtol, FLOAT32_FLOOR), pixel="area")
+
     def rough(self) -> Marks:
-        """Blocks (h, w) that are to be halved, after single pixels of the others have been tried."""
-        side = self.blocks.side
-        self.edge = _spread(self.edge, 1) | _small_bodies(self.seen, self.blocks.window)
-        self.bent = BEND_GAIN * _bend(self.value, side)
+        """Blocks (h, w) that are to be parted, after single pixels of the others have been tried.
+
+        The errors of the others become those of their pixels.
+        """
+        self.edge = _spread(self.edge, 1) | _small_bodies(self._seen(), self.blocks.window)
+        self.bent = BEND_GAIN * _bend(self.value, self.blocks.side, self.quadrature.pixel)
         # Near blurred edges four lines of sight prove nothing.
         whole = -_spread(-self.coverage, 1) > 1 - COVERAGE_ROUNDING
         number = np.flatnonzero(whole & ~self._beyond() & self.own)
         if number.size:
-            off, edge = self._tried(number)
-            there = np.zeros(whole.shape)
-            there.ravel()[number] = off
-            self.bent = np.maximum(self.bent, _spread(there, 1))
-            marks = np.zeros(whole.shape, bool)
-            marks.ravel()[number] = edge
-            self.edge |= _spread(marks, 1)
+            off, edge = np.zeros(whole.shape), np.zeros(whole.shape, bool)
+            off.ravel()[number], edge.ravel()[number] = self._tried(number)
+            self.bent = np.maximum(self.bent, TRIED_GAIN * _spread(off, 1))
+            self.edge |= _spread(edge, 1)
         rough = self._beyond() & self.own
-        if self.own.all():  # blocks without a pixel of the crop window, or of the rim that estimates need
-            wanted = np.zeros(rough.shape, bool)
-            wanted[MARGIN - 1 : 1 - MARGIN, MARGIN - 1 : 1 - MARGIN] = True
-            rough &= wanted
+        if self.own.all():  # but for what is around the crop window and the rim that estimates need
+            rough &= np.pad(np.ones([n - 2 * MARGIN + 2 for n in rough.shape], bool), MARGIN - 1)
         least = np.where(_spread(self.coverage, REACH) > 0, self.quadrature.least_error * self.peak, 0)
         self.error = np.where(self.own, np.maximum(self._left(), least), self.error)
         return rough
@@ -189,48 +196,67 @@ class _Picture:
         return self.edge | (self._left() > self.tolerance)
 
     def _left(self) -> Plane:
-        """What parts of each block may be wrong by, (h, w): errors of blocks near by, and of the interpolation."""
-        return np.hypot(_propagated(self.error, self.blocks.side), self.bent)
+        """What pixels of each block may be wrong by, (h, w): errors of blocks near by, and of the interpolation.
+
+        They have causes of their own.
+        """
+        return np.hypot(_propagated(self.error, self.blocks.side, self.quadrature.pixel), self.bent)
 
     def _tried(self, number: NDArray[np.int64]) -> tuple[Plane, Marks]:
         """On one random pixel of each of these blocks: how far it is from the interpolated value; whether it has an
         edge that the block does not show.
         """
-        side, (height, width), window = self.blocks.side, self.value.shape, self.fine
+        side, width = self.blocks.side, self.value.shape[1]
         row, column = np.divmod(number, width)
         random = mi.sample_tea_32(mi.UInt32(number), mi.UInt32(STREAM & 0xFFFFFFFF))
         i, j = (np.asarray(r.numpy() % side).astype(np.int64) for r in random)
         place = (row * side + i) * (width * side) + column * side + j
-        centres = window.centres(mi.UInt32(place.astype(np.uint32)))
-        seen = apply_rule(self.view, centres, node_rules.four(True))
+        centres = self.sizes[-1].window.centres(mi.UInt32(place.astype(np.uint32)))
+        seen = apply_rule(self.view, centres, node_rules.four(self.quadrature.pixel == "area"))
         dr.eval(seen.value, seen.coverage)
         self.rays += 4 * number.size
-        self.levels.append(f"blocks of {side}² pixels, one pixel each: {number.size} pixels")
-        weights = part_weights(side, REACH)
+        self.levels.append(f"{self.blocks}, one pixel each: {number.size} pixels")
+        weights = part_weights(side, REACH, self.quadrature.pixel)
         around = sliding_window_view(np.pad(self.value, REACH, mode="edge"), (2 * REACH + 1,) * 2)[row, column]
         found = np.einsum("na,nab,nb->n", weights[i], around, weights[j], optimize=True)
         return np.abs(found - seen.value.numpy()), seen.coverage.numpy() < 1 - COVERAGE_ROUNDING
 
-    def halve(self, rough: Marks) -> None:
-        """Interpolate all blocks but the `rough` ones, whose quarters are to be computed."""
+    def part(self, rough: Marks) -> None:
+        """Go on to smaller blocks: parts of the `rough` ones are to be computed, the others are interpolated."""
+        smaller = self._smaller(rough)
+        parts = self.blocks.side // smaller.side
         # Blocks around show which way an edge runs and whether one passes near by; their values stay.
-        self.grid = BlockGrid(_spread(rough, AROUND), 2) if rough.any() else None
-        self.error = _repeated(self.error, 2)
-        weights = part_weights(2, REACH)
+        around = math.ceil(smaller.window.rim / parts)
+        self.grid = BlockGrid(_spread(rough, around), parts) if rough.any() else None
+        self.error, self.own = _repeated(self.error, parts), _repeated(rough, parts)
+        weights = part_weights(parts, REACH, self.quadrature.pixel if smaller.side == 1 else "area")
         self.value = np.maximum(means_of_parts(self.value, weights), 0)
         inside = (self.coverage > COVERAGE_ROUNDING) & (self.coverage < 1 - COVERAGE_ROUNDING) & ~rough
-        coverage = _repeated(self.coverage, 2)
+        coverage = _repeated(self.coverage, parts)
         if inside.any():
-            between = np.clip(means_of_parts(self.coverage, weights), 0, 1)
-            coverage = np.where(_repeated(inside, 2), between, coverage)
-        self.coverage, self.own = coverage, _repeated(rough, 2)
+            between = np.clip(means_of_parts(self.coverage, part_weights(parts, REACH)), 0, 1)
+            coverage = np.where(_repeated(inside, parts), between, coverage)
+        self.blocks, self.coverage = smaller, coverage
+
+    def _smaller(self, rough: Marks) -> Blocks:
+        """The largest smaller blocks that may do for most of the rough ones, or pixels.
+
+        What is left falls with the side as at the rim of a blur disc, by its power 3/2.
+        """
+        left = np.where(self.edge, np.inf, self.error)[rough]
+        for smaller in self.sizes:
+            beyond = left * (smaller.side / self.blocks.side) ** RIM_ORDER > self.tolerance
+            if 1 < smaller.side < self.blocks.side and np.count_nonzero(beyond) < MOST * left.size:
+                return smaller
+        return self.sizes[-1]
 
     def solution(self) -> Solution:
         """The picture of pixels."""
         etendue = self.view.lens.etendue
         why = f"of {self.own.size} pixels computed are " + ", ".join(self.shares)
         findings = (Finding("smooth blocks", True, why), *self.findings)
-        whole = (self.fine.expand(plane) for plane in (self.value * etendue, self.error * etendue, self.coverage))
+        images = (self.value * etendue, self.error * etendue, self.coverage)
+        whole = (self.sizes[-1].window.expand(image) for image in images)
         return Solution(*whole, self.rays, tuple(self.levels), findings=findings)
 
 
@@ -268,18 +294,20 @@ def _small_bodies(view: View, window: Window) -> Marks:
 # ---------------------------------------------------------------------- polynomials over blocks
 
 
-def part_weights(side: int, reach: int) -> Plane:
+def part_weights(side: int, reach: int, pixel: str = "area") -> Plane:
     """Means over parts of the middle of 2 reach + 1 cells, (side, cells), of the polynomial with these cells' means.
 
-    The integral of the polynomial interpolates the sums of the cells at their ends.
+    The integral of the polynomial interpolates the sums of the cells at their ends. `pixel` 'centre': its values in
+    the middle of the parts.
     """
     ends = np.arange(2 * reach + 2) - reach - 0.5
-    parts = np.arange(side + 1) / side - 0.5
-    # Lagrange's polynomials of the ends, at the ends of the parts.
-    factor = [np.prod([(parts - other) / (end - other) for other in ends if other != end], axis=0) for end in ends]
-    lagrange = np.array(factor).T  # (side + 1, ends)
+    lagrange = [Polynomial.fromroots(ends[ends != end]) / np.prod(end - ends[ends != end]) for end in ends]
     sums = np.tril(np.ones((2 * reach + 2, 2 * reach + 1)), -1)
-    return np.diff(lagrange @ sums, axis=0) * side
+    if pixel == "centre":
+        middles = (np.arange(side) + 0.5) / side - 0.5
+        return np.array([of.deriv()(middles) for of in lagrange]).T @ sums
+    parts = np.arange(side + 1) / side - 0.5
+    return np.diff(np.array([of(parts) for of in lagrange]).T @ sums, axis=0) * side
 
 
 def means_of_parts(cells: Plane, weights: Plane) -> Plane:
@@ -291,9 +319,9 @@ def means_of_parts(cells: Plane, weights: Plane) -> Plane:
     return np.ascontiguousarray(cells)
 
 
-def _propagated(errors: Plane, side: int) -> Plane:
+def _propagated(errors: Plane, side: int, pixel: str) -> Plane:
     """Error of the parts of each cell, (h, w), that follows from independent errors of cells (h, w)."""
-    share = np.square(part_weights(side, REACH)).max(axis=0)
+    share = np.square(part_weights(side, REACH, pixel)).max(axis=0)
     square = np.square(errors)
     for axis in (0, 1):
         pad = [(REACH, REACH) if k == axis else (0, 0) for k in (0, 1)]
@@ -301,10 +329,10 @@ def _propagated(errors: Plane, side: int) -> Plane:
     return np.sqrt(square)
 
 
-def _bend(cells: Plane, side: int) -> Plane:
-    """Largest change of a part of each cell and its neighbours from polynomials over three cells to five, (h, w)."""
+def _bend(cells: Plane, side: int, pixel: str) -> Plane:
+    """Largest change of a part of each cell and its neighbours from polynomials over five cells to seven, (h, w)."""
     parts = [0, side // 2, side - 1]  # corners, where it is largest, and the middle
-    seven, five = (means_of_parts(cells, part_weights(side, reach)[parts]) for reach in (REACH + 1, REACH))
+    seven, five = (means_of_parts(cells, part_weights(side, reach, pixel)[parts]) for reach in (REACH + 1, REACH))
     height, width = cells.shape
     change = np.abs(seven - five).reshape(height, len(parts), width, len(parts)).max(axis=(1, 3))
     return _spread(change, 1)

@@ -211,8 +211,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         """Blocks of pixels between which the picture may be interpolated; none, and why, where that is not done."""
         if not quadrature.takes("smooth blocks"):
             return (), "as was wanted"
-        if quadrature.domain != "pupil" or quadrature.pixel != "area" or view.specular:
-            return (), "only lines of sight over pixels and straight to the first surface are interpolated"
+        if quadrature.domain != "pupil" or view.specular:
+            return (), "only lines of sight from the pixel straight to the first surface are interpolated"
         if math.isfinite(view.lens.optics.seen_field):
             return (), "an image-plane stop cuts blocks"
         state = (window, _view(view.lens))
