@@ -34,8 +34,8 @@ from .solution import Solution
 from .transects import integrate_by_transects
 from .window import Window
 
-# Pixels along the largest blocks; blocks along a picture's shorter side.
-SIDES, FEWEST = (8, 4), 96
+# Pixels along the largest blocks; blocks along a picture's shorter side, of which fewer do not pay.
+SIDES, FEWEST = (8, 4), 128
 REACH = 2  # blocks on either side of one from which the polynomial on it follows
 MARGIN = 3  # blocks around those that are wanted, from which the polynomials of these follow
 REFINED = 0.5  # of rtol: asked of blocks; what is left is for what lies between them
@@ -43,10 +43,11 @@ BLURRED = 1.5  # blocks: blur radius from which on no edge is narrower than a bl
 LEVELS = 4  # of transects on blocks; where more are needed smaller blocks take them
 SMALL = 4.0  # blocks: a body that is smaller may have its edges within single blocks
 # Of the change from polynomials over five blocks to those over seven, on a block and its neighbours: on blurred edges
-# and corners, whose pictures have kinks at the rim of the blur disc, up to 8.6 times as much is left for blur radii
-# from 1.5 to 16 blocks.
-BEND_GAIN = 8.6
-MOST = 0.5  # of blocks: where more of the largest are to be parted, or of their parts again, pixels are computed
+# and corners, whose pictures have kinks at the rim of the blur disc, up to 9.2 times as much is left, in the middles of
+# pixels 11.9 times, for blur radii from 1.5 to 16 blocks.
+BEND_GAIN = {"area": 9.2, "centre": 12.0}
+MOST = 0.5  # of the blocks: where more are to be parted into pixels all pixels are computed
+COST = 2.0  # pixels: of a block, which takes more lines of sight as less than rtol is asked of it
 RIM_ORDER = 1.5  # by which the error of the interpolation falls at the rim of a blur disc
 # Of the largest difference found on nine pixels, one of a block and of each neighbour: independent normal ones are
 # larger on one pixel of 600.
@@ -106,16 +107,17 @@ def solve(
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
-    """As `pupil_form.solve`, with values between blocks interpolated; None where most blocks are to be parted."""
+    """As `pupil_form.solve`, with values between blocks interpolated; None where most of them are parted into pixels."""
     picture = _Picture(view, blocks, quadrature, least_peak)
     while picture.own.any():
         picture.compute(progress)
         if picture.blocks.side == 1:
             break
         rough = picture.rough()
-        if picture.own.all() and np.count_nonzero(rough) > MOST * rough.size:
+        smaller = picture.smaller(rough)
+        if smaller.side == 1 and np.count_nonzero(rough) > MOST * rough.size:
             return None
-        picture.part(rough)
+        picture.part(rough, smaller)
     progress(1.0)
     return picture.solution()
 
@@ -175,7 +177,8 @@ class _Picture:
         The errors of the others become those of their pixels.
         """
         self.edge = _spread(self.edge, 1) | _small_bodies(self._seen(), self.blocks.window)
-        self.bent = BEND_GAIN * _bend(self.value, self.blocks.side, self.quadrature.pixel)
+        pixel = self.quadrature.pixel
+        self.bent = BEND_GAIN[pixel] * _bend(self.value, self.blocks.side, pixel)
         # Near blurred edges four lines of sight prove nothing.
         whole = -_spread(-self.coverage, 1) > 1 - COVERAGE_ROUNDING
         number = np.flatnonzero(whole & ~self._beyond() & self.own)
@@ -221,9 +224,20 @@ class _Picture:
         found = np.einsum("na,nab,nb->n", weights[i], around, weights[j], optimize=True)
         return np.abs(found - seen.value.numpy()), seen.coverage.numpy() < 1 - COVERAGE_ROUNDING
 
-    def part(self, rough: Marks) -> None:
+    def smaller(self, rough: Marks) -> Blocks:
+        """The largest smaller blocks that save more pixels than they cost where they do not do; else pixels.
+
+        What is left falls with the side as at the rim of a blur disc, by its power 3/2.
+        """
+        left = np.where(self.edge, np.inf, self.error)[rough]
+        for smaller in self.sizes:
+            do = left * (smaller.side / self.blocks.side) ** RIM_ORDER <= self.tolerance
+            if 1 < smaller.side < self.blocks.side and np.count_nonzero(do) * smaller.side**2 > COST * do.size:
+                return smaller
+        return self.sizes[-1]
+
+    def part(self, rough: Marks, smaller: Blocks) -> None:
         """Go on to smaller blocks: parts of the `rough` ones are to be computed, the others are interpolated."""
-        smaller = self._smaller(rough)
         parts = self.blocks.side // smaller.side
         # Blocks around show which way an edge runs and whether one passes near by; their values stay.
         around = math.ceil(smaller.window.rim / parts)
@@ -237,18 +251,6 @@ class _Picture:
             between = np.clip(means_of_parts(self.coverage, part_weights(parts, REACH)), 0, 1)
             coverage = np.where(_repeated(inside, parts), between, coverage)
         self.blocks, self.coverage = smaller, coverage
-
-    def _smaller(self, rough: Marks) -> Blocks:
-        """The largest smaller blocks that may do for most of the rough ones, or pixels.
-
-        What is left falls with the side as at the rim of a blur disc, by its power 3/2.
-        """
-        left = np.where(self.edge, np.inf, self.error)[rough]
-        for smaller in self.sizes:
-            beyond = left * (smaller.side / self.blocks.side) ** RIM_ORDER > self.tolerance
-            if 1 < smaller.side < self.blocks.side and np.count_nonzero(beyond) < MOST * left.size:
-                return smaller
-        return self.sizes[-1]
 
     def solution(self) -> Solution:
         """The picture of pixels."""
