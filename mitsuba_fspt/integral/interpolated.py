@@ -76,28 +76,24 @@ class Blocks:
 
 def blocks_of(window: Window, lens: mi.Sensor) -> tuple[Blocks, ...]:
     """The largest blocks that a window has enough of, then their halves down to its pixels; none of a small window."""
-    largest = next((side for side in SIDES if min(window.shape) >= side * FEWEST), 1)
-    height, width = (math.ceil(n / largest) for n in window.shape)
+    largest = next((side for side in SIDES if min(window.shape) >= side * FEWEST), 0)
+    if not largest:
+        return ()
+    blocks = tuple(math.ceil(n / largest) for n in window.shape)
     left, top = (n - MARGIN * largest for n in window.corner)
-    found = []
-    side = largest
+    found, side = [], largest
     while side > 1:
-        times, margin = largest // side, MARGIN * largest // side
-        coarser = lens.coarser(side)
+        coarser, times = lens.coarser(side), largest // side
         # The optical axis is in the middle of both films.
-        offset = tuple(
-            (n + MARGIN * largest - own / 2) / side + its / 2
-            for n, own, its in zip((left, top), lens.film().size(), coarser.film().size(), strict=True)
-        )
-        inner = (times * height, times * width)
-        shape = tuple(n + 2 * margin for n in inner)
-        found.append(Blocks(side, coarser, Window(-margin, -margin, shape, inner, offset, window.blur / side)))
+        places = zip((left, top), lens.film().size(), coarser.film().size(), strict=True)
+        offset = tuple((n - own / 2) / side + its / 2 + MARGIN * times for n, own, its in places)
+        inner, shape = (tuple(times * (n + more) for n in blocks) for more in (0, 2 * MARGIN))
+        whole = Window(-MARGIN * times, -MARGIN * times, shape, inner, offset, window.blur / side)
+        found.append(Blocks(side, coarser, whole))
         side //= 2
-    if found:
-        shape = tuple(2 * n for n in found[-1].window.shape)
-        left, top = (n - its for n, its in zip((left, top), window.crop_offset, strict=True))
-        found.append(Blocks(1, lens, replace(window, top=top, left=left, shape=shape)))
-    return tuple(found)
+    left, top = (n - its for n, its in zip((left, top), window.crop_offset, strict=True))
+    shape = tuple(largest * (n + 2 * MARGIN) for n in blocks)
+    return (*found, Blocks(1, lens, replace(window, top=top, left=left, shape=shape)))
 
 
 def solve(
@@ -107,7 +103,7 @@ def solve(
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
-    """As `pupil_form.solve`, with values between blocks interpolated; None where most of them are parted into pixels."""
+    """As `pupil_form.solve`, with values between blocks interpolated; None where most are parted into pixels."""
     picture = _Picture(view, blocks, quadrature, least_peak)
     while picture.own.any():
         picture.compute(progress)
@@ -127,6 +123,7 @@ class _Picture:
 
     blocks, own : of the present size; True where they are computed, False where larger ones gave them
     edge : blocks on which the picture may jump
+    reach : how far from where four nodes see an edge it may hide from them [blocks]
     bent : what pixels of a block may be wrong by as they are interpolated [W/mm²/sr]
     peak, tolerance : the brightest block, or what was known to be as bright; the error asked for [W/mm²/sr]
     """
@@ -142,6 +139,7 @@ class _Picture:
     def compute(self, progress: Progress) -> None:
         """Take lines of sight to the blocks that larger ones did not give."""
         blocks, grid = self.blocks, self.grid
+        progress = progress.part(self.sizes.index(blocks), len(self.sizes))
         draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
         draft.open, draft.known = grid.flat(self.own), grid.flat(self.value)
         self.edge = np.zeros(self.own.shape, bool)
@@ -158,8 +156,8 @@ class _Picture:
             self.tolerance = self.quadrature.rtol * self.peak
         self.shares.append(f"{np.count_nonzero(self.own)} {blocks}")
         self.rays += draft.rays
-        self.levels += [f"{blocks}, {level}" for level in draft.levels]
-        self.findings = draft.findings
+        self.levels += [f"{blocks}, {level}" if blocks.side > 1 else level for level in draft.levels]
+        self.findings, self.reach = draft.findings, draft.reach(4)[1]
 
     def _seen(self) -> View:
         """What the lens sees before a film of such blocks."""
@@ -240,8 +238,7 @@ class _Picture:
         """Go on to smaller blocks: parts of the `rough` ones are to be computed, the others are interpolated."""
         parts = self.blocks.side // smaller.side
         # Blocks around show which way an edge runs and whether one passes near by; their values stay.
-        around = math.ceil(smaller.window.rim / parts)
-        self.grid = BlockGrid(_spread(rough, around), parts) if rough.any() else None
+        self.grid = BlockGrid(_spread(rough, self.reach), parts) if rough.any() else None
         self.error, self.own = _repeated(self.error, parts), _repeated(rough, parts)
         weights = part_weights(parts, REACH, self.quadrature.pixel if smaller.side == 1 else "area")
         self.value = np.maximum(means_of_parts(self.value, weights), 0)
