@@ -252,7 +252,7 @@ class _Picture:
     def solution(self) -> Solution:
         """The picture of pixels."""
         etendue = self.view.lens.etendue
-        why = f"of {self.own.size} pixels computed are " + ", ".join(self.shares)
+        why = f"{', '.join(self.shares)} are computed for {self.own.size} pixels"
         findings = (Finding("smooth blocks", True, why), *self.findings)
         images = (self.value * etendue, self.error * etendue, self.coverage)
         whole = (self.sizes[-1].window.expand(image) for image in images)
