@@ -2,8 +2,8 @@
 
 The pupil form gives the power on square blocks of pixels, as on a film of larger pixels. Where it is smooth over five
 blocks a polynomial of fourth degree along each axis has their powers as its integrals, so that the power on a block is
-kept, and gives that on its pixels. Blocks with an edge, and those on which single pixels contradict, are solved pixel
-by pixel.
+kept, and gives that on its parts. Blocks with an edge, those on which the polynomial bends too much and those on which
+single pixels contradict are parted into smaller ones, down to pixels.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from ..jit.block_grid import BlockGrid
 from ..jit.mesh_buffers import box_of
-from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
+from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
 from . import node_rules
 from .draft import Draft
 from .eq9 import View
@@ -33,19 +34,24 @@ from .solution import Solution
 from .transects import integrate_by_transects
 from .window import Window
 
-# Pixels along a block, with the smallest rtol for which so large ones pay; blocks along a picture's shorter side.
-SIDES, FEWEST = ((8, 3e-3), (4, 0.0)), 96
-MARGIN = 2  # blocks around those that are wanted, from which the polynomials of these follow
+# Pixels along the largest blocks; blocks along a picture's shorter side, of which fewer do not pay.
+SIDES, FEWEST = (8, 4), 128
+REACH = 2  # blocks on either side of one from which the polynomial on it follows
+MARGIN = 3  # blocks around those that are wanted, from which the polynomials of these follow
 REFINED = 0.5  # of rtol: asked of blocks; what is left is for what lies between them
 BLURRED = 1.5  # blocks: blur radius from which on no edge is narrower than a block
-AROUND = 2  # blocks around those that are solved by pixels
-LEVELS = 4  # of transects on blocks; where more are needed pixels take them
+LEVELS = 4  # of transects on blocks; where more are needed smaller blocks take them
 SMALL = 4.0  # blocks: a body that is smaller may have its edges within single blocks
-# Of the change from polynomials over three blocks to those over five, on a block and its neighbours: on blurred edges
-# and corners, whose pictures have kinks at the rim of the blur disc, up to 3.1 times as much is left for blur radii
-# from 1.5 to 16 blocks.
-BEND_GAIN = 3.2
-MOST = 0.5  # of the blocks: where more are to be solved by pixels all are
+# Of the change from polynomials over five blocks to those over seven, on a block and its neighbours: on blurred edges
+# and corners, whose pictures have kinks at the rim of the blur disc, up to 9.2 times as much is left, in the middles of
+# pixels 11.9 times, for blur radii from 1.5 to 16 blocks.
+BEND_GAIN = {"area": 9.2, "centre": 12.0}
+MOST = 0.5  # of the blocks: where more are to be parted into pixels all pixels are computed
+COST = 2.0  # pixels: of a block, which takes more lines of sight as less than rtol is asked of it
+RIM_ORDER = 1.5  # by which the error of the interpolation falls at the rim of a blur disc
+# Of the largest difference found on nine pixels, one of a block and of each neighbour: independent normal ones are
+# larger on one pixel of 600.
+TRIED_GAIN = 2.5
 STREAM = 0x9E3779B9  # of the random pixels that are tried
 
 Plane = NDArray[np.float64]
@@ -54,125 +60,148 @@ Marks = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Blocks:
-    """Blocks of `side`² pixels over a window and `MARGIN` blocks around it.
+    """Blocks of `side`² pixels over a window and `MARGIN` of the largest blocks around it.
 
     lens : the same lens before a film of such blocks
-    coarse : window of blocks on that film
-    fine : window of all their pixels on the film itself
+    window : of all blocks on that film, on which it may begin between two of its pixels
     """
 
     side: int
     lens: mi.Sensor
-    coarse: Window
-    fine: Window
+    window: Window
 
-    @classmethod
-    def of(cls, window: Window, lens: mi.Sensor, rtol: float) -> Blocks | None:
-        """The largest blocks that a window has enough of; None where it is too small, or its film has an odd side."""
-        size = [int(n) for n in lens.film().size()]
-        fits = [side for side, least in SIDES if rtol >= least and min(window.shape) >= side * FEWEST]
-        if not fits or any(n % 2 for n in size):
-            return None
-        side, (left, top) = fits[0], window.corner
-        # Both films have the optical axis in the middle; pixels before the first of the film fill up its first block.
-        before = [(side * 2 * math.ceil(n / (2 * side)) - n) // 2 for n in size]
-        first = [(k + b) // side - MARGIN for k, b in zip((left, top), before, strict=True)]
-        last = [
-            math.ceil((k + n + b) / side) + MARGIN
-            for k, n, b in zip((left, top), window.shape[::-1], before, strict=True)
-        ]
-        width, height = (end - start for start, end in zip(first, last, strict=True))
-        inner = (height - 2 * MARGIN, width - 2 * MARGIN)
-        offset = (first[0] + MARGIN, first[1] + MARGIN)
-        coarse = Window(-MARGIN, -MARGIN, (height, width), inner, offset, window.blur / side)
-        x, y = (side * start - b for start, b in zip(first, before, strict=True))
-        fine = replace(
-            window,
-            top=y - window.crop_offset[1],
-            left=x - window.crop_offset[0],
-            shape=(side * height, side * width),
-        )
-        return cls(side, lens.coarser(side), coarse, fine)
+    def __str__(self) -> str:
+        return f"blocks of {self.side}² pixels" if self.side > 1 else "pixels"
+
+
+def blocks_of(window: Window, lens: mi.Sensor) -> tuple[Blocks, ...]:
+    """The largest blocks that a window has enough of, then their halves down to its pixels; none of a small window."""
+    largest = next((side for side in SIDES if min(window.shape) >= side * FEWEST), 0)
+    if not largest:
+        return ()
+    blocks = tuple(math.ceil(n / largest) for n in window.shape)
+    left, top = (n - MARGIN * largest for n in window.corner)
+    found, side = [], largest
+    while side > 1:
+        coarser, times = lens.coarser(side), largest // side
+        # The optical axis is in the middle of both films.
+        places = zip((left, top), lens.film().size(), coarser.film().size(), strict=True)
+        offset = tuple((n - own / 2) / side + its / 2 + MARGIN * times for n, own, its in places)
+        inner, shape = (tuple(times * (n + more) for n in blocks) for more in (0, 2 * MARGIN))
+        whole = Window(-MARGIN * times, -MARGIN * times, shape, inner, offset, window.blur / side)
+        found.append(Blocks(side, coarser, whole))
+        side //= 2
+    left, top = (n - its for n, its in zip((left, top), window.crop_offset, strict=True))
+    shape = tuple(largest * (n + 2 * MARGIN) for n in blocks)
+    return (*found, Blocks(1, lens, replace(window, top=top, left=left, shape=shape)))
 
 
 def solve(
     view: View,
-    blocks: Blocks,
+    blocks: tuple[Blocks, ...],
     quadrature: Quadrature,
-    spots: Marks,
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
-    """As `pupil_form.solve`, with values between blocks interpolated; None where most blocks have an edge.
-
-    spots : blocks (h, w) with light too narrow for lines of sight
-    """
-    picture = _Picture(view, blocks, quadrature, spots, least_peak, progress)
-    rough = picture.rough()
-    share = np.count_nonzero(rough) / rough.size
-    if share > MOST:
-        return None
-    return picture.solution(rough)
+    """As `pupil_form.solve`, with values between blocks interpolated; None where most are parted into pixels."""
+    picture = _Picture(view, blocks, quadrature, least_peak)
+    while picture.own.any():
+        picture.compute(progress)
+        if picture.blocks.side == 1:
+            break
+        rough = picture.rough()
+        smaller = picture.smaller(rough)
+        if smaller.side == 1 and np.count_nonzero(rough) > MOST * rough.size:
+            return None
+        picture.part(rough, smaller)
+    progress(1.0)
+    return picture.solution()
 
 
 class _Picture:
-    """The picture on blocks: `value` [W/mm²/sr], `error`, `coverage` (h, w), and `edge`, where it may jump."""
+    """The picture on blocks (h, w): `value` [W/mm²/sr], its `error` and `coverage`.
 
-    def __init__(
-        self,
-        view: View,
-        blocks: Blocks,
-        quadrature: Quadrature,
-        spots: Marks,
-        least_peak: float,
-        progress: Progress,
-    ) -> None:
-        self.view, self.blocks, self.quadrature = view, blocks, quadrature
-        coarse = replace(quadrature, rtol=max(REFINED * quadrature.rtol, FLOAT32_FLOOR))
-        seen = replace(view, lens=blocks.lens, detail=view.detail * blocks.side**2)
-        draft = Draft(seen, blocks.coarse, coarse, None, least_peak, progress.part(0, 2))
-        blurred = _refine_blurred(draft)
-        images = [draft.grid.array(image) for image in draft.images()]
-        self.value, self.error = (image / blocks.lens.etendue for image in images[:2])
-        self.coverage = images[2]
-        edge = (draft.outline | parted(draft.coverage)) & ~blurred
-        self.edge = _spread(draft.grid.array(edge), 1) | spots | _small_bodies(seen, blocks.coarse)
-        self.peak = max(float(draft.peak[0]), least_peak)
-        self.tolerance = quadrature.rtol * self.peak
-        self.rays, self.levels, self.findings = draft.rays, draft.levels, draft.findings
-        self.progress = progress
-        self.bent = BEND_GAIN * _bend(self.value, blocks.side)
+    blocks, own : of the present size; True where they are computed, False where larger ones gave them
+    edge : blocks on which the picture may jump
+    reach : how far from where four nodes see an edge it may hide from them [blocks]
+    bent : what pixels of a block may be wrong by as they are interpolated [W/mm²/sr]
+    peak, tolerance : the brightest block, or what was known to be as bright; the error asked for [W/mm²/sr]
+    """
+
+    def __init__(self, view: View, sizes: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float) -> None:
+        self.view, self.sizes, self.quadrature, self.peak = view, sizes, quadrature, least_peak
+        self.blocks, shape = sizes[0], sizes[0].window.shape
+        self.grid, self.own = Grid(shape), np.ones(shape, bool)
+        self.value, self.error, self.coverage = (np.zeros(shape) for _ in range(3))
+        self.rays, self.levels, self.shares = 0, [], []
+        self.findings: list[Finding] = []
+
+    def compute(self, progress: Progress) -> None:
+        """Take lines of sight to the blocks that larger ones did not give."""
+        blocks, grid = self.blocks, self.grid
+        progress = progress.part(self.sizes.index(blocks), len(self.sizes))
+        draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
+        draft.open, draft.known = grid.flat(self.own), grid.flat(self.value)
+        self.edge = np.zeros(self.own.shape, bool)
+        if blocks.side > 1:
+            grid.lay(~_refine_blurred(draft) & (draft.outline | parted(draft.coverage)), self.edge)
+        else:
+            refine(draft, np.broadcast_to(0.0, grid.shape))
+        power, error, coverage = draft.images()
+        images = (power / blocks.lens.etendue, error / blocks.lens.etendue, coverage)
+        for plane, image in zip((self.value, self.error, self.coverage), images, strict=True):
+            grid.lay(dr.select(draft.open, image, grid.flat(plane)), plane)
+        if self.own.all():
+            self.peak = float(draft.peak[0])
+            self.tolerance = self.quadrature.rtol * self.peak
+        self.shares.append(f"{np.count_nonzero(self.own)} {blocks}")
+        self.rays += draft.rays
+        self.levels += [f"{blocks}, {level}" if blocks.side > 1 else level for level in draft.levels]
+        self.findings, self.reach = draft.findings, draft.reach(4)[1]
+
+    def _seen(self) -> View:
+        """What the lens sees before a film of such blocks."""
+        return replace(self.view, lens=self.blocks.lens, detail=self.view.detail * self.blocks.side**2)
+
+    def _quadrature(self) -> Quadrature:
+        """The accuracy asked of blocks, or of pixels."""
+        if self.blocks.side == 1:
+            return self.quadrature
+        return replace(self.quadrature, rtol=max(REFINED * self.quadrature.rtol, FLOAT32_FLOOR), pixel="area")
 
     def rough(self) -> Marks:
-        """Blocks (h, w) that are to be solved by pixels, after single pixels of the others have been tried."""
+        """Blocks (h, w) that are to be parted, after single pixels of the others have been tried.
+
+        The errors of the others become those of their pixels.
+        """
+        self.edge = _spread(self.edge, 1) | _small_bodies(self._seen(), self.blocks.window)
+        pixel = self.quadrature.pixel
+        self.bent = BEND_GAIN[pixel] * _bend(self.value, self.blocks.side, pixel)
         # Near blurred edges four lines of sight prove nothing.
         whole = -_spread(-self.coverage, 1) > 1 - COVERAGE_ROUNDING
-        rough = self._beyond()
-        number = np.flatnonzero(whole & ~rough)
+        number = np.flatnonzero(whole & ~self._beyond() & self.own)
         if number.size:
-            off, edge = self._tried(number)
-            there = np.zeros(rough.shape)
-            there.ravel()[number] = off
-            self.bent = np.maximum(self.bent, _spread(there, 1))
-            marks = np.zeros(rough.shape, bool)
-            marks.ravel()[number] = edge
-            self.edge |= _spread(marks, 1)
-            rough = self._beyond()
-        return rough & self._wanted()
+            off, edge = np.zeros(whole.shape), np.zeros(whole.shape, bool)
+            off.ravel()[number], edge.ravel()[number] = self._tried(number)
+            self.bent = np.maximum(self.bent, TRIED_GAIN * _spread(off, 1))
+            self.edge |= _spread(edge, 1)
+        rough = self._beyond() & self.own
+        if self.own.all():  # but for what is around the crop window and the rim that estimates need
+            rough &= np.pad(np.ones([n - 2 * MARGIN + 2 for n in rough.shape], bool), MARGIN - 1)
+        least = np.where(_spread(self.coverage, REACH) > 0, self.quadrature.least_error * self.peak, 0)
+        self.error = np.where(self.own, np.maximum(self._left(), least), self.error)
+        return rough
 
     def _beyond(self) -> Marks:
         """Blocks with an edge, or with more than the tolerance left."""
         return self.edge | (self._left() > self.tolerance)
 
     def _left(self) -> Plane:
-        """What pixels of each block may be wrong by, (h, w): errors of blocks near by, and of the interpolation."""
-        return _propagated(self.error, self.blocks.side) + self.bent
+        """What pixels of each block may be wrong by, (h, w): errors of blocks near by, and of the interpolation.
 
-    def _wanted(self) -> Marks:
-        """Blocks (h, w) with a pixel of the crop window, or of the rim that estimates need."""
-        wanted = np.zeros(self.value.shape, bool)
-        wanted[MARGIN - 1 : 1 - MARGIN, MARGIN - 1 : 1 - MARGIN] = True
-        return wanted
+        They have causes of their own.
+        """
+        return np.hypot(_propagated(self.error, self.blocks.side, self.quadrature.pixel), self.bent)
 
     def _tried(self, number: NDArray[np.int64]) -> tuple[Plane, Marks]:
         """On one random pixel of each of these blocks: how far it is from the interpolated value; whether it has an
@@ -183,50 +212,51 @@ class _Picture:
         random = mi.sample_tea_32(mi.UInt32(number), mi.UInt32(STREAM & 0xFFFFFFFF))
         i, j = (np.asarray(r.numpy() % side).astype(np.int64) for r in random)
         place = (row * side + i) * (width * side) + column * side + j
-        centres = self.blocks.fine.centres(mi.UInt32(place.astype(np.uint32)))
-        seen = apply_rule(self.view, centres, node_rules.four(True), ("value", "coverage"))
+        centres = self.sizes[-1].window.centres(mi.UInt32(place.astype(np.uint32)))
+        seen = apply_rule(self.view, centres, node_rules.four(self.quadrature.pixel == "area"), ("value", "coverage"))
         dr.eval(seen.value, seen.coverage)
         self.rays += 4 * number.size
-        self.levels.append(f"4 nodes: {number.size} pixels")
-        weights = part_weights(side, MARGIN)
-        around = sliding_window_view(np.pad(self.value, MARGIN, mode="edge"), (2 * MARGIN + 1,) * 2)[row, column]
+        self.levels.append(f"{self.blocks}, one pixel each: {number.size} pixels")
+        weights = part_weights(side, REACH, self.quadrature.pixel)
+        around = sliding_window_view(np.pad(self.value, REACH, mode="edge"), (2 * REACH + 1,) * 2)[row, column]
         found = np.einsum("na,nab,nb->n", weights[i], around, weights[j], optimize=True)
         return np.abs(found - seen.value.numpy()), seen.coverage.numpy() < 1 - COVERAGE_ROUNDING
 
-    def solution(self, rough: Marks) -> Solution:
-        """The picture with the `rough` blocks solved by pixels."""
-        side, etendue = self.blocks.side, self.view.lens.etendue
-        count = int(np.count_nonzero(rough))
-        why = f"{rough.size - count} of {rough.size} blocks of {side}² pixels are smooth"
-        weights = part_weights(side, MARGIN)
-        value = np.maximum(means_of_parts(self.value * etendue, weights), 0)
+    def smaller(self, rough: Marks) -> Blocks:
+        """The largest smaller blocks that save more pixels than they cost where they do not do; else pixels.
+
+        What is left falls with the side as at the rim of a blur disc, by its power 3/2.
+        """
+        left = np.where(self.edge, np.inf, self.error)[rough]
+        for smaller in self.sizes:
+            do = left * (smaller.side / self.blocks.side) ** RIM_ORDER <= self.tolerance
+            if 1 < smaller.side < self.blocks.side and np.count_nonzero(do) * smaller.side**2 > COST * do.size:
+                return smaller
+        return self.sizes[-1]
+
+    def part(self, rough: Marks, smaller: Blocks) -> None:
+        """Go on to smaller blocks: parts of the `rough` ones are to be computed, the others are interpolated."""
+        parts = self.blocks.side // smaller.side
+        # Blocks around show which way an edge runs and whether one passes near by; their values stay.
+        self.grid = BlockGrid(_spread(rough, self.reach), parts) if rough.any() else None
+        self.error, self.own = _repeated(self.error, parts), _repeated(rough, parts)
+        weights = part_weights(parts, REACH, self.quadrature.pixel if smaller.side == 1 else "area")
+        self.value = np.maximum(means_of_parts(self.value, weights), 0)
         inside = (self.coverage > COVERAGE_ROUNDING) & (self.coverage < 1 - COVERAGE_ROUNDING) & ~rough
-        coverage = _repeated(self.coverage, side)
+        coverage = _repeated(self.coverage, parts)
         if inside.any():
-            coverage = np.clip(means_of_parts(self.coverage, weights), 0, 1)
-        least = np.where(_spread(self.coverage, MARGIN) > 0, self.quadrature.least_error * self.peak, 0)
-        error = _repeated(np.maximum(self._left(), least) * etendue, side)
-        planes = (value, error, coverage)
-        levels = [f"blocks: {level}" for level in self.levels]
-        findings = [Finding("smooth blocks", True, why)]
-        rays = self.rays
-        if count:
-            # Blocks around show which way an edge runs and whether one passes near by; their values stay.
-            grid = BlockGrid(_spread(rough, AROUND), side)
-            progress = self.progress.part(1, 2)
-            draft = Draft(self.view, self.blocks.fine, self.quadrature, None, self.peak, progress, grid)
-            own = _repeated(rough, side)
-            draft.open, draft.known = grid.flat(own), grid.flat(value / etendue)
-            refine(draft, np.broadcast_to(0.0, grid.shape))
-            for plane, image in zip(planes, draft.images(), strict=True):
-                grid.lay(dr.select(draft.open, image, grid.flat(plane)), plane)
-            rays, levels = rays + draft.rays, levels + draft.levels
-            findings += draft.findings
-        else:
-            findings += self.findings
-        self.progress(1.0)
-        whole = (self.blocks.fine.expand(plane) for plane in planes)
-        return Solution(*whole, rays, tuple(levels), findings=tuple(findings))
+            between = np.clip(means_of_parts(self.coverage, part_weights(parts, REACH)), 0, 1)
+            coverage = np.where(_repeated(inside, parts), between, coverage)
+        self.blocks, self.coverage = smaller, coverage
+
+    def solution(self) -> Solution:
+        """The picture of pixels."""
+        etendue = self.view.lens.etendue
+        why = f"{', '.join(self.shares)} are computed for {self.own.size} pixels"
+        findings = (Finding("smooth blocks", True, why), *self.findings)
+        images = (self.value * etendue, self.error * etendue, self.coverage)
+        whole = (self.sizes[-1].window.expand(image) for image in images)
+        return Solution(*whole, self.rays, tuple(self.levels), findings=findings)
 
 
 def _refine_blurred(draft: Draft) -> mi.Bool:
@@ -263,18 +293,20 @@ def _small_bodies(view: View, window: Window) -> Marks:
 # ---------------------------------------------------------------------- polynomials over blocks
 
 
-def part_weights(side: int, reach: int) -> Plane:
+def part_weights(side: int, reach: int, pixel: str = "area") -> Plane:
     """Means over parts of the middle of 2 reach + 1 cells, (side, cells), of the polynomial with these cells' means.
 
-    The integral of the polynomial interpolates the sums of the cells at their ends.
+    The integral of the polynomial interpolates the sums of the cells at their ends. `pixel` 'centre': its values in
+    the middle of the parts.
     """
     ends = np.arange(2 * reach + 2) - reach - 0.5
-    parts = np.arange(side + 1) / side - 0.5
-    # Lagrange's polynomials of the ends, at the ends of the parts.
-    factor = [np.prod([(parts - other) / (end - other) for other in ends if other != end], axis=0) for end in ends]
-    lagrange = np.array(factor).T  # (side + 1, ends)
+    lagrange = [Polynomial.fromroots(ends[ends != end]) / np.prod(end - ends[ends != end]) for end in ends]
     sums = np.tril(np.ones((2 * reach + 2, 2 * reach + 1)), -1)
-    return np.diff(lagrange @ sums, axis=0) * side
+    if pixel == "centre":
+        middles = (np.arange(side) + 0.5) / side - 0.5
+        return np.array([of.deriv()(middles) for of in lagrange]).T @ sums
+    parts = np.arange(side + 1) / side - 0.5
+    return np.diff(np.array([of(parts) for of in lagrange]).T @ sums, axis=0) * side
 
 
 def means_of_parts(cells: Plane, weights: Plane) -> Plane:
@@ -286,22 +318,22 @@ def means_of_parts(cells: Plane, weights: Plane) -> Plane:
     return np.ascontiguousarray(cells)
 
 
-def _propagated(errors: Plane, side: int) -> Plane:
+def _propagated(errors: Plane, side: int, pixel: str) -> Plane:
     """Error of the parts of each cell, (h, w), that follows from independent errors of cells (h, w)."""
-    share = np.square(part_weights(side, MARGIN)).max(axis=0)
+    share = np.square(part_weights(side, REACH, pixel)).max(axis=0)
     square = np.square(errors)
     for axis in (0, 1):
-        pad = [(MARGIN, MARGIN) if k == axis else (0, 0) for k in (0, 1)]
-        square = sliding_window_view(np.pad(square, pad, mode="edge"), 2 * MARGIN + 1, axis=axis) @ share
+        pad = [(REACH, REACH) if k == axis else (0, 0) for k in (0, 1)]
+        square = sliding_window_view(np.pad(square, pad, mode="edge"), 2 * REACH + 1, axis=axis) @ share
     return np.sqrt(square)
 
 
-def _bend(cells: Plane, side: int) -> Plane:
-    """Largest change of a part of each cell and its neighbours from polynomials over three cells to five, (h, w)."""
+def _bend(cells: Plane, side: int, pixel: str) -> Plane:
+    """Largest change of a part of each cell and its neighbours from polynomials over five cells to seven, (h, w)."""
     parts = [0, side // 2, side - 1]  # corners, where it is largest, and the middle
-    five, three = (means_of_parts(cells, part_weights(side, reach)[parts]) for reach in (MARGIN, MARGIN - 1))
+    seven, five = (means_of_parts(cells, part_weights(side, reach, pixel)[parts]) for reach in (REACH + 1, REACH))
     height, width = cells.shape
-    change = np.abs(five - three).reshape(height, len(parts), width, len(parts)).max(axis=(1, 3))
+    change = np.abs(seven - five).reshape(height, len(parts), width, len(parts)).max(axis=(1, 3))
     return _spread(change, 1)
 
 

@@ -28,17 +28,18 @@ class Window:
 
     It may include a rim of pixels beyond the crop window, which are computed but not shown: a silhouette there affects
     the estimates of their neighbours inside. `blur`: the largest radius of a blur disc of emitting surfaces [pixels].
+    `crop_offset`: place of the crop window on the film [pixels], for blocks of pixels no whole number.
     """
 
     top: int
     left: int
     shape: tuple[int, int]
     full: tuple[int, int]
-    crop_offset: tuple[int, int]
+    crop_offset: tuple[float, float]
     blur: float
 
     @property
-    def corner(self) -> tuple[int, int]:
+    def corner(self) -> tuple[float, float]:
         """Film position (x, y) [pixels] of the first pixel's corner."""
         return self.left + self.crop_offset[0], self.top + self.crop_offset[1]
 

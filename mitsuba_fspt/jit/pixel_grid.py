@@ -77,6 +77,10 @@ class Grid:
         """Array (h, w) of an image or mask."""
         return np.asarray(image.numpy()).reshape(self.shape)
 
+    def lay(self, image: Any, array: NDArray[Any]) -> None:
+        """Write an image into an array (h, w) of the whole picture."""
+        array[:] = self.array(image)
+
     # ------------------------------------------------------------------ neighbours
 
     def at(self, image: Any, x: mi.Int, y: mi.Int) -> Any:

@@ -19,7 +19,7 @@ from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
 from ..integral import interpolated, pupil_form, surface_form
 from ..integral.eq9 import View
 from ..integral.exitance_rows import Rows, kinds_of, sizes_of
-from ..integral.interpolated import Blocks
+from ..integral.interpolated import Blocks, blocks_of
 from ..integral.left_out import LeftOut, light_left_out
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
 from ..integral.progress import Progress
@@ -209,28 +209,28 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             missed = np.maximum(missed, window.expand(there * UNCERTAINTY * narrow.on_pixels.max() * lens.etendue))
         return replace(solution, error=np.maximum(solution.error, missed), findings=findings)
 
-    def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[Blocks | None, str]:
-        """Blocks of pixels between which the picture may be interpolated; None, and why, where that is not done."""
+    def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[tuple[Blocks, ...], str]:
+        """Blocks of pixels between which the picture may be interpolated; none, and why, where that is not done."""
         if not quadrature.takes("smooth blocks"):
-            return None, "as was wanted"
-        if quadrature.domain != "pupil" or quadrature.pixel != "area" or view.specular:
-            return None, "only lines of sight over pixels and straight to the first surface are interpolated"
+            return (), "as was wanted"
+        if quadrature.domain != "pupil" or view.specular:
+            return (), "only lines of sight from the pixel straight to the first surface are interpolated"
         if math.isfinite(view.lens.optics.seen_field):
-            return None, "an image-plane stop cuts blocks"
-        state = (window, _view(view.lens), quadrature.rtol)
-        blocks = self._grid_of_blocks.recall(state, lambda: Blocks.of(window, view.lens, quadrature.rtol))
-        return blocks, f"{' x '.join(map(str, window.shape[::-1]))} pixels are too few, or the film has an odd side"
+            return (), "an image-plane stop cuts blocks"
+        state = (window, _view(view.lens))
+        blocks = self._grid_of_blocks.recall(state, lambda: blocks_of(window, view.lens))
+        return blocks, f"{' x '.join(map(str, window.shape[::-1]))} pixels are too few"
 
     def _by_blocks(
-        self, view: View, blocks: Blocks, quadrature: Quadrature, least_peak: float, progress: Progress
+        self, view: View, blocks: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float, progress: Progress
     ) -> Solution | None:
         """Solution with values interpolated between blocks; None where that saves nothing."""
         # What is narrow for a pixel is narrow for a block.
-        narrow = self._narrow_light(replace(view, lens=blocks.lens), blocks.coarse)
-        spots = narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)
-        if spots.any():
+        largest = blocks[0]
+        narrow = self._narrow_light(replace(view, lens=largest.lens), largest.window)
+        if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
-        return interpolated.solve(view, blocks, quadrature, spots, least_peak, progress)
+        return interpolated.solve(view, blocks, quadrature, least_peak, progress)
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
         """`scene`, or a robust copy if it loses rays; tested once, and again if the geometry of a copy changes."""

@@ -154,13 +154,10 @@ class FsptLens(mi.Sensor):
         self.rounding = EPSILON * (farthest + self.optics.focus_distance) / self.virtual_pitch
 
     def coarser(self, side: int) -> FsptLens:
-        """The same lens, without losses, before a film whose pixels are blocks of `side`² of its own.
-
-        The film is an even number of blocks wide and high, so that the optical axis meets a corner of pixels of both.
-        """
+        """The same lens, without losses, before a film around the same axis whose pixels are `side` times as wide."""
         own = {name: float(value[0]) for name, value in self._numbers.items() if name not in transmittance.NUMBERS}
         own["pixel_pitch"] *= side
-        width, height = (2 * math.ceil(int(n) / (2 * side)) for n in self.film().size())
+        width, height = (math.ceil(int(n) / side) for n in self.film().size())
         film = made("hdrfilm", width=width, height=height, pixel_format="luminance")
         place = mi.ScalarTransform4f(np.array(self.placement).reshape(4, 4))
         return made("fspt_lens", model=self._model, to_world=place, film=film, **own)
