@@ -134,9 +134,10 @@ def reference(f_number: float, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def rules(draft: Draft, chosen: np.ndarray) -> list[Rule]:
     """Every rule on the chosen pixels, numbered row by row."""
+    import drjit as dr
     import mitsuba as mi
 
-    from mitsuba_fspt.integral.lattices import SHIFTS, apply_lattice
+    from mitsuba_fspt.integral.lattices import SHIFTS, Means
     from mitsuba_fspt.integral.nodes import apply_nodes
     from mitsuba_fspt.integral.transects import apply_transects, edges_of
 
@@ -159,9 +160,12 @@ def rules(draft: Draft, chosen: np.ndarray) -> list[Rule]:
         note(f"{count} transects", means.value, since)
         if level == 0:  # the edges that were met say how blurred they are
             edges.learn(draft, means, where)
-    for points in LATTICES:
-        since = draft.rays
-        note(f"{SHIFTS} lattices of {points}", apply_lattice(draft, where, points).value, since)
+    means, since, last = Means.none(draft.grid.pixels(where)), draft.rays, 0
+    for points in LATTICES:  # each with the points of the one before
+        means, last = means.refined(draft, last, points), points
+        lattice = dr.zeros(mi.Float64, dr.width(where))
+        dr.scatter(lattice, means.value, means.pixels)
+        note(f"{SHIFTS} lattices of {points}", lattice, since)
     return found
 
 
