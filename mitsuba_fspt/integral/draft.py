@@ -166,6 +166,10 @@ class Draft:
         """Set the share of each pixel's lines of sight that hit a glowing surface, and the outline that follows."""
         self.coverage, self.outline = coverage, self.grid.outline(coverage)
 
+    def grown_by_reach(self, mask: Mask) -> Mask:
+        """The marked pixels and those around on which four nodes may miss an edge that those show."""
+        return self.grid.grow(mask, *self.reach(4))
+
     def grown(self, rough: Mask) -> Mask:
         """`rough` and the pixels around that may see the same edge; silhouettes are left to `cut_off`."""
         source = rough & (self.error > self.tolerance) & ~self.outline

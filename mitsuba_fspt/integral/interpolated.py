@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache, reduce
 
 import drjit as dr
 import mitsuba as mi
@@ -123,7 +124,8 @@ class _Picture:
 
     blocks, own : of the present size; True where they are computed, False where larger ones gave them
     edge : blocks on which the picture may jump
-    reach : how far from where four nodes see an edge it may hide from them [blocks]
+    blur : of the least blurred edge that may be on a block or a neighbour, its radius [pixels]
+    draft : of the present blocks
     bent : what pixels of a block may be wrong by as they are interpolated [W/mm²/sr]
     peak, tolerance : the brightest block, or what was known to be as bright; the error asked for [W/mm²/sr]
     """
@@ -142,9 +144,11 @@ class _Picture:
         progress = progress.part(self.sizes.index(blocks), len(self.sizes))
         draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
         draft.open, draft.known = grid.flat(self.own), grid.flat(self.value)
-        self.edge = np.zeros(self.own.shape, bool)
+        self.edge, self.blur = np.zeros(self.own.shape, bool), np.zeros(self.own.shape)
         if blocks.side > 1:
-            grid.lay(~_refine_blurred(draft) & (draft.outline | parted(draft.coverage)), self.edge)
+            blur = _refine_blurred(draft)
+            grid.lay((blur < BLURRED) & (draft.outline | parted(draft.coverage)), self.edge)
+            grid.lay(blur * blocks.side, self.blur)
         else:
             refine(draft, np.broadcast_to(0.0, grid.shape))
         power, error, coverage = draft.images()
@@ -157,7 +161,7 @@ class _Picture:
         self.shares.append(f"{np.count_nonzero(self.own)} {blocks}")
         self.rays += draft.rays
         self.levels += [f"{blocks}, {level}" if blocks.side > 1 else level for level in draft.levels]
-        self.findings, self.reach = draft.findings, draft.reach(4)[1]
+        self.findings, self.draft = draft.findings, draft
 
     def _seen(self) -> View:
         """What the lens sees before a film of such blocks."""
@@ -225,11 +229,13 @@ class _Picture:
     def smaller(self, rough: Marks) -> Blocks:
         """The largest smaller blocks that save more pixels than they cost where they do not do; else pixels.
 
-        What is left falls with the side as at the rim of a blur disc, by its power 3/2.
+        What is left falls with the side as at the rim of a blur disc, by its power 3/2. Where an edge is narrower than a
+        block, what is left is not known.
         """
-        left = np.where(self.edge, np.inf, self.error)[rough]
+        left, blur = np.where(self.edge, 0, self.error)[rough], np.where(self.edge, self.blur, np.inf)[rough]
         for smaller in self.sizes:
             do = left * (smaller.side / self.blocks.side) ** RIM_ORDER <= self.tolerance
+            do &= blur >= BLURRED * smaller.side
             if 1 < smaller.side < self.blocks.side and np.count_nonzero(do) * smaller.side**2 > COST * do.size:
                 return smaller
         return self.sizes[-1]
@@ -238,7 +244,9 @@ class _Picture:
         """Go on to smaller blocks: parts of the `rough` ones are to be computed, the others are interpolated."""
         parts = self.blocks.side // smaller.side
         # Blocks around show which way an edge runs and whether one passes near by; their values stay.
-        self.grid = BlockGrid(_spread(rough, self.reach), parts) if rough.any() else None
+        around = rough.copy()
+        self.grid.lay(self.draft.grown_by_reach(self.grid.flat(rough)), around)
+        self.grid = BlockGrid(around, parts) if rough.any() else None
         self.error, self.own = _repeated(self.error, parts), _repeated(rough, parts)
         weights = part_weights(parts, REACH, self.quadrature.pixel if smaller.side == 1 else "area")
         self.value = np.maximum(means_of_parts(self.value, weights), 0)
@@ -259,17 +267,20 @@ class _Picture:
         return Solution(*whole, self.rays, tuple(self.levels), findings=findings)
 
 
-def _refine_blurred(draft: Draft) -> mi.Bool:
-    """Refine the blocks of a draft without an edge narrower than a block; returns which those are."""
+def _refine_blurred(draft: Draft) -> mi.Float64:
+    """Refine the blocks of a draft without an edge narrower than a block.
+
+    Returns the blur radius of the least blurred edge that may be on each block or a neighbour [blocks].
+    """
     rough = first_nodes(draft, np.zeros(draft.grid.shape))
-    least = draft.grid.spread_max(-draft.least_blur)
-    blurred = -least >= dr.opaque(mi.Float64, BLURRED)
+    least = -draft.grid.spread_max(-draft.least_blur)
+    blurred = least >= dr.opaque(mi.Float64, BLURRED)
     quadrature = draft.quadrature
     levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)[:LEVELS]
     rough = twelve_nodes(draft, rough, transects_follow=bool(levels)) & blurred
     if levels and dr.any(rough):
-        integrate_by_transects(draft, rough, levels)
-    return blurred
+        integrate_by_transects(draft, rough, levels, among=blurred)
+    return least
 
 
 def _small_bodies(view: View, window: Window) -> Marks:
@@ -293,6 +304,7 @@ def _small_bodies(view: View, window: Window) -> Marks:
 # ---------------------------------------------------------------------- polynomials over blocks
 
 
+@cache
 def part_weights(side: int, reach: int, pixel: str = "area") -> Plane:
     """Means over parts of the middle of 2 reach + 1 cells, (side, cells), of the polynomial with these cells' means.
 
@@ -304,18 +316,22 @@ def part_weights(side: int, reach: int, pixel: str = "area") -> Plane:
     sums = np.tril(np.ones((2 * reach + 2, 2 * reach + 1)), -1)
     if pixel == "centre":
         middles = (np.arange(side) + 0.5) / side - 0.5
-        return np.array([of.deriv()(middles) for of in lagrange]).T @ sums
-    parts = np.arange(side + 1) / side - 0.5
-    return np.diff(np.array([of(parts) for of in lagrange]).T @ sums, axis=0) * side
+        weights = np.array([of.deriv()(middles) for of in lagrange]).T @ sums
+    else:
+        parts = np.arange(side + 1) / side - 0.5
+        weights = np.diff(np.array([of(parts) for of in lagrange]).T @ sums, axis=0) * side
+    weights.flags.writeable = False  # as it is shared
+    return weights
 
 
 def means_of_parts(cells: Plane, weights: Plane) -> Plane:
     """Means of parts of cells (h, w) by `weights` (parts, cells) along each axis: (parts h, parts w)."""
-    reach = weights.shape[1] // 2
-    for _ in range(2):  # along the columns of the transposed, then of the original
-        around = sliding_window_view(np.pad(cells.T, ((0, 0), (reach, reach)), mode="edge").T, 2 * reach + 1, axis=0)
-        cells = np.einsum("sk,hwk->hsw", weights, around, optimize=True).reshape(-1, cells.shape[1]).T
-    return np.ascontiguousarray(cells)
+    count = weights.shape[1]
+    for _ in range(2):  # along the second axis, then along the first: each pass ends with the other one first
+        ends = np.pad(cells.T, ((count // 2, count // 2), (0, 0)), mode="edge")
+        around = sliding_window_view(ends, count, axis=0).swapaxes(1, 2)
+        cells = (weights @ around).reshape(-1, ends.shape[1])
+    return cells
 
 
 def _propagated(errors: Plane, side: int, pixel: str) -> Plane:
@@ -339,9 +355,9 @@ def _bend(cells: Plane, side: int, pixel: str) -> Plane:
 
 def _spread(image: NDArray, reach: int) -> NDArray:
     """Largest value within `reach` cells (square) of each cell."""
-    for axis in (0, 1):
-        pad = [(reach, reach) if k == axis else (0, 0) for k in (0, 1)]
-        image = sliding_window_view(np.pad(image, pad, mode="edge"), 2 * reach + 1, axis=axis).max(axis=-1)
+    for _ in range(2):
+        height, ends = image.shape[0], np.pad(image, ((reach, reach), (0, 0)), mode="edge")
+        image = reduce(np.maximum, (ends[k : k + height] for k in range(2 * reach + 1))).T
     return image
 
 

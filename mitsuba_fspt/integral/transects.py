@@ -25,9 +25,14 @@ DARK_LEVELS = 3  # of transects that are taken in any case while no light has be
 FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
 
 
-def integrate_by_transects(draft: Draft, rough: Mask, levels: list[tuple[int, node_rules.AlongTransect]]) -> None:
-    """Transects on the rough pixels: more of them at each level, where the error is still above the tolerance."""
-    refinement = _Refinement(draft, rough)
+def integrate_by_transects(
+    draft: Draft, rough: Mask, levels: list[tuple[int, node_rules.AlongTransect]], among: Mask | None = None
+) -> None:
+    """Transects on the rough pixels: more of them at each level, where the error is still above the tolerance.
+
+    Pixels around that may see the same edge follow, those `among` which they are to be taken at all.
+    """
+    refinement = _Refinement(draft, rough, draft.wanted() if among is None else draft.wanted() & among)
     for level, (count, along) in enumerate(levels):
         if not dr.any(refinement.where):
             break
@@ -39,7 +44,7 @@ class _Refinement:
     """Which pixels take the next level of transects, and what is known of them.
 
     where : pixels that take the next level
-    wanted : pixels that are shown, and those of the rim whose edges may reach into them
+    wanted : pixels that may take transects
     edges : of the edge that each pixel may see, its direction and blur
     has_jump : True where a transect has met a jump
     smooth : True where no transect has met one, so that node rules may converge
@@ -47,8 +52,8 @@ class _Refinement:
     count, means : of the last level, the number of transects and what they found
     """
 
-    def __init__(self, draft: Draft, rough: Mask) -> None:
-        self.draft, self.edges, self.wanted = draft, edges_of(draft), draft.wanted()
+    def __init__(self, draft: Draft, rough: Mask, wanted: Mask) -> None:
+        self.draft, self.edges, self.wanted = draft, edges_of(draft), wanted
         self.estimator = draft.estimator
         self.where = rough & self.wanted
         self.has_jump, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
