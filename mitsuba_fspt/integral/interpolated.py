@@ -32,7 +32,7 @@ from .pupil_form import refine
 from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
-from .transects import integrate_by_transects
+from .transects import edges_of, integrate_by_transects
 from .window import Window
 
 # Pixels along the largest blocks; blocks along a picture's shorter side, of which fewer do not pay.
@@ -125,9 +125,10 @@ class _Picture:
     blocks, own : of the present size; True where they are computed, False where larger ones gave them
     edge : blocks on which the picture may jump
     blur : of the least blurred edge that may be on a block or a neighbour, its radius [pixels]
-    draft : of the present blocks
+    draft, refined : of the present blocks; True where they took transects
     bent : what pixels of a block may be wrong by as they are interpolated [W/mm²/sr]
-    peak, tolerance : the brightest block, or what was known to be as bright; the error asked for [W/mm²/sr]
+    peak : lower bound of the brightest block, or what was known to be as bright [W/mm²/sr]
+    tolerance : the error asked for [W/mm²/sr]
     """
 
     def __init__(self, view: View, sizes: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float) -> None:
@@ -146,7 +147,7 @@ class _Picture:
         draft.open, draft.known = grid.flat(self.own), grid.flat(self.value)
         self.edge, self.blur = np.zeros(self.own.shape, bool), np.zeros(self.own.shape)
         if blocks.side > 1:
-            blur = _refine_blurred(draft)
+            blur, self.refined = _refine_blurred(draft)
             grid.lay((blur < BLURRED) & (draft.outline | parted(draft.coverage)), self.edge)
             grid.lay(blur * blocks.side, self.blur)
         else:
@@ -156,7 +157,9 @@ class _Picture:
         for plane, image in zip((self.value, self.error, self.coverage), images, strict=True):
             grid.lay(dr.select(draft.open, image, grid.flat(plane)), plane)
         if self.own.all():
-            self.peak = float(draft.peak[0])
+            # Blocks with a sharp edge are not refined, and may be too bright by far.
+            certain = float(dr.max(dr.select(draft.shown, draft.value - draft.error, 0))[0])
+            self.peak = max(self.peak, certain) or float(draft.peak[0])
             self.tolerance = self.quadrature.rtol * self.peak
         self.shares.append(f"{np.count_nonzero(self.own)} {blocks}")
         self.rays += draft.rays
@@ -182,7 +185,9 @@ class _Picture:
         pixel = self.quadrature.pixel
         self.bent = BEND_GAIN[pixel] * _bend(self.value, self.blocks.side, pixel)
         # Near blurred edges four lines of sight prove nothing.
-        whole = -_spread(-self.coverage, 1) > 1 - COVERAGE_ROUNDING
+        refined = np.zeros(self.own.shape, bool)
+        self.grid.lay(self.refined, refined)
+        whole = (-_spread(-self.coverage, 1) > 1 - COVERAGE_ROUNDING) & ~refined
         number = np.flatnonzero(whole & ~self._beyond() & self.own)
         if number.size:
             off, edge = np.zeros(whole.shape), np.zeros(whole.shape, bool)
@@ -229,8 +234,8 @@ class _Picture:
     def smaller(self, rough: Marks) -> Blocks:
         """The largest smaller blocks that save more pixels than they cost where they do not do; else pixels.
 
-        What is left falls with the side as at the rim of a blur disc, by its power 3/2. Where an edge is narrower than a
-        block, what is left is not known.
+        What is left falls with the side as at the rim of a blur disc, by its power 3/2. Where an edge is narrower than
+        a block, what is left is not known.
         """
         left, blur = np.where(self.edge, 0, self.error)[rough], np.where(self.edge, self.blur, np.inf)[rough]
         for smaller in self.sizes:
@@ -267,20 +272,24 @@ class _Picture:
         return Solution(*whole, self.rays, tuple(self.levels), findings=findings)
 
 
-def _refine_blurred(draft: Draft) -> mi.Float64:
+def _refine_blurred(draft: Draft) -> tuple[mi.Float64, mi.Bool]:
     """Refine the blocks of a draft without an edge narrower than a block.
 
-    Returns the blur radius of the least blurred edge that may be on each block or a neighbour [blocks].
+    Where all lines of sight meet what glows, an edge is that of the nearest body, as blurred as this is; steps of J_n
+    bend the picture. Returns the blur radius of the least blurred edge that may be on each block or a neighbour
+    [blocks], and True where transects were taken.
     """
     rough = first_nodes(draft, np.zeros(draft.grid.shape))
-    least = -draft.grid.spread_max(-draft.least_blur)
-    blurred = least >= dr.opaque(mi.Float64, BLURRED)
-    quadrature = draft.quadrature
+    quadrature, enough = draft.quadrature, dr.opaque(mi.Float64, BLURRED)
     levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)[:LEVELS]
-    rough = twelve_nodes(draft, rough, transects_follow=bool(levels)) & blurred
+    rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
+    least = -draft.grid.spread_max(-draft.least_blur)
+    inside = ~(draft.outline | parted(draft.coverage))
+    blurred = (least >= enough) | (inside & (dr.abs(edges_of(draft).blur) >= enough))
+    rough &= blurred
     if levels and dr.any(rough):
         integrate_by_transects(draft, rough, levels, among=blurred)
-    return least
+    return least, rough
 
 
 def _small_bodies(view: View, window: Window) -> Marks:

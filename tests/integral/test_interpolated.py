@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_scenes import camera_scene, disk, filled, sphere
+from small_scenes import camera_scene, disk, filled, load_scene, sphere
 
 from mitsuba_fspt.integral import interpolated
 from mitsuba_fspt.integral.interpolated import blocks_of, means_of_parts, part_weights
@@ -128,3 +128,19 @@ def test_a_pixel_has_another_mean_than_its_middle():
     )
     assert np.abs(expected).max() > 1e-5 * area.power.max()
     assert np.abs(difference - expected).sum() < 0.1 * np.abs(expected).sum()
+
+
+def test_blocks_with_sharp_edges_do_not_raise_the_peak_that_rtol_refers_to():
+    """Two spheres, the bright one in front, its limb in focus. Expected: no pixel states more than asked for.
+
+    Nor does it take much more than ten times as many lines of sight as a film of an eighth of the side: edges that are
+    blurred by several blocks are interpolated. Seen to fail with the brightest block of all: 3769 pixels at up to 1.25
+    rtol; and, twice as many lines of sight, with transects on blocks with a sharp edge, too.
+    """
+    fine, coarse = (
+        solved(load_scene("two_spheres", width=side, height=side, pixel_pitch=27.648 / side, view=180))
+        for side in (2048, 256)
+    )
+    assert np.count_nonzero(fine.error > 1.01e-2 * fine.power.max()) == 0
+    assert fine.power.sum() == pytest.approx(coarse.power.sum(), rel=1e-4)
+    assert fine.rays < 12 * coarse.rays
