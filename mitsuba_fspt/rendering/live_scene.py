@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..images.image import Image
 from ..runtime.errors import SceneError
@@ -180,12 +179,15 @@ class LiveScene:
         self, values: Mapping[str, object], model: str | None, column: int, row: int
     ) -> SurfacePoint | None:
         """Surface point under the middle of a pixel of the image; None where the line of sight meets nothing."""
+        import drjit as dr
         import mitsuba as mi
 
         scene = self.scene(values, model)
         lens = sensor_of(scene, self.sensor)
         offset = mi.Vector2f(lens.film().crop_offset())
-        ray, cosine, _ = lens.line_of_sight(mi.Point2f(column + 0.5, row + 0.5) + offset, mi.Point2f(0, 0))
+        pixel = mi.Point2f(column + 0.5, row + 0.5) + offset
+        dr.make_opaque(pixel)  # no new kernel for every pixel
+        ray, cosine, _ = lens.line_of_sight(pixel, mi.Point2f(0, 0))
         met = _surfaces(scene, lens, ray, cosine)
         if not met:
             return None

@@ -161,6 +161,7 @@ class Answers:
             "wavelength_nm": known.get("wavelength_nm"),
             "photons_per_joule_nm": 1e-9 / PLANCK_TIMES_LIGHT,
             "warnings": known.get("warnings", ""),
+            "model": request.model or "",
             "lens": {name: known[name] for name in ("focal_length", "f_number", "magnification") if name in known},
             "command": self._command(request, changed),
             "seconds": time.perf_counter() - start,
