@@ -27,6 +27,7 @@ DRAFT = 0.03  # rtol of a picture while a parameter moves
 DRAFT_NODES = 16  # lines of sight of a pixel in it: silhouettes that twelve leave unsettled wait for the full picture
 DRAFT_SAMPLES = 8  # a pixel, of such a picture by Monte Carlo
 RIGID = 1e-6  # by which the rows of a rotation may differ from orthonormal ones
+Stamp = tuple[int, int] | None
 
 
 @dataclass(frozen=True)
@@ -80,11 +81,19 @@ class Change:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A Mitsuba scene, the elements that it was loaded from, and how its shapes have moved since."""
+    """A Mitsuba scene, the elements that it was loaded from, and how its shapes have moved since.
+
+    files : meshes and other data that the scene refers to, as they were when it was loaded
+    """
 
     scene: mi.Scene
     nodes: list[mi.parser.SceneNode]
     shapes: MovedShapes
+    files: Mapping[Path, Stamp]
+
+    def is_current(self) -> bool:
+        """True as long as no file of data has changed."""
+        return self.files == {file: _stamp(file) for file in self.files}
 
     def taken(self, change: Change, exact: bool) -> Change | None:
         """The change of the lens that is left, once the shapes are where `change` wants them; None if they cannot be.
@@ -108,7 +117,7 @@ class LiveScene:
     The picture is that of the sensor with the number `sensor`. Numbers and placement of that lens change in place,
     without compilation. For drafts, shapes that make a rigid motion are moved in place, too; a motion of all of them
     is replaced by the inverse motion of the lens. Both give the same picture but for rounding. Where that shall not be,
-    and for all other changes, the scene is loaded again; `loads` counts that.
+    and for all other changes, also of the files that it refers to, the scene is loaded again; `loads` counts that.
 
     Raises
     ------
@@ -135,9 +144,11 @@ class LiveScene:
     @property
     def xml(self) -> SceneXml:
         """The XML with the given values, read again."""
-        return (
-            read_text(str(self.source), self.given) if is_text(self.source) else read_xml(Path(self.source), self.given)
-        )
+        return self._read(self.given)
+
+    def _read(self, values: Mapping[str, str]) -> SceneXml:
+        """The XML with these values, read again."""
+        return read_text(str(self.source), values) if is_text(self.source) else read_xml(Path(self.source), values)
 
     def image(self, values: Mapping[str, object], model: str | None = None, progress: Progress | None = None) -> Image:
         """Image with these values of parameters, and with another lens `model` than the scene's if it is given.
@@ -212,7 +223,7 @@ class LiveScene:
         """The Mitsuba scene with these values of its parameters and this `model` of its lens (None: its own)."""
         wanted = self.given | _texts(values)
         nodes = parsed(self.source, **wanted)
-        now = self._loaded
+        now = self._loaded if self._loaded and self._loaded.is_current() else None
         change = _change(now.nodes, nodes, self.sensor) if now else None
         change = now.taken(change, exact) if now and change else None
         if now is None or change is None:
@@ -225,11 +236,22 @@ class LiveScene:
 
     def _load(self, wanted: Mapping[str, str], nodes: list[mi.parser.SceneNode]) -> Loaded:
         """The scene with these values of its parameters, of which it has these elements."""
+        xml = self._read(wanted)
+        files = {file: _stamp(file) for file in xml.sources().difference(xml.files)}
         scene = load(self.source, **wanted)
         self.loads += 1
         if not is_lens(sensor_of(scene, self.sensor)):
             raise SceneError(f"{_name(self.source)}: sensor {self.sensor} is no fspt_lens. Give one that is.")
-        return Loaded(scene, nodes, MovedShapes(scene))
+        return Loaded(scene, nodes, MovedShapes(scene), files)
+
+
+def _stamp(file: Path) -> Stamp:
+    """Time of the last change [ns] and size [bytes] of a file; None if it is gone."""
+    try:
+        found = os.stat(file)
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
 
 
 def _surfaces(

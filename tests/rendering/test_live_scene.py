@@ -84,6 +84,28 @@ def test_shapes_that_move_alone_are_moved_in_place_and_the_image_is_that_of_the_
     assert np.array_equal(live.image(values).power, wanted.power)
 
 
+def test_a_mesh_that_is_written_again_is_loaded_again(mono, tmp_path):
+    """Half the size, a quarter of the power: the silhouette's area counts."""
+    path = tmp_path / "body.obj"
+    faces = "f 1 2 3\nf 1 3 4\n"
+
+    def write(side):
+        corners = [(0, -side, -side), (0, side, -side), (0, side, side), (0, -side, side)]
+        path.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners) + faces)
+
+    write(4)
+    start = SCENE.index('    <shape type="cube"')
+    live = LiveScene(
+        SCENE[:start]
+        + f"""<shape type="obj"><string name="filename" value="{path}"/><boolean name="face_normals" value="true"/>
+        <emitter type="fspt_surface"><float name="exitance" value="2"/></emitter></shape></scene>""".replace("\\", "/")
+    )
+    before = live.image({}).power.sum()
+    write(2)
+    assert live.image({}).power.sum() == pytest.approx(before / 4, rel=0.01)
+    assert live.loads == 2
+
+
 def test_a_lens_that_cannot_be_leaves_a_usable_scene(live):
     good = live.image({}).power
     for values, model, word in (
