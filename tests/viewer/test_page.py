@@ -202,7 +202,12 @@ def test_an_error_is_a_line_and_the_last_picture_stays_then_the_server_goes(page
     before = read_out(page, 24, 20)
     page.get_by_label("f_number").first.fill("-2")
     line = page.get_by_role("alert")
+    page.locator("select[name=model-a]").select_option("hrrt")
     shows(line, "'f_number' must be > 0")
+    page.get_by_label("log scale").check()  # draws it again
+    page.wait_for_selector("canvas.bar[data-log=true]")
+    assert "hrrt" not in page.locator("figcaption").first.inner_text()  # the caption is that of the picture
+    page.locator("select[name=model-a]").select_option("")
     assert read_out(page, 24, 20) == before
     set_number(page, "f_number", 5)
     assert line.text_content() == ""
