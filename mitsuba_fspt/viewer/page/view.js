@@ -12,6 +12,7 @@ const MAPS = { // 33 colours of matplotlib's maps, dark to bright
 };
 const QUANTITIES = { power: "power", error: "error", coverage: "coverage" };
 const UNITS = { W: "W/pixel", photons: "photons/s/pixel", radiance: "p/s/cm²/sr" };
+const POWER_IN = { W: "power", photons: "photon rate", radiance: "radiance" }; // what the power is called in each unit
 const MARKS = { cross: "#4fc3f7", region: "#7cff6b", disc: "#ffffff" };
 const PANELS = { a: "lens", b: "second lens", difference: "difference, lens − second lens" };
 const SUPERSCRIPTS = "⁰¹²³⁴⁵⁶⁷⁸⁹";
@@ -249,12 +250,17 @@ class View {
     this.resize = new ResizeObserver(() => this.draw());
     this.resize.observe(this.nodes.pictures);
     this.dark = window.matchMedia("(prefers-color-scheme: dark)");
-    this.dark.addEventListener("change", () => this.draw());
+    this.redraw = () => this.draw();
+    this.dark.addEventListener("change", this.redraw);
+    this.theme = new MutationObserver(this.redraw); // JupyterLab's
+    this.theme.observe(document.body, { attributeFilter: ["data-jp-theme-light"] });
   }
 
   close() {
     this.channel.close();
     this.resize.disconnect();
+    this.theme.disconnect();
+    this.dark.removeEventListener("change", this.redraw);
   }
 
   // ---- elements
@@ -644,6 +650,9 @@ class View {
 
   // ---- drawing
 
+  /** What is shown, as texts call it. */
+  quantityText() { return this.options.quantity === "power" ? POWER_IN[this.options.unit] : this.options.quantity; }
+
   unitText() { return this.options.quantity === "coverage" ? "" : UNITS[this.options.unit]; }
 
   shownValues(slot) {
@@ -696,7 +705,7 @@ class View {
     this.drawReadouts();
   }
 
-  drawPanel(panel, picture, values, low, high, log, map, quantity = this.options.quantity) {
+  drawPanel(panel, picture, values, low, high, log, map, quantity = this.quantityText()) {
     const { canvas } = panel;
     if (canvas.width !== picture.width || canvas.height !== picture.height) Object.assign(canvas, { width: picture.width, height: picture.height });
     const context = canvas.getContext("2d");
@@ -720,7 +729,7 @@ class View {
     const values = Float64Array.from(one, (value, i) => value - other[i]);
     const reach = values.reduce((most, value) => Math.max(most, Math.abs(value)), 0) || 1;
     panel.values = values;
-    this.drawPanel(panel, a, values, -reach, reach, false, "difference", `difference of ${this.options.quantity}`);
+    this.drawPanel(panel, a, values, -reach, reach, false, "difference", `difference of ${this.quantityText()}`);
   }
 
   drawBar(canvas, low, high, log, colours, quantity) {
@@ -796,7 +805,7 @@ class View {
     }
     const mm = this.pictures.a.place(column, row);
     const where = mm ? ` (x ${digits(mm[0])} mm, y ${digits(mm[1])} mm)` : "";
-    this.nodes.readout.replaceChildren(...tableOf(`Column ${column}, row ${row}${where}`, [`power [${UNITS[unit]}]`, "± error", "coverage"], rows));
+    this.nodes.readout.replaceChildren(...tableOf(`Column ${column}, row ${row}${where}`, [`${POWER_IN[unit]} [${UNITS[unit]}]`, "± error", "coverage"], rows));
   }
 
   drawRegion() {
@@ -884,7 +893,7 @@ class View {
     const colour = { a: style.getPropertyValue("--accent"), b: style.getPropertyValue("--other") };
     const faint = style.getPropertyValue("--faint"), rule = style.getPropertyValue("--line");
     const left = 38, right = 10, top = 22, bottom = 20, count = lines[0][1].length;
-    const { log, quantity } = this.options;
+    const { log } = this.options;
     const [low, high] = this.scale("a", false);
     const { marks, factor } = axis(low, high, log);
     const share = (value) => (log ? (value > 0 ? Math.log(value / low) / Math.log(high / low) : -1) : (value - low) / (high - low));
@@ -902,7 +911,7 @@ class View {
     context.textAlign = "center";
     for (const k of ticks(0, count - 1, false).filter(Number.isInteger)) context.fillText(String(k), x(k), tall - bottom / 2 + 1);
     context.textAlign = "left";
-    context.fillText(withUnit(quantity, factor, this.unitText()), 4, top / 2);
+    context.fillText(withUnit(this.quantityText(), factor, this.unitText()), 4, top / 2);
     context.fillStyle = MARKS.cross;
     context.fillRect(x(across) - 0.5, top, 1, tall - top - bottom);
     let end = wide - right;
