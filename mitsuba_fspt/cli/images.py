@@ -37,6 +37,9 @@ def compare(
     from ..images.image import read
 
     images = read(calculated), read(standard)
+    for path, image, other in zip((calculated, standard), images, images[::-1], strict=True):
+        if image.error is None and other.error is not None:
+            typer.echo(f"fspt: {path}: it has no plane of errors; its power is taken as exact.", err=True)
     result = compare(*images)
     if png:
         from ..images.picture import write_comparison_png

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,8 +13,8 @@ import typer
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import TransportError
 from ..runtime.progress_bar import progress_bar
-from .options import SceneFile, require_picture, require_writable, value_lists
-from .terminal import Interrupted
+from .options import AsJson, Quiet, SceneFile, require_picture, require_writable, value_lists
+from .terminal import Interrupted, print_result
 
 if TYPE_CHECKING:
     from ..inverse.transport_matrix import TransportMatrix
@@ -33,15 +32,18 @@ def matrix(
         ),
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write, .npz.")] = None,
-    on: Annotated[str, typer.Option(help="vertex (J_n linear on faces) or face.")] = "vertex",
+    on: Annotated[
+        str,
+        typer.Option(help="vertex (J_n linear on faces) or face.", autocompletion=lambda: ["vertex", "face"]),
+    ] = "vertex",
     rtol: Annotated[float, typer.Option(help="Error of T @ J relative to the brightest pixel.")] = 1e-3,
     sensor: Annotated[str | None, typer.Option(metavar="0,1,...", help="Sensors of the scene, a view each.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
     png: Annotated[bool, typer.Option("--png", help="Also a picture of the sensitivity in the views.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write the matrix from J_n on a mesh [W/mm2] to the power on the pixels of all views [W].
 
@@ -56,7 +58,7 @@ def matrix(
     if png:
         require_picture(picture)
     start = time.perf_counter()
-    with _resumable(file), progress_bar() as progress:
+    with _resumable(file), progress_bar(quiet) as progress:
         quiet_mitsuba()
         found = transport(
             scene,
@@ -74,8 +76,7 @@ def matrix(
 
         write_sensitivity(found, picture)
         summary["picture"] = str(picture)
-    if not quiet:
-        typer.echo(json.dumps(summary) if as_json else _text(summary))
+    print_result(_text(summary), summary, as_json=as_json, quiet=quiet)
 
 
 @contextmanager

@@ -45,7 +45,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rows = Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print no results and no progress; warnings stay.")]
 Unit = Annotated[
-    str, typer.Option(metavar="W|photons/s|p/s/cm2/sr", help="Of the values: power, photon rate or radiance.")
+    str,
+    typer.Option(
+        metavar="W|photons/s|p/s/cm2/sr",
+        help="Of the values: power, photon rate or radiance.",
+        autocompletion=lambda: ["W", "photons/s", "p/s/cm2/sr"],
+    ),
 ]
 WavelengthNm = Annotated[float | None, typer.Option(help="Of the light [nm], for units of photons.")]
 MOST = 100_000  # values of a range

@@ -19,6 +19,13 @@ from .terminal import Interrupted, print_result
 if TYPE_CHECKING:
     from ..studies.sweep import SweepRow
 
+Format = Annotated[
+    str,
+    typer.Option(
+        help="Of the images: exr, tif, h5, npz or fits.", autocompletion=lambda: ["exr", "tif", "h5", "npz", "fits"]
+    ),
+]
+
 
 def sweep(
     scene: SceneFile,
@@ -40,7 +47,7 @@ def sweep(
     seed: Seed = None,
     sensor: Sensor = 0,
     source_power: SourcePower = None,
-    format: Annotated[str, typer.Option(help="Of the images: exr, tif, h5, npz or fits.")] = "exr",
+    format: Format = "exr",
     jobs: Annotated[int | None, typer.Option(help="Processes on this machine.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")

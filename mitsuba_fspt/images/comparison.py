@@ -71,7 +71,7 @@ class Comparison:
         if self.z_test:
             lines.append(self.z_test.render_text())
         elif self.beyond is not None:
-            lines.append(f"beyond {self.beyond}   pixels that differ by more than both integrals' errors together")
+            lines.append(f"beyond {self.beyond}   pixels that differ by more than the errors of both together")
         return "\n".join(lines)
 
     def _repr_png_(self) -> bytes | None:

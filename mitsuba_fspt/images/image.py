@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from xarray import DataArray, Dataset
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Image:
     """Power on the pixels of a detector; row 0 is the top of the upright picture.
 
@@ -66,6 +66,12 @@ class Image:
                 "Give an image as the camera renders it."
             )
         object.__setattr__(self, "metadata", metadata)
+
+    def __repr__(self) -> str:
+        height, width = self.shape
+        total = self.power.sum(dtype=np.float64)
+        error = "unknown" if self.error is None else f"at most {self.error.max(initial=0.0):.3g} W a pixel"
+        return f"Image({width} x {height} pixels, {total:.6g} W in all, error {error})"
 
     @property
     def shape(self) -> tuple[int, int]:

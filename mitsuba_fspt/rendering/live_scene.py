@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..images.image import Image
 from ..runtime.errors import SceneError
 from ..runtime.plugin_types import is_integral, is_lens, is_surface
 from ..runtime.progress_bar import Progress
+from .moved_shapes import Matrix, MovedShapes
 from .provenance import remember_defaults, source_of
 from .render import integrator_of, render, sensor_of
 from .scene import load, parameter_text, parsed, values_of
@@ -27,7 +27,7 @@ DRAFT = 0.03  # rtol of a picture while a parameter moves
 DRAFT_NODES = 16  # lines of sight of a pixel in it: silhouettes that twelve leave unsettled wait for the full picture
 DRAFT_SAMPLES = 8  # a pixel, of such a picture by Monte Carlo
 RIGID = 1e-6  # by which the rows of a rotation may differ from orthonormal ones
-Matrix = NDArray[np.float64]  # (4, 4), points to points [mm]
+Stamp = tuple[int, int] | None
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,52 @@ class Change:
     lens : new numbers of the lens, by their names in the scene file
     placement : new `to_world` of the lens
     model : of the lens in the scene file
+    motions : of the shapes from where they were loaded; None for those that stay
     """
 
     lens: Mapping[str, float]
     placement: Matrix
     model: str
+    motions: tuple[Matrix | None, ...] = ()
+
+    @classmethod
+    def of(cls, nodes: list[mi.parser.SceneNode], sensor: int, motions: tuple[Matrix | None, ...] = ()) -> Change:
+        """Change to these elements, and these motions of their shapes."""
+        import mitsuba as mi
+
+        lens = [node for node in nodes if node.type == mi.ObjectType.Sensor][sensor].props
+        numbers = {name: float(lens[name]) for name in lens.keys() if lens.type(name) == mi.Properties.Type.Float}
+        return cls(numbers, _matrix(lens), str(lens.get("model", "diaphragm")), motions)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A Mitsuba scene, the elements that it was loaded from, and how its shapes have moved since.
+
+    files : meshes and other data that the scene refers to, as they were when it was loaded
+    """
+
+    scene: mi.Scene
+    nodes: list[mi.parser.SceneNode]
+    shapes: MovedShapes
+    files: Mapping[Path, Stamp]
+
+    def is_current(self) -> bool:
+        """True as long as no file of data has changed."""
+        return self.files == {file: _stamp(file) for file in self.files}
+
+    def taken(self, change: Change, exact: bool) -> Change | None:
+        """The change of the lens that is left, once the shapes are where `change` wants them; None if they cannot be.
+
+        `exact` : to the bit, as they are only where they were loaded
+        """
+        still = (None,) * len(change.motions)
+        if exact:
+            return None if self.shapes.moved or any(motion is not None for motion in change.motions) else change
+        if _all_alike(change.motions) and not _others_are_placed(self.nodes):
+            placement = np.linalg.inv(change.motions[0]) @ change.placement  # type: ignore[arg-type]
+            change = replace(change, placement=placement, motions=still)
+        return change if self.shapes.move(change.motions) else None
 
 
 class LiveScene:
@@ -74,9 +115,9 @@ class LiveScene:
     A scene that `load` has made stands for what it was loaded from, with the values given then.
 
     The picture is that of the sensor with the number `sensor`. Numbers and placement of that lens change in place,
-    without compilation. A rigid motion of all shapes is replaced by the inverse motion of the lens, which gives the
-    same picture but for rounding; where that shall not be, and for all other changes, the scene is loaded again.
-    `loads` counts that.
+    without compilation. For drafts, shapes that make a rigid motion are moved in place, too; a motion of all of them
+    is replaced by the inverse motion of the lens. Both give the same picture but for rounding. Where that shall not be,
+    and for all other changes, also of the files that it refers to, the scene is loaded again; `loads` counts that.
 
     Raises
     ------
@@ -98,15 +139,16 @@ class LiveScene:
         self.given = {name: parameter_text(value) for name, value in parameters.items()}
         self.sensor = sensor
         self.loads = 0
-        self._scene: mi.Scene | None = None
-        self._nodes: list[mi.parser.SceneNode] = []  # elements of the loaded scene
+        self._loaded: Loaded | None = None
 
     @property
     def xml(self) -> SceneXml:
         """The XML with the given values, read again."""
-        return (
-            read_text(str(self.source), self.given) if is_text(self.source) else read_xml(Path(self.source), self.given)
-        )
+        return self._read(self.given)
+
+    def _read(self, values: Mapping[str, str]) -> SceneXml:
+        """The XML with these values, read again."""
+        return read_text(str(self.source), values) if is_text(self.source) else read_xml(Path(self.source), values)
 
     def image(self, values: Mapping[str, object], model: str | None = None, progress: Progress | None = None) -> Image:
         """Image with these values of parameters, and with another lens `model` than the scene's if it is given.
@@ -148,12 +190,15 @@ class LiveScene:
         self, values: Mapping[str, object], model: str | None, column: int, row: int
     ) -> SurfacePoint | None:
         """Surface point under the middle of a pixel of the image; None where the line of sight meets nothing."""
+        import drjit as dr
         import mitsuba as mi
 
         scene = self.scene(values, model)
         lens = sensor_of(scene, self.sensor)
         offset = mi.Vector2f(lens.film().crop_offset())
-        ray, cosine, _ = lens.line_of_sight(mi.Point2f(column + 0.5, row + 0.5) + offset, mi.Point2f(0, 0))
+        pixel = mi.Point2f(column + 0.5, row + 0.5) + offset
+        dr.make_opaque(pixel)  # no new kernel for every pixel
+        ray, cosine, _ = lens.line_of_sight(pixel, mi.Point2f(0, 0))
         met = _surfaces(scene, lens, ray, cosine)
         if not met:
             return None
@@ -178,21 +223,35 @@ class LiveScene:
         """The Mitsuba scene with these values of its parameters and this `model` of its lens (None: its own)."""
         wanted = self.given | _texts(values)
         nodes = parsed(self.source, **wanted)
-        change = None if self._scene is None else _change(self._nodes, nodes, self.sensor, exact)
-        if change is None:
-            self._scene = None  # memory for one scene, not two
-            self._scene, self._nodes, self.loads = load(self.source, **wanted), nodes, self.loads + 1
-            try:
-                lens = sensor_of(self._scene, self.sensor)
-                if not is_lens(lens):
-                    raise SceneError(f"{_name(self.source)}: sensor {self.sensor} is no fspt_lens. Give one that is.")
-            except SceneError:
-                self._scene = None
-                raise
-            change = _change(nodes, nodes, self.sensor, exact)
-        _apply(change, sensor_of(self._scene, self.sensor), model)
-        remember_defaults(self._scene, values_of(self.source, wanted))
-        return self._scene
+        now = self._loaded if self._loaded and self._loaded.is_current() else None
+        change = _change(now.nodes, nodes, self.sensor) if now else None
+        change = now.taken(change, exact) if now and change else None
+        if now is None or change is None:
+            self._loaded = now = None  # memory for one scene, not two
+            self._loaded = now = self._load(wanted, nodes)
+            change = Change.of(nodes, self.sensor)
+        _apply(change, sensor_of(now.scene, self.sensor), model)
+        remember_defaults(now.scene, values_of(self.source, wanted))
+        return now.scene
+
+    def _load(self, wanted: Mapping[str, str], nodes: list[mi.parser.SceneNode]) -> Loaded:
+        """The scene with these values of its parameters, of which it has these elements."""
+        xml = self._read(wanted)
+        files = {file: _stamp(file) for file in xml.sources().difference(xml.files)}
+        scene = load(self.source, **wanted)
+        self.loads += 1
+        if not is_lens(sensor_of(scene, self.sensor)):
+            raise SceneError(f"{_name(self.source)}: sensor {self.sensor} is no fspt_lens. Give one that is.")
+        return Loaded(scene, nodes, MovedShapes(scene), files)
+
+
+def _stamp(file: Path) -> Stamp:
+    """Time of the last change [ns] and size [bytes] of a file; None if it is gone."""
+    try:
+        found = os.stat(file)
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
 
 
 def _surfaces(
@@ -214,14 +273,13 @@ def _surfaces(
     return found
 
 
-def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], sensor: int, exact: bool) -> Change | None:
+def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], sensor: int) -> Change | None:
     """Change of the lens, that with the number `sensor`, that makes the picture of the elements `old` that of `new`.
 
     None if there is none.
     """
     import mitsuba as mi
 
-    sensors = [node for node in new if node.type == mi.ObjectType.Sensor]
     if len(old) != len(new):
         return None
     motions: list[Matrix | None] = []  # of the shapes, None for those that are where they were
@@ -234,14 +292,7 @@ def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], sens
             same = same or _differ_in(before.props, after.props, mi.Properties.Type.Float, mi.Properties.Type.Transform)
         if not same:
             return None
-    lens = sensors[sensor].props
-    numbers = {name: float(lens[name]) for name in lens.keys() if lens.type(name) == mi.Properties.Type.Float}
-    placement = _matrix(lens)
-    if any(motion is not None for motion in motions):
-        if exact or not _all_alike(motions) or _others_are_placed(new):
-            return None
-        placement = np.linalg.inv(motions[0]) @ placement  # type: ignore[arg-type]
-    return Change(numbers, placement, str(lens.get("model", "diaphragm")))
+    return Change.of(new, sensor, tuple(motions))
 
 
 def _differ_in(before: mi.Properties, after: mi.Properties, *kinds: object) -> bool:
@@ -262,7 +313,7 @@ def _equal(one: object, other: object) -> bool:
     import mitsuba as mi
 
     reference = mi.Properties.ResolvedReference if hasattr(mi.Properties, "ResolvedReference") else ()
-    return one.index() == other.index() if isinstance(one, reference) else bool(one == other)
+    return one.index() == other.index() if isinstance(one, reference) else bool(np.all(one == other))
 
 
 def _motion(before: mi.Properties, after: mi.Properties) -> Matrix | None:
@@ -276,9 +327,9 @@ def _motion(before: mi.Properties, after: mi.Properties) -> Matrix | None:
     return motion if np.allclose(axes @ axes.T, np.eye(3), atol=RIGID) and np.linalg.det(axes) > 0 else None
 
 
-def _all_alike(motions: list[Matrix | None]) -> bool:
+def _all_alike(motions: tuple[Matrix | None, ...]) -> bool:
     """True if all shapes make the same motion."""
-    first = motions[0]
+    first = motions[0] if motions else None
     return first is not None and all(motion is not None and np.allclose(motion, first) for motion in motions)
 
 

@@ -33,6 +33,8 @@ class SceneXml:
 
     def fill_in(self, text: str) -> str:
         """`text` with values in place of `$name`, the longest name first; a name without value is kept."""
+        if "$" not in text:
+            return text
         values = {**self.defaults, **self.given}
         names = sorted(filter(None, values), key=len, reverse=True)
         pattern = "|".join(re.escape(f"${name}") for name in names)

@@ -135,9 +135,11 @@ class Answers:
 
     def _picture(self, request: Request, given: Record, may_go_on: Callable[[], None]) -> Answer:
         start = time.perf_counter()
-        image = (
-            self._image(request, may_go_on) if request.fine else self._live.draft(self._changed(request), request.model)
-        )
+        changed = self._changed(request)
+        if request.fine:
+            image = self._image(request, changed, may_go_on)
+        else:
+            image = self._live.draft(changed, request.model)
         planes: dict[str, NDArray] = {"power": image.power, "error": image.error, "coverage": image.coverage}  # type: ignore[dict-item]
         known = image.metadata
         lacks = ""
@@ -159,14 +161,15 @@ class Answers:
             "wavelength_nm": known.get("wavelength_nm"),
             "photons_per_joule_nm": 1e-9 / PLANCK_TIMES_LIGHT,
             "warnings": known.get("warnings", ""),
+            "model": request.model or "",
             "lens": {name: known[name] for name in ("focal_length", "f_number", "magnification") if name in known},
-            "command": self._command(request),
+            "command": self._command(request, changed),
             "seconds": time.perf_counter() - start,
         }
         return Answer(record, [np.ascontiguousarray(plane, "<f4").tobytes() for plane in planes.values()])
 
-    def _image(self, request: Request, may_go_on: Callable[[], None]) -> Image:
-        return self._live.image(self._changed(request), request.model, lambda *_: may_go_on())
+    def _image(self, request: Request, changed: Mapping[str, str], may_go_on: Callable[[], None]) -> Image:
+        return self._live.image(changed, request.model, lambda *_: may_go_on())
 
     def _point(self, request: Request, given: Record, _: Callable[[], None]) -> Answer:
         point = self._live.surface_point(self._changed(request), request.model, *request.pixel)
@@ -176,7 +179,7 @@ class Answers:
         return Answer(given | {"kind": "point", "pixel": list(request.pixel), "point": found})
 
     def _exr(self, request: Request, given: Record, may_go_on: Callable[[], None]) -> Answer:
-        image = self._image(request, may_go_on)
+        image = self._image(request, self._changed(request), may_go_on)
         if request.model:
             image = replace(image, metadata=image.metadata | {"model": request.model})
         with tempfile.TemporaryDirectory() as folder:
@@ -196,13 +199,13 @@ class Answers:
         stem = "scene" if is_text(source) else Path(source).stem
         return f"{stem}{'_second' if request.slot == 'b' else ''}.exr"
 
-    def _command(self, request: Request) -> str:
+    def _command(self, request: Request, changed: Mapping[str, str]) -> str:
         """Command that renders the picture; empty where there is none, for a scene's text and another lens model."""
         if is_text(self._live.source) or request.model:
             return ""
         words = ["fspt", "render", os.fspath(self._live.source)]
         words += ["--sensor", str(self._live.sensor)] if self._live.sensor else []
-        for name, text in (self._live.given | self._changed(request)).items():
+        for name, text in (self._live.given | dict(changed)).items():
             words += ["-D", f"{name}={text}"]
         return shlex.join([*words, "-o", self._file(request)])
 

@@ -18,6 +18,13 @@ TURN = 180.0  # degrees to either side
 # Unit and whether the values are > 0, by the property that a parameter sets.
 LENGTHS = re.compile(r".*(?:distance|diameter|radius|length|pitch|height|depth|origin|size)")
 UNITS = {"wavelength_nm": "nm", "angle": "°", "exitance": "W/mm²", "numerical_aperture": ""}
+# Ends of sliders, by a pattern of the property: where values beyond them have no meaning, or none of use.
+ENDS = {
+    "transmittance": (0.01, 1.0),
+    "wavelength_nm": (400.0, 1000.0),
+    r".*(?:reflectance|albedo|opacity)": (0.0, 1.0),
+    r".*_ior": (1.0, 2.0),
+}
 ANGLES = re.compile(r"angle|view|turn|rotation|azimuth|elevation|tilt")
 
 
@@ -82,10 +89,10 @@ def _slider(name: str, value: float, what: str, lens: bool, whole: bool) -> Slid
     if angle:
         turn = max(TURN, 2 * TURN * math.ceil(abs(value) / (2 * TURN))) if abs(value) > TURN else TURN
         return Slider(name, value, -turn, turn, 1.0, "linear", "°", lens)
-    if what == "transmittance":
-        return Slider(name, value, min(0.01, value), max(1.0, value), 0.01, "linear", "", lens)
-    if what == "wavelength_nm":
-        return Slider(name, value, min(400.0, value), max(1000.0, value), 1.0, "linear", "nm", lens)
+    ends = next((ends for kind, ends in ENDS.items() if re.fullmatch(kind, what)), None)
+    if ends:
+        step, (low, high) = _round((ends[1] - ends[0]) / 500), ends
+        return Slider(name, value, min(low, value), max(high, value), step, "linear", UNITS.get(what, ""), lens)
     unit = UNITS.get(what, "mm" if _is_length(what) or _is_length(name) else "")
     if whole:
         reach = max(10.0, abs(value))

@@ -157,6 +157,8 @@ def test_the_shell_completes_verbs_options_and_words():
     assert {"--rtol"} == set(completions("fspt render a.xml --rt"))
     assert completions("fspt render a.xml --method p") == ["path", "ptracer"]
     assert completions("fspt scene new m") == ["mouse"]
+    assert completions("fspt sweep a.xml --format t") == ["tif"]
+    assert completions("fspt render a.xml --unit p") == ["photons/s", "p/s/cm2/sr"]
 
 
 @pytest.mark.parametrize("name", ["cylinder", "rig"])

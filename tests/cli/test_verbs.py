@@ -213,6 +213,14 @@ def test_compare_prints_the_metrics(run, two_images):
     assert f"ratio  {truth.ratio:.6f}" in out
 
 
+def test_compare_tells_of_an_image_without_errors(run, two_images, tmp_path):
+    image = fspt.read("a.exr")
+    fspt.Image(image.power, 1e-12 + 0 * image.power, metadata={"method": "integral"}).write("c.exr")
+    code, out, err = run("compare", "c.exr", "b.exr")
+    assert (code, err) == (0, "fspt: b.exr: it has no plane of errors; its power is taken as exact.\n")
+    assert "beyond 40 " in out  # b differs from a in all rows but the first
+
+
 def test_compare_as_json_is_one_object(run, two_images):
     code, out, err = run("compare", *two_images, "--json")
     assert (code, err) == (0, "")

@@ -211,7 +211,7 @@ def test_two_integrals_have_bounds_alone():
     standard = Image(STANDARD.power, np.full((2, 2), 1.5e-9), metadata=INTEGRAL)
     found = compare(calculated, standard)
     assert (found.z_test, found.beyond) == (None, 1)
-    assert "beyond 1   pixels that differ by more than both integrals' errors together" in found.render_text()
+    assert "beyond 1   pixels that differ by more than the errors of both together" in found.render_text()
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])

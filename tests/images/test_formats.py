@@ -195,7 +195,7 @@ def foreign(path):
 
 
 @pytest.mark.parametrize("suffix", [".fits", ".h5", ".npz", ".tif"])
-def test_files_of_other_programs_and_damaged_ones(tmp_path, suffix, capfd):
+def test_files_of_other_programs_and_damaged_ones(tmp_path, suffix, capfd, caplog):
     """One line each, without a word of the libraries'."""
     path, found = tmp_path / f"a{suffix}", []
     foreign(path)
@@ -209,6 +209,7 @@ def test_files_of_other_programs_and_damaged_ones(tmp_path, suffix, capfd):
         found.append(str(caught.value))
     assert not any("\n" in message for message in found)
     assert capfd.readouterr() == ("", "")
+    assert caplog.records == []
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -307,3 +307,9 @@ def test_an_image_as_an_array_is_its_power():
     copy = np.array(image)
     copy[0, 0] = 7
     assert (image.power[0, 0], copy[0, 0], np.sum(image)) == (0, 7, 15)
+
+
+def test_the_text_of_an_image_names_size_total_and_error():
+    power = np.array([[1e-9, 2e-9, 3e-9]])
+    assert repr(Image(power, 0.1 * power)) == "Image(3 x 1 pixels, 6e-09 W in all, error at most 3e-10 W a pixel)"
+    assert repr(Image(power)) == "Image(3 x 1 pixels, 6e-09 W in all, error unknown)"

@@ -10,7 +10,7 @@ from mitsuba_fspt.rendering.live_scene import LiveScene
 
 SCENE = """<scene version="3.0.0">
     <default name="f_number" value="4"/> <default name="distance" value="160"/> <default name="turn" value="0"/>
-    <default name="aside" value="0"/>
+    <default name="aside" value="0"/> <default name="lift" value="0"/>
     <integrator type="fspt_integral"/>
     <sensor type="fspt_lens">
         <float name="focal_length" value="50"/> <float name="f_number" value="$f_number"/>
@@ -20,13 +20,13 @@ SCENE = """<scene version="3.0.0">
         <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="24"/></film>
     </sensor>
     <shape type="cube" id="box">
-        <transform name="to_world"><scale x="4" y="3" z="2"/><rotate z="1" angle="$turn"/></transform>
+        <transform name="to_world"><scale x="4" y="3" z="2"/><rotate z="1" angle="$turn"/>
+            <translate z="$lift"/></transform>
         <emitter type="fspt_surface"><float name="exitance" value="2"/></emitter>
     </shape>
     <shape type="sphere" id="bead">
-        <float name="radius" value="1"/>
-        <transform name="to_world"><translate x="2" y="5"/><rotate z="1" angle="$turn"/>
-            <translate y="$aside"/></transform>
+        <float name="radius" value="1"/> <point name="center" x="2" y="5" z="0"/>
+        <transform name="to_world"><rotate z="1" angle="$turn"/><translate y="$aside"/></transform>
         <emitter type="fspt_surface"><float name="exitance" value="1"/></emitter>
     </shape>
 </scene>"""
@@ -72,14 +72,38 @@ def test_the_draft_of_a_monte_carlo_is_one_of_few_samples(mono):
     assert draft.power.sum() == pytest.approx(image.power.sum(), rel=0.05)
 
 
-def test_a_shape_that_moves_alone_is_loaded_again(live):
+def test_shapes_that_move_alone_are_moved_in_place_and_the_image_is_that_of_the_loaded_scene(live):
+    """Mesh and sphere, one after the other and back; a shape left where it was would be off by its own radiance."""
     live.image({})
-    loads, wanted = live.loads, fspt.render(fspt.load(SCENE, aside=3))
-    assert (
-        np.abs(live.draft({"aside": 3}, rtol=1e-3, max_nodes=200_000).power - wanted.power).max()
-        <= 2e-3 * wanted.power.max()
+    loads = live.loads
+    for values in ({"aside": 3}, {"lift": 1.5, "aside": -2}, {"lift": 1.5, "turn": 20}, {}):
+        draft = live.draft(values, rtol=1e-3, max_nodes=200_000)
+        wanted = fspt.render(fspt.load(SCENE, **values))
+        assert np.abs(draft.power - wanted.power).max() <= 2e-3 * wanted.power.max()
+    assert live.loads == loads
+    assert np.array_equal(live.image(values).power, wanted.power)
+
+
+def test_a_mesh_that_is_written_again_is_loaded_again(mono, tmp_path):
+    """Half the size, a quarter of the power: the silhouette's area counts."""
+    path = tmp_path / "body.obj"
+    faces = "f 1 2 3\nf 1 3 4\n"
+
+    def write(side):
+        corners = [(0, -side, -side), (0, side, -side), (0, side, side), (0, -side, side)]
+        path.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners) + faces)
+
+    write(4)
+    start = SCENE.index('    <shape type="cube"')
+    live = LiveScene(
+        SCENE[:start]
+        + f"""<shape type="obj"><string name="filename" value="{path}"/><boolean name="face_normals" value="true"/>
+        <emitter type="fspt_surface"><float name="exitance" value="2"/></emitter></shape></scene>""".replace("\\", "/")
     )
-    assert live.loads == loads + 1
+    before = live.image({}).power.sum()
+    write(2)
+    assert live.image({}).power.sum() == pytest.approx(before / 4, rel=0.01)
+    assert live.loads == 2
 
 
 def test_a_lens_that_cannot_be_leaves_a_usable_scene(live):

@@ -69,9 +69,11 @@ def read_out(page, column, row):
     """Power and error [W/pixel] that the page reads out on a pixel."""
     box = page.locator("canvas[data-panel=a]").bounding_box()
     page.mouse.move(box["x"] + box["width"] * (column + 0.5) / 48, box["y"] + box["height"] * (row + 0.5) / 40)
-    text = page.locator(".readout").inner_text()
-    found = re.fullmatch(rf"Column {column}, row {row} .*: (\S+) ± (\S+) W/pixel, coverage .*", text)
-    return float(found[1]), float(found[2])
+    readout = page.locator(".readout")
+    shows(readout.locator(".head"), f"Column {column}, row {row} ")
+    assert readout.locator("thead th").all_inner_texts() == ["power [W/pixel]", "± error", "coverage"]
+    power, error, _ = readout.locator("tbody td").all_inner_texts()
+    return float(power), float(error)
 
 
 def test_a_drag_moves_the_picture_and_the_read_out_is_the_number_in_the_exr(page, tmp_path):
@@ -120,9 +122,23 @@ def test_log_scale_region_and_surface_point(page):
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] - 1, box["y"] + box["height"] - 1)
     page.mouse.up()
-    cells = page.locator(".region td").all_inner_texts()
-    assert cells[0] == "48 × 40 at 0, 0"
-    assert float(cells[2]) == pytest.approx(image.power.sum(dtype=np.float64), rel=1e-5)
+    shows(page.locator(".region .head"), "Region of 48 × 40 pixels from column 0, row 0")
+    total, error, *_, pixels = map(float, page.locator(".region tbody td").all_inner_texts())
+    assert pixels == 48 * 40
+    assert total == pytest.approx(image.power.sum(dtype=np.float64), rel=1e-5)
+    assert error == pytest.approx(image.error.sum(dtype=np.float64), rel=0.05)
+
+
+def test_the_surface_point_follows_the_lens(page):
+    """The disc of a point before the plane in focus, R_b = (D/2) b v/(u p), is half as wide at twice the f-number."""
+    page.locator("canvas[data-panel=a]").click()
+    point = page.locator(".point:not(.old)")
+    shows(point, "blur disc of radius")
+    before = float(re.search(r"radius (\S+) pixels", point.inner_text())[1])
+    set_number(page, "f_number", 8)
+    playwright.expect(point).not_to_contain_text(f"radius {before:g} pixels", timeout=WAIT)
+    after = float(re.search(r"radius (\S+) pixels", point.inner_text())[1])
+    assert before / after == pytest.approx(2, rel=0.02)
 
 
 def test_a_second_lens_beside_the_first(page):
@@ -135,9 +151,11 @@ def test_a_second_lens_beside_the_first(page):
     page.wait_for_timeout(100)
     box = page.locator("canvas[data-panel=a]").bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    text = page.locator(".readout").inner_text()
-    first, second = (float(number) for number in re.findall(r"lens (\S+) ±", text))
-    assert first / second == pytest.approx(4, rel=0.01)  # the area of the pupil: f/4 against f/8
+    rows = page.locator(".readout tbody tr").all_inner_texts()
+    found = {name: float(value) for name, value, *_ in (row.split("\t") for row in rows)}
+    assert list(found) == ["lens", "second lens", "difference", "ratio"]
+    assert found["ratio"] == pytest.approx(4, rel=0.01)  # the area of the pupil: f/4 against f/8
+    assert found["lens"] - found["second lens"] == pytest.approx(found["difference"], rel=1e-4)
 
 
 def test_two_pages_and_a_reload(page, browser, served):
@@ -184,7 +202,12 @@ def test_an_error_is_a_line_and_the_last_picture_stays_then_the_server_goes(page
     before = read_out(page, 24, 20)
     page.get_by_label("f_number").first.fill("-2")
     line = page.get_by_role("alert")
+    page.locator("select[name=model-a]").select_option("hrrt")
     shows(line, "'f_number' must be > 0")
+    page.get_by_label("log scale").check()  # draws it again
+    page.wait_for_selector("canvas.bar[data-log=true]")
+    assert "hrrt" not in page.locator("figcaption").first.inner_text()  # the caption is that of the picture
+    page.locator("select[name=model-a]").select_option("")
     assert read_out(page, 24, 20) == before
     set_number(page, "f_number", 5)
     assert line.text_content() == ""

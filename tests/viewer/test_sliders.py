@@ -51,3 +51,12 @@ def test_given_values_are_where_the_sliders_stand():
     assert sliders(text, f_number="2.8")["f_number"].value == 2.8
     assert sliders(text, f_number="64")["f_number"].high == 64
     assert (sliders(text)["view"].low, sliders(text)["view"].high) == (-180, 180)
+
+
+def test_shares_end_at_1_and_refractive_indices_at_that_of_air():
+    tissue, rig = (
+        {slider.name: (slider.low, slider.high) for slider in sliders_of(read_xml(SCENES / name, {}))}
+        for name in ("nylon_cylinder_tissue.xml", "mirror_rig.xml")
+    )
+    assert tissue["albedo"] == rig["reflectance"] == (0, 1)
+    assert tissue["int_ior"] == (1, 2)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +50,20 @@ class Tif(Format):
         """As `Format.read`."""
         import tifffile
 
-        with tifffile.TiffFile(path) as file:
+        with _silent(logging.getLogger("tifffile")), tifffile.TiffFile(path) as file:
             root = ElementTree.fromstring(file.ome_metadata or "")
             stack = file.series[0].asarray()
         names = [str(channel.get("Name")) for channel in root.iter() if channel.tag.endswith("}Channel")]
         (text,) = (node.text for node in root.iter() if node.tag.endswith("}Description"))
         planes = stack.reshape(len(names), *stack.shape[-2:])
         return dict(zip(names, planes, strict=True)), json.loads(text or "")
+
+
+@contextmanager
+def _silent(logger: logging.Logger) -> Iterator[None]:
+    """Context manager in which a logger says nothing: what it would say of a damaged file is an ImageError."""
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before

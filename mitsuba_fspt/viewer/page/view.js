@@ -12,8 +12,10 @@ const MAPS = { // 33 colours of matplotlib's maps, dark to bright
 };
 const QUANTITIES = { power: "power", error: "error", coverage: "coverage" };
 const UNITS = { W: "W/pixel", photons: "photons/s/pixel", radiance: "p/s/cm²/sr" };
+const POWER_IN = { W: "power", photons: "photon rate", radiance: "radiance" }; // what the power is called in each unit
 const MARKS = { cross: "#4fc3f7", region: "#7cff6b", disc: "#ffffff" };
 const PANELS = { a: "lens", b: "second lens", difference: "difference, lens − second lens" };
+const SUPERSCRIPTS = "⁰¹²³⁴⁵⁶⁷⁸⁹";
 
 let instances = 0;
 
@@ -77,14 +79,47 @@ function ticks(low, high, log) {
   return found;
 }
 
+/** A power of ten as a person writes it. */
+function powerOfTen(exponent) {
+  return `10${exponent < 0 ? "⁻" : ""}${[...String(Math.abs(exponent))].map((digit) => SUPERSCRIPTS[digit]).join("")}`;
+}
+
+/** Ticks of an axis from low to high, [value, text] each, and the power of ten that all texts leave out. */
+function axis(low, high, log) {
+  const values = ticks(low, high, log);
+  if (log) {
+    const whole = (value) => Math.abs(Math.log10(value) - Math.round(Math.log10(value))) < 1e-9;
+    return { marks: values.map((value) => [value, whole(value) ? powerOfTen(Math.round(Math.log10(value))) : digits(value, 2)]), factor: "" };
+  }
+  const most = Math.max(Math.abs(low), Math.abs(high));
+  const exponent = most >= 0.01 && most < 1e4 ? 0 : 3 * Math.floor(Math.log10(most) / 3);
+  return { marks: values.map((value) => [value, digits(value / 10 ** exponent, 3)]), factor: exponent ? powerOfTen(exponent) : "" };
+}
+
+/** A quantity with its unit and the factor that its numbers leave out. */
+function withUnit(quantity, factor, unit) {
+  const inside = [factor, unit].filter(Boolean).join(" ");
+  return inside ? `${quantity} [${inside}]` : quantity;
+}
+
+/** Title and table of rows of texts, the first of each a heading. */
+function tableOf(caption, head, rows) {
+  const line = ([first, ...others]) => make("tr", {}, make("th", { scope: "row", text: first }), ...others.map((text) => make("td", { text })));
+  const title = make("p", { class: "head", text: caption });
+  return [title, make("table", { "aria-label": caption },
+    ...(head.length ? [make("thead", {}, make("tr", {}, make("td"), ...head.map((text) => make("th", { scope: "col", text }))))] : []),
+    make("tbody", {}, ...rows.map(line)))];
+}
+
 /** Give a canvas as many pixels as the screen shows, and return its context in CSS pixels with the size. */
 function sharp(canvas) {
   const ratio = window.devicePixelRatio || 1;
   const { width, height } = canvas.getBoundingClientRect();
-  canvas.width = Math.max(1, Math.round(width * ratio));
-  canvas.height = Math.max(1, Math.round(height * ratio));
+  const size = [width, height].map((length) => Math.max(1, Math.round(length * ratio)));
+  if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
   const context = canvas.getContext("2d");
-  context.scale(ratio, ratio);
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width + 1, height + 1);
   return [context, width, height];
 }
 
@@ -196,6 +231,7 @@ class View {
     this.id = `fspt${instances++}`;
     this.keepsHash = keepsHash;
     this.sliders = [];
+    this.shows = []; // functions that show the value of a slider again
     this.values = { a: {}, b: {} };
     this.models = { a: "", b: "" };
     this.pictures = {};
@@ -214,12 +250,17 @@ class View {
     this.resize = new ResizeObserver(() => this.draw());
     this.resize.observe(this.nodes.pictures);
     this.dark = window.matchMedia("(prefers-color-scheme: dark)");
-    this.dark.addEventListener("change", () => this.draw());
+    this.redraw = () => this.draw();
+    this.dark.addEventListener("change", this.redraw);
+    this.theme = new MutationObserver(this.redraw); // JupyterLab's
+    this.theme.observe(document.body, { attributeFilter: ["data-jp-theme-light"] });
   }
 
   close() {
     this.channel.close();
     this.resize.disconnect();
+    this.theme.disconnect();
+    this.dark.removeEventListener("change", this.redraw);
   }
 
   // ---- elements
@@ -229,30 +270,31 @@ class View {
     nodes.title = make("h1", { text: "fspt view" });
     nodes.state = make("span", { class: "state", role: "status" });
     nodes.fault = make("p", { class: "fault", role: "alert" });
+    nodes.notice = make("p", { class: "notice", role: "status" });
     nodes.sliders = make("fieldset", {}, make("legend", { text: "Scene" }));
     nodes.second = make("fieldset", {}, make("legend", { text: "Second lens" }));
     nodes.display = make("fieldset", {}, make("legend", { text: "Display" }));
     nodes.files = make("fieldset", {}, make("legend", { text: "Save" }));
     nodes.pictures = make("main", { class: "pictures" });
-    nodes.readout = make("p", { class: "readout", text: "Point at a pixel, or move over it with the arrow keys." });
+    nodes.readout = make("div", { class: "readout", text: "Point at a pixel for its power. Drag for a region, click for the surface point." });
     nodes.point = make("p", { class: "point", role: "status" });
     nodes.region = make("div", { class: "region" });
     nodes.profiles = make("div", { class: "profiles" });
     for (const along of ["row", "column"]) {
-      nodes[along] = make("canvas", { class: "profile", role: "img", "aria-label": `profile along the ${along}` });
-      nodes[`${along}Title`] = make("figcaption", { text: `Profile along the ${along}` });
+      nodes[along] = make("canvas", { class: "profile", role: "img" });
+      nodes[`${along}Title`] = make("figcaption");
       nodes.profiles.append(make("figure", {}, nodes[`${along}Title`], nodes[along]));
     }
     this.buildDisplay();
     this.buildFiles();
     this.root.classList.add("fspt");
     this.root.replaceChildren(
-      make("header", {}, nodes.title, nodes.state), nodes.fault,
+      make("header", {}, nodes.title, nodes.state), nodes.fault, nodes.notice,
       make("div", { class: "body" },
         make("form", { "aria-label": "Parameters", onsubmit: (e) => e.preventDefault() },
           nodes.sliders, nodes.second, nodes.display, nodes.files),
         nodes.pictures,
-        make("section", { class: "readouts", "aria-label": "Read-outs" }, nodes.readout, nodes.point, nodes.region),
+        make("section", { class: "readouts", "aria-label": "Read-outs" }, nodes.readout, nodes.region, nodes.point),
         make("section", { class: "details", "aria-label": "Profiles" }, nodes.profiles)),
     );
     this.addPanel("a");
@@ -263,35 +305,36 @@ class View {
     const select = make("select", { id, name, onchange: () => this.setOption(name, select.value) });
     for (const [value, text] of Object.entries(entries)) select.append(make("option", { value, text }));
     select.value = this.options[name];
-    return make("span", {}, make("label", { for: id, text: `${label} ` }), select);
+    return make("div", { class: "option" }, make("label", { for: id, text: label }), select);
   }
 
   check(name, label) {
     const id = `${this.id}-${name}`;
     const box = make("input", { type: "checkbox", id, name, onchange: () => this.setOption(name, box.checked) });
-    return make("span", {}, box, make("label", { for: id, text: ` ${label}` }));
+    return make("div", { class: "check" }, box, make("label", { for: id, text: label }));
   }
 
   figure(name, label, unit, low) {
     const id = `${this.id}-${name}`;
     const field = make("input", { type: "number", id, name, min: low, step: "any", value: this.options[name],
       onchange: () => { if (Number(field.value) >= low) this.setOption(name, Number(field.value)); } });
-    return make("span", {}, make("label", { for: id, text: `${label} ` }), field, make("span", { class: "unit", text: ` ${unit}` }));
+    const text = make("label", { for: id }, label, make("span", { class: "unit", text: unit ? ` [${unit}]` : "" }));
+    return make("div", { class: "option" }, text, field);
   }
 
   buildDisplay() {
     this.nodes.wavelength = this.figure("wavelength", "wavelength", "nm", 1);
-    this.nodes.wavelength.hidden = true;
-    const row = (...parts) => make("div", { class: "choices" }, ...parts);
+    this.nodes.decades = this.figure("decades", "decades", "", 0.1);
+    this.nodes.wavelength.hidden = this.nodes.decades.hidden = true;
     this.nodes.display.append(
-      row(this.choice("quantity", "show", QUANTITIES), this.choice("unit", "in", UNITS)), row(this.nodes.wavelength),
-      row(this.choice("map", "colours", { inferno: "inferno", viridis: "viridis", grey: "grey" }), this.check("log", "log scale")),
-      row(this.figure("decades", "decades", "", 0.1), this.check("lock", "hold the scale")),
+      this.choice("quantity", "show", QUANTITIES), this.choice("unit", "unit", UNITS), this.nodes.wavelength,
+      this.choice("map", "colours", { inferno: "inferno", viridis: "viridis", grey: "grey" }),
+      this.check("log", "log scale"), this.nodes.decades, this.check("lock", "hold the scale"),
     );
   }
 
   buildFiles() {
-    this.nodes.command = make("code", { "aria-label": "command line that makes this picture" });
+    this.nodes.command = make("code", { tabindex: 0, "aria-label": "command line that makes this picture" });
     this.nodes.files.append(
       make("div", { class: "choices" },
         make("button", { type: "button", name: "png", text: "PNG", onclick: () => this.savePng() }),
@@ -307,7 +350,7 @@ class View {
   }
 
   addPanel(name) {
-    const canvas = make("canvas", { width: 1, height: 1, role: "img", tabindex: 0, "data-panel": name,
+    const canvas = make("canvas", { width: 1, height: 1, role: "application", tabindex: 0, "data-panel": name,
       "aria-label": `picture, ${PANELS[name]}: arrow keys move the crosshair, with Shift the region's corner, Enter asks for the surface point` });
     const marks = make("canvas", { class: "marks", "aria-hidden": "true" });
     const bar = make("canvas", { class: "bar", role: "img" });
@@ -368,8 +411,9 @@ class View {
   // ---- sliders
 
   hello(record) {
-    this.nodes.title.textContent = record.scene;
-    document.title = this.keepsHash ? `${record.scene} – fspt view` : document.title;
+    const cut = record.scene.lastIndexOf("/") + 1;
+    this.nodes.title.replaceChildren(make("span", { class: "folder", text: record.scene.slice(0, cut) }), record.scene.slice(cut));
+    document.title = this.keepsHash ? `${record.scene.slice(cut)} – fspt view` : document.title;
     this.allModels = record.models;
     const first = !this.sliders.length;
     this.sliders = record.sliders;
@@ -402,6 +446,7 @@ class View {
       range.setAttribute("aria-valuetext", `${digits(number)} ${slider.unit}`.trim());
     };
     show(value);
+    if (slot === "a") this.shows.push(() => show(this.values.a[slider.name]));
     const set = (number, source) => {
       this.values[slot][slider.name] = number;
       show(number, source);
@@ -419,16 +464,24 @@ class View {
     const id = `${this.id}-second`;
     const box = make("input", { type: "checkbox", id, name: "second", onchange: () => this.setSecond(box.checked) });
     this.nodes.secondRows = make("div", { hidden: true });
-    const models = (slot, text) => {
+    const models = (slot) => {
       const of = `${this.id}-model-${slot}`;
       const select = make("select", { id: of, name: `model-${slot}`, onchange: () => { this.models[slot] = select.value; this.changed(slot); } },
         make("option", { value: "", text: "of the scene" }), ...this.allModels.map((name) => make("option", { value: name, text: name })));
-      return make("div", { class: "choices" }, make("label", { for: of, text }), select);
+      return make("div", { class: "option" }, make("label", { for: of, text: "lens model" }), select);
     };
-    this.nodes.sliders.append(models("a", "lens model"));
-    this.nodes.secondRows.append(...this.sliders.filter((s) => s.lens).map((s) => this.sliderRow(s, "b")), models("b", "lens model"));
+    this.nodes.sliders.append(models("a"), make("div", { class: "choices" }, make("button", { type: "button", name: "reset", text: "values of the scene", onclick: () => this.reset() })));
+    this.nodes.secondRows.append(...this.sliders.filter((s) => s.lens).map((s) => this.sliderRow(s, "b")), models("b"));
     this.nodes.secondRows.append(this.check("each", "a colour scale for each"));
-    this.nodes.second.append(make("div", {}, box, make("label", { for: id, text: " beside the first, with their difference" })), this.nodes.secondRows);
+    this.nodes.second.append(make("div", { class: "check" }, box, make("label", { for: id, text: "beside the first, with their difference" })), this.nodes.secondRows);
+  }
+
+  /** Give the first lens and the scene the values again that the program was started with. */
+  reset() {
+    this.models.a = this.root.querySelector('[name="model-a"]').value = "";
+    for (const slider of this.sliders) this.values.a[slider.name] = slider.value;
+    for (const show of this.shows) show();
+    this.changed("a");
   }
 
   setSecond(on) {
@@ -444,6 +497,10 @@ class View {
       }
     }
     delete this.pictures.b;
+    if (this.asked?.slot === "b") {
+      this.asked = this.place = null;
+      this.tell("");
+    }
     if (on) this.changed("b");
     this.draw();
   }
@@ -453,6 +510,7 @@ class View {
     if (name === "lock") this.limits = value ? this.scale() : null;
     else if (["quantity", "unit", "log", "wavelength", "decades", "each"].includes(name)) this.limits = null;
     this.nodes.wavelength.hidden = this.options.unit === "W";
+    this.nodes.decades.hidden = !this.options.log;
     const lacks = this.options.unit === "radiance" && Object.values(this.pictures).some((p) => !p.plane.etendue);
     if (lacks) for (const slot of Object.keys(this.pictures)) this.ask("picture", slot);
     this.draw();
@@ -502,7 +560,8 @@ class View {
 
   askPoint(panel, pixel) {
     this.cursor = pixel;
-    this.ask("point", panel === "b" ? "b" : "a", { pixel });
+    this.asked = { slot: panel === "b" ? "b" : "a", pixel };
+    this.ask("point", this.asked.slot, { pixel });
     this.drawReadouts();
   }
 
@@ -534,27 +593,46 @@ class View {
     }
     this.setFault(slot, "");
     this.times = [...this.times, performance.now()].filter((t) => t > performance.now() - 1000);
-    if (slot === "a" && this.place) this.place = record.fine ? this.place : null;
+    if (this.asked?.slot === slot) this.followPoint(record);
     this.draw();
     this.root.dataset.shown = Number(this.root.dataset.shown ?? 0) + 1;
-    this.root.dataset.stage = record.fine ? "fine" : "draft";
+    this.root.dataset.stage = this.isFine() ? "fine" : "draft";
+  }
+
+  /** True once all pictures are those of a rest, and no drafts. */
+  isFine() { return (this.second ? ["a", "b"] : ["a"]).every((slot) => this.pictures[slot]?.fine); }
+
+  /** The surface point and its disc belong to the picture that is shown: ask again for those of a new one. */
+  followPoint(record) {
+    const { slot, pixel } = this.asked;
+    const gone = pixel[0] >= record.width || pixel[1] >= record.height;
+    this.place = null;
+    this.nodes.point.classList.add("old");
+    if (gone) {
+      this.asked = null;
+      this.tell("");
+    } else if (record.fine) this.ask("point", slot, { pixel });
   }
 
   takePoint(record) {
+    if (!this.asked || record.slot !== this.asked.slot) return;
     const found = record.point;
     this.place = found ? { ...found, slot: record.slot } : null;
     const [column, row] = record.pixel;
-    if (!found) this.tell(`Pixel ${column}, ${row}: its line of sight meets no surface.`);
+    if (!found) this.tell(`Column ${column}, row ${row}: its line of sight meets no surface.`);
     else {
       const at = found.position.map((x) => digits(x, 5)).join(", ");
       const glow = found.exitance === null ? "does not glow" : `J_n = ${digits(found.exitance, 5)} W/mm²`;
-      const blur = found.radius === null ? "unbounded" : `${digits(found.radius, 3)} pixels`;
-      this.tell(`Pixel ${column}, ${row}: surface point (${at}) mm on '${found.shape}'${found.by_way_of.length ? ` by way of ${found.by_way_of.join(", ")}` : ""}, ${glow}, depth ${digits(found.depth, 5)} mm, blur disc of radius ${blur}.`);
+      const blur = found.radius === null ? "unbounded" : `${digits(Math.round(found.radius * 1e3) / 1e3, 3)} pixels`;
+      this.tell(`Column ${column}, row ${row}: surface point (${at}) mm on '${found.shape}'${found.by_way_of.length ? ` by way of ${found.by_way_of.join(", ")}` : ""}, ${glow}, depth ${digits(found.depth, 5)} mm, blur disc of radius ${blur}.`);
     }
     this.drawMarks();
   }
 
-  tell(text) { this.nodes.point.textContent = text; }
+  tell(text) {
+    this.nodes.point.classList.remove("old");
+    this.nodes.point.textContent = text;
+  }
 
   setFault(slot, message) {
     this.faults[slot] = message;
@@ -572,6 +650,9 @@ class View {
 
   // ---- drawing
 
+  /** What is shown, as texts call it. */
+  quantityText() { return this.options.quantity === "power" ? POWER_IN[this.options.unit] : this.options.quantity; }
+
   unitText() { return this.options.quantity === "coverage" ? "" : UNITS[this.options.unit]; }
 
   shownValues(slot) {
@@ -580,10 +661,10 @@ class View {
   }
 
   /** Ends of the colour scale in the shown unit, common to both lenses unless each has its own. */
-  scale(slot = "a") {
+  scale(slot = "a", each = this.options.each) {
     if (this.limits) return this.limits;
     let high = 0;
-    for (const one of this.options.each ? [slot] : Object.keys(this.pictures)) for (const value of this.shownValues(one)) if (value > high) high = value;
+    for (const one of each ? [slot] : Object.keys(this.pictures)) for (const value of this.shownValues(one)) if (value > high) high = value;
     if (!(high > 0)) high = 1;
     return this.options.log ? [high / 10 ** this.options.decades, high] : [0, high];
   }
@@ -607,21 +688,24 @@ class View {
   drawAll() {
     if (this.waits()) return;
     const { log, map } = this.options;
-    this.nodes.pictures.style.setProperty("--least", this.pictures.a.width > 2 * this.pictures.a.height ? "34em" : "17em");
+    const aspect = this.pictures.a.width / this.pictures.a.height;
+    this.root.classList.toggle("wide", aspect > 2);
+    this.root.style.setProperty("--aspect", aspect.toFixed(3));
     for (const [name, panel] of Object.entries(this.panels)) {
       if (name === "difference") this.drawDifference(panel);
       else if (this.pictures[name]) this.drawPanel(panel, this.pictures[name], this.shownValues(name), ...this.scale(name), log, map);
     }
     for (const [name, panel] of Object.entries(this.panels)) this.drawCaption(name, panel);
     const picture = this.pictures.a;
-    const stage = picture.fine ? "" : ", draft";
+    const fine = this.isFine(), stage = fine ? "" : ", draft";
     const rtol = picture.rtol ? `, rtol ${digits(picture.rtol)}${stage}` : stage;
-    this.nodes.state.textContent = `${picture.width} × ${picture.height}, ${picture.method}${rtol}${!picture.fine && this.times.length > 2 ? `, ${this.times.length} pictures/s` : ""}${picture.warnings ? ` – ${picture.warnings}` : ""}`;
+    this.nodes.state.textContent = `${picture.width} × ${picture.height}, ${picture.method}${rtol}${!fine && this.times.length > 2 ? `, ${this.times.length} pictures/s` : ""}`;
+    if (this.nodes.notice.textContent !== picture.warnings) this.nodes.notice.textContent = picture.warnings;
     this.nodes.command.textContent = picture.command || "No command line makes this picture: it needs a scene file, and the lens model of the scene.";
     this.drawReadouts();
   }
 
-  drawPanel(panel, picture, values, low, high, log, map, quantity = this.options.quantity) {
+  drawPanel(panel, picture, values, low, high, log, map, quantity = this.quantityText()) {
     const { canvas } = panel;
     if (canvas.width !== picture.width || canvas.height !== picture.height) Object.assign(canvas, { width: picture.width, height: picture.height });
     const context = canvas.getContext("2d");
@@ -645,18 +729,19 @@ class View {
     const values = Float64Array.from(one, (value, i) => value - other[i]);
     const reach = values.reduce((most, value) => Math.max(most, Math.abs(value)), 0) || 1;
     panel.values = values;
-    this.drawPanel(panel, a, values, -reach, reach, false, "difference", `difference of ${this.options.quantity}`);
+    this.drawPanel(panel, a, values, -reach, reach, false, "difference", `difference of ${this.quantityText()}`);
   }
 
   drawBar(canvas, low, high, log, colours, quantity) {
-    const label = `${quantity}${this.unitText() ? ` [${this.unitText()}]` : ""}${log ? ", log" : ""}`;
-    canvas.paint = (context, width, height) => this.paintBar(context, width, height, low, high, log, colours, label);
+    const { marks, factor } = axis(low, high, log);
+    const label = withUnit(quantity, factor, this.unitText());
+    canvas.paint = (context, width, height) => this.paintBar(context, width, height, low, high, log, colours, label, marks);
     canvas.paint(...sharp(canvas));
-    canvas.setAttribute("aria-label", `colour bar: ${label} from ${digits(low)} to ${digits(high)}`);
+    canvas.setAttribute("aria-label", `colour bar: ${withUnit(quantity, "", this.unitText())}${log ? ", logarithmic," : ""} from ${digits(low)} to ${digits(high)}`);
     Object.assign(canvas.dataset, { low, high, log });
   }
 
-  paintBar(context, width, height, low, high, log, colours, label) {
+  paintBar(context, width, height, low, high, log, colours, label, marks) {
     const style = getComputedStyle(this.root);
     context.save();
     const top = 8, tall = height - 2 * top, wide = 14;
@@ -668,12 +753,11 @@ class View {
     context.fillStyle = context.strokeStyle = style.color;
     context.font = "11px system-ui, sans-serif";
     context.textBaseline = "middle";
-    const marks = ticks(low, high, log);
-    for (const value of marks) {
+    for (const [value, text] of marks) {
       const share = log ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low);
       const y = top + tall * (1 - share);
       context.fillRect(wide, y, 4, 1);
-      context.fillText(digits(value, 3), wide + 7, y, width - wide - 22);
+      context.fillText(text, wide + 7, y, width - wide - 22);
     }
     context.translate(width - 7, height / 2);
     context.rotate(-Math.PI / 2);
@@ -685,11 +769,11 @@ class View {
   drawCaption(name, panel) {
     const picture = this.pictures[name === "b" ? "b" : "a"];
     if (!picture) return;
-    if (name === "difference") panel.caption.textContent = PANELS.difference;
+    if (name === "difference") panel.caption.textContent = `Difference, lens − second lens`;
     else {
       const [total, error] = picture.total();
       const { f_number: stop, focal_length: focal, magnification: t } = picture.lens;
-      panel.caption.textContent = `${name === "b" ? "Second lens" : "Lens"}${this.models[name] ? ` (${this.models[name]})` : ""}: F = ${digits(focal)} mm, f/${digits(stop)}, magnification ${digits(t)}, total ${digits(total)} ± ${digits(error, 2)} W`;
+      panel.caption.textContent = `${name === "b" ? "Second lens" : "Lens"}${picture.model ? ` (${picture.model})` : ""}: F = ${digits(focal)} mm, f/${digits(stop)}, magnification ${digits(t)}, total ${digits(total)} ± ${digits(error, 2)} W`;
     }
   }
 
@@ -704,45 +788,60 @@ class View {
   drawReadout() {
     if (!this.cursor) return;
     const [column, row] = this.cursor;
-    const lines = Object.entries(this.pictures).map(([slot, picture]) => {
+    const { unit, wavelength } = this.options;
+    const found = {};
+    for (const [slot, picture] of Object.entries(this.pictures)) {
       const i = row * picture.width + column;
-      if (column >= picture.width || row >= picture.height) return "";
-      const factor = picture.factor(this.options.unit, this.options.wavelength, i);
-      const name = slot === "b" ? "second lens " : this.second ? "lens " : "";
-      return `${name}${digits(picture.plane.power[i] * factor, 7)} ± ${digits(picture.plane.error[i] * factor, 2)} ${UNITS[this.options.unit]}, coverage ${digits(picture.plane.coverage[i], 3)}`;
-    });
+      if (column >= picture.width || row >= picture.height) continue;
+      const factor = picture.factor(unit, wavelength, i);
+      found[slot] = ["power", "error", "coverage"].map((name) => picture.plane[name][i] * (name === "coverage" ? 1 : factor));
+    }
+    const rows = Object.entries(found).map(([slot, [power, error, coverage]]) =>
+      [this.second ? PANELS[slot] : "", digits(power, 7), digits(error, 2), digits(coverage, 3)]);
+    if (found.a && found.b) {
+      const { together } = this.pictures.a;
+      rows.push(["difference", digits(found.a[0] - found.b[0], 5), digits(together(found.a[1], found.b[1]), 2), ""]);
+      rows.push(["ratio", found.b[0] ? digits(found.a[0] / found.b[0], 5) : "–", "", ""]);
+    }
     const mm = this.pictures.a.place(column, row);
     const where = mm ? ` (x ${digits(mm[0])} mm, y ${digits(mm[1])} mm)` : "";
-    this.nodes.readout.textContent = `Column ${column}, row ${row}${where}: ${lines.filter(Boolean).join("; ")}`;
+    this.nodes.readout.replaceChildren(...tableOf(`Column ${column}, row ${row}${where}`, [`${POWER_IN[unit]} [${UNITS[unit]}]`, "± error", "coverage"], rows));
   }
 
   drawRegion() {
     if (!this.region) return this.nodes.region.replaceChildren();
     const [left, top, columns, rows] = this.region;
-    const { unit, wavelength } = this.options;
-    const heads = ["region", "pixels", `total [${unit === "radiance" ? "W" : UNITS[unit].replace("/pixel", "")}]`, "± error", "mean", "max", `sd [${UNITS[unit]}]`, "area [mm²]"];
-    const table = make("table", {}, make("tr", {}, ...heads.map((text) => make("th", { scope: "col", text }))));
-    for (const [slot, picture] of Object.entries(this.pictures)) {
-      const { together } = picture;
-      let total = 0, error = 0, sum = 0, squares = 0, most = -Infinity, count = 0;
-      for (let row = top; row < Math.min(top + rows, picture.height); row++) {
-        for (let column = left; column < Math.min(left + columns, picture.width); column++) {
-          const i = row * picture.width + column;
-          const factor = picture.factor(unit, wavelength, i), whole = unit === "radiance" ? 1 : factor;
-          const value = picture.plane.power[i] * factor;
-          total += picture.plane.power[i] * whole;
-          error = together(error, picture.plane.error[i] * whole);
-          sum += value; squares += value * value; count += 1;
-          most = Math.max(most, value);
-        }
+    const found = Object.values(this.pictures).map((picture) => this.measure(picture));
+    const { unit } = this.options;
+    const whole = unit === "radiance" ? "W" : UNITS[unit].replace("/pixel", "");
+    const line = (name, count, key) => [name, ...found.map((one) => digits(one[key], count))];
+    this.nodes.region.replaceChildren(...tableOf(
+      `Region of ${columns} × ${rows} pixels from column ${left}, row ${top}`, this.second ? [PANELS.a, PANELS.b].slice(0, found.length) : [], [
+        line(`total [${whole}]`, 6, "total"), line("± error", 2, "error"), line(`mean [${UNITS[unit]}]`, 4, "mean"),
+        line("largest", 4, "most"), line("standard deviation", 4, "sd"), line("area [mm²]", 4, "area"), line("pixels", 7, "count"),
+      ]));
+  }
+
+  /** Total, mean and other numbers of the region of a picture, in the shown unit; the total of radiance in W. */
+  measure(picture) {
+    const [left, top, columns, rows] = this.region;
+    const { unit, wavelength } = this.options, { together } = picture;
+    let total = 0, error = 0, sum = 0, squares = 0, most = -Infinity, count = 0;
+    for (let row = top; row < Math.min(top + rows, picture.height); row++) {
+      for (let column = left; column < Math.min(left + columns, picture.width); column++) {
+        const i = row * picture.width + column;
+        const factor = picture.factor(unit, wavelength, i), whole = unit === "radiance" ? 1 : factor;
+        const value = picture.plane.power[i] * factor;
+        total += picture.plane.power[i] * whole;
+        error = together(error, picture.plane.error[i] * whole);
+        sum += value;
+        squares += value * value;
+        count += 1;
+        most = Math.max(most, value);
       }
-      const mean = sum / count, sd = Math.sqrt(Math.max(0, squares / count - mean * mean));
-      const area = picture.side ? digits(count * picture.side ** 2) : "–";
-      const name = `${columns} × ${rows} at ${left}, ${top}${this.second ? (slot === "b" ? ", second lens" : ", lens") : ""}`;
-      const cells = [name, count, digits(total, 6), digits(error, 2), digits(mean), digits(most), digits(sd), area];
-      table.append(make("tr", {}, ...cells.map((text) => make("td", { text }))));
     }
-    this.nodes.region.replaceChildren(table);
+    const mean = sum / count;
+    return { total, error, mean, most, count, sd: Math.sqrt(Math.max(0, squares / count - mean * mean)), area: picture.side ? count * picture.side ** 2 : NaN };
   }
 
   drawMarks() {
@@ -774,31 +873,62 @@ class View {
   drawProfiles() {
     const { width, height } = this.pictures.a;
     const [column, row] = this.cursor ?? [width >> 1, height >> 1];
+    const slots = ["b", "a"].filter((slot) => this.pictures[slot]?.width === width && this.pictures[slot]?.height === height);
+    const curves = slots.map((slot) => [slot, this.shownValues(slot)]);
     for (const along of ["row", "column"]) {
-      const [context, wide, tall] = sharp(this.nodes[along]);
-      const style = getComputedStyle(this.root);
-      const count = along === "row" ? width : height;
-      let [low, high] = this.scale();
-      const y = (value) => {
-        const share = this.options.log ? (value > 0 ? Math.log(value / low) / Math.log(high / low) : -1) : (value - low) / (high - low);
-        return tall - 4 - (tall - 8) * Math.max(-0.02, Math.min(1.02, share));
-      };
-      const x = (k) => ((k + 0.5) / count) * wide;
-      context.fillStyle = style.getPropertyValue("--line");
-      for (const value of ticks(low, high, this.options.log)) context.fillRect(0, y(value), wide, 0.5);
-      context.fillRect(x(along === "row" ? column : row), 0, 1, tall);
-      for (const [slot, colour] of [["b", style.getPropertyValue("--faint")], ["a", style.getPropertyValue("--accent")]]) {
-        const picture = this.pictures[slot];
-        if (!picture || picture.width !== width || picture.height !== height) continue;
-        const values = this.shownValues(slot);
-        [low, high] = this.scale(slot);
-        context.strokeStyle = colour;
-        context.lineWidth = 1.5;
-        context.beginPath();
-        for (let k = 0; k < count; k++) context.lineTo(x(k), y(values[along === "row" ? row * width + k : k * width + column]));
-        context.stroke();
+      const [at, across, count] = along === "row" ? [row, column, width] : [column, row, height];
+      const lines = curves.map(([slot, values]) =>
+        [slot, Float64Array.from({ length: count }, (_, k) => values[along === "row" ? row * width + k : k * width + column])]);
+      this.paintProfile(this.nodes[along], lines, across);
+      this.nodes[`${along}Title`].textContent = `Profile along ${along} ${at}`;
+      const [low, high] = [Math.min, Math.max].map((end) => digits(lines.at(-1)[1].reduce((most, value) => end(most, value))));
+      this.nodes[along].setAttribute("aria-label", `profile along ${along} ${at}: ${low} to ${high} ${this.unitText()}`);
+    }
+  }
+
+  /** Draw profiles, [slot, values] each, with their axes; `across`: number of the pixel under the crosshair. */
+  paintProfile(canvas, lines, across) {
+    const [context, wide, tall] = sharp(canvas);
+    const style = getComputedStyle(this.root);
+    const colour = { a: style.getPropertyValue("--accent"), b: style.getPropertyValue("--other") };
+    const faint = style.getPropertyValue("--faint"), rule = style.getPropertyValue("--line");
+    const left = 38, right = 10, top = 22, bottom = 20, count = lines[0][1].length;
+    const { log } = this.options;
+    const [low, high] = this.scale("a", false);
+    const { marks, factor } = axis(low, high, log);
+    const share = (value) => (log ? (value > 0 ? Math.log(value / low) / Math.log(high / low) : -1) : (value - low) / (high - low));
+    const y = (value) => tall - bottom - (tall - top - bottom) * Math.max(0, Math.min(1, share(value)));
+    const x = (k) => left + ((k + 0.5) / count) * (wide - left - right);
+    context.font = "11px system-ui, sans-serif";
+    context.textBaseline = "middle";
+    for (const [value, text] of marks) {
+      context.fillStyle = rule;
+      context.fillRect(left, y(value), wide - left - right, 0.5);
+      context.fillStyle = faint;
+      context.textAlign = "right";
+      context.fillText(text, left - 5, y(value), left - 6);
+    }
+    context.textAlign = "center";
+    for (const k of ticks(0, count - 1, false).filter(Number.isInteger)) context.fillText(String(k), x(k), tall - bottom / 2 + 1);
+    context.textAlign = "left";
+    context.fillText(withUnit(this.quantityText(), factor, this.unitText()), 4, top / 2);
+    context.fillStyle = MARKS.cross;
+    context.fillRect(x(across) - 0.5, top, 1, tall - top - bottom);
+    let end = wide - right;
+    for (const [slot, values] of lines) {
+      context.strokeStyle = context.fillStyle = colour[slot];
+      context.lineWidth = 1.5;
+      context.beginPath();
+      values.forEach((value, k) => context.lineTo(x(k), y(value)));
+      context.stroke();
+      context.beginPath();
+      context.arc(x(across), y(values[across]), 3, 0, 2 * Math.PI);
+      context.fill();
+      if (lines.length > 1) {
+        context.textAlign = "right";
+        context.fillText(PANELS[slot], end, top / 2);
+        end -= context.measureText(PANELS[slot]).width + 12;
       }
-      this.nodes[`${along}Title`].textContent = `Profile along ${along} ${along === "row" ? row : column}, ${digits(low)} … ${digits(high)} ${this.unitText()}`;
     }
   }
 
@@ -819,7 +949,7 @@ class View {
     context.imageSmoothingEnabled = false;
     panels.forEach((panel, k) => {
       const left = gap + k * one;
-      context.fillText(panel.caption.textContent, left, gap + 12, one - gap);
+      context.fillText(panel.caption.textContent + (this.isFine() ? "" : " (draft)"), left, gap + 12, one - gap);
       context.drawImage(panel.canvas, left, gap + line, width * times, height * times);
       context.save();
       context.translate(left + width * times + 6, gap + line);

@@ -1,0 +1,74 @@
+"""Shapes of a loaded scene that are moved in place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+Matrix = NDArray[np.float64]  # (4, 4), points to points [mm]
+VECTORS = {"vertex_positions": 1.0, "vertex_normals": 0.0}  # of a mesh; the fourth coordinate of each
+
+
+class MovedShapes:
+    """Rigid motions of the shapes of `scene` from where they were when it was loaded.
+
+    A mesh gets moved vertices, another shape a new `to_world`. `moved` is True once a shape has been moved: the scene
+    then holds what a scene loaded there would hold, but for rounding.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self.moved = False
+        self._scene = scene
+        self._at: list[Matrix] = [np.eye(4) for _ in scene.shapes()]  # motion of each shape
+        self._home: dict[str, Any] = {}  # values of parameters before the first motion
+
+    def move(self, motions: Sequence[Matrix | None]) -> bool:
+        """Give each shape, in the scene's order, its motion from where it was loaded; None for none.
+
+        False, and nothing is moved, if a shape cannot be moved in place.
+        """
+        import mitsuba as mi
+
+        shapes, wanted = self._scene.shapes(), [np.eye(4) if motion is None else motion for motion in motions]
+        if len(shapes) != len(wanted):  # groups and their instances
+            return False
+        differ = [k for k, motion in enumerate(wanted) if not np.array_equal(motion, self._at[k])]
+        if not differ:
+            return True
+        parameters = mi.traverse(self._scene)
+        names = [_places(shapes[k], parameters) for k in differ]
+        if not all(names):
+            return False
+        for k, own in zip(differ, names, strict=True):
+            for name in own:
+                self._move(parameters, name, wanted[k])
+            self._at[k] = wanted[k]
+        parameters.update()
+        self.moved = True
+        return True
+
+    def _move(self, parameters: mi.SceneParameters, name: str, motion: Matrix) -> None:
+        """Set one parameter to its first value, moved."""
+        import mitsuba as mi
+
+        kind = name.rsplit(".", 1)[-1]
+        if kind in VECTORS:
+            home = self._home.setdefault(name, np.array(parameters[name], np.float64).reshape(-1, 3))
+            moved = home @ motion[:3, :3].T + VECTORS[kind] * motion[:3, 3]
+            parameters[name] = type(parameters[name])(moved.astype(np.float32).ravel())
+        else:
+            home = self._home.setdefault(name, np.array(parameters[name].matrix, np.float64).reshape(4, 4))
+            parameters[name] = mi.Transform4f(motion @ home)
+
+
+def _places(shape: mi.Shape, parameters: mi.SceneParameters) -> list[str]:
+    """Names of the parameters that place a shape; empty if it has none of them."""
+    kinds = tuple(VECTORS) if shape.is_mesh() else ("to_world",)
+    names = [f"{shape.id()}.{kind}" for kind in kinds if f"{shape.id()}.{kind}" in parameters]
+    return [name for name in names if name.endswith("to_world") or np.size(parameters[name])]
