@@ -41,7 +41,7 @@ def matrix(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     png: Annotated[bool, typer.Option("--png", help="Also a picture of the sensitivity in the views.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print no results and no progress; warnings stay.")] = False,
 ) -> None:
     """Write the matrix from J_n on a mesh [W/mm2] to the power on the pixels of all views [W].
 
@@ -74,6 +74,9 @@ def matrix(
 
         write_sensitivity(found, picture)
         summary["picture"] = str(picture)
+    if "warnings" in found.metadata:
+        summary["warnings"] = found.metadata["warnings"]
+        typer.echo(f"fspt: {file}: {summary['warnings']}.", err=True)
     if not quiet:
         typer.echo(json.dumps(summary) if as_json else _text(summary))
 
