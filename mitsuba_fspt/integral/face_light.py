@@ -39,6 +39,7 @@ class ColumnRule:
 
     edge : error at an edge of J_n, over its step: cells M along the pupil are √(edge_factor · r^1.2/edge) for a blur
         radius r [pixels]
+    step : likewise at the sides of faces, at which J_n on faces steps
     kink : error at a face's side where J_n is continuous, over its change along the face: of columns that are
         continuous and nowhere cut off M is √(kink_factor · r/(h · kink)), with h [pixels] the height of a face's image
     edge_factor : by what middles of cells leave of a half plane averaged over pixels, the most of all directions and
@@ -61,6 +62,7 @@ class ColumnRule:
     """
 
     edge: float
+    step: float
     kink: float
     speckle: float
     edge_factor: float = 0.13
@@ -84,7 +86,8 @@ class ColumnRule:
         cells = 2 * math.ceil(3 / math.sqrt(finer))
         partial = 2 * math.ceil(6 / math.sqrt(finer))
         return cls(
-            edge=rtol,
+            edge=1.5 * rtol,
+            step=rtol,
             kink=3 * rtol,
             speckle=0.25 * rtol,
             cells=cells,
@@ -254,7 +257,7 @@ class FaceLight:
     def _nodes(self, rule: ColumnRule, sides: Array, on: str) -> Array:
         """M of nodes that each face asks for."""
         fewest = np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
-        nodes = np.sqrt(rule.edge_factor * self.blur**1.2 / rule.edge)
+        nodes = np.sqrt(rule.edge_factor * self.blur**1.2 / (rule.step if on == "face" else rule.edge))
         if on == "vertex":
             kinks = np.sqrt(rule.kink_factor * self.blur / (rule.kink * np.maximum(self.heights, 1e-3)))
             nodes = np.where(self.cut[self.corners].any(axis=1), nodes, np.minimum(nodes, kinks))
