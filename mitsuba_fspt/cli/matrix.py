@@ -76,6 +76,9 @@ def matrix(
 
         write_sensitivity(found, picture)
         summary["picture"] = str(picture)
+    if "warnings" in found.metadata:
+        summary["warnings"] = found.metadata["warnings"]
+        typer.echo(f"fspt: {file}: {summary['warnings']}.", err=True)
     print_result(_text(summary), summary, as_json=as_json, quiet=quiet)
 
 

@@ -84,7 +84,7 @@ class Rows:
         counts = [columns_on(emitter.get_shape(), kind) for emitter, kind in zip(emitters, kinds, strict=True)]
         ends = itertools.pairwise(itertools.accumulate(counts, initial=0))
         columns = {emitter.mark: slice(*pair) for emitter, pair in zip(emitters, ends, strict=True)}
-        found = sparse_rows(scene, lens, picture, kinds, quadrature, name="fspt_integral")
+        found = sparse_rows(scene, lens, lambda: picture, kinds, quadrature, name="fspt_integral")
         return cls(picture.power.shape, matrix=found, columns=columns)
 
     @classmethod

@@ -39,6 +39,7 @@ class ColumnRule:
 
     edge : error at an edge of J_n, over its step: cells M along the pupil are √(edge_factor · r^1.2/edge) for a blur
         radius r [pixels]
+    step : likewise at the sides of faces, at which J_n on faces steps
     kink : error at a face's side where J_n is continuous, over its change along the face: of columns that are
         continuous and nowhere cut off M is √(kink_factor · r/(h · kink)), with h [pixels] the height of a face's image
     edge_factor : by what middles of cells leave of a half plane averaged over pixels, the most of all directions and
@@ -48,7 +49,10 @@ class ColumnRule:
     partial : least M where a face turns away from part of the pupil, or a second border cuts the pupil
     mixed : least M where one surface may hide another
     cells : M where the cells are laid; their étendue is constant in each
-    point : largest piece [pixels] that may be taken as a point then; it misplaces light by its square
+    point : largest piece [pixels] that may be taken as a point then
+    speckle : error where J_n varies at random from face to face, over its standard deviation, and pieces are points:
+        for pieces of s pixels speckle_factor · s³/r^1.5, root mean square over the pixels
+    speckle_factor : the most of random J_n on equilateral triangles, r = 0.1 … 3, s = 0.05 … 0.4
     piece : largest piece over the distance in focus, over which étendue and exit law are linear but for some of its
         square
     perspective : J_n that perspective, corrected on average, misplaces within a piece, over its change along the face:
@@ -58,9 +62,12 @@ class ColumnRule:
     """
 
     edge: float
+    step: float
     kink: float
+    speckle: float
     edge_factor: float = 0.13
     kink_factor: float = 0.13
+    speckle_factor: float = 0.04
     fewest: int = 4
     most: int = 64
     partial: int = 12
@@ -75,13 +82,14 @@ class ColumnRule:
     @classmethod
     def of(cls, rtol: float) -> ColumnRule:
         """The rule for a tolerance relative to the brightest pixel: columns are right to some ten times that."""
-        edge = 1.5 * rtol
         finer = math.sqrt(min(rtol / 1e-3, 1))
         cells = 2 * math.ceil(3 / math.sqrt(finer))
         partial = 2 * math.ceil(6 / math.sqrt(finer))
         return cls(
-            edge,
-            2 * edge,
+            edge=1.5 * rtol,
+            step=rtol,
+            kink=3 * rtol,
+            speckle=0.25 * rtol,
             cells=cells,
             partial=partial,
             mixed=2 * math.ceil(8 / math.sqrt(finer)),
@@ -229,9 +237,11 @@ class FaceLight:
         pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant / (8 * rule.perspective)), sides))
         pieces = np.maximum(np.ceil(pieces), 1)
         cells = np.where(self.partial, rule.partial, rule.cells)
+        largest = np.minimum(rule.point, np.cbrt(rule.speckle / rule.speckle_factor) * np.sqrt(self.blur))
+        smaller = np.maximum(np.ceil(sides / np.maximum(largest, 1 / LONGEST)), pieces)
         by_nodes = (nodes * pieces) ** 2 * (1 + sides / pieces)
-        by_cells = (cells * pieces) ** 2 * (1 + 2 * self.blur / cells)
-        points = (sides <= rule.point * pieces) & (by_cells < by_nodes)
+        by_cells = (cells * smaller) ** 2 * (1 + 2 * self.blur / cells)
+        points = by_cells < by_nodes
         nodes = np.minimum(nodes, rule.most)
         if on == "face":
             of_columns = np.where(points, cells, nodes)[:, None]
@@ -240,13 +250,14 @@ class FaceLight:
             points = ~self._most(~points & self.bright)[self.corners]
             of_columns = np.where(points, self._most(cells)[self.corners], self._most(nodes)[self.corners])
         of_columns = np.maximum(of_columns, 2).astype(np.int64)
+        pieces = np.where(points.any(axis=1), smaller, pieces)
         pieces = np.minimum(pieces.astype(np.int64), math.isqrt(BATCH) // of_columns.max(axis=1))
         return Plan(of_columns, pieces, points)
 
     def _nodes(self, rule: ColumnRule, sides: Array, on: str) -> Array:
         """M of nodes that each face asks for."""
         fewest = np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
-        nodes = np.sqrt(rule.edge_factor * self.blur**1.2 / rule.edge)
+        nodes = np.sqrt(rule.edge_factor * self.blur**1.2 / (rule.step if on == "face" else rule.edge))
         if on == "vertex":
             kinks = np.sqrt(rule.kink_factor * self.blur / (rule.kink * np.maximum(self.heights, 1e-3)))
             nodes = np.where(self.cut[self.corners].any(axis=1), nodes, np.minimum(nodes, kinks))

@@ -24,6 +24,7 @@ from ..jit.batches import BATCH
 from ..jit.mesh_buffers import triangles
 from ..runtime.errors import TransportError, named
 from ..runtime.memory import available_memory
+from .column_canvas import Windows
 from .column_form import MOST_CHANGE, Columns, column_windows, columns_of
 from .face_light import ColumnRule, FaceLight
 from .occlusion import hides_nothing
@@ -42,6 +43,7 @@ FEWEST_HITS = 64  # of them, on a column whose entry they determine better than 
 TURNS = 6  # in which rows and columns are scaled to their sums
 LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
 ENTRY = 36  # bytes of an entry while columns become rows
+PIXEL = 120  # bytes of a row: the picture of J_n = 1, sums of the row and factors on it, in double precision
 WORK = 3 << 29  # bytes beside the entries
 SOME = 1 << 22  # entries in double precision at a time
 LINES = 1 << 20  # of sight at a time
@@ -83,7 +85,7 @@ def columns_on(mesh: mi.Shape, on: str) -> int:
 def sparse_rows(
     scene: mi.Scene,
     lens: mi.Sensor,
-    picture: Solution,
+    picture: Callable[[], Solution],
     on: Sequence[str],
     quadrature: Quadrature,
     progress: Progress | None = None,
@@ -94,7 +96,7 @@ def sparse_rows(
 
     Parameters
     ----------
-    picture : of J_n = 1, by `quadrature`
+    picture : computes that of J_n = 1, by `quadrature`; called once the memory is known to suffice
     on : of each emitter, 'vertex' or 'face'
     progress : called with the share done
     most_bytes : that may be allocated; None for what the system says
@@ -106,13 +108,17 @@ def sparse_rows(
     """
     specular = Specular.of(scene, lens, quadrature)
     if specular:
-        entries = _by_lines(scene, lens, picture, on, quadrature.rtol, specular)
+        solution = picture()
+        entries = _by_lines(scene, lens, solution, on, quadrature.rtol, specular)
         sums = np.full(entries.count, np.nan)
     else:
         with named(name):
-            entries, sums = _by_faces(scene, lens, picture, on, quadrature.rtol, progress, most_bytes)
-    least = quadrature.least_error * float(picture.power.max(initial=0.0))
-    return _balanced(entries, sums, picture, np.maximum(picture.error, least), lens.etendue)
+            laid = _laid_out(scene, lens, on, most_bytes)
+        solution = picture()
+        with named(name):
+            entries, sums = _by_faces(scene, lens, solution, laid, on, quadrature.rtol, progress)
+    least = quadrature.least_error * float(solution.power.max(initial=0.0))
+    return _balanced(entries, sums, solution, np.maximum(solution.error, least), lens.etendue)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,38 +197,50 @@ class _Entries:
         return _Entries(self.count, starts, *arrays)
 
 
+def _laid_out(
+    scene: mi.Scene, lens: mi.Sensor, on: Sequence[str], most_bytes: int | None
+) -> list[tuple[FaceLight, Windows]]:
+    """Faces of each mesh with the windows of its columns; TransportError where the memory does not hold the entries."""
+    alone, shape = hides_nothing(scene), _shape(lens)
+    offset = (int(lens.film().crop_offset()[0]), int(lens.film().crop_offset()[1]))
+    laid = []
+    for emitter, kind in zip(scene.emitters(), on, strict=True):
+        faces = FaceLight.seen(emitter, lens, offset, shape)
+        faces = faces if alone else faces.behind(scene, lens)
+        laid.append((faces, column_windows(faces, columns_on(emitter.get_shape(), kind), kind, shape)))
+    _require_memory(sum(windows.pixels for _, windows in laid), math.prod(shape), most_bytes)
+    return laid
+
+
+def _shape(lens: mi.Sensor) -> tuple[int, int]:
+    """Height and width of the crop window [pixels]."""
+    width, height = lens.film().crop_size()
+    return int(height), int(width)
+
+
 def _by_faces(
     scene: mi.Scene,
     lens: mi.Sensor,
     picture: Solution,
+    laid: list[tuple[FaceLight, Windows]],
     on: Sequence[str],
     rtol: float,
     progress: Progress | None,
-    most_bytes: int | None,
 ) -> tuple[_Entries, Array]:
     """Entries from the faces of the meshes and, on rough pixels, from lines of sight; sums of the columns."""
-    emitters, alone = scene.emitters(), hides_nothing(scene)
-    film = lens.film()
-    shape = (int(film.crop_size()[1]), int(film.crop_size()[0]))
-    offset = (int(film.crop_offset()[0]), int(film.crop_offset()[1]))
-    laid = []
-    for emitter, kind in zip(emitters, on, strict=True):
-        faces = FaceLight.seen(emitter, lens, offset, shape)
-        faces = faces if alone else faces.behind(scene, lens)
-        laid.append((faces, column_windows(faces, columns_on(emitter.get_shape(), kind), kind, shape)))
-    _require_memory(sum(windows.pixels for _, windows in laid), most_bytes)
     columns = []
     for number, ((faces, windows), kind) in enumerate(zip(laid, on, strict=True)):
         report = None
         if progress:
 
-            def report(share: float, first: float = number / len(emitters)) -> None:
-                progress(first + share / len(emitters))
+            def report(share: float, first: float = number / len(on)) -> None:
+                progress(first + share / len(on))
 
         columns.append(columns_of(scene, lens, faces, windows, kind, ColumnRule.of(rtol), report))
     exact = np.concatenate([part.exact for part in columns])
-    entries = _Entries.of(columns, math.prod(shape))
-    del columns, laid
+    entries = _Entries.of(columns, math.prod(_shape(lens)))
+    del columns
+    laid.clear()  # the work that follows needs the memory
     rough, cut, outside = _rough(scene, lens, entries, picture, rtol)
     sums = np.where(exact, entries.column_sums(), np.nan)
     if outside.any() or cut.any():
@@ -327,9 +345,9 @@ def _rows(
     )
 
 
-def _require_memory(entries: int, most_bytes: int | None) -> None:
-    """Raise TransportError where the entries of one view, at the most so many, do not fit into memory."""
-    needed = entries * ENTRY + WORK
+def _require_memory(entries: int, pixels: int, most_bytes: int | None) -> None:
+    """Raise TransportError where one view, with at the most so many entries, does not fit into memory."""
+    needed = entries * ENTRY + pixels * PIXEL + WORK
     free = available_memory() if most_bytes is None else most_bytes
     if free is not None and needed > free:
         raise TransportError(

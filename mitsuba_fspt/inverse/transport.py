@@ -86,13 +86,16 @@ def transport(
     ----------
     scene : name of a scene file, text or dictionary of a scene, or a loaded scene; its own J_n has no effect
     on : 'vertex', J_n linear on every face, or 'face'
-    rtol : error of T @ J on every pixel, relative to the brightest pixel, for J_n as smooth as the mesh can show; a
-        single column is right to some ten times that, relative to its own brightest entry
+    rtol : error of T @ J on every pixel, relative to the brightest pixel; a single column is right to some ten times
+        that, relative to its own brightest entry
     sensor : number of the sensor, or several, one view each
     file : npz file to which the views are written one at a time; a second call goes on where the first was interrupted
     scheduler : address of a dask.distributed scheduler or 'local', as in `sweep`; the scene must be a file
     progress : called with what is being done and the share done; without it a notebook shows a bar
     parameters : values for `<default>` parameters of the scene; lists are multiplied out, the last one fastest
+
+    As Eq. 9 does, T leaves out the light that surfaces scatter on to the lens; `render` tells its share.
+    The metadata say in `warnings` on how many pixels `rtol` was not reached, if on any; `error` has by how much.
 
     Raises
     ------
@@ -277,15 +280,17 @@ def _joined(
     if partial is not None:
         partial.views = len(tasks)
         blocks = partial
-    sensitivity = np.zeros(ends[-1])
+    sensitivity, rtol, unreached, largest = np.zeros(ends[-1]), tasks[0].rtol, 0, 0.0
     for block in blocks:
         sensitivity += np.bincount(block.columns, block.values.astype(np.float64), minlength=ends[-1])
+        off = block.relative_row_error
+        unreached, largest = unreached + int(np.count_nonzero(off > rtol * (1 + rtol))), max(largest, float(off.max()))
     areas = np.concatenate([part.areas for part in parts])
     meta = {
         "format": FORMAT,
         "scene": _name_of(tasks[0].scene),
         "on": tasks[0].on,
-        "rtol": tasks[0].rtol,
+        "rtol": rtol,
         "image_shape": [len(tasks), *height_width],
         "columns": ends[-1],
         "views": [task.values for task in tasks],
@@ -297,6 +302,10 @@ def _joined(
         "versions": {name: version(name) for name in ("mitsuba-fspt", "mitsuba", "drjit", "numpy")},
         "fingerprints": [task.fingerprint for task in tasks],
     }
+    if unreached:
+        meta["warnings"] = (
+            f"rtol {rtol:g} not reached on {unreached} pixels (largest error {largest:.1e} of the peak for J = 1)"
+        )
     if partial is None:
         return TransportMatrix(blocks, meta, areas, sensitivity)
     partial.finish(meta, areas, sensitivity)

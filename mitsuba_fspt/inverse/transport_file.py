@@ -70,8 +70,12 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """Context manager that yields the arrays of an npz file by name, and closes it, damaged or not."""
-    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-        yield file
+    with path.open("rb") as raw:
+        if not zipfile.is_zipfile(raw):  # of which NumPy says that it may be unsafe to load
+            raise zipfile.BadZipFile("no zip archive")
+        raw.seek(0)
+        with np.load(raw, allow_pickle=False) as file:
+            yield file
 
 
 def _damaged(path: Path, cause: Exception) -> TransportError:

@@ -72,6 +72,14 @@ class Block:
         return np.maximum(SAFETY * self._spread(np.abs(changed)) + self.row_error * mean, least).reshape(self.shape)
 
     @property
+    def relative_row_error(self) -> Array:
+        """`row_error` over the largest sum of a row, (h · w); 0 where nothing is seen."""
+        counts = np.diff(self.starts)
+        sums = np.zeros(len(counts))
+        sums[counts > 0] = np.add.reduceat(self.values, self.starts[:-1][counts > 0], dtype=np.float64)
+        return self.row_error / sums.max() if sums.any() else sums
+
+    @property
     def least_error(self) -> float:
         """Smallest error that is stated, over the brightest pixel: the rounding of float32."""
         return 2e-7
@@ -160,6 +168,7 @@ def block_of(
     """
     import drjit as dr
 
+    from ..integral.scene_checks import check_rounding
     from ..integral.sparse_rows import sparse_rows
     from ..jit.recording import recording
     from ..rendering.render import integrator_of
@@ -170,9 +179,18 @@ def block_of(
             stack.enter_context(emitter.shining(1.0))
         with named("fspt_integral"):
             quadrature = Quadrature(rtol=rtol)
-        picture = integrator_of(scene, "integral").solve(scene, lens, quadrature)
+        integrator = integrator_of(scene, "integral")
+        check_rounding(lens)
         with recording(), dr.suspend_grad():
-            rows = sparse_rows(scene, lens, picture, [on] * len(emitters), quadrature, progress, most_bytes)
+            rows = sparse_rows(
+                scene,
+                lens,
+                lambda: integrator.solve(scene, lens, quadrature),
+                [on] * len(emitters),
+                quadrature,
+                progress,
+                most_bytes,
+            )
     return Block(**{field.name: getattr(rows, field.name) for field in fields(rows)})
 
 

@@ -168,6 +168,30 @@ def test_faces_of_many_pixels_far_out_of_focus(tmp_path, on):
     assert (off <= matrix.error(exitance)[0] + image.error).mean() > 0.99
 
 
+@pytest.mark.parametrize("on", ["vertex", "face"])
+def test_noise_on_faces_smaller_than_a_pixel(tmp_path, on):
+    """J_n of one value in five, 0 else, on faces of a third of a pixel, blurred by a quarter of one.
+
+    Expected: rtol of the brightest pixel beside the error of a render. Seen to fail with faces up to half a pixel taken
+    as points, whatever the blur.
+    """
+    import mitsuba as mi
+
+    ball = trimesh.creation.icosphere(4, radius=8.0)
+    mesh = ball.vertices @ TURN.T, ball.faces
+    scene = body_scene(tmp_path, on, FOCUS + 12.0, mesh=mesh)
+    film = mi.traverse(scene.sensors()[0].film())
+    film["crop_offset"], film["crop_size"] = [7, 7], [5, 2]
+    film.update()
+    matrix = fspt.transport(scene, on=on, rtol=RTOL)
+    exitance = 1.0 * (np.random.default_rng(4).random(matrix.shape[1]) < 0.2)
+    shine(scene, on, exitance)
+    image = fspt.render(scene, method="integral", rtol=RTOL / 4)
+    off = np.abs(matrix.forward(exitance)[0] - image.power)
+    assert image.error.max() <= RTOL / 2 * image.power.max()
+    assert (off - image.error).max() <= RTOL * image.power.max()
+
+
 @pytest.mark.parametrize("distance", [8.5, 40.0])
 def test_an_occluder_hides_what_it_hides_in_a_render(tmp_path, distance):
     """A dark wall before half the body, in focus and not. Expected: as without it, on smooth J_n.

@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -311,8 +312,33 @@ def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
     from mitsuba_fspt.integral import sparse_rows
 
     monkeypatch.setattr(sparse_rows, "available_memory", lambda: 1 << 20)
+    scene = load_scene("nylon_cylinder")
+    solved = []
+    monkeypatch.setattr(type(scene.integrator()), "solve", lambda *given: solved.append(given))
     with pytest.raises(TransportError, match=r"needs \d+ bytes .* 1048576 are free"):
-        fspt.transport(load_scene("nylon_cylinder"))
+        fspt.transport(scene)
+    assert not solved
+
+
+def test_an_rtol_that_is_not_reached_is_told(matrix, scene_file, tmp_path, run, monkeypatch):
+    """In the metadata, and as one line of the verb. Here an integral that states a hundredth of the brightest pixel."""
+    from mitsuba_fspt.plugins.integral import FsptIntegral
+
+    assert "warnings" not in matrix.metadata
+    plain = FsptIntegral.solve
+
+    def unsure(*given, **named):
+        found = plain(*given, **named)
+        return replace(found, error=0.01 * found.power.max() * (found.power > 0))
+
+    monkeypatch.setattr(FsptIntegral, "solve", unsure)
+    monkeypatch.chdir(tmp_path)
+    code, _, err = run("matrix", scene_file, "-o", "T.npz", "--quiet")
+    assert code == 0
+    assert err.startswith("fspt: T.npz: rtol 0.001 not reached on ")
+    assert "largest error 1.0e-02 of the peak" in err
+    assert err.count("\n") == 1
+    assert fspt.read_transport("T.npz").metadata["warnings"] in err
 
 
 def test_files_that_are_none_are_refused(matrix, tmp_path):
@@ -327,6 +353,9 @@ def test_files_that_are_none_are_refused(matrix, tmp_path):
     np.savez(tmp_path / "other.npz", meta=np.array(json.dumps({"format": "something"})))
     with pytest.raises(TransportError, match="has the format 'something'"):
         fspt.read_transport(tmp_path / "other.npz")
+    (tmp_path / "text.npz").write_text("no archive")
+    with pytest.raises(TransportError, match=r"\(no zip archive\)"):
+        fspt.read_transport(tmp_path / "text.npz")
 
 
 def test_the_verb(scene_file, tmp_path, run, monkeypatch):
