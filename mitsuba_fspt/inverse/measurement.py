@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..images.detector import Exposure
 from ..images.image import Image
-from ..images.reduction import reduced
+from ..images.reduction import reduced, responses
 from ..runtime.errors import InversionError
 from ..runtime.numbers import number
 from .transport_matrix import TransportMatrix
@@ -157,7 +157,8 @@ def variances(
                     f"{verb}: image {k} has {per_watt:g} electrons a watt and {read:g} electrons of read noise. Reduce "
                     "it again from its counts."
                 )
-            shot[k], other[k] = 1 / per_watt, (read**2 + dark) / per_watt**2
+            each = per_watt * responses(image)
+            shot[k], other[k] = 1 / each, (read**2 + dark) / each**2
         elif image.error is not None:
             other[k] = image.error.astype(np.float64) ** 2
         else:

@@ -70,6 +70,8 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """Context manager that yields the arrays of an npz file by name, and closes it, damaged or not."""
+    if not zipfile.is_zipfile(path):  # NumPy takes any other file for a pickle or a single array
+        raise zipfile.BadZipFile("it is no npz archive")
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         yield file
 

@@ -135,20 +135,21 @@ def test_units_of_power_do_not_matter(case):
 
 
 def test_faint_light_keeps_its_total(case):
-    """20 electrons on the brightest pixel, 60 seeds: the mean total is right to four standard errors.
+    """20 electrons on the brightest pixel, 60 seeds: the mean total is right to four standard errors, 0.36 %.
 
-    Seen to fail with variances of the measured counts in place of the fitted signal.
+    Less the relative excess of the light itself, which has the mean 0 and most of the scatter. Seen to fail with
+    variances of the measured counts (-4 %), and without the correction of M.29 (-0.5 %).
     """
     matrix, exitance = case
-    surface, true = Surface.of(matrix), matrix.areas @ exitance
+    surface, true, light = Surface.of(matrix), matrix.areas @ exitance, matrix.forward(exitance).sum()
     ratios = []
     for seed in range(60):
         images = noisy(matrix, exitance, 20, seed, read_noise=1.0)
-        found = fspt.invert(matrix, images, weight=10.0, prior=Prior(reference=1e-3), scene=surface)
-        ratios.append(found.total / true)
+        found = fspt.invert(matrix, images, weight=1.0, prior=Prior(reference=1e-3), scene=surface)
+        ratios.append(found.total / true - sum(image.power.sum() for image in images) / light)
     error = np.std(ratios, ddof=1) / np.sqrt(len(ratios))
-    assert error < 0.01
-    assert np.mean(ratios) == pytest.approx(1, abs=4 * error)
+    assert error < 1e-3
+    assert np.mean(ratios) == pytest.approx(0, abs=4 * error)
 
 
 def test_masked_pixels_do_not_count(case):
@@ -263,8 +264,18 @@ def test_draws_repeat_with_their_seed(case):
     one, other, third = (fspt.invert(matrix, images, samples=30, seed=seed, weight=10.0) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.draws, other.draws)
     assert not np.allclose(one.draws, third.draws)
-    part = matrix.areas * (one.surface.vertices[:, 0] > 0)
-    assert one.interval(part) == pytest.approx(tuple(np.quantile(part @ one.draws, [0.05, 0.95])))
+
+
+def test_ends_of_intervals_are_ranks_of_draws(case):
+    """The next of 20 draws lies between the first and the last of 19 in 18 of 20 cases: these are the ends for 90 %.
+
+    Seen to fail with quantiles at (k − 1)/(samples − 1), which hold 81 % then.
+    """
+    matrix, exitance = case
+    found = fspt.invert(matrix, noisy(matrix, exitance, 300, 3), samples=19, weight=10.0)
+    part = matrix.areas * (found.surface.vertices[:, 0] > 0)
+    assert found.interval(part) == pytest.approx(((part @ found.draws).min(), (part @ found.draws).max()))
+    np.testing.assert_allclose(found.upper, found.draws.max(axis=1))
 
 
 # --- what it takes and writes ---
