@@ -60,12 +60,7 @@ def reduce(
     from ..images.reduction import reduce_counts
 
     camera = Detector.from_toml(detector)
-    given = {
-        "exposure_time": exposure_time,
-        "wavelength_nm": wavelength_nm,
-        "binning": binning,
-        "pixel_pitch": pixel_pitch,
-    }
+    given = dict(exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, pixel_pitch=pixel_pitch)
     frames = {"bias": bias, "dark": dark, "flat": flat, "cosmic_rays": cosmic_rays}
     if calibrate:
         require_writable(output, ".toml", DetectorError)
@@ -81,11 +76,7 @@ def reduce(
             images.append(reduce_counts(camera, found, exposed, **frames))  # type: ignore[arg-type]
     if calibrate:
         record = _calibrated(camera, images, detector, output, radiance, radiance_error)
-        text = (
-            f"{output}: quantum efficiency {record['quantum_efficiency']:.5g}, gain error {record['gain_error']:.3g}, "
-            f"{record['watts_per_dn']:.5g} W per DN at this exposure time"
-        )
-        print_result(text, record, as_json=as_json, quiet=quiet)
+        print_result(_calibrated_text(record), record, as_json=as_json, quiet=quiet)
         return
     names = [output] if len(images) == 1 else [output.with_stem(f"{output.stem}_{k}") for k in range(len(images))]
     for image, name in zip(images, names, strict=True):
@@ -144,6 +135,13 @@ def _calibrated(
         "watts_per_dn": found.gain / frame.per_watt(found.quantum_efficiency),
         "masked_pixels": image.metadata["masked_pixels"],
     }
+
+
+def _calibrated_text(record: dict[str, Any]) -> str:
+    return (
+        f"{record['output']}: quantum efficiency {record['quantum_efficiency']:.5g}, gain error "
+        f"{record['gain_error']:.3g}, {record['watts_per_dn']:.5g} W per DN at this exposure time"
+    )
 
 
 def _lens(toml: Path, wavelength_nm: float) -> tuple[Lens, float]:

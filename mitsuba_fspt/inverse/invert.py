@@ -22,7 +22,7 @@ from ..runtime.errors import InversionError
 from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
 from .inversion import Inversion
-from .measurement import Measurement
+from .measurement import Measurement, tell_misfit
 from .mlem import MlemAccuracy, mlem
 from .multipliers import Multipliers
 from .nonnegative import Accuracy, Solve, factor, minimise
@@ -121,7 +121,9 @@ def invert(
     measurement = Measurement.of(matrix, images, error, mask, gain_error)
     problem = Problem.of(matrix, measurement, Surface.of(matrix, scene), prior or Prior(), settings or Settings())
     with reported(progress) as report:
-        return problem.solved(options, report)
+        found = problem.solved(options, report)
+    tell_misfit("invert", found.chi2_sum, found.pixels - found.determined)
+    return found
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,8 @@ from ..runtime.numbers import number
 from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
+LOG = logging.getLogger("mitsuba_fspt")
+MISFIT = 4.0  # standard deviations of Σ (residual/σ)² by chance: more happens in one fit of 30,000
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,3 +170,15 @@ def variances(
                 f"{', or give error= [W]' if verb == 'invert' else ''}."
             )
     return shot, other
+
+
+def tell_misfit(verb: str, chi2_sum: float, free: float) -> None:
+    """Say in one line on stderr that Σ (residual/σ)² over `free` pixels is larger than noise makes it."""
+    free = max(free, 1.0)
+    if chi2_sum > free + MISFIT * (2 * free) ** 0.5:
+        LOG.warning(
+            "fspt: %s: chi2 is %.3g, the images differ from the fit by more than their noise, which the stated errors "
+            "do not contain. Check pose, mesh, exit law, background and the detector's numbers.",
+            verb,
+            chi2_sum / free,
+        )

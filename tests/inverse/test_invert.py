@@ -296,6 +296,36 @@ def test_exposures_and_images_in_watts_agree(case):
     assert r.total == pytest.approx(matrix.areas @ exitance * scale, rel=0.05, abs=0)
 
 
+def test_a_flat_field_counts(case):
+    """Pixels that collect a third of the electrons get three times the variance; scaled images keep their electrons."""
+    matrix, exitance = case
+    images = noisy(matrix, exitance, 1000, 3)
+    k, read = (images[0].metadata[name] for name in ("electrons_per_watt", "read_noise"))
+    flat = np.where(np.arange(16)[None, :] < 8, 1.0, 1 / 3) * np.ones((16, 1))
+    stated = [
+        fspt.Image(i.power, np.sqrt(np.maximum(i.power * k * flat, 0) + read**2) / (k * flat), metadata=i.metadata)
+        for i in images
+    ]
+    found = fspt.invert(matrix, stated, weight=10.0)
+    light = found.fitted > 0
+    variance = (found.fitted * k * flat + read**2) / (k * flat) ** 2
+    np.testing.assert_allclose(found.sigma[light] ** 2, variance[light], rtol=0.03)
+    twice = fspt.invert(matrix, [image.scaled(2.0) for image in stated], weight=10.0)
+    assert twice.total == pytest.approx(2 * found.total, rel=1e-6)
+    assert twice.chi2 == pytest.approx(found.chi2, rel=1e-4)
+
+
+def test_a_misfit_is_told(case, caplog):
+    """Images 30 % of whose light moved by a pixel: χ² says so in one line; right ones say nothing."""
+    matrix, exitance = case
+    images = noisy(matrix, exitance, 1000, 3)
+    fspt.invert(matrix, images, weight=10.0)
+    assert not caplog.records
+    moved = [fspt.Image(0.7 * i.power + 0.3 * np.roll(i.power, 1, 1), metadata=i.metadata) for i in images]
+    fspt.invert(matrix, moved, weight=10.0)
+    assert "differ from the fit by more than their noise" in caplog.text
+
+
 def test_files(case, tmp_path):
     """The PLY is a phantom that scenes and `Phantom.read` take; the VTU holds the same numbers."""
     meshio = pytest.importorskip("meshio")
