@@ -10,11 +10,11 @@ seen, its J_n with the fine one at the nearest vertices.
 
 Columns: electrons on the brightest pixel, bias of the seen total [%], half of its 90 % interval [%], share of the
 intervals that hold the total, relative L2 error of J_n [%], chi2; of *light* processor time without and with samples
-[s], which other programs on the machine hardly change; means over the seeds of the counts. *light*: 100, 1e3, 1e4 electrons at
-f/2.8. *stop*: f/1.4 … f/16 at the exposure time of 1e3 electrons at f/2.8. *views*: 1, 2, 4, 8 of them. *gain*: counts
-that are too high by 1 and 3 %, without and with that as `gain_error`. *pose*: a matrix of views turned by 0.1, 0.3 and
-1 degrees from the true ones. *law*: pictures by Fresnel's exit law, a matrix by Lambert's. The last four at 1e3
-electrons and f/2.8.
+[s], which other programs on the machine hardly change; means over the seeds of the counts. *light*: 100, 1e3, 1e4
+electrons at f/2.8. *stop*: f/1.4 … f/16 at the exposure time of 1e3 electrons at f/2.8. *views*: 1, 2, 4, 8 of them.
+*gain*: counts that are too high by 1 and 3 %, without and with that as `gain_error`. *pose*: a matrix of views turned
+by 0.1, 0.3 and 1 degrees from the true ones. *law*: pictures by Fresnel's exit law, a matrix by Lambert's. The last
+four at 1e3 electrons and f/2.8.
 """
 
 from __future__ import annotations
