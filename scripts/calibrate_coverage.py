@@ -1,6 +1,6 @@
 """Coverage of the intervals of `calibrate`: how often value ± 1.645 sd holds the true value.
 
-    python scripts/calibrate_coverage.py [--seeds 120] [--direct 6] [-o docs/calibrate_coverage.csv]
+    python scripts/calibrate_coverage.py [--seeds 120] [--direct 49] [-o docs/calibrate_coverage.csv]
 
 scenes/nylon_cylinder.xml at f/2.8 on 32 x 32 pixels. View, distance and magnification are free, and start 0.7 degrees,
 0.3 mm and 5e-4 from the true ones. The images are counts of 300 and 3000 electrons on the brightest pixel, exposed and
@@ -127,7 +127,7 @@ def table(seeds: int, direct: int) -> list[Row]:
     rows = []
     ways: list[tuple[str, Callable[[str, int], Result], Iterable[int]]] = [
         ("expansion", by_expansion, range(seeds)),
-        ("direct", directly, range(5000, 5000 + direct)),
+        ("direct", directly, range(6000, 6000 + direct)),
     ]
     for way, find, numbers in ways:
         every = []
@@ -145,7 +145,7 @@ def main() -> None:
     """Write the table as CSV and print it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=120)
-    parser.add_argument("--direct", type=int, default=6)
+    parser.add_argument("--direct", type=int, default=49)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "calibrate_coverage.csv")
     arguments = parser.parse_args()
     rows = table(arguments.seeds, arguments.direct)

@@ -15,8 +15,11 @@ from .options import AsJson, Quiet, require_image, require_writable
 from .terminal import print_result
 
 if TYPE_CHECKING:
+    from ..images.counts import Counts
     from ..images.detector import Detector
     from ..images.image import Image
+    from ..images.reduction import Exposed
+    from ..optics.thin_lens import Lens
 
 Frame = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame or stack [DN]: .tif, .fits, .npy.")]
 
@@ -27,7 +30,9 @@ def reduce(
     output: Annotated[Path, typer.Option("-o", "--output", help="Image to write, .exr; of several OUT_0.exr, …")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
     exposure_time: Annotated[float | None, typer.Option(help="[s] of a frame; that of the file if left out.")] = None,
-    binning: Annotated[int, typer.Option(help="Side of the square of pixels read out as one.")] = 1,
+    binning: Annotated[
+        int | None, typer.Option(help="Side of the square of pixels read out as one; that of the file, else 1.")
+    ] = None,
     pixel_pitch: Annotated[
         float | None, typer.Option(help="Of the pixels read out [mm]; detector's x binning.")
     ] = None,
@@ -47,31 +52,31 @@ def reduce(
 
     With --calibrate and --radiance the counts show a uniform source, such as an
     integrating sphere, through the lens of the table [lens]: the output is the
-    camera's TOML with the quantum efficiency, lens included, that it shows.
+    camera's TOML with the quantum efficiency that it shows. The transmittance of
+    [lens] is not part of it; without one there, that of the lens is.
     """
+    from ..images.counts import read_counts
     from ..images.detector import Detector
+    from ..images.reduction import reduce_counts
 
     camera = Detector.from_toml(detector)
-    numbers = {"wavelength_nm": wavelength_nm, "binning": binning}
+    given = dict(exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, pixel_pitch=pixel_pitch)
     frames = {"bias": bias, "dark": dark, "flat": flat, "cosmic_rays": cosmic_rays}
     if calibrate:
         require_writable(output, ".toml", DetectorError)
     else:
         require_image(output)
     require_apart(output, [*counts, detector, *(p for p in (bias, dark, flat) if p)], error=ImageError)
-    if pixel_pitch is None and camera.pixel_pitch is not None:
-        pixel_pitch = camera.pixel_pitch * binning
     images: list[Image] = []
     with progress_bar(quiet) as report:
         for number, path in enumerate(counts):
             report(f"reducing {path.name}", number / len(counts))
-            time = _exposure_time(path, exposure_time)
-            image = camera.reduce(path, exposure_time=time, pixel_pitch=pixel_pitch, **numbers, **frames)  # type: ignore[arg-type]
-            images.append(image)
+            found = read_counts(path)
+            exposed = _exposed(path, found, camera, given)
+            images.append(reduce_counts(camera, found, exposed, **frames))  # type: ignore[arg-type]
     if calibrate:
         record = _calibrated(camera, images, detector, output, radiance, radiance_error)
-        text = f"{output}: quantum efficiency {record['quantum_efficiency']:.5g}, gain error {record['gain_error']:.3g}"
-        print_result(text, record, as_json=as_json, quiet=quiet)
+        print_result(_calibrated_text(record), record, as_json=as_json, quiet=quiet)
         return
     names = [output] if len(images) == 1 else [output.with_stem(f"{output.stem}_{k}") for k in range(len(images))]
     for image, name in zip(images, names, strict=True):
@@ -81,16 +86,16 @@ def reduce(
     print_result("\n".join(lines), {"images": records}, as_json=as_json, quiet=quiet)
 
 
-def _exposure_time(path: Path, given: float | None) -> float:
-    """The given time [s], or that of the file; DetectorError where neither is known."""
-    from ..images.counts import read_counts
+def _exposed(path: Path, counts: Counts, camera: Detector, given: dict[str, Any]) -> Exposed:
+    """Circumstances of an exposure: the `given` ones, else those of the file; DetectorError without its time."""
+    from ..images.reduction import Exposed
 
-    if given is not None:
-        return given
-    found = read_counts(path).exposure_time
-    if found is None:
+    if given["exposure_time"] is None and counts.exposure_time is None:
         raise DetectorError(f"'{path}' does not say its exposure time. Give --exposure-time, in s.")
-    return found
+    found = given | {n: getattr(counts, n) for n in ("exposure_time", "binning") if given[n] is None}
+    if found["pixel_pitch"] is None and camera.pixel_pitch is not None:
+        found["pixel_pitch"] = camera.pixel_pitch * (found["binning"] or 1)
+    return Exposed(**found)
 
 
 def _record(image: Image, name: Path) -> dict[str, Any]:
@@ -106,10 +111,8 @@ def _calibrated(
     camera: Detector, images: list[Image], toml: Path, output: Path, radiance: float | None, error: float
 ) -> dict[str, Any]:
     """Write the calibrated camera, and say what changed."""
-    from ..images.reduction import calibrated
-    from ..optics.thin_lens import Lens
+    from ..images.reduction import Exposed, calibrated
     from ..optics.uniform_source import uniform_power
-    from ..phantom.framed_scene import camera_lens
 
     if radiance is None or not 0 < radiance < np.inf:
         raise DetectorError(f"--calibrate needs --radiance > 0 [W/mm2/sr] of the uniform source, got {radiance}.")
@@ -119,16 +122,39 @@ def _calibrated(
         raise DetectorError(
             f"--calibrate takes one file of counts and needs 'pixel_pitch', got {len(images)}. Give a stack of frames."
         )
-    numbers = {k: v for k, v in camera_lens(toml).items() if k in ("focal_length", "f_number", "magnification",
-               "focus_distance", "image_distance")}  # fmt: skip
-    lens = Lens.focused(**numbers)  # type: ignore[arg-type]
     image = images[0]
-    power = uniform_power(lens, radiance, float(image.metadata["pixel_pitch"]), image.shape)
+    lens, transmittance = _lens(toml, float(image.metadata["wavelength_nm"]))
+    power = uniform_power(lens, radiance, float(image.metadata["pixel_pitch"]), image.shape, transmittance)
     found = calibrated(camera, image, power, error)
     found.to_toml(output)
+    frame = Exposed(float(image.metadata["exposure_time"]), float(image.metadata["wavelength_nm"]))
     return {
         "output": str(output),
         "quantum_efficiency": found.quantum_efficiency,
         "gain_error": found.gain_error,
+        "watts_per_dn": found.gain / frame.per_watt(found.quantum_efficiency),
         "masked_pixels": image.metadata["masked_pixels"],
     }
+
+
+def _calibrated_text(record: dict[str, Any]) -> str:
+    return (
+        f"{record['output']}: quantum efficiency {record['quantum_efficiency']:.5g}, gain error "
+        f"{record['gain_error']:.3g}, {record['watts_per_dn']:.5g} W per DN at this exposure time"
+    )
+
+
+def _lens(toml: Path, wavelength_nm: float) -> tuple[Lens, float]:
+    """Lens of the table [lens] with its borders, and its transmittance at a wavelength."""
+    from ..optics.thin_lens import Lens, number_names
+    from ..optics.transmittance import Curve, transmittance_of
+    from ..phantom.framed_scene import CURVE, camera_lens
+
+    table = camera_lens(toml)
+    if missing := [name for name in ("focal_length", "f_number") if name not in table]:
+        raise DetectorError(f"'{toml}' [lens]: '{missing[0]}' is missing, which --calibrate needs. Give it.")
+    lens = Lens.focused(**{name: table[name] for name in (*number_names(), "model") if name in table})
+    given = {name: table[name] for name in ("transmittance",) if name in table}
+    if CURVE not in table:
+        return lens, transmittance_of(given, None)
+    return lens, transmittance_of(given | {"wavelength_nm": wavelength_nm}, Curve.read(table[CURVE]))

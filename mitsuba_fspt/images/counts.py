@@ -15,6 +15,16 @@ from ..runtime.errors import BackendError, ImageError
 
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
+# Keys of ClickInfo.txt, the surest first. A photograph and a bias frame have exposures of their own.
+EXPOSURE = tuple(
+    re.compile(text, re.IGNORECASE)
+    for text in (
+        r"^luminescent exposure.*sec",
+        r"^luminescent exposure(?!.*unit)",
+        r"^(?!photo|background|bias).*exposure(?!.*unit)",
+    )
+)
+BINNING = (re.compile(r"^binning", re.IGNORECASE),)
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 
 
@@ -25,7 +35,8 @@ class Counts:
     highest : (h, w) the largest count of the frames, None for a single one
     bias, background : frames (h, w) [DN] of a click folder, or None
     exposure_time : [s], None where the file does not say
-    info : `Key: value` lines of a click folder
+    binning : side of the square of pixels read out as one, None where the file does not say
+    info : `Key: value` lines of a click folder, those of the luminescent image first
     """
 
     values: NDArray[np.float64]
@@ -35,6 +46,7 @@ class Counts:
     exposure_time: float | None = None
     info: dict[str, str] = field(default_factory=dict)
     highest: NDArray[np.float64] | None = None
+    binning: int | None = None
 
 
 def read_counts(path: str | os.PathLike[str]) -> Counts:
@@ -51,11 +63,11 @@ def read_counts(path: str | os.PathLike[str]) -> Counts:
     if not path.is_file():
         raise ImageError(f"counts '{path}' do not exist. Check the name.")
     suffix = path.suffix.lower()
-    exposure_time = None
+    exposure_time, binning = None, None
     if suffix in TIFF:
         array = _tiff(path)
     elif suffix in FITS:
-        array, exposure_time = _fits(path)
+        array, exposure_time, binning = _fits(path)
     elif suffix == ".npy":
         try:
             array = np.load(path, allow_pickle=False)
@@ -64,7 +76,7 @@ def read_counts(path: str | os.PathLike[str]) -> Counts:
     else:
         raise ImageError(f"counts '{path}': '{suffix}' is not read. Give .tif, .fits, .npy or a click folder.")
     found = counts_of(array, str(path))
-    return Counts(found.values, found.frames, exposure_time=exposure_time, highest=found.highest)
+    return Counts(found.values, found.frames, None, None, exposure_time, {}, found.highest, binning)
 
 
 def counts_of(array: Any, name: str) -> Counts:
@@ -92,7 +104,7 @@ def _tiff(path: Path) -> NDArray[Any]:
         raise ImageError(f"counts '{path}' are no readable TIFF: {_line(cause)}. Copy the file again.") from cause
 
 
-def _fits(path: Path) -> tuple[NDArray[Any], float | None]:
+def _fits(path: Path) -> tuple[NDArray[Any], float | None, int | None]:
     try:
         from astropy.io import fits
     except ImportError as cause:
@@ -100,8 +112,8 @@ def _fits(path: Path) -> tuple[NDArray[Any], float | None]:
     try:
         with fits.open(path, memmap=False) as file:
             unit = next(unit for unit in file if unit.data is not None)
-            time = unit.header.get("EXPTIME", file[0].header.get("EXPTIME"))
-            return np.asarray(unit.data), None if time is None else float(time)
+            time, sides = (unit.header.get(key, file[0].header.get(key)) for key in ("EXPTIME", "XBINNING"))
+            return np.asarray(unit.data), None if time is None else float(time), None if sides is None else int(sides)
     except Exception as cause:
         raise ImageError(f"counts '{path}' are no readable FITS: {_line(cause)}. Copy the file again.") from cause
 
@@ -113,15 +125,41 @@ def _click(folder: Path) -> Counts:
         raise ImageError(f"folder '{folder}' holds no luminescent.TIF. Give a click folder of an IVIS camera.")
     found = {n: counts_of(_tiff(files[n]), str(files[n])).values for n in (BIAS, BACKGROUND) if n in files}
     light = counts_of(_tiff(files[CLICK]), str(files[CLICK]))
-    info: dict[str, str] = {}
-    if INFO in files:
-        for line in files[INFO].read_text("utf-8", "replace").splitlines():
-            key, colon, value = line.partition(":")
-            if colon:
-                info.setdefault(key.strip(), value.strip())
-    times = [v for k, v in info.items() if "exposure" in k.lower() and NUMBER.search(v)]
-    time = float(NUMBER.search(times[0])[0]) if times else None  # type: ignore[index]
-    return Counts(light.values, light.frames, found.get(BIAS), found.get(BACKGROUND), time, info, light.highest)
+    info = _click_info(files[INFO].read_text("utf-8", "replace")) if INFO in files else {}
+    time, binning = _number(info, EXPOSURE), _number(info, BINNING)
+    sides = None if binning is None else int(binning)
+    return Counts(light.values, light.frames, found.get(BIAS), found.get(BACKGROUND), time, info, light.highest, sides)
+
+
+def _click_info(text: str) -> dict[str, str]:
+    """`Key: value` lines; a section `*** luminescent image: FILE` goes before those of other images and the camera.
+
+    Each image of a click has its own exposure and binning, the photograph's come first in the file.
+    """
+    own: dict[str, str] = {}
+    rest: dict[str, str] = {}
+    lit = False
+    for line in text.splitlines():
+        key, colon, value = (part.strip() for part in line.partition(":"))
+        if line.startswith("***"):
+            lit = key.strip("* ").lower().startswith(CLICK)
+        if colon:
+            (own if lit else rest).setdefault(key, value)
+    return own | {key: value for key, value in rest.items() if key not in own and not (own and _of_image(key))}
+
+
+def _of_image(key: str) -> bool:
+    """True for what each image of a click states of itself."""
+    return any(pattern.search(key) for pattern in (*EXPOSURE, *BINNING))
+
+
+def _number(info: dict[str, str], patterns: tuple[re.Pattern[str], ...]) -> float | None:
+    """Number of the first key that the first of the patterns matches, None where none does."""
+    for pattern in patterns:
+        for key, value in info.items():
+            if pattern.search(key) and (number := NUMBER.search(value)):
+                return float(number[0])
+    return None
 
 
 def _line(cause: BaseException) -> str:

@@ -269,7 +269,7 @@ class Detector:
         *,
         exposure_time: float,
         wavelength_nm: float,
-        binning: int = 1,
+        binning: int | None = None,
         pixel_pitch: float | None = None,
         bias: ArrayLike | str | os.PathLike[str] | None = None,
         dark: ArrayLike | str | os.PathLike[str] | None = None,
@@ -284,15 +284,18 @@ class Detector:
         counts : (h, w) or (frames, h, w) [DN], or the name of a .tif, .fits, .npy file or of a click folder
         exposure_time : [s] of one frame, > 0
         wavelength_nm : of the light in vacuum [nm]
-        binning : side of the square of pixels that was read out as one
+        binning : side of the square of pixels that was read out as one; None: that of a FITS header or a click folder,
+            else 1
         pixel_pitch : of the pixels read out [mm]; the image needs it to be checked against a scene
         bias, dark, flat : frames or stacks [DN] in place of the numbers `bias` and `dark_current`; `dark` has the same
-            exposure time and contains the bias, `flat` is free of both
+            exposure time and contains the bias, `flat` is free of both. The noise of the flat field itself is not in
+            the errors: average so many frames that it is small beside that of the counts
         cosmic_rays : also mask pixels that cosmic rays hit
         metadata : to be kept with the image
 
         The image's metadata hold `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (the variance of dark
         current, rounding and subtracted frames [e-²]) and `gain_error`: what the noise of any signal follows from.
+        Under a flat field f a pixel has f times the electrons per watt, which `invert` takes from power and error.
 
         Raises
         ------

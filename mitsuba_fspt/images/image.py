@@ -81,7 +81,8 @@ class Image:
     def scaled(self, source_power: float) -> Image:
         """Image of the same scene with a light source of `source_power` [W], where this one is per 1 W of source.
 
-        Power and error are multiplied by it; coverage stays. The metadata record it as `source_power`.
+        Power and error are multiplied by it; coverage stays. The metadata record it as `source_power`. Of a measured
+        image, `electrons_per_watt` is divided by it: the electrons stay what they were.
 
         Raises
         ------
@@ -95,6 +96,8 @@ class Image:
             )
         error = None if self.error is None else self.error.astype(np.float64) * watt
         metadata = self.metadata | {"source_power": watt}
+        if "electrons_per_watt" in metadata:
+            metadata["electrons_per_watt"] = float(metadata["electrons_per_watt"]) / watt
         return Image(self.power.astype(np.float64) * watt, error, self.coverage, metadata, self.mask)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:

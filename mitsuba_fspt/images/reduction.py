@@ -1,9 +1,10 @@
 """Counts of a detector to power [W]: bias, dark, flat, cosmic rays, quantum efficiency, and the noise that remains.
 
     electrons = gain (DN − bias) − dark,   P = electrons / (flat · k),   k = η t λ / (h c) [electrons per watt]
-    error² = (max(electrons, 0) + σ_read² + dark) / k²
+    error² = (max(electrons, 0) + σ_read² + dark) / (flat · k)²
 
-with the variance of the dark current and of the rounding in `dark_electrons`. Frames are corrected by ccdproc.
+with the variance of the dark current and of the rounding in `dark_electrons`. Frames are corrected by ccdproc. A pixel
+of a flat field below 1 collects fewer electrons per watt, flat · k: `responses` finds them again from power and error.
 """
 
 from __future__ import annotations
@@ -34,11 +35,14 @@ LEAST_FLAT = 0.05  # of the mean: pixels of a flat field darker than that are ma
 
 @dataclass(frozen=True)
 class Exposed:
-    """Circumstances of an exposure: time [s], wavelength [nm], binning, pitch of the pixels read out [mm] or None."""
+    """Circumstances of an exposure: time [s], wavelength [nm], binning, pitch of the pixels read out [mm] or None.
+
+    A binning of None is that of the file of counts, or 1.
+    """
 
     exposure_time: float
     wavelength_nm: float
-    binning: int = 1
+    binning: int | None = 1
     pixel_pitch: float | None = None
 
     def __post_init__(self) -> None:
@@ -49,9 +53,11 @@ class Exposed:
                 raise DetectorError(
                     f"reduce: '{name}' must be > 0 and at most {most:g}, got {value:g}. Give {example}."
                 )
-        object.__setattr__(self, "binning", whole("reduce: 'binning'", self.binning, DetectorError, "1"))
-        if self.binning < 1:
-            raise DetectorError(f"reduce: 'binning' must be >= 1, got {self.binning}. Give for example 1.")
+        if self.binning is not None:
+            sides = whole("reduce: 'binning'", self.binning, DetectorError, "1")
+            object.__setattr__(self, "binning", sides)
+            if sides < 1:
+                raise DetectorError(f"reduce: 'binning' must be >= 1, got {sides}. Give for example 1.")
         if self.pixel_pitch is not None:
             pitch = number("reduce: 'pixel_pitch'", self.pixel_pitch, DetectorError, "0.108")
             object.__setattr__(self, "pixel_pitch", pitch)
@@ -65,7 +71,7 @@ class Exposed:
     def dark(self, dark_current: float, own_pitch: float | None) -> float:
         """Electrons of the dark current in a pixel read out."""
         if self.pixel_pitch is None or own_pitch is None:
-            area = float(self.binning**2)
+            area = float((self.binning or 1) ** 2)
         else:
             area = (self.pixel_pitch / own_pitch) ** 2
         return dark_current * self.exposure_time * area
@@ -84,13 +90,16 @@ def reduce_counts(
 ) -> Image:
     """Image in W of raw counts; see `Detector.reduce`."""
     raw = counts if isinstance(counts, Counts) else _frame(counts, "counts")
+    if exposed.binning is None:
+        exposed = replace(exposed, binning=raw.binning or 1)
     full = saturated(detector, raw.values if raw.highest is None else raw.highest)
     values, rays = _cleaned(detector, raw.values, full) if cosmic_rays else (raw.values, np.zeros_like(full))
     level, charge, added = _background(detector, raw, exposed, bias, dark)
     response, weak = _response(flat, values.shape)
     electrons = _corrected(values, level, response) * detector.gain
     independent = charge + detector.gain**2 / 12 + raw.frames * added  # the second is that of the rounding
-    return _image(detector, electrons, independent, raw.frames, full | rays | weak, exposed, metadata)
+    flat_field = 1.0 if response is None else response
+    return _image(detector, electrons, flat_field, independent, raw.frames, full | rays | weak, exposed, metadata)
 
 
 def reduced(exposure: Exposure) -> Image:
@@ -119,7 +128,24 @@ def reduced(exposure: Exposure) -> Image:
     dark = exposed.dark(detector.dark_current, detector.pixel_pitch)
     electrons = exposure.electrons.astype(np.float64)
     full = (electrons >= detector.full_well) | saturated(detector, exposure.counts.astype(np.float64))
-    return _image(detector, electrons - dark, dark, 1, full, exposed, found)
+    return _image(detector, electrons - dark, 1.0, dark, 1, full, exposed, found)
+
+
+def responses(image: Image) -> Array:
+    """Flat field (h, w) of a reduced image, by which its pixels' electrons per watt differ from `electrons_per_watt`.
+
+    Of power P, error s, k electrons per watt and the variance R of read-out and dark current, the flat field f solves
+    s² = (max(P k f, 0) + R)/(k f)². It is 1 where the image has no error.
+    """
+    shape, error = image.shape, image.error
+    k = float(image.metadata["electrons_per_watt"])
+    rest = float(image.metadata.get("read_noise", 0.0)) ** 2 + float(image.metadata.get("dark_electrons", 0.0))
+    if error is None:
+        return np.ones(shape)
+    variance = (error.astype(np.float64) * k) ** 2
+    signal = np.maximum(image.power.astype(np.float64) * k, 0)
+    root = signal + np.sqrt(signal**2 + 4 * variance * rest)
+    return np.where((variance > 0) & (root > 0), root / np.maximum(2 * variance, 1e-300), 1.0)
 
 
 def saturated(detector: Detector, counts: Array) -> NDArray[np.bool_]:
@@ -253,13 +279,16 @@ def _ccdproc() -> tuple[Any, Any]:
 def _image(
     detector: Detector,
     electrons: Array,
+    response: Array | float,
     dark: float,
     frames: int,
     mask: NDArray[np.bool_],
     exposed: Exposed,
     metadata: Mapping[str, Any] | None,
 ) -> Image:
-    """Image in W of the mean electrons of so many frames; `dark`: variance [e-²] of one beside shot and read noise.
+    """Image in W of the mean electrons, over the `response`, of so many frames.
+
+    `dark` is the variance [e-²] of one frame beside shot and read noise.
 
     The metadata keep the numbers of the sum of the frames, whose shot noise is that of all its electrons.
     """
@@ -267,7 +296,7 @@ def _image(
     read = detector.read_noise * frames**0.5
     total = np.where(mask, 0, electrons) * frames
     independent = dark * frames
-    error = np.sqrt(np.maximum(total, 0) + read**2 + independent) / per_watt
+    error = np.sqrt(np.maximum(total * response, 0) + read**2 + independent) / (per_watt * response)
     kept: Metadata = dict(metadata or {})
     for name in ("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"):
         kept.pop(name, None)
@@ -277,7 +306,7 @@ def _image(
         "detector": detector.name,
         "exposure_time": exposed.exposure_time,
         "wavelength_nm": exposed.wavelength_nm,
-        "binning": exposed.binning,
+        "binning": exposed.binning or 1,
         "electrons_per_watt": per_watt,
         "read_noise": read,
         "dark_electrons": float(independent),

@@ -25,7 +25,7 @@ from ..studies.sweep_point import texts_of
 from .calibrated_scene import write_calibrated
 from .calibration_fit import CalibrationFit, CalibrationSettings, Fitted, Measured
 from .derivatives import scene_text, varied_value
-from .measurement import variances
+from .measurement import tell_misfit, variances
 
 Array = NDArray[np.float64]
 GAIN = "gain"  # reserved name: a factor on all powers
@@ -130,6 +130,7 @@ def calibrate(
 def _calibration(names: tuple[str, ...], measured: Measured, fitted: Fitted, scene: str) -> Calibration:
     """The fitted numbers by name."""
     pixels = int(measured.used.sum())
+    tell_misfit("calibrate", fitted.chi2_sum, pixels - len(names))
     return Calibration(
         names,
         dict(zip(names, map(float, fitted.values), strict=True)),

@@ -118,16 +118,20 @@ class Inversion:
             raise InversionError(
                 f"inversion: weights of {count} columns that no picture determines are not 0. Multiply by R.seen."
             )
-        low, high = np.quantile(given @ self._drawn(), self._quantiles)
+        low, high = self._between(given @ self._drawn())
         return float(low), float(high)
 
-    @property
-    def _quantiles(self) -> tuple[float, float]:
-        return (1 - self.confidence) / 2, (1 + self.confidence) / 2
+    def _between(self, draws: Array) -> Array:
+        """Ends of the interval of draws (..., samples): the next draw lies within it with the `confidence`.
+
+        Quantiles at k/(samples + 1), k the rank: those at (k − 1)/(samples − 1) hold 89.1 % of 200 draws for 90 %.
+        """
+        ends = (1 - self.confidence) / 2, (1 + self.confidence) / 2
+        return np.asarray(np.quantile(draws, ends, axis=-1, method="weibull"))
 
     @cached_property
     def _ends(self) -> Array:
-        return np.where(self.seen, np.quantile(self._drawn(), self._quantiles, axis=1), np.nan)
+        return np.where(self.seen, self._between(self._drawn()), np.nan)
 
     def _drawn(self) -> Array:
         if self.draws.shape[1] == 0:
@@ -148,6 +152,7 @@ class Inversion:
             "reference": self.reference,
             "gain_error": self.gain_error,
             "determined": self.determined,
+            "decrement": self.decrement,
             "samples": self.draws.shape[1],
         }
         if self.draws.shape[1]:

@@ -22,7 +22,7 @@ from ..runtime.errors import InversionError
 from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
 from .inversion import Inversion
-from .measurement import Measurement
+from .measurement import Measurement, tell_misfit
 from .mlem import MlemAccuracy, mlem
 from .multipliers import Multipliers
 from .nonnegative import Accuracy, Solve, factor, minimise
@@ -121,7 +121,9 @@ def invert(
     measurement = Measurement.of(matrix, images, error, mask, gain_error)
     problem = Problem.of(matrix, measurement, Surface.of(matrix, scene), prior or Prior(), settings or Settings())
     with reported(progress) as report:
-        return problem.solved(options, report)
+        found = problem.solved(options, report)
+    tell_misfit("invert", found.chi2_sum, found.pixels - found.determined)
+    return found
 
 
 @dataclass(frozen=True)
@@ -161,11 +163,15 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """State of the fit: x = J_n/reference (m,), standard deviations (N,) [W], the weight, determined unknowns γ."""
+    """State of the fit: x = J_n/reference (m,), standard deviations (N,) [W], the weight, determined unknowns γ.
+
+    correction : (N,) [W], added to the data: what variances of the fitted signal take from it (Eq. M.29)
+    """
 
     x: Array
     sigma: Array
     numerical: Array
+    correction: Array
     weight: float
     determined: float
     decrement: float
@@ -257,7 +263,7 @@ class Problem:
         numerical = np.zeros_like(power)
         # A start that no bright or dark pixel leads astray: the same noise on all of them.
         sigma = self._sigma(np.full_like(power, np.maximum(power, 0).mean()), numerical)
-        state = Fit(np.ones(self.surface.unknowns), sigma, numerical, weight or 0.0, np.nan, np.nan)
+        state = Fit(np.ones(self.surface.unknowns), sigma, numerical, 0 * numerical, weight or 0.0, np.nan, np.nan)
         if start is not None:
             state = replace(start, weight=state.weight)
         if weight is None:
@@ -283,21 +289,22 @@ class Problem:
         power = self.measurement.power[self.rows]
         x, gap = mlem(self.transport, power, 1 / shot, background, self.settings.mlem, lambda s: report("fit", s))
         numerical = self._numerical(x)
-        return Fit(x, self._sigma(self.transport @ x, numerical), numerical, 0.0, 0.0, 2 * gap)
+        return Fit(x, self._sigma(self.transport @ x, numerical), numerical, 0 * numerical, 0.0, 0.0, 2 * gap)
 
     def _improved(self, state: Fit, probes: Array, weight: float | None, accuracy: Accuracy) -> Fit:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
         normal, solve = self._normal(state.sigma, state.weight)
-        right = self._right(self.measurement.power[self.rows], state.sigma, state.weight)
+        right = self._right(self.measurement.power[self.rows] + state.correction, state.sigma, state.weight)
         start = Multipliers(solve, self.bounded).start(right[:, None])
         found = minimise(normal, right[:, None], start, self.bounded, solve, accuracy)
         x = found.x[:, 0]
         determined = self._determined(normal, solve, state.weight, probes)
+        correction = self._correction(solve, state.sigma)
         if weight is None:  # Eq. M.25
             weight = determined / max(self.smoothness.energy(x - self.mean), 1e-300)
         numerical = self._numerical(x)
         sigma = self._sigma(self.transport @ x, numerical)
-        return Fit(x, sigma, numerical, weight, determined, float(found.decrement[0]))
+        return Fit(x, sigma, numerical, correction, weight, determined, float(found.decrement[0]))
 
     def _first_weight(self, sigma: Array) -> float:
         """Weight to begin with: above the one at which data and penalty have the same trace, where few J_n are 0."""
@@ -308,6 +315,16 @@ class Problem:
         """γ, the number of unknowns that the data determine: tr((H + w Q)⁻¹ H), by random vectors."""
         data = normal @ probes - weight * (self.smoothness.matrix @ probes)
         return float(np.einsum("mk,mk->", probes, solve(data)) / probes.shape[1])
+
+    def _correction(self, solve: Solve, sigma: Array) -> Array:
+        """Power [W] that variances of the fitted signal take from each pixel, (N,), by random vectors (Eq. M.29).
+
+        A pixel that is too bright by chance has too large a fitted signal, too large a variance, and counts less.
+        """
+        probes = np.random.default_rng(1).choice([-1.0, 1.0], (len(self.rows), self.settings.probes))
+        found = (self.transport @ solve(self.transport.T @ (probes / sigma[:, None]))) / sigma[:, None]
+        share = np.einsum("nk,nk->n", found, probes - found) / self.settings.probes
+        return np.asarray(self.measurement.shot[self.rows] * share)
 
     def _normal(self, sigma: Array, weight: float) -> tuple[csr_array, Solve]:
         """H + w Q with H = TᵀT/σ², and what solves it."""
@@ -372,7 +389,7 @@ class Problem:
 
         The numerical error of a view has one sign: it does not average out over pixels.
         """
-        power = self.measurement.power[self.rows]
+        power = self.measurement.power[self.rows] + fit.correction
         noise = np.sqrt(np.maximum(fit.sigma**2 - fit.numerical**2, 0))[:, None]
         views, height, width = self.matrix.image_shape
         common = rng.standard_normal((views, size))[self.rows // (height * width)]

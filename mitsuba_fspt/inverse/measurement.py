@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,12 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..images.detector import Exposure
 from ..images.image import Image
-from ..images.reduction import reduced
+from ..images.reduction import reduced, responses
 from ..runtime.errors import InversionError
 from ..runtime.numbers import number
 from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
+LOG = logging.getLogger("mitsuba_fspt")
+MISFIT = 4.0  # standard deviations of Σ (residual/σ)² by chance: more happens in one fit of 30,000
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +160,8 @@ def variances(
                     f"{verb}: image {k} has {per_watt:g} electrons a watt and {read:g} electrons of read noise. Reduce "
                     "it again from its counts."
                 )
-            shot[k], other[k] = 1 / per_watt, (read**2 + dark) / per_watt**2
+            each = per_watt * responses(image)
+            shot[k], other[k] = 1 / each, (read**2 + dark) / each**2
         elif image.error is not None:
             other[k] = image.error.astype(np.float64) ** 2
         else:
@@ -166,3 +170,15 @@ def variances(
                 f"{', or give error= [W]' if verb == 'invert' else ''}."
             )
     return shot, other
+
+
+def tell_misfit(verb: str, chi2_sum: float, free: float) -> None:
+    """Say in one line on stderr that Σ (residual/σ)² over `free` pixels is larger than noise makes it."""
+    free = max(free, 1.0)
+    if chi2_sum > free + MISFIT * (2 * free) ** 0.5:
+        LOG.warning(
+            "fspt: %s: chi2 is %.3g, the images differ from the fit by more than their noise, which the stated errors "
+            "do not contain. Check pose, mesh, exit law, background and the detector's numbers.",
+            verb,
+            chi2_sum / free,
+        )

@@ -86,10 +86,17 @@ def test_calibration_writes_a_camera(run, folder, tmp_path):
     assert code == 0
     assert json.loads(out)["gain_error"] == pytest.approx(0.02, rel=0.05)
     assert fspt.Detector.from_toml(tmp_path / "c.toml").quantum_efficiency == pytest.approx(0.8 * 0.85, rel=5e-3)
+    dn = (np.load(tmp_path / "sphere.npy").mean(axis=0) - 500).sum() - power.size * 1e-3 * 600 / 1.6
+    assert json.loads(out)["watts_per_dn"] == pytest.approx(power.sum() / dn, rel=1e-3, abs=0)
     code, _, err = run(*arguments, "-o", tmp_path / "d.toml")
     assert (code, err.count("\n")) == (2, 1)
     assert "--radiance" in err
     assert files(tmp_path) == ["c.toml", "sphere.npy"]
+    # a lens that lets 0.8 of the light through explains the loss: the scene's own transmittance would count it twice
+    (tmp_path / "lens.toml").write_text(CAMERA + "transmittance = 0.8\n")
+    arguments = ("reduce", tmp_path / "sphere.npy", "--detector", tmp_path / "lens.toml", *SETTINGS, "--calibrate")
+    assert run(*arguments, "--radiance", 2e-16, "-o", tmp_path / "d.toml")[0] == 0
+    assert fspt.Detector.from_toml(tmp_path / "d.toml").quantum_efficiency == pytest.approx(0.85, rel=5e-3)
 
 
 @pytest.mark.parametrize(
@@ -101,6 +108,7 @@ def test_calibration_writes_a_camera(run, folder, tmp_path):
         (("T.npz", *(f"exposure_{k}.exr" for k in range(4)), "-o", "out.stl"), "must end in .ply or .vtu"),
         (("T.npz", *(f"exposure_{k}.exr" for k in range(4)), "-o", "out.ply", "--weight", "-1"), "'weight'"),
         (("none.npz", "exposure_0.exr", "-o", "out.ply"), "does not exist"),
+        (("counts_0.npy", "exposure_0.exr", "-o", "out.ply"), "no zip archive"),
     ],
 )
 def test_bad_input_of_invert(run, folder, monkeypatch, arguments, words):

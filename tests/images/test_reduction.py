@@ -10,7 +10,7 @@ import pytest
 
 from mitsuba_fspt.images.detector import Detector
 from mitsuba_fspt.images.image import Image, read
-from mitsuba_fspt.images.reduction import calibrated, read_measured, reduced
+from mitsuba_fspt.images.reduction import calibrated, read_measured, reduced, responses
 from mitsuba_fspt.optics.thin_lens import Lens
 from mitsuba_fspt.optics.uniform_source import uniform_power
 from mitsuba_fspt.runtime.errors import DetectorError, ImageError
@@ -61,6 +61,25 @@ def test_stacks_and_frames():
     assert chi2 == pytest.approx(1, abs=0.08)
     one = CCD.reduce(stack[0], **SETTINGS, pixel_pitch=0.0135)
     assert found.metadata["electrons_per_watt"] == pytest.approx(5 * one.metadata["electrons_per_watt"])
+
+
+def test_errors_follow_the_flat_field():
+    """A flat field of 0.3 … 1.7: χ² of the reduced image is 1 on the dark, the middle and the bright third alike.
+
+    `responses` gives the flat field back. Seen to fail (0.55 and 1.6) with electrons per watt of the mean pixel.
+    """
+    pytest.importorskip("ccdproc")
+    image = Image(np.full((60, 60), 400.0) / PER_WATT, metadata={"pixel_pitch": 0.0135})
+    flat = 1 + 0.7 * np.outer(np.ones(60), np.linspace(-1, 1, 60))
+    seen = Image(image.power * flat, metadata=image.metadata)
+    thirds = []
+    for seed in range(20):
+        counts = CCD.expose(seen, 60, 650, seed=seed).counts
+        found = CCD.reduce(counts, **SETTINGS, pixel_pitch=0.0135, flat=1e4 * flat)
+        squares = ((found.power - image.power) / found.error) ** 2
+        thirds.append([part.mean() for part in np.array_split(squares, 3, axis=1)])
+    np.testing.assert_allclose(np.mean(thirds, axis=0), 1, atol=0.05)
+    np.testing.assert_allclose(responses(found), flat, rtol=1e-5)
 
 
 def test_dark_charge_and_frames_add_their_noise():
@@ -140,6 +159,25 @@ def test_files(tmp_path):
     from mitsuba_fspt.images.counts import read_counts
 
     assert read_counts(click).exposure_time == 60
+
+
+def test_click_info_of_the_luminescent_image(tmp_path):
+    """Exposure and binning are those of its own section; photograph and bias frame, with others, come first."""
+    tifffile = pytest.importorskip("tifffile")
+    from mitsuba_fspt.images.counts import read_counts
+
+    tifffile.imwrite(tmp_path / "luminescent.TIF", np.full((4, 4), 1000, np.uint16))
+    photo = "*** photographic image:\tphotograph.TIF\nBinning Factor:\t2\nExposure Time Sec:\t0.2\n"
+    bias = "*** readbiasonly image:\treadbiasonly.TIF\nBinning Factor:\t16\nBackground Exposure (Seconds):\t0\n"
+    light = "*** luminescent image:\tluminescent.TIF\nLuminescent Exposure Units:\tsec\nBinning Factor:\t8\n"
+    time = "Luminescent Exposure (Seconds):\t60\n"
+    (tmp_path / "ClickInfo.txt").write_text(photo + bias + light + time)
+    found = read_counts(tmp_path)
+    assert (found.exposure_time, found.binning) == (60, 8)
+    assert CCD.reduce(tmp_path, **SETTINGS).metadata["binning"] == 8
+    assert CCD.reduce(tmp_path, **SETTINGS, binning=4).metadata["binning"] == 4
+    (tmp_path / "ClickInfo.txt").write_text(photo + bias + light)
+    assert read_counts(tmp_path).exposure_time is None
 
 
 def test_uniform_source_calibrates():

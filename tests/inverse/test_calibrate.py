@@ -6,10 +6,17 @@ from zlib import crc32
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 from small_scenes import LENS_XML, SCENES, write_scene
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.inverse.calibration_fit import CalibrationFit, CalibrationSettings, Measured, UndeterminedError
+from mitsuba_fspt.inverse.calibration_fit import (
+    CalibrationFit,
+    CalibrationSettings,
+    Measured,
+    UndeterminedError,
+    sampling_variance,
+)
 from mitsuba_fspt.runtime.errors import InversionError
 
 
@@ -159,6 +166,21 @@ def test_bad_input(scene):
     ):
         with pytest.raises(InversionError, match=words):
             fspt.calibrate(scene, images, free=free)
+
+
+def test_variance_of_monte_carlo_follows_the_signal():
+    """Squares of standard errors of 8 passes about a P (v − P) + b P² give that function back to 5 % (Eq. M.27).
+
+    Seen to fail with four times the squares, and without either term.
+    """
+    rng = np.random.default_rng(2)
+    signal = rng.random((1, 64, 64))
+    brightest = maximum_filter(signal, (1, 3, 3), mode="nearest")
+    true = 3e-3 * signal * (brightest - signal) + 1e-3 * signal**2
+    squares = true * rng.chisquare(7, true.shape) / 7
+    found = sampling_variance(signal, squares, np.ones(true.shape, bool))
+    large = true > 0.2 * true.max()
+    np.testing.assert_allclose(found[large], true[large], rtol=0.05)
 
 
 @pytest.mark.slow

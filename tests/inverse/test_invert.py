@@ -135,20 +135,21 @@ def test_units_of_power_do_not_matter(case):
 
 
 def test_faint_light_keeps_its_total(case):
-    """20 electrons on the brightest pixel, 60 seeds: the mean total is right to four standard errors.
+    """20 electrons on the brightest pixel, 60 seeds: the mean total is right to four standard errors, 0.36 %.
 
-    Seen to fail with variances of the measured counts in place of the fitted signal.
+    Less the relative excess of the light itself, which has the mean 0 and most of the scatter. Seen to fail with
+    variances of the measured counts (-4 %), and without the correction of M.29 (-0.5 %).
     """
     matrix, exitance = case
-    surface, true = Surface.of(matrix), matrix.areas @ exitance
+    surface, true, light = Surface.of(matrix), matrix.areas @ exitance, matrix.forward(exitance).sum()
     ratios = []
     for seed in range(60):
         images = noisy(matrix, exitance, 20, seed, read_noise=1.0)
-        found = fspt.invert(matrix, images, weight=10.0, prior=Prior(reference=1e-3), scene=surface)
-        ratios.append(found.total / true)
+        found = fspt.invert(matrix, images, weight=1.0, prior=Prior(reference=1e-3), scene=surface)
+        ratios.append(found.total / true - sum(image.power.sum() for image in images) / light)
     error = np.std(ratios, ddof=1) / np.sqrt(len(ratios))
-    assert error < 0.01
-    assert np.mean(ratios) == pytest.approx(1, abs=4 * error)
+    assert error < 1e-3
+    assert np.mean(ratios) == pytest.approx(0, abs=4 * error)
 
 
 def test_masked_pixels_do_not_count(case):
@@ -263,8 +264,18 @@ def test_draws_repeat_with_their_seed(case):
     one, other, third = (fspt.invert(matrix, images, samples=30, seed=seed, weight=10.0) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.draws, other.draws)
     assert not np.allclose(one.draws, third.draws)
-    part = matrix.areas * (one.surface.vertices[:, 0] > 0)
-    assert one.interval(part) == pytest.approx(tuple(np.quantile(part @ one.draws, [0.05, 0.95])))
+
+
+def test_ends_of_intervals_are_ranks_of_draws(case):
+    """The next of 20 draws lies between the first and the last of 19 in 18 of 20 cases: these are the ends for 90 %.
+
+    Seen to fail with quantiles at (k − 1)/(samples − 1), which hold 81 % then.
+    """
+    matrix, exitance = case
+    found = fspt.invert(matrix, noisy(matrix, exitance, 300, 3), samples=19, weight=10.0)
+    part = matrix.areas * (found.surface.vertices[:, 0] > 0)
+    assert found.interval(part) == pytest.approx(((part @ found.draws).min(), (part @ found.draws).max()))
+    np.testing.assert_allclose(found.upper, found.draws.max(axis=1))
 
 
 # --- what it takes and writes ---
@@ -283,6 +294,36 @@ def test_exposures_and_images_in_watts_agree(case):
     watts = [fspt.Image((e.electrons.astype(float) - 0.6) / per_watt, metadata=meta) for e in found]
     np.testing.assert_allclose(fspt.invert(matrix, watts, weight=10.0).exitance, r.exitance, rtol=1e-6)
     assert r.total == pytest.approx(matrix.areas @ exitance * scale, rel=0.05, abs=0)
+
+
+def test_a_flat_field_counts(case):
+    """Pixels that collect a third of the electrons get three times the variance; scaled images keep their electrons."""
+    matrix, exitance = case
+    images = noisy(matrix, exitance, 1000, 3)
+    k, read = (images[0].metadata[name] for name in ("electrons_per_watt", "read_noise"))
+    flat = np.where(np.arange(16)[None, :] < 8, 1.0, 1 / 3) * np.ones((16, 1))
+    stated = [
+        fspt.Image(i.power, np.sqrt(np.maximum(i.power * k * flat, 0) + read**2) / (k * flat), metadata=i.metadata)
+        for i in images
+    ]
+    found = fspt.invert(matrix, stated, weight=10.0)
+    light = found.fitted > 0
+    variance = (found.fitted * k * flat + read**2) / (k * flat) ** 2
+    np.testing.assert_allclose(found.sigma[light] ** 2, variance[light], rtol=0.03)
+    twice = fspt.invert(matrix, [image.scaled(2.0) for image in stated], weight=10.0)
+    assert twice.total == pytest.approx(2 * found.total, rel=1e-6)
+    assert twice.chi2 == pytest.approx(found.chi2, rel=1e-4)
+
+
+def test_a_misfit_is_told(case, caplog):
+    """Images 30 % of whose light moved by a pixel: χ² says so in one line; right ones say nothing."""
+    matrix, exitance = case
+    images = noisy(matrix, exitance, 1000, 3)
+    fspt.invert(matrix, images, weight=10.0)
+    assert not caplog.records
+    moved = [fspt.Image(0.7 * i.power + 0.3 * np.roll(i.power, 1, 1), metadata=i.metadata) for i in images]
+    fspt.invert(matrix, moved, weight=10.0)
+    assert "differ from the fit by more than their noise" in caplog.text
 
 
 def test_files(case, tmp_path):
