@@ -155,8 +155,8 @@ def _laid(
     """Light of some faces on the windows, see `ColumnCanvas.light`."""
     canvas = ColumnCanvas(shape, windows)
     corners = mi.UInt32(faces.corners.ravel().astype(np.uint32))
-    for some, cells, points, taken in plan.of(index).passes():
-        items = np.stack([index[some], cells, plan.cuts[index[some]], points, taken @ (1 << np.arange(taken.shape[1]))])
+    for some, cells, cuts, points, taken in plan.of(index).passes():
+        items = np.stack([index[some], cells, cuts, points, taken @ (1 << np.arange(taken.shape[1]))])
         for run in batch_slices((items[1] * items[2]) ** 2):
             part = items[:, run]
             row, number = numbered((part[1] * part[2]) ** 2)

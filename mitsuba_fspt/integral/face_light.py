@@ -102,8 +102,8 @@ class ColumnRule:
 
 @dataclass(frozen=True)
 class Plan:
-    """How each of some faces is divided: pieces along a side, and M of the pupil and whether its cells are laid for
-    each of its columns, (F, 1) on faces, (F, 3) on vertices."""
+    """How each of some faces is divided for each of its columns, (F, 1) on faces, (F, 3) on vertices: M of the pupil,
+    pieces along a side, and whether the pupil's cells are laid."""
 
     cells: Index
     cuts: Index
@@ -117,15 +117,15 @@ class Plan:
         """The same of some of the faces."""
         return Plan(self.cells[faces], self.cuts[faces], self.points[faces])
 
-    def passes(self) -> Iterator[tuple[Index, Index, Mask, Mask]]:
-        """Faces, their M, whether cells are laid, and the columns (n, 1 or 3) that take light so: by turns those like
-        the first column of a face, like the second if that takes others, and like the third."""
+    def passes(self) -> Iterator[tuple[Index, Index, Index, Mask, Mask]]:
+        """Faces, their M and pieces, whether cells are laid, and the columns (n, 1 or 3) that take light so: by turns
+        those like the first column of a face, like the second if that takes others, and like the third."""
         kind = 2 * self.cells + self.points
         for k in range(kind.shape[1]):
             alike = kind == kind[:, k : k + 1]
             faces = np.flatnonzero(~alike[:, :k].any(axis=1))
             if faces.size:
-                yield faces, self.cells[faces, k], self.points[faces, k], alike[faces]
+                yield faces, self.cells[faces, k], self.cuts[faces, k], self.points[faces, k], alike[faces]
 
 
 @dataclass(frozen=True)
@@ -250,9 +250,8 @@ class FaceLight:
             points = ~self._most(~points & self.bright)[self.corners]
             of_columns = np.where(points, self._most(cells)[self.corners], self._most(nodes)[self.corners])
         of_columns = np.maximum(of_columns, 2).astype(np.int64)
-        pieces = np.where(points.any(axis=1), smaller, pieces)
-        pieces = np.minimum(pieces.astype(np.int64), math.isqrt(BATCH) // of_columns.max(axis=1))
-        return Plan(of_columns, pieces, points)
+        cuts = np.where(points, smaller[:, None], pieces[:, None]).astype(np.int64)
+        return Plan(of_columns, np.minimum(cuts, math.isqrt(BATCH) // of_columns), points)
 
     def _nodes(self, rule: ColumnRule, sides: Array, on: str) -> Array:
         """M of nodes that each face asks for."""
