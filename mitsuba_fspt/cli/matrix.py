@@ -13,7 +13,7 @@ import typer
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import TransportError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Quiet, SceneFile, require_picture, require_writable, value_lists
+from .options import AsJson, ParameterLists, Quiet, SceneFile, require_picture, require_writable, value_lists
 from .terminal import Interrupted, print_result
 
 if TYPE_CHECKING:
@@ -22,15 +22,7 @@ if TYPE_CHECKING:
 
 def matrix(
     scene: SceneFile,
-    define: Annotated[
-        list[str] | None,
-        typer.Option(
-            "-D",
-            "--define",
-            metavar="NAME=V1,V2,...",
-            help="Values for a <default> of the scene, or start:stop:step with stop left out; repeatable.",
-        ),
-    ] = None,
+    define: ParameterLists = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write, .npz.")] = None,
     on: Annotated[
         str,

@@ -20,6 +20,15 @@ Parameters = Annotated[
     list[str] | None,
     typer.Option("-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; repeatable."),
 ]
+ParameterLists = Annotated[
+    list[str] | None,
+    typer.Option(
+        "-D",
+        "--define",
+        metavar="NAME=V1,V2,...",
+        help="Values for a <default> of the scene, or start:stop:step with stop left out; repeatable.",
+    ),
+]
 Method = Annotated[
     str | None,
     typer.Option(

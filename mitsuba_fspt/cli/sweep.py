@@ -13,7 +13,7 @@ import typer
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import BackendError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Method, Quiet, Rtol, SceneFile, Seed, Sensor, SourcePower, Spp, value_lists
+from .options import AsJson, Method, ParameterLists, Quiet, Rtol, SceneFile, Seed, Sensor, SourcePower, Spp, value_lists
 from .terminal import Interrupted, print_result
 
 if TYPE_CHECKING:
@@ -29,15 +29,7 @@ Format = Annotated[
 
 def sweep(
     scene: SceneFile,
-    define: Annotated[
-        list[str] | None,
-        typer.Option(
-            "-D",
-            "--define",
-            metavar="NAME=V1,V2,...",
-            help="Values for a <default> of the scene, or start:stop:step with stop left out; repeatable.",
-        ),
-    ] = None,
+    define: ParameterLists = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for the images, SCENE_sweep if left out.")
     ] = None,
