@@ -52,10 +52,15 @@ def load_scene(name, crop=None, **parameters):
     whole = {"width": WIDTH, "height": HEIGHT, "pixel_pitch": 256 * 0.108 / HEIGHT}
     scene = fspt.load(SCENES / f"{name}.xml", **whole | parameters)
     if crop:
-        film = mi.traverse(scene.sensors()[0].film())
-        film["crop_offset"], film["crop_size"] = crop[:2], crop[2:]
-        film.update()
+        look_at_crop(scene, *crop)
     return scene
+
+
+def look_at_crop(scene, x, y, width, height):
+    """Give the film of a loaded scene's first sensor this crop window [pixels]."""
+    film = mi.traverse(scene.sensors()[0].film())
+    film["crop_offset"], film["crop_size"] = [x, y], [width, height]
+    film.update()
 
 
 def camera_scene(*shapes, exitance=1.0, crop=None, lamp=None, bodies=(), **optics):

@@ -57,9 +57,10 @@ def test_a_window_lets_through_what_fresnel_says(window):
 def test_a_plate_of_glass_moves_the_focus():
     """What lies z behind a plate is seen at z - d (1 - 1/n); without the shift the blurred edge is off by 3 %."""
     depth, nearer = 190.0, THICK * (1 - 1 / N)
-    behind = power(camera_scene(disk(depth, radius=6.0), bodies=(slab(80),), f_number=4), rtol=1e-4)
-    in_air = power(camera_scene(disk(depth - nearer, radius=6.0), f_number=4), rtol=1e-4)
-    unmoved = power(camera_scene(disk(depth, radius=6.0), f_number=4), rtol=1e-4)
+    rim = {"f_number": 4, "crop": (12, 8, 8, 8)}
+    behind = power(camera_scene(disk(depth, radius=6.0), bodies=(slab(80),), **rim), rtol=3e-4)
+    in_air = power(camera_scene(disk(depth - nearer, radius=6.0), **rim), rtol=3e-4)
+    unmoved = power(camera_scene(disk(depth, radius=6.0), **rim), rtol=3e-4)
     assert abs(behind - THROUGH * in_air).max() < PEAK_MISS * behind.max()
     assert abs(behind - THROUGH * unmoved).max() > 5 * PEAK_MISS * behind.max()
 
@@ -87,8 +88,8 @@ def test_a_mirror_shows_the_mirrored_phantom(bsdf, depth):
 def test_a_mirror_whose_edge_cuts_the_field(z):
     """A small mirror at 45° hides half of a sphere and shows another one beside it."""
     mirror = pane(z, PERFECT, size=4.0, x=-3.0, tilt=45)
-    scene = camera_scene(sphere(170, 8), sphere(z, 6, x=30), bodies=(mirror,))
-    assert agrees_with_path(scene) > 1e-3
+    scene = camera_scene(sphere(170, 8), sphere(z, 6, x=30), bodies=(mirror,), crop=(8, 8, 24, 8))
+    assert agrees_with_path(scene, spp=4096) > 1e-3
 
 
 def test_three_views_on_one_detector():

@@ -16,6 +16,7 @@ from small_scenes import (
     filled,
     glow,
     lens,
+    look_at_crop,
     world_scene,
     write_ply,
 )
@@ -138,6 +139,7 @@ def test_products_are_the_pictures_of_renders(tmp_path, on, depth):
     Seen to fail with two columns swapped, and with cosθ_s dropped.
     """
     scene = body_scene(tmp_path, on, depth)
+    look_at_crop(scene, 9, 2, 6, 6)  # a quarter of the body, with the limb and the middle
     matrix = fspt.transport(scene, on=on, rtol=RTOL)
     for name, exitance in exitances(on).items():
         shine(scene, on, exitance)
@@ -175,14 +177,11 @@ def test_noise_on_faces_smaller_than_a_pixel(tmp_path, on):
     Expected: rtol of the brightest pixel beside the error of a render. Seen to fail with faces up to half a pixel taken
     as points, whatever the blur.
     """
-    import mitsuba as mi
 
     ball = trimesh.creation.icosphere(4, radius=8.0)
     mesh = ball.vertices @ TURN.T, ball.faces
     scene = body_scene(tmp_path, on, FOCUS + 12.0, mesh=mesh)
-    film = mi.traverse(scene.sensors()[0].film())
-    film["crop_offset"], film["crop_size"] = [7, 7], [5, 2]
-    film.update()
+    look_at_crop(scene, 7, 7, 5, 2)
     matrix = fspt.transport(scene, on=on, rtol=RTOL)
     exitance = 1.0 * (np.random.default_rng(4).random(matrix.shape[1]) < 0.2)
     shine(scene, on, exitance)
@@ -260,13 +259,10 @@ def test_every_lens_and_exit_law(tmp_path, optics):
 
 def test_a_crop_window_is_a_part_of_the_film(tmp_path):
     """Expected: the rows of these pixels, to rtol, whatever lies beyond."""
-    import mitsuba as mi
 
     scene, exitance = body_scene(tmp_path), exitances("vertex")["smooth"]
     whole = fspt.transport(scene).forward(exitance)[0]
-    film = mi.traverse(scene.sensors()[0].film())
-    film["crop_offset"], film["crop_size"] = [3, 4], [12, 7]
-    film.update()
+    look_at_crop(scene, 3, 4, 12, 7)
     matrix = fspt.transport(scene)
     assert matrix.image_shape == (1, 7, 12)
     np.testing.assert_allclose(matrix.forward(exitance)[0], whole[4:11, 3:15], atol=RTOL * whole.max())
@@ -286,10 +282,14 @@ def square_at(x, y, turn, bsdf, size=60.0):
 SILVERED = {"type": "conductor", "material": "none", "specular_reflectance": 0.9}
 
 
-@pytest.mark.parametrize("where", [(30, 0, 0, {"type": "thindielectric"}), (-4, 14, -50, SILVERED, 20.0)])
-def test_rows_go_on_through_windows_and_off_mirrors(tmp_path, where):
+@pytest.mark.parametrize(
+    ("where", "crop"),
+    [((30, 0, 0, {"type": "thindielectric"}), (9, 2, 6, 6)), ((-4, 14, -50, SILVERED, 20.0), (12, 3, 8, 5))],
+)
+def test_rows_go_on_through_windows_and_off_mirrors(tmp_path, where, crop):
     """Seen to fail with lines that end at the first surface: rows of the window are dark."""
     scene = body_scene(tmp_path, extra=[square_at(*where)])
+    look_at_crop(scene, *crop)
     matrix = fspt.transport(scene, rtol=RTOL)
     body = BODY.vertices @ TURN.T
     exitance = 1 + 0.9 * np.sin(body[:, 1] / 3) * np.cos(body[:, 2] / 4)
