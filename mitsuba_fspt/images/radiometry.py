@@ -1,4 +1,4 @@
-"""Units of images: watts, photons a second, and the apparent radiance of what lies in focus."""
+"""Units of images: watts, photons per second, and the apparent radiance of a surface in focus."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def in_unit(image: Image, unit: str, wavelength_nm: float | None = None) -> Conv
         or given for watts; the metadata do not describe the lens.
     """
     require_unit(unit, wavelength_nm)
-    if unit == "W":  # no copies: a large picture hardly fits
+    if unit == "W":  # without copies, to save memory
         return Converted(image.power, image.error, UNITS[unit], unit, None)
     wavelength = wavelength_of(image, wavelength_nm)
     factor: Plane | float = wavelength * 1e-9 / PLANCK_TIMES_LIGHT  # photons per joule

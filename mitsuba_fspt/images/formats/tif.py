@@ -61,7 +61,7 @@ class Tif(Format):
 
 @contextmanager
 def _silent(logger: logging.Logger) -> Iterator[None]:
-    """Context manager in which a logger says nothing: what it would say of a damaged file is an ImageError."""
+    """Context manager that silences a logger: its message about a damaged file is raised as an ImageError instead."""
     before, logger.disabled = logger.disabled, True
     try:
         yield
