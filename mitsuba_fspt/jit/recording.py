@@ -1,6 +1,6 @@
-"""Recording of kernels: a virtual call records one function of every existing plugin, also of unused scenes.
+"""Recording of kernels: a virtual call records the function of every existing plugin, those of other scenes included.
 
-So plugins must not be deleted during a recording, and unsound surfaces of other scenes must not fail in it.
+Plugins must therefore not be deleted during a recording, and invalid surfaces of other scenes must not raise in it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _checked = ContextVar("scene_is_checked", default=False)
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """Context manager for kernels of a checked scene: no garbage collection, unsound surfaces of other scenes are dark.
+    """Context manager for kernels of a checked scene: no garbage collection; invalid surfaces of other scenes are dark.
 
     If a plugin were deleted between two calls in one kernel, the calls would differ, and Dr.Jit would define one
     function twice and abort the process.
@@ -57,7 +57,7 @@ def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
 
 
 def dark_elsewhere(*kinds: str) -> Callable[[Callable], Callable]:
-    """Decorator of an emitter's method: zeros of the types `kinds` if the surface is unsound, in another scene."""
+    """Decorator of an emitter's method: for an invalid surface of another scene it returns zeros of types `kinds`."""
 
     def decorate(method: Callable) -> Callable:
         @wraps(method)
