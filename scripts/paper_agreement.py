@@ -133,7 +133,7 @@ def _draw(pictures: dict[str, Pictures], path: Path) -> None:
         _profiles(axes[2, k], images["binned"], images["tissue"])
         axes[1, k].set_title("lines: integral; points: path from J$_n$", fontsize="small", loc="right")
         axes[2, k].set_title("lines: integral; points: from the source on", fontsize="small", loc="right")
-        axes[2, k].set_xlabel("mm on the sharp plane")
+        axes[2, k].set_xlabel("mm on the virtual detector plane")
     axes[0, 1].set_ylabel(None)
     axes[0, 2].set_ylabel(None)
     axes[1, 0].set_ylabel("W/pixel of (1/9 mm)²")

@@ -98,7 +98,7 @@ def _draw(pictures: Pictures, path: Path) -> None:
         axes[3].plot(places(image), image.power[row] / image.power.max(), label=title.split(",")[0], **line)
     for each in axes[1:3]:
         each.set_ylabel(None)
-    axes[3].set(xlim=(-10, 20), xlabel="mm on the sharp plane", ylabel="power / brightest pixel")
+    axes[3].set(xlim=(-10, 20), xlabel="mm on the virtual detector plane", ylabel="power / brightest pixel")
     axes[3].set_title("row of the peak", fontsize="medium")
     axes[3].legend(fontsize="x-small", frameon=False, loc="upper left")
     save(drawn, path)

@@ -90,7 +90,7 @@ def _intensity(rows: list[tuple[float, ...]]) -> Table:
 
 def _distance(rows: list[tuple[float, ...]]) -> Table:
     side = PITCH / MAGNIFICATION
-    columns = {"f-number": "g", "distance at 5 % [pixels]": ".2f", "[mm on the sharp plane]": ".3f"}
+    columns = {"f-number": "g", "distance at 5 % [pixels]": ".2f", "[mm on the virtual detector plane]": ".3f"}
     columns |= {"distance at 50 % [pixels]": ".2f", "column of the peak": ".2f"}
     return Table("distance", columns, [(f, far, far * side, half, peak) for f, _, _, peak, far, half in rows])
 
@@ -133,7 +133,7 @@ def _draw_curves(rows: Array, path: Path) -> None:
         axes.set(ylabel=f"{name} power [W/pixel]")
     right.semilogx(f, far * side, "o-", label=f"border: {BORDER:.0%} of the peak")
     right.semilogx(f, half * side, "s--", label=f"border: {HALF:.0%} of the peak")
-    right.set(ylabel="peak to border [mm, sharp plane]")
+    right.set(ylabel="peak to border [mm, virtual detector plane]")
     for axes in (left, middle, right):
         axes.set_xticks(f, [f"{n:g}" for n in f])
         axes.minorticks_off()

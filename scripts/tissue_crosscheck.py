@@ -214,7 +214,7 @@ def draw(path: Path, pictures: Pictures) -> None:
             bottom.plot(x[seen], line[seen] / mean[seen], label=law)
         top.set_title(view)
         bottom.axhline(1, color="k", linewidth=0.6)
-        bottom.set(ylim=(0.7, 1.4), xlim=(-18, 18), xlabel="mm on the sharp plane")
+        bottom.set(ylim=(0.7, 1.4), xlim=(-18, 18), xlabel="mm on the virtual detector plane")
     axes[0, 0].set_ylabel("W per mm of the band")
     axes[1, 0].set_ylabel("law / Monte Carlo")
     axes[0, 1].legend(fontsize="small", loc="upper left")

@@ -145,7 +145,7 @@ class Grid:
         return most
 
     def box_sum(self, image: PixelArray, radius: int) -> PixelArray:
-        """Sum over the (2 radius + 1)² pixels around each one, fewer at the border. The radius does not affect the cost."""
+        """Sum over the (2 radius + 1)² pixels around each, fewer at the border, at a cost independent of the radius."""
         reach = dr.opaque(mi.Int, radius)
         rows = _sliding_sum(image, self.y * self._width, self.x, self._width, reach)
         number = mi.Int(self.number)

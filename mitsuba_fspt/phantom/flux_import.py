@@ -41,14 +41,12 @@ def import_flux(
     values : file or array with one value for each vertex, triangle, tetrahedron or boundary face. None: the values
         are in `mesh`.
     field : name of the array, property or column of the values; a column also by its number from 1
-    per : 'vertex' or 'face', the elements that carry the values; needed only if number and name of the values are
-        ambiguous
+    per : 'vertex' or 'face', the elements that carry the values; needed only if the values' number leaves it open
     format : 'auto' (by the file's name) or one of `formats.FORMATS`
     length_unit : 'mm', 'cm' or 'm', unit of the mesh **and** of its values: W per square of it. MMC's values are
         power per face, whatever the unit. None: m of a glTF file (.glb, .gltf) by its standard, else mm.
-    a : boundary factor A, if the values are fluence phi, so that J_n = phi/(2A): 'robin', 'haskell' (see
-        `optics.boundary`) or a number. None: the values are J_n; NIRFAST's are always fluence, for which None means
-        'robin', as in NIRFAST
+    a : boundary factor A if the values are fluence phi, J_n = phi/(2A): 'robin', 'haskell' (see `optics.boundary`) or
+        a number. None: the values are J_n; but NIRFAST's values are fluence, and None stands for 'robin' there
     n : refractive index of the tissue for A; None: that of the file, else 1.37
     clip : set negative values to 0 and record their power
     flip : reverse the orientation of all faces

@@ -48,8 +48,8 @@ class FsptSurface(mi.Emitter):
 
     - lambert (Eq. 1, the paper's): L = J_n/π [W/mm²/sr];
     - fresnel: L = J_n/(4π) · (2A + 3µ_i) · T(µ)/n², the diffusion approximation's radiance refracted at a smooth
-      border; µ_i = √(1 − (1 − µ²)/n²), T the unpolarised Fresnel transmittance, A of Haskell et al. (1994). At
-      n = 1.37 it is 1.11 × J_n/π face-on and falls to 0 at the limb;
+      boundary; µ_i = √(1 − (1 − µ²)/n²), T the unpolarised Fresnel transmittance, A of Haskell et al. (1994). At
+      n = 1.37 it is 1.11 × J_n/π along the normal and falls to 0 at the limb;
     - last_flight: L = C · T(µ)/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds. The light was scattered for the
       last time on the refracted line of sight ω_i. The law includes the slope of the fluence along the surface and its
       curvature above a shallow source, which the other laws neglect. C(r) makes ∫ L µ dΩ = J_n(r). 'fspt flux solve
@@ -73,8 +73,8 @@ class FsptSurface(mi.Emitter):
         self._source: exitance.ExitanceState | None = None  # data of J_n at the last `check`
         self.single_faces: tuple[mi.Float, ...] = ()  # buffers of the mesh for which no face was found twice
         self.brightest = 0.0  # largest J_n [W/mm²], set by `check`
-        # For caches: `mark` identifies this emitter, `edition` counts the changes of J_n. A cache that held the emitter
-        # itself, but not its shape, would leave Dr.Jit an emitter to record whose shape is deleted.
+        # For caches: `mark` identifies this emitter, `edition` counts the changes of J_n. A cache must not hold the
+        # emitter itself: Dr.Jit would record it even after its shape has been deleted.
         self.mark, self.edition = object(), 0
         self._shape: mi.ShapePtr | None = None
 
@@ -203,7 +203,7 @@ class FsptSurface(mi.Emitter):
     # ------------------------------------------------------------------ the surface itself
 
     def _own_shape(self) -> mi.Shape:
-        """Shape of the emitter; ExitanceError if it was deleted with its scene: Dr.Jit records every existing one."""
+        """Shape of the emitter; ExitanceError if it was deleted with its scene, while the emitter still exists."""
         if self._shape is None:
             self._shape = mi.ShapePtr(self.get_shape())
         if self._shape[0] is None:
@@ -213,7 +213,7 @@ class FsptSurface(mi.Emitter):
     def check(self) -> None:
         """Raise ExitanceError if J_n or the exit law does not fit the shape; repeated only after a change."""
         source = exitance.ExitanceState.of(self._own_shape(), self.exitance)
-        # Mitsuba does not notify an emitter of new values on its mesh, nor of objects that are updated separately.
+        # Mitsuba does not inform an emitter of new values on its mesh, or of objects that are updated separately.
         if self._source and (self._source.state() != source.state() or self.law.renewed()):
             self._forget_exitance()
         if self._source:
@@ -228,10 +228,10 @@ class FsptSurface(mi.Emitter):
         self._source = source
 
     def sound(self) -> bool:
-        """True if `check` succeeds; False if it fails during a recording for another scene, which must not fail."""
+        """True if `check` succeeds. During a recording for another scene, which must not raise: False if it fails."""
         if scene_is_checked() and (self._source or self._shape is None):
-            # Without an earlier check it belongs to another scene. If loading failed, its shape is deleted and must not
-            # be accessed.
+            # A surface that was never checked belongs to another scene. If the loading of that scene failed, the shape
+            # is deleted and must not be accessed.
             return self._source is not None
         try:
             self.check()
