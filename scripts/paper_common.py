@@ -1,6 +1,6 @@
-"""What the parts of scripts/paper.py share: the phantom before the camera, tables, figures.
+"""Code common to the parts of scripts/paper.py: the phantom in front of the camera, tables, figures.
 
-Units: mm, W; a picture holds W on each pixel per W of source.
+Units: mm, W; images hold W on each pixel per W of source.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 FOCAL, MAGNIFICATION, DISTANCE = 55.0, 0.5, 180.0  # mm, 1, mm from the lens to the phantom's axis
 FOCUS = FOCAL * (1 + 1 / MAGNIFICATION)  # mm, from the lens to the virtual detector plane: the phantom's front
-WHOLE_CONE = 0.999  # coverage from which on all of a pixel's lines of sight are said to meet the phantom
+WHOLE_CONE = 0.999  # least coverage of pixels all of whose lines of sight count as meeting the phantom
 SIZE, PITCH = 256, 0.108  # pixels a side, mm: the 2048² CCD of 13.5 µm, binned 8 × 8
 INDEX, MUA, MUSP = 1.37, 0.0138, 0.91  # of nylon_cylinder.toml: 1, 1/mm, 1/mm
 
@@ -93,7 +93,7 @@ def fill(path: Path, tables: Sequence[Table]) -> None:
 
 
 def solve(name: str, folder: Path, **finer: Any) -> Path:
-    """The phantom of scenes/NAME.toml, J_n solved for by finite elements, as a PLY file in a folder.
+    """PLY file, in a folder, of the phantom of scenes/NAME.toml with J_n by finite elements.
 
     `finer` replaces fields of the description, for example surface_edge [mm].
     """

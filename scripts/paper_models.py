@@ -1,4 +1,4 @@
-"""Part C of scripts/paper.py: with and without a diaphragm against a stand-in for the experiment (Table 2, Fig. 9)."""
+"""Part of scripts/paper.py: models with and without a diaphragm against a simulated experiment (Table 2, Fig. 9)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _pictures(fine: Path, coarse: Path, focus: float) -> Pictures:
 
 
 def expose(image: fspt.Image, source: float = SOURCE, seed: int = 5) -> tuple[fspt.Image, float]:
-    """What a cooled CCD reads of a picture [W per W of source], less the mean dark charge, as power [W/W] again.
+    """Image [W/W] that a cooled CCD records of an image [W per W of source], with the mean dark charge subtracted.
 
     `source` [W]. The second value is the brightest pixel's charge [e-].
     """

@@ -15,11 +15,11 @@ and its mirror images (columns *raw*: without); the ratios of powers are the sam
 over the outermost pixel that the phantom fills, left and right; each with the standard error of the Monte Carlo.
 Pictures have pixels of 1 mm. A profile is the power along a band 2 mm high about z_d = 0, 2 and 4 mm on the detector
 (the paper's Fig. 5), in steps of 1 mm across the CCD's 27 mm; its CF is Pearson's over those 27 values. `noise`: the
-CF that the standard errors leave of a law without fault.
+CF that an exact law would have, given the standard errors.
 
-*transport* is last_flight on a diffusion equation whose light falls off as transport's does. Diffusion's falls as
-exp(-k r), k = √(3 µa (µa + µs')), transport's with isotropic scattering by the root κ of
-µs'/κ · artanh(κ/(µa + µs')) = 1 (Case's asymptotic mode), and D = µa/κ² in place of 1/(3 (µa + µs')) mends that alone.
+*transport* is last_flight on a diffusion equation with the decay constant of transport. The fluence of diffusion falls
+as exp(-k r), k = √(3 µa (µa + µs')). In transport with isotropic scattering the decay constant is the root κ of
+µs'/κ · artanh(κ/(µa + µs')) = 1 (Case's asymptotic mode). D = µa/κ² in place of 1/(3 (µa + µs')) corrects it.
 
 Writes tissue_crosscheck.csv and .png into the folder `-o` and the tables into its emission.md.
 """
