@@ -97,9 +97,9 @@ def solve(name: str, folder: Path, **finer: Any) -> Path:
 
     `finer` replaces fields of the description, for example surface_edge [mm].
     """
-    told = replace(PhantomFile.read(SCENES / f"{name}.toml"), **finer)
+    description = replace(PhantomFile.read(SCENES / f"{name}.toml"), **finer)
     path = folder / f"{name}{'_fine' if finer else ''}.ply"
-    told.solve().phantom(told.surface_edge).write(path)
+    description.solve().phantom(description.surface_edge).write(path)
     return path
 
 

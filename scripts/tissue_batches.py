@@ -49,14 +49,14 @@ class Batches:
     def mean(self) -> fspt.Image:
         """Mean of all batches, weighted with their numbers of paths; error: the standard error."""
         shares = np.array([float(image.metadata["spp"]) for image in self._images])
-        told = self._images[0].metadata | {
+        metadata = self._images[0].metadata | {
             "spp": shares.sum(),
             "wall_time": sum(float(image.metadata["wall_time"]) for image in self._images),
         }
         shares /= shares.sum()
         power = np.tensordot(shares, [np.float64(image.power) for image in self._images], 1)
         squares = np.tensordot(shares**2, [np.float64(image.error) ** 2 for image in self._images], 1)
-        return fspt.Image(power, np.sqrt(squares), self._images[0].coverage, told)
+        return fspt.Image(power, np.sqrt(squares), self._images[0].coverage, metadata)
 
     def error(self) -> float:
         """Standard error of Σ P over Σ P; infinite before the first batch."""

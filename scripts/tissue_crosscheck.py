@@ -77,11 +77,11 @@ def decay(mua: float, musp: float) -> float:
     return (low + high) / 2
 
 
-def solve(told: PhantomFile, folder: Path) -> DiffusionSolution:
+def solve(description: PhantomFile, folder: Path) -> DiffusionSolution:
     """The phantom solved, and in a folder phantom.ply and fluence.vol of it."""
-    solution = told.solve()
-    solution.phantom(told.surface_edge).write(folder / "phantom.ply")
-    solution.volume(told.voxel).write(folder / "fluence.vol")
+    solution = description.solve()
+    solution.phantom(description.surface_edge).write(folder / "phantom.ply")
+    solution.volume(description.voxel).write(folder / "fluence.vol")
     return solution
 
 
@@ -240,17 +240,17 @@ def main() -> None:
             batches.add()
         pictures[view] = {"volpath": batches.mean()}
     exits = {}
-    told = PhantomFile.read(SCENES / "nylon_cylinder.toml")
-    source = replace(told.sources[0], shape=replace(told.sources[0].shape, centre=SOURCE))
-    told = replace(told, sources=(source,))
+    description = PhantomFile.read(SCENES / "nylon_cylinder.toml")
+    source = replace(description.sources[0], shape=replace(description.sources[0].shape, centre=SOURCE))
+    description = replace(description, sources=(source,))
     with tempfile.TemporaryDirectory() as folder:
-        for medium, laws in ((told.medium, LAWS[:-1]), (Transport(*astuple(told.medium)), LAWS[-1:])):
-            solution = solve(replace(told, medium=medium), Path(folder))
+        for medium, laws in ((description.medium, LAWS[:-1]), (Transport(*astuple(description.medium)), LAWS[-1:])):
+            solution = solve(replace(description, medium=medium), Path(folder))
             for law in laws:
                 exits[law] = solution.solved.exited
                 for view, images in pictures.items():
                     images[law] = calculated(Path(folder), law, view)
-    made = [*tables(pictures), decays(told.medium, exits)]
+    made = [*tables(pictures), decays(description.medium, exits)]
     for table in made:
         print(f"\n{table.markdown()}")
     write_csv(made, given.output / "tissue_crosscheck.csv")

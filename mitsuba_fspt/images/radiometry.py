@@ -45,9 +45,9 @@ class Converted:
         The metadata state quantity, unit and wavelength. Raises as `Image.write`.
         """
         planes = {self.quantity: self.values, "error": self.error, "coverage": image.coverage}
-        told: Metadata = {"quantity": self.quantity, "unit": self.unit}
-        told |= {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
-        write_planes(path, {name: p for name, p in planes.items() if p is not None}, image.metadata | told)
+        entries: Metadata = {"quantity": self.quantity, "unit": self.unit}
+        entries |= {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
+        write_planes(path, {name: p for name, p in planes.items() if p is not None}, image.metadata | entries)
 
 
 def require_unit(unit: str, wavelength_nm: float | None) -> None:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-BATCH = 1 << 22  # most lines of sight in one kernel, which bounds the memory for pictures of any size
+BATCH = 1 << 22  # most lines of sight in one kernel, which bounds the memory for images of any size
 
 
 def batches(index: mi.UInt32, lines_each: int = 1) -> list[mi.UInt32]:

@@ -72,7 +72,7 @@ def import_flux(
     with np.errstate(over="ignore"):  # require_single refuses inf
         exitance, provenance = _exitance(raw, found, scale, a, n)
     require_single(exitance)
-    provenance = {"source": source, **provenance, **_unit_told(found, unit, given=length_unit is not None)}
+    provenance = {"source": source, **provenance, **_unit_entries(found, unit, given=length_unit is not None)}
     exitance, negatives, removed = _without_negatives(found, exitance, clip)
     if not exitance.any():
         provenance["warning"] = " ".join([*([provenance["warning"]] if "warning" in provenance else []), DARK])
@@ -81,12 +81,12 @@ def import_flux(
     return phantom
 
 
-def _unit_told(found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
+def _unit_entries(found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
     """Entries of the provenance: the unit of the mesh if it is neither mm nor `given`, and a warning of odd size."""
-    told = {} if given or unit == "mm" else {"mesh_unit": f"{unit}, by the standard of its format; scaled to mm"}
+    entries = {} if given or unit == "mm" else {"mesh_unit": f"{unit}, by the standard of its format; scaled to mm"}
     diagonal = float(np.linalg.norm(np.ptp(found.vertices[found.faces].reshape(-1, 3), axis=0)))
     warning = unit_warning(diagonal, unit)
-    return told | ({"warning": warning} if warning else {})
+    return entries | ({"warning": warning} if warning else {})
 
 
 def _exitance(
@@ -134,7 +134,7 @@ def _require_outward(phantom: Phantom, flip: bool) -> None:
     shape = phantom.closure
     if shape.twisted:
         raise FluxError(
-            f"mesh: on {shape.twisted} edges the two faces show to opposite sides, each face must show "
+            f"mesh: on {shape.twisted} edges the two faces point to opposite sides, each face must point "
             "outward. Repair it, for example by trimesh.repair.fix_winding."
         )
     if shape.inside_out:

@@ -213,7 +213,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[tuple[Blocks, ...], str]:
         """Blocks of pixels between which the image may be interpolated; the reason if there are none."""
         if not quadrature.takes("smooth blocks"):
-            return (), "as was wanted"
+            return (), "as requested"
         if quadrature.domain != "pupil" or view.specular:
             return (), "only lines of sight from the pixel straight to the first surface are interpolated"
         if math.isfinite(view.lens.optics.seen_field):
@@ -288,7 +288,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if asked and kinds_of(scene, asked, self.quadrature) is None:
             self._refuse_specular(scene, sensor)
         solution = self.solve(scene, sensor)
-        self._tell_left_out(scene, sensor)
+        self._warn_of_light_left_out(scene, sensor)
         return mi.TensorXf(solution.power[..., None].astype(np.float32))
 
     def render_forward(
@@ -385,7 +385,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 ", which gradients do not follow. Leave them out, or render without gradients."
             )
 
-    def _tell_left_out(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+    def _warn_of_light_left_out(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
         """Log a warning about light that is left out; once, until shapes or lens change."""
         shapes = scene.shapes()
         state = ([shape_number(shape) for shape in shapes], [_pose(shape) for shape in shapes], _view(sensor))
@@ -465,7 +465,7 @@ class CachedValue:
 
 
 def _view(lens: mi.Sensor) -> tuple[object, ...]:
-    """All parameters of a lens and its film that a picture depends on."""
+    """All parameters of a lens and its film that an image depends on."""
     film = lens.film()
     sizes = (int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
     return (lens.optics, lens.pixel_pitch, lens.placement, *sizes)

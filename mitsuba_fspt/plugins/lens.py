@@ -184,7 +184,7 @@ class FsptLens(mi.Sensor):
     def virtual_point(self, position: mi.Point2f) -> mi.Point2f:
         """Point of the virtual detector plane [mm] conjugate to a film position [pixels from the top left corner].
 
-        Mitsuba's camera frame has +x to the left and +y up of the upright picture.
+        Mitsuba's camera frame has +x to the left and +y up in the upright image.
         """
         return mi.Point2f(self._middle - position) * self._pitch
 

@@ -207,7 +207,7 @@ class FsptSurface(mi.Emitter):
         if self._shape is None:
             self._shape = mi.ShapePtr(self.get_shape())
         if self._shape[0] is None:
-            raise ExitanceError("fspt_surface: its scene is gone. Keep the scene, not its emitter.")
+            raise ExitanceError("fspt_surface: its scene was deleted. Keep the scene as well as its emitter.")
         return self._shape[0]
 
     def check(self) -> None:

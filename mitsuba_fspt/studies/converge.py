@@ -28,7 +28,7 @@ from ..rendering.scene import loaded
 from ..runtime import backend
 from ..runtime.errors import FsptError, ImageError, SceneError
 from ..runtime.numbers import number, whole
-from .converge_methods import Method, Picture, methods, raw_rate
+from .converge_methods import Method, RunResult, methods, raw_rate
 from .convergence import Convergence, Measurement
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ..runtime.progress_bar import Progress
 
 BUDGET, ROUNDS = 2.0, 5
-REFERENCE_TIME = 15.0  # times the budget: run time of the reference picture
+REFERENCE_TIME = 15.0  # times the budget: run time of the reference image
 PATIENCE = 4.0  # times the budget: longest time of a method's coarsest setting
 BURST = 0.1  # s: least total time of a setting's repeated runs in one round
 WHOLE_CONE = 1 - 1e-4  # least coverage of a pixel whose lines of sight all meet the phantom; float32 sums are rounded
@@ -153,7 +153,7 @@ def _convergence(
     )
 
 
-# ---------------------------------------------------------------------- the reference picture
+# ---------------------------------------------------------------------- the reference image
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +203,7 @@ class Reference:
 def _reference(
     scene: mi.Scene, lens: mi.Sensor, path: str | os.PathLike[str] | None, budget: float, report: Progress
 ) -> Reference:
-    """The reference: the file's picture, or our own where no file is given."""
+    """The reference: that of the file, or the integral at a fine rtol if no file is given."""
     width, height = (int(n) for n in _film(scene, lens).crop_size())
     from_file = read_reference(path, (height, width)) if path is not None else None
     report("reference", 0.0)
@@ -223,7 +223,7 @@ def read_reference(path: str | os.PathLike[str], shape: tuple[int, int]) -> Refe
 
     Raises
     ------
-    ImageError : no such file, not such a file, no error in it, another size than `shape` (h, w), or a dark picture.
+    ImageError : no such file, not such a file, no error in it, another size than `shape` (h, w), or a dark image.
     """
     path = Path(path)
     if path.suffix == ".npz":
@@ -266,11 +266,11 @@ def own_reference(scene: mi.Scene, lens: mi.Sensor, seconds: float) -> Reference
 
     Raises
     ------
-    SceneError : the picture is dark.
+    SceneError : the image is dark.
     """
     fine, rtol = _finest(scene, lens, "pupil", seconds)
     if not fine.power.max() > 0:
-        raise SceneError("converge: the picture is dark, no error can be told relative to its peak. Turn the camera.")
+        raise SceneError("converge: the picture is dark, errors relative to its peak are undefined. Turn the camera.")
     name = f"fspt_integral, pupil form, rtol {rtol:g}"
     try:
         other, other_rtol = _finest(scene, lens, "surface", seconds)
@@ -311,16 +311,16 @@ class TimedSetting:
 
     cold : time of the first run [s]
     memory : peak of Dr.Jit's arrays [MiB]
-    picture : result of the last run
+    result : of the last run
     seconds : median run time of each round [s]
     errors : of each round, see `Reference.errors_of`
     """
 
     method: Method
-    run: Callable[[], Picture]
+    run: Callable[[], RunResult]
     cold: float
     memory: float
-    picture: Picture
+    result: RunResult
     seconds: list[float] = field(default_factory=list)
     errors: list[tuple[float, float, float]] = field(default_factory=list)
 
@@ -333,10 +333,10 @@ class TimedSetting:
             self.run()
         times: list[float] = []
         while sum(times) < BURST:
-            seconds, self.picture = _seconds(self.run)
+            seconds, self.result = _seconds(self.run)
             times.append(seconds)
         self.seconds.append(float(np.median(times)))
-        self.errors.append(reference.errors_of(self.picture.power, full))
+        self.errors.append(reference.errors_of(self.result.power, full))
 
     def row(self) -> Measurement:
         """The measurement. Its RMS error is a mean over the rounds, since that of Monte Carlo varies with the seed."""
@@ -344,10 +344,10 @@ class TimedSetting:
         return Measurement(
             method=self.method.name,
             knob=self.method.knob,
-            value=self.picture.knob,
+            value=self.result.knob,
             cold=self.cold,
             seconds=tuple(self.seconds),
-            rays=self.picture.rays,
+            rays=self.result.rays,
             rms=float(np.sqrt(square)),
             rms_full=float(np.sqrt(full)),
             largest=float(np.median([largest for *_, largest in self.errors])),
@@ -407,7 +407,7 @@ class Benchmark:
             self._delete_kernels()
             run = method.prepare(value)
             cold, _ = _seconds(run)
-            seconds, memory, picture = _with_memory(run)
+            seconds, memory, result = _with_memory(run)
             if seconds > self.budget:
                 seconds = min(seconds, _seconds(run)[0])  # a second run, in case the machine was slow for a moment
             if seconds > self.budget and (k > 0 or seconds > PATIENCE * self.budget):
@@ -415,7 +415,7 @@ class Benchmark:
                     raise SceneError(f"its coarsest setting takes {seconds:.3g} s")
                 from_here = f"{method.name}, {method.knob} {value:g} and finer"
                 return {from_here: f"{seconds:.3g} s a picture, more than the budget of {self.budget:g} s"}
-            self.settings.append(TimedSetting(method, run, cold, memory, picture))
+            self.settings.append(TimedSetting(method, run, cold, memory, result))
         return {}
 
     def _delete_kernels(self) -> None:
@@ -430,8 +430,8 @@ class Benchmark:
             path.unlink(missing_ok=True)
 
 
-def _with_memory(run: Callable[[], Picture]) -> tuple[float, float, Picture]:
-    """Run time [s], peak of Dr.Jit's arrays above what was allocated before the run [MiB], and the picture."""
+def _with_memory(run: Callable[[], RunResult]) -> tuple[float, float, RunResult]:
+    """Run time [s], peak of Dr.Jit's arrays above what was allocated before the run [MiB], and the result."""
     import drjit as dr
     import mitsuba as mi
 
@@ -440,8 +440,8 @@ def _with_memory(run: Callable[[], Picture]) -> tuple[float, float, Picture]:
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     before = dr.detail.malloc_watermark(device)
-    seconds, picture = _seconds(run)
-    return seconds, (dr.detail.malloc_watermark(device) - before) / MIB, picture
+    seconds, result = _seconds(run)
+    return seconds, (dr.detail.malloc_watermark(device) - before) / MIB, result
 
 
 def _seconds(run: Callable[[], Any]) -> tuple[float, Any]:

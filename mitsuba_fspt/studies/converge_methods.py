@@ -34,7 +34,7 @@ Plane = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Picture:
+class RunResult:
     """Result of a run: power, shape (h, w) [W]; number of rays; the knob's value, which may be rounded."""
 
     power: Plane
@@ -52,7 +52,7 @@ class Method:
     name: str
     knob: str
     values: tuple[float, ...]
-    prepare: Callable[[float], Callable[[], Picture]]
+    prepare: Callable[[float], Callable[[], RunResult]]
 
 
 def methods(scene: mi.Scene, lens: mi.Sensor, least_rtol: float = 0.0) -> tuple[list[Method], dict[str, str]]:
@@ -79,13 +79,13 @@ def integral(scene: mi.Scene, lens: mi.Sensor, domain: str, values: tuple[float,
     """
     import mitsuba as mi
 
-    def prepare(rtol: float) -> Callable[[], Picture]:
+    def prepare(rtol: float) -> Callable[[], RunResult]:
         accuracy = {"rtol": rtol} if rtol < 1 else {"rtol": 0.5, "max_nodes": 4}
         integrator = mi.load_dict({"type": "fspt_integral", "domain": domain, **accuracy})
 
-        def run() -> Picture:
+        def run() -> RunResult:
             solution = integrator.solve(scene, lens)
-            return Picture(solution.power, solution.rays, rtol)
+            return RunResult(solution.power, solution.rays, rtol)
 
         return run
 
@@ -116,10 +116,10 @@ def _point_sum(scene: mi.Scene, lens: mi.Sensor) -> Method:
     minima = (1, *itertools.takewhile(lambda n: n <= MOST_POINTS, (POINTS * 4**k for k in itertools.count())))
     counts = {direct_summation.points_of(scene, minimum): minimum for minimum in reversed(minima)}
 
-    def prepare(points: float) -> Callable[[], Picture]:
-        def run() -> Picture:
+    def prepare(points: float) -> Callable[[], RunResult]:
+        def run() -> RunResult:
             power, pairs = direct_summation.solve(scene, lens, counts[int(points)])
-            return Picture(power, pairs, points)
+            return RunResult(power, pairs, points)
 
         return run
 
@@ -166,7 +166,7 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
     )
 
 
-def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], Picture]]:
+def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], RunResult]]:
     """`prepare` for a number of samples per pixel, in as few passes as memory permits; every run has another seed."""
     from ..emission.face_probe import probe_beside
 
@@ -174,14 +174,14 @@ def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float
     integrator, seed = tracer(kind, scene, lens), itertools.count(1)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
 
-    def prepare(spp: float) -> Callable[[], Picture]:
+    def prepare(spp: float) -> Callable[[], RunResult]:
         count = math.ceil(spp * pixels / PASS_SAMPLES)
 
-        def run() -> Picture:
+        def run() -> RunResult:
             total, samples = np.zeros(()), 0
             for power, taken in passes(scene, lens, integrator, itertools.islice(seed, count), math.ceil(spp / count)):
                 total, samples = total + power, samples + taken
-            return Picture(total / count, samples * pixels, samples)
+            return RunResult(total / count, samples * pixels, samples)
 
         return run
 

@@ -65,7 +65,7 @@ class Convergence:
     Attributes
     ----------
     scene : its name and parameters; machine : the machine and the variant; shape : (h, w)
-    reference, check : names of the reference picture and of the picture that it was checked against, with the result
+    reference, check : names of the reference image and of the image that it was checked against, with the result
     stated, stated_largest : RMS and largest error that the reference states of itself, relative to its brightest pixel
     full : number of pixels all of whose lines of sight meet the phantom
     raw_rate : rays per second of Embree or OptiX alone, on pixels that can see a glowing surface; traced in packets or

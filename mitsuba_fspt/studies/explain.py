@@ -142,7 +142,7 @@ def _never_done(scene: mi.Scene, variant: str) -> list[Explanation]:
     uniform = [is_surface(emitter) and emitter.is_uniform() for emitter in scene.emitters()]
     return [
         Explanation("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),
-        Explanation("gradients", True, "a picture asks for none"),
+        Explanation("gradients", True, "an image needs none"),
         Explanation("optional packages", not loaded, f"imported: {', '.join(loaded) or 'none'}"),
         Explanation("further variants", True, f"{variant} alone is set"),
     ]

@@ -1,7 +1,7 @@
 """Eq. 9 in float64 NumPy by brute force: the reference for the plugins, in tests and in figures of scripts/.
 
 It shares no code with the plugins. Camera frame: lens plane z = 0, +z towards the object, +x to the left of the
-picture, +y up; virtual detector plane z = u. Lengths in mm, exitance J_n in W/mm², results in W on each
+image, +y up; virtual detector plane z = u. Lengths in mm, exitance J_n in W/mm², results in W on each
 pixel, shape (height, width), row 0 at the top. `reference_mesh` has the same integral over triangle meshes.
 """
 

@@ -50,7 +50,7 @@ from .stiff_scenes import (
 # Reference that an image is compared with. A cone is filled if all lines of sight of the pixel meet the surface.
 CONE = "filled cone: A_vd times the configuration factor"
 BALANCE = "power balance: what the disk sends through the pupil"
-SAME = "the same picture"
+SAME = "the same image"
 OTHER = "the other domain"
 REFUSAL = "a refusal"
 # Tolerances: of an image with edges, and of two images, each of which may be wrong by the default rtol of 1e-3.
@@ -149,7 +149,7 @@ def exitance_cases() -> list[Case]:
     dim = disk(FOCUS, 60, exitance=1e-26)
     return [
         *rows,
-        Case("J_n of 9 decades in one picture", CONE, two_level_error, EXACT),
+        Case("J_n of 9 decades in one image", CONE, two_level_error, EXACT),
         Case("J_n 0 on half of the mesh, edge on pixel edges", CONE, partial(half_dark_error, 0.0), SHARP),
         Case("J_n 0 on half of the mesh, edge inside pixels", CONE, partial(half_dark_error, 0.3), SHARP),
         Case("1e-36 W and less on a pixel", REFUSAL, lambda: cone_error(dim, f_number=1e6), None),

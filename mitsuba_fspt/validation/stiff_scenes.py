@@ -200,7 +200,7 @@ def moved(distance: float = 0.0, angle: float = 0.0, axis: str = "1, 2, 3") -> C
     return pose
 
 
-# ---------------------------------------------------------------------- pictures and closed forms
+# ---------------------------------------------------------------------- images and closed forms
 
 
 def power(of: mi.Scene, **accuracy: Any) -> Plane:
@@ -270,7 +270,7 @@ def pixel_error(picture: Plane, truth: Plane) -> float:
 def cone_error(
     *objects: SceneObject, nodes: int = 4, film: tuple[int, int] | None = None, share: float = 1.0, **lens: float
 ) -> float:
-    """Pixel error of a picture in which 1 W/mm² fills every cone, against `share` times the closed form."""
+    """Pixel error of an image in which 1 W/mm² fills every cone, against `share` times the closed form."""
     focal, stop = lens.get("focal_length", FOCAL), lens.get("f_number", F_NUMBER)
     t = lens.get("magnification") or focal / (lens.get("focus_distance", FOCUS) - focal)
     side, focus = lens.get("pixel_pitch", PITCH) / t, focal * (1 + 1 / t)
@@ -287,7 +287,7 @@ def balance_error(z: float, radius: float, domain: str = "pupil", rtol: float = 
 def invariance_error(
     *objects: Callable[[], SceneObject], factor: float = 1.0, pose: Any = None, **changed: Any
 ) -> float:
-    """Peak error between the standard picture and that of a changed scene, whose power is `factor` times as large."""
+    """Peak error between the standard image and that of a changed scene, whose power is `factor` times as large."""
     of = scene(*(make() for make in objects), at=pose() if pose else None, **changed)
     return peak_error(power(of) / factor, standard_picture(*objects))
 
@@ -403,7 +403,7 @@ def small_film_error(width: int, height: int) -> float:
 
 
 def crop_error(crop: tuple[int, int, int, int]) -> float:
-    """Peak error between a crop window (x, y, width, height) and the same pixels of the whole picture."""
+    """Peak error between a crop window (x, y, width, height) and the same pixels of the whole image."""
     x, y, width, height = crop
     whole, part = standard_picture(ball), power(scene(ball(), crop=crop))
     return float(np.abs(part - whole[y : y + height, x : x + width]).max() / whole.max())

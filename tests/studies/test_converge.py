@@ -62,7 +62,7 @@ def test_what_takes_longer_than_the_budget_is_left_out_and_says_so():
     def prepare(value):
         def run():
             time.sleep(0.05 * value)
-            return converge_methods.Picture(np.ones((1, 1)), 1, value)
+            return converge_methods.RunResult(np.ones((1, 1)), 1, value)
 
         return run
 
@@ -71,7 +71,7 @@ def test_what_takes_longer_than_the_budget_is_left_out_and_says_so():
     (left_out,) = (told := benchmark.try_values(slow))
     assert left_out == "slow, n 6 and finer"
     assert "more than the budget of 0.2 s" in told[left_out]
-    assert [setting.picture.knob for setting in benchmark.settings] == [1.0, 2.0]
+    assert [setting.result.knob for setting in benchmark.settings] == [1.0, 2.0]
     assert converge.Benchmark(None, None, None, budget=10.0).try_values(slow) == {}
 
 
