@@ -37,7 +37,7 @@ def recording() -> Iterator[None]:
             gc.enable()
 
 
-def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
+def evaluated_outside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
     """Result of `build(shape)`, evaluated at once even while this thread records a kernel; without gradients.
 
     Light tracers first call the emitter in the middle of a recording, when its thread cannot evaluate arrays. Dr.Jit
@@ -50,13 +50,13 @@ def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
 
     with ThreadPoolExecutor(1) as pool:
         built = pool.submit(run).result()
-    # A new scope puts later operations of this thread after those that the other left unevaluated: on CUDA the handle
-    # of a scene.
+    # On CUDA the other thread leaves the handle of a scene unevaluated. In a new scope the operations of this thread
+    # follow that evaluation.
     dr.detail.new_scope(dr.backend_v(mi.Float))
     return built
 
 
-def dark_elsewhere(*kinds: str) -> Callable[[Callable], Callable]:
+def zero_if_invalid(*kinds: str) -> Callable[[Callable], Callable]:
     """Decorator of an emitter's method: for an invalid surface of another scene it returns zeros of types `kinds`."""
 
     def decorate(method: Callable) -> Callable:

@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..emission.asked_gradients import shining_with_gradients
 from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
+from ..emission.gradients import emitters_with_gradients
 from ..integral import interpolated, pupil_form, surface_form
 from ..integral.eq9 import View
 from ..integral.exitance_rows import Rows, kinds_of, sizes_of
@@ -284,7 +284,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
         with dr.resume_grad():
-            asked = shining_with_gradients(scene, sensor)
+            asked = emitters_with_gradients(scene, sensor)
         if asked and kinds_of(scene, asked, self.quadrature) is None:
             self._refuse_specular(scene, sensor)
         solution = self.solve(scene, sensor)
@@ -331,7 +331,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
         with dr.resume_grad():
-            emitters = shining_with_gradients(scene, sensor)
+            emitters = emitters_with_gradients(scene, sensor)
         with dr.suspend_grad():
             kinds = kinds_of(scene, emitters, self.quadrature)
             if kinds is None:

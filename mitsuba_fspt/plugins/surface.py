@@ -12,7 +12,7 @@ from ..emission import exitance
 from ..emission.elements import ElementDistribution, elements_of
 from ..emission.face_probe import Probe
 from ..emission.laws import law_of
-from ..jit.recording import aside, dark_elsewhere, scene_is_checked
+from ..jit.recording import evaluated_outside, scene_is_checked, zero_if_invalid
 from ..jit.spectra import sample_wavelengths
 from ..runtime.errors import ExitanceError
 
@@ -123,7 +123,7 @@ class FsptSurface(mi.Emitter):
 
     # ------------------------------------------------------------------ sampling
 
-    @dark_elsewhere("PositionSample3f", "Float")
+    @zero_if_invalid("PositionSample3f", "Float")
     def sample_position(
         self, time: mi.Float, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.PositionSample3f, mi.Float]:
@@ -133,12 +133,12 @@ class FsptSurface(mi.Emitter):
         ps.n, ps.time, ps.pdf, ps.delta = si.n, time, pdf, False
         return ps, _rcp(pdf)
 
-    @dark_elsewhere("Float")
+    @zero_if_invalid("Float")
     def pdf_position(self, ps: mi.PositionSample3f, active: mi.Bool = True) -> mi.Float:
         """Density of `sample_position` [1/mm²]."""
         return self._distribution().pdf(self._surface_at(ps, active), active)
 
-    @dark_elsewhere("Ray3f", "Spectrum")
+    @zero_if_invalid("Ray3f", "Spectrum")
     def sample_ray(
         self,
         time: mi.Float,
@@ -156,7 +156,7 @@ class FsptSurface(mi.Emitter):
         power = self._radiance(si, direction, active) * (dr.pi * _rcp(pdf))
         return ray, mi.depolarizer(power * weight)
 
-    @dark_elsewhere("DirectionSample3f", "Spectrum")
+    @zero_if_invalid("DirectionSample3f", "Spectrum")
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
@@ -172,20 +172,20 @@ class FsptSurface(mi.Emitter):
         si.wavelengths = it.wavelengths
         return ds, mi.depolarizer(self._radiance(si, -ds.d, active) * _rcp(ds.pdf))
 
-    @dark_elsewhere("Float")
+    @zero_if_invalid("Float")
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         """Density of `sample_direction` [1/sr]."""
         pdf = self._distribution().pdf(self._surface_at(ds, active), active)
         return dr.select(active, _solid_angle(pdf, ds), 0)
 
-    @dark_elsewhere("Spectrum")
+    @zero_if_invalid("Spectrum")
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
         """Radiance [W/mm²/sr] that arrives at `it` from the surface point of `ds`."""
         si = self._surface_at(ds, active)
         si.wavelengths = it.wavelengths
         return mi.depolarizer(self._radiance(si, -ds.d, active))
 
-    @dark_elsewhere("Wavelength", "Spectrum")
+    @zero_if_invalid("Wavelength", "Spectrum")
     def sample_wavelengths(
         self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
     ) -> tuple[mi.Wavelength, mi.Spectrum]:
@@ -224,7 +224,7 @@ class FsptSurface(mi.Emitter):
             self.law.prepare(shape)
             return brightest
 
-        self.brightest = aside(checked, self._own_shape())
+        self.brightest = evaluated_outside(checked, self._own_shape())
         self._source = source
 
     def sound(self) -> bool:
@@ -265,7 +265,7 @@ class FsptSurface(mi.Emitter):
         """Distribution of positions ∝ J_n, built on first use."""
         self.check()
         if self._positions is None:
-            self._positions = aside(
+            self._positions = evaluated_outside(
                 lambda shape: ElementDistribution(elements_of(shape), exitance.function_on(shape, self.exitance)),
                 self._own_shape(),
             )
@@ -277,7 +277,7 @@ class FsptSurface(mi.Emitter):
         if not shape.is_mesh():
             return self._distribution().elements.at(ps.uv)
         if self._probe is None:
-            self._probe = aside(Probe, shape)
+            self._probe = evaluated_outside(Probe, shape)
         return self._probe.at(shape, ps, active)
 
     def trace_beside(self, scene: mi.Scene) -> None:

@@ -96,7 +96,7 @@ class Loaded:
         """True as long as no file of data has changed."""
         return self.files == {file: _stamp(file) for file in self.files}
 
-    def taken(self, change: Change, exact: bool) -> Change | None:
+    def with_shapes_moved(self, change: Change, exact: bool) -> Change | None:
         """Move the shapes as `change` requires; return the remaining change of the lens, None if that is impossible.
 
         exact : the image must be the same to the bit, which it is only if no shape moves
@@ -224,7 +224,7 @@ class LiveScene:
         nodes = parsed(self.source, **wanted)
         now = self._loaded if self._loaded and self._loaded.is_current() else None
         change = _change(now.nodes, nodes, self.sensor) if now else None
-        change = now.taken(change, exact) if now and change else None
+        change = now.with_shapes_moved(change, exact) if now and change else None
         if now is None or change is None:
             self._loaded = now = None  # memory for one scene, not two
             self._loaded = now = self._load(wanted, nodes)

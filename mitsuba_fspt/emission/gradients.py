@@ -18,7 +18,7 @@ from ..runtime.plugin_types import is_surface
 from .exitance import attribute_name
 
 
-def shining_with_gradients(scene: mi.Scene, sensor: mi.Sensor) -> list[mi.Emitter]:
+def emitters_with_gradients(scene: mi.Scene, sensor: mi.Sensor) -> list[mi.Emitter]:
     """Emitters of a scene whose J_n depends on numbers with gradients. Must be called while gradients are enabled.
 
     Raises
