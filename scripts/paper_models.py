@@ -13,7 +13,7 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.images.detector import PLANCK_TIMES_LIGHT
 
 LENSES = (FOCAL / 2.8, FOCAL / 2)  # mm: the least border that a 55 mm f/2.8 lens can have, and a larger one
-PRINTED = ("printed (Table 2), not told", None, None, 0.0421, 0.8685, 0.0110, 0.9153)
+PRINTED = ("printed (Table 2), not stated", None, None, 0.0421, 0.8685, 0.0110, 0.9153)
 VIEW = 90.0  # left, degrees
 SOURCE, TIME, WAVELENGTH = 1e-8, 20.0, 650.0  # W, s, nm
 SIZE, PITCH = 128, 0.216  # pixels a side, mm: 2048² pixels of 13.5 µm, binned 16 × 16
