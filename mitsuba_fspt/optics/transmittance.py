@@ -129,5 +129,5 @@ def transmittance_of(numbers: Mapping[str, float], curve: Curve | None) -> float
 
 
 def t_stop(f_number: float, transmittance: float) -> float:
-    """T-stop N/√τ: f-number of a lens without losses that is as bright."""
+    """T-stop N/√τ: f-number of the lens without losses that gives the same power."""
     return f_number / math.sqrt(transmittance)
