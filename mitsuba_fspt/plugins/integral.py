@@ -68,8 +68,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
          per pixel, at least 256 and at most 65536.
      * - max_specular
        - |int|
-       - Largest number of specular surfaces (null, thin and solid glass, mirrors, masks) that a line of sight passes or
-         leaves (Default: 8). The light that is cut off there is contained in the error.
+       - Largest number of specular surfaces (null, thin and solid glass, mirrors, masks) that a line of sight passes
+         through or is reflected by (Default: 8). The light that is cut off there is contained in the error.
      * - shortcuts
        - |bool|
        - Omit computations that the scene does not need (Default: true). false gives the same power, within the
