@@ -1,16 +1,15 @@
 """Errors of the integral on random scenes, against an independent float64 reference.
 
     python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
-    python scripts/audit.py --ablate all|doubt,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
+    python scripts/audit.py --ablate all|kink,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
 
 Scenes of every family of `validation/random_scenes.py` are rendered by `fspt_integral`. `fan_reference` computes the
 power, with an error of its own, on 24 pixels of each: 16 where errors are likely (large stated errors, edges, strong
 curvature of the image) and 8 random ones. A pixel counts as beyond a limit only if it exceeds the limit by more than
 the reference's error. Writes audit.csv, one row per scene, and prints the table by family.
 
-With `--ablate` the same pixels are computed with one threshold of `integral/estimator.py` removed at a time. The result
-is the number of pixels beyond `rtol` and beyond the stated error, and the number of lines of sight. Writes
-ablation.csv.
+With `--ablate` the same pixels are evaluated without each threshold of `integral/estimator.py` in turn: how many are
+beyond `rtol` and beyond the stated error, and what it costs. Writes ablation.csv.
 """
 
 from __future__ import annotations

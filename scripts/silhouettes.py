@@ -2,14 +2,13 @@
 
     python scripts/silhouettes.py [--f-number 2.8] [--pixels 100] [--out docs]
 
-The scene is that of scenes/two_spheres.xml: two glowing spheres, the near one in front of the far one. The pixels are
-those of which some of the four nodes meet a sphere and some do not. On them the script computes four and twelve nodes,
-increasing numbers of transects (the same number on every pixel, with the resolution along each that rtol 1e-5 asks
-for), and lattices of increasing size. The reference is the float64 one of `validation`, which finds the edges exactly
-and shares no code with the integral, on random pixels of each kind; its own error, the RMS of 4.1 standard errors, is
-printed above each table. Errors are relative to the brightest pixel. The order p of error ∝ (lines of sight)^-p is
-fitted from twelve nodes to 24 transects, beyond which rounding is visible. Writes silhouettes.csv and prints the
-tables.
+Two glowing spheres, the near one before the far one, as in scenes/two_spheres.xml. On the pixels whose four nodes a
+silhouette parts: four and twelve nodes, ever more transects, as many on every pixel and each looked into as for rtol
+1e-5, and lattices of ever more points. The truth is the float64 reference of `validation`, which finds the edges
+exactly and shares no code with the integral, on so many random pixels of each kind; its own error, the RMS of 4.1
+standard errors, stands above each table. Errors are relative to the brightest pixel; the order p of error ∝ lines of
+sight^-p is fitted from twelve nodes to 24 transects, beyond which rounding is visible. Writes silhouettes.csv and
+prints the tables.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 RTOL = 1e-5
 GOAL = 3e-7  # error of the reference over the brightest pixel
 LATTICES = (1 << 10, 1 << 12, 1 << 14)
-SHARES = {"RMS": None, "median": 0.5, "90 %": 0.9, "99 %": 0.99}  # quantiles of the error over the pixels
+SHARES = {"RMS": None, "median": 0.5, "90 %": 0.9, "99 %": 0.99}  # of the pixels that are no worse
 FITTED = ("12 nodes", "2 transects", "8 transects", "24 transects")
 # Frame of the camera, which looks along +z: centre [mm], radius [mm], J_n [W/mm²].
 SPHERES = {"far": ((0.0, 0.0, 175.0), 10.0, 1e-3), "near": ((-7.0, 4.0, 130.0), 5.0, 3e-3)}
@@ -84,7 +83,7 @@ def main() -> None:
 
 
 def draft_of(names: list[str], f_number: float) -> Draft:
-    """Draft of the image of these spheres, with four nodes on each pixel."""
+    """Draft of the picture of these spheres, with its first four nodes."""
     import mitsuba as mi
 
     from mitsuba_fspt.integral.draft import Draft
@@ -108,7 +107,7 @@ def draft_of(names: list[str], f_number: float) -> Draft:
 
 
 def parted_pixels(draft: Draft) -> np.ndarray:
-    """True, for each pixel of the film row by row, where some of the first nodes meet a sphere and some do not."""
+    """True, one a pixel of the film row by row, where an edge parts the first nodes."""
     from mitsuba_fspt.jit.pixel_grid import parted
 
     return on_film(draft, parted(draft.coverage)) > 0
@@ -159,7 +158,7 @@ def rules(draft: Draft, chosen: np.ndarray) -> list[Rule]:
         along = node_rules.along_transect(level, RTOL)
         means = apply_transects(draft, where, edges, node_rules.transects(count), along)
         note(f"{count} transects", means.value, since)
-        if level == 0:  # the blur of the edges is known from the first transects
+        if level == 0:  # the edges that were met say how blurred they are
             edges.learn(draft, means, where)
     means, since, last = Means.none(draft.grid.pixels(where)), draft.rays, 0
     for points in LATTICES:  # each with the points of the one before
