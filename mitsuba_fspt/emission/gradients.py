@@ -57,8 +57,8 @@ def _refuse_others(scene: mi.Scene, parameters: mi.SceneParameters) -> None:
         on_mesh = isinstance(node, mi.Shape) and (node.id(), last) in attributes
         if not (on_mesh or (_below_surface(parameters, node) and _differentiable(parameters, key))):
             raise SceneError(
-                f"fspt_integral: parameter '{key}' has gradients enabled, but only the numbers behind 'exitance' "
-                f"have a derivative. Call dr.disable_grad(params['{key}']), or use fspt.derivatives."
+                f"fspt_integral: parameter '{key}' has gradients enabled, but the image is differentiable with "
+                f"respect to 'exitance' alone. Call dr.disable_grad(params['{key}']), or use fspt.derivatives."
             )
 
 
