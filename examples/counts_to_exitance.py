@@ -1,10 +1,10 @@
-"""From the counts of four views to J_n with intervals, and back to the pictures.
+"""From the counts of four views to J_n with intervals, and back to the images.
 
     python examples/counts_to_exitance.py [FOLDER]
 
-A glowing sphere stands for the phantom. Its pictures are exposed, which gives counts as a camera would; all that
-follows takes real counts as well. Prints the total power with its 90 % interval, and how well the pictures that are
-rendered from the result agree with the first ones.
+The phantom is a glowing sphere. Its images are exposed by a simulated detector, which gives counts; the further steps
+are the same for counts of a real camera. Prints the total power with its 90 % interval, and the agreement between an
+image that is rendered from the result and the original one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ EXPOSURE = {"exposure_time": 60.0, "wavelength_nm": 660.0}  # s, nm
 
 
 def write_phantom(folder: Path) -> fspt.Phantom:
-    """A sphere of 8 mm radius that is brightest in front, 1e-13 W/mm², as phantom.ply."""
+    """Write phantom.ply, a sphere of radius 8 mm with its largest J_n, 1e-13 W/mm², in front; returns the phantom."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=8)
     distance = np.linalg.norm(sphere.vertices - [5, 0, 1], axis=1)
     phantom = fspt.Phantom(sphere.vertices, sphere.faces, 1e-13 * np.exp(-distance / 4), "vertex")
@@ -32,27 +32,27 @@ def write_phantom(folder: Path) -> fspt.Phantom:
 
 
 def main(folder: Path) -> dict[str, float]:
-    """The whole way; returns what it prints."""
+    """Run all steps; returns the printed numbers by name: powers in W, `cf` and `chi2` without unit."""
     folder.mkdir(exist_ok=True)
     phantom = write_phantom(folder)
     scene = folder / "phantom.xml"
     scene.write_text(fspt.scene_xml(folder / "phantom.ply", **CAMERA))
 
-    # 1. Counts of four views. Here they are simulated; a camera's come as TIFF or FITS files.
+    # 1. Counts of four views. Here they are simulated; those of a camera are read from TIFF or FITS files.
     detector = fspt.Detector.typical_ccd()
     pictures = [fspt.render(fspt.load(scene, view=view), rtol=1e-4) for view in VIEWS]
     counts = [detector.expose(p, **EXPOSURE, seed=k).counts for k, p in enumerate(pictures)]
 
-    # 2. Counts to power on the pixels, W, with the error of each.
+    # 2. From counts to the power on the pixels [W], with its error.
     images = [detector.reduce(c, **EXPOSURE, pixel_pitch=CAMERA["pixel_pitch"]) for c in counts]
 
-    # 3. The matrix from J_n on the mesh to all pixels; J_n from the images.
+    # 3. The matrix from J_n on the mesh to the power on all pixels; then J_n from the images.
     matrix = fspt.transport(scene, view=VIEWS, rtol=1e-3)
     found = fspt.invert(matrix, images, samples=200, seed=1)
     found.write(folder / "found.ply")
     low, high = found.total_interval
 
-    # 4. The same pictures, rendered from the result.
+    # 4. An image rendered from the result, compared with the original one.
     again = folder / "found.xml"
     again.write_text(scene.read_text().replace("phantom.ply", "found.ply"))
     rendered = fspt.render(fspt.load(again, view=0), rtol=1e-4)

@@ -1,4 +1,4 @@
-"""J_n of the nylon cylinder from four pictures: a TransportMatrix is an operator for PyLops, `pip install pylops`."""
+"""J_n of the nylon cylinder from four images, with a TransportMatrix as an operator of PyLops: `pip install pylops`."""
 
 import numpy as np
 import pylops

@@ -1,4 +1,4 @@
-"""J_n of a textured sphere as a bitmap, from one picture: gradients of plain `mi.render` in an optimisation loop."""
+"""J_n of a textured sphere as a bitmap, from one image, by gradients of plain `mi.render` in an optimisation loop."""
 
 import sys
 

@@ -1,14 +1,14 @@
 """Errors of the integral on random scenes, against an independent float64 reference.
 
     python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
-    python scripts/audit.py --ablate all|doubt,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
+    python scripts/audit.py --ablate all|kink,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
 
-Scenes of every family of `validation/random_scenes.py`, each rendered by `fspt_integral`. On 24 pixels of each,
-`fan_reference` gives the power with its own error: 16 where errors are likely (large stated errors, edges, curved
-pictures) and 8 at random. A pixel counts as beyond a limit only by more than the reference's error. Writes audit.csv,
-one line a scene, and prints the table by family.
+Scenes of every family of `validation/random_scenes.py` are rendered by `fspt_integral`. `fan_reference` computes the
+power, with an error of its own, on 24 pixels of each: 16 where errors are likely (large stated errors, edges, strong
+curvature of the image) and 8 random ones. A pixel counts as beyond a limit only if it exceeds the limit by more than
+the reference's error. Writes audit.csv, one row per scene, and prints the table by family.
 
-With `--ablate` the same pixels are looked at without each threshold of `integral/estimator.py` in turn: how many are
+With `--ablate` the same pixels are evaluated without each threshold of `integral/estimator.py` in turn: how many are
 beyond `rtol` and beyond the stated error, and what it costs. Writes ablation.csv.
 """
 
@@ -35,7 +35,7 @@ LIKELY, RANDOM = 16, 8  # pixels of each scene
 SLOW = 2.0  # s: rendered once more, as kernels may have been compiled
 GOAL, LEAST_GOAL = 0.15, 1e-5  # error of the reference: over the stated error, and over the brightest pixel
 LEAST_TRUE = 1e-7  # of the brightest pixel: smaller errors are rounding
-WIDE = 0.1  # of rtol: stated errors from which on their width counts
+WIDE = 0.1  # of rtol: least stated error of pixels for which stated over true error is evaluated
 HEAD = (
     "scenes",
     "beyond rtol, likely",
@@ -51,14 +51,16 @@ HEAD = (
 
 @dataclass(frozen=True)
 class Audit:
-    """One scene. Shares of pixels are counts here; powers over the brightest pixel.
+    """Result for one scene: numbers of pixels, and errors relative to the brightest pixel.
 
-    beyond_likely, beyond_random, beyond_5 : checked pixels beyond rtol, and beyond 5 rtol
-    beyond_error, silent : beyond the stated error; of these beyond rtol where less than rtol was stated
-    largest : difference to the reference
-    width : median of stated over true error where more than rtol/10 is stated, nan without any
-    stated : pixels of the whole picture that state more than rtol
+    likely, random : checked pixels where errors are likely, and random ones
+    beyond_likely, beyond_random, beyond_5 : checked pixels of either kind beyond rtol; of both beyond 5 rtol
+    beyond_error, silent : checked pixels beyond the stated error; of these those beyond rtol with less than rtol stated
+    largest : largest difference to the reference
+    width : median of stated over true error where more than rtol/10 is stated; NaN if there is no such pixel
+    stated : pixels of the whole image with a stated error above rtol
     reference : largest error of the reference
+    seconds : run time of the rendering
     """
 
     family: str
@@ -155,7 +157,7 @@ def audited(family: str, seed: int, rtol: float, likely: int = LIKELY, random: i
 
 
 def _rendered(made: RandomScene, rtol: float) -> tuple[fspt.Image, float]:
-    """The image of a scene, and the seconds that it took with compiled kernels."""
+    """Image of a scene, and its run time [s] with compiled kernels."""
     scene, seconds = made.scene(), np.inf
     for _ in range(2):
         began = time.perf_counter()
@@ -169,7 +171,7 @@ def _rendered(made: RandomScene, rtol: float) -> tuple[fspt.Image, float]:
 def _compared(
     made: RandomScene, image: fspt.Image, rtol: float, likely: int, random: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """On chosen pixels stated error, difference and error of the reference, over the brightest pixel, each (n,)."""
+    """Stated error, difference and error of the reference on checked pixels, over the brightest pixel, each (n,)."""
     peak = image.power.max() or 1.0
     picked = _picked(image, likely, random)
     stated = image.error.ravel()[picked] / peak
@@ -184,14 +186,14 @@ def _picked(image: fspt.Image, likely: int, random: int) -> np.ndarray:
 
 
 def _reference(made: RandomScene, picked: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Power of pixels of such numbers [W] and its error."""
+    """Reference power of the pixels with these numbers [W], and its error."""
     left, top, width, _ = made.crop
     row, column = np.divmod(picked, width)
     return made.reference.power(np.stack([row + top, column + left], axis=1), goal)
 
 
 def _likely(image: fspt.Image, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Numbers of pixels where errors are likely: half state the largest errors, half are random ones of edges."""
+    """Numbers of pixels where errors are likely: half with the largest stated errors, half random ones at edges."""
     power = image.power
     bend = sum(np.abs(np.gradient(np.gradient(power, axis=k), axis=k)) for k in (0, 1) if power.shape[k] > 2)
     edges = (bend > 0.02 * power.max()) | ((image.coverage > 0) & (image.coverage < 1))
@@ -204,11 +206,12 @@ def _likely(image: fspt.Image, count: int, generator: np.random.Generator) -> np
 
 @dataclass(frozen=True)
 class Ablation:
-    """What becomes of a number of scenes without one threshold; `without` nothing first.
+    """Result for a number of scenes with the threshold `without` removed; '' removes none.
 
-    checked : pixels; of them beyond rtol, beyond the stated error, and beyond both where less than rtol was stated
-    scenes, pixels : of the scenes and of all their pixels those that state more than rtol
-    lines : of sight, in all [million]
+    checked : number of checked pixels
+    beyond, beyond_error, silent : of these beyond rtol; beyond the stated error; beyond both with less than rtol stated
+    scenes, pixels : number of scenes and of all pixels with a stated error above rtol
+    lines : number of lines of sight [million]
     """
 
     without: str
@@ -222,7 +225,7 @@ class Ablation:
 
 
 def ablate(scenes: Sequence[tuple[str, int]], names: Sequence[str], rtol: float, out: Path) -> None:
-    """The pixels of scenes, given by family and seed, without each of these thresholds."""
+    """Compute the pixels of scenes, given by family and seed, with one of these thresholds removed at a time."""
     backend.ensure_variant()
     import mitsuba as mi
 

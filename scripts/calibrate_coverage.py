@@ -2,14 +2,15 @@
 
     python scripts/calibrate_coverage.py [--seeds 120] [--direct 49] [-o docs/calibrate_coverage.csv]
 
-scenes/nylon_cylinder.xml at f/2.8 on 32 x 32 pixels. View, distance and magnification are free, and start 0.7 degrees,
-0.3 mm and 5e-4 from the true ones. The images are counts of 300 and 3000 electrons on the brightest pixel, exposed and
-reduced as those of a camera, and Monte Carlo of 512 samples a pixel, with the standard error of its passes.
+The scene is scenes/nylon_cylinder.xml at f/2.8 on 32 x 32 pixels. View, distance and magnification are free; the fit
+starts 0.7 degrees, 0.3 mm and 5e-4 from the true values. The images are counts of 300 and 3000 electrons on the
+brightest pixel, exposed and reduced like those of a camera, and Monte Carlo images of 512 samples per pixel with the
+standard error of their passes.
 
-*expansion*: the fit of `calibrate` with pictures by an expansion to second order about the true values, made from 19
-pictures of the integral, so that many replicates are cheap. *direct*: `calibrate` itself. Columns: share of the
-intervals of 90 % that hold the true value, each parameter and all together; mean of z² = ((value − true)/sd)², of
-chi2, and the mean sd.
+*expansion*: the fit of `calibrate`, in which a second-order expansion about the true values, from 19 images of the
+integral, replaces rendering; this makes many replicates possible. *direct*: `calibrate` itself. Columns: share of the
+90 % intervals that contain the true value, for each parameter and for all together; mean of z² = ((value − true)/sd)²,
+of chi2, and of sd.
 """
 
 from __future__ import annotations
@@ -65,9 +66,9 @@ def measured(case: str, seed: int) -> fspt.Image:
 
 @cache
 def expansion() -> tuple[Array, Array, Array]:
-    """Steps (p,), and first (p, 1, h, w) and second differences (p, p, 1, h, w) of the pictures about the true values.
+    """Steps (p,), and first (p, 1, h, w) and second differences (p, p, 1, h, w) of the image about the true values.
 
-    A step changes the picture by about 3 %.
+    A step changes the image by about 3 %.
     """
     steps = np.array([1.0, 2.0, 5e-3])
     zero = power_at(np.zeros(3))
@@ -97,7 +98,7 @@ def expanded(values: Array) -> tuple[Array, Array]:
 
 
 def by_expansion(case: str, seed: int) -> Result:
-    """Values less true ones, their sd, and chi2, by the fit of `calibrate` with the expansion for pictures."""
+    """Fitted minus true values, their sd, and chi2, by `calibrate`'s fit with the expansion in place of rendering."""
     image = measured(case, seed)
     start = np.array(list(TRUE.values())) - np.array([0.7, 0.3, 5e-4])
     data = measured_of([image], [{}], [picture()], len(TRUE))

@@ -1,10 +1,11 @@
-"""How many silhouette edges of a mesh reach a pixel: whether a list of them could do what lines of sight do.
+"""Number of silhouette edges of a mesh that reach a pixel, to judge whether a list of them could replace lines of
+sight.
 
     python scripts/edge_bands.py [--out docs]
 
-An edge of a mesh belongs to the silhouette if, from some point of the pupil, one of its faces is turned to the lens and
-the other one away. Each such edge is drawn on the film as a band, as wide as its blur disc. Writes edge_bands.csv: of
-the pixels in a band, the median number of edges, the share with exactly one, and the share with hidden edges alone.
+An edge of a mesh belongs to the silhouette if, from some point of the pupil, one of its faces is visible and the other
+is not. Each such edge is drawn on the film as a band of the width of its blur disc. Writes edge_bands.csv: for the
+pixels in a band the median number of edges, the share with exactly one edge, and the share with hidden edges only.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from mitsuba_fspt.runtime.atomic_files import atomic_path
 
 F_NUMBERS = (8.0, 2.8)
 HALF_PIXEL = 0.71  # half a pixel's diagonal
-FLAT = 1e-6  # rad: an edge between faces that differ by less is none
-NEAR = 1e-3  # share of the distance up to an edge in which a line of sight to it may end
+FLAT = 1e-6  # rad: two faces at a smaller angle count as one
+NEAR = 1e-3  # of the distance to an edge: a line of sight that ends so close to it counts as having reached it
 HEAD = ("mesh", "triangles", "f_number", "edges", "pixels", "edges_a_pixel_median", "one_edge", "hidden_alone")
 RING = {"major_radius": 8.0, "minor_radius": 3.0, "major_sections": 200, "minor_sections": 100}  # mm
 

@@ -127,7 +127,7 @@ def _draw_pupil_form(axes: Axes) -> None:
 
 
 def _first_hit(a: float, x: float) -> Array:
-    """Where the line from the lens point a through the virtual point x first meets the phantom."""
+    """Point at which the line from the lens point a through the virtual point x first meets the phantom."""
     direction = np.array([U, x - a]) / math.hypot(U, x - a)
     away = np.array([0.0, a]) - CENTRE
     along = -float(away @ direction)

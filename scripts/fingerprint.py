@@ -1,11 +1,11 @@
-"""Digests of some forty renders: what must not change when code moves.
+"""Digests of some forty renderings, to check that a change of the code does not change results.
 
-    python scripts/fingerprint.py -o before.npz          # render and keep every plane
-    python scripts/fingerprint.py --against before.npz   # render and compare with what was kept
+    python scripts/fingerprint.py -o before.npz          # render and store every plane
+    python scripts/fingerprint.py --against before.npz   # render and compare with the stored planes
 
-A render is the same where power, error and coverage agree bit for bit. Otherwise the largest difference of power over
-the brightest pixel is told, and over the sum of both errors. Exit code 1 where any render differs by more than
-`--tolerance` of the peak (default 0: every bit).
+Two renderings are the same if power, error and coverage agree bit for bit. Otherwise the largest difference of power is
+printed, over the brightest pixel and over the sum of both errors. The exit code is 1 if any rendering differs by more
+than `--tolerance` of the peak (default 0: every bit).
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Coverage of the intervals of `invert`: simulation-based calibration, and fixed truths with the default weight.
+"""Coverage of the intervals of `invert`: simulation-based calibration, and fixed J_n with the default weight.
 
     python scripts/interval_calibration.py [--replicates 400] [--fixed 500] [--samples 200] [--workers 2]
 
 A sphere of 642 vertices, 4 views of 16 x 16 pixels. The pictures come from a transport matrix of rtol 1e-4, the
 inversion uses one of rtol 3e-3: its numerical error is part of the test. *Prior*: J_n is drawn from the penalty's own
 prior (mean 1e-3 W/mm², correlation length 3 mm, standard deviation about 15 %), the weight is given. *Fixed*: three
-distributions of J_n, the weight is found. Columns: share of the intervals
-of 90 % that hold the truth, over vertices, over eight octants, and of the total, where 500 replicates give the share
-to 1.4 % (one standard deviation).
+distributions of J_n, the weight is found. Columns: share of the 90 %
+intervals that contain the true value, for vertices, for eight octants, and for the total; with 500 replicates the last
+share has a standard deviation of 1.4 %.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def drawn(found: Case, rng: np.random.Generator) -> Array:
 
 
 def fixed(found: Case, name: str) -> Array:
-    """J_n (n,) [W/mm²] of a truth that no prior knows of."""
+    """J_n (n,) [W/mm²] of one of the fixed distributions, which are not drawn from a prior."""
     if name == "spot":  # light 3 mm below the surface, in front
         distance = np.linalg.norm(found.surface.vertices - [RADIUS - 3, 0, 0], axis=1)
         return 1e-2 * np.exp(-distance / 3) / distance

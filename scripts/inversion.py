@@ -1,20 +1,19 @@
-"""J_n of the nylon cylinder from four noisy views, without the inverse crime: tables of error against light and stop.
+"""J_n of the nylon cylinder from noisy views: tables of the error against light, f-number and further conditions.
 
     python scripts/inversion.py [--spp 1024] [--samples 200] [--seeds 3] [--pixels 96] [--tables light,stop]
         [-o docs/inversion.csv]
 
-The pictures are of scenes/nylon_cylinder.ply (45,002 vertices), by Mitsuba's `path`, 96 x 96 pixels a view unless
-others are asked for, on the same field; counts by `expose`, with 3.5 electrons of read noise. The inversion uses
-another mesh of the same cylinder (edges of 1 mm) with its own transport matrix. Its total is compared over what is
-seen, its J_n with the fine one at the nearest vertices.
+Images and inversion share neither mesh nor method. The images are of scenes/nylon_cylinder.ply (45,002 vertices), by
+Mitsuba's `path`, on 96 x 96 pixels per view (or `--pixels`) of the same field; `expose` makes counts of them, with 3.5
+electrons of read noise. The inversion uses another mesh of the same cylinder (edges of 1 mm) and its transport matrix.
+The total is compared over the seen part of the surface, J_n with that of the fine mesh at the nearest vertices.
 
 Columns: electrons on the brightest pixel, bias of the seen total [%], half of its 90 % interval [%], share of the
-intervals that hold the total, relative L2 error of J_n [%], chi2; of *light* processor time without and with samples
-[s], which other programs on the machine hardly change; means over the seeds of the counts. *light*: 100, 1e3, 1e4
-electrons at f/2.8. *stop*: f/1.4 … f/16 at the exposure time of 1e3 electrons at f/2.8. *views*: 1, 2, 4, 8 of them.
-*gain*: counts that are too high by 1 and 3 %, without and with that as `gain_error`. *pose*: a matrix of views turned
-by 0.1, 0.3 and 1 degrees from the true ones. *law*: pictures by Fresnel's exit law, a matrix by Lambert's. The last
-four at 1e3 electrons and f/2.8.
+intervals that contain the total, relative L2 error of J_n [%], chi2; for *light* also the processor time [s] without
+and with random draws. Values are means over the seeds of the counts. *light*: 100, 1e3, 1e4 electrons at f/2.8. *stop*:
+f/1.4 … f/16 at the exposure time of 1e3 electrons at f/2.8. *views*: 1, 2, 4, 8 views. *gain*: counts that are too high
+by 1 and 3 %, with `gain_error` 0 or the same value. *pose*: a matrix of views turned by 0.1, 0.3 and 1 degrees from the
+true ones. *law*: images with Fresnel's exit law, a matrix with Lambert's. The last four are at 1e3 electrons and f/2.8.
 """
 
 from __future__ import annotations
@@ -129,7 +128,7 @@ def row(matrix: fspt.TransportMatrix, images: list[fspt.Image], watt: float, sam
 
 @dataclass(frozen=True)
 class Case:
-    """One row: views and matrix, light, and what is wrong about them.
+    """One row: views, light, and the errors of the matrix or of the counts.
 
     electrons : on the brightest pixel; None: at the exposure time of 1e3 electrons at f/2.8
     turned : degrees by which the views of the matrix differ;  gain : factor on the powers, `gain_error` stated for it

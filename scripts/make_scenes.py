@@ -1,8 +1,8 @@
-"""Makes the data files of scenes/ that need no solver: the letter's mesh, the sphere's picture. Same bytes every run.
+"""Make the data files of scenes/ that need no solver: the letter's mesh and the sphere's bitmap; same bytes every run.
 
     python scripts/make_scenes.py [FOLDER]      default: scenes/ of this repository
 
-The cylinder is solved for: fspt flux solve scenes/nylon_cylinder.toml -o scenes/nylon_cylinder.ply
+The cylinder's J_n needs the solver: fspt flux solve scenes/nylon_cylinder.toml -o scenes/nylon_cylinder.ply
 
 Lengths in mm, exitance in W/mm². The world of all scenes: z up, the camera on the +x axis, so that +y is to
 the right of the picture.

@@ -1,4 +1,4 @@
-"""Every simulated number and picture of the paper once more, ours beside what it printed.
+"""Every simulated number and image of the paper, recomputed and compared with the printed one.
 
     python scripts/paper.py [--out docs] [--tissue-spp 8192] [--part vignetting|stops|models|agreement]
 

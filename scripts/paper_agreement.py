@@ -1,4 +1,4 @@
-"""Of scripts/paper.py, the integral against Monte Carlo at f/8 (the paper's Table 1 and Fig. 5)."""
+"""Part of scripts/paper.py: the integral against Monte Carlo at f/8 (the paper's Table 1 and Fig. 5)."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _tissue(pictures: dict[str, Pictures]) -> Table:
 
 
 def noise_of(truth: fspt.Image, exact: fspt.Image) -> tuple[float, float]:
-    """ME and CF that the standard errors of a Monte Carlo picture would give by themselves, about an exact one."""
+    """ME and CF between an exact image and one that differs from it only by the noise of a Monte Carlo image."""
     rng = np.random.default_rng(6)
     scale = exact.power.sum() / truth.power.sum()
     scatter = np.where(truth.power > 0, truth.error, 0)  # where no photon came the error is a bound, not a scatter
@@ -96,7 +96,7 @@ def noise_of(truth: fspt.Image, exact: fspt.Image) -> tuple[float, float]:
 
 
 def photon_noise(exact: fspt.Image, photons: float = PHOTONS) -> tuple[float, float]:
-    """ME and CF between a picture [W/W] and what a Monte Carlo of so many photons from the source would count."""
+    """ME and CF between an image [W/W] and the counts of a Monte Carlo of this number of photons from the source."""
     rng = np.random.default_rng(4)
     return _mean_distance(exact, (rng.poisson(photons * exact.power).astype(float) for _ in range(20)))
 
@@ -107,7 +107,7 @@ def _mean_distance(exact: fspt.Image, draws: Iterable[Array]) -> tuple[float, fl
 
 
 def _total(pictures: dict[str, Pictures]) -> Table:
-    """Power on the CCD, and how many of the paper's photons that is; errors add up before any mirroring."""
+    """Power on the CCD, also as a number of the paper's photons; errors are those of images that are not mirrored."""
     rows = []
     for view, images in pictures.items():
         everywhere = np.ones((COARSE, COARSE), bool)
@@ -133,7 +133,7 @@ def _draw(pictures: dict[str, Pictures], path: Path) -> None:
         _profiles(axes[2, k], images["binned"], images["tissue"])
         axes[1, k].set_title("lines: integral; points: path from J$_n$", fontsize="small", loc="right")
         axes[2, k].set_title("lines: integral; points: from the source on", fontsize="small", loc="right")
-        axes[2, k].set_xlabel("mm on the sharp plane")
+        axes[2, k].set_xlabel("mm on the virtual detector plane")
     axes[0, 1].set_ylabel(None)
     axes[0, 2].set_ylabel(None)
     axes[1, 0].set_ylabel("W/pixel of (1/9 mm)²")

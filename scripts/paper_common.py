@@ -1,6 +1,6 @@
-"""What the parts of scripts/paper.py share: the phantom before the camera, tables, figures.
+"""Code common to the parts of scripts/paper.py: the phantom in front of the camera, tables, figures.
 
-Units: mm, W; a picture holds W on each pixel per W of source.
+Units: mm, W; images hold W on each pixel per W of source.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 FOCAL, MAGNIFICATION, DISTANCE = 55.0, 0.5, 180.0  # mm, 1, mm from the lens to the phantom's axis
-FOCUS = FOCAL * (1 + 1 / MAGNIFICATION)  # mm, from the lens to the sharp plane: the phantom's front
-WHOLE_CONE = 0.999  # coverage from which on all of a pixel's lines of sight are said to meet the phantom
+FOCUS = FOCAL * (1 + 1 / MAGNIFICATION)  # mm, from the lens to the virtual detector plane: the phantom's front
+WHOLE_CONE = 0.999  # least coverage of pixels all of whose lines of sight count as meeting the phantom
 SIZE, PITCH = 256, 0.108  # pixels a side, mm: the 2048² CCD of 13.5 µm, binned 8 × 8
 INDEX, MUA, MUSP = 1.37, 0.0138, 0.91  # of nylon_cylinder.toml: 1, 1/mm, 1/mm
 
@@ -93,13 +93,13 @@ def fill(path: Path, tables: Sequence[Table]) -> None:
 
 
 def solve(name: str, folder: Path, **finer: Any) -> Path:
-    """The phantom of scenes/NAME.toml, J_n solved for by finite elements, as a PLY file in a folder.
+    """PLY file, in a folder, of the phantom of scenes/NAME.toml with J_n by finite elements.
 
     `finer` replaces fields of the description, for example surface_edge [mm].
     """
-    told = replace(PhantomFile.read(SCENES / f"{name}.toml"), **finer)
+    description = replace(PhantomFile.read(SCENES / f"{name}.toml"), **finer)
     path = folder / f"{name}{'_fine' if finer else ''}.ply"
-    told.solve().phantom(told.surface_edge).write(path)
+    description.solve().phantom(description.surface_edge).write(path)
     return path
 
 
@@ -159,7 +159,7 @@ def binned(image: fspt.Image, side: int) -> fspt.Image:
 
 
 def places(image: fspt.Image) -> Array:
-    """Middle of each column [mm on the sharp plane], from the middle of the picture."""
+    """Middle of each column [mm on the virtual detector plane], from the middle of the picture."""
     side = float(image.metadata["pixel_pitch"]) / float(image.metadata["magnification"])
     return (np.arange(image.shape[1]) + 0.5 - image.shape[1] / 2) * side
 
@@ -172,7 +172,11 @@ def figure(width: float, height: float) -> Figure:
 
 
 def panel(axes: Axes, image: fspt.Image, title: str, reach: float, high: float | None = None) -> None:
-    """A picture with its colour bar, ± `reach` [mm on the sharp plane] of it; `high` [W/pixel]: end of the bar."""
+    """Draw an image with its colour bar.
+
+    reach : half of the side that is shown [mm on the virtual detector plane]
+    high : upper end of the colour bar [W/pixel]
+    """
     from mitsuba_fspt.images.picture import draw_picture, scale_and_unit
 
     high = float(image.power.max()) if high is None else high

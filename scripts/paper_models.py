@@ -1,4 +1,4 @@
-"""Part C of scripts/paper.py: with and without a diaphragm against a stand-in for the experiment (Table 2, Fig. 9)."""
+"""Part of scripts/paper.py: models with and without a diaphragm against a simulated experiment (Table 2, Fig. 9)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.images.detector import PLANCK_TIMES_LIGHT
 
 LENSES = (FOCAL / 2.8, FOCAL / 2)  # mm: the least border that a 55 mm f/2.8 lens can have, and a larger one
-PRINTED = ("printed (Table 2), not told", None, None, 0.0421, 0.8685, 0.0110, 0.9153)
+PRINTED = ("printed (Table 2), not stated", None, None, 0.0421, 0.8685, 0.0110, 0.9153)
 VIEW = 90.0  # left, degrees
 SOURCE, TIME, WAVELENGTH = 1e-8, 20.0, 650.0  # W, s, nm
 SIZE, PITCH = 128, 0.216  # pixels a side, mm: 2048² pixels of 13.5 µm, binned 16 × 16
@@ -68,7 +68,7 @@ def _pictures(fine: Path, coarse: Path, focus: float) -> Pictures:
 
 
 def expose(image: fspt.Image, source: float = SOURCE, seed: int = 5) -> tuple[fspt.Image, float]:
-    """What a cooled CCD reads of a picture [W per W of source], less the mean dark charge, as power [W/W] again.
+    """Image [W/W] that a cooled CCD records of an image [W per W of source], with the mean dark charge subtracted.
 
     `source` [W]. The second value is the brightest pixel's charge [e-].
     """
@@ -98,7 +98,7 @@ def _draw(pictures: Pictures, path: Path) -> None:
         axes[3].plot(places(image), image.power[row] / image.power.max(), label=title.split(",")[0], **line)
     for each in axes[1:3]:
         each.set_ylabel(None)
-    axes[3].set(xlim=(-10, 20), xlabel="mm on the sharp plane", ylabel="power / brightest pixel")
+    axes[3].set(xlim=(-10, 20), xlabel="mm on the virtual detector plane", ylabel="power / brightest pixel")
     axes[3].set_title("row of the peak", fontsize="medium")
     axes[3].legend(fontsize="x-small", frameon=False, loc="upper left")
     save(drawn, path)

@@ -1,4 +1,4 @@
-"""Of scripts/paper.py, the diaphragm from f/2.8 to f/22, the 6 mm source from the left (Figs. 6-8)."""
+"""Part of scripts/paper.py: the diaphragm from f/2.8 to f/22, the 6 mm source seen from the left (Figs. 6-8)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import mitsuba_fspt as fspt
 F_NUMBERS = (2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0)  # full stops
 SHOWN = (2.8, 5.6, 11.0, 22.0)  # in Fig. 6
 LEFT = 90.0  # degrees
-BORDER = 0.05  # of the peak: where the picture counts as ended
+BORDER = 0.05  # of the peak: power that defines the border of the image
 HALF = 0.5
 
 
@@ -41,7 +41,7 @@ def naive_sum(scene: Any) -> fspt.Image:
 
 
 def ratio_per_stop(f_numbers: Array, values: Array) -> Array:
-    """Factor from each value to the next, per full stop: its (N_2/N_1)² th of one doubling; 1/2 where P ∝ 1/N²."""
+    """Factor between successive values, converted to a full stop, which is a factor of 2 in N²; 1/2 if P ∝ 1/N²."""
     full = 2 * np.diff(np.log2(f_numbers))
     return (values[1:] / values[:-1]) ** (1 / full)
 
@@ -90,7 +90,7 @@ def _intensity(rows: list[tuple[float, ...]]) -> Table:
 
 def _distance(rows: list[tuple[float, ...]]) -> Table:
     side = PITCH / MAGNIFICATION
-    columns = {"f-number": "g", "distance at 5 % [pixels]": ".2f", "[mm on the sharp plane]": ".3f"}
+    columns = {"f-number": "g", "distance at 5 % [pixels]": ".2f", "[mm on the virtual detector plane]": ".3f"}
     columns |= {"distance at 50 % [pixels]": ".2f", "column of the peak": ".2f"}
     return Table("distance", columns, [(f, far, far * side, half, peak) for f, _, _, peak, far, half in rows])
 
@@ -133,7 +133,7 @@ def _draw_curves(rows: Array, path: Path) -> None:
         axes.set(ylabel=f"{name} power [W/pixel]")
     right.semilogx(f, far * side, "o-", label=f"border: {BORDER:.0%} of the peak")
     right.semilogx(f, half * side, "s--", label=f"border: {HALF:.0%} of the peak")
-    right.set(ylabel="peak to border [mm, sharp plane]")
+    right.set(ylabel="peak to border [mm, virtual detector plane]")
     for axes in (left, middle, right):
         axes.set_xticks(f, [f"{n:g}" for n in f])
         axes.minorticks_off()

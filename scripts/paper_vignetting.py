@@ -34,7 +34,7 @@ def vignetting(output: Path) -> list[Table]:
 
 
 def _measured(f_number: float) -> Array:
-    """Power along a row of pixels before a uniform disk on the sharp plane, shape (PIXELS,) [W per W/mm²]."""
+    """Power along a row of pixels, for a uniform disk in the virtual detector plane, shape (PIXELS,) [W per W/mm²]."""
     import mitsuba as mi
 
     place = mi.ScalarTransform4f().translate([DISTANCE - FOCUS, 0, 0]).rotate([0, 1, 0], 90).scale(200)
@@ -59,11 +59,11 @@ def overlap(r: float, s: float, apart: Array) -> tuple[Array, Array]:
 
 
 def illumination(off: Array, diameter: float) -> Array:
-    """Power over that on the axis at points `off` the axis [mm on the sharp plane], closed form.
+    """Power over that on the axis at points `off` the axis [mm on the virtual detector plane], closed form.
 
     The diaphragm of a diameter [mm], s behind the lens, appears sF/(F − s) behind it, magnified F/(F − s). Seen from
-    a point of the sharp plane the lens border and this entrance pupil cover each other in part. The light is the
-    area they leave open, times cos⁴θ towards its centroid; what cos⁴θ varies over that area is left out.
+    a point of the virtual detector plane the lens border and this entrance pupil cover each other in part. The light is
+    the area they leave open, times cos⁴θ towards its centroid; what cos⁴θ varies over that area is left out.
     """
     behind = BEHIND * FOCAL / (FOCAL - BEHIND)
     growth = 1 + behind / FOCUS  # of the lens border, from the lens plane to that of the entrance pupil
@@ -84,7 +84,7 @@ def _draw(field: Array, points: dict[float, Array], path: Path) -> None:
     for k, (f, measured) in enumerate(points.items()):
         axes.plot(smooth, illumination(smooth / MAGNIFICATION, FOCAL / f), color=f"C{k}", linewidth=1.2)
         axes.plot(field, measured, "o", markersize=4, color=f"C{k}", label=f"f/{f:g}")
-    distance = FOCUS + BEHIND * FOCAL / (FOCAL - BEHIND)  # of the entrance pupil from the sharp plane
+    distance = FOCUS + BEHIND * FOCAL / (FOCAL - BEHIND)  # of the entrance pupil from the virtual detector plane
     cos4 = (distance**2 / (distance**2 + (smooth / MAGNIFICATION) ** 2)) ** 2
     axes.plot(smooth, cos4, "k:", linewidth=1, label="cos⁴θ alone, from the entrance pupil")
     axes.set(xlabel="mm from the middle of the CCD", ylabel="power / power on the axis", ylim=(0.6, 1.02))

@@ -2,11 +2,12 @@
 
     python scripts/scaling.py [--out docs] [--rounds 5] [--rtol 1e-2] [--only all|integral|matrix]
 
-A ball with a smooth J_n, its front in focus, f/2.8. First the same field on ever more pixels, 128 x 128 to 2048 x 2048;
-then the same ball in ever more triangles, 10 thousand to 3 million, on 256 x 256 pixels, where at last every line of
-sight meets a triangle of its own, and on 2048 x 2048. Beside each what Embree alone takes for four lines of sight a
-pixel. Then the transport matrix of one view at rtol 1e-3, over pixels, triangles and f-number: time, entries, bytes.
-Warm, in one process; medians. Writes scaling.csv, scaling.png and scaling_matrix.csv and prints the tables.
+The object is a sphere with a smooth J_n, its front in focus, at f/2.8. First the same field is rendered on 128 x 128 to
+2048 x 2048 pixels. Then the sphere has 10 thousand to 3 million triangles, on 256 x 256 pixels, where with the most
+triangles every line of sight meets a different one, and on 2048 x 2048. For each the time of Embree alone for four
+lines of sight per pixel is given. Then the transport matrix of one view at rtol 1e-3 is computed for several numbers of
+pixels and triangles and f-numbers: time, entries, bytes. Times are medians of warm runs in one process. Writes
+scaling.csv, scaling.png and scaling_matrix.csv and prints the tables.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ FIELD, RADIUS = 27.648, 15.0  # mm: the detector's width, the ball's radius
 
 @dataclass
 class Setting:
-    """One film and one mesh, and what the runs gave."""
+    """One film and one mesh, with the results of the runs."""
 
     side: int
     triangles: int
@@ -90,7 +91,7 @@ def measure_integral(arguments: argparse.Namespace) -> None:
 
 
 def ball(triangles: int, path: Path) -> None:
-    """A ball of about so many triangles around the origin, its J_n smooth, as a PLY."""
+    """Write a PLY of a sphere of about this number of triangles about the origin, with a smooth J_n."""
     rings = round(math.sqrt(triangles / 2))
     theta, phi = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.arange(rings) * 2 * np.pi / rings, indexing="ij")
     normal = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1).reshape(-1, 3)
@@ -126,7 +127,7 @@ def measure_matrices(path: Path, rounds: int) -> None:
 
 
 def scene(setting: Setting, folder: Path, f_number: float = 2.8) -> object:
-    """The ball of a setting before its film, in the camera of the nylon cylinder."""
+    """Scene of a setting: its sphere and film, with the camera of the nylon cylinder."""
     backend.ensure_variant()
     import mitsuba as mi
 
@@ -163,7 +164,7 @@ def measure(settings: list[Setting], folder: Path, rounds: int, rtol: float) -> 
     import mitsuba as mi
 
     integrator = mi.load_dict({"type": "fspt_integral", "rtol": rtol})
-    for setting in settings:  # one scene alive at a time: every living one costs all kernels
+    for setting in settings:  # one scene at a time: every existing scene makes all kernels slower
         of = scene(setting, folder)
         lens = of.sensors()[0]
         bare = [raw_rate(of, lens, together, least=1) for together in (False, True)]

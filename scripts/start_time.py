@@ -1,9 +1,9 @@
-"""How long a user waits who has nothing running yet: the import, and a picture with and without kernels on disk.
+"""Start times: of the import, and of a rendering from the start of the process, with and without kernels on disk.
 
     python scripts/start_time.py [--scene scenes/nylon_cylinder.xml] [--rounds 5]
 
-Every measurement is a process of its own. Without kernels: Dr.Jit's folder of compiled kernels is empty, as after an
-update. Prints a table of medians, least and largest, and where the time without kernels goes.
+Every measurement is a process of its own. 'Without kernels' means that Dr.Jit's folder of compiled kernels is empty, as
+after an update. Prints a table of medians, least and largest times, and the parts of the time without kernels.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def numbers(code: str, folder: str, *arguments: str) -> list[float]:
-    """What a program prints that finds its kernels in a folder."""
+    """Numbers that a program prints, with Dr.Jit's compiled kernels in a folder."""
     command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(command, env=environment(folder), check=True, capture_output=True, text=True)
     return [float(number) for number in done.stdout.split()]
@@ -83,7 +83,7 @@ def rendering(scene: Path, folder: str) -> float:
 
 
 def environment(folder: str) -> dict[str, str]:
-    """This process's, with Dr.Jit's kernels in a folder."""
+    """Environment variables of this process, with Dr.Jit's kernels in a folder."""
     return os.environ | {"DRJIT_CACHE_DIR": str(Path(folder, "kernels"))}
 
 

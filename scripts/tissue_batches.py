@@ -1,7 +1,7 @@
-"""Monte Carlo from the source in the tissue to the CCD, in batches that stay on disk, and what its symmetries give.
+"""Monte Carlo from the source in the tissue to the CCD, in batches that stay on disk, and its mean with mirror images.
 
-A batch is a picture of its own, VIEW-SEED.exr, seeded by its number. A run that is stopped, or asked for less noise the
-next time, goes on from the files that are there.
+A batch is an image, VIEW-SEED.exr, whose seed is its number. A run that was stopped, or a later one for less noise,
+continues from the existing files.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 class Batches:
-    """The Monte Carlo of one view, as far as it has come; `parameters` are those of the scene."""
+    """The batches of one view that exist so far; `parameters` are those of the scene."""
 
     def __init__(self, folder: Path, view: str, spp: int, parameters: dict[str, Any]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -47,16 +47,16 @@ class Batches:
         self._images.append(image)
 
     def mean(self) -> fspt.Image:
-        """All batches as one picture, each with the weight of its paths; error: the standard error."""
+        """Mean of all batches, weighted with their numbers of paths; error: the standard error."""
         shares = np.array([float(image.metadata["spp"]) for image in self._images])
-        told = self._images[0].metadata | {
+        metadata = self._images[0].metadata | {
             "spp": shares.sum(),
             "wall_time": sum(float(image.metadata["wall_time"]) for image in self._images),
         }
         shares /= shares.sum()
         power = np.tensordot(shares, [np.float64(image.power) for image in self._images], 1)
         squares = np.tensordot(shares**2, [np.float64(image.error) ** 2 for image in self._images], 1)
-        return fspt.Image(power, np.sqrt(squares), self._images[0].coverage, told)
+        return fspt.Image(power, np.sqrt(squares), self._images[0].coverage, metadata)
 
     def error(self) -> float:
         """Standard error of Σ P over Σ P; infinite before the first batch."""
@@ -80,10 +80,10 @@ def summed(image: fspt.Image, rows: Sequence[slice], columns: Sequence[slice]) -
 
 
 def mirrored(image: fspt.Image, axes: Sequence[int]) -> fspt.Image:
-    """Mean of a Monte Carlo picture and its mirror images along the axes along which the exact one is symmetric.
+    """Mean of a Monte Carlo image and its mirror images, along `axes` along which the exact image is symmetric.
 
-    A pixel and its mirror are independent, so that the error falls by √2 an axis; one on the axis is its own mirror and
-    keeps its error. Σ P and its error stay: pixels that mirror each other are one number from here on.
+    A pixel and its mirror image are independent, so that the error falls by √2 per axis; a pixel on the axis of
+    symmetry keeps its error. Σ P and its error do not change. Afterwards two mirrored pixels hold the same number.
     """
     power, error = np.float64(image.power), np.float64(image.error)
     for axis in axes:

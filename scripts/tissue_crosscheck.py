@@ -15,11 +15,11 @@ and its mirror images (columns *raw*: without); the ratios of powers are the sam
 over the outermost pixel that the phantom fills, left and right; each with the standard error of the Monte Carlo.
 Pictures have pixels of 1 mm. A profile is the power along a band 2 mm high about z_d = 0, 2 and 4 mm on the detector
 (the paper's Fig. 5), in steps of 1 mm across the CCD's 27 mm; its CF is Pearson's over those 27 values. `noise`: the
-CF that the standard errors leave of a law without fault.
+CF that an exact law would have, given the standard errors.
 
-*transport* is last_flight on a diffusion equation whose light falls off as transport's does. Diffusion's falls as
-exp(-k r), k = √(3 µa (µa + µs')), transport's with isotropic scattering by the root κ of
-µs'/κ · artanh(κ/(µa + µs')) = 1 (Case's asymptotic mode), and D = µa/κ² in place of 1/(3 (µa + µs')) mends that alone.
+*transport* is last_flight on a diffusion equation with the decay constant of transport. The fluence of diffusion falls
+as exp(-k r), k = √(3 µa (µa + µs')). In transport with isotropic scattering the decay constant is the root κ of
+µs'/κ · artanh(κ/(µa + µs')) = 1 (Case's asymptotic mode). D = µa/κ² in place of 1/(3 (µa + µs')) corrects it.
 
 Writes tissue_crosscheck.csv and .png into the folder `-o` and the tables into its emission.md.
 """
@@ -77,11 +77,11 @@ def decay(mua: float, musp: float) -> float:
     return (low + high) / 2
 
 
-def solve(told: PhantomFile, folder: Path) -> DiffusionSolution:
+def solve(description: PhantomFile, folder: Path) -> DiffusionSolution:
     """The phantom solved, and in a folder phantom.ply and fluence.vol of it."""
-    solution = told.solve()
-    solution.phantom(told.surface_edge).write(folder / "phantom.ply")
-    solution.volume(told.voxel).write(folder / "fluence.vol")
+    solution = description.solve()
+    solution.phantom(description.surface_edge).write(folder / "phantom.ply")
+    solution.volume(description.voxel).write(folder / "fluence.vol")
     return solution
 
 
@@ -214,7 +214,7 @@ def draw(path: Path, pictures: Pictures) -> None:
             bottom.plot(x[seen], line[seen] / mean[seen], label=law)
         top.set_title(view)
         bottom.axhline(1, color="k", linewidth=0.6)
-        bottom.set(ylim=(0.7, 1.4), xlim=(-18, 18), xlabel="mm on the sharp plane")
+        bottom.set(ylim=(0.7, 1.4), xlim=(-18, 18), xlabel="mm on the virtual detector plane")
     axes[0, 0].set_ylabel("W per mm of the band")
     axes[1, 0].set_ylabel("law / Monte Carlo")
     axes[0, 1].legend(fontsize="small", loc="upper left")
@@ -240,17 +240,17 @@ def main() -> None:
             batches.add()
         pictures[view] = {"volpath": batches.mean()}
     exits = {}
-    told = PhantomFile.read(SCENES / "nylon_cylinder.toml")
-    source = replace(told.sources[0], shape=replace(told.sources[0].shape, centre=SOURCE))
-    told = replace(told, sources=(source,))
+    description = PhantomFile.read(SCENES / "nylon_cylinder.toml")
+    source = replace(description.sources[0], shape=replace(description.sources[0].shape, centre=SOURCE))
+    description = replace(description, sources=(source,))
     with tempfile.TemporaryDirectory() as folder:
-        for medium, laws in ((told.medium, LAWS[:-1]), (Transport(*astuple(told.medium)), LAWS[-1:])):
-            solution = solve(replace(told, medium=medium), Path(folder))
+        for medium, laws in ((description.medium, LAWS[:-1]), (Transport(*astuple(description.medium)), LAWS[-1:])):
+            solution = solve(replace(description, medium=medium), Path(folder))
             for law in laws:
                 exits[law] = solution.solved.exited
                 for view, images in pictures.items():
                     images[law] = calculated(Path(folder), law, view)
-    made = [*tables(pictures), decays(told.medium, exits)]
+    made = [*tables(pictures), decays(description.medium, exits)]
     for table in made:
         print(f"\n{table.markdown()}")
     write_csv(made, given.output / "tissue_crosscheck.csv")

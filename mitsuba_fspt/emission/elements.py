@@ -5,7 +5,7 @@ shape are the cells of a grid in its surface parameters (u, v). Elements map sam
 element that contains a surface point.
 
 Shapes and textures are called directly here, never through Dr.Jit pointers: elements may be built while a kernel is
-being recorded, and a pointer of the recording would enter the expressions that are evaluated aside.
+being recorded. They are then evaluated outside the recording, where a pointer that belongs to it must not be used.
 """
 
 from __future__ import annotations
@@ -31,11 +31,15 @@ def elements_of(shape: mi.Shape, minimum: int = MIN_ELEMENTS) -> Elements:
 
 
 class Elements:
-    """`count` elements of one shape; `place` maps a point of the unit square to a point of an element."""
+    """`count` elements of one shape. `place` maps points of the unit square to an element, `locate` finds the element.
+
+    corners : points of the unit square that `place` maps to an element's corners
+    middle : point of the unit square that `place` maps to an element's centre
+    """
 
     count: int
-    corners: tuple[tuple[int, int], ...]  # samples that `place` maps to an element's corners
-    middle: tuple[float, float]  # sample that `place` maps to its centre
+    corners: tuple[tuple[int, int], ...]
+    middle: tuple[float, float]
 
     def __init__(self, shape: mi.Shape) -> None:
         # A pointer array holds no reference. Emitters hold elements, and shapes their emitter: a reference from the
@@ -51,7 +55,8 @@ class Elements:
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
         """Surface interaction on element `index` at `sample` in [0, 1]², and dA/d(sample) there [mm²].
 
-        With `cut` > 1 the same for part number `part`, from 0, of the element's cut² parts.
+        With `cut` > 1 the element is divided into cut² equal parts, and the interaction is on part number `part`,
+        counted from 0.
         """
         raise NotImplementedError
 
@@ -157,7 +162,7 @@ class ParameterElements(Elements):
         cell = mi.Point2f(mi.Point2u(index % self.side, index // self.side))
         number, cut = mi.UInt32(part), mi.UInt32(cut)
         within = (mi.Point2f(mi.Point2u(number % cut, number // cut)) + sample) / mi.Float(cut)
-        # Slightly inside: shapes that search for their own points miss some at the ends of their parameters.
+        # Slightly inside: at the ends of their parameters some shapes do not find their own points.
         uv = dr.clip((cell + within) / self.side, 2.0**-21, 1 - 2.0**-21)
         si = self.at(uv)
         return si, self._area(si) / dr.square(mi.Float(cut))
@@ -186,7 +191,8 @@ class ParameterElements(Elements):
         pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(uv))
         pi.valid, pi.t, pi.prim_uv = True, 1.0, mi.Point2f(local.x, local.y)
         si = self.shape.compute_surface_interaction(mi.Ray3f(p + n, -n), pi, mi.RayFlags.All)
-        # Mitsuba derives these from the rounded point, which has few digits left on a small shape far off.
+        # Mitsuba derives these from the rounded point, which has few correct digits on a small shape far from the
+        # origin.
         si.n = dr.select(dr.dot(si.n, n) < 0, -n, n)
         si.sh_frame.n, si.uv = si.n, uv
         return si
@@ -241,7 +247,7 @@ _UNIT_SHAPES = {
 
 
 def of_part(part: mi.UInt32, k: mi.UInt32, b: mi.Point2f) -> mi.Point2f:
-    """Barycentric coordinates (b1, b2) in a triangle of the point `b` of number `part` of its k² parts.
+    """Barycentric coordinates (b1, b2) in a triangle, of the point with coordinates `b` in part number `part` of k².
 
     Part r² + c lies in row r of k rows; triangles with odd c are inverted.
     """
@@ -263,7 +269,7 @@ def _barycentric(d: mi.Vector3f, e1: mi.Vector3f, e2: mi.Vector3f) -> mi.Point2f
 class ElementDistribution:
     """Distribution of surface points whose density [1/mm²] is ∝ the mean exitance of their element.
 
-    It is even where all elements are dark.
+    If J_n is 0 on all elements, the density is uniform.
     """
 
     def __init__(self, elements: Elements, exitance: Callable[[mi.SurfaceInteraction3f], mi.Float]) -> None:
@@ -273,11 +279,11 @@ class ElementDistribution:
         for point in _FIVE_POINTS:
             si, area = elements.place(index, mi.Point2f(*point))
             power += area * dr.maximum(exitance(si), 0)
-        if not dr.any(power > 0):  # points are drawn all the same, where no light leaves
+        if not dr.any(power > 0):  # a dark surface: points must still be drawn, with any density > 0
             power = elements.areas()
         share = power + (UNIFORM_SHARE * dr.mean(power) / dr.mean(elements.areas())) * elements.areas()
-        # First a row of elements, then an element of the row: the 24 bits of one random number do not resolve 10⁵
-        # elements evenly (the power of each is off by 1 %), those of two do.
+        # Two random numbers choose first a row of elements, then an element of the row. The 24 bits of a single number
+        # are too few for 10⁵ elements: the power of each would be wrong by 1 %.
         self._side = math.ceil(math.sqrt(elements.count))
         table = np.zeros(self._side**2, np.float32)
         table[: elements.count] = share.numpy()

@@ -18,15 +18,15 @@ from ..runtime.errors import ExitanceError
 from .elements import elements_of
 
 SLIVER = 1e-6  # of the mean area: on a smaller face the interpolation in single precision may fail
-NEGATIVE_ROUNDING = 1e-6  # share of the largest J_n by which interpolation in float32 may fall below a zero
-FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # least number of elements checked on a shape, and most texels that raise it
+NEGATIVE_ROUNDING = 1e-6  # of the largest J_n: interpolation in float32 may turn 0 into as small a negative number
+FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # elements checked on a shape: at least FEWEST, one a texel up to MOST_TEXELS
 # Beginnings of the names of Mitsuba's classes for a colour, and for a value at each wavelength.
 COLOURS, SPECTRA = ("SRGB", "D65"), ("Regular", "Irregular", "BlackBody")
 CORNERS_AND_CENTRE = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
 
 
 def texture_of(props: mi.Properties) -> mi.Texture:
-    """J_n [W/mm²] as a texture; a number becomes equal at all wavelengths, where Mitsuba would make white light.
+    """J_n [W/mm²] as a texture. A number applies at all wavelengths; Mitsuba's own reader would make it white light.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def texture_of(props: mi.Properties) -> mi.Texture:
 
 
 def uniform(value: float) -> mi.Texture:
-    """J_n of so much [W/mm²] everywhere."""
+    """Texture with the same J_n = `value` [W/mm²] everywhere."""
     properties = mi.Properties("uniform")
     properties["value"] = value
     return mi.PluginManager.instance().create_object(properties)
@@ -102,7 +102,7 @@ class ExitanceState:
 def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[..., mi.Float]:
     """J_n [W/mm²] on one shape, as a function of the surface interaction that calls no Dr.Jit pointer.
 
-    The function takes a surface interaction and, if not everywhere, where to evaluate.
+    The function takes a surface interaction and, optionally, a mask of the array entries to evaluate.
 
     Raises
     ------
@@ -133,9 +133,9 @@ def function_on(shape: mi.Shape, texture: mi.Texture) -> Callable[..., mi.Float]
 
 
 def values_on(mesh: mi.Shape, texture: mi.Texture) -> mi.Float:
-    """J_n [W/mm²] of each vertex or face of a mesh, as its attribute has it, or of each vertex where it is a number.
+    """J_n [W/mm²] on each vertex or face of a mesh, whichever carries the attribute; on each vertex if J_n is a number.
 
-    They carry the gradients of what is behind J_n.
+    The values carry the gradients of the numbers behind J_n.
 
     Raises ExitanceError as `function_on`.
     """
@@ -146,7 +146,7 @@ def values_on(mesh: mi.Shape, texture: mi.Texture) -> mi.Float:
 
 
 def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float, mi.Float] | None:
-    """J_n [W/mm²] at the three corners of every face, each of shape (F,), if it is linear between them; else None."""
+    """J_n [W/mm²] at the three corners of every face, each of shape (F,); None if J_n is not linear on the faces."""
     faces = triangles(mesh)[1]
     count = dr.width(faces) // 3
     if is_uniform(texture):
@@ -174,7 +174,7 @@ def _check_bitmap(texture: mi.Texture) -> None:
             f"fspt_surface: 'exitance' is a bitmap of {channels} channels that differ, J_n is one number. Give one of "
             "one channel, as a float EXR."
         )
-    if not dr.is_float_v(values["data"]) and "raw = 0" in str(texture):  # only its description states it
+    if not dr.is_float_v(values["data"]) and "raw = 0" in str(texture):  # no other way to ask a texture for `raw`
         raise ExitanceError(
             f"fspt_surface: 'exitance' is a picture of {width} × {height} whole numbers, which are decoded as sRGB. "
             'Give W/mm² as a float EXR, or add <boolean name="raw" value="true"/> for shares of the largest number.'
@@ -226,14 +226,14 @@ def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
 
 
 def _values_and_areas(shape: mi.Shape, texture: mi.Texture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """J_n [W/mm²] at points all over a shape, and the area of the element of each [mm²].
+    """J_n [W/mm²] at points all over a shape, and the area [mm²] of the element that each point lies on.
 
-    Where J_n is linear on faces, the points are their corners, with J_n as given.
+    If J_n is linear on the faces of a mesh, the points are the corners of the faces.
     """
     corners = at_corners(shape, texture) if shape.is_mesh() else None
     elements = elements_of(shape, minimum=1 if corners else max(FEWEST, texels_of(texture)))
     if corners:
-        # Interpolation far from the world's origin could turn a zero negative.
+        # Far from the world's origin, interpolation could turn a zero into a negative number.
         area = elements.areas()
         everywhere = [(value, area) for value in corners]
     else:
@@ -252,6 +252,6 @@ def _attribute_size(mesh: mi.Shape, attribute: str) -> int:
 
 
 def attribute_name(texture: mi.Texture) -> str | None:
-    """Name of the mesh attribute that a texture reads, which only its description states; None for other textures."""
+    """Name of the mesh attribute that a texture reads, taken from the texture's description; None if it reads none."""
     found = re.match(r'MeshAttribute\[\s*name = "([^"]*)"', str(texture))
     return found[1] if found else None

@@ -1,4 +1,4 @@
-"""Face of a mesh at a sampled position, found by a short ray, since a position sample does not contain it."""
+"""Face of a mesh at a sampled position. A position sample does not contain it, so a short ray searches for it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ from ..jit.mesh_buffers import set_triangles, triangles
 from ..jit.robust_tracing import traced_robustly
 from ..runtime.plugin_types import is_surface
 
-REACH = 1e-4  # of the largest coordinate: distance from the surface at which the ray starts, and at which it ends
+REACH = 1e-4  # of the largest coordinate: the ray runs from this distance before the surface to as much behind it
 APART = (
-    "fspt_surface: on CUDA a kernel that traces rays in the scene cannot look for faces of a mesh beside it, and loses "
-    "light. Load the scene with mitsuba_fspt.load, or render it with mitsuba_fspt.render."
+    "fspt_surface: on CUDA a kernel that traces rays in this scene cannot search a second scene for faces of a mesh, "
+    "and loses light. Load the scene with mitsuba_fspt.load, or render it with mitsuba_fspt.render."
 )
 
 
 class Probe:
-    """Search for the faces of a mesh; on CUDA, kernels that trace rays in a scene need one built `beside` the scene."""
+    """Search for the faces of a mesh, by rays in a scene of that mesh alone.
+
+    On CUDA a kernel can trace rays in two scenes only if one was built with a reference to the other: `beside`.
+    """
 
     def __init__(self, mesh: mi.Shape, beside: mi.Scene | None = None) -> None:
         if beside is None and mi.variant().startswith("cuda"):

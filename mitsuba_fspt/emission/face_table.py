@@ -1,8 +1,8 @@
 """Table of all faces of a scene of meshes, read where a line of sight ends.
 
-Mitsuba's surface interaction gathers the corners of the face, computes the point between them again and calls shape,
+Mitsuba's surface interaction loads the corners of the face, computes the point between them again and calls shape,
 emitter and texture through pointers. If J_n is linear on every face and the radiance equal in all outward directions,
-its values at three corners and the normal suffice, and they fill half a cache line.
+the radiance at the three corners and the normal suffice: eight numbers, half a cache line.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ class FaceTable:
     first : index in the table of the first face of each shape, by the shape's number
     table : eight numbers per face: the least radiance at its corners, the excess over it at each corner [W/mm²/sr],
         the normal, 0
-    sources : buffers of the meshes, kept so that no other buffers get their indices, which `edition_of` compares
+    sources : buffers of the meshes. `edition_of` compares their Dr.Jit indices; while they are kept, no other buffer
+        can get the same index
     """
 
     first: mi.UInt32
@@ -35,7 +36,7 @@ class FaceTable:
 
     @classmethod
     def of(cls, shapes: Sequence[mi.Shape]) -> FaceTable | None:
-        """Table of the faces of these shapes; None unless all that emit are meshes of a linear J_n by Lambert's law."""
+        """Table of the faces of these shapes; None if an emitter is no mesh, J_n not linear or the law another."""
         first: dict[int, int] = {}
         tables, begin = [], 0
         for shape in shapes:
@@ -65,14 +66,14 @@ class FaceTable:
 
 
 def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
-    """Key of the data that `FaceTable.of` depends on, for a checked scene; None unless all that emit are meshes."""
+    """Key of the data that `FaceTable.of` depends on, for a checked scene; None unless every emitter is a mesh."""
     if not all(shape.is_mesh() or shape.emitter() is None for shape in shapes):
         return None
     return [_edition(shape) for shape in shapes]
 
 
 def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
-    """Key of one mesh: shape, indices of its buffers, emitter and edition of J_n; of another shape that alone."""
+    """Key of one mesh: shape, indices of its buffers, emitter and edition of J_n. For other shapes: the shape alone."""
     if not mesh.is_mesh():
         return (shape_number(mesh),)
     emitter = mesh.emitter()
@@ -91,7 +92,7 @@ def _number(shape: mi.ShapePtr) -> mi.UInt32:
 
 
 def shape_number(shape: mi.Shape) -> int:
-    """Number of a shape among all that live, as it stands in intersection records."""
+    """Dr.Jit's number of a shape among all existing shapes, as intersection records contain it."""
     return int(_number(mi.ShapePtr(shape))[0])
 
 

@@ -15,8 +15,8 @@ from ..runtime.errors import ImageError
 if TYPE_CHECKING:
     from matplotlib.colors import Normalize
 
-DIM = 20.0  # ratio of peaks, or of given limits, above which the scale is logarithmic: 1/20 is nearly black if linear
-DECADES = 3  # that a logarithmic scale shows below the peak of the dimmest image
+DIM = 20.0  # ratio of peaks, or of limits, above which the scale is logarithmic; on a linear one 1/20 is nearly black
+DECADES = 3  # of a logarithmic scale below the peak of the dimmest image
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class ColourScale:
 
     @property
     def factor(self) -> float:
-        """Value [unit] that the colour bar counts as 1."""
+        """Value [unit] that corresponds to 1 on the colour bar: a power of 1000, and 1 on a logarithmic scale."""
         return 1.0 if self.log else scale_and_unit(np.array([self.low, self.high]))[0]
 
     @property
@@ -86,7 +86,7 @@ class ColourScale:
         return f"{self.quantity} [{scale_and_unit(np.array([self.high]), self.unit)[1]}]"
 
     def values(self, power: NDArray) -> NDArray:
-        """Values as the colour bar counts them; where a logarithmic scale has no value, one below its lower end."""
+        """Values in units of `factor`; on a logarithmic scale at least a tenth of the lower end, also for zeros."""
         return (np.maximum(power, self.low / 10) if self.log else power) / self.factor
 
     def norm(self) -> Normalize:

@@ -43,8 +43,8 @@ class Comparison:
     ratio : Σ P_cal / Σ P_std of the absolute powers; None if it is not finite, as for Σ P_std = 0
     profiles : power along rows and columns
     z_test : test of the differences against their errors; None if no image has a standard error above 0
-    beyond : where no image has a standard error, number of pixels that differ by more than the integrals' errors
-        together; None if there are none of these either
+    beyond : number of pixels at which the images differ by more than the sum of both integrals' errors; only if no
+        image has a standard error, else None, as without any errors
     """
 
     me: float
@@ -117,8 +117,9 @@ def compare(
     rows, columns : indices of the profiles, one or several, in 0 … h − 1 and 0 … w − 1; if neither is given, the row
         and column through the standard's brightest pixel
 
-    The z-test takes the errors of both images as independent. That of the integral is a bound, that of Monte Carlo a
-    standard error from few passes, any other a known standard deviation: see `ZTest`.
+    The z-test assumes that the errors of the two images are independent. It treats the error of the integral as a
+    bound, that of Monte Carlo as a standard error estimated from few passes, and any other as a known standard
+    deviation; see `ZTest`.
 
     Raises
     ------

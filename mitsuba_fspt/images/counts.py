@@ -1,4 +1,4 @@
-"""Files of raw counts [DN]: TIFF and stacks of it, FITS, NPY, and click folders of IVIS cameras."""
+"""Files of raw counts [DN]: TIFF with one or several frames, FITS, NPY, and click folders of IVIS cameras."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..runtime.errors import BackendError, ImageError
 
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
-# Keys of ClickInfo.txt, the surest first. A photograph and a bias frame have exposures of their own.
+# Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
 EXPOSURE = tuple(
     re.compile(text, re.IGNORECASE)
     for text in (
@@ -30,12 +30,12 @@ NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Raw counts (h, w) [DN], the mean of `frames` frames, and what comes with them.
+    """Raw counts (h, w) [DN], the mean of `frames` frames, with what the file states about them.
 
     highest : (h, w) the largest count of the frames, None for a single one
     bias, background : frames (h, w) [DN] of a click folder, or None
-    exposure_time : [s], None where the file does not say
-    binning : side of the square of pixels read out as one, None where the file does not say
+    exposure_time : [s], None if the file does not state it
+    binning : side of the square of pixels read out as one, None if the file does not state it
     info : `Key: value` lines of a click folder, those of the luminescent image first
     """
 
@@ -119,7 +119,7 @@ def _fits(path: Path) -> tuple[NDArray[Any], float | None, int | None]:
 
 
 def _click(folder: Path) -> Counts:
-    """Counts of a click folder: luminescent.TIF, with readbiasonly, background and ClickInfo.txt where they are."""
+    """Counts of a click folder: luminescent.TIF, and readbiasonly, background and ClickInfo.txt if it contains them."""
     files = {file.stem.lower(): file for file in sorted(folder.iterdir()) if file.is_file()}
     if CLICK not in files:
         raise ImageError(f"folder '{folder}' holds no luminescent.TIF. Give a click folder of an IVIS camera.")
@@ -132,9 +132,10 @@ def _click(folder: Path) -> Counts:
 
 
 def _click_info(text: str) -> dict[str, str]:
-    """`Key: value` lines; a section `*** luminescent image: FILE` goes before those of other images and the camera.
+    """`Key: value` lines of ClickInfo.txt by key; of keys that occur twice, those of the luminescent image.
 
-    Each image of a click has its own exposure and binning, the photograph's come first in the file.
+    Each image of a click has its own exposure and binning, in a section `*** luminescent image: FILE` or likewise. The
+    file begins with the photograph's.
     """
     own: dict[str, str] = {}
     rest: dict[str, str] = {}
@@ -149,7 +150,7 @@ def _click_info(text: str) -> dict[str, str]:
 
 
 def _of_image(key: str) -> bool:
-    """True for what each image of a click states of itself."""
+    """True for keys that occur once for each image of a click."""
     return any(pattern.search(key) for pattern in (*EXPOSURE, *BINNING))
 
 

@@ -42,7 +42,7 @@ EXAMPLES = {
     "bits": "16",
     "pixel_pitch": "0.0135",
 }
-TABLES = ("detector", "lens")  # of a camera's TOML file; the lens is for other readers
+TABLES = ("detector", "lens")  # of a camera's TOML file; this file reads the first one only
 COMMENTS = {
     "quantum_efficiency": "electrons per photon, η of EMVA 1288",
     "dark_current": "e-/px/s",
@@ -149,7 +149,8 @@ class Detector:
     pixel_pitch : [mm], > 0, of the pixel to which `dark_current` refers; for an image with another `pixel_pitch` in
         its metadata the dark current is scaled by area. None: it refers to the image's pixels, whatever their pitch
     name : label in the files
-    gain_error : relative standard uncertainty of a factor common to all pixels, in [0, 1), as of a calibration
+    gain_error : relative standard uncertainty, in [0, 1), of a factor common to all pixels, such as that of a
+        calibration
 
     Raises
     ------
@@ -277,7 +278,7 @@ class Detector:
         cosmic_rays: bool = False,
         metadata: Metadata | None = None,
     ) -> Image:
-        """Image in W of raw counts, with its standard error, and the mask of saturated pixels.
+        """Image in W from raw counts, with its standard error and a mask of saturated pixels.
 
         Parameters
         ----------
@@ -286,21 +287,22 @@ class Detector:
         wavelength_nm : of the light in vacuum [nm]
         binning : side of the square of pixels that was read out as one; None: that of a FITS header or a click folder,
             else 1
-        pixel_pitch : of the pixels read out [mm]; the image needs it to be checked against a scene
+        pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene
         bias, dark, flat : frames or stacks [DN] in place of the numbers `bias` and `dark_current`; `dark` has the same
-            exposure time and contains the bias, `flat` is free of both. The noise of the flat field itself is not in
-            the errors: average so many frames that it is small beside that of the counts
-        cosmic_rays : also mask pixels that cosmic rays hit
-        metadata : to be kept with the image
+            exposure time and contains the bias, `flat` is free of both. The errors do not contain the noise of the flat
+            field itself: average enough frames to make it small compared with that of the counts
+        cosmic_rays : also mask pixels that cosmic rays have hit
+        metadata : further entries for the image's metadata
 
         The image's metadata hold `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (the variance of dark
-        current, rounding and subtracted frames [e-²]) and `gain_error`: what the noise of any signal follows from.
-        Under a flat field f a pixel has f times the electrons per watt, which `invert` takes from power and error.
+        current, rounding and subtracted frames [e-²]) and `gain_error`. The noise of any signal follows from these. A
+        pixel where the flat field is f has f times `electrons_per_watt`; `responses` recovers f from power and error.
 
         Raises
         ------
         DetectorError : a parameter outside its range, a frame of another size.
-        ImageError : a file that cannot be read;  BackendError : ccdproc, tifffile or astropy is missing.
+        ImageError : a file cannot be read.
+        BackendError : ccdproc, tifffile or astropy is not installed.
         """
         from .reduction import Exposed, reduce_counts
 
@@ -347,10 +349,10 @@ class Detector:
         seed, binning = _whole("seed", seed), _whole("binning", binning)
         _require(
             "seed", seed, 0 <= seed <= 1 << 53, ">= 0 and at most 2^53, for example 1"
-        )  # an EXR holds no larger one
+        )  # an EXR stores integers as doubles, which hold no larger one exactly
         rng = np.random.default_rng(seed)
         mean = self.expected(image, exposure_time, wavelength_nm, binning=binning).mean
-        # A mean this far above the full well saturates with certainty; NumPy draws no Poisson number beyond 9e18.
+        # A mean this far above the full well saturates with certainty. NumPy cannot draw Poisson numbers above 9e18.
         charge = rng.poisson(np.minimum(mean, 2 * self.full_well + 1e6))
         electrons = np.minimum(charge + rng.normal(0.0, self.read_noise, mean.shape), self.full_well)
         full = electrons >= self.full_well
@@ -378,7 +380,7 @@ class Detector:
 
 
 def _own_names(table: dict[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
-    """A table [detector] with the names of EMVA 1288 replaced by ours; DetectorError for a number given twice."""
+    """Table [detector] with EMVA 1288's names replaced by this package's; DetectorError for a number given twice."""
     found = dict(table)
     for theirs, ours in EMVA_1288.items():
         if theirs not in found:
@@ -406,7 +408,7 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
 
 
 def _time_and_wavelength(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
-    """Both as floats, within bounds that keep photons per watt finite: 0 W times infinity is NaN, not dark."""
+    """Both as floats, or DetectorError. The bounds keep photons per watt finite: 0 W times infinity would be NaN."""
     time = number("detector: 'exposure_time'", exposure_time, DetectorError, "60")
     wavelength = number("detector: 'wavelength_nm'", wavelength_nm, DetectorError, "650")
     _require("exposure_time", time, 0 <= time <= 1e12, "in 0 … 1e12 s, for example 60")

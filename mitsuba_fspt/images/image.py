@@ -30,7 +30,7 @@ class Image:
     coverage : array, shape (h, w), unweighted share in [0, 1] of a pixel's lines of sight that reach a shape with
         `fspt_surface`, or None
     metadata : text and numbers that record the origin of the image; `quantity` and `unit` are added
-    mask : bool array, shape (h, w), True for pixels to leave out, as saturated ones, or None
+    mask : bool array, shape (h, w), True for pixels to leave out, such as saturated ones, or None
 
     The arrays are stored as read-only views with at least 32-bit floats.
 
@@ -79,10 +79,10 @@ class Image:
         return self.power.shape
 
     def scaled(self, source_power: float) -> Image:
-        """Image of the same scene with a light source of `source_power` [W], where this one is per 1 W of source.
+        """Image of the same scene with a light source of `source_power` [W], if this one is for a source of 1 W.
 
-        Power and error are multiplied by it; coverage stays. The metadata record it as `source_power`. Of a measured
-        image, `electrons_per_watt` is divided by it: the electrons stay what they were.
+        Power and error are multiplied by `source_power`; the coverage stays. The metadata record it as `source_power`.
+        For a measured image, `electrons_per_watt` is divided by it, so that the electrons do not change.
 
         Raises
         ------
@@ -105,14 +105,19 @@ class Image:
         return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
 
     def to_radiance(self, wavelength_nm: float | None = None) -> DataArray:
-        """Apparent radiance [photons/s/cm²/sr] of what lies in focus, dimensions y and x as of `to_xarray`.
+        """Apparent radiance [photons/s/cm²/sr] of a surface in focus, a DataArray with dimensions (y, x).
 
         P/(τ G ⟨cos⁴θ⟩) of every pixel, with its étendue and the transmittance τ of the lens (Eq. M.6); 0 where no light
-        passes. Its `error` and `coverage` are coordinates.
+        passes. `error` and `coverage` are coordinates of the array, x and y are as of `to_xarray`.
 
+        Parameters
+        ----------
         wavelength_nm : of the light [nm]; None: that of the lens's filter, if the image has one
 
-        Raises ImageError if the metadata lack the lens or the wavelength, BackendError if xarray is not installed.
+        Raises
+        ------
+        ImageError : the metadata lack the lens or the wavelength.
+        BackendError : xarray is not installed.
         """
         from .labelled import radiance_array
 
@@ -122,7 +127,11 @@ class Image:
         """Dataset of `power`, `error` and `coverage`, dimensions (y, x), with `units` and the metadata as attributes.
 
         Coordinates are the pixels' centres [mm] on the virtual detector plane, x to the right and y up: the first row
-        has the largest y. Raises BackendError if xarray is not installed.
+        has the largest y.
+
+        Raises
+        ------
+        BackendError : xarray is not installed.
         """
         from .labelled import dataset
 
@@ -140,13 +149,19 @@ class Image:
     ) -> Axes:
         """Draw the picture that `--png` writes, with colour bar and axes in mm; returns matplotlib's axes.
 
+        Parameters
+        ----------
         axes : to draw into; None: those of a new figure of pyplot
-        log, limits : of the colour scale, in the unit that is shown; see `ColourScale.over`
+        log, limits : of the colour scale, limits in the unit that is shown; see `ColourScale.over`
         outline : draw the silhouette of the phantom, where the coverage is 1/2
-        unit, wavelength_nm : 'W', 'photons/s' or 'p/s/cm2/sr', as of `--unit`
+        unit : 'W', 'photons/s' or 'p/s/cm2/sr'
+        wavelength_nm : of the light [nm], for the units with photons; None: that of the image's filter
 
-        Raises ImageError for limits that are no range, an outline without coverage and a unit that the image cannot
-        be shown in, BackendError without matplotlib.
+        Raises
+        ------
+        ImageError : the limits are no range, the image has no coverage for the outline, or cannot be shown in this
+            unit.
+        BackendError : matplotlib is not installed.
         """
         from .picture import plot_image
 
@@ -155,10 +170,15 @@ class Image:
     def plot_profile(self, row: int | None = None, column: int | None = None, axes: Axes | None = None) -> Axes:
         """Draw the power along a row or a column, with a band of ± error; returns matplotlib's axes.
 
+        Parameters
+        ----------
         row, column : number of one of them, from 0 at the top or left; None: the row through the brightest pixel
         axes : to draw into; None: those of a new figure of pyplot
 
-        Raises ImageError if both are given or it does not exist, BackendError without matplotlib.
+        Raises
+        ------
+        ImageError : both are given, or the row or column does not exist.
+        BackendError : matplotlib is not installed.
         """
         from .picture import plot_profile
 
@@ -181,8 +201,8 @@ class Image:
 
         .exr has the channels `Y`, `error.Y`, `coverage.Y` and metadata under `fspt:`; .tif, .h5, .npz and .fits hold
         the same.
-        The file is written completely or not at all. Pixels below float32's 1e-38 may become 0; an image whose
-        brightest pixel lies below that is refused.
+        The file is written completely or not at all. Pixels below 1e-38 W, the smallest float32, may become 0; an image
+        whose brightest pixel lies below it is refused.
 
         Raises
         ------
@@ -201,14 +221,14 @@ class Image:
 
 
 def read(path: str | os.PathLike[str]) -> Image:
-    """Image of a file that `Image.write` wrote, or of any EXR file with a channel `Y`, which counts as power [W].
+    """Image from a file that `Image.write` wrote, or from any EXR file with a channel `Y`, which is taken as power [W].
 
     `error`, `coverage` and `mask` are None if the file does not have them.
 
     Raises
     ------
     ImageError : the file does not exist, has the suffix of no format, is damaged, is that of another program, has no
-        power, or holds values that are not finite or, by its metadata, no power.
+        power, or holds values that are not finite or that are not power by its metadata.
     BackendError : the format needs a package that is not installed.
     """
     planes, metadata = read_planes(path)

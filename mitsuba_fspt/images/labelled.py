@@ -37,12 +37,12 @@ def radiance_array(image: Image, wavelength_nm: float | None) -> DataArray:
     coordinates = {
         name: (DIMENSIONS, plane, {"units": unit}) for name, (plane, unit) in beside.items() if plane is not None
     }
-    told = {"units": found.unit, "wavelength_nm": found.wavelength_nm}
-    return xr.DataArray(found.values, {**_coordinates(image), **coordinates}, DIMENSIONS, found.quantity, told)
+    attributes = {"units": found.unit, "wavelength_nm": found.wavelength_nm}
+    return xr.DataArray(found.values, {**_coordinates(image), **coordinates}, DIMENSIONS, found.quantity, attributes)
 
 
 def _coordinates(image: Image) -> dict[str, tuple]:
     """x and y of the pixels' centres, with their unit and plane."""
     axes = PixelAxes.of(image.shape, image.metadata)
-    told = {"units": axes.unit, "long_name": axes.label}
-    return {"y": ("y", axes.y, {**told}), "x": ("x", axes.x, {**told})}
+    attributes = {"units": axes.unit, "long_name": axes.label}
+    return {"y": ("y", axes.y, {**attributes}), "x": ("x", axes.x, {**attributes})}

@@ -1,4 +1,4 @@
-"""How results show themselves in a notebook: a table of the numbers that matter, and a picture."""
+"""Display of results in a notebook: a table of their main numbers, and a picture."""
 
 from __future__ import annotations
 

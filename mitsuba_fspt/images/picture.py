@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 COLOURS = "inferno"  # perceptually uniform, black where there is no light
 DIFFERENCES = "RdBu_r"  # white where the images agree
-OUTLINE = "deepskyblue"  # a colour that the map of powers does not have
+OUTLINE = "deepskyblue"  # a colour that the colour map of powers does not contain
 COLUMNS = 4  # panels in a row
 
 
@@ -208,7 +208,7 @@ def draw_panels(
     figure, grid = _panel_grid(images, wide=per_panel)
     rows, columns = grid.shape
     common = len(images) > 1 and len(set(map(caption, images))) == 1
-    alike = len({_extent(image) for image in images}) == 1  # one row of axis labels will do
+    alike = len({_extent(image) for image in images}) == 1  # then one row of axis labels suffices
     own_bar = per_panel or len(images) == 1
     for place, axes in enumerate(grid.flat):
         if place >= len(images):
@@ -304,7 +304,7 @@ def draw_picture(
     limits: tuple[float, float],
     colours: str = COLOURS,
 ) -> None:
-    """Draw `values` (h, w) within `limits` in the frame of `image`, with a colour bar of that height and a `label`."""
+    """Draw `values` (h, w) within `limits` on the axes of `image`, with a labelled colour bar of the same height."""
     extent, axis_label = _extent(image)
     low, high = limits
     shown = axes.imshow(values, cmap=colours, vmin=low, vmax=high or 1.0, extent=extent)
@@ -322,7 +322,7 @@ def _show_difference(axes: Axes, calculated: Image, standard: Image) -> None:
 
 
 def _show_deviation(axes: Axes, calculated: Image, standard: Image, comparison: Comparison) -> None:
-    """Draw the difference in standard errors, white where it is not tested; one line in its place without them."""
+    """Draw the difference in standard errors, white where it is not tested; a line of text if there are none."""
     test = comparison.z_test
     if test is None:
         axes.axis("off")
@@ -376,7 +376,7 @@ def _draw_profile(
 
 
 def _extend(planes: Sequence[NDArray], scale: ColourScale) -> Literal["neither", "min", "max", "both"]:
-    """Ends of the colour bar beyond which there is light."""
+    """Ends of the colour bar beyond which there are values, in matplotlib's words."""
     below = any(bool(np.any((plane > 0) & (plane < scale.low))) for plane in planes)
     above = any(float(plane.max()) > scale.high for plane in planes)
     return "both" if below and above else "min" if below else "max" if above else "neither"

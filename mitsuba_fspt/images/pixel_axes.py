@@ -8,14 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-CROP = ("film_width", "film_height", "crop_offset_x", "crop_offset_y")  # [pixels], of an image that is no whole film
+CROP = ("film_width", "film_height", "crop_offset_x", "crop_offset_y")  # [pixels], metadata of a crop window's image
 
 
 @dataclass(frozen=True, eq=False)
 class PixelAxes:
-    """Centres of the pixels, x to the right and y up, 0 on the optical axis: in the middle of the image.
+    """Centres of the pixels, x to the right and y up, 0 on the optical axis, which is in the middle of the film.
 
-    Of a crop window the metadata `film_width`, `film_height`, `crop_offset_x` and `crop_offset_y` [pixels] are needed.
+    The image is the whole film unless its metadata have `film_width`, `film_height`, `crop_offset_x` and
+    `crop_offset_y` [pixels].
 
     x, y : of the columns (w,) and of the rows (h,), the top one first [`unit`]
     side : of a pixel [mm]; None if it is unknown, then x and y count columns and rows from 0
@@ -55,12 +56,12 @@ class PixelAxes:
 
 
 def _first(metadata: Mapping[str, object], axis: str) -> float:
-    """Pixels of the film before the first one of the image."""
+    """Number of pixels of the film before the first one of the image, along an axis."""
     return float(metadata.get(f"crop_offset_{axis}", 0))  # type: ignore[arg-type]
 
 
 def _film(metadata: Mapping[str, object], name: str, count: int) -> float:
-    """Pixels of the film along an axis, those of the image if it is whole."""
+    """Number of pixels of the film along an axis; `count`, that of the image, if the image is the whole film."""
     return float(metadata.get(name, count))  # type: ignore[arg-type]
 
 

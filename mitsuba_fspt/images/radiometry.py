@@ -1,4 +1,4 @@
-"""Units of images: watts, photons a second, and the apparent radiance of what lies in focus."""
+"""Units of images: watts, photons per second, and the apparent radiance of a surface in focus."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class Converted:
         The metadata state quantity, unit and wavelength. Raises as `Image.write`.
         """
         planes = {self.quantity: self.values, "error": self.error, "coverage": image.coverage}
-        told: Metadata = {"quantity": self.quantity, "unit": self.unit}
-        told |= {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
-        write_planes(path, {name: p for name, p in planes.items() if p is not None}, image.metadata | told)
+        entries: Metadata = {"quantity": self.quantity, "unit": self.unit}
+        entries |= {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
+        write_planes(path, {name: p for name, p in planes.items() if p is not None}, image.metadata | entries)
 
 
 def require_unit(unit: str, wavelength_nm: float | None) -> None:
@@ -70,7 +70,7 @@ def in_unit(image: Image, unit: str, wavelength_nm: float | None = None) -> Conv
         or given for watts; the metadata do not describe the lens.
     """
     require_unit(unit, wavelength_nm)
-    if unit == "W":  # no copies: a large picture hardly fits
+    if unit == "W":  # without copies, to save memory
         return Converted(image.power, image.error, UNITS[unit], unit, None)
     wavelength = wavelength_of(image, wavelength_nm)
     factor: Plane | float = wavelength * 1e-9 / PLANCK_TIMES_LIGHT  # photons per joule

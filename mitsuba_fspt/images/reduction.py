@@ -35,9 +35,9 @@ LEAST_FLAT = 0.05  # of the mean: pixels of a flat field darker than that are ma
 
 @dataclass(frozen=True)
 class Exposed:
-    """Circumstances of an exposure: time [s], wavelength [nm], binning, pitch of the pixels read out [mm] or None.
+    """Conditions of an exposure: time [s], wavelength [nm], binning, pitch of the pixels read out [mm] or None.
 
-    A binning of None is that of the file of counts, or 1.
+    A `binning` of None stands for that of the file of counts, or for 1 if the file does not state it.
     """
 
     exposure_time: float
@@ -97,7 +97,7 @@ def reduce_counts(
     level, charge, added = _background(detector, raw, exposed, bias, dark)
     response, weak = _response(flat, values.shape)
     electrons = _corrected(values, level, response) * detector.gain
-    independent = charge + detector.gain**2 / 12 + raw.frames * added  # the second is that of the rounding
+    independent = charge + detector.gain**2 / 12 + raw.frames * added  # gain²/12: variance of the rounding
     flat_field = 1.0 if response is None else response
     return _image(detector, electrons, flat_field, independent, raw.frames, full | rays | weak, exposed, metadata)
 
@@ -132,10 +132,10 @@ def reduced(exposure: Exposure) -> Image:
 
 
 def responses(image: Image) -> Array:
-    """Flat field (h, w) of a reduced image, by which its pixels' electrons per watt differ from `electrons_per_watt`.
+    """Flat field f (h, w) of a reduced image: a pixel collects f times `electrons_per_watt`.
 
-    Of power P, error s, k electrons per watt and the variance R of read-out and dark current, the flat field f solves
-    s² = (max(P k f, 0) + R)/(k f)². It is 1 where the image has no error.
+    It follows from the power P, its error s, k = `electrons_per_watt` and the variance R of read-out and dark current
+    by s² = (max(P k f, 0) + R)/(k f)². It is 1 where the image has no error.
     """
     shape, error = image.shape, image.error
     k = float(image.metadata["electrons_per_watt"])
@@ -149,19 +149,19 @@ def responses(image: Image) -> Array:
 
 
 def saturated(detector: Detector, counts: Array) -> NDArray[np.bool_]:
-    """True (h, w) where a count is at the end of the converter or at the full well."""
+    """True (h, w) where a count has reached the largest value of the converter or the full well."""
     top = 2**detector.bits - 1
     return (counts >= top) | (counts >= detector.bias + detector.full_well / detector.gain - 0.5)
 
 
 def calibrated(detector: Detector, image: Image, power: Array, error: float) -> Detector:
-    """The detector with the quantum efficiency that a source of known `power` (h, w) [W] on the pixels shows.
+    """Detector with the quantum efficiency that follows from the image of a source of known power.
 
     Parameters
     ----------
-    detector : whose numbers made `image` from counts
-    image : of the source, reduced with them
-    power : what the source sends to the pixels [W]
+    detector : with the numbers by which `image` was reduced from counts
+    image : of the source
+    power : of the source on each pixel, (h, w) [W]
     error : relative uncertainty of `power`, which becomes the `gain_error`
 
     Raises
@@ -197,9 +197,9 @@ def _frame(given: Any, name: str) -> Counts:
 def _background(
     detector: Detector, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | None
 ) -> tuple[Array | float, float, float]:
-    """What is subtracted [DN], a number or a frame; the dark charge [e-]; the variance [e-²] that the frame adds.
+    """Level to subtract [DN], a number or a frame; the dark charge [e-]; the variance that the frame adds [e-²].
 
-    A dark frame, of the same exposure time, holds the bias as well.
+    A dark frame has the same exposure time as the counts and contains the bias.
     """
     charge = exposed.dark(detector.dark_current, detector.pixel_pitch)
     rounding = detector.gain**2 / 12
@@ -215,7 +215,7 @@ def _background(
 
 
 def _response(flat: Frame | None, shape: tuple[int, ...]) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Flat field over its mean, or None, and the pixels that it leaves too dark."""
+    """Flat field divided by its mean, or None without one, and the pixels where it is below `LEAST_FLAT`."""
     if flat is None:
         return None, np.zeros(shape, bool)
     found = _like(flat, "flat", shape).values
@@ -227,7 +227,7 @@ def _response(flat: Frame | None, shape: tuple[int, ...]) -> tuple[Array | None,
 
 
 def _like(frame: Any, name: str, shape: tuple[int, ...]) -> Counts:
-    """Counts of a frame of this shape; DetectorError for another one."""
+    """Counts of a frame; DetectorError if its shape is another."""
     found = _frame(frame, name)
     if found.values.shape != shape:
         raise DetectorError(
@@ -237,7 +237,7 @@ def _like(frame: Any, name: str, shape: tuple[int, ...]) -> Counts:
 
 
 def _corrected(values: Array, level: Array | float, response: Array | None) -> Array:
-    """Counts less the level, over the response: by ccdproc where frames are given."""
+    """(Counts − level)/response; by ccdproc if level or response are frames."""
     if response is None and np.ndim(level) == 0:
         return values - level
     ccdproc, data_of = _ccdproc()
@@ -286,11 +286,10 @@ def _image(
     exposed: Exposed,
     metadata: Mapping[str, Any] | None,
 ) -> Image:
-    """Image in W of the mean electrons, over the `response`, of so many frames.
+    """Image in W from `electrons` (h, w), the mean over `frames` frames, divided by the flat field `response`.
 
-    `dark` is the variance [e-²] of one frame beside shot and read noise.
-
-    The metadata keep the numbers of the sum of the frames, whose shot noise is that of all its electrons.
+    `dark` is the variance [e-²] of one frame in addition to shot and read noise. The numbers in the metadata are those
+    of the sum of the frames, whose shot noise is that of all its electrons.
     """
     per_watt = exposed.per_watt(detector.quantum_efficiency) * frames
     read = detector.read_noise * frames**0.5
@@ -319,7 +318,7 @@ def _image(
 
 
 def read_measured(path: str | os.PathLike[str]) -> Image:
-    """Image in W of a file: of `fspt reduce` or a render, or electrons of `fspt expose`, reduced by their metadata.
+    """Image in W from a file of `fspt reduce` or a rendering, or from electrons of `fspt expose`, which are reduced.
 
     Raises
     ------

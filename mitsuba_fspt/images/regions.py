@@ -1,4 +1,4 @@
-"""Regions of interest: which pixels, and what light comes from them."""
+"""Regions of interest: selection of pixels, and radiometric quantities of the light from them."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ HEADINGS = {
 
 
 def measure(image: Image, region: str | Mask | None = None, wavelength_nm: float | None = None) -> Measurement:
-    """Light of a region of an image; None: of all pixels.
+    """Radiometric quantities of the light from a region of an image.
 
     Parameters
     ----------
     image : power [W]
-    region : mask (h, w), or text as of `region_mask`
+    region : mask (h, w), or text as of `region_mask`; None: all pixels
     wavelength_nm : of the light [nm]; None: that of the image's filter
 
     Raises
@@ -104,9 +104,10 @@ def measure(image: Image, region: str | Mask | None = None, wavelength_nm: float
 def region_mask(image: Image, text: str) -> Mask:
     """Pixels (h, w) of a region described by text; pixels count from the upper left corner.
 
-    'x,y,width,height' a rectangle; 'circle:x,y,radius' the pixels whose centres lie in it, x and y of its centre from
-    the image's corner; '25%' the pixels with at least so much of the brightest pixel's power; the name of a TIFF file
-    of that size, its values other than 0.
+    'x,y,width,height' : a rectangle, with the first pixel x, y
+    'circle:x,y,radius' : the pixels whose centres lie in the circle; x, y of its centre from the image's corner
+    '25%' : the pixels with at least this share of the brightest pixel's power
+    name of a TIFF file of the image's size : the pixels whose value there is not 0
 
     Raises
     ------
@@ -164,7 +165,7 @@ def _check_mask(image: Image, mask: Mask, what: str) -> None:
 
 
 def _numbers(text: str, region: str, count: int) -> list[float]:
-    """So many finite numbers between commas; ImageError for another text."""
+    """`count` finite numbers, separated by commas in the text; ImageError for any other text."""
     try:
         found = [float(part) for part in text.split(",")]
     except ValueError:

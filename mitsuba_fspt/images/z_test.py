@@ -21,10 +21,10 @@ class ZTest:
     """Test of the differences in units of their standard error, z = max(|P_cal − P_std| − bound, 0) / s.
 
     s is the standard error of the difference, √(s_cal² + s_std²). The `error` of a deterministic image (`method` =
-    integral in its metadata) is no standard deviation: it is the bound, within which that image may be wrong. Any
-    other image's `error` is a standard error; where the metadata hold `passes`, s was estimated from the scatter of so
-    few passes, and z follows Student's t with passes − 1 degrees of freedom (two images: Welch's). All z below are
-    those of a normal distribution with the same probability.
+    integral in its metadata) is no standard deviation: it is the bound of that image's error. Any other image's `error`
+    is a standard error. If the metadata hold `passes`, s was estimated from the scatter of that number of passes, and z
+    follows Student's t with passes − 1 degrees of freedom (for two such images: Welch's number). The values of z below
+    are converted to those of a normal distribution with the same probability.
 
     Attributes
     ----------
@@ -109,9 +109,9 @@ class _Differences:
     excess : max(|difference| − bound, 0) [W]
     error : standard error s of the difference [W]
     freedom : its degrees of freedom, Welch's; infinite where s counts as known
-    missed : standard deviation [W] beside s, of light that no sample met
-    tested : pixels with light in either image and s > 0. Without light in both there is nothing to test, and the error
-        of the Monte Carlo is that of a sample that could have been.
+    missed : standard deviation [W] in addition to s, of light that no sample met
+    tested : pixels with light in either image and s > 0. A pixel without light in both is not tested: the error of the
+        Monte Carlo there is the power of a possible sample
     """
 
     def __init__(self, calculated: Image, standard: Image) -> None:
@@ -137,10 +137,10 @@ class _Differences:
         self.missed = self._missed(calculated, standard)
 
     def _missed(self, calculated: Image, standard: Image) -> Plane:
-        """Standard deviation [W] that the passes cannot show, where Monte Carlo is darker than a deterministic image.
+        """Standard deviation [W] missing in s where Monte Carlo is darker than a deterministic image by d.
 
-        If light arrives in events of power w, the passes of a pixel that missed some of them give w P in place of w
-        (P + d), d the difference; w = s²/P, the largest in the 3 × 3 neighbourhood.
+        If light arrives in events of power w, the variance of the mean is w (P + d). From the passes of a pixel that
+        missed some events it is estimated as w P. w = s²/P is taken as the largest in the 3 × 3 neighbourhood.
         """
         sampled = [image for image in (calculated, standard) if not is_deterministic(image)]
         if len(sampled) != 1 or "passes" not in sampled[0].metadata:

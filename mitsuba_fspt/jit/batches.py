@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-BATCH = 1 << 22  # most lines of sight in one kernel, which bounds the memory for pictures of any size
+BATCH = 1 << 22  # most lines of sight in one kernel, which bounds the memory for images of any size
 
 
 def batches(index: mi.UInt32, lines_each: int = 1) -> list[mi.UInt32]:
-    """The numbers in `index`, in batches of at most `BATCH` lines of sight, `lines_each` per number."""
+    """Parts of the array `index`, each with at most `BATCH` lines of sight, if an entry has `lines_each` of them."""
     size, count = max(1, BATCH // lines_each), dr.width(index)
     if count <= size:
         return [index] if count else []
@@ -39,6 +39,9 @@ def batch_slices(lines: NDArray[np.int64]) -> Iterator[slice]:
 
 
 def numbered(lines: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Item of each line of sight, and its number in that item, both of shape (Σ lines,); item k has `lines[k]`."""
+    """For each line of sight the item that it belongs to and its number in that item, both of shape (Σ lines,).
+
+    lines : number of lines of sight of each item
+    """
     item = np.repeat(np.arange(len(lines)), lines)
     return item, np.arange(len(item)) - np.repeat(np.cumsum(lines) - lines, lines)

@@ -1,4 +1,4 @@
-"""Square blocks of pixels of a large picture: a grid of pixels that leaves out all others."""
+"""Square blocks of pixels of a large image, as a grid that does not contain the other pixels."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 class BlockGrid(Grid):
-    """Pixels of the marked blocks of `side`² pixels; an image has one entry for each of them, block by block.
+    """Pixels of the marked blocks of `side`² pixels; an array on the grid has one entry per pixel, block by block.
 
     blocks : (rows, columns) of blocks, True where a block belongs to the grid; at least one
-    shape : (h, w) of the whole picture, which they cover
-    place : number of each pixel in the whole picture, row by row
+    shape : (h, w) of the whole image that the blocks cover
+    place : number of each pixel in the whole image, row by row
 
-    A neighbour that is left out stands for the pixel itself.
+    In operations on neighbours, a pixel's own value takes the place of a neighbour that is not in the grid.
     """
 
     def __init__(self, blocks: NDArray[np.bool_], side: int) -> None:
@@ -49,7 +49,7 @@ class BlockGrid(Grid):
         return self._count
 
     def place(self, number: mi.UInt32) -> mi.UInt32:
-        """Numbers in the whole picture of pixels of the grid."""
+        """Number in the whole image of each of these pixels of the grid."""
         return dr.gather(mi.UInt32, self.position, number)
 
     def pixels(self, mask: Mask | None = None) -> mi.UInt32:
@@ -57,19 +57,19 @@ class BlockGrid(Grid):
         return self.number if mask is None else dr.compress(mask)
 
     def flat(self, array: NDArray[Any]) -> Any:
-        """Image or mask from an array (h, w) of the whole picture."""
+        """Values or mask on the grid, from an array (h, w) of the whole image."""
         side, (rows, columns) = self.side, self.blocks.shape
         own = array.reshape(rows, side, columns, side).swapaxes(1, 2)[self.blocks].ravel()
         return mi.Bool(own) if own.dtype == bool else mi.Float64(own)
 
     def lay(self, image: Any, array: NDArray[Any]) -> None:
-        """Write an image into an array (h, w) of the whole picture."""
+        """Write values on the grid into an array (h, w) of the whole image."""
         side, (rows, columns) = self.side, self.blocks.shape
         whole = array.reshape(rows, side, columns, side).swapaxes(1, 2)
         whole[self.blocks] = np.asarray(image.numpy()).reshape(-1, side, side)
 
     def border(self) -> Mask:
-        """True on pixels with a neighbour that is left out."""
+        """True on pixels with a neighbour that is not in the grid."""
         inside = mi.Bool(True)
         for (dx, dy), index in self._around.items():
             inside &= (dr.gather(mi.Int, self.x, index) == self.x + dx) & (
@@ -97,7 +97,7 @@ class BlockGrid(Grid):
         return [dr.gather(mi.Float64, image, index, here) for image in images]
 
     def _index(self, x: mi.Int, y: mi.Int) -> mi.UInt32:
-        """Numbers of the pixels (x, y) of each pixel's surroundings; its own where such a pixel is left out."""
+        """Numbers of the neighbours (x, y) of each pixel; the pixel's own number for a neighbour beyond the grid."""
         index, here = self._looked_up(x, y)
         return dr.select(here, index, self.number)
 

@@ -1,4 +1,4 @@
-"""Buffers of Mitsuba's meshes; the only file that uses their names, which Mitsuba 3.10 changes."""
+"""Buffers of Mitsuba's meshes. Only this file uses their names, which change in Mitsuba 3.10."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def face_count(mesh: mi.Shape) -> int:
 def buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
     """Vertex positions (3 V,) [mm] and face indices (3 F,) of a mesh.
 
-    Copies that share the data: the arrays that a mesh returns would keep it alive.
+    They are copies that share the data, since the arrays that a mesh returns would keep the mesh alive.
     """
     return mi.Float(mesh.vertex_positions_buffer()), mi.UInt32(mesh.faces_buffer())
 

@@ -22,9 +22,9 @@ BLOCK = 4  # side of the squares of pixels that are processed together; each hol
 
 
 class Grid:
-    """Pixels of a picture of `shape` (h, w), at least one; an image on it is one array of h · w entries, row by row.
+    """Pixels of an image of `shape` (h, w), at least one; values on them are an array of h · w entries, row by row.
 
-    Sizes and radii reach kernels as data, so that pictures of all shapes share the kernels.
+    Kernels receive sizes and radii as data, so that images of all shapes use the same compiled kernels.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
@@ -42,11 +42,11 @@ class Grid:
         return math.prod(self.shape)
 
     def place(self, number: mi.UInt32) -> mi.UInt32:
-        """Numbers in the whole picture of pixels of the grid: the same."""
+        """Numbers in the whole image of these pixels of the grid, which are the same."""
         return number
 
     def border(self) -> Mask:
-        """True on pixels with a neighbour that the grid leaves out: none."""
+        """True on pixels with a neighbour that is not in the grid: on none."""
         return mi.Bool(False)
 
     def pixels(self, mask: Mask | None = None) -> mi.UInt32:
@@ -59,7 +59,7 @@ class Grid:
         """Numbers of all pixels, sorted by bands of `BLOCK` rows and by columns within a band."""
         number, full = mi.Int(self.number), BLOCK * self._width
         band = number // full
-        # At least 1: kernels run a little beyond the last pixel and must not divide by zero there.
+        # At least 1: kernels are also evaluated for some entries beyond the last pixel and must not divide by zero.
         position, rows = number - band * full, dr.clip(self._height - BLOCK * band, 1, BLOCK)
         column = position // rows
         return mi.UInt32((BLOCK * band + position - column * rows) * self._width + column)
@@ -78,7 +78,7 @@ class Grid:
         return np.asarray(image.numpy()).reshape(self.shape)
 
     def lay(self, image: Any, array: NDArray[Any]) -> None:
-        """Write an image into an array (h, w) of the whole picture."""
+        """Write values on the grid into an array (h, w) of the whole image."""
         array[:] = self.array(image)
 
     # ------------------------------------------------------------------ neighbours
@@ -128,9 +128,9 @@ class Grid:
         return left >= 0
 
     def _reached(self, left: mi.Int, step: int) -> mi.Int:
-        """Largest reach that is `left` over at each pixel from pixels up to two steps away.
+        """Largest reach that remains at each pixel of the `left` reach of pixels up to two steps of `step` pixels away.
 
-        Steps 1, 2, 4 … in turn connect any two pixels by a shortest path.
+        Calls with steps of 1, 2, 4 … one after the other connect any two pixels by a shortest path.
         """
         k = dr.opaque(mi.Int, step)
         dr.eval(left)
@@ -145,7 +145,7 @@ class Grid:
         return most
 
     def box_sum(self, image: PixelArray, radius: int) -> PixelArray:
-        """Sum over the (2 radius + 1)² pixels around each one, fewer at the border; cost independent of the radius."""
+        """Sum over the (2 radius + 1)² pixels around each, fewer at the border, at a cost independent of the radius."""
         reach = dr.opaque(mi.Int, radius)
         rows = _sliding_sum(image, self.y * self._width, self.x, self._width, reach)
         number = mi.Int(self.number)
@@ -166,7 +166,7 @@ class Grid:
         return mean
 
     def _beside(self, images: tuple[PixelArray, ...], dx: int, dy: int) -> list[PixelArray]:
-        """Values (dx, dy) pixels away, 0 outside the grid."""
+        """Values at the pixels (dx, dy) away from each pixel; 0 outside the grid."""
         x, y = self.x + dx, self.y + dy
         here = (x >= 0) & (x < self._width) & (y >= 0) & (y < self._height)
         index = self._index(x, y)

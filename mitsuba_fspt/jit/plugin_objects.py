@@ -1,4 +1,4 @@
-"""Mitsuba's plugins as objects, made where `mi.load_dict` must not be called."""
+"""Creation of Mitsuba's plugin objects where `mi.load_dict` must not be called."""
 
 from __future__ import annotations
 

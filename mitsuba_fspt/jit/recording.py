@@ -1,6 +1,6 @@
-"""Recording of kernels: a virtual call records one function of every existing plugin, also of unused scenes.
+"""Recording of kernels: a virtual call records the function of every existing plugin, those of other scenes included.
 
-So plugins must not be deleted during a recording, and unsound surfaces of other scenes must not fail in it.
+Plugins must therefore not be deleted during a recording, and invalid surfaces of other scenes must not raise in it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _checked = ContextVar("scene_is_checked", default=False)
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """Context manager for kernels of a checked scene: no garbage collection, unsound surfaces of other scenes are dark.
+    """Context manager for kernels of a checked scene: no garbage collection; invalid surfaces of other scenes are dark.
 
     If a plugin were deleted between two calls in one kernel, the calls would differ, and Dr.Jit would define one
     function twice and abort the process.
@@ -37,7 +37,7 @@ def recording() -> Iterator[None]:
             gc.enable()
 
 
-def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
+def evaluated_outside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
     """Result of `build(shape)`, evaluated at once even while this thread records a kernel; without gradients.
 
     Light tracers first call the emitter in the middle of a recording, when its thread cannot evaluate arrays. Dr.Jit
@@ -50,14 +50,14 @@ def aside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
 
     with ThreadPoolExecutor(1) as pool:
         built = pool.submit(run).result()
-    # A new scope puts later operations of this thread after those that the other left unevaluated: on CUDA the handle
-    # of a scene.
+    # On CUDA the other thread leaves the handle of a scene unevaluated. In a new scope the operations of this thread
+    # follow that evaluation.
     dr.detail.new_scope(dr.backend_v(mi.Float))
     return built
 
 
-def dark_elsewhere(*kinds: str) -> Callable[[Callable], Callable]:
-    """Decorator of an emitter's method: zeros of the types `kinds` if the surface is unsound, in another scene."""
+def zero_if_invalid(*kinds: str) -> Callable[[Callable], Callable]:
+    """Decorator of an emitter's method: for an invalid surface of another scene it returns zeros of types `kinds`."""
 
     def decorate(method: Callable) -> Callable:
         @wraps(method)

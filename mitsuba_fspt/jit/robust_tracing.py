@@ -1,7 +1,7 @@
 """Detection of scenes whose ray tracing loses rays at mesh edges, and robust copies of them.
 
-Embree without its robust mode misses some rays that meet an edge or a vertex exactly. A scene does not report the mode
-it was built in, so test rays detect the loss itself.
+Without its robust mode Embree misses some rays that meet an edge or a vertex exactly. A scene does not report in which
+mode it was built, so the loss is detected by test rays.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import mitsuba as mi
 from .mesh_buffers import triangles
 
 PROBES = 4096  # points on the edges of each mesh
-STEP = 1e-4  # distance from a probed point to its four neighbours in the test, over the distance from the lens
+STEP = 1e-4  # distance between a tested point and its four neighbours, over the distance from the lens
 STEPS = (3242174889, 2447445414)  # of the R₂ sequence, in units of 2⁻³²: uniform over edges and positions on them
 
 
@@ -71,7 +71,7 @@ def _lost_rays(scene: mi.Scene, lens: mi.Sensor, mesh: mi.Shape) -> int:
     around = mi.Bool(True)
     for side in (frame.s, -frame.s, frame.t, -frame.t):
         around &= meets(side * (STEP * dr.norm(d)))
-    # Embree traces packets of rays by other code, which loses other rays.
+    # Embree traces packets of rays by different code, which loses different rays.
     return sum(int(dr.count(around & ~meets(mi.Vector3f(0), together))[0]) for together in (False, True))
 
 

@@ -19,7 +19,7 @@ def at_one_wavelength(record: mi.Ray3f | mi.SurfaceInteraction3f) -> None:
 def scalar(spectrum: mi.Spectrum) -> mi.Float:
     """Value of a spectrally flat, unpolarised quantity, in any variant."""
     flat = mi.unpolarized_spectrum(spectrum) if mi.is_polarized else spectrum
-    # `dr.mean` would write the number of array entries into the kernel, which would be compiled anew for every picture.
+    # `dr.mean` would write the number of array entries into the kernel, and every image size would need a new kernel.
     return dr.sum(flat, axis=0) * (1 / len(flat))
 
 

@@ -1,8 +1,7 @@
-"""The boundary factor A of the diffusion equation: fluence and exitance where the index jumps.
+"""The boundary factor A of the diffusion equation, which relates fluence and exitance at a jump of the index.
 
 At the surface the fluence phi [W/mm²] obeys phi + 2 A D dphi/dn = 0, D the diffusion coefficient [mm], so the
-exitance is J_n = -D dphi/dn = phi/(2A). A depends on nothing but the relative index n >= 1 of the tissue;
-A = 1 where the indices match.
+exitance is J_n = -D dphi/dn = phi/(2A). A depends only on the relative index n >= 1 of the tissue; A = 1 for n = 1.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ from numpy.typing import NDArray
 
 from ..runtime.errors import FluxError
 
-LARGEST_INDEX = 100  # farther off A is all rounding
+LARGEST_INDEX = 100  # above it, rounding dominates the computed A
 
 
 def robin_a(n: float) -> float:
-    """A = (2/(1 − R0) − 1 + |cos θc|³)/(1 − |cos θc|²), no unit, >= 1; R0: reflectance face-on, sin θc = 1/n.
+    """A = (2/(1 − R0) − 1 + |cos θc|³)/(1 − |cos θc|²), no unit, >= 1; R0: normal reflectance, sin θc = 1/n.
 
-    The approximation NIRFAST calls 'robin': 2.570 at n = 1.37, 3.571 at n = 1.53. It replaces the reflectance
-    below the critical angle by R0.
+    NIRFAST calls this approximation 'robin'. It sets the reflectance below the critical angle to R0, that at normal
+    incidence. A is 2.570 at n = 1.37 and 3.571 at n = 1.53.
 
     Raises
     ------
@@ -45,8 +44,8 @@ def haskell_a(n: float) -> float:
     FluxError : n is below 1 or above 100.
     """
     n = _index(n)
-    # In the outer cosine (µ dµ = µ_o dµ_o / n²) the transmittance has no kink at the critical angle;
-    # nodes µ_o = x² crowd at grazing exit, where it is steep for n near 1.
+    # As a function of the outer cosine (µ dµ = µ_o dµ_o / n²) the transmittance has no kink at the critical angle.
+    # It is steep at grazing exit for n near 1, where the nodes µ_o = x² are dense.
     x, weight = np.polynomial.legendre.leggauss(64)
     x, weight = (x + 1) / 2, weight / 2
     outer = x**2
@@ -56,11 +55,11 @@ def haskell_a(n: float) -> float:
 
 
 def boundary_a(a: str | float, n: float) -> float:
-    """A of a description: 'robin', 'haskell', or the number itself (also as text), > 0.
+    """A [1] by one of its formulas, `a` = 'robin' or 'haskell' at the index n, or `a` itself, a number > 0 or its text.
 
     Raises
     ------
-    FluxError : neither of the names nor a positive finite number, or n below 1 or above 100.
+    FluxError : `a` is neither of the names nor a positive finite number, or n is below 1 or above 100.
     """
     if a == "robin":
         return robin_a(n)
@@ -86,7 +85,7 @@ def fresnel_transmittance(cos_inner: NDArray[np.float64], n: float) -> NDArray[n
 
 
 def _index(n: float) -> float:
-    """The refractive index, checked."""
+    """`n` as a float; FluxError if it is below 1 or above 100."""
     if not 1 <= n <= LARGEST_INDEX:
         raise FluxError(
             f"boundary factor: the refractive index n must be >= 1 and at most {LARGEST_INDEX}, got {n:g}. Give the "

@@ -1,4 +1,4 @@
-"""Discs of the lens plane that lines of sight have to pass, and the blur that a disc gives to points out of focus."""
+"""Discs of the lens plane through which lines of sight pass, and the blur disc of a point out of focus."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Disc:
-    """Disc of the lens plane open to a virtual point at (x, y, u): centre `shift`·(x, y), radius `radius` [mm].
+    """Disc of the lens plane through which the virtual point (x, y, u) is seen (Eq. M.7 of docs/model.md).
 
-    `shift` is 0 for a border that lies in the lens plane and 1 for a cone that moves along with the virtual point.
+    shift : κ, the centre is at κ (x, y): 0 for a border in the lens plane, 1 for a cone that moves with the point
+    radius : R [mm]
     """
 
     shift: float
@@ -18,15 +19,16 @@ class Disc:
 
 
 def defocus(depth: Any, focus_distance: Any, shift: Any) -> tuple[Any, Any]:
-    """How far out of focus a point at `depth` z [mm] is, (u - z)/u, and its scale on the virtual detector plane.
+    """Defocus b = (u - z)/u and scale m of a point at `depth` z [mm], both without unit (Eq. M.7 of docs/model.md).
 
-    The line of sight from the lens point a = shift·x + ρ through the virtual point x meets the plane at depth z in
-    r = x + (a - x)(u - z)/u. Solved for x, light that leaves r for the point ρ of the disc arrives at
+    The line of sight from the lens point a = κx + ρ, κ = `shift`, through the virtual point x is at depth z at
+    r = x + (a - x) b. This equation, solved for x, gives the point of the virtual detector plane at which light from r
+    towards the point ρ of the disc arrives:
 
-        x = r/scale - ρ · ((u - z)/u)/scale,   scale = 1 - (1 - shift)(u - z)/u        (Eq. M.7 of docs/model.md),
+        x = r/m - ρ b/m,   m = 1 - (1 - κ) b
 
-    so that the blur disc of r has its centre at r/scale and the radius R·|u - z|/u/scale, R the disc's own. A point
-    with `scale` <= 0 counts as one without a bounded blur disc. Floats, NumPy arrays or Dr.Jit arrays; no unit.
+    The blur disc of r therefore has its centre at r/m and the radius R |b|/m, with the radius R of the disc. For m <= 0
+    the blur disc is not bounded. Arguments are floats, NumPy arrays or Dr.Jit arrays, and the results likewise.
     """
     back = (focus_distance - depth) / focus_distance
     return back, 1 - (1 - shift) * back

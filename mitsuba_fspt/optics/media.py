@@ -1,4 +1,4 @@
-"""What tissue does to light and where light comes from: media and sources."""
+"""Optical coefficients of tissue, and isotropic light sources in it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Medium:
 
 @dataclass(frozen=True)
 class Source:
-    """Isotropic light of `power` [W] > 0 and <= 1e30, uniform over the `shape`.
+    """Isotropic light source of `power` [W] > 0 and <= 1e30, distributed uniformly over the `shape`.
 
     Raises
     ------

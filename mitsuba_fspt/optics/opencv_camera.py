@@ -1,7 +1,7 @@
-"""Camera of OpenCV's calibration (K, rvec, tvec) as pose and pixel pitch of an `fspt_lens`.
+"""Conversion of OpenCV's calibration of a camera (K, rvec, tvec) to pose and pixel pitch of an `fspt_lens`.
 
 OpenCV: X_c = R X + t with x to the right, y down and z forward, and the pixel (f_x x/z + s y/z + c_x, f_y y/z + c_y),
-whose whole numbers are centres of pixels. The lens looks along its +z with x to the left and y up, so that
+whose integer values are centres of pixels. The lens looks along its +z with x to the left and y up, so that
 to_world = [Rᵀ diag(−1, −1, 1) | −Rᵀ t]. A pinhole has f_x = v/p: the pixel pitch is p = v/f_x for a lens focused at the
 image distance v.
 """
@@ -19,19 +19,19 @@ from ..runtime.numbers import whole
 from .thin_lens import FOCUS, Lens
 
 Array = NDArray[np.float64]
-TOLERANCE = 0.5  # pixels: a corner of the image may move by as much by what a lens with square pixels does not have
-WIDEST = 3.0  # of a film whose middle is the principal point, over the image: beyond, it is no camera's
+TOLERANCE = 0.5  # pixels: largest shift of an image corner by properties of K that a lens with square pixels lacks
+WIDEST = 3.0  # largest size, over that of the image, of a film with the principal point in the middle
 
 
 @dataclass(frozen=True, eq=False)
 class OpenCVCamera:
-    """Pose and film of a camera; neither aperture nor focus, which OpenCV's numbers do not contain.
+    """Pose and film of a camera. Aperture and focus are missing, since OpenCV's numbers do not contain them.
 
     to_world : (4, 4), from the lens at the origin to the world [mm]
     focal_pixels : image distance over pixel pitch, (f_x + f_y)/2
     width, height : of the film whose middle is the principal point;  crop : (x, y, width, height) of the image in it
-    deviation : pixels that a corner of the image moves by what is left out: skew, f_x ≠ f_y, the rest of the principal
-        point beyond half pixels
+    deviation : shift of an image corner [pixels] by all that is neglected: skew, f_x ≠ f_y, and the part of the
+        principal point that is smaller than half a pixel
     """
 
     to_world: Array
@@ -46,7 +46,7 @@ class OpenCVCamera:
         return image_distance / self.focal_pixels
 
     def sensor_xml(self, *, focal_length: float, f_number: float, **focus: float) -> str:
-        """Text of the `<sensor>` for a scene file, with the lens's own numbers.
+        """XML text of the `<sensor>` for a scene file.
 
         Parameters
         ----------
@@ -55,7 +55,7 @@ class OpenCVCamera:
 
         Raises
         ------
-        OpticsError : a lens that cannot exist.
+        OpticsError : the lens cannot exist, or `focus` is not exactly one of the three.
         """
         if unknown := set(focus) - set(FOCUS):
             raise OpticsError(f"camera_from_opencv: '{unknown.pop()}' sets no focus. Give one of {', '.join(FOCUS)}.")
@@ -84,7 +84,8 @@ def camera_from_opencv(K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, wid
         camera.to_world, camera.pixel_pitch(image_distance=82.5)
         camera.sensor_xml(focal_length=55, f_number=2.8, magnification=0.5)   # for a scene file
 
-    A principal point beside the middle of the image becomes a crop of a larger film, to half a pixel.
+    If the principal point is not in the middle of the image, the image becomes a crop of a larger film, rounded to half
+    a pixel.
 
     Parameters
     ----------
@@ -133,9 +134,9 @@ def camera_from_opencv(K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, wid
 
 
 def _film(centre: float, size: int) -> tuple[int, int, float]:
-    """First pixel of the image on a film whose middle is at the pixel `centre`, that film's size, what is left over.
+    """First pixel of the image on a film with its middle at the pixel `centre`, size of that film, rounding [pixels].
 
-    The middle of the image is the pixel (size − 1)/2; a film that is larger by n pixels moves it by n/2.
+    The middle of the image is at (size − 1)/2. A film that is larger by n pixels on one side has its middle n/2 away.
     """
     off = 2 * (centre - (size - 1) / 2)
     if abs(off) > (WIDEST - 1) * size:

@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 
 from .thin_lens import Lens
 
-RADII = 4097  # distances from the axis between which the étendue is linear; wrong by 1e-6 on films of ±45°
+RADII = 4097  # distances from the axis between which the étendue is interpolated; the error is 1e-6 on films of ±45°
 CHORDS, ALONG = 16, 6  # Gauss nodes across each part of the open pupil and along its chords
-PARTS = 32  # squares along a pixel that the border of an image-plane stop cuts
+PARTS = 32  # squares along the side of a pixel that the border of an image-plane stop crosses
 Plane = NDArray[np.float64]
 
 
 def pixel_etendues(lens: Lens, side: float, x: Plane, y: Plane, transmittance: float = 1.0) -> Plane:
     """τ A_vd A_pupil/u² ⟨cos⁴θ⟩ [mm² sr] of virtual pixels, shape (h, w); 0 where no light passes.
 
-    The mean is over the pixel and the pupil, over what borders of the lens and the image-plane stop leave open (Eq. 5).
+    The mean is over the pixel and over the part of the pupil that the borders of the lens leave open (Eqs. 5, M.13);
+    light outside the image-plane stop counts as 0.
 
     lens : focused on the virtual detector plane
     side : of a virtual pixel [mm]
@@ -36,10 +37,11 @@ def pixel_etendues(lens: Lens, side: float, x: Plane, y: Plane, transmittance: f
 
 
 def mean_cos4(lens: Lens, radius: Plane) -> Plane:
-    """Mean of cos⁴θ over the pupil, 0 where a second border is in the way, of virtual points (n,) off the axis [mm].
+    """Mean of cos⁴θ over the pupil, shape (n,), for virtual points at the distances `radius` (n,) from the axis [mm].
 
-    The open pupil is symmetric about the line from the axis to the virtual point. It is integrated chord by chord at
-    right angles to that line; heights and half chords are in units of the pupil's radius.
+    cos⁴θ counts as 0 on the part of the pupil that a second border covers. The open part is symmetric about the line
+    from the axis to the virtual point. It is integrated over chords perpendicular to that line; `height` of a chord and
+    positions along it are in units of the pupil's radius.
     """
     first, *borders = lens.discs
     u, pupil = lens.focus_distance, lens.pupil_radius
@@ -72,7 +74,7 @@ def _over_chords(
     rows, shares = np.polynomial.legendre.leggauss(ALONG)
     total = np.zeros_like(start)
     for node, weight in zip(nodes, weights, strict=True):
-        # Dense at the ends, where chords shrink like a root: the integrand becomes smooth.
+        # The length of chords vanishes like a square root at both ends; with nodes dense there the integrand is smooth.
         turn = math.pi * (node + 1) / 2
         height = start + (stop - start) * (1 - math.cos(turn)) / 2
         step = (stop - start) * math.sin(turn) * math.pi / 4 * weight

@@ -1,4 +1,4 @@
-"""Spheres and cylinders in space: where light sources and inclusions are. Lengths in mm, NumPy float64."""
+"""Spheres and cylinders that describe light sources and inclusions. Lengths in mm, NumPy float64."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Small uniform spheres that together stand for a shape.
+    """Small uniform spheres that together approximate a shape.
 
-    `centres` (K, 3) [mm]; `radii` (K,) [mm], 0 for a point; `shares` (K,), no unit, sum 1: of the shape's
-    power.
+    centres : (K, 3) [mm]
+    radii : (K,) [mm], 0 for a point
+    shares : (K,) of the shape's power, with the sum 1
     """
 
     centres: Array
@@ -53,11 +54,11 @@ class Sphere:
         return Nodes(np.array([self.centre], dtype=float), np.array([self.radius]), np.ones(1))
 
     def border(self) -> Array:
-        """Points of the border, (M, 3) [mm]; a point's is itself."""
+        """Points of the border, (M, 3) [mm]; for radius 0 the centre."""
         centre = np.array([self.centre], dtype=float)
         if self.radius == 0:
             return centre
-        # A spiral of equal steps in height covers the sphere evenly; with the poles among it.
+        # A spiral with equal steps in height from pole to pole covers the sphere evenly.
         height = np.linspace(-1, 1, 64)
         angle = math.pi * (1 + math.sqrt(5)) * np.arange(64)
         across = np.sqrt(1 - height**2)

@@ -15,7 +15,7 @@ from .discs import Disc
 from .models import LensModel, model_named, model_names
 from .models.diaphragm import Diaphragm
 
-LARGEST = 1e30  # of a lens's numbers and of their inverses: squares stay finite
+LARGEST = 1e30  # largest number of a lens, and largest inverse of one: squares stay finite
 FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
 BORDERS = ("lens_diameter", "diaphragm_distance", "image_stop_diameter")
 NUMBERS = ("focal_length", "f_number", *FOCUS, *BORDERS)  # of `Lens.focused`, whatever the model
@@ -131,21 +131,21 @@ class Lens:
 
     @property
     def seen_field(self) -> float:
-        """How far [mm] off the axis virtual points lie inside the image-plane stop; inf without one."""
+        """Distance from the axis [mm] up to which virtual points lie inside the image-plane stop; inf without one."""
         return math.inf if self.image_stop_diameter is None else self.image_stop_diameter / 2 / self.magnification
 
     @property
     def pupil_radius(self) -> float:
-        """Radius [mm] over which lens points of lines of sight spread: the first disc's, of a pinhole 0."""
+        """Radius [mm] of the disc that contains the lens points of all lines of sight; 0 for a pinhole."""
         return self.model.pupil_radius(self)
 
     @property
     def discs(self) -> tuple[Disc, ...]:
-        """The one or two discs of the lens plane a line of sight has to pass; their overlap is the open pupil."""
+        """The one or two discs of the lens plane that a line of sight has to pass; their overlap is the open pupil."""
         return self.model.discs(self)
 
     def numbers(self) -> dict[str, float | str]:
-        """The model's name, all numbers that are given or follow from the lens law, and D, by name [mm]."""
+        """By name: the model, all numbers that are given or follow from the lens law, and D; lengths in mm."""
         own = {name: getattr(self.model, name) for name in self.model.parameters()}
         common = {name: getattr(self, name) for name in (*NUMBERS, "diaphragm_diameter")}
         found = {"model": self.model.name} | common | own
@@ -158,7 +158,7 @@ def number_names() -> tuple[str, ...]:
 
 
 def _model(name: str, own: dict[str, object]) -> LensModel:
-    """The model of a name with its own parameters; OpticsError for one that is not its own."""
+    """Model with this name and its own parameters; OpticsError for a parameter of another model."""
     kind = model_named(name)
     for wrong in (parameter for parameter in own if parameter not in kind.parameters()):
         home = next((other for other in model_names() if wrong in model_named(other).parameters()), None)
@@ -172,10 +172,10 @@ def _model(name: str, own: dict[str, object]) -> LensModel:
 
 
 def configuration_factor(radius: float, distance: float, offset: float) -> float:
-    """Share of a Lambertian point's power that a parallel coaxial-or-offset disc receives (no unit).
+    """Share of the power of a Lambertian surface element that a disc parallel to it receives (Eq. M.17), no unit.
 
-    f = ½ (1 − (Z − 2R²)/√(Z² − 4R²a²)), Z = u² + R² + a², with R `radius`, u `distance`, a `offset` [mm], written
-    without the cancellation at small R.
+    f = ½ (1 − (Z − 2R²)/√(Z² − 4R²a²)), Z = u² + R² + a², with the disc's R = `radius`, u = `distance` and
+    a = `offset` from the element's normal, all in mm. It is evaluated without the cancellation at small R.
     """
     z = distance**2 + radius**2 + offset**2
     s = math.sqrt((z - 2 * radius * offset) * (z + 2 * radius * offset))
@@ -183,7 +183,7 @@ def configuration_factor(radius: float, distance: float, offset: float) -> float
 
 
 def _require_positive(name: str, value: float, example: str) -> float:
-    """`value` as a plain number; OpticsError where it is none, not positive or beyond `LARGEST`."""
+    """`value` as a float; OpticsError if it is no number, not positive, or beyond `LARGEST`."""
     value = number(f"'{name}'", value, OpticsError, EXAMPLES[name])
     if not (math.isfinite(value) and value > 0):
         raise OpticsError(f"'{name}' must be > 0 and finite, got {value:g}. Give {example}.")

@@ -1,4 +1,4 @@
-"""Transmittance τ of a lens with its filters: one number, or a curve over the wavelength that a file holds."""
+"""Transmittance τ of a lens with its filters: one number, or a curve over the wavelength, read from a file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class Curve:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Curve:
-        """Curve of a CSV file: a wavelength [nm] and τ a row, in any order; one line of titles and # comments may be.
+        """Curve from a CSV file with a wavelength [nm] and τ in each row, in any order. One title line and # comments
+        are allowed.
 
         Raises
         ------
@@ -83,7 +84,7 @@ class Curve:
 
 
 def _check(path: Path, wavelengths: NDArray[np.float64], values: NDArray[np.float64]) -> None:
-    """Raise OpticsError for a wavelength that is not > 0 or is there twice, and for a τ outside [0, 1]."""
+    """Raise OpticsError for a wavelength that is not > 0 or occurs twice, and for a τ outside [0, 1]."""
     wrong = ~((wavelengths > 0) & np.isfinite(wavelengths))
     if wrong.any():
         nm = wavelengths[wrong][0]
@@ -128,5 +129,5 @@ def transmittance_of(numbers: Mapping[str, float], curve: Curve | None) -> float
 
 
 def t_stop(f_number: float, transmittance: float) -> float:
-    """T-stop N/√τ: f-number of a lens without losses that is as bright."""
+    """T-stop N/√τ: f-number of the lens without losses that gives the same power."""
     return f_number / math.sqrt(transmittance)

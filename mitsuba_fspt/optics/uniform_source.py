@@ -1,4 +1,4 @@
-"""Power on the pixels of a lens before a uniform source that fills its field, as an integrating sphere does."""
+"""Power on the pixels of a camera that sees only a uniform source, such as an integrating sphere."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ from .thin_lens import Lens
 def uniform_power(
     lens: Lens, radiance: float, pixel_pitch: float, shape: tuple[int, int], transmittance: float = 1.0
 ) -> NDArray[np.float64]:
-    """Power (h, w) [W] on pixels of side `pixel_pitch` [mm] of a source of `radiance` [W/mm²/sr]: Eq. M.6 times it.
+    """Power [W] on each pixel, shape (h, w): P = τ L G ⟨cos⁴θ⟩ (Eq. M.6), whatever the distance of the source.
 
-    P = τ L G ⟨cos⁴θ⟩ whatever the distance of the source, π L A_vd f (M.17) on the axis: no factor 4π. Borders and stop
-    of the lens count.
-    `shape` is (h, w), `transmittance` the share τ that lens and filters let through.
+    On the axis this is τ π L A_vd f (M.17). Borders of the lens and the image-plane stop are taken into account.
+
+    Parameters
+    ----------
+    radiance : L of the source [W/mm²/sr]
+    pixel_pitch : side of a pixel [mm]
+    shape : (h, w) of the image
+    transmittance : share τ of the power that lens and filters let through
     """
     side = pixel_pitch / lens.magnification  # of a virtual pixel: p/t
     y, x = (np.asarray(side * (np.arange(n) - (n - 1) / 2), np.float64) for n in shape)

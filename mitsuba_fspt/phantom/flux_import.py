@@ -41,12 +41,12 @@ def import_flux(
     values : file or array with one value for each vertex, triangle, tetrahedron or boundary face. None: the values
         are in `mesh`.
     field : name of the array, property or column of the values; a column also by its number from 1
-    per : 'vertex' or 'face', the elements that carry the values; needed if their number and name leave that open
+    per : 'vertex' or 'face', the elements that carry the values; needed only if the values' number leaves it open
     format : 'auto' (by the file's name) or one of `formats.FORMATS`
     length_unit : 'mm', 'cm' or 'm', unit of the mesh **and** of its values: W per square of it. MMC's values are
         power per face, whatever the unit. None: m of a glTF file (.glb, .gltf) by its standard, else mm.
-    a : the values are fluence, J_n = phi/(2A), with A by 'robin', 'haskell' (see `optics.boundary`) or as a number.
-        None: they are J_n, except NIRFAST's, which are always fluence, with A by 'robin' as in NIRFAST
+    a : boundary factor A if the values are fluence phi, J_n = phi/(2A): 'robin', 'haskell' (see `optics.boundary`) or
+        a number. None: the values are J_n; but NIRFAST's values are fluence, and None stands for 'robin' there
     n : refractive index of the tissue for A; None: that of the file, else 1.37
     clip : set negative values to 0 and record their power
     flip : reverse the orientation of all faces
@@ -72,7 +72,7 @@ def import_flux(
     with np.errstate(over="ignore"):  # require_single refuses inf
         exitance, provenance = _exitance(raw, found, scale, a, n)
     require_single(exitance)
-    provenance = {"source": source, **provenance, **_unit_told(found, unit, given=length_unit is not None)}
+    provenance = {"source": source, **provenance, **_unit_entries(found, unit, given=length_unit is not None)}
     exitance, negatives, removed = _without_negatives(found, exitance, clip)
     if not exitance.any():
         provenance["warning"] = " ".join([*([provenance["warning"]] if "warning" in provenance else []), DARK])
@@ -81,12 +81,12 @@ def import_flux(
     return phantom
 
 
-def _unit_told(found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
-    """For the provenance: the unit of the mesh, if it is not mm and not `given`, and a warning of an unusual size."""
-    told = {} if given or unit == "mm" else {"mesh_unit": f"{unit}, by the standard of its format; scaled to mm"}
+def _unit_entries(found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
+    """Entries of the provenance: the unit of the mesh if it is neither mm nor `given`, and a warning of odd size."""
+    entries = {} if given or unit == "mm" else {"mesh_unit": f"{unit}, by the standard of its format; scaled to mm"}
     diagonal = float(np.linalg.norm(np.ptp(found.vertices[found.faces].reshape(-1, 3), axis=0)))
     warning = unit_warning(diagonal, unit)
-    return told | ({"warning": warning} if warning else {})
+    return entries | ({"warning": warning} if warning else {})
 
 
 def _exitance(
@@ -114,7 +114,7 @@ def _exitance(
 def _boundary_factor(
     a: str | float, n: float | None, found: SurfaceValues, source: str
 ) -> tuple[float | NDArray[np.float64], str]:
-    """A, one for all values or one for each, and its description for the provenance."""
+    """A, as one number or as an array with one for each value, and its description for the provenance."""
     if n is None and found.index is not None and a in ("robin", "haskell"):
         index = found.index if found.per == "vertex" else found.index[found.faces].mean(axis=1)
         if np.isnan(index).any():
@@ -134,7 +134,7 @@ def _require_outward(phantom: Phantom, flip: bool) -> None:
     shape = phantom.closure
     if shape.twisted:
         raise FluxError(
-            f"mesh: on {shape.twisted} edges the two faces show to opposite sides, each face must show "
+            f"mesh: on {shape.twisted} edges the two faces point to opposite sides, each face must point "
             "outward. Repair it, for example by trimesh.repair.fix_winding."
         )
     if shape.inside_out:

@@ -1,4 +1,4 @@
-"""Scene file of a phantom: a camera that is placed so that the phantom fills the film from every side."""
+"""Scene file of a phantom, with the camera placed such that the phantom fills the film in every view."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
 from .phantom import Phantom
 
-FILLED = 0.9  # of the film's side, by what the phantom covers of it in its widest view, blur included
-LEAST, MOST = 1e-6, 1e6  # magnifications among which the one that fills the film is searched for
+FILLED = 0.9  # share of the film's side that the phantom covers in its widest view, blur included
+LEAST, MOST = 1e-6, 1e6  # limits of the search for the magnification that fills the film
 CURVE = "transmittance_curve"
-DIGITS = 3  # of the magnification that is found
+DIGITS = 3  # of the resulting magnification
 
 SCENE = """<?xml version="1.0" encoding="utf-8"?>
 <!--
@@ -102,14 +102,14 @@ def scene_xml(
     view: float = 0.0,
     **lens: float | str,
 ) -> str:
-    """Text of a scene file that shows a phantom, for `load` or to be saved, with these values of its parameters.
+    """XML text of a scene that shows a phantom, for `load` or to be saved; the arguments become its `<default>` values.
 
         scene = fspt.load(fspt.scene_xml("phantom.ply", focal_length=50, f_number=1.8), view=90)
 
     The lens is on the +x axis and looks at the centre of the phantom's bounding box, which is moved to the origin; up
     is +z. It is focused on the front: on the vertical plane that touches the phantom in the view in which it is
-    nearest. Magnification and distance are such that in every view all of the phantom, its blur included, lies within
-    0.9 of the film's width and height, and fills that of one of them in the widest view.
+    nearest. Magnification and distance are such that in every view the whole phantom, its blur included, lies within
+    0.9 of the film's width and height, and reaches this limit along one of them in the widest view.
 
     Parameters
     ----------
@@ -117,15 +117,15 @@ def scene_xml(
         as its only property with a name like `jn_x`; see `Phantom.read`
     focal_length : F [mm]
     f_number : f_num = F/D
-    magnification : t = v/u; None finds it
-    distance : from the lens to the axis about which the phantom turns [mm]; None finds it. Of a `magnification` or a
-        `distance` given alone the other one follows, so that the front is in focus.
+    magnification : t = v/u; None: the one that fills the film, or the one that follows from `distance`
+    distance : from the lens to the axis about which the phantom turns [mm]; None: the one at which the front is in
+        focus with this magnification
     pixel_pitch : side of a pixel [mm]
     width, height : of the film [pixels]
     rtol : error of the integral relative to the brightest pixel
     view : turns the phantom counterclockwise about +z [degrees]
-    lens : further parameters of `fspt_lens` by name, such as lens_diameter [mm] or transmittance, and in place of the
-        magnification focus_distance or image_distance [mm]
+    lens : further parameters of `fspt_lens` by name, such as lens_diameter [mm] or transmittance; also focus_distance
+        or image_distance [mm] in place of the magnification
 
     Raises
     ------
@@ -216,7 +216,7 @@ def camera_lens(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """What a phantom needs of the camera's field while it turns about the vertical axis of its bounding box.
+    """Extent of a phantom that turns about the vertical axis of its bounding box.
 
     centre, size : of the bounding box (3,) [mm]
     radii, heights : of each vertex, its distance from that axis and from the middle plane (V,) [mm]
@@ -272,7 +272,7 @@ class Frame:
         return magnification, self.focal_length * (1 + 1 / magnification) + radius
 
     def _focus(self, magnification: float | None) -> float | None:
-        """The magnification that is given, by itself or as focus_distance or image_distance; None if none is.
+        """The given magnification, or that of a given focus_distance or image_distance; None if none is given.
 
         Raises OpticsError for a lens that cannot exist.
         """
@@ -302,10 +302,10 @@ class Frame:
         return float(f"{math.floor(low / step) * step:.{DIGITS}g}")
 
     def _filled(self, magnification: float) -> float:
-        """Share of the film's width or height, whichever is larger, that the phantom covers in its widest view.
+        """Share that the phantom covers of the film's width or height in its widest view; the larger of the two.
 
-        A silhouette at the depth z and the angle α to the optical axis reaches v (tan α + R (1/u - 1/z)) on the
-        detector, with the pupil's radius R.
+        A silhouette at the depth z and the angle α to the optical axis extends to v (tan α + R (1/u - 1/z)) on the
+        detector, with the pupil's radius R and the distances u, v of focus and image.
         """
         u, v = self.focal_length * (1 + 1 / magnification), self.focal_length * (1 + magnification)
         pupil = self.focal_length / self.f_number / 2
@@ -326,7 +326,7 @@ def _pixels(name: str, value: int) -> int:
 
 
 def _numbers(**given: float) -> dict[str, float]:
-    """The values as floats; SceneError for one that is none, or not finite, and for a pitch that is not > 0."""
+    """The values as floats; SceneError for a value that is no finite number, and for a pixel pitch that is not > 0."""
     examples = {"focal_length": "50", "f_number": "1.8", "pixel_pitch": "0.108", "rtol": "1e-3", "view": "90"}
     found = {name: number(f"scene: '{name}'", value, SceneError, examples[name]) for name, value in given.items()}
     for name, value in found.items():

@@ -54,9 +54,9 @@ class Phantom:
     faces : array, shape (F, 3), indices of vertices from 0, counterclockwise seen from outside
     exitance : array, shape (V,) or (F,) as set by `per` [W/mm²], J_n, finite, >= 0; linear between vertices
     per : 'vertex' or 'face'
-    provenance : origin of the values, texts by single-word keys, for the report and the PLY's comments
+    provenance : origin of the values for the report and the PLY's comments: texts by keys of a single word
     negatives, removed_power : number of values that were negative and became 0, and their power [W], >= 0
-    attribute : name of J_n in the file that it was read from, as of a mesh attribute of Mitsuba
+    attribute : name of J_n in the file that it was read from, without the `_x` of the PLY property
 
     Raises
     ------
@@ -106,7 +106,7 @@ class Phantom:
 
     @cached_property
     def power(self) -> float:
-        """Power Σ J_n A [W] over the faces; J_n per vertex counts with the mean of a face's corners."""
+        """Power Σ J_n A [W] over the faces; J_n on vertices contributes the mean over the corners of each face."""
         return float(shares(self.vertices, self.faces, self.per) @ self.exitance)
 
     @cached_property
@@ -223,10 +223,10 @@ def _exitance_field(raw: RawMesh, path: Path) -> Field:
 
 
 def shares(vertices: Points, faces: Indices, per: str) -> NDArray[np.float64]:
-    """Area by which each value counts, shape (V,) or (F,) [mm²]: Σ shares · J_n is the power.
+    """Area that belongs to each value of J_n, shape (V,) or (F,) [mm²], so that Σ shares · J_n is the power.
 
-    A face counts with its own area, a vertex with a third of the area of each of its faces: the exact integral of a
-    linear J_n.
+    It is the area of the face, or a third of the areas of all faces at the vertex. The sum is the exact integral of a
+    J_n that is linear on the faces.
     """
     areas = face_areas(vertices, faces)
     if per == "face":

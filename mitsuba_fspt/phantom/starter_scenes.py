@@ -1,4 +1,4 @@
-"""Scenes to start from: commented XML that renders as it is, by the name of what it shows."""
+"""Commented scene files to start from, by name; each renders without changes."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ MIRROR = """
         </bsdf>
     </shape>"""
 RIG = """\
-Mirrors   flat, 40 x 44 mm, their centres 60 mm from the axis at azimuths of 120 and 240 degrees; each is turned so
-          that the camera looks by way of its centre at the middle of the phantom. The direct view is in the middle
-          of the picture, the mirrored ones, the wrong way round, to either side. reflectance is the mirrors'.
+Mirrors   flat, 40 x 44 mm, their centres 60 mm from the axis at azimuths of 120 and 240 degrees. Each is turned so
+          that the camera sees the middle of the phantom in the mirror's centre. The direct view is in the middle of
+          the picture, the two mirror images, left and right exchanged, are on either side. reflectance: of the mirrors.
 Camera    the virtual detector plane lies between the front of the phantom and its mirror images, which are farther
           away; a small stop keeps all of them sharp."""
 RIG_CAMERA = {"focal_length": 55.0, "f_number": 8.0, "distance": 320.0, "focus_distance": 340.0}
@@ -76,14 +76,14 @@ REFLECTANCE = 0.95
 def starter_scene(name: str, phantom: str | os.PathLike[str] | None = None, **camera: Any) -> str:
     """Text of the starter scene of this name.
 
-    name : cylinder (15 mm in radius, 30 mm high, of uniform J_n), mouse (a phantom's PLY, framed) or rig (the cylinder
-        before two mirrors)
+    name : cylinder (radius 15 mm, height 30 mm, uniform J_n), mouse (a PLY with J_n, seen by a camera that it fills) or
+        rig (the cylinder in front of two mirrors)
     phantom : the PLY with J_n, for mouse
     camera : keywords of `scene_xml`
 
     Raises
     ------
-    SceneError : there is no scene of this name, or a phantom is missing or has no place in it; and as `scene_xml`.
+    SceneError : there is no scene of this name, `phantom` is missing or not used by it; further as `scene_xml`.
     """
     if name not in STARTERS:
         raise SceneError(f"scene new: the name must be one of {', '.join(STARTERS)}, got '{name}'. Give one of these.")
@@ -104,7 +104,7 @@ def _rig(phantom: str | os.PathLike[str] | None, camera: dict[str, Any]) -> str:
 
 
 def _require_none(name: str, phantom: object) -> None:
-    """Raise SceneError for a phantom that the scene of this name has no place for."""
+    """Raise SceneError if a phantom is given for a scene that does not use one."""
     if phantom is not None:
         raise SceneError(f"scene new: {name} has no place for '{phantom}'. Leave --phantom out, or give mouse.")
 

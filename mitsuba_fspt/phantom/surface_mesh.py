@@ -23,13 +23,13 @@ TETRAHEDRON_OPPOSITE = np.array([3, 2, 1, 0])
 
 
 def face_normals(points: Points, faces: Indices) -> Points:
-    """Vector area of each face, shape (F, 3) [length unit of `points`, squared]: outward normal times area."""
+    """Vector area of each face, shape (F, 3) [square of the length unit of `points`]: outward normal times area."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a) / 2
 
 
 def face_areas(points: Points, faces: Indices) -> NDArray[np.float64]:
-    """Area of each face, shape (F,), >= 0 [length unit of `points`, squared]."""
+    """Area of each face, shape (F,), >= 0 [square of the length unit of `points`]."""
     return np.linalg.norm(face_normals(points, faces), axis=1)
 
 
@@ -62,9 +62,9 @@ def boundary(points: Points, tetrahedra: Indices) -> tuple[Indices, Indices]:
 
 
 def merge(points: Points, faces: Indices) -> tuple[Points, Indices]:
-    """Points without duplicates (P, 3), and the same faces in the same order on them (F, 3).
+    """Points without duplicates (P, 3), and the same faces in the same order with the new indices (F, 3).
 
-    Only equal points are merged. A format without shared corners (STL) repeats a corner for each of its faces.
+    Only points with equal coordinates are merged. An STL file repeats a corner for each of its faces.
     """
     order = np.lexsort(points.T)
     ordered = points[order]
@@ -89,7 +89,7 @@ class Closure:
     """Closure and orientation of a surface.
 
     watertight : every edge has a face on either side
-    twisted : number of edges that both their faces traverse in the same direction; 0 if orientations are consistent
+    twisted : number of edges whose two faces are oriented oppositely; 0 if all orientations are consistent
     inside_out : number of connected pieces whose faces point to the wrong side; None unless watertight and not
         twisted. Faces that point to the interior of their piece are right if the piece bounds a cavity in another one.
     pieces : number of connected pieces; 0 if `inside_out` is None
@@ -118,7 +118,7 @@ def closure(points: Points, faces: Indices) -> Closure:
     _, edge, count = np.unique(low * len(points) + high, return_inverse=True, return_counts=True)
     forward = np.bincount(edge.ravel(), weights=start < end, minlength=len(count))
     watertight = bool(len(count)) and bool((count % 2 == 0).all())
-    # An edge needs as many faces in one direction as in the other; a face at a rim has no partner.
+    # On a closed surface as many faces traverse an edge in one direction as in the other.
     twisted = int(np.count_nonzero(np.abs(2 * forward - count) > count % 2))
     if not watertight or twisted:
         return Closure(watertight, twisted, None, 0)
@@ -131,7 +131,7 @@ def _inside_out(points: Points, faces: Indices) -> tuple[int, int]:
     label = _pieces(len(points), faces)[faces[:, 0]]
     _, first, piece = np.unique(label, return_index=True, return_inverse=True)
     corners, normals = points[faces], face_normals(points, faces)
-    # Relative to a corner of the piece: far from the origin the volume would cancel.
+    # Positions relative to a corner of the piece: far from the origin the terms of the volume would cancel.
     heights = corners[:, 0] - corners[first, 0][piece]
     volumes = np.bincount(piece, weights=np.einsum("ij,ij->i", normals, heights)) / 3
     areas = np.bincount(piece, weights=np.linalg.norm(normals, axis=1))
@@ -142,7 +142,7 @@ def _inside_out(points: Points, faces: Indices) -> tuple[int, int]:
     lowest, highest = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     wrong = 0
     for number in hollow:
-        # A generic point of the piece: the line upwards from it meets no edge of an axis-aligned mesh.
+        # A point of the piece whose upward line does not meet the edges of an axis-aligned mesh.
         point = np.array([0.5377, 0.2719, 0.1904]) @ corners[first[number]]
         near = ((lowest <= point[:2]) & (highest >= point[:2])).all(axis=1) & (piece != number)
         wrong += _crossings_above(point, corners[near]) <= 0
@@ -164,7 +164,7 @@ def _pieces(count: int, faces: Indices) -> Indices:
     while True:
         before = label.copy()
         lowest = label[faces].min(axis=1).repeat(3)
-        np.minimum.at(label, before[faces.ravel()], lowest)  # attach whole trees, not single points
+        np.minimum.at(label, before[faces.ravel()], lowest)  # relabel all points with the same label at once
         np.minimum.at(label, faces.ravel(), lowest)
         label = label[label]
         if np.array_equal(label, before):

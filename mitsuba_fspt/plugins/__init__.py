@@ -41,10 +41,10 @@ def register() -> None:
 
 
 def _end_in_own_errors() -> None:
-    """Let `mi.render` raise this package's errors themselves.
+    """Replace `mi.render` by a function that raises this package's own errors.
 
-    Dr.Jit, which `mi.render` calls the integrator through, wraps an error of any integrator in a RuntimeError, so that
-    the last line of the output only says that the reason stands somewhere above. All other errors stay as they are.
+    `mi.render` calls the integrator through Dr.Jit, which wraps every error in a RuntimeError whose message only refers
+    to the error above it. The replacement raises an FsptError itself; all other errors stay as they are.
     """
     inner = mi.render
     if getattr(inner, "ends_in_own_errors", False):
@@ -59,9 +59,9 @@ def _end_in_own_errors() -> None:
             if not isinstance(own, FsptError):
                 raise
         try:
-            raise own  # out of the handler, or it would have the RuntimeError as its context
+            raise own  # outside of the handler, else the RuntimeError would be its context
         finally:
-            del own  # which refers to this frame
+            del own  # it refers to this frame
 
     render.ends_in_own_errors = True  # type: ignore[attr-defined]
     mi.render = render
@@ -70,8 +70,8 @@ def _end_in_own_errors() -> None:
 def _refuse_in(variant: str) -> None:
     """Register plugins that refuse a scalar variant.
 
-    In every variant `mi.load_dict` queries scalar_rgb for the kind of a plugin's name. Without an answer it takes equal
-    emitters of two shapes for copies of one, which cannot belong to both.
+    In every variant `mi.load_dict` asks scalar_rgb for the kind of a plugin's name. If the name is unknown there, it
+    takes equal emitters of two shapes for one and the same emitter, which cannot belong to both.
     """
     if variant in _registered:
         return

@@ -9,7 +9,7 @@ from ..runtime.errors import OpticsError
 
 
 def own_film(props: mi.Properties) -> None:
-    """Replace the film in `props` by one of equal size and crop that stores power: monochrome, float32, box filter."""
+    """Replace the film in `props` by a monochrome float32 film with a box filter and the same size and crop window."""
     size, crop_offset, crop_size = (256, 256), (0, 0), None
     for name, child in props.objects():
         if isinstance(child, mi.Film):
@@ -27,7 +27,7 @@ def own_film(props: mi.Properties) -> None:
 
 
 def default_sampler(props: mi.Properties) -> None:
-    """Add the best stock sampler for one bounce to `props` if the scene file names none."""
+    """Add Mitsuba's most efficient sampler for light straight from the surface to `props` if the scene names none."""
     if not any(isinstance(child, mi.Sampler) for _, child in props.objects()):
         props["sampler"] = made("multijitter", sample_count=64)
 

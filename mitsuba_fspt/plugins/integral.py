@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..emission.asked_gradients import shining_with_gradients
 from ..emission.face_table import FaceTable, edition_of, mark_of, shape_number
+from ..emission.gradients import emitters_with_gradients
 from ..integral import interpolated, pupil_form, surface_form
 from ..integral.eq9 import View
 from ..integral.exitance_rows import Rows, kinds_of, sizes_of
@@ -37,9 +37,9 @@ from ..runtime.errors import SceneError, named
 from ..runtime.plugin_types import is_surface
 
 MEANINGLESS = ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "timeout")
-LEAST_DISPLACEMENT = 1e-3  # pixels; larger ones occur only far from the world's origin
+LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
 NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
-UNCERTAINTY = 2.0  # factor to which that light is known
+UNCERTAINTY = 2.0  # largest ratio of that light and its estimate
 
 
 class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
@@ -56,20 +56,20 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
        - Requested error of every pixel, relative to the brightest pixel (Default: 1e-3).
      * - domain
        - |string|
-       - pupil: lines of sight from every pixel (Default). surface: the power of every surface element is spread
-         over the pixels its blur disc covers. Both are forms of Eq. 9. Light from objects and spots thinner than
-         half a pixel or half their blur disc, which lines of sight from the pixels would miss, is spread in any case.
+       - pupil: lines of sight from every pixel (Default). surface: the power of every surface element is distributed
+         over the pixels that its blur disc covers. Both are forms of Eq. 9. The second one is always used for light
+         from objects and spots thinner than half a pixel or half their blur disc, which lines of sight would miss.
      * - pixel
        - |string|
        - area: integrate over the pixel (Default). centre: the value at its centre times its area, as in the paper.
      * - max_nodes
        - |int|
-       - Most lines of sight per pixel (Default: 4194304), four in any case; domain surface: on average, 256 … 65536 in
-         any case.
+       - Largest number of lines of sight per pixel (Default: 4194304), at least four. In domain surface it is the mean
+         per pixel, at least 256 and at most 65536.
      * - max_specular
        - |int|
-       - Specular surfaces (null, thin and solid glass, mirrors, masks) that a line of sight goes through or off at most
-         (Default: 8). What is cut off there is in the error.
+       - Largest number of specular surfaces (null, thin and solid glass, mirrors, masks) that a line of sight passes
+         through or is reflected by (Default: 8). The light that is cut off there is contained in the error.
      * - shortcuts
        - |bool|
        - Omit computations that the scene does not need (Default: true). false gives the same power, within the
@@ -82,7 +82,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         _refuse_meaningless(props)
         super().__init__(props)
         self.quadrature = _quadrature_of(props)
-        # Results about the last scene; a reference to the scene, whose child this integrator is, would be a cycle.
+        # Results for the last scene. A reference to the scene itself would be a cycle: this integrator is its child.
         self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
         self._robust: RobustCopy | None = None
         self._window, self._narrow, self._faces, self._left_out, self._rows = (CachedValue() for _ in range(5))
@@ -99,9 +99,9 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     ) -> Solution:
         """Power, error and coverage of the sensor's crop window, by `quadrature` or the integrator's own.
 
-        A large film is solved in tiles; `progress` is called with the share done, 0 … 1, after every level of each.
-        Without `narrow`, objects and spots that lines of sight may miss are not searched for, and not in the error: for
-        drafts of a picture that is computed in full afterwards.
+        A large film is solved in tiles; `progress` is called with the share done, 0 … 1, after every level of each
+        tile. With `narrow` = False, objects and spots that lines of sight may miss are neither searched for nor
+        contained in the error; that is meant for drafts of an image that is computed in full afterwards.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     def light_left_out(
         self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None
     ) -> LeftOut | None:
-        """Light of a scene that `solve` can render which Eq. 9 leaves out; None where there can be none."""
+        """Light that Eq. 9 leaves out in a scene that `solve` can render; None if there can be none."""
         quadrature = quadrature or self.quadrature
         with recording(), dr.suspend_grad():
             window = visible_window(scene, sensor)
@@ -147,7 +147,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         progress: Progress,
         narrow: bool,
     ) -> None:
-        """Solve all tiles; several ones share the tolerance that follows from a lower bound of the brightest pixel."""
+        """Solve all tiles. With several, their tolerance follows from a lower bound of the brightest pixel."""
         tiles, window = mosaic.tiles, mosaic.window
         least_peak, points = 0.0, None
         progress(0.0)
@@ -174,7 +174,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         least_peak : lower bound of the brightest pixel of all tiles [W/mm²/sr]
         """
         scene, lens, specular = view.scene, view.lens, view.specular
-        # The surface form ignores the border of the image-plane stop: pixels that it cuts take lines of sight.
+        # The surface form ignores the border of the image-plane stop: pixels that the border crosses take lines of
+        # sight.
         inside, cut = window.field_stop(lens)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
@@ -190,7 +191,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if not everywhere:
             where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
             peak = max(narrow.brightest / 2, least_peak)
-        if specular and specular.bending:  # the surface form follows light straight to the lens alone
+        if specular and specular.bending:  # the surface form contains only light that goes straight to the lens
             where = np.zeros(window.shape, bool)
         if where.any():
             known = surface_form.solve(scene, lens, window, quadrature, where, peak, progress.part(0, 2), specular)
@@ -204,15 +205,15 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             return replace(solution, findings=findings)
         missed = _missed(narrow, where, cut, window, lens, solution)
         if specular and specular.bending:
-            # Where a mirror or glass shows a narrow spot is not known.
+            # The positions at which a mirror or glass shows a narrow spot are not known.
             there = window.seen_in(specular.bending, lens)
             missed = np.maximum(missed, window.expand(there * UNCERTAINTY * narrow.on_pixels.max() * lens.etendue))
         return replace(solution, error=np.maximum(solution.error, missed), findings=findings)
 
     def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[tuple[Blocks, ...], str]:
-        """Blocks of pixels between which the picture may be interpolated; none, and why, where that is not done."""
+        """Blocks of pixels between which the image may be interpolated; the reason if there are none."""
         if not quadrature.takes("smooth blocks"):
-            return (), "as was wanted"
+            return (), "as requested"
         if quadrature.domain != "pupil" or view.specular:
             return (), "only lines of sight from the pixel straight to the first surface are interpolated"
         if math.isfinite(view.lens.optics.seen_field):
@@ -224,8 +225,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     def _by_blocks(
         self, view: View, blocks: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float, progress: Progress
     ) -> Solution | None:
-        """Solution with values interpolated between blocks; None where that saves nothing."""
-        # What is narrow for a pixel is narrow for a block.
+        """Solution with values interpolated between blocks; None if that saves no lines of sight."""
+        # Light that is narrow for a pixel is narrow for a block, too.
         largest = blocks[0]
         narrow = self._narrow_light(replace(view, lens=largest.lens), largest.window)
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
@@ -233,7 +234,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         return interpolated.solve(view, blocks, quadrature, least_peak, progress)
 
     def _traced(self, scene: mi.Scene, lens: mi.Sensor) -> mi.Scene:
-        """`scene`, or a robust copy if it loses rays; tested once, and again if the geometry of a copy changes."""
+        """`scene`, or a robust copy if it loses rays. Tested once, and again if the geometry of a copy changes."""
         marks = [mark_of(emitter) for emitter in scene.emitters()]
         if marks == self._lossless:
             return scene
@@ -283,11 +284,11 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
         with dr.resume_grad():
-            asked = shining_with_gradients(scene, sensor)
+            asked = emitters_with_gradients(scene, sensor)
         if asked and kinds_of(scene, asked, self.quadrature) is None:
             self._refuse_specular(scene, sensor)
         solution = self.solve(scene, sensor)
-        self._tell_left_out(scene, sensor)
+        self._warn_of_light_left_out(scene, sensor)
         return mi.TensorXf(solution.power[..., None].astype(np.float32))
 
     def render_forward(
@@ -298,7 +299,10 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         seed: int = 0,
         spp: int = 0,
     ) -> mi.TensorXf:
-        """Tangent of the picture [W], shape (h, w, 1), of that of the numbers behind `exitance`."""
+        """Tangent of the image [W], shape (h, w, 1), from the tangents of the numbers behind `exitance`.
+
+        Raises SceneError for gradients of any other parameter, and as `render`.
+        """
         with self._derivative(scene, sensor) as (rows, view, emitters):
             tangent = rows.forward(view, self.quadrature, emitters)
         return mi.TensorXf(tangent[..., None].astype(np.float32))
@@ -312,19 +316,22 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         seed: int = 0,
         spp: int = 0,
     ) -> None:
-        """Add the transpose of `render_forward` of `grad_in`, shape (h, w, 1) [1/W], to the gradients of the numbers
-        behind `exitance`."""
+        """Apply the transpose of `render_forward` to `grad_in`, and add the result to the gradients behind `exitance`.
+
+        grad_in : gradient with respect to the image, shape (h, w, 1) [1/W]
+        Raises as `render_forward`.
+        """
         with self._derivative(scene, sensor) as (rows, view, emitters):
             gradient = np.broadcast_to(np.array(grad_in, np.float64).reshape(-1, 1), (math.prod(rows.shape), 1))
             rows.backward(view, self.quadrature, emitters, gradient.reshape(rows.shape))
 
     @contextmanager
     def _derivative(self, scene: mi.Scene, sensor: mi.Sensor | int) -> Iterator[tuple[Rows, View, list[mi.Emitter]]]:
-        """Context manager: rows of the derivative by J_n, the view that they belong to, emitters with gradients."""
+        """Context manager: rows of the derivative with respect to J_n, their view, and the emitters with gradients."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
         with dr.resume_grad():
-            emitters = shining_with_gradients(scene, sensor)
+            emitters = emitters_with_gradients(scene, sensor)
         with dr.suspend_grad():
             kinds = kinds_of(scene, emitters, self.quadrature)
             if kinds is None:
@@ -342,7 +349,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
     def _rows_of(
         self, scene: mi.Scene, sensor: mi.Sensor, kinds: tuple[str, ...] | None, sizes: tuple[int, int]
     ) -> Rows:
-        """Rows of the derivative by J_n; cached, whatever J_n is."""
+        """Rows of the derivative with respect to J_n; cached, since they do not depend on J_n."""
         shapes = scene.shapes()
         positions = tuple(buffers(shape)[0] for shape in shapes if shape.is_mesh())
         marks = [mark_of(emitter) for emitter in scene.emitters()]
@@ -378,8 +385,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 ", which gradients do not follow. Leave them out, or render without gradients."
             )
 
-    def _tell_left_out(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
-        """Log a warning about light that is left out, once as long as shapes and lens stay."""
+    def _warn_of_light_left_out(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Log a warning about light that is left out; once, until shapes or lens change."""
         shapes = scene.shapes()
         state = ([shape_number(shape) for shape in shapes], [_pose(shape) for shape in shapes], _view(sensor))
         found = self._left_out.recall(state, lambda: self.light_left_out(scene, sensor))
@@ -433,7 +440,8 @@ class RobustCopy:
     """Robust copy of a scene that loses rays: of its shapes alone, so that nothing in it refers to the integrator.
 
     state : marks of the emitters, and numbers and poses of the shapes that it was built from
-    positions : their vertices, kept so that no other ones get their indices, by which poses are compared
+    positions : vertex buffers of the shapes. Poses are compared by the indices of these buffers; while the buffers are
+        kept, no other one can get the same index
     """
 
     scene: mi.Scene
@@ -442,7 +450,7 @@ class RobustCopy:
 
 
 class CachedValue:
-    """Cache of one result, valid as long as the `state` that it depends on is unchanged."""
+    """Cache of one result, which is valid while the `state` that it depends on is unchanged."""
 
     def __init__(self) -> None:
         self._state: object = None
@@ -457,7 +465,7 @@ class CachedValue:
 
 
 def _view(lens: mi.Sensor) -> tuple[object, ...]:
-    """All parameters of a lens and its film that a picture depends on."""
+    """All parameters of a lens and its film that an image depends on."""
     film = lens.film()
     sizes = (int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
     return (lens.optics, lens.pixel_pitch, lens.placement, *sizes)
@@ -479,7 +487,7 @@ def _pose(shape: mi.Shape) -> tuple[float, ...]:
 
 
 def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solution:
-    """The surface form's `solution` with the coverage of elements that do not glow, which that form leaves out."""
+    """The surface form's `solution`, with the coverage of elements with J_n = 0 added, which that form leaves out."""
     if not any(finding.name == "dark" and finding.taken for finding in solution.findings):
         return solution
     met = np.where(solution.where, pupil_form.coverage_of(view, window), 0)
@@ -489,10 +497,10 @@ def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solut
 def _missed(
     narrow: NarrowLight, where: NDArray[np.bool_], cut: NDArray[np.bool_], window: Window, lens: mi.Sensor, of: Solution
 ) -> NDArray[np.float64]:
-    """Narrow light that lines of sight may miss [W], shape (h, w): on pixels that did not take the surface form.
+    """Light of narrow spots that lines of sight may miss [W], shape (h, w), on pixels without the surface form.
 
     where : pixels of the window that took the surface form
-    cut : those that the image-plane stop cuts, which take lines of sight however bright they are
+    cut : pixels that the border of the image-plane stop crosses, which always take lines of sight
     """
     light = np.where(where, 0, UNCERTAINTY * narrow.on_pixels)
     bright = window.expand(np.where(cut, light, 0)) * lens.etendue - of.power

@@ -21,7 +21,7 @@ from .film import default_sampler, number, own_film
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
 STRETCH = 1e-5  # deviation of a rotation's matrix from orthonormality that float32 may cause
-CLEAR, MOST_CLEAR = 0.999, 0.9  # of the nearest depth of the scene, and of u: lines of sight skip so much
+CLEAR, MOST_CLEAR = 0.999, 0.9  # shares of the nearest depth of the scene and of u; rays start at the smaller product
 EPSILON = 2.0**-23  # float32's rounding error of a length, relative to the largest length it is computed from
 
 
@@ -108,11 +108,11 @@ class FsptLens(mi.Sensor):
         try:
             self._update()
         except OpticsError as error:
-            self.fault = error  # the numbers before the update stay in use
+            self.fault = error  # the numbers before the update remain in use
             raise
 
     def prepare_model(self, name: str) -> None:
-        """Change `model`, from the next update of the numbers on, which may be those that the new one needs."""
+        """Set the `model` to use from the next update of the numbers on, so that they can be changed together."""
         self._model = name
 
     def _update(self) -> None:
@@ -144,7 +144,7 @@ class FsptLens(mi.Sensor):
         self._middle = mi.Point2f(*(dr.opaque(mi.Float, 0.5 * int(n)) for n in self.film().size()))
         self.transmittance, self._wavelength = passed, light.get("wavelength_nm")
         bare = pixel_etendue(self.virtual_pitch, self.optics.discs[0].radius, self.optics.focus_distance)
-        self.etendue = passed * bare  # by which all forms and integrators turn radiance into power
+        self.etendue = passed * bare  # the factor between mean radiance and power in all forms and integrators
         self._etendue = dr.opaque(mi.Float, self.etendue * flat_share())
         self._solid_angle = dr.opaque(mi.Float, bare / self.virtual_pitch**2)
         self._passed = dr.opaque(mi.Float, passed * flat_share())
@@ -154,7 +154,7 @@ class FsptLens(mi.Sensor):
         self.rounding = EPSILON * (farthest + self.optics.focus_distance) / self.virtual_pitch
 
     def coarser(self, side: int) -> FsptLens:
-        """The same lens, without losses, before a film around the same axis whose pixels are `side` times as wide."""
+        """The same lens without losses, with a film on the same axis whose pixels are `side` times as wide."""
         own = {name: float(value[0]) for name, value in self._numbers.items() if name not in transmittance.NUMBERS}
         own["pixel_pitch"] *= side
         width, height = (math.ceil(int(n) / side) for n in self.film().size())
@@ -163,7 +163,7 @@ class FsptLens(mi.Sensor):
         return made("fspt_lens", model=self._model, to_world=place, film=film, **own)
 
     def numbers(self) -> dict[str, float | int | str]:
-        """Numbers of the lens and its pixels for an image's metadata: lengths in mm, wavelength in nm."""
+        """Numbers of the lens and its pixels by name, for an image's metadata: lengths in mm, wavelength in nm."""
         light: dict[str, float | int | str] = {"transmittance": self.transmittance}
         light["t_stop"] = transmittance.t_stop(self.optics.f_number, self.transmittance)
         if self._curve:
@@ -184,7 +184,7 @@ class FsptLens(mi.Sensor):
     def virtual_point(self, position: mi.Point2f) -> mi.Point2f:
         """Point of the virtual detector plane [mm] conjugate to a film position [pixels from the top left corner].
 
-        Mitsuba's camera frame has +x to the left and +y up of the upright picture.
+        Mitsuba's camera frame has +x to the left and +y up in the upright image.
         """
         return mi.Point2f(self._middle - position) * self._pitch
 
@@ -202,7 +202,8 @@ class FsptLens(mi.Sensor):
         cos_theta = self._u * dr.rcp(dr.norm(towards))
         share = start / self._u
         offset = self.m_to_world @ (mi.Vector3f(a.x, a.y, 0) + share * towards)
-        # Far from the world's origin the start point is rounded: the ray aims from there at the same virtual point.
+        # Far from the world's origin the start point is rounded; the ray is directed from there to the same virtual
+        # point.
         centre = mi.Point3f(self.m_to_world.translation())
         origin = centre + offset
         lost = offset - (origin - centre)
@@ -213,18 +214,18 @@ class FsptLens(mi.Sensor):
         )
 
     def open_pupil(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
-        """Point of the part of the pupil that a second border (Eq. 5) leaves open at a film position, and its share.
+        """Point of the open part of the pupil at a film position, and the share of the pupil's area that is open.
 
-        Its density on that part is uniform if that of `pupil` is on the unit disc, so that rules over the disc apply
-        with and without the border.
+        A second border (Eq. 5) may cover a part of the pupil. The map from `pupil` [unit disc] to the open part has a
+        constant Jacobian (Eq. M.13), so that quadrature rules over the disc apply with and without the border.
         """
         return self._pupil.opened(self.virtual_point(position), pupil)
 
     def blur_disc(self, point: mi.Point3f) -> tuple[mi.Point2f, mi.Float, mi.Float]:
         """Blur disc of a world point: centre and signed radius [film pixels]; side of a pixel at its depth [mm].
 
-        Light of the point towards `pupil` [unit disc] arrives at centre + radius · pupil: r = x + (a − x)(u − z)/u with
-        a = shift·x + ρ, solved for the virtual point x of the line through r and ρ.
+        Light of the point towards `pupil` [unit disc] arrives at centre + radius · pupil (Eq. M.8). This is the
+        solution of r = x + (a − x)(u − z)/u, a = κx + ρ, for the virtual point x on the line through r and ρ.
         """
         p = self._in_camera(point)
         back, scale = defocus(p.z, self._u, self._pupil.shift)
@@ -235,9 +236,12 @@ class FsptLens(mi.Sensor):
     def arrival(self, point: mi.Point3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
         """Arrival of the light of a world point towards `pupil` [unit disc], four values.
 
-        Film position [pixels]; lens point in world coordinates [mm]; weight (da/dρ)² cosθ u²/d², by which A_pupil/u²
-        becomes the solid angle of the pupil [sr], 0 where no light passes the lens (an image-plane stop has no effect
-        on it); cosθ of the line of sight to the optical axis.
+        1. Film position [pixels].
+        2. Lens point in world coordinates [mm].
+        3. Weight (da/dρ)² cosθ u²/d², d the distance to the lens point: A_pupil/u² times its mean over the pupil is the
+           solid angle of the pupil [sr] (Eq. M.10). It is 0 where no light passes the lens; an image-plane stop does
+           not affect it.
+        4. cosθ of the line of sight to the optical axis.
         """
         centre, radius, _ = self.blur_disc(point)
         position, shift = centre + radius * pupil, self._pupil.shift
@@ -247,7 +251,7 @@ class FsptLens(mi.Sensor):
         depth = self._in_camera(point).z
         distance = dr.norm(lens_point - point)
         cos_theta = depth / distance
-        # dA_a = (da/dρ)² dA_ρ: the pupil point shifts along with x unless the disc is fixed in the lens plane.
+        # dA_a = (da/dρ)² dA_ρ: unless the disc is fixed in the lens plane, the lens point depends on ρ through x, too.
         back, scale = defocus(depth, self._u, shift)
         growth = 1 - shift * back / scale
         weight = dr.square(growth * self._u / distance) * cos_theta
@@ -255,7 +259,7 @@ class FsptLens(mi.Sensor):
         return position, lens_point, dr.select(passes, weight, 0), cos_theta
 
     def _in_camera(self, point: mi.Point3f) -> mi.Vector3f:
-        """World point in the camera frame [mm]; the difference is taken first, exact far from the world's origin."""
+        """World point in the camera frame [mm]; subtracted before it is rotated, which is exact far from the origin."""
         return self.m_to_world.inverse() @ mi.Vector3f(point - mi.Point3f(self.m_to_world.translation()))
 
     def _through_stop(self, x: mi.Point2f) -> mi.Bool:
@@ -265,7 +269,7 @@ class FsptLens(mi.Sensor):
     # ------------------------------------------------------------------ the visible space, in double precision
 
     def blur_radius(self, depth: mi.Float64) -> mi.Float64:
-        """Radius [pixels] of the blur disc of a point at `depth` z [mm], < 0 beyond the sharp plane; inf at z <= 0."""
+        """Signed radius [pixels] of the blur disc of a point at `depth` z [mm]: < 0 for z > u, inf for z <= 0."""
         disc = self.optics.discs[0]
         numbers = (self.optics.focus_distance, disc.shift, self.optics.pupil_radius, self.virtual_pitch)
         u, shift, radius, pitch = (dr.opaque(mi.Float64, n) for n in numbers)
@@ -274,7 +278,7 @@ class FsptLens(mi.Sensor):
         return dr.select((scale > 0) & ~dr.isnan(blur), blur, dr.inf)
 
     def clear_depth(self, box: mi.ScalarBoundingBox3f) -> float:
-        """Depth [mm], in 0 … 0.9 u, before which no part of a box lies; 0 if the box reaches the lens plane."""
+        """Depth [mm], in 0 … 0.9 u, up to which the space is free of the box; 0 if the box reaches the lens plane."""
         ends = np.array([box.min, box.max], np.float64)
         axis, offset = self._to_camera[2, :3], self._to_camera[2, 3]
         nearest = float((ends * axis).min(axis=0).sum() + offset)
@@ -287,7 +291,7 @@ class FsptLens(mi.Sensor):
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; radius inf: unbounded."""
-        # A rotated sphere gives no finite position for a few of its points: z = -inf makes their discs unbounded.
+        # A few points of a rotated sphere are not finite; with z = -inf their discs are unbounded.
         lost = ~np.isfinite(points).all(axis=-1, keepdims=True)
         p = np.where(lost, 0, points) @ self._to_camera[:3, :3].T + self._to_camera[:3, 3]
         p[..., 2:][lost] = -np.inf

@@ -12,7 +12,7 @@ from ..emission import exitance
 from ..emission.elements import ElementDistribution, elements_of
 from ..emission.face_probe import Probe
 from ..emission.laws import law_of
-from ..jit.recording import aside, dark_elsewhere, scene_is_checked
+from ..jit.recording import evaluated_outside, scene_is_checked, zero_if_invalid
 from ..jit.spectra import sample_wavelengths
 from ..runtime.errors import ExitanceError
 
@@ -48,8 +48,8 @@ class FsptSurface(mi.Emitter):
 
     - lambert (Eq. 1, the paper's): L = J_n/π [W/mm²/sr];
     - fresnel: L = J_n/(4π) · (2A + 3µ_i) · T(µ)/n², the diffusion approximation's radiance refracted at a smooth
-      border; µ_i = √(1 − (1 − µ²)/n²), T the unpolarised Fresnel transmittance, A of Haskell et al. (1994). At
-      n = 1.37 it is 1.11 × J_n/π face-on and falls to 0 at the limb;
+      boundary; µ_i = √(1 − (1 − µ²)/n²), T the unpolarised Fresnel transmittance, A of Haskell et al. (1994). At
+      n = 1.37 it is 1.11 × J_n/π along the normal and falls to 0 at the limb;
     - last_flight: L = C · T(µ)/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds. The light was scattered for the
       last time on the refracted line of sight ω_i. The law includes the slope of the fluence along the surface and its
       curvature above a shallow source, which the other laws neglect. C(r) makes ∫ L µ dΩ = J_n(r). 'fspt flux solve
@@ -73,8 +73,8 @@ class FsptSurface(mi.Emitter):
         self._source: exitance.ExitanceState | None = None  # data of J_n at the last `check`
         self.single_faces: tuple[mi.Float, ...] = ()  # buffers of the mesh for which no face was found twice
         self.brightest = 0.0  # largest J_n [W/mm²], set by `check`
-        # For caches: `mark` identifies this emitter, `edition` counts the changes of J_n. A cache that held the emitter
-        # itself, but not its shape, would leave Dr.Jit an emitter to record whose shape is deleted.
+        # For caches: `mark` identifies this emitter, `edition` counts the changes of J_n. A cache must not hold the
+        # emitter itself: Dr.Jit would record it even after its shape has been deleted.
         self.mark, self.edition = object(), 0
         self._shape: mi.ShapePtr | None = None
 
@@ -123,7 +123,7 @@ class FsptSurface(mi.Emitter):
 
     # ------------------------------------------------------------------ sampling
 
-    @dark_elsewhere("PositionSample3f", "Float")
+    @zero_if_invalid("PositionSample3f", "Float")
     def sample_position(
         self, time: mi.Float, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.PositionSample3f, mi.Float]:
@@ -133,12 +133,12 @@ class FsptSurface(mi.Emitter):
         ps.n, ps.time, ps.pdf, ps.delta = si.n, time, pdf, False
         return ps, _rcp(pdf)
 
-    @dark_elsewhere("Float")
+    @zero_if_invalid("Float")
     def pdf_position(self, ps: mi.PositionSample3f, active: mi.Bool = True) -> mi.Float:
         """Density of `sample_position` [1/mm²]."""
         return self._distribution().pdf(self._surface_at(ps, active), active)
 
-    @dark_elsewhere("Ray3f", "Spectrum")
+    @zero_if_invalid("Ray3f", "Spectrum")
     def sample_ray(
         self,
         time: mi.Float,
@@ -156,7 +156,7 @@ class FsptSurface(mi.Emitter):
         power = self._radiance(si, direction, active) * (dr.pi * _rcp(pdf))
         return ray, mi.depolarizer(power * weight)
 
-    @dark_elsewhere("DirectionSample3f", "Spectrum")
+    @zero_if_invalid("DirectionSample3f", "Spectrum")
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
@@ -172,20 +172,20 @@ class FsptSurface(mi.Emitter):
         si.wavelengths = it.wavelengths
         return ds, mi.depolarizer(self._radiance(si, -ds.d, active) * _rcp(ds.pdf))
 
-    @dark_elsewhere("Float")
+    @zero_if_invalid("Float")
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         """Density of `sample_direction` [1/sr]."""
         pdf = self._distribution().pdf(self._surface_at(ds, active), active)
         return dr.select(active, _solid_angle(pdf, ds), 0)
 
-    @dark_elsewhere("Spectrum")
+    @zero_if_invalid("Spectrum")
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
         """Radiance [W/mm²/sr] that arrives at `it` from the surface point of `ds`."""
         si = self._surface_at(ds, active)
         si.wavelengths = it.wavelengths
         return mi.depolarizer(self._radiance(si, -ds.d, active))
 
-    @dark_elsewhere("Wavelength", "Spectrum")
+    @zero_if_invalid("Wavelength", "Spectrum")
     def sample_wavelengths(
         self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
     ) -> tuple[mi.Wavelength, mi.Spectrum]:
@@ -203,17 +203,17 @@ class FsptSurface(mi.Emitter):
     # ------------------------------------------------------------------ the surface itself
 
     def _own_shape(self) -> mi.Shape:
-        """Shape of the emitter; ExitanceError if it was deleted with its scene: Dr.Jit records every existing one."""
+        """Shape of the emitter; ExitanceError if it was deleted with its scene, while the emitter still exists."""
         if self._shape is None:
             self._shape = mi.ShapePtr(self.get_shape())
         if self._shape[0] is None:
-            raise ExitanceError("fspt_surface: its scene is gone. Keep the scene, not its emitter.")
+            raise ExitanceError("fspt_surface: its scene was deleted. Keep the scene as well as its emitter.")
         return self._shape[0]
 
     def check(self) -> None:
         """Raise ExitanceError if J_n or the exit law does not fit the shape; repeated only after a change."""
         source = exitance.ExitanceState.of(self._own_shape(), self.exitance)
-        # Mitsuba does not notify an emitter of new values on its mesh, nor of objects that are updated separately.
+        # Mitsuba does not inform an emitter of new values on its mesh, or of objects that are updated separately.
         if self._source and (self._source.state() != source.state() or self.law.renewed()):
             self._forget_exitance()
         if self._source:
@@ -224,14 +224,14 @@ class FsptSurface(mi.Emitter):
             self.law.prepare(shape)
             return brightest
 
-        self.brightest = aside(checked, self._own_shape())
+        self.brightest = evaluated_outside(checked, self._own_shape())
         self._source = source
 
     def sound(self) -> bool:
-        """True if `check` succeeds; False if it fails during a recording for another scene, which must not fail."""
+        """True if `check` succeeds. During a recording for another scene, which must not raise: False if it fails."""
         if scene_is_checked() and (self._source or self._shape is None):
-            # Without an earlier check it belongs to another scene. If loading failed, its shape is deleted and must not
-            # be accessed.
+            # A surface that was never checked belongs to another scene. If the loading of that scene failed, the shape
+            # is deleted and must not be accessed.
             return self._source is not None
         try:
             self.check()
@@ -265,7 +265,7 @@ class FsptSurface(mi.Emitter):
         """Distribution of positions ∝ J_n, built on first use."""
         self.check()
         if self._positions is None:
-            self._positions = aside(
+            self._positions = evaluated_outside(
                 lambda shape: ElementDistribution(elements_of(shape), exitance.function_on(shape, self.exitance)),
                 self._own_shape(),
             )
@@ -277,7 +277,7 @@ class FsptSurface(mi.Emitter):
         if not shape.is_mesh():
             return self._distribution().elements.at(ps.uv)
         if self._probe is None:
-            self._probe = aside(Probe, shape)
+            self._probe = evaluated_outside(Probe, shape)
         return self._probe.at(shape, ps, active)
 
     def trace_beside(self, scene: mi.Scene) -> None:

@@ -1,4 +1,4 @@
-"""A scene whose parameters change while one looks at it: in place where that is possible, loaded again elsewhere."""
+"""A scene whose parameters change between images: in place where that is possible, else by loading it again."""
 
 from __future__ import annotations
 
@@ -23,25 +23,26 @@ from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 if TYPE_CHECKING:
     import mitsuba as mi
 
-DRAFT = 0.03  # rtol of a picture while a parameter moves
-DRAFT_NODES = 16  # lines of sight of a pixel in it: silhouettes that twelve leave unsettled wait for the full picture
-DRAFT_SAMPLES = 8  # a pixel, of such a picture by Monte Carlo
-RIGID = 1e-6  # by which the rows of a rotation may differ from orthonormal ones
+DRAFT = 0.03  # rtol of a draft, the quick image while a parameter moves
+DRAFT_NODES = 16  # lines of sight of a pixel in a draft; silhouettes that need more are left to the full image
+DRAFT_SAMPLES = 8  # samples of a pixel in a draft by Monte Carlo
+RIGID = 1e-6  # largest deviation of a rotation's rows from orthonormality
 Stamp = tuple[int, int] | None
 
 
 @dataclass(frozen=True)
 class SurfacePoint:
-    """The surface on the line of sight through the centres of a pixel and of the pupil.
+    """Surface point on the line of sight through the centres of a pixel and of the pupil.
 
-    It is the first one that glows, or else the last one that the line meets; windows and mirrors lead the line on.
+    It is on the first surface that glows, or, if none does, on the last one that the line meets. The line continues
+    through windows and off mirrors.
 
     position : [mm], in world coordinates
     shape : its id
     exitance : J_n [W/mm²]; None where the shape has no `fspt_surface`
-    depth : distance from the lens plane along the optical axis [mm] at which the point is seen
-    column, row, radius : centre and radius of the blur disc [pixels of the image; 0.5, 0.5 is the middle of the first]
-    by_way_of : ids of the windows and mirrors before it, in the order in which the line meets them
+    depth : distance from the lens plane along the optical axis [mm] at which the lens sees the point
+    column, row, radius : centre and radius of the blur disc [pixels]; the middle of the first pixel is at (0.5, 0.5)
+    by_way_of : ids of the windows and mirrors between lens and point, in the order in which the line meets them
     """
 
     position: tuple[float, float, float]
@@ -56,12 +57,12 @@ class SurfacePoint:
 
 @dataclass(frozen=True)
 class Change:
-    """What differs between the loaded scene and a wanted one, if it can be changed in place.
+    """Difference between the loaded scene and a requested one, if the loaded scene can be changed in place.
 
     lens : new numbers of the lens, by their names in the scene file
     placement : new `to_world` of the lens
-    model : of the lens in the scene file
-    motions : of the shapes from where they were loaded; None for those that stay
+    model : lens model in the scene file
+    motions : motion of each shape from its position when it was loaded; None for a shape that does not move
     """
 
     lens: Mapping[str, float]
@@ -71,7 +72,7 @@ class Change:
 
     @classmethod
     def of(cls, nodes: list[mi.parser.SceneNode], sensor: int, motions: tuple[Matrix | None, ...] = ()) -> Change:
-        """Change to these elements, and these motions of their shapes."""
+        """Change that gives the lens the values in these elements, and the shapes these motions."""
         import mitsuba as mi
 
         lens = [node for node in nodes if node.type == mi.ObjectType.Sensor][sensor].props
@@ -81,9 +82,9 @@ class Change:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A Mitsuba scene, the elements that it was loaded from, and how its shapes have moved since.
+    """A Mitsuba scene, the elements that it was loaded from, and the motion of its shapes since then.
 
-    files : meshes and other data that the scene refers to, as they were when it was loaded
+    files : meshes and other files that the scene refers to, with time and size when it was loaded
     """
 
     scene: mi.Scene
@@ -95,10 +96,10 @@ class Loaded:
         """True as long as no file of data has changed."""
         return self.files == {file: _stamp(file) for file in self.files}
 
-    def taken(self, change: Change, exact: bool) -> Change | None:
-        """The change of the lens that is left, once the shapes are where `change` wants them; None if they cannot be.
+    def with_shapes_moved(self, change: Change, exact: bool) -> Change | None:
+        """Move the shapes as `change` requires; return the remaining change of the lens, None if that is impossible.
 
-        `exact` : to the bit, as they are only where they were loaded
+        exact : the image must be the same to the bit, which it is only if no shape moves
         """
         still = (None,) * len(change.motions)
         if exact:
@@ -110,14 +111,15 @@ class Loaded:
 
 
 class LiveScene:
-    """A scene file or its text, and the Mitsuba scene of the last values of its parameters.
+    """A scene file or its text, with the Mitsuba scene for the last values of its parameters.
 
-    A scene that `load` has made stands for what it was loaded from, with the values given then.
+    A scene from `load` is replaced by the file or text that it was loaded from, with the values given then.
 
-    The picture is that of the sensor with the number `sensor`. Numbers and placement of that lens change in place,
-    without compilation. For drafts, shapes that make a rigid motion are moved in place, too; a motion of all of them
-    is replaced by the inverse motion of the lens. Both give the same picture but for rounding. Where that shall not be,
-    and for all other changes, also of the files that it refers to, the scene is loaded again; `loads` counts that.
+    Images are those of the sensor number `sensor`. Numbers and pose of that lens are changed in place, without
+    compilation. In drafts, shapes that make a rigid motion are moved in place, too, and a motion common to all shapes
+    is replaced by the inverse motion of the lens; both give the same image but for rounding. Where the image must not
+    differ, and for all other changes, those of referenced files included, the scene is loaded again. `loads` counts how
+    often it was loaded.
 
     Raises
     ------
@@ -151,11 +153,10 @@ class LiveScene:
         return read_text(str(self.source), values) if is_text(self.source) else read_xml(Path(self.source), values)
 
     def image(self, values: Mapping[str, object], model: str | None = None, progress: Progress | None = None) -> Image:
-        """Image with these values of parameters, and with another lens `model` than the scene's if it is given.
+        """Image with these values of parameters and this lens `model`; None: the scene's own model.
 
-        The same bits as from `render` of a scene that is loaded with these values. `progress` as of `render`.
-
-        Raises what `load` and `render` raise. The scene stays usable.
+        It is equal to the bit to that of `render` for a scene loaded with these values. `progress` as of `render`.
+        Raises what `load` and `render` raise; afterwards the object can still be used.
         """
         image = render(self.scene(values, model), sensor=self.sensor, progress=progress)
         taken = self.given | _texts(values)
@@ -171,10 +172,8 @@ class LiveScene:
     ) -> Image:
         """Quick image by the integral, to `rtol` or with `max_nodes` lines of sight on a pixel.
 
-        Spots that lines of sight may miss are not searched for. Parameters as of `image`.
-
-        Where the scene has another integrator, that takes few samples instead: the integral may leave out its light.
-        A moved phantom is seen by the lens moved the other way. Raises as `image`.
+        Spots that lines of sight may miss are not searched for. If the scene has another integrator, it is used with
+        few samples, because the integral may leave out light of that scene. Parameters and errors as of `image`.
         """
         scene = self.scene(values, model, exact=False)
         lens, integrator = sensor_of(scene, self.sensor), integrator_of(scene, None)
@@ -189,7 +188,7 @@ class LiveScene:
     def surface_point(
         self, values: Mapping[str, object], model: str | None, column: int, row: int
     ) -> SurfacePoint | None:
-        """Surface point under the middle of a pixel of the image; None where the line of sight meets nothing."""
+        """Surface point seen in the middle of a pixel of the image; None if the line of sight meets no surface."""
         import drjit as dr
         import mitsuba as mi
 
@@ -225,7 +224,7 @@ class LiveScene:
         nodes = parsed(self.source, **wanted)
         now = self._loaded if self._loaded and self._loaded.is_current() else None
         change = _change(now.nodes, nodes, self.sensor) if now else None
-        change = now.taken(change, exact) if now and change else None
+        change = now.with_shapes_moved(change, exact) if now and change else None
         if now is None or change is None:
             self._loaded = now = None  # memory for one scene, not two
             self._loaded = now = self._load(wanted, nodes)
@@ -274,9 +273,9 @@ def _surfaces(
 
 
 def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], sensor: int) -> Change | None:
-    """Change of the lens, that with the number `sensor`, that makes the picture of the elements `old` that of `new`.
+    """Change that turns the scene of the elements `old` into that of `new`; None if it cannot be made in place.
 
-    None if there is none.
+    sensor : number of the lens
     """
     import mitsuba as mi
 
@@ -296,7 +295,7 @@ def _change(old: list[mi.parser.SceneNode], new: list[mi.parser.SceneNode], sens
 
 
 def _differ_in(before: mi.Properties, after: mi.Properties, *kinds: object) -> bool:
-    """True if properties have the same names, and differ in values of these kinds alone."""
+    """True if the properties have the same names and differ only in values of these kinds."""
     names = list(before.keys())
     if before.plugin_name() != after.plugin_name() or names != list(after.keys()):
         return False
@@ -309,7 +308,7 @@ def _differ_in(before: mi.Properties, after: mi.Properties, *kinds: object) -> b
 
 
 def _equal(one: object, other: object) -> bool:
-    """Equality of values of properties; references by the element that they refer to."""
+    """True if two values of properties are equal; references are equal if they refer to the same element."""
     import mitsuba as mi
 
     reference = mi.Properties.ResolvedReference if hasattr(mi.Properties, "ResolvedReference") else ()
@@ -334,7 +333,7 @@ def _all_alike(motions: tuple[Matrix | None, ...]) -> bool:
 
 
 def _others_are_placed(nodes: list[mi.parser.SceneNode]) -> bool:
-    """True if an element that is no shape and no sensor, as an emitter or a volume, has a place of its own."""
+    """True if an element other than a shape or a sensor, such as an emitter or a volume, has its own `to_world`."""
     import mitsuba as mi
 
     moved = (mi.ObjectType.Shape, mi.ObjectType.Sensor)
@@ -361,7 +360,7 @@ def _apply(change: Change, lens: mi.Sensor, model: str | None) -> None:
 
 
 def _unchanged_source(scene: mi.Scene) -> tuple[Any, dict[str, object]]:
-    """What a scene was loaded from; SceneError if that is not known, or if the scene was changed since."""
+    """Source of a scene and the values given to `load`; SceneError if unknown, or if the scene was changed since."""
     import mitsuba as mi
 
     kept = source_of(scene) if isinstance(scene, mi.Scene) else None
@@ -391,5 +390,5 @@ def _texts(values: Mapping[str, object]) -> dict[str, str]:
 
 
 def _name(source: str | os.PathLike[str]) -> str:
-    """What messages and metadata call the scene."""
+    """Name of the scene in messages and metadata."""
     return str(TEXT) if is_text(source) else os.fspath(source)

@@ -15,16 +15,17 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 METHODS = ("path", "ptracer")
-ALIKE = 3.0  # the errors of neighbouring pixels with the same view differ by less than this factor
-FEW = 20  # events on a pixel, below which its own passes estimate the variance badly
+ALIKE = 3.0  # largest ratio of the errors of neighbouring pixels that see the same surfaces
+FEW = 20  # events on a pixel, below which its own passes give a poor estimate of the variance
 Plane = NDArray[np.float64]
 
 
 def tracer(method: str, scene: mi.Scene, lens: mi.Sensor, max_depth: int | None = None) -> mi.Integrator:
-    """Mitsuba's integrator `path` or `ptracer` that follows light over `max_depth` legs.
+    """Mitsuba's integrator `path` or `ptracer` that follows light over at most `max_depth` straight segments.
 
-    One leg goes from the surface straight into the lens, which is all light in free space; each further one takes a
-    surface that reflects light or lets it through. None: as many as the scene's specular surfaces need.
+    With one segment light goes straight from the glowing surface to the lens, which is all there is in free space. Each
+    further segment begins at a surface that reflects or transmits the light. None: as many as the scene's specular
+    surfaces need.
 
     Raises
     ------
@@ -65,7 +66,7 @@ def passes(
 
 
 def standard_error(mean: Plane, mean_square: Plane, count: int, samples: int) -> Plane:
-    """Standard error s [W], shape (h, w), of the `mean` ⟨P⟩ of `count` passes with `samples` per pixel in all.
+    """Standard error s [W], shape (h, w), of the `mean` ⟨P⟩ of `count` passes with `samples` per pixel in total.
 
     `mean` [W] and `mean_square` ⟨P²⟩ [W²] have the shape (h, w). s² = (⟨P²⟩ - ⟨P⟩²)/(count - 1) where the passes
     determine it. If light arrives in events of power w each, s² = w ⟨P⟩, and ⟨P⟩²/s² is the number of events. In three
@@ -73,8 +74,9 @@ def standard_error(mean: Plane, mean_square: Plane, count: int, samples: int) ->
 
     (a) at most `FEW` events: s² is its mean over such pixels in the 3 × 3 neighbourhood, those without events left out;
     (b) no event: in addition s is at least the largest w in the neighbourhood;
-    (c) passes that agree, but a neighbour's s above `ALIKE` times this one: some samples there miss the light, so that
-        a sample here could miss it too, and s is at least the smaller of ⟨P⟩/samples and the neighbour's s.
+    (c) passes that agree, but a neighbour with s above `ALIKE` times this one: some samples of the neighbour miss the
+        light, so that samples of this pixel could miss it too. s is at least the smaller of ⟨P⟩/samples and the
+        neighbour's s.
     """
     from ..jit.pixel_grid import Grid
 

@@ -1,4 +1,4 @@
-"""Shapes of a loaded scene that are moved in place."""
+"""Rigid motion of the shapes of a loaded scene, in place."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import mitsuba as mi
 
-Matrix = NDArray[np.float64]  # (4, 4), points to points [mm]
-VECTORS = {"vertex_positions": 1.0, "vertex_normals": 0.0}  # of a mesh; the fourth coordinate of each
+Matrix = NDArray[np.float64]  # (4, 4), acts on homogeneous coordinates [mm]
+VECTORS = {"vertex_positions": 1.0, "vertex_normals": 0.0}  # of a mesh, with their fourth homogeneous coordinate
 
 
 class MovedShapes:
-    """Rigid motions of the shapes of `scene` from where they were when it was loaded.
+    """Rigid motions of the shapes of `scene`, relative to their positions when it was loaded.
 
-    A mesh gets moved vertices, another shape a new `to_world`. `moved` is True once a shape has been moved: the scene
-    then holds what a scene loaded there would hold, but for rounding.
+    The vertices of a mesh are moved; any other shape gets a new `to_world`. `moved` is True once a shape has been
+    moved: the scene then equals one that is loaded with the moved shapes, but for rounding.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -29,9 +29,9 @@ class MovedShapes:
         self._home: dict[str, Any] = {}  # values of parameters before the first motion
 
     def move(self, motions: Sequence[Matrix | None]) -> bool:
-        """Give each shape, in the scene's order, its motion from where it was loaded; None for none.
+        """Move each shape, in the scene's order, by its motion from where it was loaded; None: no motion.
 
-        False, and nothing is moved, if a shape cannot be moved in place.
+        Returns False, without moving any shape, if one of them cannot be moved in place.
         """
         import mitsuba as mi
 
@@ -68,7 +68,7 @@ class MovedShapes:
 
 
 def _places(shape: mi.Shape, parameters: mi.SceneParameters) -> list[str]:
-    """Names of the parameters that place a shape; empty if it has none of them."""
+    """Names of the parameters that determine the position of a shape; empty if it has none of them."""
     kinds = tuple(VECTORS) if shape.is_mesh() else ("to_world",)
     names = [f"{shape.id()}.{kind}" for kind in kinds if f"{shape.id()}.{kind}" in parameters]
     return [name for name in names if name.endswith("to_world") or np.size(parameters[name])]

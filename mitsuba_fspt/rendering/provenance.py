@@ -1,4 +1,4 @@
-"""What a scene was made from: values of its `<default>` parameters, and digests of its glowing meshes."""
+"""Origin of a scene: its source, the values of its `<default>` parameters, and digests of its glowing meshes."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from .scene_rules import is_number
 if TYPE_CHECKING:
     import mitsuba as mi
 
-BLOCKS = 15  # sums of weighted lengths of edges, each over as many edges in a row
-TOLERANCE = 2e-5  # relative: by which float32 may change such a sum when a mesh is moved
+BLOCKS = 15  # number of sums of weighted edge lengths in a digest, each over the same number of consecutive edges
+TOLERANCE = 2e-5  # relative change of such a sum that float32 may cause when a mesh is moved
 
 
 def remember_defaults(scene: mi.Scene, values: Mapping[str, str]) -> None:
-    """Keep values of a scene's `<default>` parameters with its lenses, in place of those kept before."""
+    """Store the values of a scene's `<default>` parameters with its lenses, in place of those stored before."""
     for sensor in scene.sensors():
         if is_lens(sensor):
             sensor.defaults = getattr(sensor, "defaults", {}) | dict(values)
 
 
 def remember_source(scene: mi.Scene, source: object, parameters: Mapping[str, object]) -> None:
-    """Keep with a scene's lenses what it was loaded from: a file's name or its text, and the given parameters."""
+    """Store the source of a scene, a file's name or XML text, and the given values with the scene's lenses."""
     for sensor in scene.sensors():
         if is_lens(sensor):
             sensor.source = source, dict(parameters)
 
 
 def source_of(scene: mi.Scene) -> tuple[Any, dict[str, object]] | None:
-    """What `remember_source` has kept; None for a scene from another loader, or from a dictionary."""
+    """Source and values that `remember_source` has stored; None for a scene from another loader or a dictionary."""
     kept = (getattr(sensor, "source", None) for sensor in scene.sensors())
     return next((one for one in kept if one is not None), None)
 
 
 def defaults_of(sensor: mi.Sensor) -> dict[str, float | str]:
-    """Values of the `<default>` parameters of the scene of this lens: numbers where they are; empty if none are known.
+    """Values of the `<default>` parameters of the lens's scene, as numbers where possible; empty if none are known.
 
-    `load` records them; a scene from Mitsuba's own loader has none.
+    `load` stores them; a scene from Mitsuba's own loader has none.
     """
     return {name: value_of(text) for name, text in getattr(sensor, "defaults", {}).items()}
 
 
 def value_of(text: str) -> float | str:
-    """The number that a text stands for, whole where it is written so; any other text unchanged."""
+    """Number that a text represents, an int if it is written as one; any other text unchanged."""
     if not is_number(text):
         return text
     number = float(text)
@@ -89,10 +89,10 @@ def digest_of(emitter: Any, mesh: mi.Shape) -> str:
 
 
 def mesh_digest(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> str:
-    """Digest of a mesh that no rigid motion changes but for rounding; `same_mesh` compares two of them.
+    """Digest of a mesh, the same before and after any rigid motion but for rounding; `same_mesh` compares two of them.
 
-    A hash of the faces (F, 3), then float32 numbers: sums of the lengths of edges with weights 1 … 2, and the volume
-    that the faces enclose with their middle, whose sign a mirror image changes.
+    It consists of a hash of the faces (F, 3) and of float32 numbers: sums of edge lengths with weights 1 … 2, and the
+    volume between the faces and their middle point, which has the opposite sign for a mirror image.
     """
     corners = vertices.astype(np.float64)[faces]
     edges = corners - np.roll(corners, 1, axis=1)
@@ -107,7 +107,7 @@ def mesh_digest(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> s
 
 
 def same_mesh(one: str, other: str) -> bool:
-    """True if two texts of digests are those of the same meshes in the same order, each moved as a rigid body."""
+    """True if two texts of digests belong to the same meshes in the same order, each possibly moved rigidly."""
     first, second = one.split(), other.split()
     return len(first) == len(second) and all(map(_alike, first, second))
 
@@ -117,6 +117,6 @@ def _alike(one: str, other: str) -> bool:
     if hash_a != hash_b:
         return False
     a, b = (np.frombuffer(b64decode(text), "<f4").astype(np.float64) for text in (text_a, text_b))
-    # Of a flat or open mesh the volume may be anything small: judged against the cube of the mean edge sum.
+    # The volume of a flat or open mesh may be near 0, so its difference is compared with the cube of the mean edge sum.
     scale = np.append(np.abs(a[:-1]), max(abs(a[-1]), 1e-3 * np.abs(a[:-1]).max() ** 3 / max(len(a), 1) ** 3))
     return bool((np.abs(a - b) <= TOLERANCE * scale).all())

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 METHODS = ("integral", *monte_carlo.METHODS)
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
-SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples of one pass
+SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples of one pass, which bounds its memory
 DARK = (
     "the picture is dark, no light reaches the lens. Check the lens's 'to_world', that 'exitance' is not 0 everywhere, "
     "and that the faces' normals point outwards"
@@ -61,20 +61,24 @@ def render(
     scene : Mitsuba scene, or what `load` takes
     method : 'integral' (Eq. 9, deterministic), 'path' or 'ptracer' (Monte Carlo); None takes the scene's own
     sensor : number of the sensor, an `fspt_lens`
-    rtol, domain, pixel, max_nodes, max_specular : of the integral, see `Quadrature`; None takes the scene's own
-    shortcuts : False takes no shortcut of the integral, see `SHORTCUTS`; True takes the scene's own setting
-    spp : Monte Carlo samples per pixel, >= 2 (default 256); the error is the standard error of independent passes, and
-        on a pixel where no sample met light, but one could have, about the power of a single sample
-    max_depth : legs of light that path and ptracer follow (default 1, where specular surfaces lead on 1 + max_specular)
+    rtol, domain, pixel, max_nodes, max_specular : parameters of `fspt_integral`, see there; None takes the scene's own
+    shortcuts : False: the integral also does work that the scene does not need; True takes the scene's own setting
+    spp : Monte Carlo samples per pixel, >= 2 (default 256). The error is the standard error of independent passes. On a
+        pixel where no sample met light although one could have, it is about the power of a single sample
+    max_depth : segments of light paths that path and ptracer follow (default: 1, or 1 + max_specular in a scene with
+        specular surfaces)
     seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
     progress : function called with the name of the stage and the share done, 0 … 1
 
-    The metadata say in `warnings`, if anything, that `rtol` was not reached, that light after a scattering reflection
-    is left out, or that the picture is dark.
+    If `rtol` was not reached, light after a scattering reflection is left out, or the image is dark, the metadata state
+    so in `warnings`.
 
     Raises
     ------
-    SceneError, OpticsError, ExitanceError, BackendError : the message names the fault and its fix.
+    SceneError : the scene, or a setting, cannot be used.
+    OpticsError : the lens cannot exist.
+    ExitanceError : J_n is missing, negative or not finite.
+    BackendError : no working LLVM or CUDA.
     """
     scene = loaded(scene)
     backend.ensure_variant()

@@ -69,7 +69,7 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
 
 
 def parsed(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: object) -> list[mi.parser.SceneNode]:
-    """Elements of a scene as `load` parses and checks them, before any object is made of them; raises as `load`."""
+    """Elements of a scene as `load` parses and checks them, before Mitsuba's objects are made; raises as `load`."""
     backend.ensure_variant()
     _, folder, parse = _source_of(scene, parameters)
     with _files_of(folder):
@@ -77,7 +77,7 @@ def parsed(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters
 
 
 def _source_of(scene: object, parameters: Mapping[str, object]) -> tuple[Path, Path, Parser]:
-    """Name of a scene for messages, folder of its files, and the function that parses it."""
+    """Name of a scene for messages, folder in which its files are searched for, and the function that parses it."""
     if isinstance(scene, Mapping):
         return Path("dictionary"), Path(), _parser_of_dictionary(scene, parameters)
     if is_text(scene):
@@ -112,7 +112,7 @@ def _files_of(folder: Path) -> Iterator[None]:
 
 
 def values_of(scene: object, parameters: Mapping[str, object]) -> dict[str, str]:
-    """Texts of all `<default>` parameters of a scene as `load` takes it, with these values given."""
+    """Values of all `<default>` parameters of a scene as texts, with the given `parameters`; `scene` as of `load`."""
     if isinstance(scene, Mapping):
         return {}
     given = _texts(parameters)
@@ -121,7 +121,7 @@ def values_of(scene: object, parameters: Mapping[str, object]) -> dict[str, str]
 
 
 def _path_of(scene: object) -> Path:
-    """Name of a scene file as a path; SceneError for what is none."""
+    """Name of a scene file as a path; SceneError if `scene` is no name of a file."""
     if not isinstance(scene, (str, os.PathLike)):
         raise SceneError(
             f"scene: must be the name of a file, XML text or a dictionary, got {type(scene).__name__}. Give one."
@@ -139,7 +139,7 @@ def _parser_of_file(path: Path, parameters: Mapping[str, object]) -> Parser:
 
 
 def _parser_of_text(text: str, parameters: Mapping[str, object]) -> Parser:
-    """Function that parses the text of a scene, likewise."""
+    """Function that parses the XML text of a scene with these values of its parameters, after their check."""
     import mitsuba as mi
 
     xml = read_text(text, _texts(parameters))
@@ -161,7 +161,7 @@ def _parser_of_dictionary(scene: Mapping[str, object], parameters: Mapping[str, 
 
 
 def _set_up(state: mi.parser.ParserState, path: Path, parameters: Mapping[str, object]) -> None:
-    """Set in a parsed scene what `load` promises: robust mode, ids and films; SceneError for the root of another."""
+    """Set robust mode, ids and film formats of a parsed scene; SceneError if its root element is no scene."""
     root = state.root.props
     if root.plugin_name() != "scene":
         raise SceneError(f"{path}: the root is <{root.plugin_name()}>, a scene file has <scene>. Give one.")
@@ -209,18 +209,18 @@ def parameter_text(value: object) -> str:
 
 
 def _refuse_colours(path: Path, state: mi.parser.ParserState) -> None:
-    """Raise SceneError for J_n as a colour or a spectrum, also within a texture: variants make different watts of it.
+    """Raise SceneError for J_n as a colour or a spectrum, also within a texture: its power would depend on the variant.
 
-    Here, before the plugins are made: monochrome and colour variants replace `d65` by a number.
+    The check precedes the loading of the plugins, because monochrome and colour variants replace `d65` by a number.
     """
     import mitsuba as mi
 
     todo = [node.props for node in state.nodes if node.props.plugin_name() == "fspt_surface"]
     while todo:
         props = todo.pop()
-        for name in props.keys():  # they do not iterate themselves
+        for name in props.keys():  # Properties have no iterator
             kind, used, value = props.type(name), props.was_queried(name), props[name]
-            props.mark_queried(name, used)  # by its plugin, not here: else a name that no plugin has would pass
+            props.mark_queried(name, used)  # as before this look-up: Mitsuba reports names that no plugin has queried
             what = "colour" if kind == mi.Properties.Type.Color else ""
             if kind == mi.Properties.Type.Spectrum and not value.is_uniform():
                 what = "spectrum"

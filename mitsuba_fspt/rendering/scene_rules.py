@@ -1,4 +1,4 @@
-"""Rules for the XML of a scene, checked before Mitsuba reads it, which would report less, report nothing, or crash."""
+"""Rules for the XML of a scene. They are checked first, as Mitsuba reports violations badly, not at all, or crashes."""
 
 from __future__ import annotations
 

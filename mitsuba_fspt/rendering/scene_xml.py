@@ -69,7 +69,7 @@ def read_text(text: str, given: Mapping[str, str]) -> SceneXml:
 
 
 def is_text(scene: object) -> bool:
-    """True for the text of a scene, which starts with '<', and not the name of its file."""
+    """True if `scene` is the XML text of a scene, which starts with '<'; False for the name of a file."""
     return isinstance(scene, str) and scene.lstrip("\ufeff \t\r\n").startswith("<")
 
 

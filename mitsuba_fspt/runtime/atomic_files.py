@@ -43,7 +43,7 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
 
 
 def require_place(path: Path, error: type[FsptError] = FsptError) -> None:
-    """Raise `error` if no file can be written at `path`: a folder, no folder above, a bad name, write protection."""
+    """Raise `error` if no file can be written at `path`: it is a folder or write-protected, or has no folder."""
     if os.path.isdir(path):
         raise error(f"output file '{path}' is a folder. Give the name of a file in it.")
     if os.path.isfile(path.parent):

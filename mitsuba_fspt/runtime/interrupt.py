@@ -18,9 +18,9 @@ from .errors import FsptError
 def ctrl_c_noted() -> Iterator[Callable[[], None]]:
     """Context manager that yields a function, which raises KeyboardInterrupt if Ctrl-C was pressed in the block.
 
-    The usual handler runs as well. After Ctrl-C, an exception that leaves the block becomes KeyboardInterrupt unless
-    it is an FsptError, and exceptions in destructors, which Python can only print, are not printed. The block runs
-    unchanged if `_handlers` is empty.
+    The usual handler runs as well. After Ctrl-C, an exception that leaves the block becomes KeyboardInterrupt unless it
+    is an FsptError, and exceptions in destructors, which Python could only print, are suppressed. If `_handlers` is
+    empty, the context manager has no effect.
     """
     pressed = False
 
@@ -63,8 +63,8 @@ def ctrl_c_noted() -> Iterator[Callable[[], None]]:
 def ctrl_c_held() -> Iterator[None]:
     """Context manager that delays Ctrl-C to the end of the block.
 
-    An interrupt inside C++ code that is not prepared for it may end the process. The block runs unchanged if
-    `_handlers` is empty.
+    An interrupt inside C++ code that is not prepared for it may end the process. If `_handlers` is empty, the context
+    manager has no effect.
     """
     before = _handlers()
     pressed: list[tuple[int, FrameType | None]] = []

@@ -1,9 +1,9 @@
 """LLVM library of Dr.Jit's CPU backend: search for candidates, test of each, selection of one.
 
-Dr.Jit loads libLLVM when it is imported, takes the first it finds, and checks too little: version 1.5 accepts LLVM
-15 and 16, and the first float minimum or maximum then aborts the process (before LLVM 17, x86-64 has no
-instruction selection for `llvm.minimum`). So this module selects the library before Dr.Jit is imported and passes
-its path in DRJIT_LIBLLVM_PATH.
+Dr.Jit loads the first libLLVM that it finds when it is imported. It does not check enough: version 1.5 accepts LLVM 15
+and 16, with which the first float minimum or maximum aborts the process (before LLVM 17, x86-64 has no instruction
+selection for `llvm.minimum`). This module therefore selects the library before Dr.Jit is imported and passes its path
+in DRJIT_LIBLLVM_PATH.
 """
 
 import ctypes

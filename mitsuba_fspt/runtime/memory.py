@@ -1,4 +1,4 @@
-"""Memory that this process may still take, as the operating system and a container's limit say."""
+"""Memory that this process can still allocate, by the operating system and the limits of a container."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LIMITS = (  # of a container: limit and use, of control groups of version 2 and 
 
 
 def available_memory() -> int | None:
-    """Bytes that can be allocated without paging; None where the system does not say."""
+    """Bytes that can be allocated without paging; None if the system does not state it."""
     found = []
     with contextlib.suppress(OSError, ValueError, IndexError):
         rows = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines() if ":" in line)

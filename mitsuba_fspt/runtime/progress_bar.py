@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from .interrupt import ctrl_c_noted
 
 NOTEBOOK_DELAY = 1.0  # s: shorter work shows no bar
-Progress = Callable[[str, float], None]  # what is being done, and the share done in [0, 1]
+Progress = Callable[[str, float], None]  # called with the name of the stage and the share done in [0, 1]
 
 
 def in_notebook() -> bool:
@@ -24,12 +24,10 @@ def in_notebook() -> bool:
 
 @contextmanager
 def progress_bar(quiet: bool = False, delay: float = 0.0) -> Iterator[Progress]:
-    """A function of (what is being done, share done in [0, 1]) that shows a progress bar.
+    """Context manager that yields a function (name of the stage, share done in [0, 1]), which shows a progress bar.
 
-    In a pipe it shows nothing, nor if `quiet`, nor before the function is called after `delay` [s].
-
-    The function, and the end of the block, raise KeyboardInterrupt if Ctrl-C was pressed before, as the exception that
-    Ctrl-C raises can get lost in the renderer.
+    Nothing is shown in a pipe, if `quiet`, or before `delay` [s] have passed. The function, and the end of the block,
+    raise KeyboardInterrupt if Ctrl-C was pressed before, because the exception of Ctrl-C can be lost in the renderer.
     """
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
@@ -62,7 +60,7 @@ def progress_bar(quiet: bool = False, delay: float = 0.0) -> Iterator[Progress]:
 
 @contextmanager
 def reported(progress: Progress | None) -> Iterator[Progress]:
-    """The function to which long work of Python's interface reports: `progress`, or else a bar in a notebook.
+    """Context manager that yields the function to which long work in Python reports: `progress`, or a notebook's bar.
 
     The function, and the end of the block, raise KeyboardInterrupt if Ctrl-C was pressed before.
     """

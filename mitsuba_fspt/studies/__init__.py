@@ -1,1 +1,1 @@
-"""Many renderings for one answer: error against run time, sweeps, and what the integral leaves out."""
+"""Studies of many renderings: error against run time, sweeps, and the shortcuts of the integral."""

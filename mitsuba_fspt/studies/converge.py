@@ -1,6 +1,7 @@
-"""Error against run time: the reference picture, and every method timed over its own accuracy parameter (its knob).
+"""Error against run time: the reference image, and every method timed for several values of its accuracy parameter.
 
-The timed rounds go through all settings by turns, so that a slow moment of the machine slows all methods alike.
+The accuracy parameter of a method is called its knob. Every timed round runs all settings one after the other, so that
+a slow moment of the machine affects all methods alike.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from ..rendering.scene import loaded
 from ..runtime import backend
 from ..runtime.errors import FsptError, ImageError, SceneError
 from ..runtime.numbers import number, whole
-from .converge_methods import Method, Picture, methods, raw_rate
+from .converge_methods import Method, RunResult, methods, raw_rate
 from .convergence import Convergence, Measurement
 
 if TYPE_CHECKING:
@@ -36,16 +37,16 @@ if TYPE_CHECKING:
     from ..runtime.progress_bar import Progress
 
 BUDGET, ROUNDS = 2.0, 5
-REFERENCE_TIME = 15.0  # times the budget: run time of the reference picture
+REFERENCE_TIME = 15.0  # times the budget: run time of the reference image
 PATIENCE = 4.0  # times the budget: longest time of a method's coarsest setting
-BURST = 0.1  # s: least time of a setting's runs in one round
-WHOLE_CONE = 1 - 1e-4  # of a pixel's lines of sight; less than 1, as float32 weights are summed
+BURST = 0.1  # s: least total time of a setting's repeated runs in one round
+WHOLE_CONE = 1 - 1e-4  # least coverage of a pixel whose lines of sight all meet the phantom; float32 sums are rounded
 MIB = 1 << 20
 CACHE_VARIABLE = "DRJIT_CACHE_DIR"  # environment variable that names Dr.Jit's folder of compiled kernels
-# The first rtol of the reference is always taken, a finer one if the expected time is within REFERENCE_TIME.
+# The reference always takes the first rtol, and a finer one if its expected time is within REFERENCE_TIME.
 REFERENCE_RTOL = {"pupil": (1e-4, 1e-5, 1e-6), "surface": (1e-2, 1e-3, 1e-4, 1e-5)}
-GROWTH = 8.0  # expected ratio of the times of one of these and the one before
-COARSER = 10.0  # times the reference's rtol: the finest setting of the same form whose error is measured
+GROWTH = 8.0  # expected ratio of the times of an rtol and of the one before it
+COARSER = 10.0  # times the reference's rtol: least rtol of the same form whose error is measured
 
 Plane = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -61,33 +62,37 @@ def converge(
     kernels: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
 ) -> Convergence:
-    """Error against run time of the integral in both its forms, of the paper's sum, and of Mitsuba's Monte Carlo.
+    """Error against run time of both forms of the integral, of the paper's sum, and of Mitsuba's Monte Carlo.
 
         found = fspt.converge("scenes/two_spheres.xml", budget=0.5)
         found.order("integral"), found.time_to("path, multijitter", 1e-3)
         print(found.render_text())
 
-    Every setting runs once cold, once more for its memory, once untimed before the first round, and in each round for
-    0.1 s, at least once. The rounds go through all settings alternately forwards and backwards, so that a slow moment
-    of the machine slows all of them; medians count. `convergence_report` writes the CSV file and the figure.
+    Every setting runs once cold, once more to measure its memory, once untimed before the first round, and in each
+    round at least once and for 0.1 s. The rounds go through all settings alternately forwards and backwards, so that a
+    slow moment of the machine affects all of them; results are medians. `convergence_report` writes the CSV file and
+    the figure.
 
-    The cold run is the first run of a setting: recording, compilation, and what an integrator computes once a scene.
-    Kernels that Dr.Jit has in memory or on disk are not compiled again, unless `kernels` allows to delete them.
+    The cold run is the first run of a setting. It includes recording, compilation, and whatever an integrator computes
+    once per scene. Kernels that Dr.Jit has in memory or on disk are not compiled again, unless `kernels` permits to
+    delete them.
 
     Parameters
     ----------
     scene : Mitsuba scene (see `load`) or the name of a scene file
     sensor : number of the sensor, an `fspt_lens`
     rounds : timed rounds, >= 1; in each the median of a setting's runs counts
-    budget : longest time of one picture [s], > 0; finer settings are left out. About rounds × 20 × budget in all,
-        and some seconds a setting for its first runs.
+    budget : longest time of one image [s], > 0; finer settings are left out. The study takes about rounds × 20 ×
+        budget, and some seconds per setting for its first runs.
     reference : EXR file with error.Y, or NPZ file with arrays power and error [W]; None makes one, see `own_reference`
     kernels : DRJIT_CACHE_DIR of this process, if all kernels may be deleted before every cold run; else None
-    progress : called with what is being done and the share done
+    progress : called with the name of the stage and the share done, 0 … 1
 
     Raises
     ------
-    SceneError, OpticsError, ExitanceError, ImageError, BackendError : what is wrong and how to fix it.
+    SceneError, OpticsError, ExitanceError : the scene or an argument cannot be used, or its image is dark.
+    ImageError : the reference cannot be used.
+    BackendError : no working LLVM or CUDA.
     """
     sensor = whole("converge: 'sensor'", sensor, SceneError, "0")
     rounds = whole("converge: 'rounds'", rounds, SceneError, str(ROUNDS))
@@ -108,9 +113,9 @@ def converge(
 
 @contextmanager
 def empty_kernel_cache() -> Iterator[Path | None]:
-    """An empty folder for Dr.Jit's kernels, deleted at the end; None if Dr.Jit is imported and has its folder.
+    """Context manager: an empty folder for Dr.Jit's kernels, deleted at the end; None if Dr.Jit is imported already.
 
-    For the parameter `kernels` of `converge`: in a fresh folder the cold runs compile everything.
+    It is meant for the parameter `kernels` of `converge`: with an empty folder the cold runs compile all kernels.
     """
     if "drjit" in sys.modules:
         yield None
@@ -128,7 +133,7 @@ def empty_kernel_cache() -> Iterator[Path | None]:
 def _convergence(
     scene: mi.Scene, benchmark: Benchmark, rounds: int, rate: float, skipped: dict[str, str]
 ) -> Convergence:
-    """All that was measured, as plain data."""
+    """All measurements as plain data."""
     import mitsuba as mi
 
     reference = benchmark.reference
@@ -148,18 +153,18 @@ def _convergence(
     )
 
 
-# ---------------------------------------------------------------------- the reference picture
+# ---------------------------------------------------------------------- the reference image
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The picture that errors are measured from.
+    """The image with which all others are compared.
 
     power, error : power and its stated absolute error, shape (h, w) [W]
-    name : file or method that it is from
-    check : result of the comparison with an independent picture, '' without one
-    least_rtol : finest rtol of the integral's pupil form whose error can be measured; the reference is of that form,
-        and finer pictures share its error
+    name : its file, or the method that computed it
+    check : result of the comparison with an independent image, '' without one
+    least_rtol : finest rtol of the integral's pupil form whose error can be measured. The reference is of that form;
+        images of a finer rtol have partly the same error
     """
 
     power: Plane
@@ -184,9 +189,10 @@ class Reference:
         return float(self.error.max() / self.peak)
 
     def errors_of(self, power: Plane, full: Mask) -> tuple[float, float, float]:
-        """Errors of a picture, shape (h, w) [W], relative to the brightest pixel.
+        """Errors of an image with this `power`, shape (h, w) [W], relative to the reference's brightest pixel.
 
-        Their mean square over all pixels, that over the pixels of `full` (NaN without any), and the largest one.
+        Three numbers: the mean square over all pixels, that over the pixels of `full` (NaN if there are none), and the
+        largest error.
         """
         error = (power - self.power) / self.peak
         square = np.square(error)
@@ -197,7 +203,7 @@ class Reference:
 def _reference(
     scene: mi.Scene, lens: mi.Sensor, path: str | os.PathLike[str] | None, budget: float, report: Progress
 ) -> Reference:
-    """The reference: the file's picture, or our own where no file is given."""
+    """The reference: that of the file, or the integral at a fine rtol if no file is given."""
     width, height = (int(n) for n in _film(scene, lens).crop_size())
     from_file = read_reference(path, (height, width)) if path is not None else None
     report("reference", 0.0)
@@ -217,7 +223,7 @@ def read_reference(path: str | os.PathLike[str], shape: tuple[int, int]) -> Refe
 
     Raises
     ------
-    ImageError : no such file, not such a file, no error in it, another size than `shape` (h, w), or a dark picture.
+    ImageError : no such file, not such a file, no error in it, another size than `shape` (h, w), or a dark image.
     """
     path = Path(path)
     if path.suffix == ".npz":
@@ -255,16 +261,16 @@ def _arrays(path: Path) -> tuple[Plane, Plane]:
 def own_reference(scene: mi.Scene, lens: mi.Sensor, seconds: float) -> Reference:
     """The integral's pupil form at the finest rtol that takes about `seconds`, checked by the surface form.
 
-    The surface form is another algorithm on the same rays. The stated error of a pixel is the larger one of the pupil
-    form's own estimate and of the difference between the forms beyond the surface form's estimate.
+    The surface form is a different algorithm on the same ray tracer. The stated error of a pixel is the larger of two:
+    the pupil form's own estimate, and the difference between the forms less the surface form's estimate.
 
     Raises
     ------
-    SceneError : the picture is dark.
+    SceneError : the image is dark.
     """
     fine, rtol = _finest(scene, lens, "pupil", seconds)
     if not fine.power.max() > 0:
-        raise SceneError("converge: the picture is dark, no error can be told relative to its peak. Turn the camera.")
+        raise SceneError("converge: the picture is dark, errors relative to its peak are undefined. Turn the camera.")
     name = f"fspt_integral, pupil form, rtol {rtol:g}"
     try:
         other, other_rtol = _finest(scene, lens, "surface", seconds)
@@ -287,11 +293,11 @@ def _finest(scene: mi.Scene, lens: mi.Sensor, domain: str, seconds: float) -> tu
     import mitsuba as mi
 
     integrator = mi.load_dict({"type": "fspt_integral"})
-    ladder = REFERENCE_RTOL[domain]
-    for rtol in ladder:
+    values = REFERENCE_RTOL[domain]
+    for rtol in values:
         start = time.perf_counter()
         solution = integrator.solve(scene, lens, Quadrature(rtol=rtol, domain=domain))
-        if rtol == ladder[-1] or (time.perf_counter() - start) * GROWTH > seconds:
+        if rtol == values[-1] or (time.perf_counter() - start) * GROWTH > seconds:
             break
     return solution, rtol
 
@@ -303,42 +309,45 @@ def _finest(scene: mi.Scene, lens: mi.Sensor, domain: str, seconds: float) -> tu
 class TimedSetting:
     """One method at one setting: a function that runs it, and the results of its runs.
 
-    cold : time of the first run [s]; memory : peak of Dr.Jit's arrays [MiB]; picture : of the last run
-    seconds : median run time of each round [s]; errors : of each round, see `Reference.errors_of`
+    cold : time of the first run [s]
+    memory : peak of Dr.Jit's arrays [MiB]
+    result : of the last run
+    seconds : median run time of each round [s]
+    errors : of each round, see `Reference.errors_of`
     """
 
     method: Method
-    run: Callable[[], Picture]
+    run: Callable[[], RunResult]
     cold: float
     memory: float
-    picture: Picture
+    result: RunResult
     seconds: list[float] = field(default_factory=list)
     errors: list[tuple[float, float, float]] = field(default_factory=list)
 
     def run_timed(self, reference: Reference, full: Mask) -> None:
-        """One round: repeated runs for `BURST` seconds, of which the median time counts.
+        """One round: repeated runs for `BURST` seconds, whose median time is stored.
 
-        A single run of a short setting would depend on the caches that the setting before left behind.
+        A single short run would depend on the contents of the caches after the setting before it.
         """
         if not self.seconds:  # its kernels were deleted before the cold runs of the settings after it
             self.run()
         times: list[float] = []
         while sum(times) < BURST:
-            seconds, self.picture = _seconds(self.run)
+            seconds, self.result = _seconds(self.run)
             times.append(seconds)
         self.seconds.append(float(np.median(times)))
-        self.errors.append(reference.errors_of(self.picture.power, full))
+        self.errors.append(reference.errors_of(self.result.power, full))
 
     def row(self) -> Measurement:
-        """The measurement; its RMS error is averaged over the rounds, as Monte Carlo's differs from seed to seed."""
+        """The measurement. Its RMS error is a mean over the rounds, since that of Monte Carlo varies with the seed."""
         square, full, _ = np.mean(self.errors, axis=0)
         return Measurement(
             method=self.method.name,
             knob=self.method.knob,
-            value=self.picture.knob,
+            value=self.result.knob,
             cold=self.cold,
             seconds=tuple(self.seconds),
-            rays=self.picture.rays,
+            rays=self.result.rays,
             rms=float(np.sqrt(square)),
             rms_full=float(np.sqrt(full)),
             largest=float(np.median([largest for *_, largest in self.errors])),
@@ -347,16 +356,16 @@ class TimedSetting:
 
 
 class Benchmark:
-    """The settings that are timed: of each method, from coarse to fine, those that take at most `budget` seconds."""
+    """The settings that are timed: for each method, from coarse to fine, those that take at most `budget` seconds."""
 
     def __init__(self, reference: Reference, full: Mask, kernels: Path | None, budget: float) -> None:
-        """`full`: mask, shape (h, w), of the pixels whose whole cone sees the phantom; `kernels` as of `converge`."""
+        """`full`: mask (h, w) of pixels all of whose lines of sight meet the phantom; `kernels` as of `converge`."""
         self.reference, self.full = reference, full
         self.kernels, self.budget = kernels, budget
         self.settings: list[TimedSetting] = []
 
     def try_all(self, offered: list[Method], skipped: dict[str, str], report: Progress) -> dict[str, str]:
-        """Run all methods for the first time; returns `skipped` with the settings that take too long, and the reasons.
+        """Run all methods for the first time; return `skipped` plus the settings that take too long, with reasons.
 
         Raises
         ------
@@ -366,7 +375,7 @@ class Benchmark:
         for k, method in enumerate(offered):
             report(f"first runs: {method.name}", 0.1 + 0.4 * k / len(offered))
             try:
-                left_out |= self.try_ladder(method)
+                left_out |= self.try_values(method)
             except FsptError as refusal:
                 left_out[method.name] = str(refusal)
         if left_out and not self.settings:
@@ -388,17 +397,17 @@ class Benchmark:
                 setting.run_timed(self.reference, self.full)
         return max(count / float(np.median(own)) for count, own in zip(rays, seconds, strict=True))
 
-    def try_ladder(self, method: Method) -> dict[str, str]:
+    def try_values(self, method: Method) -> dict[str, str]:
         """Run a method's settings from coarse to fine until one takes longer than the budget; the first is always kept.
 
         Returns the settings that are left out for that, with the reason; raises SceneError if the first one takes
         longer than PATIENCE × the budget.
         """
-        for k, value in enumerate(method.ladder):
+        for k, value in enumerate(method.values):
             self._delete_kernels()
             run = method.prepare(value)
             cold, _ = _seconds(run)
-            seconds, memory, picture = _with_memory(run)
+            seconds, memory, result = _with_memory(run)
             if seconds > self.budget:
                 seconds = min(seconds, _seconds(run)[0])  # a second run, in case the machine was slow for a moment
             if seconds > self.budget and (k > 0 or seconds > PATIENCE * self.budget):
@@ -406,7 +415,7 @@ class Benchmark:
                     raise SceneError(f"its coarsest setting takes {seconds:.3g} s")
                 from_here = f"{method.name}, {method.knob} {value:g} and finer"
                 return {from_here: f"{seconds:.3g} s a picture, more than the budget of {self.budget:g} s"}
-            self.settings.append(TimedSetting(method, run, cold, memory, picture))
+            self.settings.append(TimedSetting(method, run, cold, memory, result))
         return {}
 
     def _delete_kernels(self) -> None:
@@ -421,8 +430,8 @@ class Benchmark:
             path.unlink(missing_ok=True)
 
 
-def _with_memory(run: Callable[[], Picture]) -> tuple[float, float, Picture]:
-    """Run time [s], peak of Dr.Jit's arrays above what was allocated before the run [MiB], and the picture."""
+def _with_memory(run: Callable[[], RunResult]) -> tuple[float, float, RunResult]:
+    """Run time [s], peak of Dr.Jit's arrays above what was allocated before the run [MiB], and the result."""
     import drjit as dr
     import mitsuba as mi
 
@@ -431,8 +440,8 @@ def _with_memory(run: Callable[[], Picture]) -> tuple[float, float, Picture]:
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     before = dr.detail.malloc_watermark(device)
-    seconds, picture = _seconds(run)
-    return seconds, (dr.detail.malloc_watermark(device) - before) / MIB, picture
+    seconds, result = _seconds(run)
+    return seconds, (dr.detail.malloc_watermark(device) - before) / MIB, result
 
 
 def _seconds(run: Callable[[], Any]) -> tuple[float, Any]:

@@ -1,6 +1,6 @@
 """The methods that `converge` compares: the integral in both forms, the paper's sum over points, and Monte Carlo.
 
-Each has one accuracy parameter, its knob: rtol, number of points, or samples a pixel.
+Each has one accuracy parameter, its knob: rtol, number of points, or samples per pixel.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SAMPLERS = ("multijitter", "independent", "stratified", "orthogonal", "ldsampler")
 RTOL = (1.0, 0.5, 0.2, 0.05, 0.03, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
 RTOL_SURFACE = (0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)
-# Square roots of the samples a pixel; primes for the orthogonal array.
+# Square roots of the samples per pixel; the orthogonal array needs primes.
 SIDES = (2, 4, 6, 8, 10, 12, 16, 23, 32, 45, 64, 91, 128)
 PRIMES = (2, 5, 11, 17, 23, 31, 47, 67, 89, 127)
 POWERS_OF_TWO = (2, 4, 8, 16, 32, 64, 128)
@@ -34,8 +34,8 @@ Plane = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Picture:
-    """Power, shape (h, w) [W]; number of rays; the knob's value, which may be rounded from the one asked for."""
+class RunResult:
+    """Result of a run: power, shape (h, w) [W]; number of rays; the knob's value, which may be rounded."""
 
     power: Plane
     rays: int
@@ -44,15 +44,15 @@ class Picture:
 
 @dataclass(frozen=True)
 class Method:
-    """A method: `ladder`, the values of its `knob` from coarse to fine; `prepare(value)` returns a function to run.
+    """A method with the `values` of its `knob`, from coarse to fine; `prepare(value)` returns a function to run.
 
-    What a method computes once a scene it computes in the first run of that function, not in `prepare`.
+    Computations that a method makes once per scene are part of the first run of that function, not of `prepare`.
     """
 
     name: str
     knob: str
-    ladder: tuple[float, ...]
-    prepare: Callable[[float], Callable[[], Picture]]
+    values: tuple[float, ...]
+    prepare: Callable[[float], Callable[[], RunResult]]
 
 
 def methods(scene: mi.Scene, lens: mi.Sensor, least_rtol: float = 0.0) -> tuple[list[Method], dict[str, str]]:
@@ -72,24 +72,24 @@ def methods(scene: mi.Scene, lens: mi.Sensor, least_rtol: float = 0.0) -> tuple[
     return found, skipped
 
 
-def integral(scene: mi.Scene, lens: mi.Sensor, domain: str, ladder: tuple[float, ...]) -> Method:
+def integral(scene: mi.Scene, lens: mi.Sensor, domain: str, values: tuple[float, ...]) -> Method:
     """The deterministic integral over the pixels' area, with rtol as its knob; the scene's integrator is not used.
 
-    rtol = 1 means four lines of sight a pixel, without a check of the error.
+    rtol = 1 means four lines of sight per pixel, without refinement.
     """
     import mitsuba as mi
 
-    def prepare(rtol: float) -> Callable[[], Picture]:
+    def prepare(rtol: float) -> Callable[[], RunResult]:
         accuracy = {"rtol": rtol} if rtol < 1 else {"rtol": 0.5, "max_nodes": 4}
         integrator = mi.load_dict({"type": "fspt_integral", "domain": domain, **accuracy})
 
-        def run() -> Picture:
+        def run() -> RunResult:
             solution = integrator.solve(scene, lens)
-            return Picture(solution.power, solution.rays, rtol)
+            return RunResult(solution.power, solution.rays, rtol)
 
         return run
 
-    return Method(INTEGRAL if domain == "pupil" else SURFACE_FORM, "rtol", ladder, prepare)
+    return Method(INTEGRAL if domain == "pupil" else SURFACE_FORM, "rtol", values, prepare)
 
 
 def _surfaces_and_pupil(scene: mi.Scene, lens: mi.Sensor) -> tuple[bool, str]:
@@ -116,15 +116,15 @@ def _point_sum(scene: mi.Scene, lens: mi.Sensor) -> Method:
     minima = (1, *itertools.takewhile(lambda n: n <= MOST_POINTS, (POINTS * 4**k for k in itertools.count())))
     counts = {direct_summation.points_of(scene, minimum): minimum for minimum in reversed(minima)}
 
-    def prepare(points: float) -> Callable[[], Picture]:
-        def run() -> Picture:
+    def prepare(points: float) -> Callable[[], RunResult]:
+        def run() -> RunResult:
             power, pairs = direct_summation.solve(scene, lens, counts[int(points)])
-            return Picture(power, pairs, points)
+            return RunResult(power, pairs, points)
 
         return run
 
-    ladder = tuple(float(count) for count in sorted(counts) if count > 2)
-    return Method(DIRECT_SUM, "points", ladder, prepare)
+    values = tuple(float(count) for count in sorted(counts) if count > 2)
+    return Method(DIRECT_SUM, "points", values, prepare)
 
 
 def _path(scene: mi.Scene, lens: mi.Sensor, sampler: str) -> Method:
@@ -149,7 +149,7 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
 
     own = dict(mi.traverse(lens))
     numbers = {name: float(value[0]) for name, value in own.items() if isinstance(value, mi.Float64)}
-    numbers.pop("wavelength_nm", None)  # of a curve, whose value there is the transmittance
+    numbers.pop("wavelength_nm", None)  # belongs to a curve; `numbers` has the curve's transmittance there
     numbers["transmittance"] = lens.transmittance
     film = lens.film()
     names = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
@@ -166,22 +166,22 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
     )
 
 
-def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], Picture]]:
-    """A `prepare` function over the samples a pixel, in as few passes as memory allows; every run has another seed."""
+def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], RunResult]]:
+    """`prepare` for a number of samples per pixel, in as few passes as memory permits; every run has another seed."""
     from ..emission.face_probe import probe_beside
 
     probe_beside(scene)
     integrator, seed = tracer(kind, scene, lens), itertools.count(1)
     pixels = math.prod(int(n) for n in lens.film().crop_size())
 
-    def prepare(spp: float) -> Callable[[], Picture]:
+    def prepare(spp: float) -> Callable[[], RunResult]:
         count = math.ceil(spp * pixels / PASS_SAMPLES)
 
-        def run() -> Picture:
+        def run() -> RunResult:
             total, samples = np.zeros(()), 0
             for power, taken in passes(scene, lens, integrator, itertools.islice(seed, count), math.ceil(spp / count)):
                 total, samples = total + power, samples + taken
-            return Picture(total / count, samples * pixels, samples)
+            return RunResult(total / count, samples * pixels, samples)
 
         return run
 
@@ -189,12 +189,12 @@ def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float
 
 
 def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 << 20) -> Callable[[], int]:
-    """A function that only traces rays, from rays in memory to hits in memory, and returns their number.
+    """A function that only traces rays, reads them from memory, writes the intersections to memory, and counts them.
 
     The rays are lines of sight like the integral's: four nodes on every pixel that can see a glowing surface, rotated
-    about the pupil's centre until there are `least` rays. Rays of neighbouring pixels are neighbours in memory;
+    about the pupil's centre until there are `least` rays. Rays of neighbouring pixels are neighbours in memory.
     `together`: Embree traces them in packets, else one by one. Pixels that cannot see a glowing surface have no rays
-    here. Such rays cost far less, so that a method with many of them may trace more rays per second than this function.
+    here. As such rays are far faster to trace, a method with many of them may reach more rays per second than this.
     """
     import drjit as dr
     import mitsuba as mi

@@ -1,4 +1,4 @@
-"""The result of `converge`: errors and times of every setting, what follows from them, and their text tables."""
+"""The result of `converge`: errors and times of every setting, quantities derived from them, and text tables."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-# Names of the methods. Monte Carlo from the camera has one for every sampler; `PEER` is the one with the best sampler.
+# Names of the methods. Monte Carlo from the camera counts as one method per sampler; `PEER` has the best sampler.
 INTEGRAL, SURFACE_FORM, DIRECT_SUM, PTRACER = "integral", "integral, surface form", "sum over points", "ptracer"
 PATH = "path, "
 PEER = PATH + "multijitter"
 FLOOR = 3.0  # times the reference's stated error: smaller errors are not used to fit an order
-LEAST_CORRELATION = 0.7  # of the logarithms of work and error; no order is fitted where it is less
+LEAST_CORRELATION = 0.7  # of the logarithms of work and error; no order is fitted below it
 TARGETS = (1e-3, 1e-4, 1e-5)  # RMS errors relative to the brightest pixel
-# Pixels ('full': those whose whole cone sees the phantom) and RMS errors at which the integral is compared with `path`.
+# Pixels and RMS errors at which the integral is compared with `path`. 'full': all lines of sight meet the phantom.
 PAIRS = (("all", 1e-3), ("all", 1e-4), ("all", 3e-5), ("all", 1e-5), ("full", 1e-4), ("full", 3e-5), ("full", 1e-5))
 NONE = "–"  # in the table, for a number that does not exist
 
@@ -26,10 +26,10 @@ NONE = "–"  # in the table, for a number that does not exist
 class Measurement:
     """One method at one setting of its `knob`. Errors are relative to the reference's brightest pixel.
 
-    cold : time of the first run [s], with the compilation and with what an integrator computes once a scene
+    cold : time of the first run [s], including compilation and computations once per scene
     seconds : median run time of each round [s]
     rays : number of lines of sight; for the sum over points, number of pairs of a point and a pixel
-    rms, rms_full : RMS error over all pixels and over those whose whole cone sees the phantom (NaN: there are none)
+    rms, rms_full : RMS error over all pixels, and over those all of whose lines of sight meet the phantom (NaN: none)
     largest : largest error of a pixel; for Monte Carlo the median of it over the rounds, while `rms` is the root of
         the mean square over the rounds
     memory : peak of Dr.Jit's arrays during a run [MiB], without those of the scene; NumPy's and Embree's memory is not
@@ -65,9 +65,9 @@ class Convergence:
     Attributes
     ----------
     scene : its name and parameters; machine : the machine and the variant; shape : (h, w)
-    reference, check : names of the reference picture and of the picture that it was checked against, with the result
+    reference, check : names of the reference image and of the image that it was checked against, with the result
     stated, stated_largest : RMS and largest error that the reference states of itself, relative to its brightest pixel
-    full : number of pixels whose whole cone sees the phantom
+    full : number of pixels all of whose lines of sight meet the phantom
     raw_rate : rays per second of Embree or OptiX alone, on pixels that can see a glowing surface; traced in packets or
         one by one, whichever is faster
     rows : method by method, from coarse to fine
@@ -101,9 +101,11 @@ class Convergence:
         return fitted_order([row.rays for row in rows], [row.rms for row in rows])
 
     def time_to(self, method: str, target: float, full: bool = False, run: int | None = None) -> float | None:
-        """Least time [s] in which a method reaches an RMS error, by the median times or by those of one round.
+        """Least time [s] in which a method reaches the RMS error `target`.
 
-        None where no setting reaches it, or where the target is smaller than the error the reference states of itself.
+        full : only pixels all of whose lines of sight meet the phantom
+        run : number of the round whose times are used; None: medians over the rounds
+        None if no setting reaches the target, or if it is smaller than the stated error of the reference.
         """
         rows = self.of(method)
         errors = [row.rms_full if full else row.rms for row in rows]
@@ -113,7 +115,7 @@ class Convergence:
     def ratio(self, method: str, peer: str, target: float, full: bool = False) -> tuple[float, float, float] | None:
         """Time of `peer` over time of `method` to an RMS error: median, least and largest over the rounds.
 
-        The two times of a ratio are of the same round, in which a slow machine slows both.
+        The two times of a ratio are of the same round, so that a slow machine slows both.
         """
         ratios = []
         for run in range(len(self.rows[0].seconds)):
@@ -152,7 +154,7 @@ class Convergence:
 def fitted_order(work: Sequence[float], errors: Sequence[float]) -> float | None:
     """p of error ∝ work^-p by least squares in the logarithms.
 
-    None without two settings of different work, and where the errors do not fall like any power of it.
+    None if there are fewer than two different values of `work`, or if the errors follow no power of it.
     """
     points = [(w, e) for w, e in zip(work, errors, strict=True) if w > 0 and e > 0]
     if len({w for w, _ in points}) < 2:
@@ -165,10 +167,10 @@ def fitted_order(work: Sequence[float], errors: Sequence[float]) -> float | None
 
 
 def time_to(times: Sequence[float], errors: Sequence[float], target: float) -> float | None:
-    """Least time in which an error is reached; None where no setting reaches it.
+    """Least time in which the error `target` is reached; None if no setting reaches it.
 
-    Between a setting that does not reach it and the next slower one that does, the time is interpolated by the power
-    law through both.
+    The time is interpolated, by a power law, between a setting that does not reach the target and the next slower one
+    that does.
     """
     points = sorted((t, e) for t, e in zip(times, errors, strict=True) if not math.isnan(e))
     reached = [t for t, e in points if e <= target]
@@ -190,7 +192,7 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _method_rows(found: Convergence) -> list[list[str]]:
-    """A row a method: the rates of its finest setting, its largest memory, its coarsest setting's first run."""
+    """One row per method: rates of its finest setting, its largest memory, first run of its coarsest setting."""
     head = ["method", "order", *(f"to {target:g}" for target in TARGETS), "cold start", "Mrays/s", "of raw", "Dr.Jit"]
     rows = [head]
     for method in found.methods:
@@ -211,7 +213,7 @@ def _method_rows(found: Convergence) -> list[list[str]]:
 
 
 def _ratio_rows(found: Convergence) -> list[list[str]]:
-    """A row an error: times of the integral and of `PEER`, their ratio, and the fastest of `path`'s other samplers."""
+    """One row per error: times of the integral and of `PEER`, their ratio, and the fastest other sampler of `path`."""
     rows = [["pixels", "RMS error", INTEGRAL, PEER, "ratio (over the rounds)", "best other sampler"]]
     others = [method for method in found.methods if method.startswith(PATH) and method != PEER]
     for pixels, target in PAIRS:

@@ -44,9 +44,9 @@ STYLES: dict[str, dict[str, Any]] = {
 
 
 def write_csv(found: Convergence, path: str | os.PathLike[str]) -> None:
-    """Write a CSV file: the reference with its stated errors, the raw rate of rays, then one row a setting.
+    """Write a CSV file: the reference with its stated errors, the raw rate of rays, then one row per setting.
 
-    Times in s, errors relative to the brightest pixel. Raises ImageError where the file cannot be written.
+    Times are in s, errors relative to the brightest pixel. Raises ImageError if the file cannot be written.
     """
     with atomic_path(path, ImageError) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         rows = csv.DictWriter(file, COLUMNS, restval="")
@@ -76,11 +76,12 @@ def _line(row: Measurement, raw_rate: float) -> dict[str, str | int]:
 
 
 def png_file(found: Convergence, path: str | os.PathLike[str]) -> AbstractContextManager[None]:
-    """A PNG file of error over warm run time; drawn before the `with` block, renamed to `path` after it succeeded.
+    """Context manager: a PNG file of error against warm run time, drawn before the block and renamed to `path` after
+    it.
 
-    Three panels: RMS error of all pixels, RMS error of those whose whole cone sees the phantom, largest error. The
-    dotted line is the error that the reference states of itself; points below it are hollow, and points below the
-    axes stand on their lower edge.
+    Three panels: RMS error of all pixels, RMS error of pixels all of whose lines of sight meet the phantom, largest
+    error. The dotted line is the stated error of the reference. Points below it are hollow; points below the range of
+    the axis are drawn on its lower edge.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The shortcuts of a scene's integral: which ones are taken, why, and what share of its work they save."""
+"""The shortcuts that the integral takes in a scene, the reasons, and the share of the work that each saves."""
 
 from __future__ import annotations
 
@@ -29,15 +29,17 @@ if TYPE_CHECKING:
 
 ROUNDS = 3  # timed pairs of runs, of which the median counts; only one where a run takes longer than LONG [s]
 LONG = 5.0
-NO_GAIN = "no gain"  # in place of a share of the time within the noise
+NO_GAIN = "no gain"  # printed if the saved time does not exceed the noise of its measurement
 WHAT_WIDTH = 1 + max(len(what) for what in SHORTCUTS.values())
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """One row of the table: something that the integral may leave out.
+    """One row of the table: a computation that the integral may leave out.
 
-    what : name; `left_out`: True if it is left out of this scene; `why` : the reason
+    what : its name
+    left_out : True if it is left out in this scene
+    why : the reason
     lines_saved, time_saved : measured saving, as a share of the lines of sight and of the time without the shortcut, at
         most 1; None where it is not taken or cannot be switched off
     time_spread : half the difference between the largest and the smallest share of the time saved in any round; a
@@ -79,10 +81,10 @@ def explain(
     rtol: float | None = None,
     domain: str | None = None,
 ) -> list[Explanation]:
-    """One row for everything that the integral may leave out of a scene.
+    """One row for every computation that the integral may leave out in a scene.
 
-    Each shortcut that is taken is switched off, to measure the lines of sight and the time that it saves. Parameters
-    and errors are those of `render`.
+    Each shortcut that is taken is switched off in turn, to measure how many lines of sight and how much time it saves.
+    Parameters and errors are those of `render`.
     """
     scene = loaded(scene)
     variant = backend.ensure_variant()
@@ -112,9 +114,8 @@ def _saved(
 ) -> tuple[float, float, float]:
     """Shares of the lines of sight and of the time that a shortcut saves, from pairs of runs with and without it.
 
-    The third number is the spread of the second, as in `Explanation`.
-
-    A first run without it compiles the kernels; its time does not count.
+    The third number is `time_spread` of `Explanation`. A first run without the shortcut compiles the kernels and is not
+    timed.
     """
     long, seconds = solve(without)
     rounds = ROUNDS if seconds < LONG else 1
@@ -136,12 +137,12 @@ def _scattered(left_out: LeftOut) -> Explanation:
 
 
 def _never_done(scene: mi.Scene, variant: str) -> list[Explanation]:
-    """Rows for work that is never begun where it is not needed, and so has no cost to measure."""
+    """Rows for work that is not started unless it is needed, so that there is no cost to measure."""
     loaded = [one.module for one in EXTRAS if one.module in sys.modules]
     uniform = [is_surface(emitter) and emitter.is_uniform() for emitter in scene.emitters()]
     return [
         Explanation("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),
-        Explanation("gradients", True, "a picture asks for none"),
+        Explanation("gradients", True, "an image needs none"),
         Explanation("optional packages", not loaded, f"imported: {', '.join(loaded) or 'none'}"),
         Explanation("further variants", True, f"{variant} alone is set"),
     ]

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 class SceneCache:
     """Renders the points of a sweep one at a time and keeps the last scene.
 
-    The images are the same, to the last bit, as from a scene that is loaded for each point. `loads` counts the scenes
-    that were loaded.
+    The images are equal to the bit to those of a scene that is loaded for each point. `loads` counts the scenes that
+    were loaded.
     """
 
     def __init__(self, *, threads: int | None = None, quiet: bool = False) -> None:
@@ -59,7 +59,7 @@ class SceneCache:
     def _set_up(self, point: SweepPoint) -> mi.Scene:
         """The scene of a point, loaded or with its lens changed."""
         scene = self._scene if self._geometry == point.geometry else None
-        self._scene = None  # if the set-up fails, no half changed scene is kept
+        self._scene = None  # if the set-up fails, no partly changed scene is kept
         if scene is not None:
             _set_lens(scene, point)
         else:

@@ -45,7 +45,7 @@ class SweepRow:
     power, peak : power on all pixels and on the brightest one [W]
     largest_error : largest error of a pixel [W]; None where the image has no error
     wall_time : time of the rendering [s]
-    reused : True if the image was there already
+    reused : True if the image existed before and was not rendered again
     """
 
     parameters: dict[str, str | int | float]
@@ -90,12 +90,12 @@ def sweep(
     folder : folder of the images; created if its parent exists
     method, rtol, spp, seed, sensor : as in `render`
     source_power : power of the light source [W], for a scene that is per 1 W of it, as in `Image.scaled`
-    format : of the images, by its suffix: exr, tif, h5, npz or fits
+    format : suffix of the images, which chooses their format: exr, tif, h5, npz or fits
     jobs : number of processes, >= 1; None renders in this one (with scheduler 'local': one process a core). Each
         imports the script that calls: keep the call behind `if __name__ == "__main__":`
     scheduler : address of a dask.distributed scheduler, for example 'tcp://10.0.0.1:8786', or 'local' to start one
         on this machine; needs the extra `cluster`. Workers must find the scene under the same path.
-    progress : called with what is being done and the share done; without it a notebook shows a bar
+    progress : called with the name of the stage and the share done, 0 … 1; without it a notebook shows a bar
 
     Raises
     ------
@@ -172,7 +172,7 @@ def _completed(
                     report()
                     continue
                 folder.mkdir(exist_ok=True)
-                with ctrl_c_held():  # so that every image has its row in the index
+                with ctrl_c_held():  # else an image could exist without its row in the index
                     image.write(folder / point.file)
                     rows[point.file] = _row(point, folder, image)
                 report()
@@ -217,7 +217,7 @@ def _images(missing: list[SweepPoint], jobs: int | None, scheduler: str | None) 
 
 
 def _by_geometry(missing: Iterable[SweepPoint]) -> list[SweepPoint]:
-    """The points, those that can use the same loaded scene one after the other."""
+    """The points in an order in which those that can use the same loaded scene follow one another."""
     groups: dict[str, list[SweepPoint]] = {}
     for point in missing:
         groups.setdefault(point.geometry, []).append(point)
@@ -300,8 +300,8 @@ def write_contact_sheet(rows: Sequence[SweepRow], path: str | os.PathLike[str]) 
 
     The scale is logarithmic where the peaks differ a lot, see `ColourScale.over`. Above each image are its values of
     the parameters that vary and its total power. A scale bar is in the first image, and in those of another scale.
-    Where several parameters vary, there is a column for every value of the last one. An image smaller than the others
-    is in the upper left corner of its cell.
+    If several parameters vary, there is a column for every value of the last one. An image that is smaller than the
+    others is drawn in the upper left corner of its cell.
 
     Raises
     ------

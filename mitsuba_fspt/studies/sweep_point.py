@@ -1,6 +1,6 @@
 """The points of a sweep: parameter values, name of the image, and a fingerprint of all that the image depends on.
 
-`SceneSource` reads two things from the scene's XML: the files that it names, and which parameters only set the lens.
+`SceneSource` reads from the scene's XML which files it names, and which parameters set only numbers of the lens.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_BYTES = 250  # of a file name without its suffix; file systems allow 255 wit
 
 @dataclass(frozen=True)
 class SweepPoint:
-    """One image of a sweep and all that it is made from; plain data that can be sent to other processes.
+    """One image of a sweep and all that determines it; plain data that can be sent to other processes.
 
     scene : the scene file as given
     path : its absolute path, for a process that works in another folder
@@ -159,7 +159,7 @@ class SceneSource:
         self._xml = read_xml(path, self._parameters)
         self._nodes = self._xml.nodes
         sensors = [node for node in self._nodes if node.tag == "sensor"]
-        # The elements inside <sensor type="fspt_lens">; none where there is another sensor, too.
+        # The elements inside <sensor type="fspt_lens">; none if the scene has further sensors.
         self._lens = list(sensors[0]) if [node.get("type") for node in sensors] == ["fspt_lens"] else []
         self._digests = {} if digests is None else digests
 

@@ -1,6 +1,6 @@
-"""Rendering the points of a sweep elsewhere: in processes of this machine, or on a dask.distributed cluster.
+"""Rendering the points of a sweep in other processes of this machine, or on a dask.distributed cluster.
 
-A process that ends while it renders (out of memory, killed) costs only its point another try.
+If a process ends while it renders a point (out of memory, killed), only this point is rendered again.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from .sweep_point import SweepPoint
 if TYPE_CHECKING:
     from distributed import Client
 
-TRIES = 3  # processes that one point may end before it counts as failed
-SCHEDULER_TIMEOUT = 10  # s, for a scheduler to answer, and for its first worker to be there
-# Options of a cluster on this machine. Its scheduler opens an HTTP port even without a dashboard: with port 0 any free
-# one, by default 8787, with a warning on stderr where another cluster has that.
+TRIES = 3  # a point fails if this many processes have ended while they rendered it
+SCHEDULER_TIMEOUT = 10  # s, for a scheduler to answer, and for its first worker to be available
+# Options of a cluster on this machine. Its scheduler opens an HTTP port even without a dashboard. Port 0 stands for any
+# free port; the default 8787 causes a warning on stderr if another cluster uses it.
 LOCAL_CLUSTER: dict[str, Any] = {
     "threads_per_worker": 1,
     "memory_limit": 0,
@@ -44,11 +44,11 @@ def share_of_cores(jobs: int) -> int:
 
 @contextmanager
 def ctrl_c_blocked() -> Iterator[None]:
-    """Processes and threads that are started in the block ignore Ctrl-C; the main process handles it and ends them."""
+    """Context manager: processes and threads started in the block ignore Ctrl-C; the main process ends them instead."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    resource_tracker.ensure_running()  # else it starts with the first process, and unblocks the signal
+    resource_tracker.ensure_running()  # if it started with the first process, it would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -57,7 +57,7 @@ def ctrl_c_blocked() -> Iterator[None]:
 
 
 def _lost_workers(point: Any, verb: str = "sweep") -> BackendError:
-    """The error of a point that ended every process which rendered it."""
+    """Error for a point during whose rendering `TRIES` processes have ended."""
     return BackendError(
         f"{verb}: {TRIES} worker processes died at {point.label}. Give it more memory, or fewer jobs at a time."
     )
@@ -69,7 +69,7 @@ def _lost_workers(point: Any, verb: str = "sweep") -> BackendError:
 def images_of_processes(points: list[SweepPoint], jobs: int) -> Iterator[tuple[SweepPoint, Image | FsptError]]:
     """Points and their images in the order they are finished, from at most `jobs` processes that share the cores.
 
-    Instead of an image: the FsptError that the rendering raised, or BackendError where the point ended TRIES processes.
+    In place of an image: the FsptError that the rendering raised, or BackendError if `TRIES` processes have ended.
     """
     waiting, ended = list(points), Counter[str]()
     jobs = min(jobs, len(points))
@@ -101,7 +101,7 @@ def images_of_processes(points: list[SweepPoint], jobs: int) -> Iterator[tuple[S
 
 
 class _Worker:
-    """A process that renders one point after the other; `point` is the one it has now."""
+    """A process that renders one point after the other; `point` is the present one."""
 
     point: SweepPoint
 
@@ -114,7 +114,7 @@ class _Worker:
         theirs.close()
 
     def take_from(self, waiting: list[SweepPoint]) -> None:
-        """Remove a point from `waiting` and start it; if possible one for which the process has the scene loaded."""
+        """Remove a point from `waiting` and start it, preferably one for which the process has loaded the scene."""
         geometry = getattr(getattr(self, "point", None), "geometry", None)
         self.point = next((point for point in waiting if point.geometry == geometry), waiting[0])
         waiting.remove(self.point)
@@ -122,9 +122,9 @@ class _Worker:
             self.connection.send(self.point)
 
     def image(self) -> Image | FsptError | None:
-        """The image of `point` or its FsptError, None if the process has ended; raises any other error of the process.
+        """Wait for the image of `point` or its FsptError; None if the process has ended.
 
-        Waits until one of these is there.
+        Raises any other exception of the process.
         """
         try:
             answer = self.connection.recv()
@@ -159,7 +159,7 @@ def _work(connection: Connection, threads: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process as soon as the main one has ended; killed, that one could not do it itself."""
+    """End this process as soon as the main process has ended, which cannot do it itself if it was killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -179,14 +179,18 @@ def images_of_cluster(
 def results_of_cluster(
     points: list[Any], scheduler: str, jobs: int | None, work: Callable[[Any, int | None], Any], verb: str = "sweep"
 ) -> Iterator[tuple[Any, Any]]:
-    """Points and what `work` makes of each, in the order they are finished, by workers of the scheduler at an address.
+    """Points and their results from `work`, in the order they are finished, computed by workers of a dask scheduler.
 
-    'local' starts a scheduler and `jobs` workers on this machine. When a worker ends, its points are tried again.
-    `work` takes a point, which has a `label`, and a number of threads, None for that of the worker. Messages begin with
-    `verb`.
+    Parameters
+    ----------
+    points : each with a `label`
+    scheduler : its address; 'local' starts a scheduler and `jobs` workers on this machine
+    jobs : number of workers, for 'local' only
+    work : function of a point and a number of threads, None for that of the worker
+    verb : first word of messages
 
-    Instead of a result: the FsptError that `work` returned, or BackendError where the point ended every worker that
-    tried it.
+    If a worker ends, its points are computed again. In place of a result: the FsptError that `work` returned, or
+    BackendError if every worker that tried the point has ended.
 
     Raises
     ------
@@ -245,7 +249,7 @@ def _remote(address: str, verb: str) -> Iterator[tuple[Client, None]]:
             f"{verb}: no dask scheduler answers at '{address}'. Start one with 'dask scheduler', or give "
             "--scheduler local."
         ) from cause
-    with client, _quiet("distributed.client"):  # a lost connection is reported once, by our error
+    with client, _quiet("distributed.client"):  # a lost connection is reported once, by this package's error
         try:
             client.wait_for_workers(1, timeout=SCHEDULER_TIMEOUT)
         except TimeoutError as cause:
@@ -257,7 +261,7 @@ def _remote(address: str, verb: str) -> Iterator[tuple[Client, None]]:
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """No messages of the logger of this name, but for critical ones."""
+    """Context manager that silences the logger of this name, except for critical messages."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.CRITICAL)

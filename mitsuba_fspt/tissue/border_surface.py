@@ -36,7 +36,8 @@ def refined_border(grid: Any, cuts: int) -> tuple[Array, Index]:
 def nearest_points(points: Array, triangles: Array) -> Array:
     """Nearest point on `triangles` (F, 3 corners, 3) to each of `points` (N, 3), shape (N, 3), all [mm].
 
-    Exact if the nearest triangle is among the eight with the nearest centroids, as on a border lattice.
+    The result is exact if the nearest triangle is among the eight with the nearest centroids, as is the case for
+    triangles of similar size.
     """
     from scipy.spatial import cKDTree
     from trimesh.triangles import closest_point

@@ -2,9 +2,10 @@
 
     -∇·(D ∇φ) + µa φ = q inside,   φ + 2 A D ∂φ/∂n = 0 on the border,   D = 1/(3 (µa + µs')).
 
-φ is split into φ_f + w. φ_f is the field of the sources in infinite tissue with the optics found at the source, in
-closed form, including its singularity and its power. The finite elements solve for the smooth rest w only, so that
-both orders of element converge at their full rate and the mesh is independent of the sources' positions.
+The solution is split, φ = φ_f + w. φ_f is the closed-form field of the sources in infinite tissue that has the optical
+coefficients at the source everywhere; it contains the singularity of point sources. The finite elements solve for the
+smooth rest w only. Elements of both orders therefore converge at their full rate, and the mesh does not depend on the
+positions of the sources.
 
     mesh = cylinder_tetrahedra(radius=15, height=30, edge=1.5)
     solution = solve(mesh, [Medium(0.0138, 0.91, 1.37)], [Source(Sphere((8, 0, 0)))])
@@ -48,7 +49,7 @@ def solve(
     mesh : tetrahedra of the tissue; `media[label]` fills its region `label`
     media : absorption, reduced scattering and refractive index of each region
     sources : at least one; their shapes must lie inside the mesh
-    a : boundary factor: 'robin', 'haskell' (from each region's n) or a number
+    a : boundary factor A: 'robin' or 'haskell' (from the n of each region, see `optics.boundary`), or a number
     order : 1 or 2, of the tetrahedra
     progress : called with the name of each stage
 
@@ -83,7 +84,7 @@ def solve(
 
 
 def _free_fields(mesh: Tetrahedra, media: Sequence[Medium], sources: Sequence[Source]) -> tuple[FreeField, ...]:
-    """Free field of the sources in each region; each node of a source counts to the region that contains it."""
+    """Free field of the sources of each region; every node of a source belongs to the region that contains it."""
     if not sources:
         raise FluxError("solve: there is no source. Give at least one.")
     parts = []

@@ -25,11 +25,11 @@ from .tetrahedra import Tetrahedra
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Relative residual of the linear system. Far from the sources φ is nine decades below its peak and keeps some digits.
+# Relative residual of the linear system: far from the sources φ is nine decades below its peak and must keep digits.
 TOLERANCE = 1e-13
 MOST_ITERATIONS = 5000
-# Degree of the quadrature on the border, where φ_f is no polynomial; its error is the power that shallow sources lose
-# (see `balance`).
+# Degree of the quadrature on the border, where φ_f is no polynomial. Its error is that of the power balance of shallow
+# sources (see `balance`).
 BORDER_DEGREE = 8
 
 
@@ -73,7 +73,7 @@ class System:
         self.factor = np.asarray(factors)[mesh.region[grid.f2t[0, self.border.find]]][:, None]
 
     def solve(self, fields: Sequence[FreeField]) -> Solved:
-        """Rest w of φ beside the free fields of the sources, with the absorbed and the exit power.
+        """Rest w = φ − φ_f, where φ_f is the sum of the sources' free fields, with the absorbed and the exit power.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class System:
         changed = (self.diffusion != field.diffusion) | (self.mua != field.mua)
         other = np.flatnonzero(changed[:, 0])
         load, power = np.zeros(self.basis.N), 0.0
-        # ∇φ_f is steep near a source: cells there take a rule of many small tetrahedra.
+        # ∇φ_f is steep near a source: cells there are integrated by a rule on many small tetrahedra.
         near = self._near(other, field.centres)
         skfem = import_skfem()
         degree = 2 * self.element.maxdeg
@@ -203,7 +203,7 @@ def import_skfem() -> Any:
 
 
 def _split_rule(degree: int) -> tuple[Array, Array]:
-    """Points (3, Q) and weights (Q,) on the reference tetrahedron, cut into 64 with a rule of `degree` in each."""
+    """Points (3, Q) and weights (Q,) on the reference tetrahedron: a rule of `degree` on each of its 64 equal parts."""
     skfem = import_skfem()
     parts = skfem.Basis(skfem.MeshTet1.init_refdom().refined(2), skfem.ElementTetP1(), intorder=degree)
     return np.asarray(parts.global_coordinates()).reshape(3, -1), parts.dx.ravel()

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Below this decay [1/mm] the factor exp(-kr) is 1 over any phantom. It replaces k = 0 of tissue without absorption, for
-# which the closed form of the ball is 0/0.
+# With this decay constant [1/mm] the factor exp(-kr) is 1 over any phantom. It replaces k = 0 of tissue without
+# absorption, for which the closed form of the ball is 0/0.
 SMALLEST_DECAY = 1e-7
 PAIRS_AT_ONCE = 500_000
 

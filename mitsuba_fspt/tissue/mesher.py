@@ -19,8 +19,8 @@ from ..runtime.errors import BackendError, FluxError
 from .border_surface import nearest_points
 from .tetrahedra import Tetrahedra, require_few
 
-ENVELOPE = 20  # edge over the distance by which the mesher may leave the surface, onto which its border is moved after
-ROUNDS = 5  # of restoring vertices whose move has crushed a cell
+ENVELOPE = 20  # edge over the largest distance between mesher's border and surface; later the border is moved onto it
+ROUNDS = 5  # of moving vertices back whose move has flattened or inverted a cell
 CRUSHED = 0.3  # least ratio of a cell's signed volumes after and before the move
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -21,16 +21,16 @@ from .tetrahedra import OUTSIDE, Tetrahedra, depth
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Largest share of the exit power that values below 0, an error of the mesh, may remove.
+# Largest share of the exit power that may be removed with the values below 0, which are errors of the mesh.
 LARGEST_REMOVED = 1e-4
 # Iterations of the search in curved cells; each one divides the error by about 8 radii of curvature over an edge.
 CURVED_STEPS = 6
-NEARBY = 0.5  # barycentric distance from a cell, beyond which its straight form is accurate enough
+NEARBY = 0.5  # barycentric distance from a cell beyond which straight edges are accurate enough for the search
 
 
 @dataclass(frozen=True, eq=False)
 class DiffusionSolution:
-    """Solution φ = free `fields` of the sources + the rest `solved.rest` on the finite element `basis` of `mesh`.
+    """Solution φ: sum of the free `fields` of the sources and the rest `solved.rest` in the `basis` on `mesh`.
 
     `media` and boundary `factors` A: one per region of the mesh; `source_power` [W].
     """
@@ -45,7 +45,7 @@ class DiffusionSolution:
 
     @property
     def balance(self) -> float:
-        """(absorbed + exit power)/source power - 1, no unit: error of the quadrature of the sources on the border."""
+        """(absorbed + exit power)/source power - 1, no unit: error of the sources' field integrated on the border."""
         return (self.solved.absorbed + self.solved.exited) / self.source_power - 1
 
     def report(self) -> dict[str, float | int]:
@@ -69,8 +69,8 @@ class DiffusionSolution:
     def fluence_at(self, points: Array, core: float = 0.0) -> Array:
         """φ [W/mm²] at `points` (N, 3) [mm] in the tissue, shape (N,).
 
-        Just outside, the rest w is that of a nearby point of the border. Closer than `core` [mm] to a point source φ
-        is constant; with core 0 it is infinite there.
+        For points just outside, w is that of a nearby point of the border. Closer than `core` [mm] to a point source φ
+        is set constant; with core 0 it is infinite at the source.
         """
         cells, local = self._locate(points)
         return self._fluence(points, cells, local, core)
@@ -137,7 +137,7 @@ class DiffusionSolution:
         cells, local = self._curved(points, *self.mesh.locate(points))
         inside = depth(local) > -OUTSIDE
         fluence = np.empty(len(points))
-        # The mean of 1/r over a cube about its centre is 1/(0.42 edge): a point source leaves its voxel finite.
+        # The mean of 1/r over a cube about its centre is 1/(0.42 edge): the value of a voxel with a point source.
         fluence[inside] = self._fluence(points[inside], cells[inside], local[inside], 0.42 * voxel)
         nearest = self._snap(nearest_points(points[~inside], border[faces]))
         fluence[~inside] = self._continued(points[~inside], nearest)

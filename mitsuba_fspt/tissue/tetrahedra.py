@@ -34,7 +34,7 @@ class Tetrahedra:
     vertices : array, shape (V, 3) [mm]
     cells : array, shape (T, 4), indices of vertices in either orientation
     region : array, shape (T,), label of each cell; all 0 if left out
-    snap : function that moves points (N, 3) [mm] near the border onto the true, curved border; None: it is straight
+    snap : function that moves points (N, 3) [mm] near the border onto the curved border; None if the border is flat
 
     Raises
     ------
@@ -123,7 +123,7 @@ class Tetrahedra:
         starts = tree.query(points, k=min(STARTS, len(self.cells)))[1].reshape(len(points), -1)
         cells, local = self._walk(points, starts[:, 0])
         for start in starts.T[1:]:
-            # The walk ended at the border: the point is outside, or beyond a gap in the mesh. Try another start.
+            # The search ended at the border: the point is outside, or behind a concave part. Try another start cell.
             lost = np.flatnonzero(depth(local) < -ROUND_OFF)
             other, there = self._walk(points[lost], start[lost])
             better = depth(there) > depth(local[lost])
@@ -131,9 +131,10 @@ class Tetrahedra:
         return cells, local
 
     def _walk(self, points: Array, start: Index) -> tuple[Index, Array]:
-        """Cells (N,) and local coordinates (N, 3) after a walk from `start`.
+        """Cells (N,) and local coordinates (N, 3) that a search from cell to cell reaches from the cells `start`.
 
-        Each step crosses the facet that the point lies farthest behind, up to the point's cell or the border.
+        Each step crosses the facet behind which the point lies farthest, until the point's cell or the border is
+        reached.
         """
         cells, local = start.copy(), np.empty((len(points), 3))
         moving = np.arange(len(points))
@@ -145,7 +146,7 @@ class Tetrahedra:
             if len(moving) == 0:
                 break
         else:
-            local[moving] = -np.inf  # the walk is cyclic
+            local[moving] = -np.inf  # the search runs in a cycle
         return cells, local
 
     def local(self, points: Array, cells: Index) -> Array:

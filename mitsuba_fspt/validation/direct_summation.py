@@ -1,8 +1,9 @@
 """Eq. 9 as the paper sums it: over surface points, at the middle of every pixel.
 
-A point r adds L cosθ_s dS · A_vd cosθ_d/|r_vd − r|² to each pixel r_vd whose line to it meets the diaphragm (β), that
-is, to those with their middle in its blur disc, where nothing hides it along that line (α). Here to be measured: the
-blur disc shrinks to nothing on the sharp plane, and points whose disc holds no middle are lost.
+A point r adds L cosθ_s dS · A_vd cosθ_d/|r_vd − r|² to each pixel whose middle r_vd lies in the blur disc of r, so that
+the line through r and r_vd passes the diaphragm (β = 1), if nothing hides r along this line (α = 1). The blur disc
+vanishes on the virtual detector plane: the power of a point whose blur disc contains no pixel's middle is lost. This
+module serves to measure that error.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ Index = NDArray[np.int64]
 
 
 def points_of(scene: mi.Scene, minimum: int) -> int:
-    """Number of points that `solve` sums over: faces, each cut into k² alike, or cells of (u, v)."""
+    """Number of points that `solve` sums over: faces, each divided into k² equal parts, or cells of (u, v)."""
     return sum(elements_of(emitter.get_shape(), minimum).count for emitter in scene.emitters())
 
 
@@ -51,13 +52,13 @@ def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Plane, in
 
 
 def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]:
-    """Elements and the flat numbers of the pixels around their blur discs, some `BATCH` pairs at a time."""
+    """Pairs of an element and the number of a pixel near its blur disc, about `BATCH` pairs at a time."""
     si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
     centre, radius = lens.film_discs(si.p.numpy().T.astype(np.float64))
     size, offset = (
         np.array([int(n) for n in corner]) for corner in (lens.film().crop_size(), lens.film().crop_offset())
     )
-    # Whole numbers k with |k + ½ - centre| <= radius, a float32's rounding more.
+    # Integers k with |k + ½ - centre| <= radius, plus the rounding error of float32.
     reach = np.where(np.isfinite(radius), radius * (1 + 1e-4) + 1e-3, np.inf)
     first = np.clip(np.ceil(centre - reach - 0.5 - offset), 0, size).astype(np.int64)
     last = np.clip(np.floor(centre + reach - 0.5 - offset), -1, size - 1).astype(np.int64)
@@ -80,7 +81,7 @@ def _add(
     index: Index,
     pixel: Index,
 ) -> None:
-    """Add what the elements give to their pixels, a pair a lane, in one kernel."""
+    """Add the contributions of the pairs to their pixels, one array entry per pair, in one kernel."""
     number = mi.UInt32(pixel.astype(np.uint32))
     width = dr.opaque(mi.UInt32, int(lens.film().crop_size()[0]))
     corner = mi.Point2f(*(dr.opaque(mi.Float, int(n) + 0.5) for n in lens.film().crop_offset()))
@@ -99,7 +100,7 @@ def _add(
     si.initialize_sh_frame()
     si.wi = si.to_local(to_lens)
     radiance = dr.select(lit, scalar(emitter.eval(si, lit)), 0)
-    # |r_vd - r| = |u - z|/cosθ_d; A_vd last, so that nothing leaves float32 on the way.
+    # |r_vd - r| = |u - z|/cosθ_d. A_vd is multiplied last, so that no intermediate value exceeds float32.
     defocus = dr.opaque(mi.Float, lens.optics.focus_distance) - distance * cos_d
     solid_angle = cos_d * dr.square(cos_d * dr.opaque(mi.Float, lens.virtual_pitch) / defocus)
     added = eq9(mi.Float64(radiance), mi.Float64(cos_s) * mi.Float64(area) * mi.Float64(solid_angle))

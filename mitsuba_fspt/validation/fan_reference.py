@@ -1,9 +1,10 @@
-"""Eq. 9 in float64 NumPy on chosen pixels, adaptively: along one coordinate exact between edges, lattices for the rest.
+"""Eq. 9 in float64 NumPy on single pixels: edges are found exactly along one of four coordinates.
 
-Lines of sight through one point of the pupil and a segment of the pixel form a fan. Where a fan meets the edges of
-bodies, stops and texels follows from linear and quadratic equations; between them Gauss's rule integrates. What is left
-are three smooth coordinates, for which randomly shifted lattices of growing size are taken. Their scatter is the error.
-Frame and units as in `reference`, with which this shares no integration; no code is shared with the plugins.
+Lines of sight through one point of the pupil and a segment of the pixel form a fan. The positions at which a fan meets
+edges of bodies, stops and texels follow from linear and quadratic equations; between them Gauss's rule integrates. The
+result is smooth in the other three coordinates, over which randomly shifted lattices of growing size integrate. The
+scatter over the shifts gives the error. Frame and units are those of `reference`. No integration is shared with that
+module, and no code with the plugins.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ from .reference_shapes import Array, dot, unit_disc
 Indices = NDArray[np.int64]
 SHIFTS = 16
 CERTAIN = 4.1  # standard errors of the mean of 16 shifts that 999 of 1000 stay within (Student's t)
-FEW, UNMET = 16, 6.9  # fans with light that say how much they scatter; −ln of one case of 1000
-# Of a lattice: fans a shift. Of the first all ways are tried; the second is taken in any case, lest all fans pass by
-# a corner in the pixel.
+FEW, UNMET = 16, 6.9  # fans with light from which a scatter can be estimated; −ln of one case of 1000
+# Numbers of fans in a shift of a lattice. At the first size all ways to lay fans are tried; the second size is always
+# computed, because all fans of the first may miss a corner in the pixel.
 LINES = (64, 512, 2048, 8192, 32768)
-MOST_LINES = 8192  # of these, unless more are asked for
+MOST_LINES = 8192  # largest number of fans in a shift, unless another is requested
 GAUSS = 8  # nodes on a piece between two edges
-SHORTEST = 1e-13  # piece of a fan that is left out, of the fan's length
+SHORTEST = 1e-13  # of a fan's length: shorter pieces are left out
 
 
 @dataclass(frozen=True)
 class Stops:
-    """What holds light back beside the lens's own pupil.
+    """Borders that a line of sight has to pass: entrance pupil, border of the lens and image-plane stop.
 
     Parameters
     ----------
@@ -65,13 +66,13 @@ class Stops:
 
 @dataclass(frozen=True)
 class FanReference:
-    """Scene for the reference on chosen pixels.
+    """Scene, and its reference on single pixels.
 
     Parameters
     ----------
-    camera : its film is the whole one, pixels are numbered on it
-    stops : `Stops.of(camera)` without further ones
-    bodies : what lines of sight meet; opaque ones must not intersect
+    camera : with the whole film, on which pixels are numbered
+    stops : `Stops.of(camera)` if there are no further ones
+    bodies : surfaces that lines of sight meet; opaque ones must not intersect
     pixel : 'area' or 'centre'
     """
 
@@ -88,7 +89,7 @@ class FanReference:
         """
         pixels = np.asarray(pixels, int)
         goals = np.broadcast_to(np.asarray(goal, np.float64), len(pixels))
-        # A pixel is some 10⁵ lines of sight, so that this loop costs nothing.
+        # A pixel takes some 10⁵ lines of sight, so that the overhead of this loop is negligible.
         found = [self._on_pixel(int(r), int(c), own, seed, most) for (r, c), own in zip(pixels, goals, strict=True)]
         return np.array([value for value, _ in found]), np.array([error for _, error in found])
 
@@ -111,7 +112,7 @@ class FanReference:
             for way in ways:
                 means, lit = self._means(bodies, centre, way, lines, random.random((SHIFTS, 3)))
                 error = CERTAIN * float(np.std(means, ddof=1)) / math.sqrt(SHIFTS)
-                if lit < FEW:  # all of a part of pixel × pupil may be passed by
+                if lit < FEW:  # all fans may have missed a part of pixel × pupil with light
                     error = max(error, UNMET / (SHIFTS * lines) * self._most(bodies))
                 if best is None or error < best[1] or way == best[2]:
                     best = (float(np.mean(means)), error, way)
@@ -121,7 +122,7 @@ class FanReference:
         return best[:2] if best else (0.0, 0.0)
 
     def _most(self, bodies: Sequence[Body]) -> float:
-        """Upper bound of the power on a pixel [W]: all of its lines of sight meet the brightest of what glows."""
+        """Upper bound of the power on a pixel [W], as if all of its lines of sight met the brightest surface."""
         stops = self.stops
         size = self.camera.pixel_side * stops.pupil_radius / (self.camera.focus_distance - stops.pupil_depth)
         return size**2 * max((body.most for body in bodies), default=0.0)
@@ -131,8 +132,8 @@ class FanReference:
     ) -> tuple[Array, int]:
         """Power [W] by each shift's lattice of fans, and the number of fans that meet light.
 
-        way : whether fans cover a chord of the pupil, or of the pixel, and along which axis. Edges along the fans,
-            or across what hardly matters, spoil all but one of the four.
+        way : whether fans cover a chord of the pupil or of the pixel, and along which axis. The caller takes the best
+            of the four: edges parallel to the fans make a way inaccurate.
         """
         camera, stops = self.camera, self.stops
         u, depth, side = camera.focus_distance, stops.pupil_depth, camera.pixel_side
@@ -146,7 +147,7 @@ class FanReference:
             start, share, behind = _at(centre + side * corner, u) - apex, np.ones(number), 0.0
             step[:, axis] = side
         else:
-            # Even steps of the angle at which chords end: their density 2 sin² vanishes at both ends.
+            # Uniform in the angle at which chords end: the density of chords, 2 sin², vanishes at both ends.
             height, share = -np.cos(np.pi * nodes[:, 0]), 2 * np.sin(np.pi * nodes[:, 0]) ** 2
             half = np.sqrt(1 - height**2)
             first = stops.pupil_radius * np.stack([-half, height], axis=1)[:, [axis, 1 - axis]]
@@ -174,7 +175,7 @@ class FanReference:
         low, high = ends[fan_of, piece], ends[fan_of, piece + 1]
         node, weight = np.polynomial.legendre.leggauss(GAUSS)
         node, weight = (node + 1) / 2, weight / 2
-        # Drawn towards both ends, where the square root at a limb becomes linear.
+        # Nodes are dense towards both ends, by a map that makes the square root at a limb linear.
         place, slope = node**2 * (3 - 2 * node), 6 * node * (1 - node)
         s = low[:, None] + (high - low)[:, None] * place
         share = (high - low)[:, None] * (weight * slope)
@@ -183,7 +184,7 @@ class FanReference:
         return np.bincount(row, value, minlength=count).astype(np.float64)
 
     def _integrand(self, bodies: Sequence[Body], fan: Fan, row: Indices, s: Array) -> Array:
-        """cos⁴θ times radiance [W/mm²/sr] on single lines of fans, (n,); 0 where a stop holds a line back."""
+        """cos⁴θ times radiance [W/mm²/sr] on single lines of fans, (n,); 0 where a stop blocks the line."""
         stops, u = self.stops, self.camera.focus_distance
         direction = fan.start[row] + s[:, None] * fan.step[row]
         origin = fan.apex[row] - fan.behind * direction
@@ -199,13 +200,13 @@ class FanReference:
         return cos2**2 * value
 
     def _stop_edges(self, fan: Fan) -> Array:
-        """Where the borders of lens and image-plane stop cut fans, (n, 4)."""
+        """Parameters s at which fans meet the borders of the lens and of the image-plane stop, (n, 4)."""
         stops, u = self.stops, self.camera.focus_distance
         found = []
         for radius, depth in ((stops.lens_radius, 0.0), (stops.field_radius, u)):
             if not math.isfinite(radius):
                 continue
-            # All lines take the same share of their direction to this plane, as `step` lies across the axis.
+            # `step` is perpendicular to the axis, so that all lines reach this plane at the same parameter τ.
             far = ((depth - fan.apex[:, 2]) / fan.start[:, 2])[:, None]
             at, along = (fan.apex + far * fan.start)[:, :2], (far * fan.step)[:, :2]
             found.append(roots(dot(along, along), 2 * dot(at, along), dot(at, at) - radius**2))

@@ -1,7 +1,7 @@
 """Random scenes of several families, each for Mitsuba and for `fan_reference`, reproducible from family and seed.
 
-Camera frame: the lens at the origin looks along +z. Bodies lie around the virtual detector plane, where a film of 24 to
-64 pixels a side sees some 30 to 60 mm; blur discs reach from a hundredth of a pixel to tens of pixels.
+Camera frame: the lens is at the origin and looks along +z. Bodies lie around the virtual detector plane, of which a
+film of 24 to 64 pixels a side sees some 30 to 60 mm. Blur discs measure from a hundredth of a pixel to tens of pixels.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 Indices = NDArray[np.int64]
 DARK = {"type": "diffuse"}
-APART = 1.02  # of the sum of two bodies' radii: centres are farther apart, so that bodies do not intersect
+APART = 1.02  # least distance of the centres of two bodies, over the sum of their radii, so that they do not intersect
 FRESNEL_INDEX = 1.37
-TRIES = 60  # places tried for a body
+TRIES = 60  # random positions tried for a body
 
 
 @dataclass(frozen=True)
 class RandomScene:
-    """One scene: what `mitsuba.load_dict` takes, the reference, and how to render it.
+    """One scene: dictionaries for `mitsuba.load_dict`, its reference, and the crop window.
 
     crop : (x, y, width, height) of the crop window on the film
     """
@@ -54,7 +54,7 @@ class RandomScene:
 
 @dataclass
 class _Maker:
-    """What is drawn step by step: lens, bodies in both forms, and the spheres around bodies that exist."""
+    """Scene under construction: lens, bodies for Mitsuba and the reference, and the spheres that contain the bodies."""
 
     random: np.random.Generator
     lens: dict[str, Any] = field(default_factory=dict)
@@ -83,7 +83,7 @@ class _Maker:
         return self.lens["focus_distance"]
 
     def place(self, radius: float, depth: tuple[float, float] = (-40, 40)) -> Array | None:
-        """Centre for a body within a sphere of this radius, off the others; None if there is no room."""
+        """Centre for a body within a sphere of this `radius` that meets no other one; None if none is found."""
         for _ in range(TRIES):
             z = self.focus + self.random.uniform(*depth)
             xy = self.random.uniform(-0.5, 0.5, 2) * self.field_width * z / self.focus
@@ -106,11 +106,11 @@ class _Maker:
         return matrix
 
     def exitance(self) -> float:
-        """J_n [W/mm²] over two decades."""
+        """Random J_n [W/mm²], from two decades."""
         return float(10 ** self.random.uniform(-2, 0))
 
     def add(self, what: dict[str, Any] | mi.Mesh, body: Body, glow: Any = None) -> None:
-        """A body in both forms; `glow`: parameters of its emitter."""
+        """Add a body for Mitsuba and for the reference; `glow`: parameters of its emitter."""
         if isinstance(what, dict):
             if glow is not None:
                 law = {} if self.index is None else {"emission": "fresnel", "int_ior": self.index}
@@ -121,7 +121,7 @@ class _Maker:
         self.bodies.append(body)
 
     def glowing(self, shape: Any, what: dict[str, Any], dark: bool = False) -> None:
-        """A body with one J_n, or none."""
+        """Add a body with uniform J_n, or a dark one."""
         if dark:
             self.add(what, Body(shape))
             return
@@ -224,7 +224,7 @@ class _Maker:
         self.add({"type": "rectangle", "to_world": _matrix(turn * [*half, 1], centre)}, body, texture)
 
     def pane(self, mirror: bool) -> None:
-        """A flat mirror beside or behind what glows, or a thin pane before it."""
+        """A flat mirror beside or behind the glowing bodies, or a thin pane in front of them."""
         half = self.random.uniform(10, 40, 2)
         angle = self.random.uniform(-0.6, 0.6, 2) + ([0.9, 0] if mirror else [0, 0])
         (cx, cy), (sx, sy) = np.cos(angle), np.sin(angle)

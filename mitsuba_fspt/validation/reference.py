@@ -1,7 +1,7 @@
-"""Eq. 9 in float64 NumPy by brute force: the truth that tests, and figures of scripts/, measure the plugins against.
+"""Eq. 9 in float64 NumPy by brute force: the reference for the plugins, in tests and in figures of scripts/.
 
-It shares no code with them. Camera frame: lens plane z = 0, +z towards the object, +x to the left of the
-picture, +y up; virtual detector plane z = u. Lengths in mm, exitance J_n in W/mm², results in W on each
+It shares no code with the plugins. Camera frame: lens plane z = 0, +z towards the object, +x to the left of the
+image, +y up; virtual detector plane z = u. Lengths in mm, exitance J_n in W/mm², results in W on each
 pixel, shape (height, width), row 0 at the top. `reference_mesh` has the same integral over triangle meshes.
 """
 
@@ -19,14 +19,14 @@ from .reference_shapes import Array, Shape, dot, unit_disc
 
 Pixel = Literal["area", "centre"]
 Exitance = Callable[[Array, int], Array]  # (points (n, 3) of shape number i, i) -> (n,) [W/mm²]
-BLOCK = 2_000_000  # lines of sight held at a time: bounds the memory at about half a gigabyte
-# Two unrelated shifts of a lattice, off its points of symmetry: there the fold doubles every node.
+BLOCK = 2_000_000  # lines of sight at a time: limits the memory to about half a gigabyte
+# Two independent shifts of a lattice, away from its points of symmetry, where the fold would map nodes onto each other.
 SHIFT, OTHER_SHIFT = (0.137, 0.419, 0.683, 0.911), (0.271, 0.833, 0.059, 0.547)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Thin lens with a diaphragm at it, before a film of width × height pixels (paper, section 2).
+    """Thin lens with a diaphragm in the lens plane and a film of width × height pixels (paper, section 2).
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Camera:
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
-    """`to_world` of a camera at `origin` that sees `target` in the middle and `up` upwards, (4, 4)."""
+    """`to_world` (4, 4) of a camera at `origin` with `target` in the middle of the image and `up` pointing upwards."""
     forward = np.subtract(target, origin) / np.linalg.norm(np.subtract(target, origin))
     left = np.cross(np.asarray(up), forward)
     left /= np.linalg.norm(left)
@@ -122,10 +122,10 @@ class Rule:
 
 
 def gauss_rule(n: int, pixel: Pixel = "area") -> Rule:
-    """Product rule, spectrally accurate for what is smooth over pixel and pupil.
+    """Product rule, which converges exponentially if the integrand is smooth over pixel and pupil.
 
-    n Gauss nodes along each side of the pixel and in the squared radius of the pupil, 2n + 1 even steps of
-    its angle.
+    It has n Gauss nodes along each side of the pixel and in the squared radius of the pupil, and 2n + 1 equal steps in
+    the pupil's angle.
     """
     node, weight = np.polynomial.legendre.leggauss(n)
     node, weight = node / 2, weight / 2
@@ -169,10 +169,10 @@ def pupil_form(
 
         P = 1/π ∫_pixel dA ∫_pupil dA_a  J_n(r) cos⁴θ / u²
 
-    with r the first surface point on the line from a through r_vd. `n` is that of `gauss_rule` (nodes a
-    dimension) or `lattice_rule` (nodes in all). The error is the difference to the same rule with n/2: above
-    the true error as long as doubling n helps. With pixel = 'centre' the value there stands for the pixel's
-    average.
+    with r the first surface point on the line from a through r_vd. `n` is that of `gauss_rule` (nodes per dimension) or
+    of `lattice_rule` (total number of nodes). The error is the difference to the same rule with n/2; it exceeds the
+    true error as long as doubling n reduces the error. With pixel = 'centre' the value at the centre replaces the mean
+    over the pixel.
     """
     if kind == "gauss":
         fine, coarse = gauss_rule(n, pixel), gauss_rule(n // 2, pixel)
@@ -189,9 +189,9 @@ def surface_form(
 
         P = 1/π ∫_S J_n(r) α β |cos θ_s| |cos θ_d| / |r_vd − r|² dA_vd dS
 
-    A plain sum over `n` lattice points of the surface, all of which have to be off the plane z = u (in focus
-    the sum is stiff: β's support shrinks to a point). With pixel = 'area' every surface point has its own
-    place in the pixels. Error as in `pupil_form`.
+    It is a plain sum over `n` lattice points of the surface, none of which may lie in the plane z = u (near it the sum
+    is stiff: the region with β = 1 shrinks to a point). With pixel = 'area' every surface point is combined with
+    another point of the pixel. The error is that of `pupil_form`.
     """
     power, half = (
         _surface_sum(camera, shape, exitance, lattice(m, shift), pixel)
@@ -201,9 +201,9 @@ def surface_form(
 
 
 def collected_power(camera: Camera, shape: Shape, exitance: Exitance, n: int) -> float:
-    """∫_S J_n f dS [W], the power of one convex body that passes the diaphragm; no virtual detector plane enters.
+    """∫_S J_n f dS [W], the power of one convex body that passes the diaphragm, whatever the focus (Eq. M.9).
 
-    f is the configuration factor of a surface element to the pupil; n lattice points over surface × pupil.
+    f is the configuration factor from a surface element to the pupil. `n` lattice points cover surface × pupil.
     """
     nodes = lattice(n, SHIFT)
     points, area = shape.surface(nodes[:, :2])
@@ -234,7 +234,7 @@ def _average(camera: Camera, shapes: Sequence[Shape], exitance: Exitance, rule: 
 
 
 def _seen(shapes: Sequence[Shape], exitance: Exitance, origin: Array, direction: Array) -> Array:
-    """J_n at the first point of each line [W/mm²], 0 where that is none or the back of a body."""
+    """J_n at the first surface point on each line [W/mm²]; 0 if there is none or it is the inward side."""
     nearest = np.stack([shape.meet(origin, direction) for shape in shapes])
     first = np.argmin(nearest, axis=0)
     first[~np.isfinite(np.min(nearest, axis=0))] = -1
@@ -261,10 +261,10 @@ def _surface_sum(camera: Camera, shape: Shape, exitance: Exitance, nodes: Array,
         virtual = _on_plane(centres[pixels, None] + offset[part], u)
         line = r[part] - virtual
         distance2 = dot(line, line)
-        # The line through r and r_vd pierces the lens plane here.
+        # The point in which the line through r and r_vd meets the lens plane.
         pierced = virtual - line * (u / line[..., 2])[..., None]
         beta = dot(pierced[..., :2], pierced[..., :2]) <= camera.pupil_radius**2
-        # One convex body: whatever faces the pupil is seen from there.
+        # A convex body hides no part of itself that faces the pupil.
         alpha = dot(normal[part], pierced - r[part]) > 0
         cos_s = np.abs(dot(normal[part], line))
         cos_d = np.abs(line[..., 2])

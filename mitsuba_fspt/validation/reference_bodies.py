@@ -1,4 +1,4 @@
-"""Bodies of `fan_reference`: where lines of sight meet them, what they radiate, and where fans of lines meet edges."""
+"""Bodies of `fan_reference`: intersection with lines of sight, radiance, and the edges that fans of lines meet."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from .reference import Camera
 
 Indices = NDArray[np.int64]
-MOST_SPECULAR = 6  # mirrors and panes one after the other
-BEYOND = 1e-9  # of a line's length: what begins nearer than this is the surface that it comes from
+MOST_SPECULAR = 6  # mirrors and panes that a line meets one after the other
+BEYOND = 1e-9  # of a line's length: an intersection nearer than this is with the surface where the line starts
 
 
 @dataclass(frozen=True)
 class Fan:
     """Fans of lines apex + τ (start + s · step), s in [0, 1]; columns (n, 3).
 
-    behind : lines of sight begin so many directions before the apex
+    behind : lines of sight start at τ = −behind
     """
 
     apex: Array
@@ -70,12 +70,12 @@ class Body:
     most: float = 0.0
 
     def edges(self, fan: Fan) -> Array:
-        """Parameters s at which fans meet an edge, (n, k); nan or beyond [0, 1] where they do not."""
+        """Parameters s at which fans meet an edge, (n, k); NaN or outside [0, 1] where they do not."""
         own = self.shape.edges(fan)
         return own if self.texture is None else np.concatenate([own, self.texture(fan)], axis=1)
 
     def radiance(self, points: Array, direction: Array, face: Indices) -> Array:
-        """L [W/mm²/sr] from points against the direction of lines of sight, (n,); 0 from the inward side."""
+        """L [W/mm²/sr] at points, opposite to the direction of lines of sight, (n,); 0 on the inward side."""
         if self.exitance is None:
             return np.zeros(len(points))
         cosine = -dot(self.shape.outward(points, face), direction) / np.sqrt(dot(direction, direction))
@@ -176,7 +176,7 @@ def roots(a: Array, b: Array, c: Array) -> Array:
 
 
 def reflected(fan: Fan, shape: BodyShape) -> Fan:
-    """The fan in the plane of a flat `shape`: what it meets off a mirror it meets straight on."""
+    """The fan mirrored in the plane of a flat `shape`; straight on, it meets what `fan` meets after the reflection."""
     point = shape.corners()[0]
     normal = shape.outward(point[None], np.zeros(1, int))[0]
 
@@ -187,13 +187,13 @@ def reflected(fan: Fan, shape: BodyShape) -> Fan:
 
 
 def _crossing(fan: Fan, normal: Array) -> Array:
-    """Where the directions of fans lie across a normal, (n, 1)."""
+    """Parameters s at which the directions of fans are perpendicular to a normal, (n, 1)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return (-dot(fan.start, normal) / dot(fan.step, normal))[:, None]
 
 
 def _circle(fan: Fan, centre: Array, normal: Array, radius: float) -> Array:
-    """Where fans pass the rim of a disc, and where they lie in its plane, (n, 3)."""
+    """Parameters s at which fans meet the rim of a disc, and at which they are parallel to its plane, (n, 3)."""
     w = fan.apex - centre
     height = (w @ normal)[:, None]
     at, along = (w * (d @ normal)[:, None] - d * height for d in (fan.start, fan.step))
@@ -204,7 +204,7 @@ def _circle(fan: Fan, centre: Array, normal: Array, radius: float) -> Array:
 
 
 def _limb(w: Array, start: Array, step: Array, radius: float) -> Array:
-    """Where lines from w, seen from the centre or projected along an axis, touch the distance `radius`, (n, 2)."""
+    """Parameters s at which lines from w are tangent to a sphere, or projected along an axis to a circle, (n, 2)."""
     out = dot(w, w) - radius**2
     p, q = dot(w, start), dot(w, step)
     return roots(out * dot(step, step) - q * q, 2 * (out * dot(start, step) - p * q), out * dot(start, start) - p * p)
@@ -252,7 +252,10 @@ class Simple:
 
 
 def rectangle_lines(fan: Fan, shape: Rectangle, columns: Sequence[float], rows: Sequence[float]) -> Array:
-    """Where fans cross lines at these shares of the half width and half height of a rectangle, or lie in its plane."""
+    """Parameters s at which fans cross grid lines of a rectangle, or are parallel to its plane.
+
+    columns, rows : of the grid lines, as shares of the half width and the half height
+    """
     a, b = np.asarray(shape.half_width, np.float64), np.asarray(shape.half_height, np.float64)
     normal = _unit(np.cross(a, b))
     w = fan.apex - np.asarray(shape.centre)
@@ -288,7 +291,7 @@ class Triangles:
         """First positive parameters (n,), inf for none, and numbers of the faces in the whole mesh."""
         best, face = np.full(len(origin), np.inf), np.zeros(len(origin), int)
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        for k in range(len(self.faces)):  # few, and each is met by some 10⁵ lines
+        for k in range(len(self.faces)):  # few faces, each with some 10⁵ lines
             e1, e2 = b[k] - a[k], c[k] - a[k]
             normal = np.cross(e1, e2)
             slope = direction @ normal

@@ -1,9 +1,9 @@
 """Eq. 9 over triangle meshes in float64 NumPy, without tracing a ray.
 
-Seen from one point a of the pupil the lines of sight are a central projection: the vertices are projected
-through a onto the virtual detector plane and the triangles are scan-converted onto the sample points of the film, with
-a depth buffer. The samples are a grid of k × k points a pixel that moves from node to node, so that nodes and
-samples together fill pixel × pupil. Independently shifted lattices of nodes give the mean and its error.
+The lines of sight through one point a of the pupil are a central projection. The vertices are projected through a onto
+the virtual detector plane, and the triangles are rasterised onto the sample points of the film, with a depth buffer.
+The samples form a grid of k × k points per pixel, which is shifted from one point a to the next, so that pupil points
+and samples together cover pixel × pupil. Independently shifted lattices of pupil points give the mean and its error.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class TriangleMesh:
             )
 
     def closed(self) -> bool:
-        """Whether this is the outside of solid bodies, of which no back is ever seen from outside.
+        """True if the mesh is the boundary of solid bodies, so that no inward side is visible from outside.
 
-        Every directed edge meets its opposite once and the volume is positive.
+        Every directed edge then occurs once in the opposite direction, and the volume is positive.
         """
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         count = len(self.vertices)
@@ -97,11 +97,11 @@ def mesh_truth(
 
     Parameters
     ----------
-    levels : (pupil nodes of one lattice, a power of two; sample points along a pixel's side) of each level.
-        A level computes afresh the pixels whose own or neighbour's error exceeds `tolerance` × the brightest
-        pixel wanted
-    region : (height, width) mask of the pixels wanted, None for all; the others come back as nan
-    replicas : independently shifted lattices, ≥ 2; the result is their mean, the error its standard error
+    levels : for each level the number of pupil points of one lattice, a power of two, and the number of sample points
+        along a pixel's side. A level computes anew the pixels whose own or neighbour's error exceeds `tolerance` × the
+        brightest pixel of the region
+    region : (height, width) mask of the pixels to compute, None for all; the result is NaN on the others
+    replicas : number of independently shifted lattices, ≥ 2; the result is their mean, the error its standard error
     seed : of the shifts
 
     Raises
@@ -110,9 +110,10 @@ def mesh_truth(
 
     Notes
     -----
-    Silhouettes converge about like (nodes · samples²)^(−3/4), the rest faster. The pixels share
-    the shifts, so even the RMS of the error over the film is uncertain: by a third with 4 replicas, a fifth with 8.
-    Memory: some 100 bytes for each sample of one node that sees the mesh; do a large film region by region.
+    On silhouettes the error falls about as (nodes · samples²)^(−3/4), elsewhere faster. All pixels have the same
+    shifts, so that the RMS of the stated error over the film is uncertain, too: by a third with 4 replicas, by a fifth
+    with 8. Memory: about 100 bytes for each sample of one node that sees the mesh; compute a large film region by
+    region.
     """
     wanted = np.ones((camera.height, camera.width), bool) if region is None else np.array(region, dtype=bool)
     power, error = np.full((2, *wanted.shape), np.nan)
@@ -132,7 +133,7 @@ def mesh_truth(
 
 @dataclass(frozen=True)
 class _View:
-    """Faces in the camera frame: `corners` (xyz, corner, F), `exitance` (corner, F); closed hides backs."""
+    """Faces in the camera frame: `corners` (xyz, corner, F), `exitance` (corner, F); `closed` as in the mesh."""
 
     camera: Camera
     corners: Array
@@ -159,7 +160,7 @@ class _View:
         return middle[:, None, None] - virtual / self.camera.pixel_side
 
     def part(self, region: Mask) -> _View:
-        """The faces that some point of the pupil sees over some pixel of the region."""
+        """The faces that are visible from some point of the pupil in some pixel of the region."""
         blur = np.abs(1 - self.camera.focus_distance / self.corners[2])
         blur = blur * self.camera.pupil_radius / self.camera.pixel_side
         film, size = self.film(np.zeros(2)), np.array(region.shape[::-1])[:, None]
@@ -177,16 +178,16 @@ class _View:
         pupil, shift = camera.pupil_radius * unit_disc(nodes[:, :2]), nodes[:, 2:]
         total: Array = np.zeros(camera.height * camera.width)
         depth = np.zeros(total.size * samples**2)
-        # A node is some 10⁵ array elements of work, so this loop costs nothing.
+        # A node takes operations on some 10⁵ array elements, so that the overhead of this loop is negligible.
         for a, s in zip(pupil, shift, strict=True):
             total += self.radiate(a, s, samples, depth)
         return camera.scale / (len(nodes) * samples**2) * total.reshape(camera.height, camera.width)
 
     def radiate(self, pupil: Array, shift: Array, samples: int, depth: Array) -> Array:
-        """Σ J_n cos⁴θ [W/mm²] over the samples of each pixel as one pupil point sees it, (height·width,).
+        """Σ J_n cos⁴θ [W/mm²] over the samples of each pixel, seen from one pupil point, shape (height·width,).
 
-        Samples lie at (m + shift)/samples within a pixel, m = 0 … samples − 1 along both sides. `depth` is a
-        buffer of zeros, one a sample, and is left so.
+        Samples lie at (m + shift)/samples within a pixel, m = 0 … samples − 1 along both sides. `depth` is a buffer
+        with one entry per sample, all 0 before and after.
         """
         camera = self.camera
         film = self.film(pupil) * samples - shift[:, None, None]  # puts the samples at the integers
@@ -194,7 +195,7 @@ class _View:
         drawn = np.flatnonzero(turn < 0 if self.closed else turn)
         film, turn = film[..., drawn], turn[drawn]
         face, row, column = _scan(film, samples * camera.width, samples * camera.height)
-        # 1/z and J_n/z are linear on the film, J_n is not: this is what perspective asks for.
+        # By perspective 1/z and J_n/z are linear on the film, J_n itself is not.
         inverse = 1 / self.corners[2][:, drawn]
         near = _linear(_planes(film, turn, inverse), face, row, column)
         first = _nearest(row * (samples * camera.width) + column, near, depth)
@@ -211,10 +212,10 @@ class _View:
 
 
 def _nearest(sample: Indices, near: Array, depth: Array) -> Indices:
-    """Which of the points (sample number, 1/z) come first on their line of sight: one for each sample met."""
+    """Indices of the points (sample number, 1/z) that are the nearest of their sample, one for each sample met."""
     np.maximum.at(depth, sample, near)
     first = np.flatnonzero(near == depth[sample])
-    # Where two coincide to the last bit the later one stays, so that none counts twice.
+    # If two are equal to the bit, only the later one is kept, so that no sample counts twice.
     place = sample[first]
     depth[place] = first
     first = first[depth[place] == first]
@@ -225,7 +226,8 @@ def _nearest(sample: Indices, near: Array, depth: Array) -> Indices:
 def _scan(film: Array, width: int, height: int) -> tuple[Indices, Indices, Indices]:
     """(face, row, column) of every integer point of the film inside a triangle of `film`, (xy, corner, F).
 
-    Neighbours compute their common edge from the same numbers in the same order: no point is lost or doubled.
+    Neighbouring triangles compute their common edge from the same numbers in the same order, so that no point is lost
+    or counted twice.
     """
     x, y = np.take_along_axis(film, np.argsort(film[1], axis=0)[None], axis=1)
     face, row = _ranges(y[0], y[2], height)
@@ -249,7 +251,7 @@ def _ranges(low: Array, high: Array, size: int) -> tuple[Indices, Indices]:
 
 
 def _turn(film: Array) -> Array:
-    """Twice the signed area of each triangle, (F,): negative where its outward side is seen."""
+    """Twice the signed area of each triangle, (F,); negative where the outward side is visible."""
     (x0, x1, x2), (y0, y1, y2) = film
     return (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
 
@@ -269,7 +271,7 @@ def _linear(planes: Array, face: Indices, row: Indices, column: Indices) -> Arra
 
 
 def _widened(mask: Mask) -> Mask:
-    """The mask and its neighbours: an error seen beside a pixel may have been missed in it."""
+    """The mask with the neighbours of its pixels, which may have an undetected error of the same kind."""
     height, width = mask.shape
     padded = np.pad(mask, 1)
     return np.any([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)

@@ -1,4 +1,4 @@
-"""The runner of `fspt stability`: a case is a stiff or extreme scene, its result an error or a refusal."""
+"""Execution of `fspt stability`: a case is a stiff or extreme scene, its result an error or a refusal."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ NAME_WIDTH = 46  # characters of the longest case's name
 class Case:
     """One row of the table.
 
-    name : what is stiff or extreme
-    why : the truth that the picture is compared with
-    run : function that returns the largest relative error, >= 0 (no unit); NaN for a picture that is not finite
-    tolerance : largest error allowed, > 0; None where float32 cannot be right, so that a refusal is expected
-    slow : True for a case that runs on request only
+    name : the stiff or extreme property
+    why : the reference that the image is compared with
+    run : function that returns the largest relative error, >= 0 (no unit); NaN for an image that is not finite
+    tolerance : largest error allowed, > 0; None if float32 cannot give a right result, so that a refusal is expected
+    slow : True for a case that is run on request only
     """
 
     name: str
@@ -69,7 +69,7 @@ class Result:
 
 
 def check(case: Case) -> Result:
-    """Run a case. An FsptError is its refusal; any other exception is a fault of the code and is raised."""
+    """Run a case. An FsptError counts as its refusal; any other exception is an error of the code and is raised."""
     start = time.perf_counter()
     error, refusal = None, None
     try:

@@ -1,8 +1,8 @@
 """The rows of `fspt stability`: stiff scenes, each against a closed form, an invariance or the other domain.
 
-Where 1 W/mm² fills the cone of a pixel, its power has a closed form, whatever the shape of the surface; the tolerance
-is 1e-5 of the pixel's own power, and float32 reaches 4e-7. Pictures with a silhouette have errors relative to the
-brightest pixel.
+If all lines of sight of a pixel meet a surface of 1 W/mm², its power has a closed form, whatever the shape of the
+surface. The tolerance is then 1e-5 of the pixel's own power; float32 reaches 4e-7. In images with a silhouette errors
+are relative to the brightest pixel.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ from .stiff_scenes import (
     wall_error,
 )
 
-# What a picture is compared with.
+# Reference that an image is compared with. A cone is filled if all lines of sight of the pixel meet the surface.
 CONE = "filled cone: A_vd times the configuration factor"
 BALANCE = "power balance: what the disk sends through the pupil"
-SAME = "the same picture"
+SAME = "the same image"
 OTHER = "the other domain"
 REFUSAL = "a refusal"
-# Tolerances: of a picture with edges, and of two pictures, each of which may be off by the default rtol of 1e-3.
+# Tolerances: of an image with edges, and of two images, each of which may be wrong by the default rtol of 1e-3.
 SHARP, AGREED = 5e-4, 2e-3
-ROUNDED = 1e-4  # at the default rtol: with other float32 rounding a bisection of an edge ends at another place
+ROUNDED = 1e-4  # at the default rtol: float32 rounding changes the position at which the bisection of an edge ends
 
 
 def cases() -> list[Case]:
-    """All rows, also the slow ones; scenes are built and rendered when a row is run, not here."""
+    """All rows, the slow ones included. Their scenes are built and rendered when a row is run, not here."""
     return [
         *focus_cases(),
         *lens_cases(),
@@ -74,21 +74,21 @@ def cases() -> list[Case]:
 
 
 def focus_cases() -> list[Case]:
-    """Surfaces in, through and around the sharp plane, and focus from the focal point to far away."""
+    """Surfaces in, through and around the virtual detector plane z = u, and focus from the focal point to far away."""
     rows = []
     for name, share in (("in", 0.0), ("1e-7 before", -1e-7), ("1e-7 behind", 1e-7)):
         z = FOCUS * (1 + share)
         rows += [
-            Case(f"surface {name} the sharp plane", CONE, partial(lambda z: cone_error(disk(z, 60)), z), EXACT),
-            Case(f"edge {name} the sharp plane", BALANCE, partial(balance_error, z, 4.0), EXACT),
+            Case(f"surface {name} the plane z = u", CONE, partial(lambda z: cone_error(disk(z, 60)), z), EXACT),
+            Case(f"edge {name} the plane z = u", BALANCE, partial(balance_error, z, 4.0), EXACT),
         ]
-    tilted = "surface through the sharp plane, 80° tilted"
+    tilted = "surface through the plane z = u, 80° tilted"
     rows += [
         Case(tilted, CONE, lambda: cone_error(disk(FOCUS, 600, tilt=80)), EXACT),
         Case(
-            "edge in the sharp plane, surface form", BALANCE, partial(balance_error, FOCUS, 4.0, "surface", 1e-3), SHARP
+            "edge in the plane z = u, surface form", BALANCE, partial(balance_error, FOCUS, 4.0, "surface", 1e-3), SHARP
         ),
-        Case("ball through the sharp plane", OTHER, lambda: domain_error(ball()), AGREED),
+        Case("sphere through the plane z = u", OTHER, lambda: domain_error(ball()), AGREED),
     ]
     for share, tolerance in ((1e-6, None), (1e-5, EXACT), (1e-4, EXACT), (1e-2, EXACT)):
         run = partial(lambda u: cone_error(disk(u, 60), focus_distance=u, pixel_pitch=10), FOCAL * (1 + share))
@@ -105,7 +105,7 @@ def focus_cases() -> list[Case]:
 
 
 def lens_cases() -> list[Case]:
-    """Stops, magnifications, pixel sizes, and a lens that nearly touches the surface."""
+    """Stops, magnifications, pixel sizes, and a lens very close to the surface."""
     rows = []
     for stop in (0.5, 2.8, 64, 1e4, 1e6):
         run = partial(lambda n: cone_error(disk(FOCUS, 200), f_number=n), stop)
@@ -134,7 +134,7 @@ def lens_cases() -> list[Case]:
 
 
 def grazing_cases() -> list[Case]:
-    """A wall beside the axis, which lines of sight meet at slopes down to the one in the name."""
+    """A wall beside the axis, which lines of sight meet at grazing angles; the name gives the least slope."""
     return [
         Case(f"grazing incidence {slope:g}", CONE, partial(wall_error, slope), EXACT) for slope in (1e-2, 1e-4, 1e-6)
     ]
@@ -149,7 +149,7 @@ def exitance_cases() -> list[Case]:
     dim = disk(FOCUS, 60, exitance=1e-26)
     return [
         *rows,
-        Case("J_n of 9 decades in one picture", CONE, two_level_error, EXACT),
+        Case("J_n of 9 decades in one image", CONE, two_level_error, EXACT),
         Case("J_n 0 on half of the mesh, edge on pixel edges", CONE, partial(half_dark_error, 0.0), SHARP),
         Case("J_n 0 on half of the mesh, edge inside pixels", CONE, partial(half_dark_error, 0.3), SHARP),
         Case("1e-36 W and less on a pixel", REFUSAL, lambda: cone_error(dim, f_number=1e6), None),
@@ -192,7 +192,7 @@ def object_cases() -> list[Case]:
 
 
 def specular_cases() -> list[Case]:
-    """Panes, plates, mirrors between lens and surface: at an index of 1 or a reflectance of 1 they change nothing."""
+    """Panes, plates and mirrors between lens and surface, which have no effect at an index or a reflectance of 1."""
     null, mirror = {"type": "null"}, {"type": "conductor", "material": "none"}
     mask = {"type": "mask", "opacity": 0.75, "nested": {"type": "diffuse"}}
     beside = disk(80, 600, x=300, tilt=90)  # its mirror image faces the lens
@@ -218,7 +218,7 @@ def specular_cases() -> list[Case]:
 
 
 def pose_cases() -> list[Case]:
-    """The scene as a whole rotated, moved and scaled: the same power, times scale²."""
+    """The whole scene rotated, moved or scaled: the power stays the same, times the square of the scale."""
     rows = [
         Case(f"camera turned {angle}° about ({axis})", SAME, partial(rotation_error, axis, angle), SHARP)
         for axis, angle in (("0, 1, 0", 90), ("1, 0, 0", -90), ("1, 2, 3", 50), ("-3, 1, 1", 200))

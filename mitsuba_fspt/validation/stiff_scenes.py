@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 24, 20
 FOCAL, F_NUMBER, FOCUS, PITCH = 55.0, 8.0, 165.0, 0.4
-SIDE = PITCH * (FOCUS - FOCAL) / FOCAL  # edge of a virtual pixel, in the sharp plane
+SIDE = PITCH * (FOCUS - FOCAL) / FOCAL  # edge of a virtual pixel, in the virtual detector plane
 PUPIL = FOCAL / F_NUMBER / 2  # radius of the pupil
 EXACT = 1e-5  # tolerance, and rtol, where every cone is filled; float32 reaches 4e-7 there
 
@@ -44,8 +44,9 @@ def scene(
 ) -> mi.Scene:
     """Scene of objects and a lens, with all lengths times `scale`, and rotated and moved as a whole by the pose `at`.
 
-    `film`: (width, height); `crop`: x, y, width, height of the crop window; `lens`: parameters of fspt_lens that
-    replace 55 mm, f/8, u = 165 mm, 0.4 mm pixels.
+    film : (width, height)
+    crop : x, y, width, height of the crop window
+    lens : parameters of fspt_lens in place of 55 mm, f/8, u = 165 mm, 0.4 mm pixels
     """
     import mitsuba as mi
 
@@ -156,7 +157,7 @@ def grid(x: ArrayLike, y: ArrayLike, z: float) -> tuple[Plane, NDArray[np.int64]
 
 
 def square_grid(cells: int) -> tuple[Plane, NDArray[np.int64]]:
-    """Vertices and faces of a square of 60 × 60 mm in the sharp plane, of `cells`² cells."""
+    """Vertices and faces of a square of 60 × 60 mm in the virtual detector plane, of `cells`² cells."""
     lines = np.linspace(-30, 30, cells + 1)
     return grid(lines, lines, FOCUS)
 
@@ -168,7 +169,7 @@ def pixel_grid(shift: float) -> tuple[Plane, NDArray[np.int64]]:
 
 
 def ball() -> SceneObject:
-    """A sphere through the sharp plane, off the axis."""
+    """A sphere through the virtual detector plane, off the axis."""
     return sphere(168.0, 6.0, 1.5, -1.0)
 
 
@@ -178,7 +179,7 @@ def limb_on_axis() -> SceneObject:
 
 
 def square() -> SceneObject:
-    """A square of 8 × 8 mm in the sharp plane, with its edges at pixel centres and vertices that float32 holds."""
+    """A square of 8 × 8 mm in the plane z = u, with edges at pixel centres and vertices that are exact in float32."""
     lines = np.linspace(-4, 4, 9)
     return mesh(*grid(lines, lines, FOCUS))
 
@@ -199,7 +200,7 @@ def moved(distance: float = 0.0, angle: float = 0.0, axis: str = "1, 2, 3") -> C
     return pose
 
 
-# ---------------------------------------------------------------------- pictures and closed forms
+# ---------------------------------------------------------------------- images and closed forms
 
 
 def power(of: mi.Scene, **accuracy: Any) -> Plane:
@@ -254,12 +255,12 @@ def shared_area(r: float, s: float, apart: Plane) -> Plane:
 
 
 def peak_error(picture: Plane, truth: Plane) -> float:
-    """Largest error of a pixel, relative to the brightest pixel of the truth."""
+    """Largest error of a pixel, relative to the brightest pixel of the reference `truth`."""
     return float(np.abs(picture - truth).max() / truth.max())
 
 
 def pixel_error(picture: Plane, truth: Plane) -> float:
-    """Largest error of a pixel, relative to the truth of that pixel; infinite if a pixel that should be 0 is not."""
+    """Largest error of a pixel, relative to the reference there; infinite if a pixel that should be 0 is not."""
     error = np.where(
         truth == 0, np.where(picture == 0, 0, np.inf), np.abs(picture / np.where(truth == 0, 1, truth) - 1)
     )
@@ -269,7 +270,7 @@ def pixel_error(picture: Plane, truth: Plane) -> float:
 def cone_error(
     *objects: SceneObject, nodes: int = 4, film: tuple[int, int] | None = None, share: float = 1.0, **lens: float
 ) -> float:
-    """Pixel error of a picture in which 1 W/mm² fills every cone, against `share` times the closed form."""
+    """Pixel error of an image in which 1 W/mm² fills every cone, against `share` times the closed form."""
     focal, stop = lens.get("focal_length", FOCAL), lens.get("f_number", F_NUMBER)
     t = lens.get("magnification") or focal / (lens.get("focus_distance", FOCUS) - focal)
     side, focus = lens.get("pixel_pitch", PITCH) / t, focal * (1 + 1 / t)
@@ -278,7 +279,7 @@ def cone_error(
 
 
 def balance_error(z: float, radius: float, domain: str = "pupil", rtol: float = 10 * EXACT, **lens: float) -> float:
-    """Relative error of the power on all pixels, for a disk whose whole picture is on the film."""
+    """Relative error of the total power on all pixels, for a disk whose whole image is on the film."""
     expected = power_through_pupil(radius, z, FOCAL / lens.get("f_number", F_NUMBER) / 2)
     return abs(float(power(scene(disk(z, radius), **lens), domain=domain, rtol=rtol).sum()) / expected - 1)
 
@@ -286,7 +287,7 @@ def balance_error(z: float, radius: float, domain: str = "pupil", rtol: float = 
 def invariance_error(
     *objects: Callable[[], SceneObject], factor: float = 1.0, pose: Any = None, **changed: Any
 ) -> float:
-    """Peak error between the standard picture and that of a changed scene, whose power is `factor` times as large."""
+    """Peak error between the standard image and that of a changed scene, whose power is `factor` times as large."""
     of = scene(*(make() for make in objects), at=pose() if pose else None, **changed)
     return peak_error(power(of) / factor, standard_picture(*objects))
 
@@ -307,9 +308,9 @@ def pinhole_limit_error() -> float:
 
 
 def wall_error(slope: float) -> float:
-    """Pixel error of a wall 1 mm beside the axis, which lines of sight meet at slopes down to `slope`.
+    """Pixel error of a wall 1 mm beside the axis, which lines of sight meet at grazing angles, of slope >= `slope`.
 
-    Half of the film sees the wall, through the centres of its pixels, and the other half sees past it.
+    The lines through the pixels' centres meet the wall on one half of the film and miss it on the other.
     """
     length = 100 / slope
     corners = [[-1, -1e3, 0], [-1, 1e3, 0], [-1, 1e3, length], [-1, -1e3, length]]
@@ -368,8 +369,8 @@ def pinhole_vertex_error() -> float:
 def small_disk_error() -> float:
     """Peak error of a disk out of focus that is smaller than its blur, against the overlap of two circles.
 
-    From the point h off the axis in the sharp plane, a disk of radius r at z covers a circle of the pupil, of radius
-    r u/|u − z|, its centre h z/|u − z| off the pupil's. P = J_n/π · A_vd · (area of the overlap) cos⁴θ/u².
+    From the point h off the axis in the virtual detector plane, a disk of radius r at z covers a circle of the pupil,
+    of radius r u/|u − z|, its centre h z/|u − z| off the pupil's. P = J_n/π · A_vd · (area of the overlap) cos⁴θ/u².
     """
     z, radius, pitch = 110.0, 0.8, 0.1
     side = pitch * (FOCUS - FOCAL) / FOCAL
@@ -402,7 +403,7 @@ def small_film_error(width: int, height: int) -> float:
 
 
 def crop_error(crop: tuple[int, int, int, int]) -> float:
-    """Peak error between a crop window (x, y, width, height) and the same pixels of the whole picture."""
+    """Peak error between a crop window (x, y, width, height) and the same pixels of the whole image."""
     x, y, width, height = crop
     whole, part = standard_picture(ball), power(scene(ball(), crop=crop))
     return float(np.abs(part - whole[y : y + height, x : x + width]).max() / whole.max())

@@ -1,1 +1,1 @@
-"""The live view of a scene: a page in the browser or a notebook, and what answers its requests."""
+"""The live view of a scene: a page in the browser or a notebook, and the code that answers its requests."""

@@ -1,4 +1,4 @@
-"""Answers to what a page asks about a scene: pictures, surface points and files."""
+"""Answers to the requests of a page about a scene: images, surface points and files."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class Request:
-    """What a page asks for.
+    """Request of a page.
 
-    kind : of `KINDS`
+    kind : one of `KINDS`
     slot : 'a', or 'b' for the second lens
     number : counted by the page, returned with the answer
-    values : texts of the scene's parameters
-    model : of the lens; None: the scene's own
-    fine : False asks for a quick draft of the picture
-    etendue : the étendue of the pixels is wanted too
-    pixel : column and row, of a point
+    values : values of the scene's parameters as texts
+    model : lens model; None: the scene's own
+    fine : False requests a draft in place of the full image
+    etendue : True requests the étendue of the pixels, too
+    pixel : column and row of the pixel, for a surface point
     """
 
     kind: str
@@ -96,7 +96,7 @@ class Answer:
 
 
 class Superseded(Exception):
-    """A picture that nobody waits for any more, or that has to wait for a draft."""
+    """Raised to end the computation of an image that is no longer needed, or that has to wait for a draft."""
 
 
 class Answers:
@@ -109,16 +109,16 @@ class Answers:
         self._live.scene({})  # bad scenes are refused before a page opens
 
     def hello(self) -> Answer:
-        """What a page needs first: name of the scene, sliders, models of the lens."""
+        """Initial data of a page: name of the scene, sliders, names of the lens models."""
         source = self._live.source
         name = "XML text" if is_text(source) else os.fspath(source)
         sliders = [slider.record() for slider in sliders_of(self._live.xml)]
         return Answer({"kind": "hello", "scene": name, "sliders": sliders, "models": list(model_names())})
 
     def answer(self, request: Request, may_go_on: Callable[[], None] = lambda: None) -> Answer:
-        """Answer to a request; an error of the scene becomes one of kind 'error', with its one line.
+        """Answer to a request. An error of the scene becomes an answer of kind 'error' with its one-line message.
 
-        `may_go_on` is called from time to time while a picture is computed, and may raise to end that.
+        `may_go_on` is called repeatedly while an image is computed, and may raise an exception to end the computation.
         """
         given = {"slot": request.slot, "number": request.number, "fine": request.fine}
         try:
@@ -127,7 +127,7 @@ class Answers:
             return Answer(given | {"kind": "error", "message": _one_line(error)})
         except Superseded:
             raise
-        except Exception as error:  # of the renderer, or a fault of ours: the page and its last picture stay
+        except Exception as error:  # of the renderer or of this package: the page and its last image stay
             if os.environ.get("FSPT_DEBUG"):
                 raise
             line = f"{type(error).__name__}: {_one_line(error)} (FSPT_DEBUG=1 shows where)"
@@ -200,7 +200,7 @@ class Answers:
         return f"{stem}{'_second' if request.slot == 'b' else ''}.exr"
 
     def _command(self, request: Request, changed: Mapping[str, str]) -> str:
-        """Command that renders the picture; empty where there is none, for a scene's text and another lens model."""
+        """Command that renders the image; empty for a scene given as text and for another lens model."""
         if is_text(self._live.source) or request.model:
             return ""
         words = ["fspt", "render", os.fspath(self._live.source)]

@@ -1,4 +1,4 @@
-"""Requests that wait for the one thread that renders: of each page and lens the latest, drafts first."""
+"""Requests that wait for the one thread that renders: the latest of each page and lens, drafts before full images."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class RequestQueue:
     def __init__(self) -> None:
         self._waiting: dict[tuple[Page, str, str, bool], Request] = {}
         self._changed = threading.Condition()
-        self._newest: dict[tuple[Page, str], int] = {}  # number of the last picture asked for
+        self._newest: dict[tuple[Page, str], int] = {}  # number of the last image requested
 
     def put(self, page: Page, request: Request) -> None:
-        """Add a request; it replaces those of the same page, lens and kind, but a full picture no draft before it."""
+        """Add a request. It replaces those of the same page, lens and kind; but a full image replaces no draft."""
         with self._changed:
             for fine in (True,) if request.fine else (True, False):
                 self._waiting.pop((page, request.slot, request.kind, fine), None)
@@ -34,7 +34,7 @@ class RequestQueue:
             self._changed.notify()
 
     def take(self, timeout: float) -> tuple[Page, Request] | None:
-        """The next request and its page: a draft before the others, else the oldest; None after `timeout` [s]."""
+        """Next request and its page: a draft if there is one, else the oldest; None if none comes in `timeout` [s]."""
         with self._changed:
             if not self._waiting:
                 self._changed.wait(timeout)
@@ -58,7 +58,7 @@ class RequestQueue:
                 del self._newest[place]
 
     def check(self, page: Page, request: Request) -> None:
-        """Raise Superseded if a draft waits, or if a newer picture has been asked for in place of `request`."""
+        """Raise Superseded if a draft waits, or if a newer image has been requested in place of `request`."""
         with self._changed:
             draft_waits = any(not waiting.fine for waiting in self._waiting.values())
             if draft_waits or not self._is_newest(page, request):

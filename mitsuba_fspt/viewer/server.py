@@ -30,7 +30,7 @@ PAGES = {
     "view.css": ("view.css", "text/css"),
 }
 LARGEST_MESSAGE = 1 << 16  # bytes that a page may send at once
-PATIENCE = 0.2  # s between looks at whether to end
+PATIENCE = 0.2  # s between checks whether to end
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' blob: data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -41,7 +41,7 @@ HEADERS = {
 
 
 class Outbox:
-    """Messages to one page; a picture that is not sent yet is replaced by the next one of its lens."""
+    """Messages to one page; an image that has not been sent yet is replaced by the next one of the same lens."""
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -77,7 +77,7 @@ class ViewServer:
 
     Raises
     ------
-    ViewerError : the port is no port, or cannot be opened.
+    ViewerError : `port` is no port number, or cannot be opened.
     """
 
     def __init__(self, answers: Callable[[], Answers], port: int) -> None:
@@ -166,7 +166,7 @@ class ViewServer:
         )
 
     async def _page(self, request: HttpRequest) -> Response:
-        """A file of the page, for those who know the token."""
+        """A file of the page, if the address contains the token; else status 403."""
         token, name = request.path_params.get("token", ""), request.path_params["name"]
         if not (self._is_known(token) and self._is_own_host(request.headers.get("host", ""))):
             line = "fspt: this address has no valid token. Open the one that 'fspt view' printed.\n"

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import SceneXml
 
-# Properties that no slider moves: size of the film, accuracy, seeds and numbers of samples.
+# Properties without a slider: size of the film, accuracy, seeds and numbers of samples.
 FIXED = re.compile(
     r"(?:.*_)?(?:width|height|rtol|seed|spp|sample_count|max_nodes|max_specular|max_depth|rr_depth)|crop_.*"
 )
@@ -18,7 +18,7 @@ TURN = 180.0  # degrees to either side
 # Unit and whether the values are > 0, by the property that a parameter sets.
 LENGTHS = re.compile(r".*(?:distance|diameter|radius|length|pitch|height|depth|origin|size)")
 UNITS = {"wavelength_nm": "nm", "angle": "°", "exitance": "W/mm²", "numerical_aperture": ""}
-# Ends of sliders, by a pattern of the property: where values beyond them have no meaning, or none of use.
+# Ends of sliders, by a pattern of the property, for properties whose values are meaningless or useless beyond them.
 ENDS = {
     "transmittance": (0.01, 1.0),
     "wavelength_nm": (400.0, 1000.0),
@@ -55,7 +55,7 @@ class Slider:
 
 
 def sliders_of(scene: SceneXml) -> list[Slider]:
-    """Sliders of a scene in the order of its file, those of numbers that its text uses and `FIXED` does not name."""
+    """Sliders of the numeric parameters that the scene uses, in the order of its file, without those in `FIXED`."""
     sliders = []
     for name, text in scene.defaults.items():
         value = scene.given.get(name, text)

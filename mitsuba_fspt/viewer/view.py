@@ -23,13 +23,13 @@ def view(
     ready: Callable[[str], object] | None = None,
     **parameters: object,
 ) -> object:
-    """Show a scene whose picture follows sliders for the numbers among its `<default>` parameters.
+    """Show a scene with sliders for the numbers among its `<default>` parameters; the image follows them.
 
     In a notebook it returns a widget. Elsewhere it serves a page on 127.0.0.1 until Ctrl-C, and returns None.
 
     Parameters
     ----------
-    scene : name of an XML file, its text, or what `load` has made of one of them
+    scene : name of an XML file, XML text, or a scene that `load` has made from one of them
     sensor : number of the lens, in a scene with several
     port : of the page; 0: any free one. Without effect in a notebook
     ready : function that is called with the page's address; None opens it in the browser

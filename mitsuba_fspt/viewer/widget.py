@@ -1,4 +1,4 @@
-"""The live view as a widget of notebooks: the page's own module, whose messages take the notebook's channel."""
+"""The live view as a widget of notebooks. It runs the script of the page; messages go through the notebook's kernel."""
 
 from __future__ import annotations
 

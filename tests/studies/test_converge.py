@@ -62,17 +62,17 @@ def test_what_takes_longer_than_the_budget_is_left_out_and_says_so():
     def prepare(value):
         def run():
             time.sleep(0.05 * value)
-            return converge_methods.Picture(np.ones((1, 1)), 1, value)
+            return converge_methods.RunResult(np.ones((1, 1)), 1, value)
 
         return run
 
     slow = converge_methods.Method("slow", "n", (1.0, 2.0, 6.0, 12.0), prepare)
     benchmark = converge.Benchmark(None, None, None, budget=0.2)
-    (left_out,) = (told := benchmark.try_ladder(slow))
+    (left_out,) = (told := benchmark.try_values(slow))
     assert left_out == "slow, n 6 and finer"
     assert "more than the budget of 0.2 s" in told[left_out]
-    assert [setting.picture.knob for setting in benchmark.settings] == [1.0, 2.0]
-    assert converge.Benchmark(None, None, None, budget=10.0).try_ladder(slow) == {}
+    assert [setting.result.knob for setting in benchmark.settings] == [1.0, 2.0]
+    assert converge.Benchmark(None, None, None, budget=10.0).try_values(slow) == {}
 
 
 def test_errors_near_the_references_own_have_no_say_in_the_order():

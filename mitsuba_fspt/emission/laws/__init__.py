@@ -79,7 +79,7 @@ def law_of(props: mi.Properties) -> ExitLaw:
 
 
 def required(props: mi.Properties, name: str, kind: str) -> Any:
-    """Value of the parameter `name`; ExitanceError, which asks for a `kind` of value, if it is missing."""
+    """Value of the parameter `name`. If it is missing: ExitanceError, whose message asks for a value of this `kind`."""
     if name not in props:
         raise ExitanceError(f"fspt_surface: emission '{props['emission']}' needs '{name}'. Give it as {kind}.")
     return props[name]

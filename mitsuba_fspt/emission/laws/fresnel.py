@@ -11,7 +11,7 @@ from . import ExitLaw, refractive_index
 
 
 class Fresnel(ExitLaw):
-    """Diffuse light that leaves a smooth boundary of relative index n >= 1, to first order in the angle.
+    """Diffuse light that leaves a smooth boundary of relative index n >= 1 (Eq. M.15 of docs/model.md).
 
     L(µ) = J_n/(4π) · (2A + 3µ_i) · T(µ)/n²,  µ_i = √(1 − (1 − µ²)/n²): inside, the radiance of the diffusion
     approximation is φ/(4π) + 3J_n µ_i/(4π) with φ = 2A J_n; at the boundary, a share T (unpolarised) is transmitted and

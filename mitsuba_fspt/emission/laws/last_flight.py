@@ -1,4 +1,4 @@
-"""Last-flight law: light that leaves tissue was scattered for the last time inside, at a rate ∝ the fluence there."""
+"""Last-flight law: the exit radiance follows from where inside the tissue the light was scattered for the last time."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from ...runtime.errors import ExitanceError
 from ..elements import elements_of
 from . import ExitLaw, refractive_index, required, required_number
 
-NODES = 8  # of the quadrature along the line of sight
+NODES = 8  # of the quadrature along the line of sight inside the tissue
 RINGS, SPOKES = 8, 8  # of the quadrature over the hemisphere, which normalises the law to J_n
 
 
 class LastFlight(ExitLaw):
-    r"""Radiance of light scattered for the last time on the refracted line of sight ω_i inside the tissue.
+    r"""Radiance of light scattered for the last time on the refracted line of sight ω_i inside the tissue (Eq. M.16).
 
     L(r, ω) ∝ T/n² · µs'/(4π) ∫₀^∞ Φ(r − s ω_i) exp(−(µa + µs') s) ds by Gauss–Laguerre, with a factor that makes
     ∫ L µ dΩ = J_n at every point r. Φ, the `fluence`, is a volume in world coordinates; only its relative values
-    matter, not its unit. Scattering is taken as isotropic. Beyond the border Φ is that of the volume.
+    matter, not its unit. The rate of scattering is µs' Φ; scattering is taken as isotropic. Where the line leaves the
+    tissue again, the values of the volume there are used.
 
     Raises
     ------
@@ -146,8 +147,8 @@ def _values_of(volume: mi.Volume) -> mi.Float:
 def _hemisphere() -> tuple[mi.Float, ...]:
     """Unit vectors (x, y, z) about +z and weights such that Σ w f is ∫ f µ dΩ.
 
-    Rings at µ = x² with Gauss nodes x, since the transmittance is steep at grazing exit. Each ring is rotated relative
-    to the next.
+    The directions form rings at µ = x² with Gauss nodes x: the transmittance is steep at grazing exit, where these
+    rings are dense. Each ring is rotated relative to the next.
     """
     x, weight = np.polynomial.legendre.leggauss(RINGS)
     x, weight = (x + 1) / 2, weight / 2

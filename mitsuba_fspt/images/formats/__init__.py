@@ -1,7 +1,7 @@
-"""Files of images: planes of float32 with their metadata. One format a file, found by the suffix of the image's name.
+"""Formats of image files: float32 planes with metadata. Each Python file here has one format, found by its suffix.
 
-A format is a class with the name of its file, a subclass of `Format`: `Exr` in exr.py for .exr. Planes are named by the
-quantity of their values: `power` or `electrons`, then `error` and `coverage`; row 0 is the top in every format.
+A format is a subclass of `Format` that is named like its Python file: `Exr` in exr.py reads and writes .exr. The first
+plane is `power` or `electrons`, further planes are `error`, `coverage` and `mask`. Row 0 is the top in every format.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ ALIASES = {"tiff": "tif"}
 
 
 class Format:
-    """A format of image files: base of all.
+    """Base class of the formats of image files.
 
-    kind : what its files are, for messages
-    package : optional package that reads and writes it, as imported; None: none is needed
+    kind : name of the kind of file, for messages
+    package : import name of the optional package that reads and writes it; None if none is needed
     """
 
     kind: ClassVar[str]
@@ -46,13 +46,14 @@ class Format:
     def read(cls, path: Path) -> tuple[dict[str, NDArray], Metadata]:
         """Planes by name, shape (h, w), and metadata of an existing file.
 
-        Any exception but an FsptError counts as a damaged file, or as one of another program.
+        The caller takes any exception other than an FsptError as the sign of a damaged file or of another program's
+        file.
         """
         raise NotImplementedError
 
 
 def suffixes() -> tuple[str, ...]:
-    """Suffixes of all formats, without those that are other spellings."""
+    """Suffixes of all formats, without alternative spellings such as .tiff."""
     return tuple(f".{name}" for name in names_in(sys.modules[__name__]))
 
 
@@ -80,9 +81,9 @@ def format_of(path: str | os.PathLike[str]) -> type[Format]:
 def write_planes(
     path: str | os.PathLike[str], planes: Mapping[str, NDArray], metadata: Mapping[str, str | int | float]
 ) -> None:
-    """Write planes, all of one shape (h, w), as 32-bit floats with metadata, completely or not at all.
+    """Write planes, all of the same shape (h, w), as 32-bit floats with metadata, completely or not at all.
 
-    A value beyond float32 is refused, one too small for it becomes 0.
+    A value too large for float32 is refused; one too small for it becomes 0.
 
     Raises
     ------
@@ -148,7 +149,7 @@ def _plain(key: str, value: object) -> str | int | float:
 def _float32(name: str, values: NDArray) -> NDArray[np.float32]:
     """`values` as contiguous float32; ImageError if one is not finite or too large."""
     limit = float(np.finfo(np.float32).max)
-    # Whole planes of temporaries only on failure: a large picture hardly fits. NaN is neither larger nor smaller.
+    # Temporary arrays of the size of a plane only on failure, to save memory. The comparisons are False for NaN, too.
     if not (values.min() >= -limit and values.max() <= limit):
         unfit = ~(np.abs(values) <= limit)
         row, column = np.argwhere(unfit)[0]

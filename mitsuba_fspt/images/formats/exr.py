@@ -39,7 +39,7 @@ class Exr(Format):
         pixels = {_channel(name): OpenEXR.Channel(values) for name, values in planes.items()}
         OpenEXR.File(header, pixels).write(str(path))
         if os.path.getsize(path) < STREAM_BUFFER:
-            # Such a file stays in the stream's buffer until the close, which reports no failure: read it back.
+            # So small a file stays in the stream's buffer until the close, which reports no failure: read it back.
             OpenEXR.File(str(path))
 
     @classmethod

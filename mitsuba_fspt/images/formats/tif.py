@@ -32,7 +32,7 @@ class Tif(Format):
         import tifffile
 
         stack = np.stack(list(planes.values()))
-        told: dict[str, object] = {
+        attributes: dict[str, object] = {
             "axes": "CYX",
             "Channel": {"Name": list(planes)},
             "Description": json.dumps(metadata),
@@ -40,10 +40,10 @@ class Tif(Format):
         side = PixelAxes.of(stack.shape[1:], metadata).side
         resolution: dict[str, Any] = {}
         if side:
-            told |= {"PhysicalSizeX": side, "PhysicalSizeY": side}
-            told |= {"PhysicalSizeXUnit": "mm", "PhysicalSizeYUnit": "mm"}
+            attributes |= {"PhysicalSizeX": side, "PhysicalSizeY": side}
+            attributes |= {"PhysicalSizeXUnit": "mm", "PhysicalSizeYUnit": "mm"}
             resolution = {"resolution": (10 / side, 10 / side), "resolutionunit": "CENTIMETER"}
-        tifffile.imwrite(path, stack, ome=True, photometric="minisblack", metadata=told, **resolution)
+        tifffile.imwrite(path, stack, ome=True, photometric="minisblack", metadata=attributes, **resolution)
 
     @classmethod
     def read(cls, path: Path) -> tuple[dict[str, NDArray], Metadata]:
@@ -61,7 +61,7 @@ class Tif(Format):
 
 @contextmanager
 def _silent(logger: logging.Logger) -> Iterator[None]:
-    """Context manager in which a logger says nothing: what it would say of a damaged file is an ImageError."""
+    """Context manager that silences a logger: its message about a damaged file is raised as an ImageError instead."""
     before, logger.disabled = logger.disabled, True
     try:
         yield

@@ -1,4 +1,4 @@
-"""Models of a lens: which lines of sight a lens lets through. One class a file, found by the file's name."""
+"""Lens models: which lines of sight a lens lets through. One class per file, found by the file's name."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LensModel:
-    """What a lens of focal length F, f-number and focus lets through. Base of all models.
+    """Base class of the lens models: the discs that a line of sight through the lens has to pass.
 
-    The fields of a subclass are its own parameters, numbers of `fspt_lens` that no other model has; None: not given.
-    `EXAMPLES` has a number, as text, for each of them. docs/extending.md shows a whole model.
+    The fields of a subclass are numbers of `fspt_lens` that this model alone has; None where one is not given.
+    `EXAMPLES` contains a valid number, as text, for each of them. docs/extending.md shows a complete model.
 
     Raises
     ------
@@ -51,12 +51,12 @@ class LensModel:
     def discs(self, lens: Lens) -> tuple[Disc, ...]:
         """The one or two discs of the lens plane that a line of sight has to pass; their overlap is the open pupil.
 
-        Eq. 5's β, generalised: the first disc is the one to integrate over, a second one clips it.
+        They generalise β of Eq. 5. The integral runs over the first disc; a second one clips it.
         """
         raise NotImplementedError
 
     def pupil_radius(self, lens: Lens) -> float:
-        """Radius [mm] over which the lens points of lines of sight spread: the first disc's."""
+        """Radius [mm] of the disc that contains the lens points of all lines of sight: the first disc."""
         return self.discs(lens)[0].radius
 
 
@@ -66,7 +66,7 @@ def model_names() -> tuple[str, ...]:
 
 
 def model_named(name: str) -> type[LensModel]:
-    """The model's class. Raises OpticsError where there is none of this name."""
+    """Class of the model with this name; OpticsError if there is none."""
     try:
         return class_named(sys.modules[__name__], name)
     except KeyError:

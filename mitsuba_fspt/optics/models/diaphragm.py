@@ -17,7 +17,7 @@ ROUNDING = 1e-6  # share by which D = F/f_num of float32 numbers may exceed a le
 
 @dataclass(frozen=True)
 class Diaphragm(LensModel):
-    """Lines of sight pass the diaphragm and, where the two lie apart, the border of the lens (paper, Fig. 2)."""
+    """Lines of sight pass the diaphragm, and also the border of the lens if the diaphragm is apart from it (Fig. 2)."""
 
     def check(self, lens: Lens) -> None:
         if lens.diaphragm_distance != 0:
@@ -49,7 +49,7 @@ class Diaphragm(LensModel):
             )
 
     def discs(self, lens: Lens) -> tuple[Disc, ...]:
-        """The diaphragm; apart from the lens its entrance pupil, and the border of the lens."""
+        """A diaphragm in the lens itself; otherwise its entrance pupil and the border of the lens."""
         if lens.diaphragm_distance == 0 or lens.lens_diameter is None:
             return (Disc(0.0, lens.diaphragm_diameter / 2),)
         pupil = _entrance_pupil(lens)
@@ -58,17 +58,17 @@ class Diaphragm(LensModel):
 
 
 def _entrance_pupil(lens: Lens) -> Disc | None:
-    """The diaphragm's image through the lens, projected from the virtual detector plane onto the lens plane.
+    """Entrance pupil, projected from the virtual point onto the lens plane (Eqs. M.11, M.12); None on the detector.
 
-    A diaphragm at s behind the lens has its image at s F/(s - F), magnified F/(F - s), seen from the object side; one
-    in front is its own image. A virtual point at (x, u) sees a circle of radius R_p at depth z_p as the disc of the
-    lens plane with radius R_p u/(u - z_p) about -x z_p/(u - z_p).
+    The image of a diaphragm at the distance s behind the lens, seen from the object side, is at s F/(s - F) and
+    magnified by F/(F - s); a diaphragm in front of the lens is its own image. From the virtual point (x, u) a circle of
+    radius R_p at depth z_p projects onto the disc of the lens plane with radius R_p u/(u - z_p) about -x z_p/(u - z_p).
     """
     s, focal, u, radius = lens.diaphragm_distance, lens.focal_length, lens.focus_distance, lens.diaphragm_diameter / 2
     if s < 0:
         depth, pupil_radius = -s, radius
     elif s == focal:
-        # The image lies at infinity: the diaphragm stops directions, |slope| <= radius / F, a cone about the axis.
+        # The image is at infinity: the diaphragm passes directions with |slope| <= radius / F, a cone about the axis.
         return Disc(1.0, u * radius / focal)
     else:
         depth, pupil_radius = s * focal / (s - focal), abs(radius * focal / (focal - s))

@@ -1,4 +1,4 @@
-"""The HRRT model: no diaphragm, the border of the lens stops the light (the paper's reference 16)."""
+"""The HRRT model: no diaphragm, only the border of the lens limits the light (the paper's reference 16)."""
 
 from __future__ import annotations
 

@@ -20,5 +20,5 @@ class Pinhole(LensModel):
         return (Disc(0.0, lens.diaphragm_diameter / 2),)
 
     def pupil_radius(self, lens: Lens) -> float:
-        """0: all lens points are one."""
+        """0, since all lines of sight pass the same lens point."""
         return 0.0

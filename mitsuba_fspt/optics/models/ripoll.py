@@ -32,5 +32,5 @@ class Ripoll(LensModel):
             )
 
     def discs(self, lens: Lens) -> tuple[Disc, ...]:
-        """The cone cuts the lens plane in a disc about the point opposite to the virtual point."""
+        """The disc in which the cone meets the lens plane; its centre is opposite the virtual point (κ = 1)."""
         return (Disc(1.0, lens.focus_distance * math.tan(math.asin(self.numerical_aperture or 0.0))),)

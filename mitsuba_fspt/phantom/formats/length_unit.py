@@ -7,8 +7,8 @@ from pathlib import Path
 from ...runtime.errors import FluxError
 
 IN_METRES = (".glb", ".gltf")  # by the standard of glTF 2.0
-# Diagonals of a bounding box [mm]: those of phantoms and small animals pass without a word, and a warning suggests the
-# unit that leads to one that is usual.
+# Usual diagonals of the bounding box of phantoms and small animals [mm]. For any other a warning suggests the unit with
+# which the diagonal would be usual.
 PASSED, USUAL = (5.0, 1000.0), (10.0, 500.0)
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 
@@ -27,7 +27,7 @@ def own_unit(mesh: object) -> str:
 
 
 def unit_warning(diagonal: float, length_unit: str) -> str | None:
-    """Sentence on a mesh that is too small or too large for a phantom, with the unit it suggests; None for any other.
+    """Warning of a mesh that is too small or too large for a phantom, with a more likely unit; None for a usual size.
 
     diagonal : of the bounding box [mm], with the mesh in `length_unit`
     """

@@ -39,7 +39,7 @@ def read_mmc(mesh: Path, values: Path | None) -> RawMesh:
             f"MMC: node and elem files must have 4 and 6 columns after their first line, '{mesh}' has "
             f"{nodes.shape[1]} and {elements.shape[1]}. Linear tetrahedra are read only."
         )
-    # MMC does not reorder the elements if it finds these files beside them.
+    # MMC does not reorder the elements if it finds one of these files beside them.
     kept = any(mesh.with_name(f"{part}_{session}.dat").exists() for part in ("facenb", "velem"))
     tetrahedra = elements[:, 1:5].astype(np.int64)
     return mmc_mesh(nodes[:, 1:], tetrahedra, _read_dref(values), f"MMC {values.name}", turn=not kept)
@@ -54,8 +54,8 @@ def mmc_mesh(nodes: Points, elements: Indices, dref: NDArray, source: str, turn:
     elements : array, shape (T, 4 or more), node numbers from 1
     dref : array, shape (F,), (F, gates) or (gates · F,); summed over the gates
     source : origin of the values, for messages and provenance
-    turn : before MMC numbers the faces, it exchanges the last two nodes of each element whose (2−1)·(3−1)×(4−1) is
-        positive; False if it did not
+    turn : True if MMC exchanged the last two nodes of each element whose (2−1)·(3−1)×(4−1) is positive before it
+        numbered the faces, which it does unless the files velem or facenb exist
     """
     tetrahedra = elements[:, :4].astype(np.int64) - 1
     RawMesh(nodes, tetrahedra, source)  # checks the numbers of the nodes
@@ -72,7 +72,7 @@ def mmc_mesh(nodes: Points, elements: Indices, dref: NDArray, source: str, turn:
     energy = dref.sum(axis=1) if dref.ndim == 2 else dref.reshape(-1, faces).sum(axis=0)
     if np.isfinite(energy).all() and energy.sum() > 1 + 1e-3:
         raise FluxError(
-            f"{source}: {energy.sum():.6g} times the launched energy leaves the mesh, at most 1 can. It is "
+            f"{source}: {energy.sum():.6g} times the launched energy leaves the mesh, at most 1 can. The values are "
             "not normalised, or not dref; run mmc with -U 1."
         )
     field = Field("dref", energy, "face")

@@ -40,7 +40,7 @@ def read_nirfast(mesh: Path) -> RawMesh:
     if elements.shape[1] != 4:
         raise FluxError(
             f"NIRFAST: '{stem}.elem' must have 4 columns (tetrahedra), it has {elements.shape[1]}. Meshes "
-            "in the plane and bare surfaces have no exitance to see."
+            "in the plane and bare surfaces have no exitance to render."
         )
     index = _index(stem.with_name(f"{stem.name}.param"), len(nodes))
     return nirfast_mesh(nodes[:, 1:], elements.astype(np.int64), f"NIRFAST {stem.name}", index)

@@ -52,13 +52,16 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
 
 
 def attribute_name(name: str) -> str:
-    """Name of the mesh attribute that Mitsuba makes of a scalar property, 'jn' of 'jn_x'; '' if it ignores it."""
+    """Name of the attribute that Mitsuba makes of a property, 'jn' of 'jn_x'; '' if Mitsuba ignores the property."""
     grouped = GROUPED.fullmatch(name)
     return grouped[1] if grouped else ""
 
 
 def _require_corners(faces: Any, path: Path) -> None:
-    """Raise FluxError for `faces`, trimesh's array (binary) or columns (text) of lines, that it drops or misreads."""
+    """Raise FluxError for face lines that trimesh would drop or misread: polygons in binary form, fewer than 3 corners.
+
+    faces : as trimesh has read them, an array of records (binary) or columns of the lines (text)
+    """
     binary = isinstance(faces, np.ndarray)
     names = (faces.dtype.names or ()) if binary else faces
     for name in {"vertex_indices", "vertex_index"} & set(names):

@@ -1,4 +1,4 @@
-"""Contents of a mesh file before conversion to a phantom: points, cells, fields; and the choice of one field."""
+"""Contents of a mesh file before conversion to a phantom: points, cells and fields; and the choice of one field."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class RawMesh:
 
     quantity : of the values: 'exitance' or 'fluence' [W per square of the file's length unit], or 'power' [W] of each
         face
-    point_order : False if the file has no vertices of its own, so that values cannot be in their order
-    index : refractive index at the points (V,), NaN if the file's kind of parameters lacks it; None without parameters
+    point_order : False if the file defines no order of the vertices (STL), so that values cannot refer to it
+    index : refractive index at the points (V,), NaN if the parameter file does not contain it; None without such a file
     """
 
     points: Points
@@ -142,9 +142,7 @@ def _choose(mesh: RawMesh, name: str | None, per: str | None) -> Field:
         name = pick(names, f"{name}_x" if name not in names and f"{name}_x" in names else name, mesh.source)
     same = [f for f in fitting if f.name == name]
     if len(same) > 1:
-        raise FluxError(
-            f"{mesh.source}: '{name}' stands on vertices and on faces. Choose by --per vertex or --per face."
-        )
+        raise FluxError(f"{mesh.source}: '{name}' is on vertices and on faces. Choose by --per vertex or --per face.")
     return same[0]
 
 

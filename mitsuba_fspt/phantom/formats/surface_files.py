@@ -72,7 +72,7 @@ def read_obj(path: Path) -> RawMesh:
 
 
 def read_off(path: Path) -> RawMesh:
-    """Vertices and triangles of an OFF file in its order; trimesh loads a file with more (colours, polygons)."""
+    """Vertices and triangles of an OFF file in its order; trimesh loads a file with colours or polygons."""
     return _plain_off(path) or read_trimesh(path)
 
 

@@ -121,7 +121,7 @@ def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], li
 
 
 def _text(path: Path) -> str:
-    """Content of a text file, read only once, since a pipe can be read only once."""
+    """Content of a text file. The file is opened once only, so that it may be a pipe."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as cause:
@@ -154,9 +154,9 @@ def _layout(text: str, skip_lines: int) -> tuple[list[str], str | None, int | No
 
 
 def _with_points(text: str, delimiter: str | None) -> str:
-    """Lines of a table whose numbers have decimal points: where semicolons separate them, they may have commas.
+    """Lines of a table with decimal commas replaced by points, which is done if semicolons separate the numbers.
 
-    A semicolon at the end of a line begins no column.
+    A semicolon at the end of a line does not begin another column.
     """
     if delimiter != ";":
         return text

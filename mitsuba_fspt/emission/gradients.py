@@ -1,7 +1,8 @@
-"""Which parameters of a scene carry gradients, and whether the picture can be differentiated by them.
+"""Parameters of a scene that carry gradients, and the refusal of those that the integral cannot differentiate.
 
-P is linear in J_n, so that all numbers behind `exitance` have a derivative that lines of sight give exactly. Where a
-line of sight ends depends on lens and shapes, which would need the light along silhouettes.
+The power P on a pixel is linear in J_n, so that its derivative with respect to any number behind `exitance` is a sum
+over lines of sight. Lens and shapes determine where a line of sight ends; a derivative with respect to them would need
+an integral along silhouettes, which is not computed.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from ..runtime.plugin_types import is_surface
 from .exitance import attribute_name
 
 
-def shining_with_gradients(scene: mi.Scene, sensor: mi.Sensor) -> list[mi.Emitter]:
-    """Emitters of a scene whose J_n depends on numbers with gradients; called where gradients are not suspended.
+def emitters_with_gradients(scene: mi.Scene, sensor: mi.Sensor) -> list[mi.Emitter]:
+    """Emitters of a scene whose J_n depends on numbers with gradients. Must be called while gradients are enabled.
 
     Raises
     ------
-    SceneError : a parameter with gradients is none of those behind `exitance`.
+    SceneError : a parameter with gradients is not one of the numbers behind `exitance`.
     """
     found, parameters = [], mi.traverse(scene)
     for emitter in scene.emitters():
@@ -56,8 +57,8 @@ def _refuse_others(scene: mi.Scene, parameters: mi.SceneParameters) -> None:
         on_mesh = isinstance(node, mi.Shape) and (node.id(), last) in attributes
         if not (on_mesh or (_below_surface(parameters, node) and _differentiable(parameters, key))):
             raise SceneError(
-                f"fspt_integral: parameter '{key}' has gradients enabled, but the picture is differentiated by what "
-                f"is behind 'exitance' alone. Give dr.disable_grad(params['{key}']), or take differences of pictures."
+                f"fspt_integral: parameter '{key}' has gradients enabled, but the image is differentiable with "
+                f"respect to 'exitance' alone. Call dr.disable_grad(params['{key}']), or use fspt.derivatives."
             )
 
 
