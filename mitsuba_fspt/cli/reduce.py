@@ -64,6 +64,8 @@ def reduce(
     frames = {"bias": bias, "dark": dark, "flat": flat, "cosmic_rays": cosmic_rays}
     if calibrate:
         require_writable(output, ".toml", DetectorError)
+    elif radiance is not None or radiance_error:
+        raise DetectorError("--radiance and --radiance-error have no meaning without --calibrate. Give that, too.")
     else:
         require_image(output)
     require_apart(output, [*counts, detector, *(p for p in (bias, dark, flat) if p)], error=ImageError)
