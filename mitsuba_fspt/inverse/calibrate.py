@@ -114,14 +114,11 @@ def calibrate(
     SceneError, OpticsError, ExitanceError : as `render`.
     """
     settings = settings or CalibrationSettings()
-    names = tuple([free] if isinstance(free, str) else free)
+    names = _names(free)
     texts = {name: texts_of(name, given, "calibrate") for name, given in parameters.items()}
     views = [dict(zip(texts, one, strict=True)) for one in itertools.product(*texts.values())]
     start = _start(scene, names, views)
-    given = [images] if isinstance(images, (Image, Exposure, str, os.PathLike)) else list(images)
-    found = [measured(image) for image in given]
-    if len(found) != len(views):
-        raise InversionError(f"calibrate: {len(found)} images for {len(views)} views. Give one a view, in their order.")
+    found = _images(images, len(views))
     settings = settings.for_noise(_noise(found))
     with reported(progress) as report:
         powers = [image.metadata.get("source_power") for image in found]
@@ -130,6 +127,27 @@ def calibrate(
         data = measured_of(found, views, pictures.first, len(names))
         fitted = CalibrationFit(names, start, data, pictures, settings).solved()
     return _calibration(names, data, fitted, os.fspath(scene))
+
+
+def _names(free: Any) -> tuple[str, ...]:
+    """Names of the free parameters; InversionError for what is no list of them."""
+    if not isinstance(free, (str, list, tuple)):
+        raise InversionError(f"calibrate: 'free' must be a list of names, got {type(free).__name__}. Give ['view'].")
+    return (free,) if isinstance(free, str) else tuple(free)
+
+
+def _images(given: Any, views: int) -> list[Image]:
+    """Images in W, one a view; InversionError for another number of them, or for what is none."""
+    found = [measured(image) for image in (given if isinstance(given, (list, tuple)) else [given])]
+    for image in found:
+        if not isinstance(image, Image):
+            raise InversionError(
+                f"calibrate: each image must be an Image, an Exposure or the name of a file, got "
+                f"{type(image).__name__}. Give fspt.Image(power, error) in W."
+            )
+    if len(found) != views:
+        raise InversionError(f"calibrate: {len(found)} images for {views} views. Give one a view, in their order.")
+    return found
 
 
 def _calibration(names: tuple[str, ...], measured: Measured, fitted: Fitted, scene: str) -> Calibration:
@@ -154,13 +172,20 @@ def _start(scene: str | os.PathLike[str], names: tuple[str, ...], views: Sequenc
         raise InversionError(f"calibrate: 'free' = {list(names)} names nothing, or a parameter twice. Give each once.")
     if both := set(names) & set(views[0]):
         raise InversionError(f"calibrate: '{both.pop()}' is free and given. Leave one of them out.")
-    xml = scene_text(scene, views[0])
+    try:
+        xml = scene_text(scene, views[0])
+    except InversionError as error:
+        raise _renamed(error) from error
     if GAIN in names and GAIN in xml.defaults:
         raise InversionError("calibrate: 'gain' is a factor on all powers, and a <default>. Rename that in the scene.")
     try:
         return np.array([1.0 if name == GAIN else varied_value(xml, name) for name in names])
     except InversionError as error:
-        raise InversionError(str(error).replace("derivatives:", "calibrate:", 1)) from error
+        raise _renamed(error) from error
+
+
+def _renamed(error: InversionError) -> InversionError:
+    return InversionError(str(error).replace("derivatives:", "calibrate:", 1))
 
 
 def _noise(images: Sequence[Image]) -> float:

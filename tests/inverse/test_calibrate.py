@@ -173,6 +173,8 @@ def test_bad_input(scene):
     image = noisy(scene, 1)
     for images, free, words in (
         (image, [], "names nothing"),
+        (image, 5, "must be a list of names, got int"),
+        (image.power, ["distance"], "each image must be an Image.* got ndarray"),
         (image, ["colour"], "no parameter 'colour'"),
         ([image, image], ["distance"], "2 images for 1 views"),
         (fspt.Image(image.power), ["distance"], "nor an error"),
@@ -180,6 +182,8 @@ def test_bad_input(scene):
     ):
         with pytest.raises(InversionError, match=words):
             fspt.calibrate(scene, images, free=free)
+    with pytest.raises(InversionError, match="calibrate: the scene must be a file"):
+        fspt.calibrate(5, image, free=["distance"])
 
 
 def test_variance_of_monte_carlo_follows_the_signal():
