@@ -62,10 +62,7 @@ def reduce(
     camera = Detector.from_toml(detector)
     given = dict(exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, pixel_pitch=pixel_pitch)
     frames = {"bias": bias, "dark": dark, "flat": flat, "cosmic_rays": cosmic_rays}
-    if calibrate:
-        require_writable(output, ".toml", DetectorError)
-    else:
-        require_image(output)
+    _require_output(output, calibrate, radiance is not None or radiance_error != 0)
     require_apart(output, [*counts, detector, *(p for p in (bias, dark, flat) if p)], error=ImageError)
     images: list[Image] = []
     with progress_bar(quiet) as report:
@@ -84,6 +81,16 @@ def reduce(
     records = [_record(image, name) for image, name in zip(images, names, strict=True)]
     lines = [f"{r['output']}: {r['power']:.6g} W in total, {r['masked_pixels']} pixels masked" for r in records]
     print_result("\n".join(lines), {"images": records}, as_json=as_json, quiet=quiet)
+
+
+def _require_output(output: Path, calibrate: bool, source: bool) -> None:
+    """Refuse an output that cannot be written, and numbers of a `source` that nothing is calibrated by."""
+    if calibrate:
+        require_writable(output, ".toml", DetectorError)
+    elif source:
+        raise DetectorError("--radiance and --radiance-error have no meaning without --calibrate. Give that, too.")
+    else:
+        require_image(output)
 
 
 def _exposed(path: Path, counts: Counts, camera: Detector, given: dict[str, Any]) -> Exposed:

@@ -316,6 +316,10 @@ class Detector:
         Parameters and errors as for `expose`.
         """
         exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
+        if not isinstance(image, Image):
+            raise DetectorError(
+                f"detector: must be given an image, got {type(image).__name__}. Give fspt.Image(power)."
+            )
         wavelength_of(image, wavelength_nm)
         if (darkest := image.power.min()) < 0:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")

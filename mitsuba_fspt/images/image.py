@@ -78,6 +78,25 @@ class Image:
         """Height and width (h, w) [pixels]."""
         return self.power.shape
 
+    @property
+    def electrons_per_watt(self) -> float | None:
+        """Electrons per watt on a pixel, of an image that `Detector.reduce` made; None of any other."""
+        return self._recorded("electrons_per_watt")
+
+    @property
+    def read_noise(self) -> float | None:
+        """Read noise [e-] of the sum of its frames, of an image that `Detector.reduce` made; None of any other."""
+        return self._recorded("read_noise")
+
+    @property
+    def gain_error(self) -> float | None:
+        """Relative uncertainty common to all pixels, of an image that `Detector.reduce` made; None of any other."""
+        return self._recorded("gain_error")
+
+    def _recorded(self, name: str) -> float | None:
+        value = self.metadata.get(name)
+        return None if value is None else float(value)
+
     def scaled(self, source_power: float) -> Image:
         """Image of the same scene with a light source of `source_power` [W], if this one is for a source of 1 W.
 

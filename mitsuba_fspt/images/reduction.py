@@ -317,6 +317,13 @@ def _image(
     return Image(total / per_watt, error, metadata=kept, mask=mask)
 
 
+def measured(given: Image | Exposure | str | os.PathLike[str]) -> Image:
+    """Image in W of an image, an exposure, or a file of either, as `reduced` and `read_measured` make it."""
+    if isinstance(given, (str, os.PathLike)):
+        return read_measured(given)
+    return reduced(given) if isinstance(given, Exposure) else given
+
+
 def read_measured(path: str | os.PathLike[str]) -> Image:
     """Image in W from a file of `fspt reduce` or a rendering, or from electrons of `fspt expose`, which are reduced.
 

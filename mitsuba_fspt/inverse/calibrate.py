@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..images.detector import Exposure
 from ..images.image import Image
-from ..images.reduction import reduced
+from ..images.reduction import measured
 from ..rendering.render import render
 from ..rendering.scene import load
 from ..rendering.scene_rules import is_number
@@ -28,6 +28,7 @@ from .derivatives import scene_text, varied_value
 from .measurement import tell_misfit, variances
 
 Array = NDArray[np.float64]
+Picture = Image | Exposure | str | os.PathLike[str]
 GAIN = "gain"  # reserved name: a factor on all powers
 PITCH_TOLERANCE = 1e-6  # relative: of the pixel pitch, which files may hold in single precision
 
@@ -78,7 +79,7 @@ class Calibration:
 
 def calibrate(
     scene: str | os.PathLike[str],
-    images: Image | Exposure | Sequence[Image | Exposure],
+    images: Picture | Sequence[Picture],
     /,
     *,
     free: Sequence[str],
@@ -98,7 +99,8 @@ def calibrate(
     ----------
     scene : name or text of a scene file
     images : one a view, in the order of the views: Image with its standard error, as of `reduce` or of Monte Carlo, or
-        Exposure; masked pixels are left out
+        Exposure; or the name of a file of either. Masked pixels are left out. The scene's pictures take the light
+        source's power that an image was scaled to
     free : names of parameters, common to all views, or `gain`, a factor on all powers
     sensor : number of the sensor
     settings : accuracy
@@ -112,19 +114,40 @@ def calibrate(
     SceneError, OpticsError, ExitanceError : as `render`.
     """
     settings = settings or CalibrationSettings()
-    names = tuple([free] if isinstance(free, str) else free)
+    names = _names(free)
     texts = {name: texts_of(name, given, "calibrate") for name, given in parameters.items()}
     views = [dict(zip(texts, one, strict=True)) for one in itertools.product(*texts.values())]
     start = _start(scene, names, views)
-    given = [images] if isinstance(images, (Image, Exposure)) else list(images)
-    found = [reduced(image) if isinstance(image, Exposure) else image for image in given]
+    found = _images(images, len(views))
     settings = settings.for_noise(_noise(found))
     with reported(progress) as report:
-        pictures = _Pictures(scene, names, views, sensor, settings.rtol or 1e-4, report)
+        powers = [image.metadata.get("source_power") for image in found]
+        pictures = _Pictures(scene, names, views, powers, sensor, settings.rtol or 1e-4, report)
         pictures(start)
-        measured = measured_of(found, views, pictures.first, len(names))
-        fitted = CalibrationFit(names, start, measured, pictures, settings).solved()
-    return _calibration(names, measured, fitted, os.fspath(scene))
+        data = measured_of(found, views, pictures.first, len(names))
+        fitted = CalibrationFit(names, start, data, pictures, settings).solved()
+    return _calibration(names, data, fitted, os.fspath(scene))
+
+
+def _names(free: Any) -> tuple[str, ...]:
+    """Names of the free parameters; InversionError for what is no list of them."""
+    if not isinstance(free, (str, list, tuple)):
+        raise InversionError(f"calibrate: 'free' must be a list of names, got {type(free).__name__}. Give ['view'].")
+    return (free,) if isinstance(free, str) else tuple(free)
+
+
+def _images(given: Any, views: int) -> list[Image]:
+    """Images in W, one a view; InversionError for another number of them, or for what is none."""
+    found = [measured(image) for image in (given if isinstance(given, (list, tuple)) else [given])]
+    for image in found:
+        if not isinstance(image, Image):
+            raise InversionError(
+                f"calibrate: each image must be an Image, an Exposure or the name of a file, got "
+                f"{type(image).__name__}. Give fspt.Image(power, error) in W."
+            )
+    if len(found) != views:
+        raise InversionError(f"calibrate: {len(found)} images for {views} views. Give one a view, in their order.")
+    return found
 
 
 def _calibration(names: tuple[str, ...], measured: Measured, fitted: Fitted, scene: str) -> Calibration:
@@ -149,13 +172,20 @@ def _start(scene: str | os.PathLike[str], names: tuple[str, ...], views: Sequenc
         raise InversionError(f"calibrate: 'free' = {list(names)} names nothing, or a parameter twice. Give each once.")
     if both := set(names) & set(views[0]):
         raise InversionError(f"calibrate: '{both.pop()}' is free and given. Leave one of them out.")
-    xml = scene_text(scene, views[0])
+    try:
+        xml = scene_text(scene, views[0])
+    except InversionError as error:
+        raise _renamed(error) from error
     if GAIN in names and GAIN in xml.defaults:
         raise InversionError("calibrate: 'gain' is a factor on all powers, and a <default>. Rename that in the scene.")
     try:
         return np.array([1.0 if name == GAIN else varied_value(xml, name) for name in names])
     except InversionError as error:
-        raise InversionError(str(error).replace("derivatives:", "calibrate:", 1)) from error
+        raise _renamed(error) from error
+
+
+def _renamed(error: InversionError) -> InversionError:
+    return InversionError(str(error).replace("derivatives:", "calibrate:", 1))
 
 
 def _noise(images: Sequence[Image]) -> float:
@@ -169,6 +199,7 @@ def _noise(images: Sequence[Image]) -> float:
 class _Pictures:
     """Power and numerical error [W] of all views, (views, h, w), as a function of the values of the free parameters.
 
+    powers : of the light source [W] by which the image of each view was scaled, and its picture is, or None
     first : the pictures of the first call
     """
 
@@ -177,11 +208,12 @@ class _Pictures:
         scene: str | os.PathLike[str],
         names: tuple[str, ...],
         views: Sequence[Mapping[str, str]],
+        powers: Sequence[Any],
         sensor: int,
         rtol: float,
         report: Progress,
     ) -> None:
-        self.scene, self.names, self.views, self.sensor = scene, names, views, sensor
+        self.scene, self.names, self.views, self.powers, self.sensor = scene, names, views, powers, sensor
         self.rtol, self.report = rtol, report
         self.first: list[Image] = []
         self._last: tuple[dict[str, float], tuple[Array, Array]] | None = None
@@ -203,6 +235,7 @@ class _Pictures:
                 render(load(self.scene, **{**view, **found}), method="integral", sensor=self.sensor, rtol=self.rtol)
                 for view in self.views
             ]
+            images = [i if watt is None else i.scaled(watt) for i, watt in zip(images, self.powers, strict=True)]
         self.first = self.first or images
         power, error = (np.stack([np.asarray(getattr(i, n), np.float64) for i in images]) for n in ("power", "error"))
         return power, error
@@ -212,10 +245,6 @@ def measured_of(
     images: Sequence[Image], views: Sequence[Mapping[str, str]], pictures: Sequence[Image], parameters: int
 ) -> Measured:
     """Pixels of the images, after checks against the views and the scene's pictures."""
-    if len(images) != len(views):
-        raise InversionError(
-            f"calibrate: {len(images)} images for {len(views)} views. Give one a view, in their order."
-        )
     for number, (image, picture) in enumerate(zip(images, pictures, strict=True)):
         if image.shape != picture.shape:
             raise InversionError(

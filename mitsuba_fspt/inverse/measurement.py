@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..images.detector import Exposure
 from ..images.image import Image
-from ..images.reduction import reduced, responses
+from ..images.reduction import measured, responses
 from ..runtime.errors import InversionError
 from ..runtime.numbers import number
 from .transport_matrix import TransportMatrix
@@ -43,27 +44,24 @@ class Measurement:
     def of(
         cls,
         matrix: TransportMatrix,
-        images: ArrayLike | Sequence[Image | Exposure] | Image | Exposure,
+        images: ArrayLike | Sequence[Image | Exposure | str | os.PathLike[str]] | Image | Exposure | os.PathLike[str],
         error: ArrayLike | None,
         mask: ArrayLike | None,
         gain_error: float | None,
     ) -> Measurement:
-        """Measurement from images as `invert` takes them.
+        """Measurement from images as `invert` takes them; a file of `fspt reduce` or `fspt expose` may stand for one.
 
         Raises
         ------
         InversionError : no error is known, it is not > 0, or nothing is left to fit.
         TransportError : the images do not fit the matrix.
         DetectorError : an Exposure without the numbers of its detector.
+        ImageError : a file that cannot be read.
         """
-        if isinstance(images, (Image, Exposure)):
+        if isinstance(images, (Image, Exposure, str, os.PathLike)):
             images = [images]
         listed = isinstance(images, (list, tuple))
-        planes: Any = (
-            [reduced(i) if isinstance(i, Exposure) else i for i in images]  # type: ignore[union-attr]
-            if listed
-            else images
-        )
+        planes: Any = [measured(image) for image in images] if listed else images  # type: ignore[union-attr,arg-type]
         masks = _mask(matrix, planes if listed else [], mask)
         if not listed:
             planes = np.where(masks, 0.0, _numbers(planes, masks.shape))

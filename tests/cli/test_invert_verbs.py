@@ -153,6 +153,7 @@ def test_bad_input_of_reduce(run, folder, monkeypatch, tmp_path):
         (("none.tif", "--detector", "camera.toml", *SETTINGS, "-o", "x.exr"), "do not exist"),
         (("counts_0.npy", "--detector", "camera.toml", *SETTINGS, "-o", "x.png"), "must end in"),
         (("counts_0.npy", "--detector", "none.toml", *SETTINGS, "-o", "x.exr"), "none.toml"),
+        (("counts_0.npy", "--detector", "camera.toml", *SETTINGS, "-o", "x.exr", "--radiance", 1), "--calibrate"),
     ):
         code, out, err = run("reduce", *arguments)
         assert (code, out, err.count("\n")) == (2, "", 1)

@@ -98,6 +98,11 @@ def test_coarse_pixels_have_the_dark_current_of_their_area():
     np.testing.assert_allclose(own, 0.1, rtol=1e-12)
 
 
+def test_arrays_are_no_images():
+    with pytest.raises(DetectorError, match="must be given an image, got ndarray"):
+        Detector.typical_ccd().expose(np.ones((2, 2)), 60, 650)
+
+
 def test_expected_is_what_expose_draws_about():
     """On an image with structure: z over 2^18 pixels has mean 0 and variance 1."""
     rng = np.random.default_rng(8)

@@ -139,6 +139,14 @@ def test_exposures_reduce_by_their_own_numbers(tmp_path):
         assert again.metadata[name] == one.metadata[name]
 
 
+def test_numbers_of_the_noise_are_attributes():
+    """k = η t λ/(h c), read noise of one frame 3.5 e-, gain error of the detector; a render has none of them."""
+    found = replace(CCD, gain_error=0.03).reduce(CCD.expose(ramp(), 60, 650).counts, **SETTINGS)
+    assert found.electrons_per_watt == pytest.approx(PER_WATT, rel=1e-12)
+    assert (found.read_noise, found.gain_error) == (3.5, 0.03)
+    assert (ramp().electrons_per_watt, ramp().read_noise, ramp().gain_error) == (None, None, None)
+
+
 def test_files(tmp_path):
     """TIFF, a stack, FITS with EXPTIME, NPY and a click folder give the image of the array."""
     tifffile, fits = pytest.importorskip("tifffile"), pytest.importorskip("astropy.io.fits")

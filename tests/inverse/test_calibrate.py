@@ -54,6 +54,20 @@ def test_monte_carlo_gives_the_parameters_of_its_scene(scene):
     assert found.covariance.shape == (2, 2)
 
 
+def test_electrons_of_another_source_give_the_parameters(scene, tmp_path):
+    """The file that `expose` writes of the scene with a source far below 1 W: the pictures are of that source, too.
+
+    Seen not to come to an end without the power of the source in the pictures.
+    """
+    image = fspt.render(fspt.load(scene, distance=164), rtol=1e-3)
+    ccd = fspt.Detector.typical_ccd()
+    watt = 0.005 * ccd.full_well / ccd.expected(image, 60, 660).mean.max()
+    ccd.expose(image.scaled(watt), 60, 660, seed=2).write(tmp_path / "e.exr")
+    found = fspt.calibrate(scene, tmp_path / "e.exr", free=["distance"])
+    assert found.values["distance"] == pytest.approx(164, abs=4 * found.sd["distance"])
+    assert found.sd["distance"] < 2
+
+
 def test_degenerate_sets_are_told(scene):
     """Gain and f-number both scale the picture: the message names both, and no small sd is returned."""
     with pytest.raises(InversionError, match="do not determine f_number, gain separately"):
@@ -159,6 +173,8 @@ def test_bad_input(scene):
     image = noisy(scene, 1)
     for images, free, words in (
         (image, [], "names nothing"),
+        (image, 5, "must be a list of names, got int"),
+        (image.power, ["distance"], "each image must be an Image.* got ndarray"),
         (image, ["colour"], "no parameter 'colour'"),
         ([image, image], ["distance"], "2 images for 1 views"),
         (fspt.Image(image.power), ["distance"], "nor an error"),
@@ -166,6 +182,8 @@ def test_bad_input(scene):
     ):
         with pytest.raises(InversionError, match=words):
             fspt.calibrate(scene, images, free=free)
+    with pytest.raises(InversionError, match="calibrate: the scene must be a file"):
+        fspt.calibrate(5, image, free=["distance"])
 
 
 def test_variance_of_monte_carlo_follows_the_signal():

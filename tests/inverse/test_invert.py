@@ -281,8 +281,8 @@ def test_ends_of_intervals_are_ranks_of_draws(case):
 # --- what it takes and writes ---
 
 
-def test_exposures_and_images_in_watts_agree(case):
-    """`expose` on rendered pictures: the Exposures themselves, and their electrons over η t λ/(hc), give one J_n."""
+def test_exposures_and_images_in_watts_agree(case, tmp_path):
+    """`expose` on rendered pictures: the Exposures, their files, and their electrons over η t λ/(hc) give one J_n."""
     matrix, exitance = case
     detector = fspt.Detector.typical_ccd()
     scale = 3e-18 / matrix.forward(exitance).max()
@@ -293,6 +293,10 @@ def test_exposures_and_images_in_watts_agree(case):
     meta = {"electrons_per_watt": per_watt, "read_noise": 3.5, "dark_electrons": 0.6}
     watts = [fspt.Image((e.electrons.astype(float) - 0.6) / per_watt, metadata=meta) for e in found]
     np.testing.assert_allclose(fspt.invert(matrix, watts, weight=10.0).exitance, r.exitance, rtol=1e-6)
+    for k, exposure in enumerate(found):
+        exposure.write(tmp_path / f"{k}.exr")
+    files = [tmp_path / "0.exr", *(str(tmp_path / f"{k}.exr") for k in range(1, len(found)))]
+    np.testing.assert_allclose(fspt.invert(matrix, files, weight=10.0).exitance, r.exitance, rtol=1e-6)
     assert r.total == pytest.approx(matrix.areas @ exitance * scale, rel=0.05, abs=0)
 
 

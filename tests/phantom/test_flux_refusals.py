@@ -180,6 +180,11 @@ def test_meshio_choices(tmp_path, cells, point_data, cell_data, options, message
         import_flux(tmp_path / "m.vtu", **options)
 
 
+def test_other_objects_are_no_mesh():
+    with pytest.raises(FluxError, match=r"name of a file or \(points, cells\), got list"):
+        import_flux([POINTS, TRIANGLES], np.ones(4))
+
+
 def test_a_vtu_of_several_pieces(tmp_path):
     """Rationale: of two pieces the cells of the last one alone came, with half the power."""
     meshio.Mesh(POINTS, [("triangle", TRIANGLES)], {"jn": np.ones(4)}).write(tmp_path / "m.vtu", binary=False)

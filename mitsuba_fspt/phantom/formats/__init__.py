@@ -57,6 +57,11 @@ def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, form
         raise FluxError(f"flux import: 'format' must be one of {', '.join(FORMATS)}, got '{format}'.")
     if isinstance(mesh, tuple):
         return _from_arrays(mesh, values, field, format)
+    if not isinstance(mesh, (str, os.PathLike)):
+        raise FluxError(
+            f"flux import: the mesh must be the name of a file or (points, cells), got {type(mesh).__name__}. Give for "
+            "example (mesh.vertices, mesh.faces)."
+        )
     path = Path(mesh)
     if format == "auto" and not os.path.exists(path) and os.path.isfile(path.with_name(f"{path.name}.node")):
         format = "nirfast"
