@@ -9,6 +9,7 @@ of a flat field below 1 collects fewer electrons per watt, flat · k: `responses
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections.abc import Mapping
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 Frame = ArrayLike | str | os.PathLike[str]
+LOG = logging.getLogger("mitsuba_fspt")
+DARKER = 5.0  # standard deviations of a total below 0: noise makes more once in 3 million images
 LEAST_FLAT = 0.05  # of the mean: pixels of a flat field darker than that are masked, their error is 20 times as large
 
 
@@ -99,7 +102,23 @@ def reduce_counts(
     electrons = _corrected(values, level, response) * detector.gain
     independent = charge + detector.gain**2 / 12 + raw.frames * added  # gain²/12: variance of the rounding
     flat_field = 1.0 if response is None else response
-    return _image(detector, electrons, flat_field, independent, raw.frames, full | rays | weak, exposed, metadata)
+    mask = full | rays | weak
+    image = _image(detector, electrons, flat_field, independent, raw.frames, mask, exposed, metadata)
+    _tell_darkness(image, mask)
+    return image
+
+
+def _tell_darkness(image: Image, mask: NDArray[np.bool_]) -> None:
+    """Say in one line on stderr that the power of all pixels is negative by more than noise makes it."""
+    power, error = (np.asarray(plane, np.float64) for plane in (image.power, image.error))
+    total, noise = power.sum(), np.sqrt(np.square(error[~mask]).sum())
+    if total < -DARKER * noise:
+        LOG.warning(
+            "fspt: reduce: the total is %.3g W, %.0f standard deviations below 0: the counts are darker than bias and "
+            "dark current say. Check 'bias', 'dark_current' and the frames.",
+            total,
+            -total / noise,
+        )
 
 
 def reduced(exposure: Exposure) -> Image:
@@ -314,6 +333,8 @@ def _image(
     }
     if exposed.pixel_pitch is not None:
         kept["pixel_pitch"] = exposed.pixel_pitch
+    if detector.pixel_pitch is not None:
+        kept[RECORDED["pixel_pitch"]] = detector.pixel_pitch
     return Image(total / per_watt, error, metadata=kept, mask=mask)
 
 

@@ -224,6 +224,12 @@ def _differences(
             "mm. Give images of the same film."
         )
     notes = []
+    own = float(metadata.get("detector_pixel_pitch", np.nan)) * float(metadata.get("binning", 1))
+    if pitch is None and abs(own - lens["pixel_pitch"]) > PITCH_TOLERANCE * lens["pixel_pitch"]:
+        notes.append(
+            f"image {number} was reduced with the dark current of pixels of {own:g} mm, the matrix has pixels of "
+            f"{lens['pixel_pitch']:g} mm. Give pixel_pitch to reduce."
+        )
     try:
         made = {"sensor": metadata.get("sensor"), **json.loads(str(metadata.get("parameters", "{}")))}
     except ValueError:

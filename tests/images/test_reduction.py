@@ -103,6 +103,15 @@ def test_dark_charge_and_frames_add_their_noise():
         assert chi2 == pytest.approx(1, abs=4 * (2 / 4096) ** 0.5)
 
 
+def test_a_total_below_zero_is_told(caplog):
+    """Dark frames scatter about 0 and say nothing; counts 40 DN below the bias are told."""
+    dark = np.random.default_rng(5).normal(CCD.bias, CCD.read_noise / CCD.gain, (32, 32))
+    CCD.reduce(dark, **SETTINGS)
+    assert not caplog.records
+    CCD.reduce(dark - 40, **SETTINGS)
+    assert [record.getMessage().count("standard deviations below 0") for record in caplog.records] == [1]
+
+
 def test_saturated_pixels_are_masked_not_clipped():
     counts = np.full((4, 5), 1000, np.uint16)
     counts[1, 2], counts[3, 4] = 65535, 500 + 62500

@@ -244,6 +244,19 @@ def test_images_are_held_against_the_views(scene_file, matrix, caplog):
     assert [record.getMessage() for record in caplog.records] == [
         "fspt: image 0 shows another mesh than the one of the matrix."
     ]
+    caplog.clear()
+    counts = [np.full(image.shape, 600) for image in images]
+    camera = fspt.Detector.typical_ccd()
+    numbers = {"exposure_time": 60, "wavelength_nm": 650}
+    with caplog.at_level(logging.WARNING):
+        matrix.backward([camera.reduce(c, **numbers) for c in counts])
+    assert [record.getMessage() for record in caplog.records] == [
+        f"fspt: image 0 was reduced with the dark current of pixels of {camera.pixel_pitch:g} mm, the matrix has "
+        f"pixels of {images[0].metadata['pixel_pitch']:g} mm. Give pixel_pitch to reduce."
+    ]
+    caplog.clear()
+    matrix.backward([camera.reduce(c, pixel_pitch=images[0].metadata["pixel_pitch"], **numbers) for c in counts])
+    assert not caplog.records
 
 
 def test_a_digest_knows_a_mesh_wherever_it_is():
