@@ -139,9 +139,9 @@ def _add(file: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
         np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
 
 
-def _stored(block: Block) -> dict[str, NDArray[Any]]:
+def _stored(block: Block) -> dict[str, Any]:
     """The arrays of a view by name, as they stand in files."""
-    arrays = {name: getattr(block, name) for name in ARRAYS}
+    arrays: dict[str, Any] = {name: getattr(block, name) for name in ARRAYS}
     if block.count <= 1 << 16:
         arrays["columns"] = block.columns.astype(np.uint16)
     return arrays
