@@ -183,7 +183,9 @@ class ColumnCanvas:
             (self._level, after, beside),
             (self._slope, x, slope),
         ):
-            dr.scatter_add(layer, mi.UInt64(mi.Int64(amount)), line + mi.UInt32(column_at), on & (amount != 0))
+            index = line + mi.UInt32(column_at)
+            # Directly: lines of one packet mostly add to different entries, and to look for equal ones costs more.
+            dr.scatter_add(layer, mi.UInt64(mi.Int64(amount)), index, on & (amount != 0), mode=dr.ReduceMode.Direct)
 
 
 def _cross(a: mi.Vector2d, b: mi.Vector2d) -> mi.Float64:

@@ -197,7 +197,7 @@ class _Lines:
         if faces.shadows:
             within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
             spot, _ = elements.place(face, within, self.cut, part)
-            _, to, _, _ = lens.arrival(spot.p, mi.warp.square_to_uniform_disk_concentric(aim))
+            _, to, _, _ = lens.arrival(spot.p, aim)
             active &= ~hidden(scene, spot.p, to, active)
         origin = mi.Vector2f(*(dr.opaque(mi.Float, int(n)) for n in lens.film().crop_offset()))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)

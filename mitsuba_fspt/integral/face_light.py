@@ -24,6 +24,7 @@ from .occlusion import hidden
 CORNERS = ((0, 0), (1, 0), (0, 1))  # of a face, in the square that `Elements.place` maps to it
 MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for float32, and of the blur radius, for cells
 RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
+INWARD = 0.05  # of a face: how far from its sides rays start that look for the edge of a shadow
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
 # M of columns of several faces: neighbours mostly take the same.
 LEVELS = (4, 6, 8, 10, 12, 16, 20, 24, 28, 32, 36, 40, 44, 50, 56, 64)
@@ -37,13 +38,13 @@ Mask = NDArray[np.bool_]
 class ColumnRule:
     """Numbers of cells and pieces, each with the error it bounds.
 
-    edge : error at an edge of J_n, over its step: cells M along the pupil are √(edge_factor · r^1.2/edge) for a blur
-        radius r [pixels]
+    edge : error at an edge of J_n, over its step: cells M along the pupil are √(edge_factor · r/edge) for a blur
+        radius r [pixels], or √(coarse_factor · r/edge) where that is below `coarse` · r
     step : likewise at the sides of faces, at which J_n on faces steps
     kink : error at a face's side where J_n is continuous, over its change along the face: of columns that are
         continuous and nowhere cut off M is √(kink_factor · r/(h · kink)), with h [pixels] the height of a face's image
-    edge_factor : by what middles of cells leave of a half plane averaged over pixels, the most of all directions and
-        offsets; fitted for r = 0.3 … 4, M = 2 … 16
+    edge_factor, coarse_factor : by what middles of cells leave of a half plane averaged over pixels, the most of all
+        directions and offsets for r = 0.5 … 32, M = 4 … 32, with more and with less than `coarse` · r cells
     kink_factor : likewise for a slope that begins at a straight line; fitted for r = 1 … 64, M = 4 … 32
     fewest, most : least and largest M
     partial : least M where a face turns away from part of the pupil, or a second border cuts the pupil
@@ -57,7 +58,10 @@ class ColumnRule:
         square
     perspective : J_n that perspective, corrected on average, misplaces within a piece, over its change along the face:
         pieces along a side of a face of relative depth δ are √(δ/(8 · perspective))
-    shadow : largest piece [pixels] where one surface may hide another: lines of sight through a piece are sampled
+    shadow : largest piece [pixels] where one surface may hide another: each piece is lit or not on a line of sight
+    displaced : light of a column that is displaced so, over all of it, times the distance [pixels], on faces smaller
+        than their blur disc: w · s²/a for pieces of s on a face of a pixels, with w the share of the lines of sight of
+        which the edge of a shadow crosses it
     drop : entries below this share of a column's brightest are left out
     """
 
@@ -65,7 +69,9 @@ class ColumnRule:
     step: float
     kink: float
     speckle: float
-    edge_factor: float = 0.13
+    edge_factor: float = 0.12
+    coarse_factor: float = 0.18
+    coarse: float = 1.25
     kink_factor: float = 0.13
     speckle_factor: float = 0.04
     fewest: int = 4
@@ -77,6 +83,7 @@ class ColumnRule:
     piece: float = 0.03
     perspective: float = 2e-3
     shadow: float = 0.7
+    displaced: float = 0.16
     drop: float = 1e-5
 
     @classmethod
@@ -86,7 +93,7 @@ class ColumnRule:
         cells = 2 * math.ceil(3 / math.sqrt(finer))
         partial = 2 * math.ceil(6 / math.sqrt(finer))
         return cls(
-            edge=1.5 * rtol,
+            edge=2 * rtol,
             step=rtol,
             kink=3 * rtol,
             speckle=0.25 * rtol,
@@ -95,6 +102,7 @@ class ColumnRule:
             mixed=2 * math.ceil(8 / math.sqrt(finer)),
             point=0.5 * finer,
             shadow=0.7 * finer,
+            displaced=0.16 * finer**2,
             perspective=2 * rtol,
             drop=1e-2 * rtol,
         )
@@ -136,7 +144,9 @@ class FaceLight:
     empty for a face that sends none. sides, heights, blur (F,): longest edge, height over it and blur radius of the
     image [pixels]. slant (F,): depth of the face over its distance. partial (F,): only part of the pupil takes light of
     the face. cut (V,): vertices at which the light of the surface ends for part of the pupil, at silhouettes and
-    borders. mixed (F,): one surface hides part of another here. distance: in focus [virtual pixels].
+    borders. mixed (F,): one surface hides part of another here. edges (F, 3): of the image, from each corner to the
+    next [pixels]. crossed (F,): share of the lines of sight of which the edge of a shadow lies on the face, along its
+    longest edge. distance: in focus [virtual pixels].
     """
 
     emitter: mi.Emitter
@@ -151,6 +161,8 @@ class FaceLight:
     partial: Mask
     cut: Mask
     mixed: Mask
+    edges: Array
+    crossed: Array
     distance: float
     shadows: bool
 
@@ -166,8 +178,9 @@ class FaceLight:
         reach = radius * (1 + RIM) + MARGIN
         low, high = (centre - reach)[corners].min(axis=1), (centre + reach)[corners].max(axis=1)
         blur = radius[:, 0][corners].max(axis=1)
-        edges = centre[corners] - centre[np.roll(corners, 1, axis=1)]
-        sides = np.hypot(edges[..., 0], edges[..., 1]).max(axis=1)
+        edges = centre[np.roll(corners, -1, axis=1)] - centre[corners]
+        lengths = np.hypot(edges[..., 0], edges[..., 1])
+        sides = lengths.max(axis=1)
         turn = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
         heights = np.divide(turn, sides, out=np.zeros(len(sides)), where=(sides > 0) & np.isfinite(turn))
         elements = elements_of(mesh, minimum=1)
@@ -198,6 +211,8 @@ class FaceLight:
             partial,
             cut,
             none,
+            lengths,
+            np.zeros(len(corners)),
             lens.optics.focus_distance / lens.virtual_pitch,
             shadows=False,
         )
@@ -226,13 +241,21 @@ class FaceLight:
         low[hidden_all], high[hidden_all] = np.inf, -np.inf
         cut = self.cut.copy()
         cut[self.corners[mixed | hidden_all].ravel()] = True
-        return replace(self, low=low, high=high, cut=cut, mixed=mixed, shadows=True)
+        crossed = np.zeros(len(self.corners))
+        some = np.flatnonzero(mixed & np.isfinite(self.edges).all(axis=1) & (self.sides > 0))
+        shares = _crossed_share(scene, lens, self.elements, some)
+        crossed[mixed] = 1
+        crossed[some] = (shares * self.edges[some]).max(axis=1) / self.sides[some]
+        return replace(self, low=low, high=high, cut=cut, mixed=mixed, crossed=crossed, shadows=True)
 
     def plan(self, rule: ColumnRule, on: str) -> Plan:
         """How the faces are divided: the cheaper of nodes with images of pieces and pieces with images of cells."""
         sides = np.minimum(self.sides, LONGEST)
         nodes = self._nodes(rule, sides, on)
-        pieces = np.ceil(sides / np.where(self.mixed, rule.shadow, rule.piece * self.distance))
+        shaded = np.where(self.mixed, sides / rule.shadow, 0)
+        small = sides < 2 * self.blur + 1
+        shaded = np.where(small, np.minimum(shaded, np.sqrt(self.crossed * sides / rule.displaced)), shaded)
+        pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
         # Within a pixel perspective misplaces nothing.
         pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant / (8 * rule.perspective)), sides))
         pieces = np.maximum(np.ceil(pieces), 1)
@@ -256,7 +279,9 @@ class FaceLight:
     def _nodes(self, rule: ColumnRule, sides: Array, on: str) -> Array:
         """M of nodes that each face asks for."""
         fewest = np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
-        nodes = np.sqrt(rule.edge_factor * self.blur**1.2 / (rule.step if on == "face" else rule.edge))
+        error = self.blur / (rule.step if on == "face" else rule.edge)
+        many = np.minimum(np.sqrt(rule.coarse_factor * error), rule.coarse * self.blur)
+        nodes = np.maximum(np.sqrt(rule.edge_factor * error), many)
         if on == "vertex":
             kinks = np.sqrt(rule.kink_factor * self.blur / (rule.kink * np.maximum(self.heights, 1e-3)))
             nodes = np.where(self.cut[self.corners].any(axis=1), nodes, np.minimum(nodes, kinks))
@@ -325,8 +350,31 @@ def _open_share(scene: mi.Scene, lens: mi.Sensor, elements: Elements, faces: Ind
     m = mi.UInt32(cells)
     within, aim = pupil_cells.strata(number % m, number // m, m, index * pupil_cells.STRIDE)
     spot, _ = elements.place(index, within)
-    _, lens_point, arrival, _ = lens.arrival(spot.p, mi.warp.square_to_uniform_disk_concentric(aim))
+    _, lens_point, arrival, _ = lens.arrival(spot.p, aim)
     reaches = (arrival > 0) & (dr.dot(spot.n, lens_point - spot.p) > 0)
     blocked = reaches & hidden(scene, spot.p, lens_point, reaches)
     counted = [np.asarray(flag.numpy()).reshape(-1, cells**2).sum(axis=1) for flag in (reaches, blocked)]
     return 1 - counted[1] / np.maximum(counted[0], 1)
+
+
+def _crossed_share(scene: mi.Scene, lens: mi.Sensor, elements: Elements, faces: Index, cells: int = 4) -> Array:
+    """Share (n, 3) of the lines of sight of some faces, through `cells`² points of the pupil, for which not all of an
+    edge is lit: over those for which any of the face is, for the edges from each corner to the next."""
+    if not faces.size:
+        return np.zeros((0, 3))
+    index = mi.UInt32(np.repeat(faces, cells**2).astype(np.uint32))
+    number = mi.UInt32(np.tile(np.arange(cells**2), len(faces)).astype(np.uint32))
+    node = pupil_cells.middle(number % cells, number // cells, dr.opaque(mi.UInt32, cells))
+    middle, _ = elements.place(index, mi.Point2f(*elements.middle))
+    corners = [elements.place(index, mi.Point2f(*at))[0].p for at in CORNERS]
+    corners = [corner + INWARD * (middle.p - corner) for corner in corners]
+    seen = []
+    for k in range(6):
+        point = 0.5 * (corners[k // 2] + corners[(k + 1) // 2 % 3])
+        _, lens_point, arrival, _ = lens.arrival(point, node)
+        open_to = (arrival > 0) & (dr.dot(middle.n, lens_point - point) > 0)
+        seen.append((open_to & ~hidden(scene, point, lens_point, open_to)).numpy().reshape(-1, cells**2))
+    lit = np.stack(seen, axis=-1)
+    some = np.maximum(lit.any(axis=-1).sum(axis=1), 1)
+    edges = [lit[..., [2 * k, 2 * k + 1, (2 * k + 2) % 6]] for k in range(3)]
+    return np.stack([(edge.any(axis=-1) & ~edge.all(axis=-1)).sum(axis=1) / some for edge in edges], axis=-1)

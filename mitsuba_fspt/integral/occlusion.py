@@ -7,11 +7,13 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ..emission.elements import elements_of
+from ..emission.elements import Elements, elements_of
 
 GRAZING = 0.01  # rad above the surface; less light than this leaves it at flatter angles
 LIFT = 1e-6  # of the shape's size: distance from the surface that float32 resolves
 DIRECTIONS = 4  # rays from each element
+ELEMENTS = 1 << 14  # rays leave so many elements at least
+SLIVERS = 1e-6  # of the shape's area: elements that float32 gives no direction, whose rays may meet anything
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 # Start of a ray that leaves the surface: these shares of the largest coordinate and of the distance [mm/mm], some
 # hundred times the rounding of float32.
@@ -47,19 +49,32 @@ def hides_nothing(scene: mi.Scene) -> bool:
     """True for a scene of one shape that no grazing ray from any of its elements meets again.
 
     A test of the mesh edge by edge would miss a shallow dent in a fine mesh, where each edge bends by less than
-    rounding.
+    rounding. Elements too narrow for float32 to give them a normal, such as those at the poles of a sphere, have no
+    say as long as they are next to none of the surface.
     """
     shapes = scene.shapes()
     if len(shapes) != 1:
         return False
-    elements, box = elements_of(shapes[0]), shapes[0].bbox()
+    elements, box = elements_of(shapes[0], ELEMENTS), shapes[0].bbox()
     index = dr.arange(mi.UInt32, elements.count)
     si, area = elements.place(index, mi.Point2f(0.5))
     frame = mi.Frame3f(si.n)
     origin = si.p + LIFT * float(dr.norm(box.extents())) * si.n
+    directed = area > clear_of(si.p) * _longest_side(elements, index)
+    met = dr.zeros(mi.Bool, elements.count)
     for k in range(DIRECTIONS):
         sine, cosine = dr.sincos(GOLDEN_ANGLE * mi.Float(index) + dr.opaque(mi.Float, 2 * math.pi * k / DIRECTIONS))
         direction = dr.normalize(frame.to_world(mi.Vector3f(cosine, sine, GRAZING)))
-        if dr.any(scene.ray_test(mi.Ray3f(origin, direction), active=area > 0)):
+        met |= scene.ray_test(mi.Ray3f(origin, direction), active=area > 0)
+        if dr.any(met & directed):
             return False
-    return True
+    return float(dr.sum(dr.select(met, area, 0))[0]) <= SLIVERS * float(dr.sum(area)[0])
+
+
+def _longest_side(elements: Elements, index: mi.UInt32) -> mi.Float:
+    """Largest distance between neighbouring corners of each element [mm]."""
+    corners = [elements.place(index, mi.Point2f(*at))[0].p for at in elements.corners]
+    longest = mi.Float(0)
+    for k, corner in enumerate(corners):
+        longest = dr.maximum(longest, dr.norm(corner - corners[k - 1]))
+    return longest

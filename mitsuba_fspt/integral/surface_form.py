@@ -167,7 +167,7 @@ class _Refinement:
         # a round shape noisy. J_n and occlusion, which may jump within a piece, are sampled all over it.
         middle, area = elements.place(index, mi.Point2f(*elements.middle), cut, part)
         spot, _ = elements.place(index, within, cut, part)
-        _, lens_point, arrival, cos_theta = lens.arrival(middle.p, mi.warp.square_to_uniform_disk_concentric(aim))
+        _, lens_point, arrival, cos_theta = lens.arrival(middle.p, aim)
         to_lens = dr.normalize(lens_point - middle.p)
         cos_s = dr.dot(middle.n, to_lens)
         active = (cos_s > 0) & (arrival > 0)

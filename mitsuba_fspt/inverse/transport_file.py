@@ -1,7 +1,8 @@
 """Files of transport matrices: npz, not compressed, with the arrays of each view apart, so that one can be read alone.
 
 Members: `meta` (JSON: format, views, lenses, parts, …), `areas` and `sensitivity` (n,), and for view k
-`view_k/values`, `columns`, `starts`, `change`, `row_error` as in `Block`. While a matrix is made, finished views stand
+`view_k/values`, `columns`, `starts`, `change`, `row_error` as in `Block`, the columns as 16-bit numbers where these
+suffice. While a matrix is made, finished views stand
 in a folder beside the file, so that an interrupted run goes on with the next one.
 """
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 FORMAT = "fspt transport matrix 1"
 ARRAYS = ("values", "columns", "starts", "change", "row_error")
+IN_MEMORY = 2.25  # bytes of a matrix that is read, over those of its file, at the most
 KEPT_SHARE = 0.25  # of the free memory: a matrix up to that size stays in memory once it is read
 DAMAGED = (zipfile.BadZipFile, KeyError, ValueError, EOFError, OSError, json.JSONDecodeError)
 
@@ -91,9 +93,9 @@ class FileBlocks(Sequence[Block]):
     def __init__(self, path: Path, meta: Mapping[str, Any]) -> None:
         self._path, self._meta = path, meta
         free = available_memory()
-        # In double precision with its columns, twice the size of the file.
+        # With its values in double precision, too.
         self._kept: dict[int, Block] | None = (
-            {} if free is None or 2 * path.stat().st_size < KEPT_SHARE * free else None
+            {} if free is None or IN_MEMORY * path.stat().st_size < KEPT_SHARE * free else None
         )
 
     def __len__(self) -> int:
@@ -109,7 +111,7 @@ class FileBlocks(Sequence[Block]):
         except DAMAGED as cause:
             raise _damaged(self._path, cause) from cause
         _, height, width = self._meta["image_shape"]
-        block = Block((height, width), int(self._meta["columns"]), **arrays)
+        block = _block((height, width), int(self._meta["columns"]), arrays)
         if self._kept is not None:
             self._kept[number] = block
         return block
@@ -128,13 +130,26 @@ def _write(
         _add(file, "areas", areas)
         _add(file, "sensitivity", sensitivity)
         for number, block in enumerate(blocks):
-            for name in ARRAYS:
-                _add(file, _name(number, name), getattr(block, name))
+            for name, values in _stored(block).items():
+                _add(file, _name(number, name), values)
 
 
 def _add(file: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
     with file.open(f"{name}.npy", "w", force_zip64=True) as member:
         np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
+
+
+def _stored(block: Block) -> dict[str, Any]:
+    """The arrays of a view by name, as they stand in files."""
+    arrays: dict[str, Any] = {name: getattr(block, name) for name in ARRAYS}
+    if block.count <= 1 << 16:
+        arrays["columns"] = block.columns.astype(np.uint16)
+    return arrays
+
+
+def _block(shape: tuple[int, int], count: int, arrays: Mapping[str, NDArray[Any]]) -> Block:
+    """The view of these stored arrays."""
+    return Block(shape, count, **{**arrays, "columns": arrays["columns"].astype(np.int32, copy=False)})
 
 
 def _name(number: int, array: str) -> str:
@@ -176,9 +191,8 @@ class PartialFile(Sequence[Block]):
             raise TransportError(
                 f"transport: the folder '{self.folder}' cannot be made: {cause.strerror}. Give another file."
             ) from cause
-        arrays = {name: getattr(block, name) for name in ARRAYS}
         with atomic_path(self._view(number), TransportError) as temporary, temporary.open("wb") as file:
-            np.savez(file, fingerprint=fingerprint, shape=[*block.shape, block.count], **arrays)
+            np.savez(file, fingerprint=fingerprint, shape=[*block.shape, block.count], **_stored(block))
 
     def __len__(self) -> int:
         return self.views
@@ -188,7 +202,7 @@ class PartialFile(Sequence[Block]):
             raise IndexError(number)
         with opened(self._view(number)) as file:
             height, width, count = (int(n) for n in file["shape"])
-            return Block((height, width), count, **{name: file[name] for name in ARRAYS})
+            return _block((height, width), count, {name: file[name] for name in ARRAYS})
 
     def __iter__(self) -> Iterator[Block]:
         return (self[number] for number in range(self.views))

@@ -122,6 +122,24 @@ def test_a_wide_pupil_and_a_wide_blur_take_all_lines_of_sight():
     assert not found(solved(world_scene(ball(), sensor=lens(24, f_number=100.0, pitch=0.005))), "one line")
 
 
+def with_slivers_at_its_pole(path):
+    """A ball on a grid in both angles whose last row of faces is 1e-15 mm wide at sin π, as floats have it."""
+    rings = 40
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.arange(rings) * 2 * np.pi / rings, indexing="ij")
+    across = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1).reshape(-1, 3)
+    first = np.add.outer(np.arange(rings) * rings, np.arange(rings)).ravel()
+    beside = np.add.outer(np.arange(rings) * rings, (np.arange(rings) + 1) % rings).ravel()
+    faces = np.concatenate(
+        [np.stack([first, first + rings, beside + rings], -1), np.stack([first, beside + rings, beside], -1)]
+    )
+    return world_scene(mesh_of(trimesh.Trimesh(5 * across, faces, process=False), path))
+
+
+def test_faces_that_float32_gives_no_direction_have_no_say(tmp_path):
+    """Seen to fail with rays from all faces: those at the pole meet the ball."""
+    assert found(solved(with_slivers_at_its_pole(tmp_path / "body.ply"), "surface", rtol=0.3), "occlusion")
+
+
 def dented(path):
     """A ball with a shallow dent around its waist, so fine a mesh that no edge tells."""
     body = trimesh.creation.uv_sphere(radius=5, count=[800, 60])

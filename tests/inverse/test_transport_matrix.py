@@ -17,6 +17,8 @@ from small_scenes import SCENES, attribute, ball, glow, lens, load_scene, world_
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse import transport as module
+from mitsuba_fspt.inverse.transport_file import PartialFile
+from mitsuba_fspt.inverse.view_block import Block
 from mitsuba_fspt.rendering.provenance import mesh_digest, same_mesh
 from mitsuba_fspt.runtime.errors import SceneError, TransportError
 from mitsuba_fspt.studies import sweep_workers
@@ -142,7 +144,19 @@ def test_a_file_holds_the_matrix(matrix, tmp_path):
     np.testing.assert_array_equal(again.error(exitance), matrix.error(exitance))
     with np.load(tmp_path / "T.npz") as file:
         assert file["view_1/values"].dtype == np.float32
-        assert file["view_1/columns"].dtype == np.int32
+        assert file["view_1/columns"].dtype == np.uint16
+
+
+@pytest.mark.parametrize("count", [1 << 16, (1 << 16) + 1])
+def test_files_hold_the_last_column(tmp_path, count):
+    """Seen to fail with 16-bit numbers of columns whatever their count."""
+    columns = np.array([count - 1, 3], np.int32)
+    light, change = np.array([1, 2], np.float32), np.zeros(2, np.float16)
+    partial = PartialFile(tmp_path / "T.npz")
+    partial.put(0, Block((1, 2), count, light, columns, np.array([0, 1, 2]), change, 0 * light), "one")
+    partial.views = 1
+    np.testing.assert_array_equal(partial[0].columns, columns)
+    assert partial[0].columns.dtype == np.int32
 
 
 def test_an_interrupted_file_goes_on(scene_file, tmp_path, monkeypatch):
