@@ -288,8 +288,8 @@ class Detector:
             else 1
         pixel_pitch : of the pixels read out [mm]; the image needs it to be checked against a scene
         bias, dark, flat : frames or stacks [DN] in place of the numbers `bias` and `dark_current`; `dark` has the same
-            exposure time and contains the bias, `flat` is free of both. The noise of the flat field itself is not in
-            the errors: average so many frames that it is small beside that of the counts
+            exposure time and contains the bias, `flat` is free of both. Of a stack the shot and read noise of the flat
+            field enter the errors. Of a single frame they do not, as it may be the mean of any number of frames
         cosmic_rays : also mask pixels that cosmic rays hit
         metadata : to be kept with the image
 
