@@ -27,9 +27,9 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 
 
-def sphere_views(folder, **options):
-    """Transport matrix of the sphere of 162 vertices, whose scene `sphere.xml` is written into the folder."""
-    trimesh.creation.icosphere(subdivisions=2, radius=RADIUS).export(folder / "sphere.ply")
+def sphere_views(folder, subdivisions=2, **options):
+    """Transport matrix of the sphere, 162 vertices by default; its scene `sphere.xml` is written into the folder."""
+    trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS).export(folder / "sphere.ply")
     (folder / "sphere.xml").write_text(SCENE)
     return fspt.transport(folder / "sphere.xml", view=VIEWS, **{"rtol": 1e-3} | options)
 

@@ -289,8 +289,9 @@ class Detector:
             else 1
         pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene
         bias, dark, flat : frames or stacks [DN] in place of the numbers `bias` and `dark_current`; `dark` has the same
-            exposure time and contains the bias, `flat` is free of both. The errors do not contain the noise of the flat
-            field itself: average enough frames to make it small compared with that of the counts
+            exposure time and contains the bias, `flat` is free of both. The shot and read noise of the flat field are
+            part of the errors if `flat` is a stack. They are not if it is a single frame, which may be the mean of any
+            number of frames: average enough of them to make its noise small compared with that of the counts
         cosmic_rays : also mask pixels that cosmic rays have hit
         metadata : further entries for the image's metadata
 

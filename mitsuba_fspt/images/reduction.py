@@ -1,10 +1,11 @@
 """Counts of a detector to power [W]: bias, dark, flat, cosmic rays, quantum efficiency, and the noise that remains.
 
     electrons = gain (DN − bias) − dark,   P = electrons / (flat · k),   k = η t λ / (h c) [electrons per watt]
-    error² = (max(electrons, 0) + σ_read² + dark) / (flat · k)²
+    error² = (max(electrons, 0) + σ_read² + dark) / (flat · k)² + (P ε)²
 
-with the variance of the dark current and of the rounding in `dark_electrons`. Frames are corrected by ccdproc. A pixel
-of a flat field below 1 collects fewer electrons per watt, flat · k: `responses` finds them again from power and error.
+with the variance of the dark current and of the rounding in `dark_electrons`, and the relative error ε of the flat
+field. Frames are corrected by ccdproc. A pixel of a flat field below 1 collects fewer electrons per watt, flat · k:
+`responses` finds them again from power and error.
 """
 
 from __future__ import annotations
@@ -98,12 +99,12 @@ def reduce_counts(
     full = saturated(detector, raw.values if raw.highest is None else raw.highest)
     values, rays = _cleaned(detector, raw.values, full) if cosmic_rays else (raw.values, np.zeros_like(full))
     level, charge, added = _background(detector, raw, exposed, bias, dark)
-    response, weak = _response(flat, values.shape)
+    response, weak, noise = _response(detector, flat, values.shape)
     electrons = _corrected(values, level, response) * detector.gain
     independent = charge + detector.gain**2 / 12 + raw.frames * added  # gain²/12: variance of the rounding
     flat_field = 1.0 if response is None else response
     mask = full | rays | weak
-    image = _image(detector, electrons, flat_field, independent, raw.frames, mask, exposed, metadata)
+    image = _image(detector, electrons, flat_field, independent, raw.frames, mask, exposed, metadata, noise)
     _tell_darkness(image, mask)
     return image
 
@@ -233,16 +234,24 @@ def _background(
     return detector.bias + charge / detector.gain, charge, 0.0
 
 
-def _response(flat: Frame | None, shape: tuple[int, ...]) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Flat field divided by its mean, or None without one, and the pixels where it is below `LEAST_FLAT`."""
+def _response(
+    detector: Detector, flat: Frame | None, shape: tuple[int, ...]
+) -> tuple[Array | None, NDArray[np.bool_], Array | float]:
+    """Flat field divided by its mean, or None without one; the pixels where it is below `LEAST_FLAT`; its variance.
+
+    The variance is relative to its square. It is 0 for a single frame, which may be the mean of any number of frames.
+    """
     if flat is None:
-        return None, np.zeros(shape, bool)
-    found = _like(flat, "flat", shape).values
+        return None, np.zeros(shape, bool), 0.0
+    frame = _like(flat, "flat", shape)
+    found, frames = frame.values, frame.frames
     if not found.mean() > 0:
         raise DetectorError(f"reduce: the flat field has the mean {found.mean():g}, it must be > 0. Give another one.")
     relative = found / found.mean()
     weak = relative < LEAST_FLAT
-    return np.where(weak, 1.0, relative), weak
+    electrons = np.where(weak, 1.0, found) * detector.gain * frames
+    variance = (electrons + detector.read_noise**2 * frames) / electrons**2 if frames > 1 else 0.0
+    return np.where(weak, 1.0, relative), weak, variance
 
 
 def _like(frame: Any, name: str, shape: tuple[int, ...]) -> Counts:
@@ -304,17 +313,20 @@ def _image(
     mask: NDArray[np.bool_],
     exposed: Exposed,
     metadata: Mapping[str, Any] | None,
+    flat_noise: Array | float = 0.0,
 ) -> Image:
     """Image in W from `electrons` (h, w), the mean over `frames` frames, divided by the flat field `response`.
 
-    `dark` is the variance [e-²] of one frame in addition to shot and read noise. The numbers in the metadata are those
-    of the sum of the frames, whose shot noise is that of all its electrons.
+    `dark` is the variance [e-²] of one frame in addition to shot and read noise, `flat_noise` the relative variance of
+    `response`. The numbers in the metadata are those of the sum of the frames, whose shot noise is that of all its
+    electrons.
     """
     per_watt = exposed.per_watt(detector.quantum_efficiency) * frames
     read = detector.read_noise * frames**0.5
     total = np.where(mask, 0, electrons) * frames
     independent = dark * frames
-    error = np.sqrt(np.maximum(total * response, 0) + read**2 + independent) / (per_watt * response)
+    variance = np.maximum(total * response, 0) + read**2 + independent + flat_noise * (total * response) ** 2
+    error = np.sqrt(variance) / (per_watt * response)
     kept: Metadata = dict(metadata or {})
     for name in ("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"):
         kept.pop(name, None)

@@ -30,6 +30,7 @@ from .measurement import tell_misfit, variances
 Array = NDArray[np.float64]
 Picture = Image | Exposure | str | os.PathLike[str]
 GAIN = "gain"  # reserved name: a factor on all powers
+KEPT = 2**28  # bytes of pictures that are not computed again, 256 MB
 PITCH_TOLERANCE = 1e-6  # relative: of the pixel pitch, which files may hold in single precision
 
 
@@ -216,15 +217,19 @@ class _Pictures:
         self.scene, self.names, self.views, self.powers, self.sensor = scene, names, views, powers, sensor
         self.rtol, self.report = rtol, report
         self.first: list[Image] = []
-        self._last: tuple[dict[str, float], tuple[Array, Array]] | None = None
+        self._known: dict[tuple[float, ...], tuple[Array, Array]] = {}
         self._count = 0
 
     def __call__(self, values: Array) -> tuple[Array, Array]:
         found = dict(zip(self.names, map(float, values), strict=True))
         gain = found.pop(GAIN, 1.0)
-        if self._last is None or self._last[0] != found:
-            self._last = found, self._rendered(found)
-        power, error = self._last[1]
+        key = tuple(found.values())
+        if key not in self._known:
+            power, error = self._rendered(found)
+            while self._known and (len(self._known) + 1) * 2 * power.nbytes > KEPT:
+                self._known.pop(next(iter(self._known)))  # the oldest
+            self._known[key] = power, error
+        power, error = self._known[key]
         return gain * power, gain * error
 
     def _rendered(self, found: Mapping[str, float]) -> tuple[Array, Array]:

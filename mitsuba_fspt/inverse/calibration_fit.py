@@ -31,7 +31,7 @@ class CalibrationSettings:
     change : of the picture by a step of the differences, root mean square over that of the picture, for an rtol of
         1e-4, and in proportion to rtol^½. The slopes are then right to about 0.5 %, half of it from the pictures and
         half from the step; at an rtol of 1e-3 to 3 %.
-    chi2 : change of Σ (residual/σ)² at which the fit ends: 1e-3 leaves parameters within 0.03 of their sd
+    chi2 : change of Σ (residual/σ)² at which the fit ends: 1e-2 leaves parameters within 0.1 of their sd
     reweighted : relative change of the standard deviations, root mean square, at which they count as converged
     nearby : steps of the differences within which slopes are taken again; they then belong to a picture that differs by
         less than half of `change`
@@ -46,7 +46,7 @@ class CalibrationSettings:
     rtol: float | None = None
     rtols: tuple[float, float] = (1e-4, 1e-3)
     change: float = 5e-3
-    chi2: float = 1e-3
+    chi2: float = 1e-2
     reweighted: float = 1e-3
     nearby: float = 0.5
     rounds: int = 8
@@ -135,6 +135,14 @@ class Fitted:
     condition: float
 
 
+class _AtMinimum(Exception):
+    """Ends the search at y (p,)."""
+
+    def __init__(self, y: Array) -> None:
+        self.y = np.array(y, np.float64)
+        super().__init__()
+
+
 class CalibrationFit:
     """Fit of parameters `names` to what was `measured`.
 
@@ -183,16 +191,19 @@ class CalibrationFit:
 
     def _minimum(self, y: Array, sigma: Array) -> Array:
         """y (p,) of the minimum for these standard deviations."""
-        found = least_squares(
-            lambda x: ((self._power(x) - self.measured.power) / sigma)[self.measured.used],
-            y,
-            lambda x: self._slopes(x, sigma),
-            x_scale=self.settings.reach,
-            ftol=self.settings.chi2 / max(int(self.measured.used.sum()), 1),
-            xtol=1e-6,
-            gtol=None,
-            max_nfev=self.settings.evaluations,
-        )
+        try:
+            found = least_squares(
+                lambda x: self._residual(x, sigma),
+                y,
+                lambda x: self._slopes_beyond(x, sigma),
+                x_scale=self.settings.reach,
+                ftol=self.settings.chi2 / max(int(self.measured.used.sum()), 1),
+                xtol=1e-6,
+                gtol=None,
+                max_nfev=self.settings.evaluations,
+            )
+        except _AtMinimum as reached:
+            return reached.y
         if found.status == 0:
             values = zip(self.names, self._values(found.x), strict=True)
             shown = ", ".join(f"{name} = {value:.6g}" for name, value in values)
@@ -201,6 +212,21 @@ class CalibrationFit:
                 "nearer, with other <default> values."
             )
         return np.asarray(found.x, np.float64)
+
+    def _residual(self, y: Array, sigma: Array) -> Array:
+        return np.asarray(((self._power(y) - self.measured.power) / sigma)[self.measured.used])
+
+    def _slopes_beyond(self, y: Array, sigma: Array) -> Array:
+        """Slopes at y; raises _AtMinimum where no step lowers Σ (residual/σ)² by more than the fit's end.
+
+        Of a smaller change the errors of the pictures would be the larger part, and the search only tries ever shorter
+        steps.
+        """
+        slopes, residual = self._slopes(y, sigma), self._residual(y, sigma)
+        step = np.linalg.lstsq(slopes, residual)[0]
+        if np.sum((slopes @ step) ** 2) <= self.settings.chi2:
+            raise _AtMinimum(y)
+        return slopes
 
     def _power(self, y: Array) -> Array:
         return self._pictures(self._values(y))[0]

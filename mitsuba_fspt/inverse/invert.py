@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +21,7 @@ from ..runtime.errors import InversionError
 from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
 from .inversion import Inversion
-from .measurement import Measurement, tell_misfit
+from .measurement import LOG, Measurement, tell_misfit
 from .mlem import MlemAccuracy, mlem
 from .multipliers import Multipliers
 from .nonnegative import Accuracy, Solve, factor, minimise
@@ -52,6 +51,11 @@ class Settings:
     seen : of the largest sensitivity per area, the least at which a vertex counts as seen
     block : samples that are computed together
     threads : blocks that are computed at the same time
+    unknowns : most of them to begin with; of a finer mesh, J_n is linear between some of its vertices (Eq. M.30)
+    resolved : least number of unknowns for each one that the data determine; with fewer, and a finer mesh, the fit
+        begins anew with three times as many. What is smoother than the data resolve makes up (2/π)/`resolved` of the
+        variance of a vertex, which intervals then lack: 6 %, or 3 % of their width.
+    rough : times the bounds of variances and weight, the bounds of the first fit, whose J_n only scales the penalty
     """
 
     accuracy: Accuracy = field(default_factory=Accuracy)
@@ -66,6 +70,9 @@ class Settings:
     seen: float = 0.01
     block: int = 25
     threads: int = 2
+    unknowns: int = 6000
+    resolved: float = 10.0
+    rough: float = 10.0
 
 
 def invert(
@@ -123,6 +130,7 @@ def invert(
     with reported(progress) as report:
         found = problem.solved(options, report)
     tell_misfit("invert", found.chi2_sum, found.pixels - found.determined)
+    _tell_unsettled(found, problem.settings.rounds)
     return found
 
 
@@ -166,6 +174,7 @@ class Fit:
     """State of the fit: x = J_n/reference (m,), standard deviations (N,) [W], the weight, determined unknowns γ.
 
     correction : (N,) [W], added to the data: what variances of the fitted signal take from it (Eq. M.29)
+    settled : False where variances or weight still changed in the last round
     """
 
     x: Array
@@ -175,13 +184,16 @@ class Fit:
     weight: float
     determined: float
     decrement: float
+    settled: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Data and penalty on the unknowns x = J_n/reference, over the pixels that see the surface and are not masked.
 
-    rows : numbers of these pixels;  transport : (N, m) [W], the power of x = 1;  data : those pixels of `measurement`
+    rows : numbers of these pixels;  transport : (N, m) [W], the power of x = 1
+    sensitivity : (points,) of the mesh to these pixels [mm²]
+    bounded : (m,) unknowns that some pixel sees: J_n >= 0 holds there, the others only continue them
     """
 
     matrix: TransportMatrix
@@ -189,6 +201,8 @@ class Problem:
     measurement: Measurement
     rows: NDArray[np.int64]
     transport: csr_array
+    sensitivity: Array
+    bounded: NDArray[np.bool_]
     smoothness: Smoothness
     reference: float
     prior: Prior
@@ -203,11 +217,12 @@ class Problem:
         prior: Prior,
         settings: Settings,
     ) -> Problem:
-        whole_matrix = csr_array(matrix.matrix @ surface.spread)
-        rows = np.flatnonzero((np.diff(whole_matrix.indptr) > 0) & ~measurement.mask)
+        rows = np.flatnonzero((np.diff(matrix.matrix.indptr) > 0) & ~measurement.mask)
         if not len(rows):
             raise InversionError("invert: all pixels that see the surface are masked. Expose for a shorter time.")
-        part = csr_array(whole_matrix[rows])
+        columns = csr_array(matrix.matrix[rows])
+        sensitivity = np.bincount(surface.number, columns.sum(axis=0), surface.points).astype(np.float64)
+        part = csr_array(columns @ surface.spread)
         light = float(measurement.power[rows].sum())
         reference = prior.reference or light / float(part.sum())
         if not reference > 0:
@@ -217,21 +232,43 @@ class Problem:
             )
         smooth = Smoothness.of(surface, prior.correlation_length)
         part = csr_array(part * reference)
-        return cls(matrix, surface, measurement, rows, part, smooth, reference, prior, settings)
+        bounded = part.sum(axis=0) > 0
+        return cls(matrix, surface, measurement, rows, part, sensitivity, bounded, smooth, reference, prior, settings)
 
     def solved(self, options: Options, report: Progress) -> Inversion:
-        """Fit and draws. Unless the prior has a reference, the penalty is relative to a first fit."""
+        """Fit and draws, with more unknowns where the data determine too many of them."""
         if options.method == "mlem":
             return self.result(self.most_likely(report), np.empty((self.surface.unknowns, 0)), options)
-        problem, first = self, None
         if options.weight == 0:
             self._require_pixels()
-        elif self.prior.reference is None:
-            first = self.fit(None, report)
-            problem = self.relative_to(first.x)
-        fit = problem.fit(options.weight, report, first)
+        many = options.weight != 0 and self.surface.unknowns > self.settings.unknowns
+        levels = self.surface.coarser() if many else [self.surface]
+        while len(levels) > 1 and levels[-2].unknowns <= self.settings.unknowns:
+            levels.pop()
+        for surface in reversed(levels):
+            problem, fit = self._with(surface).fitted(options, report)
+            if surface.unknowns >= self.settings.resolved * fit.determined:
+                break
         draws = problem.draws(fit, options.samples, options.seed, report)
         return problem.result(fit, draws, options)
+
+    def _with(self, surface: Surface) -> Problem:
+        """The same problem with other unknowns."""
+        if surface is self.surface:
+            return self
+        return Problem.of(self.matrix, self.measurement, surface, self.prior, self.settings)
+
+    def fitted(self, options: Options, report: Progress) -> tuple[Problem, Fit]:
+        """The fit, and the problem with its penalty: relative to a first fit unless the prior has a reference.
+
+        The first fit has no bounds: where its J_n is small or negative, the penalty is relative to the least ρ.
+        """
+        if options.weight == 0 or self.prior.reference is not None:
+            return self, self.fit(options.weight, report)
+        free = replace(self, bounded=np.zeros_like(self.bounded))
+        first = free.fit(None, report, rough=True)
+        problem = self.relative_to(first.x)
+        return problem, problem.fit(options.weight, report, first)
 
     def _require_pixels(self) -> None:
         """Raise InversionError where fewer pixels than unknowns leave J_n undetermined without a penalty."""
@@ -246,19 +283,17 @@ class Problem:
         """Mean of the prior over the reference."""
         return self.prior.mean / self.reference
 
-    @cached_property
-    def bounded(self) -> NDArray[np.bool_]:
-        """(m,) unknowns that some pixel sees: J_n >= 0 holds there, the others only continue them."""
-        return self.transport.sum(axis=0) > 0
-
     def relative_to(self, x: Array) -> Problem:
         """The same problem with a penalty relative to a first fit x: ρ = J_n, at least a share of the reference."""
         light = np.maximum(x, self.settings.darkest)
         relative = np.where(self.bounded, light, 1.0)
         return replace(self, smoothness=Smoothness.of(self.surface, self.prior.correlation_length, relative))
 
-    def fit(self, weight: float | None, report: Progress, start: Fit | None = None) -> Fit:
-        """Minimum with variances from its own signal and, where `weight` is None, the weight of Eq. M.25."""
+    def fit(self, weight: float | None, report: Progress, start: Fit | None = None, rough: bool = False) -> Fit:
+        """Minimum with variances from its own signal and, where `weight` is None, the weight of Eq. M.25.
+
+        The weight is a fixed point, whose logarithm is sought by secants.
+        """
         power = self.measurement.power[self.rows]
         numerical = np.zeros_like(power)
         # A start that no bright or dark pixel leads astray: the same noise on all of them.
@@ -269,14 +304,22 @@ class Problem:
         if weight is None:
             state = replace(state, weight=self._first_weight(sigma))
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (self.surface.unknowns, self.settings.probes))
+        looser = self.settings.rough if rough else 1.0
+        settled, tried = False, list[tuple[float, float]]()
         for turn in range(self.settings.rounds):
             report("fit", turn / self.settings.rounds)
             before, state = state, self._improved(state, probes, weight, self.settings.drawn)
             drift = float(np.sqrt(np.mean((state.sigma / before.sigma - 1) ** 2)))
             changed = abs(np.log(state.weight / before.weight)) if weight is None else 0.0
-            if drift < self.settings.reweighted and changed < self.settings.weight:
+            settled = bool(drift < looser * self.settings.reweighted and changed < looser * self.settings.weight)
+            if settled:
                 break
-        return self._improved(state, probes, weight, self.settings.accuracy)
+            if weight is None:
+                tried = [*tried[-1:], (float(np.log(before.weight)), float(np.log(state.weight)))]
+                state = replace(state, weight=float(np.exp(_secant(tried))))
+        if not rough and state.decrement > self.settings.accuracy.decrement:
+            state = self._improved(state, probes, weight, self.settings.accuracy)
+        return replace(state, settled=settled)
 
     def most_likely(self, report: Progress) -> Fit:
         """Maximum of the likelihood without a penalty."""
@@ -295,7 +338,7 @@ class Problem:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
         normal, solve = self._normal(state.sigma, state.weight)
         right = self._right(self.measurement.power[self.rows] + state.correction, state.sigma, state.weight)
-        start = Multipliers(solve, self.bounded).start(right[:, None])
+        start = Multipliers(solve, self.bounded).start(right[:, None], state.x)
         found = minimise(normal, right[:, None], start, self.bounded, solve, accuracy)
         x = found.x[:, 0]
         determined = self._determined(normal, solve, state.weight, probes)
@@ -369,7 +412,7 @@ class Problem:
 
         def block(size: int, sequence: np.random.SeedSequence) -> Array:
             right, factors = self._drawn(fit, size, np.random.default_rng(sequence))
-            found = minimise(normal, right, multipliers.start(right), self.bounded, solve, self.settings.drawn)
+            found = minimise(normal, right, multipliers.start(right, fit.x), self.bounded, solve, self.settings.drawn)
             return found.x * factors
 
         found = []
@@ -400,11 +443,12 @@ class Problem:
 
     def result(self, fit: Fit, draws: Array, options: Options) -> Inversion:
         """What the fit and the draws say, on the columns of the matrix."""
-        columns = self.surface.number
-        areas = np.where(self.surface.areas > 0, self.surface.areas, np.inf)
-        per_area = self.transport.sum(axis=0) / areas
+        spread = self.surface.spread * self.reference
+        solution = spread @ fit.x
+        areas = self.surface.point_areas
+        per_area = self.sensitivity / np.where(areas > 0, areas, np.inf)
         seen = per_area >= self.settings.seen * per_area.max()
-        fitted = (self.matrix @ (fit.x * self.reference)[columns]).reshape(self.matrix.image_shape)
+        fitted = (self.matrix @ solution).reshape(self.matrix.image_shape)
         residual = (self.measurement.power[self.rows] - self.transport @ fit.x) / fit.sigma
         sigma = np.full(self.matrix.shape[0], np.nan)
         sigma[self.rows] = fit.sigma
@@ -412,18 +456,39 @@ class Problem:
         return Inversion(
             matrix=self.matrix,
             surface=self.surface,
-            solution=(fit.x * self.reference)[columns],
-            draws=draws[columns] * self.reference,
-            seen=seen[columns] & self.matrix.seen,
+            solution=solution,
+            draws=np.asarray(spread @ draws),
+            seen=seen[self.surface.number] & self.matrix.seen,
             confidence=options.confidence,
             weight=fit.weight,
             reference=self.reference,
             determined=fit.determined,
             pixels=len(self.rows),
             decrement=fit.decrement,
+            settled=fit.settled,
             gain_error=self.measurement.gain_error,
             chi2_sum=float(residual @ residual),
             measured=np.where(self.measurement.mask, np.nan, self.measurement.power).reshape(views),
             fitted=fitted,
             sigma=sigma.reshape(views),
+        )
+
+
+def _secant(tried: Sequence[tuple[float, float]]) -> float:
+    """Next x towards g(x) = x from the last pairs (x, g(x)): the secant's, with its slope in -1 … 0.8 lest it leaps."""
+    x, found = tried[-1]
+    slope = 0.0
+    if len(tried) > 1 and abs(x - tried[-2][0]) > 1e-12:
+        slope = float(np.clip((found - tried[-2][1]) / (x - tried[-2][0]), -1.0, 0.8))
+    return x + (found - x) / (1 - slope)
+
+
+def _tell_unsettled(found: Inversion, rounds: int) -> None:
+    """Say in one line on stderr that the rounds were too few for variances and weight."""
+    if not found.settled:
+        LOG.warning(
+            "fspt: invert: variances and weight still change after %d rounds; the last ones are kept. Give a weight, "
+            "for example %.3g.",
+            rounds,
+            found.weight,
         )

@@ -33,18 +33,21 @@ class Multipliers:
         self._count = 0
         self._lock = Lock()
 
-    def start(self, right: Array) -> Array:
-        """x (m, k) >= 0 for right-hand sides (m, k): the minimum, or near it where active sets did not become final."""
-        free = self._solve(right)
-        return np.stack([self._one(column) for column in free.T], axis=1)
+    def start(self, right: Array, near: Array) -> Array:
+        """x (m, k) >= 0 for right-hand sides (m, k): the minimum, or near it where active sets did not become final.
 
-    def _one(self, free: Array) -> Array:
+        near : (m,), whose zeros are the first active set
+        """
+        free, first = self._solve(right), np.flatnonzero(self._bounded & (near == 0))
+        return np.stack([self._one(column, first) for column in free.T], axis=1)
+
+    def _one(self, free: Array, first: Index) -> Array:
         """x (m,) from the minimum without bounds: exact on a set of unknowns that grows until no other one is < 0."""
         x, among = free, np.empty(0, np.int64)
         slack = 1e-12 * float(np.abs(free).max())
         for _ in range(ROUNDS):
             below = np.flatnonzero(self._bounded & (x < -slack))
-            grown = np.union1d(among, below)
+            grown = np.union1d(among if len(among) else first, below)
             if len(grown) == len(among) or (columns := self._inverse(grown)) is None:
                 break
             among = grown

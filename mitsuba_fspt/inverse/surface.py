@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from ..rendering.provenance import same_mesh, scene_digest
 from ..rendering.scene import load
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, SceneError
+from .coarse_basis import coarser, neighbours
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 SLIVER = 1e-6  # least sine of an angle: a triangle flatter than that counts as if it had this one
+LEAST = 500  # unknowns that are not made fewer
 AREA_TOLERANCE = 1e-3  # relative: float32 positions may change an area of the mesh by so much
 
 
@@ -35,7 +37,8 @@ class Surface:
 
     vertices : (V, 3) [mm], in the frame of the scene;  faces : (F, 3), indices of vertices
     parts : shape id → slice of columns;  on : 'vertex' or 'face', what a column is
-    number : (n,) the unknown of each column: coincident vertices of one mesh share an unknown
+    number : (n,) the point of each column: coincident vertices of one mesh are one point
+    basis : (points, m) the functions ψ of the m unknowns at the points (Eq. M.30); None: each point is an unknown
     """
 
     vertices: Array
@@ -43,6 +46,7 @@ class Surface:
     parts: Mapping[str, slice]
     on: str
     number: NDArray[np.int64]
+    basis: csr_array | None = None
 
     @classmethod
     def of(cls, matrix: TransportMatrix, scene: object = None) -> Surface:
@@ -81,30 +85,64 @@ class Surface:
     @property
     def unknowns(self) -> int:
         """Number m of unknowns."""
+        return self.points if self.basis is None else int(self.basis.shape[1])
+
+    @cached_property
+    def points(self) -> int:
+        """Number of points."""
         return int(self.number.max()) + 1
 
     @cached_property
     def spread(self) -> csr_array:
-        """(n, m): J_n of the columns from the unknowns, one entry 1 in every row."""
+        """(n, m): J_n of the columns from the unknowns; rows sum to 1."""
         n = len(self.number)
-        return csr_array((np.ones(n), (np.arange(n), self.number)), shape=(n, self.unknowns))
+        joined = csr_array((np.ones(n), (np.arange(n), self.number)), shape=(n, self.points))
+        return joined if self.basis is None else csr_array(joined @ self.basis)
 
     @cached_property
-    def areas(self) -> Array:
-        """(m,) ∫ φ dS of each unknown [mm²], the lumped mass."""
+    def point_areas(self) -> Array:
+        """(points,) ∫ φ dS of each point [mm²], the lumped mass of the mesh."""
         area = face_areas(self.vertices, self.faces)
         if self.on == "face":
             return area
-        return np.bincount(self._corners.ravel(), np.repeat(area / 3, 3), self.unknowns).astype(np.float64)
+        return np.bincount(self._corners.ravel(), np.repeat(area / 3, 3), self.points).astype(np.float64)
+
+    @cached_property
+    def areas(self) -> Array:
+        """(m,) ∫ ψ dS of each unknown [mm²], the lumped mass."""
+        return self.point_areas if self.basis is None else np.asarray(self.basis.T @ self.point_areas)
 
     @cached_property
     def stiffness(self) -> csr_array:
-        """(m, m) of −Δ: ∫ ∇φ_i · ∇φ_j dS for vertices (Eq. M.22); over faces, lengths of edges over distances."""
-        return self._of_faces() if self.on == "face" else self._of_vertices()
+        """(m, m) of −Δ: ∫ ∇ψ_i · ∇ψ_j dS for vertices (Eq. M.22); over faces, lengths of edges over distances."""
+        found = self._of_faces() if self.on == "face" else self._of_vertices()
+        return found if self.basis is None else csr_array(self.basis.T @ found @ self.basis)
+
+    def coarser(self) -> list[Surface]:
+        """This surface, and the same with fewer and fewer unknowns, a half to a quarter each time, to some hundred.
+
+        Of J_n on faces the second has its unknowns on the vertices, whose mean is that of a face.
+        """
+        found = [self]
+        if self.on == "face":
+            places, corners = merge(self.vertices, self.faces)
+            entries = np.full(corners.size, 1 / 3), (np.repeat(np.arange(len(corners)), 3), corners.ravel())
+            found.append(replace(self, basis=csr_array(entries, shape=(len(corners), len(places)))))
+        else:
+            places, corners = np.empty((self.points, 3)), self._corners
+            places[self.number] = self.vertices
+        graph = neighbours(corners, len(places))
+        while len(places) > LEAST:
+            basis, graph, chosen = coarser(graph, places)
+            if len(chosen) > 0.7 * len(places):  # pieces of few vertices, which stay as they are
+                break
+            places, finer = places[chosen], found[-1].basis
+            found.append(replace(self, basis=basis if finer is None else csr_array(finer @ basis)))
+        return found
 
     @property
     def _corners(self) -> NDArray[np.int64]:
-        """(F, 3) unknowns of the corners of each face, on vertices."""
+        """(F, 3) points of the corners of each face, on vertices."""
         return self.number[self.faces]
 
     def _of_vertices(self) -> csr_array:
@@ -119,7 +157,7 @@ class Surface:
             rows.append(self._corners[:, (k + 1) % 3])
             columns.append(self._corners[:, (k + 2) % 3])
             values.append(0.5 * np.einsum("fi,fi->f", one, other) / np.maximum(sine, floor))
-        return _laplacian(np.concatenate(rows), np.concatenate(columns), np.concatenate(values), self.unknowns)
+        return _laplacian(np.concatenate(rows), np.concatenate(columns), np.concatenate(values), self.points)
 
     def _of_faces(self) -> csr_array:
         """For the two faces of an edge: its length over the way from centre to centre by the middle of the edge."""
@@ -134,12 +172,12 @@ class Surface:
         one, other = order[:-1][same], order[1:][same]
         middle, length = ends[one].mean(axis=1), np.linalg.norm(ends[one, 1] - ends[one, 0], axis=1)
         way = sum(np.linalg.norm(centre[owner[k]] - middle, axis=1) for k in (one, other))
-        return _laplacian(owner[one], owner[other], length / np.maximum(way, 1e-30), self.unknowns)
+        return _laplacian(owner[one], owner[other], length / np.maximum(way, 1e-30), self.points)
 
     def _require_areas(self, areas: Array) -> None:
         """Raise InversionError where the areas of the columns differ from those that the matrix was made with."""
-        own = np.bincount(self.number, areas, self.unknowns)
-        if len(areas) != len(self.number) or np.abs(own - self.areas).max() > AREA_TOLERANCE * self.areas.max():
+        true, own = self.point_areas, np.bincount(self.number, areas, self.points)
+        if len(areas) != len(self.number) or np.abs(own - true).max() > AREA_TOLERANCE * true.max():
             raise InversionError(
                 "invert: the meshes of the scene have other areas than those of the matrix. Give 'scene', the scene "
                 "that the matrix was made from, or make the matrix again."

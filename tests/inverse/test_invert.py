@@ -95,17 +95,17 @@ def test_multipliers_give_the_minimum(monkeypatch):
     solve, right = factor(csr_array(dense.T @ dense)), dense.T @ data
     expected = np.stack([nnls(dense, column)[0] for column in data.T], axis=1)
     assert (expected == 0).sum() > 40
-    found = multipliers.Multipliers(solve, np.ones(40, bool)).start(right)
+    found = multipliers.Multipliers(solve, np.ones(40, bool)).start(right, np.ones(40))
     np.testing.assert_allclose(found, expected, atol=1e-10)
     assert ((found == 0) == (expected == 0)).all()
     half = np.arange(40) < 20
-    found = multipliers.Multipliers(solve, half).start(right)
+    found = multipliers.Multipliers(solve, half).start(right, np.ones(40))
     least = np.where(half, 0, -np.inf)
     expected = [lsq_linear(dense, column, (least, np.inf), method="bvls").x for column in data.T]
     np.testing.assert_allclose(found, np.transpose(expected), atol=1e-8)
     assert (found[20:] < 0).any()
     monkeypatch.setattr(multipliers, "MOST", 0)
-    cut = multipliers.Multipliers(solve, np.ones(40, bool)).start(right)
+    cut = multipliers.Multipliers(solve, np.ones(40, bool)).start(right, np.ones(40))
     np.testing.assert_allclose(cut, np.maximum(solve(right), 0))
 
 
