@@ -1,14 +1,14 @@
 """Errors of the integral on random scenes, against an independent float64 reference.
 
     python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
-    python scripts/audit.py --ablate all|doubt,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
+    python scripts/audit.py --ablate all|kink,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
 
 Scenes of every family of `validation/random_scenes.py`, each rendered by `fspt_integral`. On 24 pixels of each,
 `fan_reference` gives the power with its own error: 16 where errors are likely (large stated errors, edges, curved
 pictures) and 8 at random. A pixel counts as beyond a limit only by more than the reference's error. Writes audit.csv,
 one line a scene, and prints the table by family.
 
-With `--ablate` the same pixels are looked at without each threshold of `integral/estimator.py` in turn: how many are
+With `--ablate` the same pixels are evaluated without each threshold of `integral/estimator.py` in turn: how many are
 beyond `rtol` and beyond the stated error, and what it costs. Writes ablation.csv.
 """
 
