@@ -24,7 +24,6 @@ class Estimator:
     falloff : of rtol. One line of sight a pixel suffices if cos⁴θ varies by less over the pupil
     in_pixel : blur radius [pixels] up to which one line of sight suffices: the curvature of the image, from which its
         error follows, is that over a pixel
-    curvature : of the tolerance. Pixels with a larger curvature of the image take twelve nodes
     missed_body : ratio of the light that surfaces send to a pixel to that of the lines of sight around, above which
         four nodes replace one: a body 0.9 to 1.4 pixels wide may lie between single lines
     largest_gain : largest factor by which twelve nodes reduce the estimate for four, as both may agree by chance on a
@@ -45,7 +44,6 @@ class Estimator:
     slant : the same of transects across a sharp edge, over their number to the power 3/2: the edge is slanted
     corner : error of a corner of a sharp edge between transects, over the light and the squared number of transects
     step_ratio : remaining error over the change from one node rule to the next where no transect crosses a jump
-    uneven : change over the value above which J_n is not smooth and transects go on
     new_jump : remaining error over the tolerance where a jump is crossed for the first time, so that a level follows
     neighbour_share : share of a neighbour's remaining error that counts, as its edge may reach into the pixel; all of
         it where an edge is sharp
@@ -54,7 +52,6 @@ class Estimator:
     sharp : blur radius [pixels] below which transects are placed in the pixel instead of the pupil
     least_jump : of the tolerance. Smaller steps of the radiance along a transect are no jumps
     steep : a step of the radiance along a transect is a jump if it is so many times the mean of the other steps
-    faint : of the brightest pixel. Jumps of pixels with less light do not count
 
     Of lattices:
 
@@ -64,7 +61,6 @@ class Estimator:
 
     falloff: float = _bound(0.1, 1.0)
     in_pixel: float = _bound(0.5, 1.0)
-    curvature: float = _bound(0.25, 1.0)
     missed_body: float = _bound(2.0, 1e30)
     largest_gain: float = _bound(8.0, 1e30)
     smooth_ratio: float = _bound(0.5, 0.0)
@@ -79,7 +75,6 @@ class Estimator:
     slant: float = _bound(2.0, 0.0)
     corner: float = _bound(1 / 8, 0.0)
     step_ratio: float = _bound(2.0, 0.0)
-    uneven: float = _bound(1e-2, 1e30)
     new_jump: float = _bound(1.5, 0.0)
     neighbour_share: float = _bound(0.5, 0.0)
     unexpected: float = _bound(3.0, 1e30)
@@ -87,7 +82,6 @@ class Estimator:
     sharp: float = _bound(0.2, 0.0)
     least_jump: float = _bound(0.1, 0.0)
     steep: float = _bound(4.0, 1e30)
-    faint: float = _bound(1e-5, 0.0)
     student_t: float = _bound(4.1, 1.0)
     missed_share: float = _bound(6.9, 0.0)
 

@@ -64,7 +64,7 @@ def first_nodes(draft: Draft, light: NDArray[np.float64]) -> Mask:
     bend = grid.spread_max(bend)
     draft.error = dr.maximum(bend, draft.edge_error())
     tolerance = draft.tolerance
-    rough = (draft.error > tolerance) | (bend > draft.estimator.curvature * tolerance)
+    rough = draft.error > tolerance
     dr.eval(draft.error, rough)
     if (neighbours and min(grid.shape) < 3) or not draft.quadrature.takes("smooth"):
         rough = grid.full(mi.Bool, True)

@@ -69,8 +69,7 @@ class _Refinement:
             self.edges.update(draft, self.means, self.has_jump, across=level % 2 == 0)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
         # The outline of a dark body counts only where some lines of sight meet light.
-        lit = means.value > dr.opaque(mi.Float64, self.estimator.faint) * draft.peak
-        first_met = where & means.jumps & lit & ~self.has_jump
+        first_met = where & means.jumps & (means.value > 0) & ~self.has_jump
         self.has_jump |= first_met
         self.smooth = self.smooth & where & ~self.has_jump
         value, coverage = self._smooth_by_nodes(level)
@@ -79,7 +78,6 @@ class _Refinement:
             remaining, around = self._after_first(first_met, moved, parted(coverage))
         else:
             remaining, around = self._after_later(level, first_met, moved, len(rule))
-            self.smooth = self.smooth & (moved < self.estimator.uneven * value)
         # An edge may reach into pixels around whose transects have crossed no jump.
         around = dr.select((self.has_jump & where) | ~draft.computed, 0, around)
         self.remaining = dr.select(where, remaining, self.remaining)
