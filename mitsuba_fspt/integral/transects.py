@@ -73,11 +73,12 @@ class _Refinement:
         self.has_jump |= first_met
         self.smooth = self.smooth & where & ~self.has_jump
         value, coverage = self._smooth_by_nodes(level)
-        moved = dr.abs(value - draft.value)
+        change = dr.abs(value - draft.value)
         if level == 0:
-            remaining, around = self._after_first(first_met, moved, parted(coverage))
+            remaining, around = self._after_first(first_met, change, parted(coverage))
         else:
-            remaining, around = self._after_later(level, first_met, moved, len(rule))
+            remaining, around = self._after_later(level, first_met, change, len(rule))
+            self.smooth = self.smooth & (value > 0)  # where all is dark, only transects detect a small body
         # An edge may reach into pixels around whose transects have crossed no jump.
         around = dr.select((self.has_jump & where) | ~draft.computed, 0, around)
         self.remaining = dr.select(where, remaining, self.remaining)
@@ -116,22 +117,24 @@ class _Refinement:
         blurred = dr.maximum(share * near, dr.select(met_before, 0, with_jump))
         return dr.select(self.edges.sharp, near, blurred)
 
-    def _after_first(self, first_met: Mask, moved: PixelArray, silhouette: Mask) -> tuple[PixelArray, PixelArray]:
+    def _after_first(self, first_met: Mask, change: PixelArray, silhouette: Mask) -> tuple[PixelArray, PixelArray]:
         """Error that remains after the first transects, and error of pixels around a jump, which may have missed it.
 
         Two transects that agree with the nodes suffice on a silhouette, which coverage shows too, but not on a step of
         J_n.
         """
         draft, estimator = self.draft, self.estimator
-        at_jump = dr.maximum(estimator.first_ratio * moved, self.means.scatter)
+        at_jump = dr.maximum(estimator.first_ratio * change, self.means.scatter)
         at_jump = dr.select(silhouette, at_jump, self._above_tolerance(at_jump))
         elsewhere = dr.select(parted(draft.coverage), draft.error, draft.roughness)
-        elsewhere = dr.maximum(estimator.nodes_ratio * moved, elsewhere)
+        elsewhere = dr.maximum(estimator.nodes_ratio * change, elsewhere)
         # Pixels that another solution gives take no transects; their outlines count as jumps here.
         jumps = first_met | (draft.outline & ~draft.computed)
         return dr.select(first_met, at_jump, elsewhere), draft.missed_edge_error(jumps)
 
-    def _after_later(self, level: int, first_met: Mask, moved: PixelArray, count: int) -> tuple[PixelArray, PixelArray]:
+    def _after_later(
+        self, level: int, first_met: Mask, change: PixelArray, count: int
+    ) -> tuple[PixelArray, PixelArray]:
         """Error that remains after a later level, and error around pixels that this level changed beyond their error.
 
         The smaller the change of the value relative to the error before, the smaller the error that remains; but the
@@ -140,16 +143,17 @@ class _Refinement:
         """
         before, estimator = self.remaining, self.estimator
         least, most = estimator.least_ratio, estimator.most_ratio
-        change = dr.maximum(moved, before * dr.opaque(mi.Float64, (self.count / count) ** estimator.order))
-        ratio = dr.clip(dr.select(before > 0, most * change / before, most), least, most)
-        remaining = dr.maximum(change * ratio, self.means.scatter)
+        least_change = before * dr.opaque(mi.Float64, (self.count / count) ** estimator.order)
+        assumed = dr.maximum(change, least_change)
+        ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), least, most)
+        remaining = dr.maximum(assumed * ratio, self.means.scatter)
         if level <= node_rules.SMOOTH_LEVELS:
             # On smooth pixels the next node rule changes the value by less than this one did.
-            remaining = dr.select(self.smooth, estimator.step_ratio * moved, remaining)
+            remaining = dr.select(self.smooth, estimator.step_ratio * change, remaining)
         remaining = dr.select(first_met, self._above_tolerance(remaining), remaining)
         expected = dr.maximum(dr.opaque(mi.Float64, estimator.unexpected) * before, self.draft.tolerance)
-        unexpected = self.where & (moved > expected)
-        return remaining, self.draft.near_edge(dr.select(first_met | unexpected, moved, 0))
+        unexpected = self.where & (change > expected)
+        return remaining, self.draft.near_edge(dr.select(first_met | unexpected, change, 0))
 
 
 # ---------------------------------------------------------------------- direction and blur of edges

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 DRAFT = 0.03  # rtol of a picture while a parameter moves
-DRAFT_NODES = 16  # lines of sight of a pixel in it: silhouettes that twelve leave unsettled wait for the full picture
+DRAFT_NODES = 16  # lines of sight of a pixel in it: silhouettes beyond the accuracy of twelve wait for the full picture
 DRAFT_SAMPLES = 8  # a pixel, of such a picture by Monte Carlo
 RIGID = 1e-6  # by which the rows of a rotation may differ from orthonormal ones
 Stamp = tuple[int, int] | None
