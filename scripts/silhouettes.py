@@ -1,14 +1,14 @@
 """Order of convergence on silhouettes: error against lines of sight, where one edge crosses a pixel and where two do.
 
-    python scripts/silhouettes.py [--f-number 2.8] [--pixels 100] [--out docs]
+    python scripts/silhouettes.py [--f-number 2.8] [--pixels 24] [--out docs]
 
 Two glowing spheres, the near one before the far one, as in scenes/two_spheres.xml. On the pixels whose four nodes a
 silhouette parts: four and twelve nodes, ever more transects, as many on every pixel and each looked into as for rtol
-1e-5, and lattices of ever more points. The truth is the float64 reference of `validation`, which finds the edges
-exactly and shares no code with the integral, on so many random pixels of each kind; its own error, the RMS of 4.1
-standard errors, stands above each table. Errors are relative to the brightest pixel; the order p of error ∝ lines of
-sight^-p is fitted from twelve nodes to 24 transects, beyond which rounding is visible. Writes silhouettes.csv and
-prints the tables.
+1e-5, and lattices of ever more points. The reference is that of `validation` in float64, which finds the edges exactly
+and shares no code with the integral, on so many random pixels of each kind; the RMS of its own standard error stands
+above each table. Errors are relative to the brightest pixel. The order p of error ∝ lines of sight^-p is fitted where
+one edge crosses a pixel from twelve nodes to 24 transects, beyond which rounding is visible, where two do from two
+transects on. Writes silhouettes.csv and prints the tables.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mitsuba_fspt.integral import node_rules
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.runtime.atomic_files import atomic_path
 from mitsuba_fspt.studies.convergence import fitted_order
-from mitsuba_fspt.validation.fan_reference import LINES, FanReference, Stops
+from mitsuba_fspt.validation.fan_reference import CERTAIN, FanReference, Stops
 from mitsuba_fspt.validation.reference import Camera
 from mitsuba_fspt.validation.reference_bodies import Body, Simple
 from mitsuba_fspt.validation.reference_shapes import Sphere
@@ -35,10 +35,13 @@ if TYPE_CHECKING:
     from mitsuba_fspt.integral.draft import Draft
 
 RTOL = 1e-5
-GOAL = 3e-7  # error of the reference over the brightest pixel
-LATTICES = (1 << 10, 1 << 12, 1 << 14)
+GOAL, FANS = 3e-7, 8192  # of the reference: error over the brightest pixel at which it ends, fans at most
+LATTICES = (1 << 10, 1 << 12, 1 << 14, 1 << 16)
 SHARES = {"RMS": None, "median": 0.5, "90 %": 0.9, "99 %": 0.99}  # of the pixels that are no worse
-FITTED = ("12 nodes", "2 transects", "8 transects", "24 transects")
+FITTED = {
+    "one edge": ("12 nodes", "2 transects", "8 transects", "24 transects"),
+    "two edges": tuple(f"{count} transects" for count in node_rules.TRANSECT_LEVELS),
+}
 # Frame of the camera, which looks along +z: centre [mm], radius [mm], J_n [W/mm²].
 SPHERES = {"far": ((0.0, 0.0, 175.0), 10.0, 1e-3), "near": ((-7.0, 4.0, 130.0), 5.0, 3e-3)}
 LENS = {"focal_length": 55.0, "focus_distance": 165.0, "pixel_pitch": 0.108}
@@ -58,7 +61,7 @@ def main() -> None:
     """Measure, write the file, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--f-number", type=float, default=2.8)
-    parser.add_argument("--pixels", type=int, default=100)
+    parser.add_argument("--pixels", type=int, default=24)
     parser.add_argument("--out", type=Path, default=Path("docs"))
     arguments = parser.parse_args()
     arguments.out.mkdir(exist_ok=True)
@@ -72,14 +75,13 @@ def main() -> None:
         sheet.writerow(["pixels", "rule", "lines_of_sight_a_pixel", *SHARES])
         for kind, among in kinds.items():
             chosen = np.random.default_rng(1).permutation(np.flatnonzero(among))[: arguments.pixels]
-            truth, uncertain = reference(arguments.f_number, chosen)
+            exact, standard_error = reference(arguments.f_number, chosen)
             peak = float(draft.peak[0])
-            errors = [(rule, shares(np.abs(rule.value - truth) / peak)) for rule in rules(draft, chosen)]
+            errors = [(rule, shares(np.abs(rule.value - exact) / peak)) for rule in rules(draft, chosen)]
             sheet.writerows([kind, r.name, f"{r.rays:.5g}", *map("{:.3g}".format, e)] for r, e in errors)
-            report(
-                f"{kind}, {len(chosen)} of {among.sum()} pixels, truth ± {np.sqrt(np.mean(uncertain**2)) / peak:.0e}",
-                errors,
-            )
+            uncertain = np.sqrt(np.mean(standard_error**2)) / peak
+            title = f"{kind}, {len(chosen)} of {among.sum()} pixels, reference ± {uncertain:.0e}"
+            report(title, errors, FITTED[kind])
 
 
 def draft_of(names: list[str], f_number: float) -> Draft:
@@ -119,7 +121,7 @@ def on_film(draft: Draft, values: object) -> np.ndarray:
 
 
 def reference(f_number: float, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean radiance on film [W/mm²/sr] of pixels, numbered row by row, and its error, both in float64."""
+    """Mean radiance on film [W/mm²/sr] of pixels, numbered row by row, and its standard error, both in float64."""
     camera = Camera(**LENS, f_number=f_number, width=SIZE, height=SIZE)
     bodies = [
         Body(Simple(Sphere(centre, radius)), lambda points, _, j=exitance: np.full(len(points), j), most=exitance)
@@ -128,8 +130,8 @@ def reference(f_number: float, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarr
     etendue = camera.scale * math.pi  # [mm² sr] of a pixel on the axis
     goal = GOAL * camera.scale * max(exitance for *_, exitance in SPHERES.values())
     pixels = np.stack(np.unravel_index(chosen, (SIZE, SIZE)), axis=1)
-    power, error = FanReference(camera, Stops.of(camera), bodies).power(pixels, goal, most=LINES[-1])
-    return power / etendue, error / etendue
+    power, error = FanReference(camera, Stops.of(camera), bodies).power(pixels, goal, most=FANS)
+    return power / etendue, error / etendue / CERTAIN
 
 
 def rules(draft: Draft, chosen: np.ndarray) -> list[Rule]:
@@ -159,7 +161,7 @@ def rules(draft: Draft, chosen: np.ndarray) -> list[Rule]:
         means = apply_transects(draft, where, edges, node_rules.transects(count), along)
         note(f"{count} transects", means.value, since)
         if level == 0:  # the edges that were met say how blurred they are
-            edges.learn(draft, means, where)
+            edges.update(draft, means, where)
     means, since, last = Means.none(draft.grid.pixels(where)), draft.rays, 0
     for points in LATTICES:  # each with the points of the one before
         means, last = means.refined(draft, last, points), points
@@ -174,13 +176,13 @@ def shares(error: np.ndarray) -> list[float]:
     return [np.sqrt(np.mean(error**2)) if s is None else np.quantile(error, s) for s in SHARES.values()]
 
 
-def report(title: str, measured: list[tuple[Rule, list[float]]]) -> None:
-    """The table of one kind of pixels, as Markdown, with the orders of nodes and transects and of lattices."""
+def report(title: str, measured: list[tuple[Rule, list[float]]], fitted: tuple[str, ...]) -> None:
+    """The table of one kind of pixels, as Markdown, with the orders of the rules `fitted` and of lattices."""
     print(f"\n| {title} | lines of sight a pixel | {' | '.join(SHARES)} |\n|---|---|{'---|' * len(SHARES)}")
     for rule, errors in measured:
         print(f"| {rule.name} | {rule.rays:.0f} | {' | '.join(f'{e:.1e}' for e in errors)} |")
     groups = {
-        "order of nodes and transects": [entry for entry in measured if entry[0].name in FITTED],
+        f"order from {fitted[0]} to {fitted[-1]}": [entry for entry in measured if entry[0].name in fitted],
         "order of lattices": [entry for entry in measured if "lattices" in entry[0].name],
     }
     for name, group in groups.items():

@@ -80,8 +80,8 @@ def calibrate(
             )
         except UndeterminedError as error:
             if as_json:
-                told = {"determined": False, "condition": error.condition, "combinations": error.combinations}
-                print_result("", told, as_json=True, quiet=quiet)
+                refusal = {"determined": False, "condition": error.condition, "combinations": error.combinations}
+                print_result("", refusal, as_json=True, quiet=quiet)
             raise
     record: dict[str, Any] = {"determined": True, **found.summary()}
     if output is not None:

@@ -26,7 +26,7 @@ def stability(
     as_json: Rows = False,
     quiet: Quiet = False,
 ) -> None:
-    """Try stiff and extreme cases against the truth: each must be right to its tolerance, or refused."""
+    """Compute stiff and extreme cases: each must agree with its reference to a tolerance, or be refused."""
     from ..validation.stability import check
     from ..validation.stiff_cases import cases
 
@@ -52,7 +52,7 @@ def explain(
     as_json: Rows = False,
     quiet: Quiet = False,
 ) -> None:
-    """Tell what the integral leaves out of a scene, why, and what that saves: 'render --no-shortcuts' goes without."""
+    """List the integral's shortcuts on a scene, with reason and time saved; 'render --no-shortcuts' takes none."""
     with progress_bar(quiet):
         from ..rendering.scene import load
         from ..studies.explain import HEADER, explain

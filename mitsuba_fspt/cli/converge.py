@@ -48,5 +48,5 @@ def converge(
         found = converge(loaded, rounds=rounds, budget=budget, reference=reference, kernels=kernels, progress=progress)
     with png_file(found, figure):  # both files or none
         write_csv(found, sheet)
-    text = f"{found.render_text()}\n\n{sheet}: every setting; {figure}: the same to look at"
+    text = f"{found.render_text()}\n\n{sheet}: every setting; {figure}: the same as a figure"
     print_result(text, found.to_dict(), as_json=as_json, quiet=quiet)

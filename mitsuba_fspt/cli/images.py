@@ -165,7 +165,7 @@ def expose(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Expose a CCD to an image: electrons, and counts if asked.
+    """Expose a CCD to an image: electrons, and with --counts counts.
 
     The CCD is that of CAMERA.toml, or a typical cooled one (not a data sheet);
     options replace its numbers.

@@ -108,7 +108,7 @@ def render(
     unit: Unit = "W",
     wavelength_nm: WavelengthNm = None,
     define: Parameters = None,
-    png: Annotated[bool, typer.Option("--png", help="Also write a picture to look at, beside the image.")] = False,
+    png: Annotated[bool, typer.Option("--png", help="Also write the image as a PNG picture.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -252,4 +252,4 @@ def _summary_text(summary: dict[str, Any]) -> str:
     """A line for each file of an image."""
     numbers = f"total {summary['total_power']:.6g} W, brightest pixel {summary['peak']:.6g} {summary['unit']}"
     line = f"{summary['output']}: {numbers}, {summary['wall_time']:.3g} s"
-    return f"{line}\n{summary['picture']}: the same to look at" if "picture" in summary else line
+    return f"{line}\n{summary['picture']}: the same as a picture" if "picture" in summary else line

@@ -72,7 +72,7 @@ def sweep(
         sheet = _written_sheet(rows, folder / "contact_sheet.png")
     record = {"index": str(folder / INDEX), "contact_sheet": sheet and str(sheet)}
     text = f"{folder / INDEX}: {len(rows)} points, {_work(rows)}" + (
-        f"\n{sheet}: all of them to look at" if sheet else ""
+        f"\n{sheet}: all of them as pictures" if sheet else ""
     )
     points = [asdict(row) | {"file": str(row.file)} for row in rows]
     print_result(text, record | {"points": points}, as_json=as_json, quiet=quiet)

@@ -23,8 +23,8 @@ def view(
 ) -> None:
     """Show a scene in the browser, with a slider for each of its numbers.
 
-    Prints the address of the page, with its access token: whoever knows it
-    on this machine can use the page. Ctrl-C ends it.
+    Prints the address of the page, with its access token; anyone on this
+    machine who has the address can use the page. Ctrl-C ends it.
     """
     from ..viewer.view import view as show
 

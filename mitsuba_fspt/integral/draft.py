@@ -1,4 +1,4 @@
-"""The picture of the pupil form while it is refined, and where in it an edge may hide between lines of sight."""
+"""Image of the pupil form during refinement, and the error of pixels on which lines of sight may miss an edge."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from .window import Window
 if TYPE_CHECKING:
     from ..jit.pixel_grid import Mask, PixelArray
 
-FULL = 1e-6  # share of lines of sight that may miss where all hit: rounding of a sum of float32 weights
-# A straight silhouette makes a rule wrong by at most this share of the light, sharp or blurred, where it parts the
-# nodes and where it passes through the rule's gap at the rim of the pupil.
-CUT = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
-UNSEEN = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
+FULL = 1e-6  # rounding of the coverage, a sum of float32 weights
+# Largest error of a rule at a straight silhouette, sharp or blurred, as a share of the light: where the silhouette lies
+# between the nodes, and where it lies in the gap between the nodes and the rim of the pupil.
+PARTED = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
+MISSED = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
 IN_FOCUS = 0.3  # blur radius [pixels] below which an edge counts as sharp in these tables
 
 
 class Draft:
     """Images on the `grid` of the window: `value`, mean radiance on film [W/mm²/sr], its `error` and `coverage`.
 
-    nodes : of the rule that saw the last edges
+    nodes : number of nodes of the last rule that was applied
     lost : share of the radiance on film that is not followed through or off specular surfaces
-    roughness : how far four nodes and twelve differ near by, silhouettes left out
-    nearest : depth of what is nearest [mm], inf where nothing is met
-    blur, most_blur : largest blur radius of what a pixel or a neighbour sees, of all pixels [pixels]
-    least_blur : the smallest one between what is nearest and farthest on a pixel, inf where nothing is met [pixels]
-    sharp : True where the least one is small
-    outline : True within a pixel of both a hit and a miss
-    shown : False on the rim, True everywhere where there is none
+    roughness : difference between four nodes and twelve on a pixel or a neighbour, without silhouettes [W/mm²/sr]
+    nearest : depth of the nearest surface [mm], inf without one
+    blur, most_blur : largest blur radius of surfaces on a pixel and its neighbours; of all pixels [pixels]
+    least_blur : smallest blur radius between the nearest and the farthest surface, inf without one [pixels]
+    sharp : True where least_blur is below `IN_FOCUS` on the pixel or a neighbour
+    outline : True within a pixel of lines of sight that meet a glowing surface and of others that do not
+    shown : False on the rim of the window; one entry if there is none
     clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
-    open, known, known_error : False where the value is known from elsewhere, that value and its error
-    least_peak : lower bound of the brightest pixel, of a picture that this one is a tile of [W/mm²/sr]
+    computed, given, given_error : False on pixels that another solution gives; its values and errors [W/mm²/sr]
+    least_peak : lower bound of the brightest pixel of the whole image, of which this one is a part [W/mm²/sr]
     progress : called after each step with the share of the steps that is done
-    grid : the pixels that are computed; all of the window unless another grid is given
+    grid : the pixels that are computed; by default all of the window
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Draft:
         view: View,
         window: Window,
         quadrature: Quadrature,
-        known: Solution | None,
+        given: Solution | None,
         least_peak: float = 0.0,
         progress: Progress = SILENT,
         grid: Grid | None = None,
@@ -72,12 +72,12 @@ class Draft:
             inside, cut = window.field_stop(view.lens)
             self.clipped, self.outside = grid.flat(cut & self.area), grid.flat(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
-        self.open = grid.full(mi.Bool, True)
-        self.known, self.known_error = (grid.full(mi.Float64, 0) for _ in range(2))
-        if known is not None:
-            self.open = grid.flat(~window.cut(known.where))
-            self.known, self.known_error = (
-                grid.flat(window.cut(image) / view.lens.etendue) for image in (known.power, known.error)
+        self.computed = grid.full(mi.Bool, True)
+        self.given, self.given_error = (grid.full(mi.Float64, 0) for _ in range(2))
+        if given is not None:
+            self.computed = grid.flat(~window.cut(given.where))
+            self.given, self.given_error = (
+                grid.flat(window.cut(image) / view.lens.etendue) for image in (given.power, given.error)
             )
         self._peak: tuple[PixelArray, PixelArray] | None = None  # of the value before it
         self.nodes = self.rays = 0
@@ -86,7 +86,7 @@ class Draft:
 
     @property
     def peak(self) -> PixelArray:
-        """The largest value that is shown [W/mm²/sr], of all if those are dark, one lane; at least `least_peak`."""
+        """Largest value in the crop window, else on its rim, and at least `least_peak` [W/mm²/sr]; one entry."""
         if self._peak is None or self._peak[0] is not self.value:
             most = dr.max(self.value)
             if len(self.shown) > 1:
@@ -101,11 +101,11 @@ class Draft:
 
     @property
     def tolerance(self) -> PixelArray:
-        """The error asked for [W/mm²/sr], one lane."""
+        """Tolerance: rtol times the brightest pixel [W/mm²/sr]; one entry."""
         return dr.opaque(mi.Float64, self.quadrature.rtol) * self.peak
 
     def centres(self, number: mi.UInt32) -> mi.Point2f:
-        """Film positions [pixels] of the centres of the grid's pixels of so much `number`."""
+        """Film positions [pixels] of the centres of the pixels with this `number` on the grid."""
         return self.window.centres(self.grid.place(number))
 
     def images(self) -> tuple[PixelArray, PixelArray, PixelArray]:
@@ -113,7 +113,7 @@ class Draft:
         least = dr.opaque(mi.Float64, self.quadrature.least_error) * self.peak
         error = dr.select(self.coverage == 0, self.error, dr.maximum(self.error, least))
         if self.view.specular:
-            # The few lines of sight of a pixel may miss a surface that a neighbour's have met.
+            # The few lines of sight of a pixel may miss a surface that those of a neighbour meet.
             lost = self.grid.spread_max(self.lost, self.reach(self.nodes)[1])
             error += lost * dr.opaque(mi.Float64, most_radiance(self.view.scene))
         coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))
@@ -124,29 +124,30 @@ class Draft:
         return images
 
     def solution(self) -> Solution:
-        """The picture as it is, on the crop window."""
+        """The present image, on the crop window."""
         arrays = (self.window.expand(self.grid.array(image)) for image in self.images())
         return Solution(*arrays, self.rays, tuple(self.levels), findings=tuple(self.findings))
 
-    def recall_known_errors(self) -> None:
-        """Errors of values that are known from elsewhere; until then those of the rules tell about their neighbours."""
-        self.error = dr.select(self.open, self.error, self.known_error)
+    def restore_given_errors(self) -> None:
+        """Set the errors of given values; before, errors of the rules on these pixels count for their neighbours."""
+        self.error = dr.select(self.computed, self.error, self.given_error)
 
     def count(self, what: str, pixels_touched: int, rays: int) -> None:
-        """Record one rule: its name, the pixels that took it and their lines of sight."""
+        """Record the name of a rule, the number of pixels it was applied to and their lines of sight."""
         self.rays += rays
         self.levels.append(f"{what}: {pixels_touched} pixels")
 
-    # ------------------------------------------------------------------ where an edge may hide
+    # ------------------------------------------------------------------ edges between lines of sight
 
     def set_blur(self, front: PixelArray, farthest: PixelArray) -> None:
-        """Blur radii from depths of the nearest and the farthest surface: blur grows to both sides of the sharp plane.
+        """Set blur radii from the depths of the nearest and the farthest surface [mm].
 
-        `front`: depth of the nearest surface, mirrors and panes included.
+        `front`: depth of the nearest surface, mirrors and panes included. The blur grows on both sides of the virtual
+        detector plane.
         """
         seen = dr.isfinite(self.nearest)
         front, back = (self.lens.blur_radius(depth) for depth in (front, farthest))
-        through = (front > 0) & (back < 0)  # the sharp plane lies between
+        through = (front > 0) & (back < 0)  # the virtual detector plane lies between
         front, back = dr.abs(front), dr.abs(back)
         self.least_blur = dr.select(seen, dr.select(through, 0, dr.minimum(front, back)), dr.inf)
         most = dr.opaque(mi.Float64, max(self.grid.shape))
@@ -158,61 +159,57 @@ class Draft:
         self.sharp = self.grid.dilate(near, math.ceil(IN_FOCUS))
 
     def reach(self, rule: int | str) -> tuple[mi.Int, int]:
-        """How far from a pixel whose nodes show an edge others may miss it, at each pixel and at most [pixels]."""
+        """Distance [pixels] from a pixel with an edge at which a rule may miss it: of each pixel, and the largest."""
         reach = 1 + mi.Int(dr.ceil(dr.opaque(mi.Float64, node_rules.GAP[rule]) * self.blur))
         return reach, 1 + math.ceil(node_rules.GAP[rule] * self.most_blur)
 
     def set_coverage(self, coverage: PixelArray) -> None:
-        """Set the share of each pixel's lines of sight that hit a glowing surface, and the outline that follows."""
+        """Set the coverage of each pixel, and the outline that follows from it."""
         self.coverage, self.outline = coverage, self.grid.outline(coverage)
 
     def grown_by_reach(self, mask: Mask) -> Mask:
-        """The marked pixels and those around on which four nodes may miss an edge that those show."""
+        """The marked pixels, and those around on which four nodes may miss the same edge."""
         return self.grid.grow(mask, *self.reach(4))
 
     def grown(self, rough: Mask) -> Mask:
-        """`rough` and the pixels around that may see the same edge; silhouettes are left to `cut_off`."""
+        """`rough` and the pixels around on which the same step of J_n may lie; silhouettes are in `edge_error`."""
         source = rough & (self.error > self.tolerance) & ~self.outline
         return rough | self.grid.grow(source, *self.reach(self.nodes))
 
-    def doubt(self, rough: Mask) -> None:
-        """Count errors of `rough` pixels for those around that may see the same edge, where no finer rule follows."""
+    def spread_error(self, rough: Mask) -> None:
+        """Extend errors of `rough` pixels to those around on which the same edge may lie; no finer rule follows."""
         around = self.grid.spread_max(dr.select(rough, self.error, 0), self.reach(self.nodes)[1])
         self.error = dr.select(self.grown(rough), dr.maximum(self.error, around), self.error)
 
-    def cut_off(self) -> PixelArray:
-        """Error of nodes at silhouettes and at the image-plane stop.
-
-        The edge passes between a pixel's nodes, or between the outermost ones and the rim of the pupil (tables `CUT`
-        and `UNSEEN`).
-        """
+    def edge_error(self) -> PixelArray:
+        """Error of the nodes at silhouettes and at the image-plane stop (tables `PARTED` and `MISSED`)."""
         reach, most = self.reach(self.nodes)
         cut, unseen = (
-            dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[self.nodes])) for share in (CUT, UNSEEN)
+            dr.select(self.sharp, *(dr.opaque(mi.Float64, n) for n in share[self.nodes])) for share in (PARTED, MISSED)
         )
         share = dr.select(self.grid.grow(self.outline, reach - 1, most - 1), unseen, 0)
         share = dr.select(parted(self.coverage) | self.clipped, cut, share)
         return share * self._whole(most)
 
-    def unseen_by_transects(self, split: Mask) -> PixelArray:
-        """Error of the first transects that met no jump, near pixels on which they did (`split`)."""
+    def missed_edge_error(self, split: Mask) -> PixelArray:
+        """Error of the first transects that cross no jump, near pixels on which they do (`split`)."""
         reach, most = self.reach("transects")
         return dr.select(
-            self.grid.grow(split, reach, most), dr.opaque(mi.Float64, self.estimator.unseen) * self._whole(most), 0
+            self.grid.grow(split, reach, most), dr.opaque(mi.Float64, self.estimator.missed_edge) * self._whole(most), 0
         )
 
     def wanted(self) -> Mask:
-        """Pixels that are shown, and those of the rim with edges that may reach into them."""
+        """Pixels of the crop window, and those of the rim whose edges may reach into it."""
         if len(self.shown) == 1:
             return self.shown
         return self.grid.dilate(self.shown, self.reach("transects")[1])
 
     def near_edge(self, image: PixelArray) -> PixelArray:
-        """Largest value around, as far as transects may miss an edge."""
+        """Largest value within the distance at which transects may miss an edge."""
         return self.grid.spread_max(image, self.reach("transects")[1])
 
     def _whole(self, reach: int) -> PixelArray:
-        """Largest value within `reach` that pixels would have if all their lines of sight hit."""
+        """Largest value within `reach`, each scaled to full coverage."""
         whole = dr.select(self.coverage > COVERAGE_ROUNDING, self.value / self.coverage, 0)
         return self.grid.spread_max(whole, reach)
 

@@ -73,7 +73,7 @@ def etendue_from_surface(
 
 @dataclass(frozen=True)
 class Sight:
-    """What is found along one line of sight.
+    """One line of sight.
 
     integrand : of Eq. 9 in the pupil form [W/mm²/sr], whose mean over pixel and pupil, times the pixel's étendue, is P
     radiance : [W/mm²/sr]
@@ -166,7 +166,7 @@ class View:
         return met & (dr.gather(mi.Float, self.emitting, number, met) > 0)
 
     def findings(self) -> list[Finding]:
-        """Whether lines of sight end at the first surface, and do without Mitsuba's surface records."""
+        """Whether lines of sight end at the first surface, and are evaluated without Mitsuba's surface records."""
         why = "what glows are meshes, J_n is linear on every face, the radiance the same in all directions"
         record = Finding("record", self.faces is not None, why if self.faces else f"wanted: {why}")
         if self.specular is None:

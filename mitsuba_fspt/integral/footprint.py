@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 GRID = 2.0**-20  # corners lie on a grid this fine [pixels], where differences of coordinates are exact
 SPECK = 2.0**-4  # half the side [pixels] of the square that stands for a polygon folded over
-DENSEST = 2.0**57  # quanta a pixel of an honest polygon at the most
+DENSEST = 2.0**57  # largest density of a polygon [quanta a pixel]
 
 
 class Canvas:
@@ -122,13 +122,13 @@ def _sound(polygon: Sequence[mi.Point2f], lights: Sequence[mi.Float64]) -> list[
     """The corners on the grid, or those of a speck."""
     ring = [mi.Point2d(dr.round(mi.Point2d(corner) / GRID) * GRID) for corner in polygon]
     turns = [_cross(ring[k - 1] - ring[k - 2], ring[k] - ring[k - 1]) for k in range(4)]
-    honest = (_bound(dr.minimum, turns) >= 0) | (_bound(dr.maximum, turns) <= 0)
+    sound = (_bound(dr.minimum, turns) >= 0) | (_bound(dr.maximum, turns) <= 0)
     area = 0.5 * dr.abs(_cross(ring[2] - ring[0], ring[3] - ring[1]))
     for light in lights:
-        honest &= (area > GRID) & (light < DENSEST * area)
+        sound &= (area > GRID) & (light < DENSEST * area)
     middle = mi.Point2d(dr.round(0.25 * (ring[0] + ring[1] + ring[2] + ring[3]) / GRID) * GRID)
     speck = [middle + SPECK * mi.Vector2d(x, y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return [dr.select(honest, own, other) for own, other in zip(ring, speck, strict=True)]
+    return [dr.select(sound, own, other) for own, other in zip(ring, speck, strict=True)]
 
 
 def _cross(a: mi.Vector2d, b: mi.Vector2d) -> mi.Float64:

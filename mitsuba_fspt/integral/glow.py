@@ -50,7 +50,7 @@ class Batch:
         row, number = numbered(self.lines)
         row = mi.UInt32(row.astype(np.uint32))
         index, cuts = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in (self.index, self.cuts))
-        # Lanes beyond the last one gather 0, and whole numbers divided by 0 end the process.
+        # Entries beyond the last one gather 0, and an integer division by 0 ends the process.
         return index, dr.maximum(cuts, 1), mi.UInt32(number.astype(np.uint32))
 
 
@@ -88,7 +88,7 @@ class Glow:
             yield Batch(self, index[run], cuts[run], cells)
 
     def finer(self, tolerance: float) -> Glow:
-        """With elements below a pixel cut like larger ones where they misplace more than so much light [W/mm²/sr]."""
+        """With elements below a pixel cut like larger ones where they misplace more than `tolerance` [W/mm²/sr]."""
         misplaced = MISPLACED * self.sides**2 * self.steps / (1 + math.pi * self.blur**2)
         return replace(self, sides=np.where(misplaced > tolerance, np.maximum(self.sides, 1), self.sides))
 
@@ -104,7 +104,7 @@ class Glow:
 
     @classmethod
     def seen(cls, emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol: float, skip_dark: bool) -> Glow:
-        """What `lens` sees of an emitter's shape in `window`; SceneError where the emitter has no surface."""
+        """The shape of an emitter, imaged by `lens` in `window`; SceneError where the emitter has no surface."""
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
             raise SceneError(
                 f"fspt_integral: domain 'surface' needs surfaces, but emitter {emitter.class_name()} has none. Set "
@@ -139,9 +139,9 @@ class Glow:
         lit = ~(away | dark)
         area, extent = _area(*centres)[lit].sum(), _extent(np.concatenate([corner[lit] for corner in centres]))
         small = area < math.pi * blur.min(initial=np.inf) ** 2
-        # An element smaller than a pixel would stay in one piece at the first levels, which would agree on a wrong
-        # picture. A piece of side s misplaces about s²/8 of a step in J_n, less where a thick body is blurred. Where
-        # that is below the tolerance it stays in one piece, unless `finer` finds the picture dim beside the step.
+        # An element smaller than a pixel would stay in one piece at the first levels, which would agree. A
+        # piece of side s misplaces about s²/8 of a step in J_n, less where a thick body is blurred. Where that is below
+        # the tolerance it stays in one piece, unless `finer` finds the image dim beside the step.
         thickness = max(1, area / extent) if small and extent > 0 else 1
         sides = np.where(sides > math.sqrt(rtol * thickness / MISPLACED), np.maximum(sides, 1), sides)
         return cls(
@@ -179,7 +179,7 @@ def cells_of(lines: int) -> int:
 
 
 def _elements(shape: mi.Shape, lens: mi.Sensor, rtol: float) -> Elements:
-    """Elements of a few pixels each, so that what one pixel needs concerns few others."""
+    """Elements of a few pixels each, so that the refinement of one pixel affects few others."""
     pixel = float(lens.blur_disc(mi.Point3f(shape.bbox().center()))[2][0])
     ideal = float(shape.surface_area()[0]) / (PIXELS_PER_ELEMENT * pixel**2)
     curved = shape.class_name() in ("Sphere", "Cylinder")

@@ -1,9 +1,9 @@
-"""Large pictures by blocks of pixels: where the picture is smooth over several of them, few blocks say it all.
+"""Large images by blocks of pixels, between which a smooth image is interpolated.
 
-The pupil form gives the power on square blocks of pixels, as on a film of larger pixels. Where it is smooth over five
-blocks a polynomial of fourth degree along each axis has their powers as its integrals, so that the power on a block is
-kept, and gives that on its parts. Blocks with an edge, those on which the polynomial bends too much and those on which
-single pixels contradict are parted into smaller ones, down to pixels.
+The pupil form gives the power on square blocks of pixels, as on a film of larger pixels. The polynomial of fourth
+degree along each axis whose integrals over five blocks are their powers gives the power on the parts of the middle
+one; it keeps the power on the block. Blocks with an edge, and those on which the estimated error of the interpolation
+or the difference to a single pixel exceeds the tolerance, are divided into smaller ones, down to pixels.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from .solution import Solution
 from .transects import edges_of, integrate_by_transects
 from .window import Window
 
-# Pixels along the largest blocks; blocks along a picture's shorter side, of which fewer do not pay.
+# Pixels along the largest blocks; fewest blocks along the shorter side of an image for which blocks save time.
 SIDES, FEWEST = (8, 4), 128
-REACH = 2  # blocks on either side of one from which the polynomial on it follows
-MARGIN = 3  # blocks around those that are wanted, from which the polynomials of these follow
-REFINED = 0.5  # of rtol: asked of blocks; what is left is for what lies between them
-BLURRED = 1.5  # blocks: blur radius from which on no edge is narrower than a block
-LEVELS = 4  # of transects on blocks; where more are needed smaller blocks take them
-SMALL = 4.0  # blocks: a body that is smaller may have its edges within single blocks
-# Of the change from polynomials over five blocks to those over seven, on a block and its neighbours: on blurred edges
-# and corners, whose pictures have kinks at the rim of the blur disc, up to 9.2 times as much is left, in the middles of
-# pixels 11.9 times, for blur radii from 1.5 to 16 blocks.
+REACH = 2  # blocks on either side of one that its polynomial depends on
+MARGIN = 3  # blocks around the crop window that polynomials and their error estimates depend on
+REFINED = 0.5  # of rtol: tolerance of blocks; the rest is for the interpolation
+BLURRED = 1.5  # blocks: least blur radius at which an edge is interpolated
+LEVELS = 4  # of transects on blocks; where more are needed, blocks are divided
+SMALL = 4.0  # blocks: the image of a smaller body may lie within single blocks
+# Error of the interpolation over the change from polynomials over five blocks to those over seven, on a block and its
+# neighbours: at most 9.2 on blurred edges and corners, whose images have kinks at the rim of the blur disc, 11.9 in the
+# middles of pixels, for blur radii from 1.5 to 16 blocks.
 BEND_GAIN = {"area": 9.2, "centre": 12.0}
-MOST = 0.5  # of the blocks: where more are to be parted into pixels all pixels are computed
-COST = 2.0  # pixels: of a block, which takes more lines of sight as less than rtol is asked of it
-RIM_ORDER = 1.5  # by which the error of the interpolation falls at the rim of a blur disc
-# Of the largest difference found on nine pixels, one of a block and of each neighbour: independent normal ones are
-# larger on one pixel of 600.
+MOST = 0.5  # share of the blocks: where more are to be divided into pixels all pixels are computed
+COST = 2.0  # pixels that take as many lines of sight as a block, whose tolerance is smaller
+RIM_ORDER = 1.5  # power of the block's side by which the error falls at the rim of a blur disc
+# Error over the largest difference to nine pixels, one of a block and of each neighbour: independent normal ones
+# exceed it on one pixel of 600.
 TRIED_GAIN = 2.5
-STREAM = 0x9E3779B9  # of the random pixels that are tried
+STREAM = 0x9E3779B9  # seed of the random pixels that are compared
 
 Plane = NDArray[np.float64]
 Marks = NDArray[np.bool_]
@@ -76,7 +76,7 @@ class Blocks:
 
 
 def blocks_of(window: Window, lens: mi.Sensor) -> tuple[Blocks, ...]:
-    """The largest blocks that a window has enough of, then their halves down to its pixels; none of a small window."""
+    """The largest blocks of which a window has `FEWEST`, then their halves down to pixels; none for a small window."""
     largest = next((side for side in SIDES if min(window.shape) >= side * FEWEST), 0)
     if not largest:
         return ()
@@ -104,7 +104,7 @@ def solve(
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
-    """As `pupil_form.solve`, with values between blocks interpolated; None where most are parted into pixels."""
+    """As `pupil_form.solve`, with values between blocks interpolated; None if most blocks are divided into pixels."""
     picture = _Picture(view, blocks, quadrature, least_peak)
     while picture.own.any():
         picture.compute(progress)
@@ -120,15 +120,15 @@ def solve(
 
 
 class _Picture:
-    """The picture on blocks (h, w): `value` [W/mm²/sr], its `error` and `coverage`.
+    """Image on blocks (h, w): `value` [W/mm²/sr], its `error` and `coverage`.
 
-    blocks, own : of the present size; True where they are computed, False where larger ones gave them
-    edge : blocks on which the picture may jump
-    blur : of the least blurred edge that may be on a block or a neighbour, its radius [pixels]
-    draft, refined : of the present blocks; True where they took transects
-    bent : what pixels of a block may be wrong by as they are interpolated [W/mm²/sr]
-    peak : lower bound of the brightest block, or what was known to be as bright [W/mm²/sr]
-    tolerance : the error asked for [W/mm²/sr]
+    blocks, own : the present size; True where blocks are computed, False where larger ones gave their value
+    edge : True for blocks on which the image may jump
+    blur : least blur radius of an edge on a block or a neighbour [pixels]
+    draft, refined : image of the present blocks in the pupil form; True where transects were taken
+    bent : estimated error of the interpolation on the pixels of a block [W/mm²/sr]
+    peak : lower bound of the brightest block or pixel [W/mm²/sr]
+    tolerance : rtol times `peak` [W/mm²/sr]
     """
 
     def __init__(self, view: View, sizes: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float) -> None:
@@ -140,11 +140,11 @@ class _Picture:
         self.findings: list[Finding] = []
 
     def compute(self, progress: Progress) -> None:
-        """Take lines of sight to the blocks that larger ones did not give."""
+        """Compute the blocks of the present size that are not interpolated from larger ones."""
         blocks, grid = self.blocks, self.grid
         progress = progress.part(self.sizes.index(blocks), len(self.sizes))
         draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
-        draft.open, draft.known = grid.flat(self.own), grid.flat(self.value)
+        draft.computed, draft.given = grid.flat(self.own), grid.flat(self.value)
         self.edge, self.blur = np.zeros(self.own.shape, bool), np.zeros(self.own.shape)
         if blocks.side > 1:
             blur, self.refined = _refine_blurred(draft)
@@ -155,9 +155,9 @@ class _Picture:
         power, error, coverage = draft.images()
         images = (power / blocks.lens.etendue, error / blocks.lens.etendue, coverage)
         for plane, image in zip((self.value, self.error, self.coverage), images, strict=True):
-            grid.lay(dr.select(draft.open, image, grid.flat(plane)), plane)
+            grid.lay(dr.select(draft.computed, image, grid.flat(plane)), plane)
         if self.own.all():
-            # Blocks with a sharp edge are not refined, and may be too bright by far.
+            # Blocks with a sharp edge are not refined: their error may be large.
             certain = float(dr.max(dr.select(draft.shown, draft.value - draft.error, 0))[0])
             self.peak = max(self.peak, certain) or float(draft.peak[0])
             self.tolerance = self.quadrature.rtol * self.peak
@@ -167,54 +167,51 @@ class _Picture:
         self.findings, self.draft = draft.findings, draft
 
     def _seen(self) -> View:
-        """What the lens sees before a film of such blocks."""
+        """View of the lens before a film of such blocks."""
         return replace(self.view, lens=self.blocks.lens, detail=self.view.detail * self.blocks.side**2)
 
     def _quadrature(self) -> Quadrature:
-        """The accuracy asked of blocks, or of pixels."""
+        """Accuracy of the blocks, or of pixels."""
         if self.blocks.side == 1:
             return self.quadrature
         return replace(self.quadrature, rtol=max(REFINED * self.quadrature.rtol, FLOAT32_FLOOR), pixel="area")
 
     def rough(self) -> Marks:
-        """Blocks (h, w) that are to be parted, after single pixels of the others have been tried.
+        """Blocks (h, w) to be divided, after a comparison of single pixels on the others.
 
         The errors of the others become those of their pixels.
         """
         self.edge = _spread(self.edge, 1) | _small_bodies(self._seen(), self.blocks.window)
         pixel = self.quadrature.pixel
         self.bent = BEND_GAIN[pixel] * _bend(self.value, self.blocks.side, pixel)
-        # Near blurred edges four lines of sight prove nothing.
+        # Near blurred edges four lines of sight are too few for a comparison.
         refined = np.zeros(self.own.shape, bool)
         self.grid.lay(self.refined, refined)
         whole = (-_spread(-self.coverage, 1) > 1 - COVERAGE_ROUNDING) & ~refined
         number = np.flatnonzero(whole & ~self._beyond() & self.own)
         if number.size:
             off, edge = np.zeros(whole.shape), np.zeros(whole.shape, bool)
-            off.ravel()[number], edge.ravel()[number] = self._tried(number)
+            off.ravel()[number], edge.ravel()[number] = self._compared(number)
             self.bent = np.maximum(self.bent, TRIED_GAIN * _spread(off, 1))
             self.edge |= _spread(edge, 1)
         rough = self._beyond() & self.own
-        if self.own.all():  # but for what is around the crop window and the rim that estimates need
+        if self.own.all():  # except blocks farther from the crop window than estimates reach
             rough &= np.pad(np.ones([n - 2 * MARGIN + 2 for n in rough.shape], bool), MARGIN - 1)
         least = np.where(_spread(self.coverage, REACH) > 0, self.quadrature.least_error * self.peak, 0)
         self.error = np.where(self.own, np.maximum(self._left(), least), self.error)
         return rough
 
     def _beyond(self) -> Marks:
-        """Blocks with an edge, or with more than the tolerance left."""
+        """Blocks with an edge, or with an error above the tolerance."""
         return self.edge | (self._left() > self.tolerance)
 
     def _left(self) -> Plane:
-        """What pixels of each block may be wrong by, (h, w): errors of blocks near by, and of the interpolation.
-
-        They have causes of their own.
-        """
+        """Error of the pixels of each block, (h, w): root of the summed squares of both contributions."""
         return np.hypot(_propagated(self.error, self.blocks.side, self.quadrature.pixel), self.bent)
 
-    def _tried(self, number: NDArray[np.int64]) -> tuple[Plane, Marks]:
-        """On one random pixel of each of these blocks: how far it is from the interpolated value; whether it has an
-        edge that the block does not show.
+    def _compared(self, number: NDArray[np.int64]) -> tuple[Plane, Marks]:
+        """Difference between one random pixel and the interpolated value on each of these blocks; True where the pixel
+        has an edge.
         """
         side, width = self.blocks.side, self.value.shape[1]
         row, column = np.divmod(number, width)
@@ -232,10 +229,10 @@ class _Picture:
         return np.abs(found - seen.value.numpy()), seen.coverage.numpy() < 1 - COVERAGE_ROUNDING
 
     def smaller(self, rough: Marks) -> Blocks:
-        """The largest smaller blocks that save more pixels than they cost where they do not do; else pixels.
+        """The largest smaller blocks that save more lines of sight than they take; else pixels.
 
-        What is left falls with the side as at the rim of a blur disc, by its power 3/2. Where an edge is narrower than
-        a block, what is left is not known.
+        The error is taken to fall with the side as at the rim of a blur disc, by its power 3/2. Where an edge is
+        narrower than a block there is no estimate of it.
         """
         left, blur = np.where(self.edge, 0, self.error)[rough], np.where(self.edge, self.blur, np.inf)[rough]
         for smaller in self.sizes:
@@ -246,9 +243,9 @@ class _Picture:
         return self.sizes[-1]
 
     def part(self, rough: Marks, smaller: Blocks) -> None:
-        """Go on to smaller blocks: parts of the `rough` ones are to be computed, the others are interpolated."""
+        """Divide into smaller blocks: parts of the `rough` ones are to be computed, the others are interpolated."""
         parts = self.blocks.side // smaller.side
-        # Blocks around show which way an edge runs and whether one passes near by; their values stay.
+        # Blocks around are evaluated for direction and reach of edges; their values stay.
         around = rough.copy()
         self.grid.lay(self.draft.grown_by_reach(self.grid.flat(rough)), around)
         self.grid = BlockGrid(around, parts) if rough.any() else None
@@ -293,7 +290,7 @@ def _refine_blurred(draft: Draft) -> tuple[mi.Float64, mi.Bool]:
 
 
 def _small_bodies(view: View, window: Window) -> Marks:
-    """Blocks (h, w) that light of bodies smaller than `SMALL` blocks may cross."""
+    """Blocks (h, w) that light of bodies smaller than `SMALL` blocks may reach."""
     shapes = [box_of([shape]) for shape in view.scene.shapes()]
     ends = np.array([[box.min, box.max] for box in shapes], np.float64).reshape(-1, 2, 3)
     corners = np.stack([ends[:, (k >> np.arange(3)) & 1, np.arange(3)] for k in range(8)], axis=1)

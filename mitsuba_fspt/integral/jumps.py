@@ -16,10 +16,10 @@ from .node_sums import TRANSECTS_TOGETHER
 from .specular import first_met
 from .transect import Transect
 
-MOST_STEPS = 2  # of jumps within a body: beside two the scan has too little left to tell a third from a slope
-SHIFT = 0.1  # of an interval: by which scanned points are moved, as the phase wants
-SHORTEST = 1e-6  # half of a piece, lest its moments are divided by nothing
-FLAT = 1e-4  # variance of z over nodes that lie in one place
+MOST_STEPS = 2  # jumps of J_n on one body: with a third, too few steps are left to estimate the slope from
+SHIFT = 0.1  # of an interval: range over which the phase shifts the scanned points
+SHORTEST = 1e-6  # half the length of a piece, which divides its moments
+FLAT = 1e-4  # variance of z over nodes below which they coincide
 
 
 def integrate_transect(
@@ -31,30 +31,32 @@ def integrate_transect(
     least: mi.Float,
     steep: float,
 ) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
-    """Of a transect means of integrand and coverage, number of jumps, depth of the edge at the largest, lines of sight.
+    """Means of integrand and coverage along a transect, number of jumps, depth of the edge at the largest jump [mm],
+    number of lines of sight.
 
-    It is split at its `MOST_JUMPS` largest jumps. A jump is looked for between neighbours of `along.scan` + 1 points,
-    then bisected towards the larger difference; every piece that is not dark gets `along.nodes` at even distances, the
-    first of them at `phase` of one; a transect without a jump is one piece. In units of the integrand an `outline`
-    counts so much as a jump of the radiance, and less than `least` does not. A jump within a body is `steep` times the
-    mean of the transect's other steps.
+    The transect is split at its `MOST_JUMPS` largest jumps. A scan of `along.scan` + 1 points finds the intervals with
+    jumps; `along.bisections` halve each of them towards the larger difference. Every piece between jumps that is not
+    dark has `along.nodes` nodes at even distances, the first at the share `phase` of a distance.
+    outline : size that an outline counts as, in units of the radiance [W/mm²/sr]
+    least : smallest jump of the radiance on one body [W/mm²/sr]
+    steep : a jump on one body is larger than so many times the mean of the other steps of the scan
     """
     together = view.detail <= TRANSECTS_TOGETHER
 
-    def look(s: mi.Float) -> Seen:
+    def trace(s: mi.Float) -> Seen:
         position, pupil, _ = transect.at(s)
         sight = view.integrand(position, pupil, together)
         if view.specular:
             return mi.Vector4f(sight.radiance, sight.body, sight.depth, sight.front)
         return mi.Point3f(sight.radiance, sight.body, sight.depth)
 
-    found = _search(look, phase, along, outline, least, steep, mi.Vector4f(0) if view.specular else mi.Point3f(0))
+    found = _search(trace, phase, along, outline, least, steep, mi.Vector4f(0) if view.specular else mi.Point3f(0))
     jumps, places = found.jumps, found.places()
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
-    # Pieces 0 … jumps between -1, the places and 1; an outer one on which every point looked past the phantom is dark.
+    # Pieces 0 … jumps between -1, the places and 1; an outer one is dark if all its lines of sight miss the phantom.
     def integrate(
-        piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, value: mi.Float, coverage: mi.Float, looks: mi.UInt32
+        piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, value: mi.Float, coverage: mi.Float, rays: mi.UInt32
     ) -> tuple:
         at_start, at_end = piece > 0, piece < jumps
         high = mi.Float(1)
@@ -74,15 +76,15 @@ def integrate_transect(
         (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))
         until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
         more_value, more_coverage = sums.corrected(_about(until - since, middle, half))
-        return high, until, value + more_value, coverage + more_coverage, looks + count
+        return high, until, value + more_value, coverage + more_coverage, rays + count
 
-    start = (mi.Float(-1), mi.Vector2d(0), mi.Float(0), mi.Float(0), found.looks)
-    _, _, value, coverage, looks = repeat(jumps + 1, integrate, *start)
+    start = (mi.Float(-1), mi.Vector2d(0), mi.Float(0), mi.Float(0), found.rays)
+    _, _, value, coverage, rays = repeat(jumps + 1, integrate, *start)
     depth = dr.select(jumps > 0, found.largest[0].depth(), 0)
-    return value, coverage, jumps, depth, looks
+    return value, coverage, jumps, depth, rays
 
 
-# ---------------------------------------------------------------------- where it jumps
+# ---------------------------------------------------------------------- search for jumps
 
 
 Seen: TypeAlias = (
@@ -92,18 +94,18 @@ Seen: TypeAlias = (
 
 @dataclass
 class _Jump:
-    """Two neighbouring points of a transect: their places `at`, and what is `Seen` at each."""
+    """Two neighbouring points of a transect: their positions `at` and the line of sight `before` and `after`."""
 
     at: mi.Point2f
     before: Seen
     after: Seen
 
     def middle(self) -> mi.Float:
-        """The place half-way between the two."""
+        """The position half-way between the two."""
         return 0.5 * (self.at.x + self.at.y)
 
     def depth(self) -> mi.Float:
-        """Of what is nearer, and hides the other [mm]: of the first surfaces where those are two."""
+        """Depth of the nearer surface, which occludes the other [mm]; of the first surfaces where these differ."""
         nearer = dr.minimum(self.before.z, self.after.z)
         if len(self.before) == 3:
             return nearer
@@ -111,14 +113,14 @@ class _Jump:
         return dr.select(alike, nearer, dr.minimum(self.before.w, self.after.w))
 
     def size(self, outline: mi.Float) -> mi.Float:
-        """How much the radiance changes; an `outline` outranks whatever steep but smooth change lies elsewhere."""
+        """Change of the radiance [W/mm²/sr]; a change of the body adds `outline`, more than any change on one."""
         before, after = self.before.y, self.after.y
-        if len(self.before) == 4:  # behind mirrors and panes, too, nothing is nothing
+        if len(self.before) == 4:  # no body at the end counts as 0, also behind mirrors and panes
             before, after = dr.maximum(before, 0), dr.maximum(after, 0)
         return dr.abs(self.after.x - self.before.x) + dr.select(before != after, outline, 0)
 
     def larger_half(self, s: mi.Float, seen: Seen, outline: mi.Float) -> _Jump:
-        """Of the two parts that a look at s makes the one with the larger jump."""
+        """Of the two parts on either side of s, where the line of sight is `seen`, the one with the larger jump."""
         left = _Jump(mi.Point2f(self.at.x, s), self.before, seen)
         right = _Jump(mi.Point2f(s, self.at.y), seen, self.after)
         return dr.select(left.size(outline) >= right.size(outline), left, right)
@@ -126,13 +128,13 @@ class _Jump:
 
 @dataclass
 class _Search:
-    """What is known of the jumps of a transect after so many `looks`.
+    """State of the search along a transect after so many `rays`.
 
-    largest : the `MOST_JUMPS` largest steps of the scan, the largest first, then bisected one by one
-    place, seen : the last point of the scan
-    total : all its steps together
-    lit : first and last place where anything was met
-    jumps : how many of the largest are jumps, known when the scan is over
+    largest : the `MOST_JUMPS` largest steps of the scan, the largest first; then each in turn is bisected
+    place, seen : position and line of sight of the last point of the scan
+    total : sum of all steps
+    lit : first and last position at which a line of sight meets a body
+    jumps : number of the largest steps that are jumps, from the end of the scan on
     """
 
     largest: list[_Jump]
@@ -141,10 +143,10 @@ class _Search:
     total: mi.Float
     lit: mi.Point2f
     jumps: mi.UInt32
-    looks: mi.UInt32
+    rays: mi.UInt32
 
     def places(self) -> list[mi.Float]:
-        """Where the jumps are, in order along the transect, and 1 for each that is none."""
+        """Positions of the jumps in order along the transect, and 1 for each of the largest steps that is none."""
         ordered: list[mi.Float] = []
         for k, jump in enumerate(self.largest):
             place = dr.select(self.jumps > k, jump.middle(), 1)
@@ -155,12 +157,12 @@ class _Search:
 
 
 def _met(seen: Seen) -> mi.Bool:
-    """True where a line of sight met anything; weak light along it may come from elsewhere than its end."""
+    """True where a line of sight meets a body, or has radiance from a weak reflection."""
     return seen.y > 0 if len(seen) == 3 else (seen.y > 0) | (seen.x > 0)
 
 
 def _search(
-    look: Callable[[mi.Float], Seen],
+    trace: Callable[[mi.Float], Seen],
     phase: mi.Float,
     along: AlongTransect,
     outline: mi.Float,
@@ -168,9 +170,9 @@ def _search(
     steep: float,
     nothing: Seen,
 ) -> _Search:
-    """Jumps of what lines of sight `look` at; scan and bisection are one loop, so that it is compiled once.
+    """Scan and bisection of a transect on which `trace` gives the line of sight at a position.
 
-    `nothing`: what a line of sight sees that meets nothing.
+    One loop, so that the ray tracing is compiled once. `nothing`: line of sight that meets no body.
     """
     intervals, bisections = dr.opaque(mi.UInt32, along.scan), dr.opaque(mi.UInt32, along.bisections)
     number = mi.Float(intervals)
@@ -178,11 +180,11 @@ def _search(
 
     def scan(found: _Search, s: mi.Float, seen: Seen) -> _Search:
         new = _Jump(mi.Point2f(found.place, s), found.seen, seen)
-        size = dr.select(found.looks > 0, new.size(outline), 0)
+        size = dr.select(found.rays > 0, new.size(outline), 0)
         total = rest = found.total + size
-        # An outline is a jump. A step of one body's radiance that is not much larger than the rest is a slope; on a
-        # parabola one is at most 3 times their mean.
-        largest, jumps, large = [], mi.UInt32(0), found.looks == intervals
+        # An outline is a jump. A step of one body's radiance is one if it is much larger than the mean of the others;
+        # on a parabola the largest step is at most 3 times the mean.
+        largest, jumps, large = [], mi.UInt32(0), found.rays == intervals
         for k, old in enumerate(found.largest):
             old_size = old.size(outline)
             larger, most = size > old_size, dr.maximum(size, old_size)
@@ -195,14 +197,14 @@ def _search(
             large &= jump
             jumps += dr.select(large, mi.UInt32(1), 0)
         lit = dr.select(_met(seen), mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
-        return _Search(largest, s, seen, total, lit, jumps, found.looks)
+        return _Search(largest, s, seen, total, lit, jumps, found.rays)
 
     def bisect(found: _Search, turn: mi.UInt32, jump: _Jump, s: mi.Float, seen: Seen) -> _Search:
         half = jump.larger_half(s, seen, outline)
         return replace(found, largest=[dr.select(turn == k, half, old) for k, old in enumerate(found.largest)])
 
     def once(found: _Search) -> tuple[_Search]:
-        k = found.looks
+        k = found.rays
         scans, inside = k <= intervals, (k > 0) & (k < intervals)
         even = dr.select(inside, 2 * (mi.Float(k) + shift) / number, dr.select(k > 0, 2, 0)) - 1
         turn = (k - intervals - 1) // bisections
@@ -210,24 +212,24 @@ def _search(
         for i, other in enumerate(found.largest[1:], 1):
             jump = dr.select(turn == i, other, jump)
         s = dr.select(scans, even, jump.middle())
-        seen = look(s)
+        seen = trace(s)
         found = dr.select(scans, scan(found, s, seen), bisect(found, turn, jump, s, seen))
-        found.looks = k + 1
+        found.rays = k + 1
         return (found,)
 
     # Not `dr.zeros`: of a dataclass's fields it keeps the types of the variant that it meets first.
     none = [_Jump(mi.Point2f(0), nothing, nothing) for _ in range(MOST_JUMPS)]
     start = _Search(none, mi.Float(0), nothing, mi.Float(0), mi.Point2f(2, -2), mi.UInt32(0), mi.UInt32(0))
-    return dr.while_loop((start,), lambda found: found.looks <= intervals + found.jumps * bisections, once)[0]
+    return dr.while_loop((start,), lambda found: found.rays <= intervals + found.jumps * bisections, once)[0]
 
 
-# ---------------------------------------------------------------------- the pieces between jumps
+# ---------------------------------------------------------------------- pieces between jumps
 
 
 def _towards_jumps(x: mi.Float, at_start: mi.Bool, at_end: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """Place in a piece, x in [0, 1] drawn towards the ends that are jumps, and its derivative.
+    """Position in a piece for x in [0, 1], denser towards the ends that are jumps, and its derivative by x.
 
-    There a silhouette's square root (of the cosine, of the place on the surface) becomes linear.
+    A silhouette's square root (of the cosine, of the position on the surface) is linear in x there.
     """
     y = 1 - x
     place = dr.select(at_start, dr.select(at_end, x * x * (3 - 2 * x), x * x), dr.select(at_end, 1 - y * y, x))
@@ -243,7 +245,7 @@ def _about(moments: mi.Vector2d, middle: mi.Float, half: mi.Float) -> mi.Vector2
 
 @dataclass
 class _Sums:
-    """Over the nodes of a piece, of weights times 1, z and z²; times f, z f; times coverage; z ∈ [-1, 1]."""
+    """Sums over the nodes of a piece: weights times 1, z, z²; times f, z f; times coverage; z in [-1, 1]."""
 
     one: mi.Vector3f
     f: mi.Vector2f
@@ -258,13 +260,13 @@ class _Sums:
         )
 
     def corrected(self, exact: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
-        """Integrals of f and of the coverage by weights times α + β z, for which those of 1 and z are `exact`.
+        """Integrals of f and of the coverage with weights times α + β z that integrate 1 and z to their `exact` values.
 
-        The density has kinks that a few nodes do not see, and f is almost linear.
+        The density has kinks that a few nodes do not resolve; f is almost linear.
         """
         scale, mean = exact.x / self.one.x, self.one.y / self.one.x
         variance = self.one.z - self.one.y * mean
         tilt = dr.select(variance > FLAT * self.one.x, (exact.y - exact.x * mean) / variance, 0)
-        found = self.one.x > 0  # on a piece of no measure there is nothing to correct
+        found = self.one.x > 0  # else the piece has no measure
         value = scale * self.f.x + tilt * (self.f.y - mean * self.f.x)
         return dr.select(found, value, 0), dr.select(found, scale * self.coverage, 0)

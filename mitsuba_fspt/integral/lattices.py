@@ -1,8 +1,8 @@
-"""Lattices over pixel × pupil, for pixels on which transects do not settle: corners, many edges, rough textures.
+"""Lattices over pixel × pupil, for pixels on which transects do not converge: corners, many edges, rough textures.
 
-A rank-1 lattice in four dimensions is moved by a random shift. The means over several shifts are independent estimates
-without bias, and their scatter is the error, whatever the integrand. Points are taken in such an order that the first
-2^m of them are a lattice for every m, so that each step adds points to those of the last one.
+A rank-1 lattice in four dimensions is moved by random shifts. The means of the shifts are independent unbiased
+estimates, and their scatter gives the error for any integrand. The points are in such an order that the first 2^m of
+them form a lattice for every m, so that each step adds points to those of the last one.
 """
 
 from __future__ import annotations
@@ -22,20 +22,22 @@ if TYPE_CHECKING:
     from ..jit.pixel_grid import PixelArray
 
 # x and y of pixel and pupil. Of a million random vectors, among those none of whose two-dimensional projections has a
-# dual vector below 0.45 of the longest one possible, the one with the least error P₂ (Sloan and Joe 1994) at 2¹⁰ … 2¹⁸
-# points. With a vector that is poor at one of these sizes, more points would gain nothing there.
+# dual vector below 0.45 of the longest one possible, the one with the least error P₂ (Sloan and Joe 1994) over all
+# of 2¹⁰ … 2¹⁸ points.
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
-# By which the error falls at best with the number of points where the integrand jumps at a smooth edge: 1/2 + 1/(2 d)
-# where it depends on d coordinates, 2 in focus. Lattices end where the points that are left would not do at that rate.
+# Largest power by which the error falls with the number of points where the integrand jumps at a smooth edge:
+# 1/2 + 1/(2 d) if the edge depends on d coordinates, d = 2 in focus. A pixel is given up where `MOST` points would not
+# suffice at that rate.
 ORDER = 0.75
 
 
-def settle_by_lattices(draft: Draft) -> None:
-    """Value and error of the pixels above the tolerance, from ever more points until they are below it.
+def refine_by_lattices(draft: Draft) -> None:
+    """Value and error of the pixels above the tolerance by lattices of more and more points, until they are below it.
 
-    What is known from elsewhere is of light that may be far brighter than what lines of sight met around.
+    The error of a pixel is at least `missed_share` over the number of points times the brightest value around; on
+    pixels that another solution gives, times the brightest surface.
     """
     most = min(1 << (draft.quadrature.max_nodes // SHIFTS).bit_length() >> 1, MOST)  # a power of two
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
@@ -43,16 +45,16 @@ def settle_by_lattices(draft: Draft) -> None:
         return
     tolerance = draft.tolerance
     brightest = dr.select(
-        draft.open, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
+        draft.computed, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
     )
     means, points = Means.none(draft.grid.pixels(above)), 0
     while points < most:
         more = min(GROWTH * points or FIRST, most)
         means, points = means.refined(draft, points, more), more
-        unmet = dr.opaque(mi.Float64, draft.estimator.unmet / (points * SHIFTS)) * dr.gather(
+        unmet = dr.opaque(mi.Float64, draft.estimator.missed_share / (points * SHIFTS)) * dr.gather(
             mi.Float64, brightest, means.pixels
         )
-        scatter = draft.estimator.certain * means.standard_error
+        scatter = draft.estimator.student_t * means.standard_error
         error = dr.maximum(scatter, unmet)
         better = error < dr.gather(mi.Float64, draft.error, means.pixels)
         images = mi.Float64(draft.value), mi.Float64(draft.coverage), mi.Float64(draft.error)
@@ -70,7 +72,7 @@ def settle_by_lattices(draft: Draft) -> None:
 
 @dataclass(frozen=True)
 class Means:
-    """Of each of the `pixels` (n,), shift by shift (16 n,): mean `radiance` on film [W/mm²/sr] and `coverage`."""
+    """Means of each shift on each of the `pixels` (n,): `radiance` on film [W/mm²/sr] and `coverage`, (16 n,)."""
 
     pixels: mi.UInt32
     radiance: PixelArray
@@ -78,7 +80,7 @@ class Means:
 
     @classmethod
     def none(cls, pixels: mi.UInt32) -> Means:
-        """Of no points yet."""
+        """Means before the first point."""
         zero = dr.zeros(mi.Float64, dr.width(pixels) * SHIFTS)
         return cls(pixels, zero, zero)
 
@@ -94,19 +96,19 @@ class Means:
 
     @property
     def standard_error(self) -> PixelArray:
-        """Of `value` [W/mm²/sr], by the scatter of the shifts."""
+        """Standard error of `value` [W/mm²/sr], from the scatter of the shifts."""
         deviation = self.radiance - dr.repeat(self.value, SHIFTS)
         return dr.sqrt(dr.block_sum(dr.square(deviation), SHIFTS) / (SHIFTS * (SHIFTS - 1)))
 
     def of(self, which: mi.Bool) -> Means:
-        """Those of some of the pixels."""
+        """Means of the pixels marked in `which`."""
         number = dr.compress(which)
         shifts = dr.repeat(number * SHIFTS, SHIFTS) + dr.tile(dr.arange(mi.UInt32, SHIFTS), dr.width(number))
         columns = (dr.gather(mi.Float64, column, shifts) for column in (self.radiance, self.coverage))
         return Means(dr.gather(mi.UInt32, self.pixels, number), *columns)
 
     def refined(self, draft: Draft, points: int, more: int) -> Means:
-        """Means over so many points `more`, powers of two, of which these are over the first `points`."""
+        """Means over `more` points, given these over the first `points`; both are powers of two."""
         sums = [dr.zeros(mi.Float64, dr.width(self.pixels) * SHIFTS) for _ in range(2)]
         runs = (more - points) // FIRST
         lanes = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS * runs)
@@ -125,13 +127,13 @@ class Means:
 
 
 def _run(draft: Draft, pixels: mi.UInt32, shift: mi.UInt32, first: mi.UInt32) -> tuple[PixelArray, PixelArray]:
-    """Sums of integrand and coverage over `FIRST` points from the `first` on, of so many a `shift` of all pixels'."""
+    """Sums of integrand and coverage over `FIRST` points from number `first` on, for each `shift` of `pixels`."""
     pixel = dr.gather(mi.UInt32, pixels, shift // SHIFTS)
     centre, area = draft.centres(pixel), dr.opaque(mi.Float, float(draft.area))
     shifts = [mi.sample_tea_32(pixel, SHIFTS * k + shift % SHIFTS)[0] for k in range(len(VECTOR))]
 
-    def look(k: mi.UInt32, value: mi.Float64, coverage: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
-        # In units of 2⁻³², where whole numbers wrap around as a lattice does.
+    def add(k: mi.UInt32, value: mi.Float64, coverage: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
+        # In units of 2⁻³²: whole numbers wrap around as the lattice does.
         point = dr.brev(first + k)
         x, y, u, v = (
             _folded(start + point * dr.opaque(mi.UInt32, step)) for start, step in zip(shifts, VECTOR, strict=True)
@@ -140,10 +142,10 @@ def _run(draft: Draft, pixels: mi.UInt32, shift: mi.UInt32, first: mi.UInt32) ->
         sight = draft.view.integrand(centre + area * mi.Point2f(x - 0.5, y - 0.5), pupil)
         return value + mi.Float64(sight.integrand), coverage + dr.select(sight.covered, mi.Float64(1), 0)
 
-    return repeat(dr.opaque(mi.UInt32, FIRST), look, mi.Float64(0), mi.Float64(0))
+    return repeat(dr.opaque(mi.UInt32, FIRST), add, mi.Float64(0), mi.Float64(0))
 
 
 def _folded(place: mi.UInt32) -> mi.Float:
-    """Place in [0, 1] along the tent, up and down again: an integrand becomes periodic in it."""
+    """Tent transform to [0, 1], by which any integrand becomes periodic."""
     x = mi.Float(place) * 2.0**-31
     return dr.minimum(dr.abs(1 - dr.abs(1 - x)), 1)

@@ -1,7 +1,7 @@
 """Light that Eq. 9 leaves out: what reaches the lens after a scattering reflection, or from points and beams.
 
 Eq. 9 sums what surfaces send to the lens themselves, and specular surfaces lead on. A white table, a second phantom or
-a dent of the phantom itself reflects some of the light once more; a short Monte Carlo tells how much that is.
+a dent of the phantom itself reflects some of the light once more; a short Monte Carlo run estimates how much.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from .eq9 import View, etendue_from_pixel
 from .occlusion import hides_nothing
 from .quadrature import Quadrature
 
-PATHS = 1 << 14  # a share of 5 % is known to about 0.1 %
+PATHS = 1 << 14  # standard error of a share of 5 %: about 0.1 %
 BOUNCES = 2  # scattering reflections that are counted: further ones are weaker by the albedo each
-SURE = 2.0  # standard errors from which on a share is told from none
+SURE = 2.0  # standard errors above which a share is significant
 
 
 @dataclass
 class LeftOut:
     """Share of a picture's power that Eq. 9 leaves out, its standard error, and ids of the shapes that scatter.
 
-    told : True once a user has been told
+    reported : True once the warning has been given
     """
 
     share: float
     error: float
     bodies: tuple[str, ...]
-    told: bool = False
+    reported: bool = False
 
     def warning(self, rtol: float) -> str | None:
-        """One line about it; None where it is below `rtol`, or not told from none."""
+        """One line about it; None where it is below `rtol` or not significant."""
         if not self.share > max(rtol, SURE * self.error):
             return None
         named = f"{', '.join(self.bodies)} scatters light" if self.bodies else "emitters other than surfaces shine"

@@ -1,8 +1,8 @@
 """Narrow light: bodies and spots much smaller than a pixel and brighter than everything around them.
 
-Four nodes a pixel find what is as large as a pixel at the phantom, or as its blur disc where that is larger. They meet
-smaller bodies and spots by chance or not at all, and error estimates that follow from the nodes do not show that. Such
-light is found from points all over the surfaces; the pixels that it reaches take the surface form.
+Four nodes a pixel detect light from a region as large as a pixel at the phantom, or as its blur disc where that is
+larger. Smaller bodies and spots they may miss, and error estimates from the nodes do not show that. Such light is
+detected from points all over the surfaces; the pixels that it reaches take the surface form.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from .node_rules import PLASTIC, twelve
 from .specular import Specular, transmission
 from .window import Window
 
-OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than every square around, seen in focus
-# The limb of a wide body is no narrow light, as transects follow it: the surface is slanted (cosine to the lens), a
-# square around is covered (a share) and the point is not so many times brighter than the body around.
+OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than every square around, in focus
+# The limb of a wide body is not narrow light, as transects integrate it: its cosine to the lens is below `SLANTED`, the
+# body covers at least the share `COVERED` of a square around, the point is at most `GLARES` times as bright as that.
 SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
-WIDE, MOST_POINTS = 2.0, 1 << 12  # so thick [pixels, blur radii] no element is narrow; points of a thin one
-LARGEST_GRID = 1 << 12  # pixels along each side that are told apart
+WIDE, MOST_POINTS = 2.0, 1 << 12  # least width of a wide element [pixels, blur radii]; most points of a thin one
+LARGEST_GRID = 1 << 12  # cells along each side of the grid
 
 Column = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -53,9 +53,9 @@ class NarrowLight:
 
 
 def points_on_surfaces(scene: mi.Scene, lens: mi.Sensor, specular: Specular | None = None) -> Points | None:
-    """Points all over the surfaces as `lens` sees them; None where no emitter is an `fspt_surface`.
+    """Points all over the surfaces, imaged by `lens`; None where no emitter is an `fspt_surface`.
 
-    It sees them straight on alone, if need be through `specular` shapes.
+    Along straight lines only, also through `specular` shapes.
     """
     parts = [_seen(scene, emitter, lens, specular) for emitter in scene.emitters() if is_surface(emitter)]
     return Points.joined(parts) if parts else None
@@ -177,9 +177,9 @@ class Points:
 
 
 def _hidden(points: Points, side: float) -> NDArray[np.bool_]:
-    """True of points that are narrow light among squares of a `side` [pixels], and not the limb of a wide body.
+    """True for points that are narrow light among squares of a `side` [pixels], and not the limb of a wide body.
 
-    Points just beyond the limb, which only a part of the pupil sees, lie beside points that the pupil's middle sees.
+    Points beyond the limb, visible from a part of the pupil only, lie beside points visible from the pupil's middle.
     """
     cells = points.cells(side)
     grid = Grid(cells.shape)
@@ -221,7 +221,7 @@ def _spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) -
 
 
 def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor, specular: Specular | None) -> Points:
-    """Points all over a surface as the lens sees them."""
+    """Points all over a surface, with their images."""
     shape = emitter.get_shape()
     texels = texels_of(emitter.exitance)
     if shape.is_mesh():  # whose elements lie across the texels
@@ -229,17 +229,17 @@ def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor, specular: Specu
     else:
         elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
     counts = np.ones(elements.count, np.int64)
-    middles = _look(emitter, elements, lens, counts)
+    middles = _on_elements(emitter, elements, lens, counts)
     area, unit = middles.image.numpy(), np.maximum(middles.blur.numpy(), 1)
     reach = _reach(elements, lens) / unit
     # A long and thin element is represented by many points, a quarter of a unit apart, any other by one.
-    long = np.isfinite(reach) & (reach > MOST_POINTS)  # points all along would be too far apart to tell
+    long = np.isfinite(reach) & (reach > MOST_POINTS)  # `MOST_POINTS` points would be too far apart
     thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
-    look = _look(emitter, elements, lens, counts)
+    at = _on_elements(emitter, elements, lens, counts)
     if len(scene.shapes()) > 1:
-        look.radiance = dr.select(_in_sight(scene, lens, look.place, specular), look.radiance, 0)
-    columns = (look.radiance, look.image, look.cosine, look.front, look.blur, look.centre.x, look.centre.y)
+        at.radiance = dr.select(_in_sight(scene, lens, at.place, specular), at.radiance, 0)
+    columns = (at.radiance, at.image, at.cosine, at.front, at.blur, at.centre.x, at.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
     radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
@@ -249,9 +249,9 @@ def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor, specular: Specu
 
 
 @dataclass
-class _Look:
-    """At points of elements: `radiance` towards the point of the pupil that sees most of them, area of the element's
-    `image` from there [pixels²]; cosine, front, blur and `centre` on film as in `Points`; `place` in the world.
+class _OnElements:
+    """Values at points of elements: `radiance` towards the point of the pupil highest above them, area of the element's
+    `image` from there [pixels²]; cosine, front, blur, `centre` on film as in `Points`; `place` in the world.
     """
 
     radiance: mi.Float
@@ -263,8 +263,8 @@ class _Look:
     place: mi.Point3f
 
 
-def _look(emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index) -> _Look:
-    """At so many points of each element, the first its middle."""
+def _on_elements(emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index) -> _OnElements:
+    """Values at `counts` points of each element, the first in its middle."""
     index, number = numbered(counts)
     sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
     si, area = elements.place(mi.UInt32(index), sample)
@@ -277,20 +277,20 @@ def _look(emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Inde
     cosine = dr.dot(si.n, to_lens)
     image = area * dr.abs(cosine / (dr.dot(axis, to_lens) * dr.square(scale)))
     front = dr.dot(si.n, lens.world_transform() @ mi.Point3f(0) - si.p)
-    look = _Look(scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre, si.p)
-    dr.eval(look)
-    return look
+    at = _OnElements(scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre, si.p)
+    dr.eval(at)
+    return at
 
 
 def _in_sight(scene: mi.Scene, lens: mi.Sensor, place: mi.Point3f, specular: Specular | None) -> mi.Bool:
-    """True of points from which nothing hides one of twelve points of the pupil."""
+    """True for points that one of twelve points of the pupil is visible from."""
     x, y = (mi.Float(column) for column in twelve(False).pupil.T)
 
-    def look(k: mi.UInt32, seen: mi.Bool) -> tuple[mi.Bool]:
+    def test(k: mi.UInt32, seen: mi.Bool) -> tuple[mi.Bool]:
         pupil = mi.Point2f(dr.gather(mi.Float, x, k), dr.gather(mi.Float, y, k))
         return (seen | (transmission(scene, specular, place, lens.arrival(place, pupil)[1], ~seen) > 0),)
 
-    return repeat(dr.opaque(mi.UInt32, len(twelve(False))), look, mi.Bool(False))[0]
+    return repeat(dr.opaque(mi.UInt32, len(twelve(False))), test, mi.Bool(False))[0]
 
 
 def _rim_above(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Point3f:

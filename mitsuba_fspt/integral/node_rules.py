@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 GOLDEN = 0.6180339887498949
 PLASTIC = (0.7548776662466927, 0.5698402909980532)  # steps of the R₂ sequence, even in the unit square
 
-# So far in (blur radii) a silhouette can pass unseen between the outermost of a rule's nodes and the rim of the pupil,
-# or beside the first transects.
+# Width [blur radii] of the gap between the outermost nodes of a rule, or the first transects, and the rim of the pupil,
+# in which a silhouette changes none of the lines of sight.
 GAP = {1: 1.0, 4: 0.6, 12: 0.25, "transects": 0.1}
 
 PixelArray = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
@@ -28,7 +28,7 @@ PixelArray = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
 class Rule:
     """Nodes of disc × square: `pupil` (n, 2) in the unit disc, `pixel` (n, 2) in [-½, ½]², `weight` (n,) of sum 1.
 
-    `contrast` (n,) has sum 0 and vanishes on linear functions: |Σ contrast f| measures how far f bends.
+    `contrast` (n,) has sum 0 and vanishes on linear functions: |Σ contrast f| measures the curvature of f.
     """
 
     pupil: NDArray[np.float64]
@@ -54,7 +54,7 @@ def one() -> Rule:
 
 @cache
 def four(area: bool) -> Rule:
-    """Four nodes, exact to degree 3 on the pupil; with `area` also over the pixel, for what blurs like a picture.
+    """Four nodes, exact to degree 3 on the pupil; with `area` also over the pixel, for functions of p - r a.
 
     Over the pixel each node takes a step of length 1/√6 at right angles to its place on the pupil: so the second
     moments of any sum of pupil and pixel offset, whatever the blur, are those of disc and square.
@@ -66,7 +66,7 @@ def four(area: bool) -> Rule:
 
 
 def one_spread(laplacian: PixelArray, blur: PixelArray, area: bool) -> PixelArray:
-    """What `one` has too little: half the second moments of pixel and blur disc along each axis, 1/12 and r²/4.
+    """Correction of `one`: half the second moments of pixel and blur disc along each axis, 1/12 and r²/4.
 
     `laplacian` of the picture [1/pixels²], `blur` r [pixels].
     """
@@ -74,7 +74,7 @@ def one_spread(laplacian: PixelArray, blur: PixelArray, area: bool) -> PixelArra
 
 
 def four_turn(curl: PixelArray, laplacian: PixelArray) -> PixelArray:
-    """What `four` has too much where the blur changes over the picture; `curl` is ∂M_x/∂y - ∂M_y/∂x of its moments.
+    """Error of `four` where the blur varies over the image; `curl` is ∂M_x/∂y - ∂M_y/∂x of its moments.
 
     Steps at right angles leave c (∂²f/∂a_x∂y - ∂²f/∂a_y∂x), c = Σ w a_x y = √3/12, of pupil a and pixel (x, y). The
     moments over the pupil are M = ¼ ∂f/∂a + c (∂f/∂y, -∂f/∂x), so that their curl over the picture holds it.
@@ -108,9 +108,7 @@ def twelve(area: bool) -> Rule:
 
 @cache
 def product(level: int, area: bool) -> Rule:
-    """Rings × spokes over the pupil, with `area` times Gauss nodes over the pixel: finer with the level, for what is
-    smooth.
-    """
+    """Rings × spokes over the pupil, with `area` times Gauss nodes over the pixel: for smooth integrands."""
     rings, spokes, side = (level + 1, 4 * level + 3, level + 1) if area else (2 * level + 1, 8 * level + 1, 1)
     square, ring_weight = gauss(rings)
     turn = 2 * np.pi * (np.arange(spokes) + GOLDEN * np.arange(rings)[:, None]) / spokes
@@ -122,27 +120,26 @@ def product(level: int, area: bool) -> Rule:
     return Rule(pupil, pixel, weight, np.zeros(len(weight)))
 
 
-SMOOTH_LEVELS = 3  # of transects on which nodes may do yet where nothing jumps
+SMOOTH_LEVELS = 3  # levels of transects at which pixels without a jump take a `product` rule
 TRANSECT_LEVELS = (2, 8, 24, 72, 256, 1024)
-# Places across the pupil at each level but the last. A second edge makes what transects find bend and kink there, while
-# along their other two places it is nearly linear.
+# Places across the pupil at each level but the last. With a second edge the mean along a transect has kinks in this
+# coordinate, and is nearly linear in the other two.
 ACROSS = (2, 4, 6, 8, 16)
-# Where at each place across the pupil the others lie around the middle [degrees]. Levels of the same heights agree on
-# what they all miss, as of a plate seen edge-on through the sharp plane.
+# Directions of the other two coordinates from the middle, at each place across the pupil [degrees]. Levels with equal
+# coordinates would miss the same, such as a plate edge-on through the virtual detector plane.
 TURNS = {2: [[45], [225]], 8: [[30, 210], [120, 300]] * 2, 24: [[0, 90, 180, 270]] * 6}
-# Steps along the first two places from one transect across a sharp edge to the next, in numbers of transects: of all
-# without a common divisor those that fill the cube most evenly (least centred discrepancy).
+# Generating vectors of the lattices of transects across a sharp edge: those of least centred discrepancy.
 STEPS = {2: (1, 1), 8: (3, 5), 24: (5, 11), 72: (19, 61)}
-TREND = 3  # degree across the pupil that says nothing yet of a kink
-TRENDS = TREND + 2  # polynomials in all
-SCANS = (4, 6, 10, 16, 24, 32)  # intervals on each transect, level by level: two edges in one of them go unseen
-LEAST_PARTS = 32  # of an interval of the first scan, by bisection: a jump's place there, for any rtol
-MOST_JUMPS = 3  # that split a transect: one body before another has three outlines
+TREND = 3  # degree across the pupil of the trend that is subtracted from the scatter
+TRENDS = TREND + 2  # polynomials of the trend
+SCANS = (4, 6, 10, 16, 24, 32)  # intervals of the scan at each level; of two edges in one interval none is found
+LEAST_PARTS = 32  # of an interval of the first scan, to which bisection resolves a jump at any rtol
+MOST_JUMPS = 3  # jumps at which a transect is split: one body before another has three outlines
 
 
 @dataclass(frozen=True)
 class AlongTransect:
-    """How far a transect is looked into: `scan` intervals, `bisections` of a jump, `nodes` on a smooth piece."""
+    """Accuracy along a transect: `scan` intervals, `bisections` of a jump, `nodes` on a smooth piece."""
 
     scan: int
     bisections: int
@@ -150,16 +147,15 @@ class AlongTransect:
 
     @property
     def rays(self) -> int:
-        """Lines of sight at most: all jumps bisected, all pieces lit."""
+        """Largest number of lines of sight: all jumps bisected, no piece dark."""
         return self.scan + 1 + MOST_JUMPS * self.bisections + (MOST_JUMPS + 1) * self.nodes
 
 
 def along_transect(level: int, rtol: float) -> AlongTransect:
-    """So far that the first transects know a jump's place to `rtol`, and to 1/64 of an interval in any case.
+    """Accuracy along the transects of a level: a jump's position to `rtol`, and to 1/64 of an interval in any case.
 
-    On a sphere's limb that halves the RMS error of two transects at rtol 0.03, for 3 % more lines of sight.
-
-    Every level looks further along its transects too, or what all levels miss there would pass for converged.
+    On a sphere's limb that halves the RMS error of two transects at rtol 0.03, for 3 % more lines of sight. The
+    accuracy grows with the level, as levels with the same error along their transects would agree on it.
     """
     bisections = math.ceil(math.log2(max(0.25 / rtol, LEAST_PARTS)))
     nodes = 3 + math.ceil(math.log10(max(1e-3 / rtol, 1)))
@@ -167,8 +163,8 @@ def along_transect(level: int, rtol: float) -> AlongTransect:
 
 
 def transect_levels(rtol: float, area: bool, most: int) -> list[tuple[int, AlongTransect]]:
-    """Number of transects and how far each is looked into, level by level, while a pixel takes at most so many lines
-    of sight in all of them.
+    """Number of transects and accuracy along each, level by level, while all levels together take no more than `most`
+    lines of sight a pixel.
     """
     levels = []
     for level, count in enumerate(TRANSECT_LEVELS):
@@ -184,10 +180,10 @@ def transect_levels(rtol: float, area: bool, most: int) -> list[tuple[int, Along
 class Transects:
     """Places in [0, 1]³ of n transects through pixel × pupil, (n, 3), for sharp edges and for blurred ones.
 
-    `sharp` lie evenly in the pixel, each on a line of its own, where the edge leaves it with a kink; all of weight 1/n.
-    `blurred` have the `weight` (n,) of sum 1, and `trend` (k, n) are orthonormal polynomials on them (on a net nearly),
-    of mean 0, that are part of any smooth function. `phase` (n,) in [0, 1) is where between two of a transect's even
-    nodes they begin: were it the same on all, all would miss the same.
+    `sharp` fill the pixel evenly, no two on one line, as the mean has kinks where an edge leaves the pixel; weight 1/n.
+    `blurred` have the `weight` (n,) of sum 1, and `trend` (k, n) are orthonormal polynomials on them (on a net nearly)
+    of mean 0. `phase` (n,) in [0, 1) shifts the even nodes along each transect: with equal phases all transects would
+    have the same error.
     """
 
     sharp: NDArray[np.float64]
@@ -225,7 +221,7 @@ class Transects:
 
 @cache
 def transects(count: int) -> Transects:
-    """As many transects as a level of `TRANSECT_LEVELS` has: Gauss's places, at last a net for whatever is left."""
+    """The transects of a level of `TRANSECT_LEVELS`, by their number: at Gauss's places, at the last level a net."""
     level = TRANSECT_LEVELS.index(count)
     if level == len(ACROSS):
         return Transects(_net(count), _net(count), np.full(count, 1 / count))
@@ -236,10 +232,10 @@ def transects(count: int) -> Transects:
 
 
 def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (n, 3) and weights (n,): Gauss's `across` the pupil, at each of them n/across on both other axes.
+    """Places (n, 3) and weights (n,): Gauss's `across` the pupil, with n/across on the other two axes at each of them.
 
-    These are Gauss's, too, or few on a circle: corners of a square, exact to degree 3 however it is turned; opposite
-    ones, exact to degree 2 over all places; one, exact to degree 1.
+    These are Gauss's, too, or on a circle: corners of a square, exact to degree 3 for any direction; two opposite ones,
+    exact to degree 2 over all places; one, exact to degree 1.
     """
     y, w = gauss(across)
     each = count // across
@@ -253,9 +249,7 @@ def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDA
 
 
 def _lattice(count: int, *steps: int) -> NDArray[np.float64]:
-    """Rank-1 lattice of points in [0, 1]³, the last coordinate in order; each has its opposite, so that what is odd
-    about the middle cancels.
-    """
+    """Rank-1 lattice in [0, 1]³, the last coordinate in order; symmetric about the middle, so that odd parts cancel."""
     return np.mod(np.outer(np.arange(count) + 0.5, (*steps, 1)) / count, 1.0)
 
 

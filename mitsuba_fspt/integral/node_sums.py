@@ -14,8 +14,8 @@ from . import node_rules
 from .eq9 import Sight, View
 from .specular import first_met
 
-# Triangles a pixel up to which packets of neighbouring lines of sight are traced faster than single ones: packets of
-# the nodes of pixels in a square, and of the transects of one pixel.
+# Triangles a pixel up to which packets of neighbouring lines of sight are traced faster than single ones: of a node on
+# neighbouring pixels, and of the transects of one pixel.
 NODES_TOGETHER, TRANSECTS_TOGETHER = 4.0, 0.5
 
 
@@ -24,11 +24,11 @@ class Sums:
     """Weighted sums over the nodes of a rule, for each pixel.
 
     value, x, y : Σ w f of the integrand f of Eq. 9 [W/mm²/sr]; Σ w f a_x and Σ w f a_y with the pupil point a
-    contrast : Σ c f, a measure of the integrand's curvature, see `node_rules.Rule`
+    contrast : Σ c f, a measure of the integrand's curvature, see `node_rules.Rule` [W/mm²/sr]
     coverage : share of the lines of sight that meet a shape with an `fspt_surface`
-    nearest, farthest : depths at which lines of sight end on surfaces, dark ones too [mm]; inf and 0 where none does
+    nearest, farthest : depths of the surfaces at which lines of sight end, dark ones too [mm]; inf and 0 without one
     lost : Σ w cos⁴θ of what is not followed through or off specular surfaces
-    front : depth of the nearest edge that there may be, of mirrors and panes too [mm]
+    front : least depth of an edge, those of mirrors and panes included [mm]
     """
 
     value: mi.Float
@@ -42,17 +42,17 @@ class Sums:
     front: mi.Float
 
 
-# Columns of `Sums` as a rule sees nothing; what is not asked for, or without specular surfaces, keeps these values.
+# `Sums` of lines of sight that meet nothing; also the values of columns that are not computed.
 NOTHING_SEEN = dict(zip(Sums.__annotations__, (0, 0, 0, 0, 0, math.inf, 0, 0, math.inf), strict=True))
 ALL = tuple(NOTHING_SEEN)
 
 
 def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule, names: Sequence[str] = ALL) -> Sums:
-    """Sums of one rule for every pixel, those of the given `names`; the others are as if nothing were seen."""
+    """Sums of one rule for every pixel, in the columns `names`; the others are `NOTHING_SEEN`."""
     table, count = mi.Float(rule.table), dr.opaque(mi.UInt32, len(rule))
     together = view.detail <= NODES_TOGETHER
 
-    # Only sums that change are states of the loop: with others Dr.Jit records its body twice.
+    # Only sums that change are states of the loop; with others Dr.Jit would record its body twice.
     def node(k: mi.UInt32, sums: dict[str, mi.Float], first: _FirstSurfaces | None) -> tuple:
         ax, ay, dx, dy, weight, null = (dr.gather(mi.Float, table, k + n * count) for n in range(6))
         sight = view.integrand(centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay), together)
@@ -81,9 +81,9 @@ def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule, names: Seq
 
 @dataclass
 class _FirstSurfaces:
-    """Of the first surfaces on lines of sight: number of that of the last line, least depth [mm], whether they differ.
+    """First surfaces on the lines of sight: number of that on the last line, least depth [mm], whether they differ.
 
-    Only where they differ does an edge of a mirror or a pane lie.
+    Where they do not differ there is no edge of a mirror or a pane.
     """
 
     number: mi.Float
@@ -91,11 +91,11 @@ class _FirstSurfaces:
     differ: mi.Bool
 
     def plus(self, sight: Sight) -> _FirstSurfaces:
-        """With one line more."""
+        """With one more line of sight."""
         number = mi.Float(first_met(sight.body))
         differ = self.differ | ((self.number >= 0) & (self.number != number))
         return _FirstSurfaces(number, dr.minimum(self.depth, sight.front), differ)
 
     def front(self, nearest: mi.Float) -> mi.Float:
-        """Depth of the nearest edge that there may be [mm]: that of what is `nearest` without those before it."""
+        """Least depth of an edge [mm]: of the first surfaces if they differ, else the `nearest` at the end."""
         return dr.select(self.differ, self.depth, nearest)

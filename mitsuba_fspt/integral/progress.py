@@ -1,4 +1,4 @@
-"""Share of the integral's work that is done, reported after every level of refinement."""
+"""Share of the integral's levels that are done, reported after each of them."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
 """Eq. 9 in its pupil form: P = étendue · mean over pixel and pupil of cos⁴θ · L(first surface point on the line).
 
-Three rules in turn. Every pixel takes four nodes over pupil and pixel, or one node where the pupil is nearly a point
-and the blur disc stays in the pixel; pixels on which the picture is curved take twelve; pixels on which the radiance
-jumps from line to line (a silhouette, an occluder, an edge of J_n) take transects: curves across the edge through pixel
-and pupil together. Along each transect the jumps are found by bisection and the pieces between them are integrated one
-by one, so that only the variation along the edge is left to sample. Pixels that transects do not settle take lattices
-of lines of sight, whose scatter is their error. Each line of sight is `eq9.View.integrand`.
+Four rules in turn. Every pixel takes four nodes over pupil and pixel, or one node where the pupil is nearly a point
+and the blur disc stays in the pixel. Pixels on which the image is curved take twelve. Pixels on which the radiance
+jumps between lines of sight (a silhouette, an occluder, an edge of J_n) take transects: curves across the edge through
+pixel × pupil. The jumps along each transect are found by bisection and the pieces between them are integrated
+separately, so that only the variation along the edge is left to sample. Pixels on which transects do not converge take
+lattices of lines of sight, whose scatter gives the error. Each line of sight is `eq9.View.integrand`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..jit.pixel_grid import Grid
 from . import node_rules
 from .draft import Draft, open_share
 from .eq9 import View
-from .lattices import settle_by_lattices
+from .lattices import refine_by_lattices
 from .node_sums import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
 from .progress import SILENT, Progress
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-FEW = 1 << 18  # pixels, all over a picture, of which the brightest tells how bright a picture is at least
-MARGIN = 0.9  # so much of what twelve nodes find there counts, which may be wrong
+FEW = 1 << 18  # pixels of the coarse lattice for a lower bound of the brightest pixel
+MARGIN = 0.9  # share of their brightest value that counts, for the error of twelve nodes
 
 
 def solve(
@@ -45,17 +45,17 @@ def solve(
     window: Window,
     quadrature: Quadrature,
     light: NDArray[np.float64],
-    known: Solution | None = None,
+    given: Solution | None = None,
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution:
-    """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
+    """Power [W], error [W] and coverage on every pixel of the crop window, to the accuracy of `quadrature`.
 
     Only pixels of the `window` are computed, the others are dark. `light`: of surfaces as if in focus, see
-    `NarrowLight`. Pixels on which a partial solution is `known` are not refined. `least_peak`: lower bound of the
+    `NarrowLight`. Pixels that the partial solution `given` has are not refined. `least_peak`: lower bound of the
     brightest pixel's mean radiance on film [W/mm²/sr]. `progress` is called after every level.
     """
-    draft = Draft(view, window, quadrature, known, least_peak, progress)
+    draft = Draft(view, window, quadrature, given, least_peak, progress)
     refine(draft, light)
     return draft.solution()
 
@@ -70,12 +70,12 @@ def refine(draft: Draft, light: NDArray[np.float64]) -> None:
         rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
     progress(2 / (2 + len(levels)))
     if not levels:
-        draft.doubt(rough)
+        draft.spread_error(rough)
     elif dr.any(rough):
         integrate_by_transects(draft, rough, levels)
-    draft.recall_known_errors()
+    draft.restore_given_errors()
     if levels:
-        settle_by_lattices(draft)
+        refine_by_lattices(draft)
     progress(1.0)
 
 

@@ -11,10 +11,10 @@ from .estimator import Estimator
 from .shortcuts import SHORTCUTS
 
 DOMAINS, PIXELS = ("pupil", "surface"), ("area", "centre")
-# No error is stated below these shares of the tolerance and of the brightest pixel: two rules that agree may both miss
-# something, and float32 resolves lines of sight only so far.
-LEAST_CLAIM, FLOAT32_FLOOR = 0.05, 2e-7
-LEAST_WEIGHT = 0.1  # of rtol: what is followed through or off specular surfaces; weaker light counts as error
+# Smallest error that is stated, over the tolerance and over the brightest pixel: two rules that agree may have the same
+# error, and lines of sight are rounded to float32.
+LEAST_STATED, FLOAT32_FLOOR = 0.05, 2e-7
+LEAST_WEIGHT = 0.1  # of rtol: smallest share that is followed through or off specular surfaces; less counts as error
 MOST_SPECULAR = 64  # specular surfaces one after the other
 
 
@@ -25,11 +25,11 @@ class Quadrature:
     rtol : absolute error of every pixel, relative to the brightest pixel; 2e-7 <= rtol < 1 (default 1e-3)
     domain : 'pupil' (lines of sight from the pixel) or 'surface' (power spread from surface elements)
     pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
-    max_nodes : lines of sight a pixel may take at most, four in any case (default 2²²; domain 'surface': on
-        average, 256 … 65,536 in any case); bounds the time, and where it is reached the error says so
-    max_specular : specular surfaces that a line of sight goes through or off at most, 0 … 64 (default 8); what is cut
-        off there is in the error
-    shortcuts_off : names of `SHORTCUTS` that are not taken; they change no more than the error asked for
+    max_nodes : largest number of lines of sight of a pixel, four in any case (default 2²²; domain 'surface': on
+        average, 256 … 65,536 in any case); bounds the time; where it is reached, `error` may exceed rtol
+    max_specular : largest number of specular surfaces on a line of sight, 0 … 64 (default 8); light beyond is in the
+        error
+    shortcuts_off : names of `SHORTCUTS` that are not taken; shortcuts change the image by less than rtol
     estimator : thresholds of the pupil form's error estimates
     """
 
@@ -66,14 +66,14 @@ class Quadrature:
             raise SceneError(f"'shortcuts_off' must be some of {', '.join(SHORTCUTS)}, got {min(unknown)!r}.")
 
     def metadata(self) -> dict[str, str | float]:
-        """What was asked for, as an image's metadata have it."""
-        asked = {name: value for name, value in vars(self).items() if name not in ("estimator", "shortcuts_off")}
-        return asked | {"shortcuts_off": ", ".join(sorted(self.shortcuts_off)) or "nothing"}
+        """The parameters as an image's metadata have them."""
+        given = {name: value for name, value in vars(self).items() if name not in ("estimator", "shortcuts_off")}
+        return given | {"shortcuts_off": ", ".join(sorted(self.shortcuts_off)) or "nothing"}
 
     @property
     def least_error(self) -> float:
         """Smallest error that is stated, over the brightest pixel."""
-        return max(FLOAT32_FLOOR, LEAST_CLAIM * self.rtol)
+        return max(FLOAT32_FLOOR, LEAST_STATED * self.rtol)
 
     @property
     def least_weight(self) -> float:

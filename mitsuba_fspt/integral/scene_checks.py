@@ -152,7 +152,7 @@ def check_alone(scene: mi.Scene, emitter: mi.Emitter) -> None:
     ray.maxt = 2 * lift
     met = scene.ray_intersect_preliminary(ray, active=area > 0)
     near = met.is_valid() & (met.shape != mi.ShapePtr(shape))
-    if not dr.any(near):  # else only: what it is asks every shape of the scene
+    if not dr.any(near):  # the query below, for the second shape, is slow
         return
     other = met.compute_surface_interaction(ray, active=near)
     shared = near & (dr.dot(other.n, si.n) > PARALLEL)
@@ -190,7 +190,7 @@ def check_outside(scene: mi.Scene, lens: mi.Sensor) -> None:
     # Turned a little, so that no direction runs along the faces of an axis-aligned box.
     rays = mi.Ray3f(lens.world_transform() @ mi.Point3f(0, 0, 0), dr.normalize(mi.Vector3f(directions.T + 0.1234)))
     si = scene.ray_intersect(rays)
-    opaque = mi.Bool(True)  # through a chamber's panes it looks out
+    opaque = mi.Bool(True)  # False for directions through panes of a chamber
     for shape in scene.shapes():
         if specular_bsdf(shape):
             opaque &= si.shape != mi.ShapePtr(shape)

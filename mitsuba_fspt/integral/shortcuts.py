@@ -1,4 +1,4 @@
-"""Shortcuts: work of the integral that a scene does not need, and whether it was left out."""
+"""Shortcuts: computations that a scene does not need, and whether they were left out."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ SHORTCUTS = {
     "smooth": "all further lines of sight of a pixel",
     "specular": "lines of sight beyond the first surface",
     "record": "surface records where lines of sight end",
-    "occlusion": "rays that look for an occluder",
+    "occlusion": "rays that test for an occluder",
     "dark": "surface elements that do not glow",
 }
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Whether shortcut `name` was taken, and the reason `why`, with the numbers that decided."""
+    """Whether the shortcut `name` was taken, and the reason `why` with the numbers that it depends on."""
 
     name: str
     taken: bool

@@ -15,7 +15,7 @@ class Solution:
     """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
 
     rays : lines of sight of all pixels together, in the EXR header `nodes`
-    levels : what each step of the refinement did, as text
+    levels : name, pixels and lines of sight of each step of the refinement, as text
     where : pixels on which a partial solution is complete
     findings : which shortcuts were taken, and why
     """

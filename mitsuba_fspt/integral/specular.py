@@ -1,11 +1,10 @@
-"""Specular surfaces: what lines of sight go through or off, and where they lead.
+"""Specular surfaces: transmission and reflection of lines of sight.
 
-A BSDF sends light on in single directions by three kinds of lobes: the null lobe (straight on: `null`, `mask`, a thin
+A BSDF sends light on in single directions by three kinds of lobes: the null lobe (undeviated: `null`, `mask`, a thin
 pane), specular transmission (refraction at the border of a solid) and specular reflection (mirrors, and every pane).
 Radiance along a line of sight is the sum over all sequences of such lobes of the product of their weights and the
-radiance of the surface where each sequence ends (Eq. M.19). A line of sight follows the lobe of the largest weight and
-keeps the others to follow them after it. Sequences are cut where they carry too little or get too long; what is cut off
-counts as error.
+radiance of the surface where each sequence ends (Eq. M.19). The lobe of the largest weight is followed first, the
+others after it. Sequences end where their weight is too small or their length too large; the rest counts as error.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ from .quadrature import Quadrature
 SMOOTHEST = 1e-4  # roughness below which Mitsuba's rough conductor has the lobe of this roughness: a mirror's
 FLAT = 1e-5  # of its size: how far a flat shape may leave its plane
 ROUNDING = 2e-6  # of the largest coordinate: margin of a box
-LIFT = 4e-7  # of a shape's largest coordinate: distance from it at which float32 tells its sides apart
-CODES = 4095  # numbers for a first surface, and for those after it, that float32 holds together
+LIFT = 4e-7  # of a shape's largest coordinate: distance at which its sides differ in float32
+CODES = 4095  # numbers for a first surface, and for all later ones, that one float32 can encode
 DELTA = {
     "null": mi.BSDFFlags.Null,
     "transmission": mi.BSDFFlags.DeltaTransmission,
@@ -54,13 +53,13 @@ class Specular:
 
     names : ids of the shapes
     lobes : kinds of lobes that can lead to light, of 'null', 'transmission' and 'reflection'
-    bending : boxes of the shapes that lead lines of sight elsewhere than straight on
+    bending : boxes of the shapes that deviate lines of sight
     bsdf : Dr.Jit's number of a shape's BSDF; 0 where lines of sight end
-    reach : box of all that light can come from which leaves a shape, six numbers [mm]
-    lift : how far from a shape a line goes on [mm]
+    reach : box of all surfaces from which light can reach a shape, six numbers [mm]
+    lift : distance from a shape at which the next leg of a line starts [mm]
     most : longest sequence of lobes that is followed
     least : smallest weight with which a sequence is followed
-    kept : BSDFs that stand for others, kept alive
+    kept : BSDFs that replace others, referenced so that they stay alive
     """
 
     names: tuple[str, ...]
@@ -77,7 +76,7 @@ class Specular:
     def of(
         cls, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature | None = None, even_if_none: bool = False
     ) -> Specular | None:
-        """Specular shapes of a scene as a `lens` sees it; None if there is none, unless wanted `even_if_none`."""
+        """Specular shapes of a scene before a `lens`; None if there is none, unless `even_if_none`."""
         quadrature = quadrature or Quadrature()
         shapes = [(shape, bsdf) for shape in scene.shapes() if (bsdf := specular_bsdf(shape)) is not None]
         if not (shapes or even_if_none):
@@ -88,7 +87,7 @@ class Specular:
             _box(*scene.shapes())
         ]
         if len(bent) == 1 and "transmission" not in lobes and _between(bent[0][0], lens, glowing):
-            lobes, bent = lobes - {"reflection"}, []  # a pane reflects to the lens what is dark
+            lobes, bent = lobes - {"reflection"}, []  # what a pane reflects to the lens is dark
         if not (lobes or even_if_none):
             return None
         boxes = [_box(shape) for shape, _ in bent]
@@ -115,28 +114,28 @@ class Specular:
         )
 
     def state(self) -> tuple[object, ...]:
-        """Key of what the light through these shapes depends on, beside where they stand."""
+        """Key of the parameters that light through these shapes depends on, without their poses."""
         values = [mi.traverse(bsdf) for bsdf in self.kept]
         return self.names, self.lobes, tuple(_key(value[name]) for value in values for name in value.keys())
 
     @property
     def straight(self) -> bool:
-        """True if lines of sight that lead to light go straight on."""
+        """True if lines of sight that lead to light are not deviated."""
         return not self.bending
 
 
 def _key(value: object) -> object:
-    """A number itself, of an array the index of its data, alike as long as these live."""
+    """A number itself; of an array the index of its data, which is unique while they live."""
     held = getattr(value, "array", value)
     return held.index if dr.is_array_v(held) and dr.width(held) > 1 else str(value)
 
 
 def specular_bsdf(shape: mi.Shape) -> mi.BSDF | None:
-    """BSDF whose specular lobes are those of the shape's, None if it has none that can be told from its other ones."""
+    """BSDF with the specular lobes of the shape's; None if it has none, or none separate from other lobes."""
     bsdf = shape.bsdf()
     if bsdf.class_name() == "RoughConductor" and (mirror := _mirror(bsdf)) is not None:
         return mirror
-    # Mitsuba draws one of the two parts of a blend; which one cannot be asked for.
+    # Mitsuba draws one of the two parts of a blend at random, and gives no access to them.
     return bsdf if lobes_of(bsdf) and bsdf.class_name() != "BlendBSDF" else None
 
 
@@ -203,7 +202,7 @@ def _between(shape: mi.Shape, lens: mi.Sensor, glowing: Sequence[Box]) -> bool:
 def transmission(
     scene: mi.Scene, specular: Specular | None, point: mi.Point3f, lens_point: mi.Point3f, active: mi.Bool
 ) -> mi.Float:
-    """Share of the light of a surface point that reaches a point of the lens straight on; 0 where something hides it.
+    """Share of the light of a surface point that reaches a point of the lens undeviated; 0 where it is occluded.
 
     Through null lobes alone: what bends light counts as hiding it.
     """
@@ -235,11 +234,11 @@ def transmission(
 
 @dataclass
 class Course:
-    """Where a sequence of lobes has led a line of sight to.
+    """State of a line of sight after a sequence of lobes.
 
     origin, direction : of its last leg [mm]
     weight : product of the lobes' weights
-    depth : along the optical axis, at which its origin is seen [mm]: lengths in a medium count over its index
+    depth : apparent depth of its origin along the optical axis [mm]: lengths in a medium are divided by its index
     index : of refraction of the medium, relative to that at the lens
     plain : 1 if every lobe was the strongest of its surface, or led straight on; else 0 (Dr.Jit 1.5 generates invalid
         code for truth values in local memory)
@@ -261,20 +260,19 @@ class Course:
         return cls(mi.Point3f(ray.o), mi.Vector3f(ray.d), one, mi.Float(start), mi.Float(1), number(1), number(0))
 
     def carries(self) -> mi.Float:
-        """Share of the light along the line: radiance over the squared index is what refraction leaves alone."""
+        """Share of the light along the line: refraction conserves radiance over the squared index."""
         return self.weight * dr.square(self.index)
 
 
 @dataclass
 class Found:
-    """What a line of sight finds on all its courses.
+    """Result of a line of sight over all its courses.
 
     radiance : Σ weight × radiance [W/mm²/sr]
     covered : True if it meets a shape with an `fspt_surface` on a plain course
-    body : number of all that the course of the strongest lobes met, the first surface in its last 12 bits; 0 where it
-        met nothing
-    depth, front : depth [mm] at which the surface where that course ends and the first one are seen, inf without one
-    lost : share of the light that is cut off
+    body : code of all surfaces on the course of the strongest lobes, the first one in its last 12 bits; 0 without one
+    depth, front : apparent depth [mm] of the surface at the end of that course and of the first one, inf without one
+    lost : share of the light that is not followed
     """
 
     radiance: mi.Float
@@ -289,7 +287,7 @@ class Found:
 class _Lobe:
     """A lobe where a line of sight meets a surface: its `direction`, `weight` and ratio of refractive `indices`.
 
-    origin : where the line goes on
+    origin : start of the next leg [mm]
     """
 
     origin: mi.Point3f
@@ -310,7 +308,7 @@ def follow(
     covers: Covers,
     note: Note | None = None,
 ) -> Found:
-    """What a line of sight finds that begins with a `ray` at the depth `start` [mm].
+    """Result of the line of sight that begins with a `ray` at the depth `start` [mm].
 
     cosine : of the ray to the optical axis
     passes : False for lines that are not followed
@@ -364,10 +362,9 @@ def follow(
 def strongest_course(
     scene: mi.Scene, specular: Specular, ray: mi.Ray3f, cosine: mi.Float, start: mi.Float
 ) -> Iterator[tuple[mi.SurfaceInteraction3f, mi.Float]]:
-    """Surfaces on the course of the strongest lobes of one line of sight, and the depth [mm] at which each is seen.
+    """Surfaces on the course of the strongest lobes of one line of sight, and the apparent depth [mm] of each.
 
-    Parameters as of `follow`, for one line. The last one is where the line ends, unless it leaves that for a place
-    where it meets nothing.
+    Parameters as of `follow`, for one line. The line ends on the last surface, or leaves it and meets none.
     """
     course = Course.begun(ray, start)
     most, least = mi.UInt32(specular.most), mi.Float(specular.least)
@@ -395,7 +392,7 @@ def first_met(body: mi.Float) -> mi.UInt32:
 def _followed(
     specular: Specular, most: mi.UInt32, least: mi.Float, number: mi.UInt32, course: Course
 ) -> tuple[mi.Bool, mi.Float]:
-    """True where a course that leaves a shape of this number is followed, and what it carries where it is cut off."""
+    """True where a course from a shape of this number is followed; its share of the light where it is not."""
     leads = _leads_to_light(specular, number, course)
     on = leads & (course.carries() > least) & (course.length <= most)
     return on, dr.select(leads & ~on, course.carries(), 0)
@@ -411,7 +408,7 @@ def _noted(
     radiance: mi.Float,
     covered: mi.Bool,
 ) -> Found:
-    """What was found, and the surface where one leg of a course ends."""
+    """`found` with the surface at the end of one leg added."""
     foremost = met & foremost
     first = foremost & (found.body == 0)
     entry, rest = found.body & CODES, found.body // (CODES + 1)
@@ -453,12 +450,12 @@ def _lobes(
 
 
 def _off(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, lift: mi.Float) -> mi.Point3f:
-    """Where a ray with this direction leaves a surface, off it by a little more than its coordinates are rounded."""
+    """Start of a ray from a surface in this direction, off it by a little more than coordinates are rounded."""
     return mi.Point3f(si.p + dr.mulsign(lift, dr.dot(si.n, direction)) * si.n)
 
 
 def _onward(course: Course, lobe: _Lobe, depth: mi.Float) -> Course:
-    """A course and one lobe more."""
+    """`course` with one more lobe."""
     return replace(
         course,
         origin=lobe.origin,
@@ -472,7 +469,7 @@ def _onward(course: Course, lobe: _Lobe, depth: mi.Float) -> Course:
 
 
 def _strongest_first(courses: list[Course]) -> tuple[Course, list[Course]]:
-    """The course that carries most, the first of equal ones, and the others."""
+    """The course with the largest share of the light, the first of equal ones, and the others."""
     best, others = courses[0], []
     for course in courses[1:]:
         stronger = course.carries() > best.carries()
@@ -482,7 +479,7 @@ def _strongest_first(courses: list[Course]) -> tuple[Course, list[Course]]:
 
 
 def _leads_to_light(specular: Specular, number: mi.UInt32, course: Course) -> mi.Bool:
-    """True where a course carries anything, and its last leg meets the box of all that light can come from."""
+    """True where the weight is positive and the last leg meets the box of surfaces that light can come from."""
     low, high = (
         mi.Vector3f(*(dr.gather(mi.Float, specular.reach, 6 * number + k, course.weight > 0) for k in of))
         for of in (range(3), range(3, 6))

@@ -31,16 +31,17 @@ from .solution import Solution
 from .specular import Specular, transmission
 from .window import Window
 
-# Lines of sight a pixel of the image at the first level, and how many times more at each further one: by the second
-# level both pieces and cells are refined, or what one of them does wrong would pass for converged.
+# Lines of sight a pixel of the image at the first level, and factors from level to level: at the second level both
+# pieces and cells are refined, as the change of one alone would not show the error of the other.
 FIRST_LINES, FIRST_GROWTH, GROWTH = 16, 16, 4
 MOST_LINES = 1 << 16  # a pixel of an image
-# The same on some pixels, if the pupil form's lattices can go on: with light up to so many times brighter than a pixel.
-HANDED_ON, SETTLED = 1 << 12, 10.0
-BLURRED = 0.5  # of the blur radius: a smaller piece of a small shape is imaged as one point
-DARK_LINES = 4096  # lines of sight a pixel before a pixel without light counts as dark: two levels may miss it
-SAFETY = 3.0  # the last change of a pixel and of its neighbours, times this, bounds what is left
-CARRIED = 0.4  # of the estimate of the level before that the next one keeps: two levels may agree by chance
+# Largest number on some pixels only, if the pupil form's lattices can refine them: for surfaces up to `HANDED_ON_PEAK`
+# times brighter than the brightest pixel.
+HANDED_ON, HANDED_ON_PEAK = 1 << 12, 10.0
+BLURRED = 0.5  # of the blur radius: side below which a piece of a small shape is imaged as a point
+DARK_LINES = 4096  # lines of sight a pixel from which on a pixel without light counts as dark
+SAFETY = 3.0  # error over the largest last change of a pixel and of its neighbours
+CARRIED = 0.4  # least error over that of the level before, as two levels may agree by chance
 # No pixel is brighter than the brightest piece: so much above it and so small a share of it are whole numbers of 60
 # bits, and thousands of roundings on a pixel stay below 1e-9 of any but the faintest.
 HEADROOM, RESOLUTION, COVERAGE_QUANTUM = 2.0**4, 2.0**-56, 2.0**-50
@@ -58,7 +59,7 @@ def solve(
     progress: Progress = SILENT,
     specular: Specular | None = None,
 ) -> Solution:
-    """Power [W], error [W] and coverage on every pixel of the crop window; see `Quadrature` for what is promised.
+    """Power [W], error [W] and coverage on every pixel of the crop window, to the accuracy of `quadrature`.
 
     Only pixels of the `window` are computed, the others are dark. With `where`, of its shape, the solution is complete
     on the pixels marked there and 0 elsewhere. `least_peak`: lower bound of the brightest pixel's mean radiance on film
@@ -73,7 +74,7 @@ def solve(
 
 
 class _Refinement:
-    """The picture while it is refined: mean radiance on film, its error and coverage, shape (h, w)."""
+    """Image during refinement: mean radiance on film [W/mm²/sr], its error and coverage, shape (h, w)."""
 
     def __init__(
         self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, specular: Specular | None
@@ -114,18 +115,18 @@ class _Refinement:
         error[self.coverage == 0] = self.error[self.coverage == 0]
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.coverage, 0, 1))
-        known = self.window.expand(where.astype(np.float64)) > 0
+        complete = self.window.expand(where.astype(np.float64)) > 0
         progress(1.0)
-        return Solution(power, error, coverage, self.rays, tuple(self.levels), known, self._findings())
+        return Solution(power, error, coverage, self.rays, tuple(self.levels), complete, self._findings())
 
     def _most_lines(self, partial: bool, least_peak: float) -> int:
-        """Lines of sight a pixel of the image at the last level; `partial`: where the pupil form goes on."""
-        bright = SETTLED * self._tolerance(least_peak) / self.quadrature.rtol
+        """Lines of sight a pixel of the image at the last level; `partial`: the pupil form follows."""
+        bright = HANDED_ON_PEAK * self._tolerance(least_peak) / self.quadrature.rtol
         most = HANDED_ON if partial and most_radiance(self.scene) <= bright else MOST_LINES
         return max(min(self.quadrature.max_nodes, most), FIRST_LINES * FIRST_GROWTH)
 
     def _tolerance(self, least_peak: float) -> float:
-        """The error asked for [W/mm²/sr]."""
+        """Tolerance [W/mm²/sr]."""
         return self.quadrature.rtol * max(self.window.brightest(self.value), least_peak)
 
     def _hides_nothing(self) -> bool:
@@ -133,7 +134,7 @@ class _Refinement:
 
     def _findings(self) -> tuple[Finding, ...]:
         dark, count = (sum(getattr(glow, name) for glow in self.glows) for name in ("dark", "count"))
-        seen = "one surface may hide another" if self.hidden else "one convex shape hides nothing of itself"
+        seen = "one surface may occlude another" if self.hidden else "one convex shape does not occlude itself"
         return (
             Finding("occlusion", not self.hidden, seen),
             Finding("dark", dark > 0, f"{dark} of {count} elements are dark"),
@@ -152,7 +153,7 @@ class _Refinement:
             self.rays += rays
             if peak <= HEADROOM * self.peak:
                 break
-            self.peak = peak  # brighter than foreseen: once more in coarser steps
+            self.peak = peak  # beyond the range of the quanta: once more with larger ones
         self.levels.append(f"{lines} lines a pixel: {np.count_nonzero(mark)} pixels, {rays} lines")
         return canvas.pictures()
 

@@ -1,9 +1,9 @@
 """Transects: curves through pixel × pupil that cross every straight edge at right angles to them just once.
 
-Light that leaves a point for pupil point a arrives at film position c + r a; r is the signed radius of its blur disc.
-So a straight edge with normal n parts pixel × pupil at one value of n·(p - r a), whatever its blur. A transect goes
-from the smallest to the largest value. What it leaves open, three places between 0 and 1, moves along the edge, and the
-mean along a transect depends on them but little: where edges are nearly straight, a few transects do.
+Light from a surface point through pupil point a arrives at film position c + r a; r is the signed radius of the blur
+disc. So a straight edge with normal n divides pixel × pupil at one value of n·(p - r a), whatever its blur. A transect
+goes from the smallest to the largest value. Three more coordinates in [0, 1] run along the edge. The mean along a
+transect hardly depends on them: where edges are nearly straight, a few transects suffice.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ import mitsuba as mi
 from ..jit.disc_segments import segment, segment_double_integral, segment_height, segment_integral
 from .pupil import turned
 
-# Blur radii [pixels] that stand for smaller and larger ones; the edge moves by a share of a pixel then with the places.
+# Blur radii [pixels] at which smaller and larger ones are clipped; the position of the edge then depends on `place`.
 LEAST_BLUR, MOST_BLUR = 0.01, 32.0
-CENTRE_WIDTH = 0.1  # of the blur radius: the pixel that stands for its centre
+CENTRE_WIDTH = 0.1  # of the blur radius: width taken for a pixel that is evaluated at its centre
 
 
 @dataclass
 class Transect:
     """Curve s ∈ [-1, 1] through pixel × pupil, on which h x + b y = (h/2 + b) s.
 
-    x ∈ [-½, ½] is the place in the pixel along the film's `axis` nearest to n, h the `width` of the pixel across n;
-    y ∈ [-1, 1] the place in the pupil along `lean`, b the `blur`. `place` ∈ [0, 1]³ says what share of the pupil with
-    the same sum has a smaller y, where across the pupil at y it lies, and where on the pixel's other axis.
+    x ∈ [-½, ½] is the position in the pixel along the film's `axis` nearest to n, h the `width` of the pixel across n;
+    y ∈ [-1, 1] the position in the pupil along `lean`, b the `blur`. The coordinates `place` ∈ [0, 1]³ are: the share
+    of the pupil with the same sum that has a smaller y; the position on the chord of the pupil at y; the position along
+    the pixel's other axis.
     """
 
     centre: mi.Point2f
@@ -39,7 +40,7 @@ class Transect:
     area: mi.Float
 
     def at(self, s: mi.Float) -> tuple[mi.Point2f, mi.Point2f, mi.Float]:
-        """Film position [pixels], pupil point [unit disc], and the density by which the mean over all is one over s."""
+        """Film position [pixels], pupil point [unit disc], and density over s of the measure of pixel × pupil."""
         half = 0.5 * self.width + self.blur
         low, high = (segment((half * s + side * self.width) / self.blur) for side in (-0.5, 0.5))
         y = segment_height(dr.lerp(low, high, self.place.x))
@@ -50,7 +51,7 @@ class Transect:
         return self.centre + self.area * offset, pupil, half * (high - low) / self.width
 
     def moments(self, s: mi.Float) -> mi.Vector2d:
-        """Integrals from -1 on of the density and of s times it; in double precision, as their terms nearly cancel."""
+        """Integrals from -1 to s of the density and of s times it; in double precision, as terms nearly cancel."""
         h, b, s = mi.Float64(self.width), mi.Float64(self.blur), mi.Float64(s)
         half = 0.5 * h + b
         low, high = (half * s - 0.5 * h) / b, (half * s + 0.5 * h) / b
@@ -60,7 +61,7 @@ class Transect:
 
 
 def transect(centre: mi.Point2f, angle: mi.Float, blur: mi.Float, place: mi.Point3f, area: mi.Float) -> Transect:
-    """Transect of a pixel whose picture changes along `angle` and that sees an edge with `blur` [pixels], signed.
+    """Transect of a pixel across an edge with its normal at `angle` [rad] and the signed blur radius `blur` [pixels].
 
     `area`: 1 over the pixel, 0 at its centre.
     """

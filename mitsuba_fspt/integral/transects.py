@@ -1,4 +1,4 @@
-"""Transects through pixel × pupil where the integrand jumps, level by level until the estimated errors are small."""
+"""Refinement by transects where the integrand jumps: more of them at each level, until the estimated error is small."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from .transect import transect
 if TYPE_CHECKING:
     from ..jit.pixel_grid import Mask, PixelArray
 
-DARK_LEVELS = 3  # of transects that are taken in any case while no light has been found anywhere
-FAR = 1e30  # depth [mm] that stands for infinity, where an edge has a finite blur
+DARK_LEVELS = 3  # levels of transects that are taken while no line of sight of the image has met light
+FAR = 1e30  # depth [mm] at which larger ones are clipped; the blur of an edge is finite there
 
 
 def integrate_by_transects(
     draft: Draft, rough: Mask, levels: list[tuple[int, node_rules.AlongTransect]], among: Mask | None = None
 ) -> None:
-    """Transects on the rough pixels: more of them at each level, where the error is still above the tolerance.
+    """Refine the `rough` pixels, and those around on which the same edge may lie, by transects.
 
-    Pixels around that may see the same edge follow, those `among` which they are to be taken at all.
+    levels : number of transects of each level, and the accuracy along each
+    among : pixels that may be refined; None: all that influence a pixel of the crop window
     """
     refinement = _Refinement(draft, rough, draft.wanted() if among is None else draft.wanted() & among)
     for level, (count, along) in enumerate(levels):
@@ -41,15 +42,15 @@ def integrate_by_transects(
 
 
 class _Refinement:
-    """Which pixels take the next level of transects, and what is known of them.
+    """State of the refinement by transects.
 
     where : pixels that take the next level
     wanted : pixels that may take transects
-    edges : of the edge that each pixel may see, its direction and blur
-    has_jump : True where a transect has met a jump
-    smooth : True where no transect has met one, so that node rules may converge
-    remaining : error of each pixel that follows from its own transects alone [W/mm²/sr]
-    count, means : of the last level, the number of transects and what they found
+    edges : direction and blur of the edge on each pixel
+    has_jump : True where a transect has crossed a jump
+    smooth : True where no transect has crossed one, so that node rules may converge
+    remaining : error of each pixel that follows from its own transects [W/mm²/sr]
+    count, means : number of transects of the last level, and their means
     """
 
     def __init__(self, draft: Draft, rough: Mask, wanted: Mask) -> None:
@@ -65,24 +66,23 @@ class _Refinement:
         """One level: new values and errors, and the pixels that take the next level."""
         draft, where = self.draft, self.where
         if self.means:
-            self.edges.learn(draft, self.means, self.has_jump, across=level % 2 == 0)
+            self.edges.update(draft, self.means, self.has_jump, across=level % 2 == 0)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
-        # The outline of a dark body counts only where light comes past it.
-        lit = means.value > dr.opaque(mi.Float64, self.estimator.dim) * draft.peak
-        first_met = where & means.jumps & lit & ~self.has_jump
+        # The outline of a dark body counts only where some lines of sight meet light.
+        first_met = where & means.jumps & (means.value > 0) & ~self.has_jump
         self.has_jump |= first_met
         self.smooth = self.smooth & where & ~self.has_jump
         value, coverage = self._smooth_by_nodes(level)
-        moved = dr.abs(value - draft.value)
+        change = dr.abs(value - draft.value)
         if level == 0:
-            remaining, around = self._after_first(first_met, moved, parted(coverage))
+            remaining, around = self._after_first(first_met, change, parted(coverage))
         else:
-            remaining, around = self._after_later(level, first_met, moved, len(rule))
-            self.smooth = self.smooth & (moved < self.estimator.bumpy * value)
-        # Pixels around that have met no jump, or take no more transects, may have passed by the same edge.
-        around = dr.select((self.has_jump & where) | ~draft.open, 0, around)
+            remaining, around = self._after_later(level, first_met, change, len(rule))
+            self.smooth = self.smooth & (value > 0)  # where all is dark, only transects detect a small body
+        # An edge may reach into pixels around whose transects have crossed no jump.
+        around = dr.select((self.has_jump & where) | ~draft.computed, 0, around)
         self.remaining = dr.select(where, remaining, self.remaining)
-        replaced = where if level else first_met  # without a jump nodes do better than the first transects
+        replaced = where if level else first_met  # without a jump, nodes are more accurate than two transects
         draft.value = dr.select(replaced, value, draft.value)
         draft.set_coverage(dr.select(replaced, coverage, draft.coverage))
         error = dr.maximum(self.remaining, self._by_neighbours(self.has_jump & ~first_met))
@@ -102,72 +102,77 @@ class _Refinement:
         seen = apply_nodes(self.draft, rule, self.smooth, ("value", "coverage"))
         return dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.coverage, coverage)
 
-    def _at_least_unsettled(self, remaining: PixelArray) -> PixelArray:
+    def _above_tolerance(self, remaining: PixelArray) -> PixelArray:
         """The error that remains, or one above the tolerance, so that another level follows."""
-        return dr.maximum(remaining, self.estimator.unsettled * self.draft.tolerance)
+        return dr.maximum(remaining, self.estimator.new_jump * self.draft.tolerance)
 
     def _by_neighbours(self, met_before: Mask) -> PixelArray:
-        """Error of each pixel that follows from its neighbours', whose edges may reach into it.
+        """Error of each pixel that follows from the errors of its neighbours, as their edges may reach into it.
 
-        Half of a neighbour's counts; all of it where the edge is sharp, or where the neighbour has met a jump and the
-        pixel had not (`met_before`).
+        `neighbour_share` of a neighbour's error; all of it where the edge is sharp, or where the neighbour's transects
+        have crossed a jump and those of the pixel had not (`met_before`).
         """
         near, with_jump = self.draft.grid.spread_all((self.remaining, dr.select(self.has_jump, self.remaining, 0)))
-        doubt = dr.maximum(dr.opaque(mi.Float64, self.estimator.doubt) * near, dr.select(met_before, 0, with_jump))
-        return dr.select(self.edges.sharp, near, doubt)
+        share = dr.opaque(mi.Float64, self.estimator.neighbour_share)
+        blurred = dr.maximum(share * near, dr.select(met_before, 0, with_jump))
+        return dr.select(self.edges.sharp, near, blurred)
 
-    def _after_first(self, first_met: Mask, moved: PixelArray, silhouette: Mask) -> tuple[PixelArray, PixelArray]:
-        """Error that remains after the first transects; error of pixels around a jump, which may pass it by.
+    def _after_first(self, first_met: Mask, change: PixelArray, silhouette: Mask) -> tuple[PixelArray, PixelArray]:
+        """Error that remains after the first transects, and error of pixels around a jump, which may have missed it.
 
-        Two transects that agree with nodes are evidence enough of a silhouette, which coverage shows too, but not of a
-        step of J_n.
+        Two transects that agree with the nodes suffice on a silhouette, which coverage shows too, but not on a step of
+        J_n.
         """
         draft, estimator = self.draft, self.estimator
-        at_jump = dr.maximum(estimator.first_gain * moved, self.means.scatter)
-        at_jump = dr.select(silhouette, at_jump, self._at_least_unsettled(at_jump))
+        at_jump = dr.maximum(estimator.first_ratio * change, self.means.scatter)
+        at_jump = dr.select(silhouette, at_jump, self._above_tolerance(at_jump))
         elsewhere = dr.select(parted(draft.coverage), draft.error, draft.roughness)
-        elsewhere = dr.maximum(estimator.nodes_gain * moved, elsewhere)
-        # Pixels that are known from elsewhere take no transects; their outlines count as jumps here.
-        jumps = first_met | (draft.outline & ~draft.open)
-        return dr.select(first_met, at_jump, elsewhere), draft.unseen_by_transects(jumps)
+        elsewhere = dr.maximum(estimator.nodes_ratio * change, elsewhere)
+        # Pixels that another solution gives take no transects; their outlines count as jumps here.
+        jumps = first_met | (draft.outline & ~draft.computed)
+        return dr.select(first_met, at_jump, elsewhere), draft.missed_edge_error(jumps)
 
-    def _after_later(self, level: int, first_met: Mask, moved: PixelArray, count: int) -> tuple[PixelArray, PixelArray]:
-        """Error that remains after a later level; error of pixels around those that this level changed unexpectedly.
+    def _after_later(
+        self, level: int, first_met: Mask, change: PixelArray, count: int
+    ) -> tuple[PixelArray, PixelArray]:
+        """Error that remains after a later level, and error around pixels that this level changed beyond their error.
 
-        The less a level moved of what remained before, the less remains; but no less than the order of convergence
-        grants, as two wrong values may agree by chance. A jump that is met for the first time takes another level: what
-        was moved before tells nothing of it.
+        The smaller the change of the value relative to the error before, the smaller the error that remains; but the
+        change counts as no smaller than the order of convergence predicts, as two wrong values may agree by chance.
+        Where a jump is crossed for the first time another level follows, as earlier changes do not bound its error.
         """
         before, estimator = self.remaining, self.estimator
-        least, most = estimator.least_gain, estimator.most_gain
-        change = dr.maximum(moved, before * dr.opaque(mi.Float64, (self.count / count) ** estimator.order))
-        gain = dr.clip(dr.select(before > 0, most * change / before, most), least, most)
-        remaining = dr.maximum(change * gain, self.means.scatter)
+        least, most = estimator.least_ratio, estimator.most_ratio
+        least_change = before * dr.opaque(mi.Float64, (self.count / count) ** estimator.order)
+        assumed = dr.maximum(change, least_change)
+        ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), least, most)
+        remaining = dr.maximum(assumed * ratio, self.means.scatter)
         if level <= node_rules.SMOOTH_LEVELS:
             # On smooth pixels the next node rule changes the value by less than this one did.
-            remaining = dr.select(self.smooth, estimator.step_gain * moved, remaining)
-        remaining = dr.select(first_met, self._at_least_unsettled(remaining), remaining)
-        expected = dr.maximum(dr.opaque(mi.Float64, estimator.misled) * before, self.draft.tolerance)
-        unexpected = self.where & (moved > expected)
-        return remaining, self.draft.near_edge(dr.select(first_met | unexpected, moved, 0))
+            remaining = dr.select(self.smooth, estimator.step_ratio * change, remaining)
+        remaining = dr.select(first_met, self._above_tolerance(remaining), remaining)
+        expected = dr.maximum(dr.opaque(mi.Float64, estimator.unexpected) * before, self.draft.tolerance)
+        unexpected = self.where & (change > expected)
+        return remaining, self.draft.near_edge(dr.select(first_met | unexpected, change, 0))
 
 
-# ---------------------------------------------------------------------- which way transects go
+# ---------------------------------------------------------------------- direction and blur of edges
 
 
 @dataclass
 class Edges:
-    """Of the edge a pixel may see: `angle` across it, signed `blur` radius [pixels], whether it counts as `sharp`."""
+    """Edge on each pixel: `angle` of its normal [rad], signed `blur` radius [pixels], whether it counts as `sharp`."""
 
     angle: PixelArray
     blur: PixelArray
     sharp: Mask
 
-    def learn(self, draft: Draft, means: Means, has_jump: Mask, across: bool = False) -> None:
-        """Take the blur of the edges that the last transects met, on pixels around as well.
+    def update(self, draft: Draft, means: Means, has_jump: Mask, across: bool = False) -> None:
+        """Set the blur to that of the edges which the last transects crossed, on pixels around as well.
 
-        A pixel that met no jump may see the tip of a neighbour's edge: its next transects go along the gradient of the
-        coverage, at every other level `across` it, as the light that a dark body leaves may lie beside all of them.
+        Where no transect has crossed a jump, the end of a neighbour's edge may lie on the pixel: the next transects go
+        along the gradient of the coverage, at every other level `across` it, as light beside a dark body may lie
+        between all those along it.
         """
         grid, jumps = draft.grid, means.jumps
         around = (means.blur, -means.blur, jumps, has_jump | draft.outline)
@@ -183,39 +188,41 @@ class Edges:
 
 
 def _around(draft: Draft) -> int:
-    """Radius [pixels] of the square over which the gradient is taken that tells the direction of an edge."""
+    """Radius [pixels] of the square over which the gradient is averaged for the direction of an edge."""
     return 1 + math.ceil(draft.most_blur / 2)
 
 
 def _most_blurred(ahead: PixelArray, behind: PixelArray) -> PixelArray:
-    """Of two signed blur radii the one of larger magnitude; their mean could be 0, as of a sharp edge."""
+    """The one of two signed blur radii with the larger magnitude; their mean could be 0, that of a sharp edge."""
     return dr.select(ahead > -behind, ahead, behind)
 
 
 def edges_of(draft: Draft) -> Edges:
-    """Edges before any transect: along the gradient of the picture, with the blur of the nearest surface.
+    """Edges before the first transect: normal along the gradient of the image, blur of the nearest surface.
 
     The image-plane stop is sharp.
     """
     grid = draft.grid
     angle = grid.principal_angle(*grid.gradient(draft.value), _around(draft))
     nearest = grid.spread_max(-draft.nearest)
-    # A pixel without a silhouette may see a part of a blurred one that its nodes missed.
+    # On a pixel without a silhouette there may be a part of a blurred one that its nodes missed.
     farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
     nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
     blur = dr.select(draft.clipped, 0, draft.lens.blur_radius(nearest))
     return Edges(angle, blur, dr.abs(blur) < draft.estimator.sharp)
 
 
-# ---------------------------------------------------------------------- many transects in one launch
+# ---------------------------------------------------------------------- evaluation of transects
 
 
 @dataclass(frozen=True)
 class Means:
-    """Of each marked pixel mean radiance on film, share of coverage, whether a transect has met a jump.
+    """Means over the transects of each marked pixel.
 
-    scatter : error of the value that follows from how far the transects differ [W/mm²/sr]
-    blur : signed radius of the most blurred edge that a transect met, 0 where none did [pixels]
+    value, coverage : mean radiance on film [W/mm²/sr], share of lines of sight that meet a glowing surface
+    jumps : True where a transect crosses a jump
+    scatter : error of the value that follows from the differences between transects [W/mm²/sr]
+    blur : signed radius of the most blurred edge that a transect crosses, 0 without one [pixels]
     """
 
     value: PixelArray
@@ -233,18 +240,18 @@ def apply_transects(
     images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
     rays = 0
     for part in batches(index, len(rule)):
-        *found, looks = _along_transects(draft, part, edges, rule, table, along)
+        *found, traced = _along_transects(draft, part, edges, rule, table, along)
         for image, column in zip(images, _sums(part, edges, rule, table, found), strict=True):
             dr.scatter(image, column, part)
         dr.eval(images)
-        rays += int(dr.sum(looks)[0])
+        rays += int(dr.sum(traced)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
     value, coverage, squares, trend, split, blur = images
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = squares - value * value
     spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
     blurred = spread * dr.safe_sqrt(variance - trend) / number
-    # Those of a sharp edge differ as it slants, each has a part of it that is its own, and all may pass a corner by.
+    # A sharp edge slants: each transect crosses a part of its own, and a corner may lie between two.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, estimator.corner * value / (number * number))
     return Means(value, coverage, split > 0, dr.select(edges.sharp, sharp, blurred), blur)
@@ -258,8 +265,8 @@ def _along_transects(
     table: mi.Float,
     along: node_rules.AlongTransect,
 ) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
-    """Of each transect of the listed pixels, those of a pixel one after the other: value, coverage, number of jumps,
-    signed blur radius of the edge at the largest, 0 without one [pixels], lines of sight taken.
+    """Value, coverage, number of jumps, signed blur radius of the edge at the largest jump (0 without one) [pixels] and
+    number of lines of sight of each transect of the pixels `part`, those of a pixel one after the other.
     """
     count = dr.opaque(mi.UInt32, len(rule))
     lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
@@ -271,22 +278,22 @@ def _along_transects(
     curve = transect(draft.centres(pixel), angle, blur, place, dr.opaque(mi.Float, float(draft.area)))
     outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
     least, steep = mi.Float(draft.estimator.least_jump * draft.tolerance), draft.estimator.steep
-    value, coverage, jumps, depth, looks = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
-    # Of the edge of a weak reflection beside nothing the depth is not known.
-    known = (jumps > 0) & dr.isfinite(depth)
-    blur = mi.Float(dr.select(known, draft.lens.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
-    found = value, coverage, jumps, blur, looks
-    dr.eval(found)  # together: a reduction evaluates what it needs alone, and would trace every ray twice
+    value, coverage, jumps, depth, traced = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
+    # The edge of a weak reflection beside nothing has no depth.
+    has_depth = (jumps > 0) & dr.isfinite(depth)
+    blur = mi.Float(dr.select(has_depth, draft.lens.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
+    found = value, coverage, jumps, blur, traced
+    dr.eval(found)  # together, as a later reduction of one of them would trace every ray again
     return found
 
 
 def _sums(
     part: mi.UInt32, edges: Edges, rule: node_rules.Transects, table: mi.Float, found: list[mi.Float]
 ) -> list[PixelArray]:
-    """Of each listed pixel means over its transects of value, coverage, value squared, what of that is a trend; how
-    many a jump splits, and the blur of the most blurred edge.
+    """Means over the transects of each pixel of `part`: value, coverage, value squared, sum of the squared trends,
+    number of transects with a jump, blur of the most blurred edge [pixels].
 
-    `found` as of `_along_transects`: value, coverage, jumps, blur.
+    `found`: value, coverage, jumps, blur as of `_along_transects`.
     """
     count = dr.opaque(mi.UInt32, len(rule))
     first = dr.arange(mi.UInt32, dr.width(part)) * count

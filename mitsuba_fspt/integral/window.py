@@ -71,7 +71,7 @@ class Window:
         return Window(top, left, (bottom - top, right - left), (len(rows), len(columns)), offset, self.blur)
 
     def centres(self, number: mi.UInt32) -> mi.Point2f:
-        """Film positions [pixels] of the centres of the window's pixels of so much `number`, row by row."""
+        """Film positions [pixels] of the centres of the window's pixels with this `number`, row by row."""
         width = dr.opaque(mi.UInt32, self.shape[1])
         left, top = (dr.opaque(mi.Float, n + 0.5) for n in self.corner)
         return mi.Point2f(left + mi.Float(number % width), top + mi.Float(number // width))
@@ -115,7 +115,7 @@ class Window:
         return self.cut(np.ones(self.full, bool))
 
     def brightest(self, image: NDArray[np.float64]) -> float:
-        """Largest value of an image (h, w) that is shown, of all if those are 0."""
+        """Largest value of an image (h, w) in the crop window, or on its rim if all those are 0."""
         return float(image[self.inner].max(initial=0.0) or image.max(initial=0.0))
 
     def _common(self) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
@@ -159,7 +159,7 @@ def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False, bending: 
     points = np.array([ends[:, list(pick), range(3)] for pick in itertools.product((0, 1), repeat=3)]).reshape(-1, 3)
     discs, radii = lens.film_discs(points)
     blur = radii.max(initial=0.0)
-    if bending:  # what a mirror shows lies as far behind it as its light goes on before it
+    if bending:  # an image behind a mirror is as far as its light travels in front of it
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
         far = lens.blur_radius(mi.Float64(lens.farthest_depth(points) + size))
         blur = max(blur, abs(float(far[0])))
@@ -177,6 +177,6 @@ def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False, bending: 
         )
         for k, size in enumerate((width, height))
     )
-    if left >= width or top >= height or right <= 0 or bottom <= 0:  # only the rim sees it
+    if left >= width or top >= height or right <= 0 or bottom <= 0:  # visible on the rim alone
         right, bottom = left, top
     return replace(crop, top=top, left=left, shape=(max(0, bottom - top), max(0, right - left)))

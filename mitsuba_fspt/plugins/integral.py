@@ -391,9 +391,9 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         state = ([shape_number(shape) for shape in shapes], [_pose(shape) for shape in shapes], _view(sensor))
         found = self._left_out.recall(state, lambda: self.light_left_out(scene, sensor))
         warning = found.warning(self.quadrature.rtol) if found else None
-        if warning and not found.told:
+        if warning and not found.reported:
             mi.Log(mi.LogLevel.Warn, f"fspt_integral: {warning}.")
-            found.told = True
+            found.reported = True
 
     def to_string(self) -> str:
         return f"FsptIntegral[{self.quadrature}]"

@@ -148,12 +148,12 @@ def dim_icosphere(path, radius, center, turn, *, bright_faces=(), bright_vertice
     return shape, TriangleMesh(vertices, faces, corners)
 
 
-def test_who_settled_by_chance_looks_again_when_a_neighbour_was_misled(tmp_path):
+def test_pixels_that_converged_by_chance_are_refined_beside_unexpected_changes(tmp_path):
     """A bright face of a dim body that only the pupil's rim sees, f/1.2, blur 20 pixels; against the depth buffer.
 
     Expected: the error is a bound, beside three standard errors of the reference. Seen to fail (0.012 of the brightest
-    pixel, error 0.012, for 0.26 on the middle one) where pixels that settled on the first two transects, of which one
-    met the dim body, are asked no more, though neighbours moved by forty times what they were thought to be wrong by.
+    pixel, error 0.012, for 0.26 on the middle one) where pixels that converged on the first two transects, of which one
+    met the dim body, are not refined, though neighbours changed by forty times their estimated error.
     """
     far, behind = dim_icosphere(
         tmp_path / "far.ply", 2.1849, [0.2823, 0.8456, 111.7323], [-0.1238, 0.972, -2.671], bright_faces=(5, 48)

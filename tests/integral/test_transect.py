@@ -133,7 +133,7 @@ def test_scatter_says_where_transects_kink_and_where_they_only_lean():
     first_nodes(draft, np.zeros(draft.grid.shape))
     cut = parted(draft.coverage)
     edges = edges_of(draft)
-    edges.learn(
+    edges.update(
         draft, apply_transects(draft, cut, edges, node_rules.transects(2), node_rules.along_transect(0, 1e-4)), cut
     )
     few, many = (

@@ -40,7 +40,7 @@ def test_silhouettes_finds_errors_that_fall(tmp_path, monkeypatch, capsys):
             for key in ("RMS", "lines_of_sight_a_pixel")
         )
         assert rms["24 transects"] < rms["12 nodes"] * (rays["12 nodes"] / rays["24 transects"]) ** order
-    assert "order of nodes and transects" in capsys.readouterr().out
+    assert "order from 12 nodes to 24 transects" in capsys.readouterr().out
 
 
 def test_scaling_measures_every_setting(tmp_path, monkeypatch, capsys):

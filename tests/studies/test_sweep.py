@@ -98,7 +98,7 @@ def test_every_combination_becomes_an_image_and_a_row(run, tmp_path):
     code, out, err = run("sweep", "s.xml", *DEFINE)
     assert (code, err) == (0, "")
     assert re.match(r"s_sweep/index\.csv: 4 points, 4 rendered in \S+ s, 0 reused\n", out)
-    assert out.endswith("s_sweep/contact_sheet.png: all of them to look at\n")
+    assert out.endswith("s_sweep/contact_sheet.png: all of them as pictures\n")
     folder = tmp_path / "s_sweep"
     assert sorted(os.listdir(folder)) == sorted([*NAMES, "index.csv", "contact_sheet.png"])
     with (folder / "index.csv").open(newline="") as file:
