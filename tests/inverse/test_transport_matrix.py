@@ -336,6 +336,7 @@ def test_scenes_without_columns_are_refused(tmp_path):
 
 
 def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
+    """Seen to fail where nothing compares the bytes."""
     from mitsuba_fspt.integral import sparse_rows
 
     monkeypatch.setattr(sparse_rows, "available_memory", lambda: 1 << 20)
@@ -348,7 +349,10 @@ def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
 
 
 def test_an_rtol_that_is_not_reached_is_told(matrix, scene_file, tmp_path, run, monkeypatch):
-    """In the metadata, and as one line of the verb. Here an integral that states a hundredth of the brightest pixel."""
+    """In the metadata, and as one line of the verb. Here an integral that states a hundredth of the brightest pixel.
+
+    Seen to fail without `warnings` in the metadata.
+    """
     import mitsuba as mi
 
     assert "warnings" not in matrix.metadata
@@ -370,6 +374,7 @@ def test_an_rtol_that_is_not_reached_is_told(matrix, scene_file, tmp_path, run, 
 
 
 def test_files_that_are_none_are_refused(matrix, tmp_path):
+    """Seen to fail with a text that NumPy opens: its message is that of a pickled file, which may be unsafe."""
     with pytest.raises(TransportError, match="does not exist"):
         fspt.read_transport(tmp_path / "none.npz")
     whole = tmp_path / "T.npz"
