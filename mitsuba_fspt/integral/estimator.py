@@ -52,6 +52,8 @@ class Estimator:
     sharp : blur radius [pixels] below which transects are placed in the pixel instead of the pupil
     least_jump : of the tolerance. Smaller steps of the radiance along a transect are no jumps
     steep : a step of the radiance along a transect is a jump if it is so many times the mean of the other steps
+    faint : of the brightest pixel. With less light a jump shows nothing of a brighter body around, as beside the rim of
+        blurred occluders at f/0.95
 
     Of lattices:
 
@@ -82,6 +84,7 @@ class Estimator:
     sharp: float = _bound(0.2, 0.0)
     least_jump: float = _bound(0.1, 0.0)
     steep: float = _bound(4.0, 1e30)
+    faint: float = _bound(1e-5, 0.0)
     student_t: float = _bound(4.1, 1.0)
     missed_share: float = _bound(6.9, 0.0)
 

@@ -69,7 +69,8 @@ class _Refinement:
             self.edges.update(draft, self.means, self.has_jump, across=level % 2 == 0)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
         # The outline of a dark body counts only where some lines of sight meet light.
-        first_met = where & means.jumps & (means.value > 0) & ~self.has_jump
+        lit = means.value > dr.opaque(mi.Float64, self.estimator.faint) * draft.peak
+        first_met = where & means.jumps & lit & ~self.has_jump
         self.has_jump |= first_met
         self.smooth = self.smooth & where & ~self.has_jump
         value, coverage = self._smooth_by_nodes(level)
