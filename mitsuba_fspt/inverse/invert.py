@@ -53,8 +53,8 @@ class Settings:
     threads : blocks that are computed at the same time
     unknowns : most of them to begin with; of a finer mesh, J_n is linear between some of its vertices (Eq. M.30)
     resolved : least number of unknowns for each one that the data determine; with fewer, and a finer mesh, the fit
-        begins anew with three times as many. What is smoother than the data resolve makes up (2/π)/`resolved` of the
-        variance of a vertex, which intervals then lack: 6 %, or 3 % of their width.
+        begins anew with two to four times as many. What is finer than these unknowns makes up (2/π)/`resolved` of the
+        variance of a vertex, which intervals then lack: 8 %, or 4 % of their width.
     rough : times the bounds of variances and weight, the bounds of the first fit, whose J_n only scales the penalty
     """
 
@@ -71,7 +71,7 @@ class Settings:
     block: int = 25
     threads: int = 2
     unknowns: int = 6000
-    resolved: float = 10.0
+    resolved: float = 8.0
     rough: float = 10.0
 
 

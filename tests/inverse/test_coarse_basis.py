@@ -66,7 +66,7 @@ def case(tmp_path_factory, mono):
 def test_j_is_that_of_the_whole_mesh(case):
     """With a quarter of the unknowns J_n is the same to a fraction of its sd, the total of its interval.
 
-    The default takes more unknowns where the data determine more than a tenth of them.
+    The default takes more unknowns where the data determine more than an eighth of them.
     """
     matrix, images = case
     few = Settings(unknowns=400, resolved=1.0)
