@@ -7,6 +7,7 @@ noise added (randomise then optimise: J. M. Bardsley et al., SIAM J. Sci. Comput
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -77,7 +78,7 @@ class Settings:
 
 def invert(
     matrix: TransportMatrix,
-    images: ArrayLike | Sequence[Image | Exposure] | Image | Exposure,
+    images: ArrayLike | Sequence[Image | Exposure | str | os.PathLike[str]] | Image | Exposure | os.PathLike[str],
     /,
     *,
     error: ArrayLike | None = None,
@@ -93,24 +94,25 @@ def invert(
     progress: Progress | None = None,
     settings: Settings | None = None,
 ) -> Inversion:
-    """Surface flux density J_n >= 0 that explains the pictures of all views of a transport matrix.
+    """Surface flux density J_n >= 0 [W/mm²] that fits the images of all views of a transport matrix, with intervals.
 
         R = fspt.invert(T, images, samples=200, seed=1)
 
     Parameters
     ----------
     matrix : of `transport` or `read_transport`
-    images : one Image or Exposure a view, in the order of the views, or powers (views, h, w) [W] with `error`
-    error : standard error of the power [W], a number or (views, h, w); None: what the images say of themselves
-    mask : (views, h, w), True for pixels to leave out, beside those that the images leave out
-    weight : of the penalty on roughness [mm²], >= 0; None: the one that the roughness found agrees with (Eq. M.25)
-    prior : what else the penalty says; None: only that J_n is smooth relative to itself
+    images : one Image, Exposure or name of a file of either per view, in the order of the views; or an array of powers
+        (views, h, w) [W] together with `error`
+    error : standard error of the power [W], a number or (views, h, w); None: the noise stated by the images
+    mask : (views, h, w), True for pixels to leave out, in addition to those that the images mask
+    weight : of the penalty on roughness [mm²], >= 0; None: the weight that agrees with the roughness found (Eq. M.25)
+    prior : mean, reference and correlation length of the penalty; None: roughness relative to J_n itself is penalised
     gain_error : relative uncertainty of a factor common to all pixels, in [0, 1); None: that of the images, else 0
     samples, seed : number of random draws, from which the intervals follow (0: none), and their seed, 0 … 2⁵³
     confidence : of the intervals, in (0, 1)
     method : 'smooth', with the penalty; or 'mlem', maximum likelihood without penalty and intervals (Eq. M.28)
     scene : scene with the meshes of the matrix, where its own cannot be read any more
-    progress : called with what is being done and the share done; without it a notebook shows a bar
+    progress : function of the present step (text) and the share done (0 … 1); None: a bar in notebooks
     settings : accuracy
 
     Raises
@@ -118,6 +120,7 @@ def invert(
     InversionError : an option outside its range, images without light, without an error or with all pixels masked,
         fewer pixels than J_n needs without a penalty, meshes that are not those of the matrix.
     TransportError, DetectorError : images that do not fit the matrix, counts without their detector's numbers.
+    ImageError : a file of an image cannot be read.
     """
     if not isinstance(matrix, TransportMatrix):
         raise InversionError(

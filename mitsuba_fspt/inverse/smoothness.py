@@ -20,11 +20,11 @@ RIDGE = 1e-10
 
 @dataclass(frozen=True)
 class Prior:
-    """What the penalty says of J_n beside its weight.
+    """Prior knowledge of J_n: the numbers of the penalty in addition to its weight (Eq. M.23 of docs/model.md).
 
-    correlation_length : [mm], > 0; None: infinite, only the curvature of J_n counts
-    mean : J_n [W/mm²], >= 0, to which it draws over lengths larger than `correlation_length`
-    reference : ρ [W/mm²], > 0, over which it takes the roughness; None: J_n of a first fit, vertex by vertex
+    correlation_length : 1/κ [mm], > 0; None: infinite, so that only the curvature of J_n is penalised
+    mean : [W/mm²], >= 0, value that J_n tends to over lengths larger than `correlation_length`
+    reference : ρ [W/mm²], > 0, by which J_n is divided in the penalty; None: J_n of a first fit at each vertex
 
     Raises InversionError for a number outside its range.
     """
