@@ -333,6 +333,12 @@ def test_scenes_without_columns_are_refused(tmp_path):
     away = lens(to_world=mi.ScalarTransform4f().look_at([165, 0, 0], [300, 0, 0], [0, 0, 1]))
     with pytest.raises(TransportError, match="sees nothing"):
         fspt.transport(world_scene(body, sensor=away))
+    grid = mi.VolumeGrid(np.ones((2, 2, 2, 1), np.float32))
+    around = mi.ScalarTransform4f().translate([-20] * 3).scale(40)
+    volume = {"type": "gridvolume", "grid": grid, "to_world": around, "accel": False}
+    law = {"emission": "last_flight", "int_ior": 1.37, "mua": 0.01, "musp": 1.0, "fluence": volume}
+    with pytest.raises(TransportError, match=r"'last_flight' of shape .* depends on the fluence.*Give 'lambert'"):
+        fspt.transport(world_scene(body | {"emitter": glow(attribute()) | law}))
 
 
 def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
