@@ -54,7 +54,9 @@ def draw(inversion: Inversion) -> Figure:
                 ax.set_title(title, fontsize="small")
             if column == 0:
                 ax.set_ylabel(labels[row], fontsize="small")
-        figure.colorbar(drawn, ax=list(axes[:, column]), location="bottom", shrink=0.9, pad=0.02)
+        bar = figure.colorbar(drawn, ax=list(axes[:, column]), location="bottom", shrink=0.9, pad=0.02)
+        bar.ax.locator_params(axis="x", nbins=5)
+        bar.ax.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3))
     return figure
 
 
