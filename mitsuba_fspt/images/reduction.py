@@ -5,7 +5,7 @@
 
 with the variance of the dark current and of the rounding in `dark_electrons`, and the relative error ε of the flat
 field. Frames are corrected by ccdproc. A pixel of a flat field below 1 collects fewer electrons per watt, flat · k:
-`responses` finds them again from power and error.
+`responses` recovers flat from power and error.
 """
 
 from __future__ import annotations
@@ -105,11 +105,11 @@ def reduce_counts(
     flat_field = 1.0 if response is None else response
     mask = full | rays | weak
     image = _image(detector, electrons, flat_field, independent, raw.frames, mask, exposed, metadata, noise)
-    _tell_darkness(image, mask)
+    _report_darkness(image, mask)
     return image
 
 
-def _tell_darkness(image: Image, mask: NDArray[np.bool_]) -> None:
+def _report_darkness(image: Image, mask: NDArray[np.bool_]) -> None:
     """Say in one line on stderr that the power of all pixels is negative by more than noise makes it."""
     power, error = (np.asarray(plane, np.float64) for plane in (image.power, image.error))
     total, noise = power.sum(), np.sqrt(np.square(error[~mask]).sum())
@@ -155,7 +155,8 @@ def responses(image: Image) -> Array:
     """Flat field f (h, w) of a reduced image: a pixel collects f times `electrons_per_watt`.
 
     It follows from the power P, its error s, k = `electrons_per_watt` and the variance R of read-out and dark current
-    by s² = (max(P k f, 0) + R)/(k f)². It is 1 where the image has no error.
+    by s² = (max(P k f, 0) + R)/(k f)². It is 1 where the image has no error. If the noise of a stack of flat fields is
+    part of s, the result is smaller than f, such that k times it still gives the variance s².
     """
     shape, error = image.shape, image.error
     k = float(image.metadata["electrons_per_watt"])

@@ -107,12 +107,12 @@ class Rows:
                 rough[:] = False
             wanted = np.where(off > CERTAIN * uncertain[pixels], power[pixels], sums)
             factors = np.divide(wanted, sums, out=np.ones(len(pixels)), where=sums > 0)
-            settled = ~rough & (sums > 0)
+            converged = ~rough & (sums > 0)
             groups.append(
                 RowGroup(
                     lines,
-                    pixels[settled].astype(np.uint32),
-                    np.clip(factors[settled], 0, LARGEST_FACTOR).astype(np.float32),
+                    pixels[converged].astype(np.uint32),
+                    np.clip(factors[converged], 0, LARGEST_FACTOR).astype(np.float32),
                 )
             )
             pixels, lines = pixels[rough], finer

@@ -40,7 +40,7 @@ class Inversion:
     pixels : number of pixels fitted;  chi2_sum : Σ (residual/σ)² over them
     decrement : bound of the squared numerical error of any weighted sum, over its variance; of 'mlem' twice the duality
         gap of the log-likelihood
-    settled : False where variances or weight still changed in the last round
+    converged : False where variances or weight still changed in the last round
     gain_error : relative uncertainty of a common factor, contained in the intervals
     measured, fitted, sigma : (views, height, width) [W]; NaN where masked, or outside the surface
     """
@@ -56,7 +56,7 @@ class Inversion:
     determined: float
     pixels: int
     decrement: float
-    settled: bool
+    converged: bool
     gain_error: float
     chi2_sum: float
     measured: Array
@@ -155,7 +155,7 @@ class Inversion:
             "gain_error": self.gain_error,
             "determined": self.determined,
             "decrement": self.decrement,
-            "settled": self.settled,
+            "converged": self.converged,
             "unknowns": self.surface.unknowns,
             "samples": self.draws.shape[1],
         }

@@ -133,7 +133,7 @@ def invert(
     with reported(progress) as report:
         found = problem.solved(options, report)
     tell_misfit("invert", found.chi2_sum, found.pixels - found.determined)
-    _tell_unsettled(found, problem.settings.rounds)
+    _report_unconverged(found, problem.settings.rounds)
     return found
 
 
@@ -177,7 +177,7 @@ class Fit:
     """State of the fit: x = J_n/reference (m,), standard deviations (N,) [W], the weight, determined unknowns γ.
 
     correction : (N,) [W], added to the data: what variances of the fitted signal take from it (Eq. M.29)
-    settled : False where variances or weight still changed in the last round
+    converged : False where variances or weight still changed in the last round
     """
 
     x: Array
@@ -187,7 +187,7 @@ class Fit:
     weight: float
     determined: float
     decrement: float
-    settled: bool = True
+    converged: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,21 +308,21 @@ class Problem:
             state = replace(state, weight=self._first_weight(sigma))
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (self.surface.unknowns, self.settings.probes))
         looser = self.settings.rough if rough else 1.0
-        settled, tried = False, list[tuple[float, float]]()
+        converged, tried = False, list[tuple[float, float]]()
         for turn in range(self.settings.rounds):
             report("fit", turn / self.settings.rounds)
             before, state = state, self._improved(state, probes, weight, self.settings.drawn)
             drift = float(np.sqrt(np.mean((state.sigma / before.sigma - 1) ** 2)))
             changed = abs(np.log(state.weight / before.weight)) if weight is None else 0.0
-            settled = bool(drift < looser * self.settings.reweighted and changed < looser * self.settings.weight)
-            if settled:
+            converged = bool(drift < looser * self.settings.reweighted and changed < looser * self.settings.weight)
+            if converged:
                 break
             if weight is None:
                 tried = [*tried[-1:], (float(np.log(before.weight)), float(np.log(state.weight)))]
                 state = replace(state, weight=float(np.exp(_secant(tried))))
         if not rough and state.decrement > self.settings.accuracy.decrement:
             state = self._improved(state, probes, weight, self.settings.accuracy)
-        return replace(state, settled=settled)
+        return replace(state, converged=converged)
 
     def most_likely(self, report: Progress) -> Fit:
         """Maximum of the likelihood without a penalty."""
@@ -468,7 +468,7 @@ class Problem:
             determined=fit.determined,
             pixels=len(self.rows),
             decrement=fit.decrement,
-            settled=fit.settled,
+            converged=fit.converged,
             gain_error=self.measurement.gain_error,
             chi2_sum=float(residual @ residual),
             measured=np.where(self.measurement.mask, np.nan, self.measurement.power).reshape(views),
@@ -486,9 +486,9 @@ def _secant(tried: Sequence[tuple[float, float]]) -> float:
     return x + (found - x) / (1 - slope)
 
 
-def _tell_unsettled(found: Inversion, rounds: int) -> None:
+def _report_unconverged(found: Inversion, rounds: int) -> None:
     """Say in one line on stderr that the rounds were too few for variances and weight."""
-    if not found.settled:
+    if not found.converged:
         LOG.warning(
             "fspt: invert: variances and weight still change after %d rounds; the last ones are kept. Give a weight, "
             "for example %.3g.",

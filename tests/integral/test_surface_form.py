@@ -335,9 +335,9 @@ def test_a_thin_tube_far_away():
 def test_no_pixel_is_dark_because_the_first_lines_of_sight_pass_it_by(tmp_path):
     """Pixels' centres behind a lens whose border passes a hundredth of the cone of its telecentric diaphragm.
 
-    Stripes a pixel high, near the sharp plane. Expected at a pixel that sees but a stripe: A_vd times the configuration
-    factor of the border's disc seen from the pixel's virtual point. Seen to fail (0 W, error 0) where a pixel is
-    settled that the first two levels light alike, with nothing.
+    Stripes a pixel high, near the virtual detector plane. Expected at a pixel that sees but a stripe: A_vd times the
+    configuration factor of the border's disc seen from the pixel's virtual point. Seen to fail (0 W, error 0) where a
+    pixel counts as converged because no line of sight of the first two levels meets light there.
     """
     heights = [(-1.95, -0.601), (0.2465, 1.5955), (4.639, 5.988), (6.835, 8.184), (9.03, 10.379)]
     corners = [

@@ -82,9 +82,9 @@ def test_j_is_that_of_the_whole_mesh(case):
 
 def test_rounds_that_do_not_settle_are_told(case, caplog):
     matrix, images = case
-    assert fspt.invert(matrix, images).settled
+    assert fspt.invert(matrix, images).converged
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
         found = fspt.invert(matrix, images, settings=Settings(rounds=1))
-    assert not found.settled
+    assert not found.converged
     assert "still change after 1 rounds" in caplog.text
