@@ -8,7 +8,6 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +22,7 @@ from ..runtime.errors import BackendError, FsptError, SceneError, TransportError
 from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import whole
 from ..runtime.progress_bar import Progress, reported
+from ..runtime.versions import version, versions
 from ..studies.sweep_point import SceneSource, point_of, texts_of
 from .transport_file import FORMAT, PartialFile, read_transport
 from .transport_matrix import TransportMatrix
@@ -299,7 +299,7 @@ def _joined(
         "parts": {part.name: pair for part, pair in zip(parts, itertools.pairwise(ends), strict=True)},
         "laws": [part.law for part in parts],
         "mesh_digest": " ".join(part.digest for part in parts),
-        "versions": {name: version(name) for name in ("mitsuba-fspt", "mitsuba", "drjit", "numpy")},
+        "versions": versions(),
         "fingerprints": [task.fingerprint for task in tasks],
     }
     if unreached:

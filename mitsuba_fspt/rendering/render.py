@@ -9,7 +9,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +21,7 @@ from ..runtime.errors import SceneError, named
 from ..runtime.numbers import whole
 from ..runtime.plugin_types import is_integral
 from ..runtime.progress_bar import Progress, reported
+from ..runtime.versions import versions
 from . import monte_carlo
 from .provenance import origin_of
 from .scene import loaded
@@ -272,5 +272,4 @@ def _refuse(settings: dict[str, object], method: str) -> None:
 def _versions() -> dict[str, str]:
     import mitsuba as mi
 
-    packages = ("mitsuba-fspt", "mitsuba", "drjit", "numpy")
-    return {"variant": mi.variant(), "versions": ", ".join(f"{name} {version(name)}" for name in packages)}
+    return {"variant": mi.variant(), "versions": ", ".join(f"{name} {number}" for name, number in versions().items())}

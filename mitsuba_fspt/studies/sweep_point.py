@@ -12,7 +12,6 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 from ..optics.thin_lens import Lens, number_names
@@ -21,6 +20,7 @@ from ..rendering.scene import check_parameters, parameter_text
 from ..rendering.scene_rules import REFERENCE, check_values, is_number
 from ..rendering.scene_xml import read_xml
 from ..runtime.errors import SceneError, named
+from ..runtime.versions import version
 
 Setting = str | int | float | None
 MAX_CHARACTERS = 60  # of a value in a file name
