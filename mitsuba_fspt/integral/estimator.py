@@ -38,7 +38,7 @@ class Estimator:
         edges of a coarse mesh
     least_ratio, most_ratio : remaining error over the change by later transects: `most_ratio` if the change is as large
         as the error before, less if it is smaller
-    order : least power by which the error of transects falls with their number
+    order : least power by which the error of transects falls with their number, where several edges cross a pixel
     spread, kink : remaining error of two transects over the deviation between them and their number; of more, over the
         deviation without its trend, as J_n may have a kink between two
     slant : the same of transects across a sharp edge, over their number to the power 3/2: the edge is slanted
@@ -71,7 +71,7 @@ class Estimator:
     nodes_ratio: float = _bound(0.9, 0.0)
     least_ratio: float = _bound(1.0, 0.0)
     most_ratio: float = _bound(3.0, 1.0)
-    order: float = _bound(1.5, 100.0)
+    order: float = _bound(1.0, 100.0)
     spread: float = _bound(2.0, 0.0)
     kink: float = _bound(6.0, 0.0)
     slant: float = _bound(2.0, 0.0)

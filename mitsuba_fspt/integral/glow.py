@@ -24,7 +24,7 @@ PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
 # of n elements is wrong by 0.8/n, which has to be less than the least error that is stated.
 FLAT, CURVED = 8.0, 24.0
 BULGE = 0.1  # how far a curved element may reach beyond its corners, in units of their distance
-MISPLACED = 1 / 8  # of a step in J_n along a row of elements, times their side squared, they misplace
+MISPLACED = 1 / 8  # of a step in J_n along an element, times its side squared [pixels], it misplaces
 UNBOUNDED = 4.0  # side [pixels] counted for an element that reaches through the lens plane and has no image
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))  # of an element, once around
 
@@ -89,7 +89,9 @@ class Glow:
 
     def finer(self, tolerance: float) -> Glow:
         """With elements below a pixel cut like larger ones where they misplace more than `tolerance` [W/mm²/sr]."""
-        misplaced = MISPLACED * self.sides**2 * self.steps / (1 + math.pi * self.blur**2)
+        # Along a pixel's side the elements of a row misplace light alike, 1/side of them; in a blur disc they do so
+        # along a line through it, by its density 1/(π r²).
+        misplaced = MISPLACED * self.sides**2 * self.steps / (self.sides + math.pi / 2 * self.blur**2)
         return replace(self, sides=np.where(misplaced > tolerance, np.maximum(self.sides, 1), self.sides))
 
     def _touching(self, mark: NDArray[np.bool_]) -> Index:
