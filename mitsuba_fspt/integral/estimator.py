@@ -28,8 +28,6 @@ class Estimator:
         four nodes replace one: a body 0.9 to 1.4 pixels wide may lie between single lines
     largest_gain : largest factor by which twelve nodes reduce the estimate for four, as both may agree by chance on a
         rough texture
-    smooth_ratio, rough_ratio : least and largest remaining error of twelve nodes over their change: where J_n is
-        smooth, the error falls by the same factor from rule to rule, at jumps not at all
 
     Of transects:
 
@@ -38,7 +36,8 @@ class Estimator:
         edges of a coarse mesh
     least_ratio, most_ratio : remaining error over the change by later transects: `most_ratio` if the change is as large
         as the error before, less if it is smaller
-    order : least power by which the error of transects falls with their number, where several edges cross a pixel
+    order : least power by which the error of transects falls with their number
+    several_order : the same where edges are sharp and a transect crosses several, as a corner may lie between two
     spread, kink : remaining error of two transects over the deviation between them and their number; of more, over the
         deviation without its trend, as J_n may have a kink between two
     slant : the same of transects across a sharp edge, over their number to the power 3/2: the edge is slanted
@@ -65,13 +64,12 @@ class Estimator:
     in_pixel: float = _bound(0.5, 1.0)
     missed_body: float = _bound(2.0, 1e30)
     largest_gain: float = _bound(8.0, 1e30)
-    smooth_ratio: float = _bound(0.5, 0.0)
-    rough_ratio: float = _bound(2.0, 1.0)
     first_ratio: float = _bound(0.2, 0.0)
     nodes_ratio: float = _bound(0.9, 0.0)
     least_ratio: float = _bound(1.0, 0.0)
     most_ratio: float = _bound(3.0, 1.0)
-    order: float = _bound(1.0, 100.0)
+    order: float = _bound(1.5, 100.0)
+    several_order: float = _bound(1.0, 1.5)
     spread: float = _bound(2.0, 0.0)
     kink: float = _bound(6.0, 0.0)
     slant: float = _bound(2.0, 0.0)

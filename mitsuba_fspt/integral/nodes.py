@@ -131,15 +131,12 @@ def _refine(draft: Draft, where: Mask) -> PixelArray:
     """Twelve nodes on the marked pixels; returns by how much they change the value there, 0 elsewhere."""
     seen = apply_nodes(draft, node_rules.twelve(draft.area), where, REFINED)
     difference = dr.select(where, dr.abs(seen.value - draft.value), 0)
-    # Where the rules converge, the error falls by the same factor from rule to rule; by less at a kink of J_n.
-    ratio = dr.select(draft.error > 0, 8 * difference / draft.error, 1)
     draft.value = dr.select(where, seen.value, draft.value)
     draft.set_coverage(dr.select(where, seen.coverage, draft.coverage))
     draft.nearest = dr.minimum(draft.nearest, seen.nearest)
     draft.lost = dr.select(where, dr.maximum(draft.lost, seen.lost), draft.lost)
-    left = difference * dr.clip(ratio, draft.estimator.smooth_ratio, draft.estimator.rough_ratio)
-    rough = dr.select(parted(seen.coverage), 0, dr.maximum(left, difference))
-    rough, left = draft.grid.spread_all((rough, left))
+    rough = dr.select(parted(seen.coverage), 0, difference)
+    rough, left = draft.grid.spread_all((rough, difference))
     draft.roughness = dr.maximum(draft.roughness, rough)
     error = dr.maximum(left, draft.error / draft.estimator.largest_gain)
     draft.error = dr.select(where, dr.maximum(error, draft.edge_error()), draft.error)

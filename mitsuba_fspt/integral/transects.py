@@ -144,7 +144,9 @@ class _Refinement:
         """
         before, estimator = self.remaining, self.estimator
         least, most = estimator.least_ratio, estimator.most_ratio
-        least_change = before * dr.opaque(mi.Float64, (self.count / count) ** estimator.order)
+        fewer = self.count / count
+        one, several = (dr.opaque(mi.Float64, fewer**order) for order in (estimator.order, estimator.several_order))
+        least_change = before * dr.select(self.edges.sharp & self.means.several, several, one)
         assumed = dr.maximum(change, least_change)
         ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), least, most)
         remaining = dr.maximum(assumed * ratio, self.means.scatter)
@@ -222,6 +224,7 @@ class Means:
 
     value, coverage : mean radiance on film [W/mm²/sr], share of lines of sight that meet a glowing surface
     jumps : True where a transect crosses a jump
+    several : True where a transect crosses more than one
     scatter : error of the value that follows from the differences between transects [W/mm²/sr]
     blur : signed radius of the most blurred edge that a transect crosses, 0 without one [pixels]
     """
@@ -229,6 +232,7 @@ class Means:
     value: PixelArray
     coverage: PixelArray
     jumps: Mask
+    several: Mask
     scatter: PixelArray
     blur: PixelArray
 
@@ -238,7 +242,7 @@ def apply_transects(
 ) -> Means:
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
     index, table = draft.grid.pixels(where), mi.Float(rule.table)
-    images = [draft.grid.full(mi.Float64, 0) for _ in range(6)]
+    images = [draft.grid.full(mi.Float64, 0) for _ in range(7)]
     rays = 0
     for part in batches(index, len(rule)):
         *found, traced = _along_transects(draft, part, edges, rule, table, along)
@@ -247,7 +251,7 @@ def apply_transects(
         dr.eval(images)
         rays += int(dr.sum(traced)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
-    value, coverage, squares, trend, split, blur = images
+    value, coverage, squares, trend, split, several, blur = images
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = squares - value * value
     spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
@@ -255,7 +259,7 @@ def apply_transects(
     # A sharp edge slants: each transect crosses a part of its own, and a corner may lie between two.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, estimator.corner * value / (number * number))
-    return Means(value, coverage, split > 0, dr.select(edges.sharp, sharp, blurred), blur)
+    return Means(value, coverage, split > 0, several > 0, dr.select(edges.sharp, sharp, blurred), blur)
 
 
 def _along_transects(
@@ -292,7 +296,7 @@ def _sums(
     part: mi.UInt32, edges: Edges, rule: node_rules.Transects, table: mi.Float, found: list[mi.Float]
 ) -> list[PixelArray]:
     """Means over the transects of each pixel of `part`: value, coverage, value squared, sum of the squared trends,
-    number of transects with a jump, blur of the most blurred edge [pixels].
+    number of transects with a jump and with several, blur of the most blurred edge [pixels].
 
     `found`: value, coverage, jumps, blur as of `_along_transects`.
     """
@@ -303,15 +307,16 @@ def _sums(
     def add(k: mi.UInt32, sums: list[PixelArray], trends: list[PixelArray], ends: list[mi.Float]) -> tuple:
         value, coverage, blur = (dr.gather(mi.Float, found[n], first + k) for n in (0, 1, 3))
         weight = mi.Float64(dr.select(sharp, even, dr.gather(mi.Float, table, 6 * count + k)))
-        share, split = weight * mi.Float64(value), dr.gather(mi.UInt32, found[2], first + k) > 0
-        terms = share, weight * mi.Float64(coverage), share * mi.Float64(value), dr.select(split, mi.Float64(1), 0)
+        share, jumps = weight * mi.Float64(value), dr.gather(mi.UInt32, found[2], first + k)
+        counts = (dr.select(counted, mi.Float64(1), 0) for counted in (jumps > 0, jumps > 1))
+        terms = share, weight * mi.Float64(coverage), share * mi.Float64(value), *counts
         sums = [total + term for total, term in zip(sums, terms, strict=True)]
         polynomials = [dr.gather(mi.Float, table, (8 + n) * count + k) for n in range(len(trends))]
         trends = [total + share * mi.Float64(p) for total, p in zip(trends, polynomials, strict=True)]
         return sums, trends, [dr.maximum(ends[0], blur), dr.minimum(ends[1], blur)]
 
-    nothing = [mi.Float64(0) for _ in range(4)], [mi.Float64(0) for _ in range(node_rules.TRENDS)]
+    nothing = [mi.Float64(0) for _ in range(5)], [mi.Float64(0) for _ in range(node_rules.TRENDS)]
     sums, trends, (ahead, behind) = repeat(count, add, *nothing, [mi.Float(-dr.inf), mi.Float(dr.inf)])
-    value, coverage, squares, split = sums
+    value, coverage, squares, split, several = sums
     trend = sum(map(dr.square, trends))
-    return [value, coverage, squares, trend, split, mi.Float64(_most_blurred(ahead, behind))]
+    return [value, coverage, squares, trend, split, several, mi.Float64(_most_blurred(ahead, behind))]

@@ -66,8 +66,8 @@ def test_a_shape_far_below_a_pixel_sends_what_its_area_says(shape, seed):
 def test_the_error_holds_where_two_levels_agree_by_chance(family, seed, pixels):
     """Pixels with several edges, on which two levels agree, against the float64 reference: within the stated error.
 
-    Seen to fail with an error of transects that falls as n^(-3/2) (up to 1.8 times the stated error), and with elements
-    of the surface whose errors along a pixel's side add up by chance (up to 6.3 times).
+    Seen to fail with an error of transects that falls as n^(-3/2) everywhere (up to 1.8 times that stated), and with
+    elements of the surface whose errors along a pixel's side are taken for independent (up to 6.3 times).
     """
     made = random_scene(family, seed)
     image = fspt.render(made.scene(), method="integral", rtol=1e-2, pixel=made.reference.pixel)
