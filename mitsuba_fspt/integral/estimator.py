@@ -37,7 +37,9 @@ class Estimator:
     least_ratio, most_ratio : remaining error over the change by later transects: `most_ratio` if the change is as large
         as the error before, less if it is smaller
     order : least power by which the error of transects falls with their number
-    several_order : the same where edges are sharp and a transect crosses several, as a corner may lie between two
+    several_order : the same where edges are sharp and several on a transect, as a corner may lie between two transects
+    several_share : least share of the transects that cross several edges there. If it is smaller, as where a smooth
+        outline touches a transect, their order adds less than an eighth to the error
     spread, kink : remaining error of two transects over the deviation between them and their number; of more, over the
         deviation without its trend, as J_n may have a kink between two
     slant : the same of transects across a sharp edge, over their number to the power 3/2: the edge is slanted
@@ -70,6 +72,7 @@ class Estimator:
     most_ratio: float = _bound(3.0, 1.0)
     order: float = _bound(1.5, 100.0)
     several_order: float = _bound(1.0, 1.5)
+    several_share: float = _bound(1 / 16, 0.0)
     spread: float = _bound(2.0, 0.0)
     kink: float = _bound(6.0, 0.0)
     slant: float = _bound(2.0, 0.0)

@@ -271,7 +271,8 @@ def _refined(
 ) -> _Entries:
     """The same with entries of rough pixels as lines of sight find them, where enough of these meet the column.
 
-    On pixels that a stop has `cut` in any case, for there the surface form does not know where.
+    Entries of pixels in `cut` are always replaced: the border of a stop crosses these pixels, and the surface form does
+    not know which part of a pixel lies inside it.
     """
     pixels = np.flatnonzero(rough)
     lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2

@@ -224,7 +224,7 @@ class Means:
 
     value, coverage : mean radiance on film [W/mm²/sr], share of lines of sight that meet a glowing surface
     jumps : True where a transect crosses a jump
-    several : True where a transect crosses more than one
+    several : True where a share of the transects, `several_share`, crosses more than one
     scatter : error of the value that follows from the differences between transects [W/mm²/sr]
     blur : signed radius of the most blurred edge that a transect crosses, 0 without one [pixels]
     """
@@ -259,7 +259,14 @@ def apply_transects(
     # A sharp edge slants: each transect crosses a part of its own, and a corner may lie between two.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, estimator.corner * value / (number * number))
-    return Means(value, coverage, split > 0, several > 0, dr.select(edges.sharp, sharp, blurred), blur)
+    return Means(
+        value,
+        coverage,
+        split > 0,
+        several >= estimator.several_share * number,
+        dr.select(edges.sharp, sharp, blurred),
+        blur,
+    )
 
 
 def _along_transects(

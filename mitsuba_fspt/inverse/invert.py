@@ -478,7 +478,10 @@ class Problem:
 
 
 def _secant(tried: Sequence[tuple[float, float]]) -> float:
-    """Next x towards g(x) = x from the last pairs (x, g(x)): the secant's, with its slope in -1 … 0.8 lest it leaps."""
+    """Next estimate of the solution of g(x) = x from the last pairs (x, g(x)), by the secant method.
+
+    The slope of the secant is limited to -1 … 0.8, which bounds the step to five times g(x) - x.
+    """
     x, found = tried[-1]
     slope = 0.0
     if len(tried) > 1 and abs(x - tried[-2][0]) > 1e-12:

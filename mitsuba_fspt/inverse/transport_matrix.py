@@ -88,7 +88,8 @@ class TransportMatrix(LinearOperator):
     def images(self, images: ArrayLike | Sequence[Image]) -> Array:
         """Power (views, height, width) [W] of an array, or of one Image a view after the checks of `backward`.
 
-        What differs otherwise, such as the mesh, is said in one line on stderr: real cameras know nothing of meshes.
+        Other differences from the matrix, such as another mesh, are reported in one line on stderr and are no error: a
+        camera's picture has no mesh.
         """
         if isinstance(images, Image):
             images = [images]

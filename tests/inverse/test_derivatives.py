@@ -115,7 +115,7 @@ def test_silhouettes_move(tmp_path, mono):
         return fspt.render(fspt.load(scene, distance=distance), method="integral", rtol=1e-6).power.astype(np.float64)
 
     off, stated = relative(found, difference(law, 165.0, 3.3))
-    assert off <= stated <= 0.08
+    assert off <= stated <= 0.05
     total = difference(lambda distance: 1e-3 * collected(3.0, distance, pupil=55 / 8 / 2), 165.0, 1.0)
     assert found.value.sum() == pytest.approx(total, rel=3e-3, abs=0)
 
