@@ -9,6 +9,8 @@ from .inverse.calibrate import calibrate as calibrate
 from .inverse.derivatives import derivatives as derivatives
 from .inverse.inversion import Inversion as Inversion
 from .inverse.invert import invert as invert
+from .inverse.locate import locate as locate
+from .inverse.location import Location as Location
 from .inverse.transport import transport as transport
 from .inverse.transport_file import read_transport as read_transport
 from .inverse.transport_matrix import TransportMatrix as TransportMatrix

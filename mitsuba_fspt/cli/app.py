@@ -19,6 +19,7 @@ from .converge import converge
 from .flux import app as flux
 from .images import compare, expose, plot, roi
 from .invert import invert
+from .locate import locate
 from .matrix import matrix
 from .reduce import reduce
 from .render import render
@@ -36,7 +37,7 @@ app = typer.Typer(
 )
 VERBS = (
     *(render, plot, compare, roi, expose, doctor, stability, explain, sweep, converge),
-    *(matrix, reduce, invert, calibrate, view),
+    *(matrix, reduce, invert, locate, calibrate, view),
 )
 for verb in VERBS:
     app.command()(verb)

@@ -103,6 +103,9 @@ def solve(
     volume: Annotated[
         Path | None, typer.Option(help="Also write the fluence inside on a grid, for gridvolume: .vol.")
     ] = None,
+    band: Annotated[
+        str | None, typer.Option(help="Name of [bands.NAME]: its coefficients, and its share of the power.")
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -120,7 +123,7 @@ def solve(
     tissue = PhantomFile.read(description)
     _require_apart(output, volume, [description, *tissue.files])
     with Console(stderr=True, quiet=quiet).status("mesh") as status:
-        solution = tissue.solve(status.update)
+        solution = tissue.solve(status.update, band)
         status.update("surface")
         phantom = solution.phantom(tissue.surface_edge)
         report = phantom.report() | solution.report()

@@ -69,6 +69,7 @@ NAMES = {
     ".csv": "table",
     ".ply": "phantom",
     ".vol": "fluence",
+    ".vtu": "source",
     ".npz": "T",
     ".toml": "camera",
 }

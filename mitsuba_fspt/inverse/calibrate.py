@@ -19,7 +19,7 @@ from ..rendering.render import render
 from ..rendering.scene import load
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
-from ..runtime.errors import InversionError, named
+from ..runtime.errors import InversionError, named, renamed
 from ..runtime.progress_bar import Progress, reported
 from ..studies.sweep_point import texts_of
 from .calibrated_scene import write_calibrated
@@ -173,20 +173,12 @@ def _start(scene: str | os.PathLike[str], names: tuple[str, ...], views: Sequenc
         raise InversionError(f"calibrate: 'free' = {list(names)} names nothing, or a parameter twice. Give each once.")
     if both := set(names) & set(views[0]):
         raise InversionError(f"calibrate: '{both.pop()}' is free and given. Leave one of them out.")
-    try:
+    with renamed("derivatives", "calibrate"):
         xml = scene_text(scene, views[0])
-    except InversionError as error:
-        raise _renamed(error) from error
     if GAIN in names and GAIN in xml.defaults:
         raise InversionError("calibrate: 'gain' is a factor on all powers, and a <default>. Rename that in the scene.")
-    try:
+    with renamed("derivatives", "calibrate"):
         return np.array([1.0 if name == GAIN else varied_value(xml, name) for name in names])
-    except InversionError as error:
-        raise _renamed(error) from error
-
-
-def _renamed(error: InversionError) -> InversionError:
-    return InversionError(str(error).replace("derivatives:", "calibrate:", 1))
 
 
 def _noise(images: Sequence[Image]) -> float:

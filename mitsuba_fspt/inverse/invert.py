@@ -389,15 +389,7 @@ class Problem:
 
     def _sigma(self, signal: Array, numerical: Array) -> Array:
         """Standard deviation of each pixel [W] for a fitted signal (Eq. M.24)."""
-        m = self.measurement
-        variance = m.shot[self.rows] * np.maximum(signal, 0) + m.other[self.rows] + numerical**2
-        if not (variance > 0).all():
-            count = int(np.sum(~(variance > 0)))
-            raise InversionError(
-                f"invert: {count} pixels that see the surface have no noise, σ = 0. Give error= > 0 there, a read "
-                "noise, or mask them."
-            )
-        return np.sqrt(variance)
+        return self.measurement.sigma(self.rows, signal, numerical, "invert")
 
     def _numerical(self, x: Array) -> Array:
         """Numerical error of T J [W] on the pixels."""

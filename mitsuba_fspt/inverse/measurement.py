@@ -82,6 +82,20 @@ class Measurement:
             raise InversionError("invert: every pixel is masked or saturated. Expose for a shorter time.")
         return cls(np.where(masks, 0, power).ravel(), shot.ravel(), other.ravel(), masks.ravel(), found)
 
+    def sigma(self, rows: NDArray[np.int64], signal: Array, numerical: Array, verb: str) -> Array:
+        """Standard deviation [W] of the pixels `rows` for a fitted signal and its numerical error [W] (Eq. M.24).
+
+        Raises InversionError, in the name of `verb`, for pixels without noise.
+        """
+        variance = self.shot[rows] * np.maximum(signal, 0) + self.other[rows] + numerical**2
+        if not (variance > 0).all():
+            count = int(np.sum(~(variance > 0)))
+            raise InversionError(
+                f"{verb}: {count} pixels that see the surface have no noise, σ = 0. Give error= > 0 there, a read "
+                "noise, or mask them."
+            )
+        return np.sqrt(variance)
+
 
 def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
     """`values` as an array of this shape where it has it up to the axis of views, else unchanged for a later check."""

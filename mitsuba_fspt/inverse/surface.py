@@ -100,6 +100,14 @@ class Surface:
         return joined if self.basis is None else csr_array(joined @ self.basis)
 
     @cached_property
+    def from_vertices(self) -> csr_array:
+        """(n, V): J_n of the columns from its values at `vertices`; on a face the mean of its corners."""
+        if self.on == "vertex":
+            return csr_array(diags_array(np.ones(len(self.vertices))))
+        entries = np.full(self.faces.size, 1 / 3), (np.repeat(np.arange(len(self.faces)), 3), self.faces.ravel())
+        return csr_array(entries, shape=(len(self.faces), len(self.vertices)))
+
+    @cached_property
     def point_areas(self) -> Array:
         """(points,) ∫ φ dS of each point [mm²], the lumped mass of the mesh."""
         area = face_areas(self.vertices, self.faces)

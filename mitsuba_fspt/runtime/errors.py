@@ -55,3 +55,12 @@ def named(thing: str) -> Iterator[None]:
         yield
     except FsptError as error:
         raise type(error)(f"{thing}: {error}") from error
+
+
+@contextmanager
+def renamed(verb: str, other: str) -> Iterator[None]:
+    """Context manager: a message of an FsptError in its block that begins with `verb: ` begins with `other: `."""
+    try:
+        yield
+    except FsptError as error:
+        raise type(error)(str(error).replace(f"{verb}: ", f"{other}: ", 1)) from error

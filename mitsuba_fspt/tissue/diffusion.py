@@ -60,27 +60,51 @@ def solve(
     BackendError : scikit-fem or SciPy is missing.
     """
     report = progress or (lambda stage: None)
-    if order not in (1, 2):
-        raise FluxError(f"solve: 'order' must be 1 or 2, got {order}.")
-    if mesh.region.min() < 0 or mesh.region.max() >= len(media):
-        raise FluxError(
-            f"solve: the mesh has regions {mesh.region.min()} to {mesh.region.max()}, media are given for 0 "
-            f"to {len(media) - 1}. Give one a region."
-        )
-    factors = [boundary_a(a, medium.n) for medium in media]
     report("assemble")
-    system = System(mesh, order, [m.diffusion for m in media], [m.mua for m in media], factors)
-    fields = _free_fields(mesh, media, sources)
+    tissue = Tissue(mesh, media, a=a, order=order)
     report("solve")
-    solved = system.solve(fields)
-    power = math.fsum(source.power for source in sources)
-    solution = DiffusionSolution(mesh, system.basis, tuple(media), tuple(factors), fields, power, solved)
-    if abs(solution.balance) > LARGEST_IMBALANCE:
-        raise FluxError(
-            f"solve: absorbed + exited power is {1 + solution.balance:.6g} of the source's. A source is too close "
-            f"to the border for mesh edges of {mesh.edge:.3g} mm; make them shorter than its depth."
-        )
-    return solution
+    return tissue.solve(sources)
+
+
+class Tissue:
+    """Tissue without sources: mesh, media, boundary factors and the finite elements, which serve any sources.
+
+    Arguments as of `solve`.
+
+    Raises
+    ------
+    FluxError : a region without medium, or another order.
+    BackendError : scikit-fem or SciPy is missing.
+    """
+
+    def __init__(self, mesh: Tetrahedra, media: Sequence[Medium], *, a: str | float = "robin", order: int = 2) -> None:
+        if order not in (1, 2):
+            raise FluxError(f"solve: 'order' must be 1 or 2, got {order}.")
+        if mesh.region.min() < 0 or mesh.region.max() >= len(media):
+            raise FluxError(
+                f"solve: the mesh has regions {mesh.region.min()} to {mesh.region.max()}, media are given for 0 "
+                f"to {len(media) - 1}. Give one a region."
+            )
+        self.mesh, self.media, self._a = mesh, tuple(media), a
+        self.factors = tuple(boundary_a(a, medium.n) for medium in media)
+        self.system = System(mesh, order, [m.diffusion for m in media], [m.mua for m in media], self.factors)
+
+    def linear(self) -> Tissue:
+        """The same tissue with finite elements of order 1."""
+        return Tissue(self.mesh, self.media, a=self._a, order=1)
+
+    def solve(self, sources: Sequence[Source]) -> DiffusionSolution:
+        """Solution for these sources; raises FluxError as `solve`."""
+        fields = _free_fields(self.mesh, self.media, sources)
+        solved = self.system.solve(fields)
+        power = math.fsum(source.power for source in sources)
+        solution = DiffusionSolution(self.mesh, self.system.basis, self.media, self.factors, fields, power, solved)
+        if abs(solution.balance) > LARGEST_IMBALANCE:
+            raise FluxError(
+                f"solve: absorbed + exited power is {1 + solution.balance:.6g} of the source's. A source is too close "
+                f"to the border for mesh edges of {self.mesh.edge:.3g} mm; make them shorter than its depth."
+            )
+        return solution
 
 
 def _free_fields(mesh: Tetrahedra, media: Sequence[Medium], sources: Sequence[Source]) -> tuple[FreeField, ...]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -144,7 +145,7 @@ class System:
         SciPy's conjugate gradients take dot products by threaded BLAS, whose threads wait for each other on a busy
         machine: five times the time.
         """
-        matrix = self._matrix()
+        matrix = self.matrix
         jacobi = 1 / matrix.diagonal()
         rest, residual = np.zeros_like(load), load.copy()
         direction = jacobi * residual
@@ -164,8 +165,9 @@ class System:
             "flat cells or the optics differ by many decades; mesh again or use a larger edge."
         )
 
-    def _matrix(self) -> Any:
-        """Sparse matrix of the left side of the module's equation."""
+    @cached_property
+    def matrix(self) -> Any:
+        """Sparse matrix (N, N) of the left side of the module's equation [mm]."""
         skfem = import_skfem()
         volume = skfem.BilinearForm(lambda u, v, w: self.diffusion * (u.grad * v.grad).sum(axis=0) + self.mua * u * v)
         surface = skfem.BilinearForm(lambda u, v, w: u * v / (2 * self.factor))

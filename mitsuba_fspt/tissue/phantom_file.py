@@ -30,6 +30,11 @@ length = 1
 axis = [0, 0, 1]
 power = 1
 
+# [bands.red]            # optional: coefficients in a band of wavelengths, in place of those above
+# share = 0.3            # of a source's power that is emitted in the band, in (0, 1]
+# mua = 0.01
+# musp = 0.85            # and n; then, for each of the regions in their order, [[bands.red.regions]] with mua and musp
+
 [mesh]
 edge = 1.5               # of the tetrahedra
 order = 2                # 1 or 2
@@ -42,7 +47,8 @@ voxel = 0.4              # of the volume
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -94,8 +100,21 @@ class Region:
 
 
 @dataclass(frozen=True)
+class Band:
+    """Band of wavelengths: `share` of a source's power that is emitted in it, in (0, 1], and the `media` in it.
+
+    media : of the tissue outside the regions, then of each region
+    """
+
+    share: float
+    media: tuple[Medium, ...]
+
+
+@dataclass(frozen=True)
 class PhantomFile:
     """Content of a TOML file that describes a phantom. `medium` fills all tissue outside the `regions`.
+
+    `bands`: other optical coefficients, those in a band of wavelengths, by its name.
 
     `edge` of the tetrahedra, `surface_edge` of the surface's triangles and `voxel` [mm]; `order` 1 or 2 of the finite
     elements; `a` name or value of the boundary factor.
@@ -110,6 +129,7 @@ class PhantomFile:
     order: int = 2
     surface_edge: float = 0.35
     voxel: float = 0.4
+    bands: Mapping[str, Band] = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> PhantomFile:
@@ -124,16 +144,18 @@ class PhantomFile:
         optical = file.table("optical")
         mesh, output = file.table("mesh", {}), file.table("output", {})
         medium = _medium(optical, 1.37)
+        regions = tuple(_region(table, medium.n) for table in file.tables("regions"))
         result = cls(
             _geometry(file.table("geometry"), path.parent),
             medium,
             tuple(_source(table) for table in file.tables("sources")),
-            tuple(_region(table, medium.n) for table in file.tables("regions")),
+            regions,
             optical.text_or_number("a", cls.a),
             mesh.number("edge", cls.edge),
             mesh.whole("order", cls.order),
             output.number("edge", cls.surface_edge),
             output.number("voxel", cls.voxel),
+            _bands(file.table("bands", {}), (medium, *(part.medium for part in regions))),
         )
         boundary_a(result.a, medium.n)
         for table in (optical, mesh, output, file):
@@ -164,15 +186,38 @@ class PhantomFile:
             region[inside] = number
         return replace(mesh, region=region)
 
-    def solve(self, progress: Progress | None = None) -> DiffusionSolution:
-        """Solution for the phantom on its mesh; see `diffusion.solve`."""
-        import_skfem()  # a missing package is reported before the mesher's minutes
+    def solve(self, progress: Progress | None = None, band: str | None = None) -> DiffusionSolution:
+        """Solution for the phantom on its mesh, in a band or with the coefficients of no band; see `diffusion.solve`.
+
+        In a band the sources have their share of the power.
+        """
+        optics = self.band(band)
         if progress:
             progress("mesh")
+        mesh = self.checked_mesh()
+        sources = [replace(source, power=optics.share * source.power) for source in self.sources]
+        return solve(mesh, optics.media, sources, a=self.a, order=self.order, progress=progress)
+
+    def band(self, name: str | None) -> Band:
+        """Band of this name; without a name, the coefficients of no band and all of the sources' power.
+
+        Raises
+        ------
+        FluxError : there is no such band.
+        """
+        if name is None:
+            return Band(1.0, (self.medium, *(part.medium for part in self.regions)))
+        if name not in self.bands:
+            known = f"The bands are {', '.join(self.bands)}" if self.bands else "It has no bands"
+            raise FluxError(f"band '{name}' is not in the phantom file. {known}; add a table [bands.{name}].")
+        return self.bands[name]
+
+    def checked_mesh(self) -> Tetrahedra:
+        """`mesh`; before that, a missing package and an impossible edge of the surface are reported."""
+        import_skfem()
         mesh = self.mesh()
-        mesh.cuts(self.surface_edge)  # an impossible edge is refused before the solver's minutes
-        media = (self.medium, *(part.medium for part in self.regions))
-        return solve(mesh, media, self.sources, a=self.a, order=self.order, progress=progress)
+        mesh.cuts(self.surface_edge)
+        return mesh
 
 
 def _geometry(table: Table, folder: Path) -> CylinderGeometry | MeshGeometry:
@@ -199,6 +244,29 @@ def _region(table: Table, n: float) -> Region:
     result = Region(where, _medium(table, n))
     table.done()
     return result
+
+
+def _bands(table: Table, media: tuple[Medium, ...]) -> dict[str, Band]:
+    """Bands of the tables [bands.NAME]; refractive indices are those of `media` unless they name others."""
+    bands = {}
+    for name in list(table.left):
+        own = table.table(name)
+        regions = own.tables("regions")
+        if len(regions) != len(media) - 1:
+            raise FluxError(
+                f"{own.name}: {len(regions)} tables [[bands.{name}.regions]] for {len(media) - 1} [[regions]]. Give "
+                "one for each, in their order."
+            )
+        share = own.number("share")
+        if not 0 < share <= 1:
+            raise FluxError(
+                f"{own.name}: 'share' must be in (0, 1], got {share:g}. Give the part of a source's power that is "
+                "emitted in the band."
+            )
+        bands[name] = Band(share, tuple(_medium(part, of.n) for part, of in zip([own, *regions], media, strict=True)))
+        for part in (own, *regions):
+            part.done()
+    return bands
 
 
 def _source(table: Table) -> Source:

@@ -276,3 +276,45 @@ def test_flux_solve_writes_both_files_or_none(tmp_path: Path, monkeypatch: pytes
     result = CliRunner().invoke(app, ["solve", description, "-o", ply, "--volume", vol])
     assert isinstance(result.exception, FluxError)
     assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
+
+
+BANDS = """
+[[regions]]
+shape = "sphere"
+centre = [-3, 0, 0]
+radius = 2
+mua = 0.3
+musp = 1
+[bands.red]
+share = 0.25
+mua = 0.01
+musp = 0.9
+n = 1.4
+[[bands.red.regions]]
+mua = 0.2
+musp = 0.8
+"""
+
+
+def test_bands(tmp_path: Path) -> None:
+    """A band has its own media, in the order of the regions, and its share of the sources' power."""
+    phantom = described(tmp_path, SMALL + BANDS)
+    assert phantom.band("red").media == (Medium(0.01, 0.9, 1.4), Medium(0.2, 0.8, 1.37))
+    assert phantom.band(None).media == (Medium(0.05, 1, 1.37), Medium(0.3, 1, 1.37))
+    assert phantom.solve(band="red").source_power == pytest.approx(0.25 * 2.5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("share = 0.25", "share = 0", r"'share' must be in \(0, 1\], got 0"),
+        ("share = 0.25", "", "'share' is missing"),
+        ("[[bands.red.regions]]\nmua = 0.2\nmusp = 0.8\n", "", "0 tables .* for 1"),
+        ("n = 1.4", "N = 1.4", "'N' means nothing here"),
+        ("[bands.red]", "[bands.red]\nregion = 3", "'region' means nothing here"),
+    ],
+)
+def test_bad_bands(tmp_path: Path, old: str, new: str, words: str) -> None:
+    assert old in BANDS
+    with pytest.raises(FluxError, match=words):
+        described(tmp_path, SMALL + BANDS.replace(old, new))

@@ -1,0 +1,102 @@
+"""`fspt locate`: the light sources inside a phantom from images of several views, in one band or several."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..runtime.atomic_files import require_apart
+from ..runtime.backend import quiet_mitsuba
+from ..runtime.errors import InversionError
+from ..runtime.progress_bar import progress_bar
+from .options import AsJson, Quiet, require_writable
+from .terminal import print_result
+
+if TYPE_CHECKING:
+    from ..inverse.location import Location
+
+
+def locate(
+    phantom: Annotated[Path, typer.Argument(metavar="PHANTOM.toml", help="Geometry, optics and mesh.")],
+    matrix: Annotated[Path, typer.Argument(metavar="T.npz", help="Transport matrix of 'fspt matrix'.")],
+    images: Annotated[
+        list[Path],
+        typer.Argument(metavar="IMAGE...", help="One a view, of 'fspt reduce' or 'fspt expose'; T.npz of a next band."),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Tetrahedra with the density to write, .vtu.")
+    ] = None,
+    sources: Annotated[int, typer.Option(help="Number of point sources.")] = 1,
+    band: Annotated[
+        list[str] | None, typer.Option(help="Name of [bands.NAME] in PHANTOM.toml; one for each T.npz.")
+    ] = None,
+    confidence: Annotated[float, typer.Option(help="Of the intervals.")] = 0.9,
+    gain_error: Annotated[
+        float | None, typer.Option(help="Relative uncertainty common to all pixels; that of the images if left out.")
+    ] = None,
+    scene: Annotated[Path | None, typer.Option(metavar="SCENE.xml", help="Scene of T.npz, where it has moved.")] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find position [mm] and power [W] of light sources inside, with intervals.
+
+    In several bands: T.npz and images of each, one after the other, and
+    --band for each, in the same order.
+    """
+    from ..images.reduction import read_measured
+    from ..inverse.locate import locate
+    from ..inverse.transport_file import read_transport
+
+    if output:
+        require_writable(output, ".vtu", InversionError)
+        require_apart(output, [phantom, matrix, *images], error=InversionError)
+    groups = _groups([matrix, *images], band or [])
+    with progress_bar(quiet) as progress:
+        quiet_mitsuba()
+        matrices = {name: read_transport(paths[0]) for name, paths in groups.items()}
+        planes = {name: [read_measured(path) for path in paths[1:]] for name, paths in groups.items()}
+        found = locate(
+            phantom,
+            matrices if band else next(iter(matrices.values())),
+            planes if band else next(iter(planes.values())),
+            sources=sources,
+            confidence=confidence,
+            gain_error=gain_error,
+            scene=scene,
+            progress=progress,
+        )
+    if output:
+        found.write(output)
+    record: dict[str, Any] = ({"output": str(output)} if output else {}) | found.summary()
+    print_result(_text(found, output), record, as_json=as_json, quiet=quiet)
+
+
+def _groups(paths: list[Path], bands: list[str]) -> dict[str, list[Path]]:
+    """Files of each band, a transport matrix first; raises InversionError where their numbers differ."""
+    starts = [k for k, path in enumerate(paths) if path.suffix.lower() == ".npz" or k == 0]
+    names = bands or [""]
+    if len(starts) != len(names) or len(set(names)) != len(names):
+        raise InversionError(
+            f"locate: {len(starts)} transport matrices (.npz) for the bands {', '.join(bands) or '(none)'}. Give "
+            "--band once for each matrix, with different names."
+        )
+    ends = [*starts[1:], len(paths)]
+    return {name: paths[start:end] for name, start, end in zip(names, starts, ends, strict=True)}
+
+
+def _text(found: Location, output: Path | None) -> str:
+    """A line for each source, and one about the fit."""
+    lines = []
+    for number, source in enumerate(found.sources, start=1):
+        (low, high), (least, most) = source.position_interval, source.power_interval
+        place = ", ".join(
+            f"{name} {value:.5g} ({a:.5g} to {b:.5g})"
+            for name, value, a, b in zip("xyz", source.position, low, high, strict=True)
+        )
+        lines.append(f"source {number}: {place} mm, {source.power:.4g} W ({least:.4g} to {most:.4g} W)")
+    lines.append(f"{100 * found.confidence:g} % intervals; chi2 {found.chi2:.3g} over {found.pixels} pixels")
+    if output:
+        lines.append(f"{output}: source density and sources")
+    return "\n".join(lines)

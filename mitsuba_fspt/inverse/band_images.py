@@ -1,0 +1,125 @@
+"""Images of a phantom in one band of wavelengths, and the images that point sources inside it have there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from ..optics.media import Source
+from ..optics.shapes import Sphere
+from ..phantom.surface_mesh import boundary
+from ..runtime.errors import InversionError
+from ..tissue.border_surface import nearest_points
+from ..tissue.diffusion import Tissue
+from .measurement import Measurement
+from .surface import Surface
+from .transport_matrix import TransportMatrix
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+# Largest distance of the matrix's surface from the tissue's border, over the edge of the tetrahedra. J_n there
+# is that of the border's nearest point, so that the sources are wrong by at most about that distance.
+OFF_BORDER = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class BandImages:
+    """Images of one band of wavelengths, over the N pixels that see the surface and are not masked.
+
+    name : of the band; None where there is only one, without a name
+    matrix : transport matrix of the band;  surface : its surface, in the frame of the phantom file
+    measurement : of all pixels;  rows : (N,) the pixels that are fitted
+    tissue : with the optical coefficients of the band;  share : of a source's power that is emitted in the band
+    transport : (N, V) power on the pixels from J_n at the surface's vertices [mm²]
+    """
+
+    name: str | None
+    matrix: TransportMatrix
+    surface: Surface
+    measurement: Measurement
+    tissue: Tissue
+    share: float
+    rows: Index
+    transport: csr_array
+
+    @classmethod
+    def of(
+        cls,
+        name: str | None,
+        matrix: TransportMatrix,
+        surface: Surface,
+        measurement: Measurement,
+        tissue: Tissue,
+        share: float,
+    ) -> BandImages:
+        """Raises InversionError where no pixel is left, no light is in them, or the surface is not the border."""
+        rows = np.flatnonzero((np.diff(matrix.matrix.indptr) > 0) & ~measurement.mask)
+        if not len(rows):
+            raise InversionError("locate: all pixels that see the surface are masked. Expose for a shorter time.")
+        # From J_n at the vertices of the surface, whatever the columns are.
+        transport = csr_array(matrix.matrix[rows] @ surface.from_vertices)
+        found = cls(name, matrix, surface, measurement, tissue, share, rows, transport)
+        if not found.power.sum() > 0:
+            raise InversionError(
+                f"locate: the pixels that see the surface hold {found.power.sum():.3g} W in total, no light. Check the "
+                "images, their background and the order of the views."
+            )
+        found._require_border()
+        return found
+
+    @property
+    def power(self) -> Array:
+        """(N,) measured power [W]."""
+        return self.measurement.power[self.rows]
+
+    def flat_sigma(self) -> Array:
+        """Noise (N,) [W] if all pixels had the same signal, their mean."""
+        mean = np.full(len(self.rows), self.power.mean())
+        return self.measurement.sigma(self.rows, mean, np.zeros_like(mean), "locate")
+
+    def sigma(self, exitance: Array) -> Array:
+        """Noise (N,) [W] for J_n (V,) [W/mm²], with the numerical error of the matrix (Eq. M.24)."""
+        numerical = self.matrix.error(self.surface.from_vertices @ exitance).ravel()[self.rows]
+        return self.measurement.sigma(self.rows, self.transport @ exitance, numerical, "locate")
+
+    def exitance(self, position: Array) -> Array:
+        """(V,) J_n [1/mm²] at the surface's vertices in this band, per watt of a point source over all bands.
+
+        Raises FluxError where there is no tissue, or a source is too close to the border.
+        """
+        x, y, z = (float(value) for value in position)
+        solution = self.tissue.solve([Source(Sphere((x, y, z)))])
+        return self.share * solution.exitance_at(self.surface.vertices)
+
+    def from_fluence(self) -> csr_array:
+        """(N, W) power on the pixels from the fluence at the W vertices of the tetrahedra: J_n = φ/(2A) [mm²]."""
+        mesh, points = self.tissue.mesh, self.surface.vertices
+        cells, local = mesh.locate(points)
+        weights = np.maximum(np.column_stack([1 - local.sum(axis=1), local]), 0)
+        weights /= weights.sum(axis=1, keepdims=True)
+        weights /= 2 * np.asarray(self.tissue.factors)[mesh.region[cells], None]
+        rows = np.repeat(np.arange(len(points)), 4)
+        shape = len(points), len(mesh.vertices)
+        return csr_array(self.transport @ csr_array((weights.ravel(), (rows, mesh.cells[cells].ravel())), shape))
+
+    def image(self, values: Array) -> Array:
+        """(views, height, width) with `values` (N,) on the pixels that are fitted, NaN elsewhere."""
+        image = np.full(self.matrix.shape[0], np.nan)
+        image[self.rows] = values
+        return image.reshape(self.matrix.image_shape)
+
+    def _require_border(self) -> None:
+        """Raise InversionError where the matrix's surface is not the border of the tissue."""
+        mesh, points = self.tissue.mesh, self.surface.vertices
+        nearest = nearest_points(points, mesh.vertices[boundary(mesh.vertices, mesh.cells)[0]])
+        if mesh.snap is not None:
+            nearest = mesh.snap(nearest)
+        away = np.linalg.norm(points - nearest, axis=1).max()
+        if away > OFF_BORDER * mesh.edge:
+            raise InversionError(
+                f"locate: the surface of the matrix is up to {away:.3g} mm away from the phantom's border. Give the "
+                "matrix of this phantom's surface, and 'scene' in the frame of the phantom file."
+            )

@@ -1,0 +1,186 @@
+"""`locate`: light sources inside a phantom, from images of its surface.
+
+J_n of a point source is the solution of the diffusion equation (see `tissue.diffusion`), its image T J_n.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+from numpy.typing import ArrayLike
+
+from ..images.detector import Exposure
+from ..images.image import Image
+from ..runtime.errors import InversionError, renamed
+from ..runtime.numbers import number, whole
+from ..runtime.progress_bar import Progress, reported
+from ..tissue.diffusion import Tissue
+from ..tissue.phantom_file import PhantomFile
+from .band_images import BandImages
+from .location import Location
+from .measurement import Measurement, tell_misfit
+from .source_fit import LocationSettings, SourceFit
+from .source_grid import SourceGrid
+from .surface import Surface
+from .transport_matrix import TransportMatrix
+
+Images: TypeAlias = (
+    ArrayLike | Sequence[Image | Exposure | str | os.PathLike[str]] | Image | Exposure | os.PathLike[str]
+)
+MOST_SOURCES = 20
+
+
+def locate(
+    phantom: PhantomFile | str | os.PathLike[str],
+    matrix: TransportMatrix | Mapping[str, TransportMatrix],
+    images: Images | Mapping[str, Images],
+    /,
+    *,
+    sources: int = 1,
+    error: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    mask: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    gain_error: float | None = None,
+    confidence: float = 0.9,
+    scene: object = None,
+    progress: Progress | None = None,
+    settings: LocationSettings | None = None,
+) -> Location:
+    """Positions and powers of point sources inside a phantom, and a source density, from images of its surface.
+
+        S = fspt.locate("phantom.toml", T, images)
+        S.sources[0].position, S.sources[0].position_interval  # mm, in the frame of phantom.toml
+
+    The intervals contain the noise of the images, the numerical error of the matrix and `gain_error`, not errors of the
+    optical coefficients, of the mesh or of the diffusion equation itself.
+
+    Parameters
+    ----------
+    phantom : TOML file of `fspt flux solve`, or a PhantomFile: shape, optical coefficients, mesh; its own sources are
+        not used
+    matrix : of `transport` or `read_transport`, for the surface of this phantom. The scene of the matrix, with its
+        default values, shows the phantom in the frame of the phantom file.
+    images : one Image, Exposure or name of a file of either per view, in the order of the views; or an array of powers
+        (views, h, w) [W] together with `error`
+    sources : number of point sources, 1 … 20
+    error, mask, gain_error, scene : as in `invert`
+    confidence : of the intervals, in (0, 1)
+    progress : function of the present step (text) and the share done (0 … 1); None: a bar in notebooks
+    settings : accuracy
+
+    Images in several bands of wavelengths: `matrix` and `images`, and `error` and `mask` if given, are dictionaries
+    with the names of the tables [bands.NAME] of the phantom file, which hold the optical coefficients in a band and the
+    share of the sources' power that is emitted in it. `power` is that of all bands.
+
+    Raises
+    ------
+    InversionError : an option outside its range, bands that differ, images without light or without an error, a surface
+        that is not the phantom's border, sources that the images do not determine, or a source so close to the border
+        that the mesh does not resolve it.
+    TransportError, DetectorError, ImageError : as in `invert`.
+    FluxError : the phantom file cannot be used, or has no such band.
+    BackendError : scikit-fem, or the mesher that the phantom needs, is missing.
+    """
+    count, confidence = _checked(sources, confidence)
+    given = _given(matrix, images, error, mask)
+    described = phantom if isinstance(phantom, PhantomFile) else PhantomFile.read(phantom)
+    with reported(progress) as report:
+        bands = _band_images(described, given, gain_error, scene, report)
+        return _located(bands, count, confidence, settings or LocationSettings(), report)
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """Arguments for one band; `name` is None where there is only one, without a name."""
+
+    name: str | None
+    matrix: TransportMatrix
+    images: Images
+    error: ArrayLike | None
+    mask: ArrayLike | None
+
+    @property
+    def label(self) -> str:
+        """Beginning of messages."""
+        return "locate" if self.name is None else f"locate, band '{self.name}'"
+
+
+def _checked(sources: int, confidence: float) -> tuple[int, float]:
+    """Number of sources and confidence; raises InversionError where one is outside its range."""
+    count = whole("locate: 'sources'", sources, InversionError, "1")
+    if not 1 <= count <= MOST_SOURCES:
+        raise InversionError(f"locate: 'sources' must be in 1 … {MOST_SOURCES}, got {count}. Give their number.")
+    confidence = number("locate: 'confidence'", confidence, InversionError, "0.9")
+    if not 0 < confidence < 1:
+        raise InversionError(f"locate: 'confidence' must be in (0, 1), got {confidence:g}. Give for example 0.9.")
+    return count, confidence
+
+
+def _given(matrix: TransportMatrix | Mapping[str, TransportMatrix], images: Any, error: Any, mask: Any) -> list[_Given]:
+    """Arguments of each band; raises InversionError where dictionaries and bands do not fit together."""
+    others = {"images": images, "error": error, "mask": mask}
+    if not isinstance(matrix, Mapping):
+        for name, value in others.items():
+            if isinstance(value, Mapping):
+                raise InversionError(
+                    f"locate: '{name}' is a dictionary, the matrix is not. Give the matrices as a dictionary by the "
+                    "same names."
+                )
+        bands: dict[str | None, Any] = {None: matrix}
+        others = {name: {None: value} for name, value in others.items()}
+    else:
+        bands = {name: one for name, one in matrix.items()}
+        if not bands:
+            raise InversionError("locate: no band is given. Give one matrix a band.")
+        for name, value in others.items():
+            if value is None and name != "images":
+                others[name] = dict.fromkeys(bands)
+            elif not isinstance(value, Mapping) or set(value) != set(bands):
+                raise InversionError(
+                    f"locate: '{name}' must be a dictionary of the bands {', '.join(map(str, bands))}, as the matrices "
+                    f"are, got {', '.join(map(str, value)) if isinstance(value, Mapping) else type(value).__name__}."
+                )
+    for one in bands.values():
+        if not isinstance(one, TransportMatrix):
+            raise InversionError(
+                f"locate: the second argument must be a transport matrix, got {type(one).__name__}. Make one with "
+                "fspt.transport, or read one with fspt.read_transport."
+            )
+    return [_Given(name, one, *(value[name] for value in others.values())) for name, one in bands.items()]
+
+
+def _located(
+    bands: Sequence[BandImages], count: int, confidence: float, settings: LocationSettings, report: Progress
+) -> Location:
+    """Sources and density that fit the images of all bands."""
+    report("first positions", 0.0)
+    grid = SourceGrid.of(bands)
+    fit = SourceFit(bands, settings, report)
+    found = fit.minimum(grid.positions(count))
+    covariance = fit.covariance(found)
+    density = replace(grid, sigma=found.sigma).density(report)
+    tell_misfit("locate", found.cost, fit.free(found))
+    return Location.of(fit, found, covariance, density, confidence)
+
+
+def _band_images(
+    described: PhantomFile, given: Sequence[_Given], gain_error: float | None, scene: object, report: Progress
+) -> list[BandImages]:
+    """Images and tissue of each band, on the same tetrahedra."""
+    report("images", 0.0)
+    read = []
+    for one in given:
+        with renamed("invert", one.label):
+            surface = Surface.of(one.matrix, scene)
+            measurement = Measurement.of(one.matrix, one.images, one.error, one.mask, gain_error)
+        read.append((surface, measurement, described.band(one.name)))
+    report("tissue", 0.0)
+    mesh = described.checked_mesh()
+    bands = []
+    for one, (surface, measurement, optics) in zip(given, read, strict=True):
+        tissue = Tissue(mesh, optics.media, a=described.a, order=described.order)
+        with renamed("locate", one.label):
+            bands.append(BandImages.of(one.name, one.matrix, surface, measurement, tissue, optics.share))
+    return bands

@@ -1,0 +1,160 @@
+"""Result of `locate`: point sources with their intervals, a density, and files of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from ..runtime.atomic_files import atomic_path
+from ..runtime.errors import BackendError, InversionError
+from ..tissue.tetrahedra import Tetrahedra
+from .source_fit import PointSources, SourceFit
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedSource:
+    """Point source that fits the images.
+
+    Attributes
+    ----------
+    position : (3,) [mm], in the frame of the phantom file;  position_sd : (3,) standard deviations [mm]
+    position_interval : (low, high), each (3,) [mm]
+    power : [W];  power_sd : [W];  power_interval : (low, high) [W]
+    """
+
+    position: Array
+    position_sd: Array
+    position_interval: tuple[Array, Array]
+    power: float
+    power_sd: float
+    power_interval: tuple[float, float]
+
+    @classmethod
+    def of(cls, position: Array, power: float, sd: Array, confidence: float) -> LocatedSource:
+        """Source with normal intervals; `sd`: (4,) of x, y, z and power."""
+        reach = float(norm.ppf((1 + confidence) / 2)) * sd
+        ends = (position - reach[:3], position + reach[:3])
+        return cls(
+            position, sd[:3], ends, power, float(sd[3]), (max(float(power - reach[3]), 0.0), float(power + reach[3]))
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """All numbers by name, ready for JSON."""
+        return {
+            "position": self.position.tolist(),
+            "position_sd": self.position_sd.tolist(),
+            "position_interval": [end.tolist() for end in self.position_interval],
+            "power": self.power,
+            "power_sd": self.power_sd,
+            "power_interval": list(self.power_interval),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Location:
+    """Light sources inside a phantom, from images of its surface.
+
+    Attributes
+    ----------
+    sources : point sources, the one of the largest power first
+    covariance : (4K, 4K) of x, y, z [mm] and power [W] of the sources, in their order (Eq. M.26)
+    density : (V,) source density >= 0 [W/mm³] at the vertices of `mesh`
+    mesh : tetrahedra of the phantom
+    chi2 : Σ (residual/σ)² over (pixels − 4K): about 1 where model and noise are right
+    pixels : number of pixels fitted
+    confidence : of the intervals
+    gain_error : relative uncertainty of a common factor, contained in the intervals of power
+    measured, fitted, sigma : (views, height, width) [W], NaN where masked or outside the surface; by the names of the
+        bands where the images were given so
+    residual : (measured − fitted)/sigma, in the same form
+    """
+
+    sources: tuple[LocatedSource, ...]
+    covariance: Array
+    density: Array
+    mesh: Tetrahedra
+    chi2: float
+    pixels: int
+    confidence: float
+    gain_error: float
+    measured: Array | dict[str, Array]
+    fitted: Array | dict[str, Array]
+    sigma: Array | dict[str, Array]
+    residual: Array | dict[str, Array]
+
+    @classmethod
+    def of(cls, fit: SourceFit, found: PointSources, covariance: Array, density: Array, confidence: float) -> Location:
+        """Result of a fit."""
+        sd = np.sqrt(np.diag(covariance)).reshape(-1, 4)
+        return cls(
+            sources=tuple(
+                LocatedSource.of(position, float(power), own, confidence)
+                for position, power, own in zip(found.positions, found.powers, sd, strict=True)
+            ),
+            covariance=covariance,
+            density=density,
+            mesh=fit.bands[0].tissue.mesh,
+            chi2=found.cost / fit.free(found),
+            pixels=len(fit.power),
+            confidence=confidence,
+            gain_error=fit.gain_error,
+            measured=fit.images(fit.power),
+            fitted=fit.images(found.signal),
+            sigma=fit.images(found.sigma),
+            residual=fit.images((fit.power - found.signal) / found.sigma),
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Numbers about the result by name, ready for JSON."""
+        return {
+            "sources": [source.summary() for source in self.sources],
+            "length_unit": "mm",
+            "power_unit": "W",
+            "confidence": self.confidence,
+            "chi2": self.chi2,
+            "pixels": self.pixels,
+            "gain_error": self.gain_error,
+        }
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the tetrahedra with `density` [W/mm³], and the point sources with their `power` [W], to a .vtu file.
+
+        A point source is a cell of one vertex. On vertices of the mesh `power` is 0, on point sources `density`.
+
+        Raises
+        ------
+        InversionError : another suffix, or the file cannot be written.
+        BackendError : meshio is not installed.
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".vtu":
+            raise InversionError(f"output file '{path}' must end in .vtu. Give a name such as source.vtu.")
+        try:
+            import meshio
+        except ImportError as cause:
+            raise BackendError(
+                f"location: meshio, which writes '{path.name}', is not installed. pip install 'mitsuba-fspt[mesh]'."
+            ) from cause
+        count, vertices = len(self.sources), self.mesh.vertices
+        points = np.concatenate([vertices, [source.position for source in self.sources]])
+        cells = [("tetra", self.mesh.cells), ("vertex", np.arange(count)[:, None] + len(vertices))]
+        values = {
+            "density": np.concatenate([self.density, np.zeros(count)]),
+            "power": np.concatenate([np.zeros(len(vertices)), [source.power for source in self.sources]]),
+        }
+        with atomic_path(path, InversionError) as temporary:
+            meshio.Mesh(points, cells, point_data=values).write(temporary, "vtu")
+
+    def __repr__(self) -> str:
+        found = "; ".join(
+            f"{source.power:.4g} W at ({', '.join(f'{x:.4g}' for x in source.position)}) mm" for source in self.sources
+        )
+        return f"Location({found}, chi2 {self.chi2:.4g})"
