@@ -19,6 +19,7 @@ class BlockGrid(Grid):
     """Pixels of the marked blocks of `side`² pixels; an array on the grid has one entry per pixel, block by block.
 
     blocks : (rows, columns) of blocks, True where a block belongs to the grid; at least one
+    side : a power of two, so that shifts take the place of divisions, which processors have none of for vectors
     shape : (h, w) of the whole image that the blocks cover
     place : number of each pixel in the whole image, row by row
 
@@ -33,13 +34,13 @@ class BlockGrid(Grid):
         number = np.full(blocks.shape, -1, np.int32)
         number[row, column] = np.arange(len(row))
         self._blocks, self._rows = mi.Int(number.ravel()), (mi.Int(row), mi.Int(column))
-        self._side, self._columns = dr.opaque(mi.Int, side), dr.opaque(mi.Int, blocks.shape[1])
+        self._shift, self._columns = (dr.opaque(mi.Int, n) for n in (side.bit_length() - 1, blocks.shape[1]))
         self._height, self._width = (dr.opaque(mi.Int, n) for n in self.shape)
         self.number = dr.arange(mi.UInt32, self._count)
-        within = mi.Int(self.number) % (self._side * self._side)
-        block = mi.UInt32(mi.Int(self.number) // (self._side * self._side))
-        self.y, self.x = (dr.gather(mi.Int, ends, block) * self._side for ends in self._rows)
-        self.y, self.x = self.y + within // self._side, self.x + within % self._side
+        number = mi.Int(self.number)
+        block, inside = mi.UInt32(number >> (2 * self._shift)), (1 << self._shift) - 1
+        self.y, self.x = (dr.gather(mi.Int, ends, block) << self._shift for ends in self._rows)
+        self.y, self.x = self.y + ((number >> self._shift) & inside), self.x + (number & inside)
         self.position = mi.UInt32(self.y * self._width + self.x)
         dr.eval(self.number, self.x, self.y, self.position)
         self._around = {(dx, dy): self._index(self.x + dx, self.y + dy) for dx, dy in AROUND}
@@ -104,8 +105,8 @@ class BlockGrid(Grid):
     def _looked_up(self, x: mi.Int, y: mi.Int) -> tuple[mi.UInt32, Mask]:
         """Numbers of the pixels (x, y), and True where they belong to the grid."""
         here = (x >= 0) & (x < self._width) & (y >= 0) & (y < self._height)
-        row, column = y // self._side, x // self._side
+        row, column, inside = y >> self._shift, x >> self._shift, (1 << self._shift) - 1
         block = dr.gather(mi.Int, self._blocks, mi.UInt32(row * self._columns + column), here)
         here &= block >= 0
-        within = (y - row * self._side) * self._side + x - column * self._side
-        return mi.UInt32(dr.select(here, block * self._side * self._side + within, 0)), here
+        number = (((block << self._shift) + (y & inside)) << self._shift) + (x & inside)
+        return mi.UInt32(dr.select(here, number, 0)), here

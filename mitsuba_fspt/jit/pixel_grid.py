@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from functools import reduce
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -33,10 +33,8 @@ class Grid:
         self._height, self._width = (dr.opaque(mi.Int, side) for side in shape)
         self.y = mi.Int(self.number) // self._width
         self.x = mi.Int(self.number) - self.y * self._width
-        # Numbers of the neighbours, computed once for repeated use.
         self._around = {(dx, dy): self._index(self.x + dx, self.y + dy) for dx, dy in AROUND}
-        self._by_squares = self._in_bands()
-        dr.eval(self.number, self.x, self.y, self._around, self._by_squares)
+        dr.eval(self.number, self.x, self.y)
 
     def __len__(self) -> int:
         return math.prod(self.shape)
@@ -55,14 +53,17 @@ class Grid:
             return self._by_squares
         return dr.gather(mi.UInt32, self._by_squares, dr.compress(dr.gather(mi.Bool, mask, self._by_squares)))
 
-    def _in_bands(self) -> mi.UInt32:
+    @cached_property
+    def _by_squares(self) -> mi.UInt32:
         """Numbers of all pixels, sorted by bands of `BLOCK` rows and by columns within a band."""
         number, full = mi.Int(self.number), BLOCK * self._width
         band = number // full
         # At least 1: kernels are also evaluated for some entries beyond the last pixel and must not divide by zero.
         position, rows = number - band * full, dr.clip(self._height - BLOCK * band, 1, BLOCK)
         column = position // rows
-        return mi.UInt32((BLOCK * band + position - column * rows) * self._width + column)
+        ordered = mi.UInt32((BLOCK * band + position - column * rows) * self._width + column)
+        dr.eval(ordered)
+        return ordered
 
     def full(self, kind: type, value: Any) -> Any:
         """Image with the same value on every pixel."""
