@@ -126,6 +126,7 @@ class _Picture:
     edge : True for blocks on which the image may jump
     blur : least blur radius of an edge on a block or a neighbour [pixels]
     draft, refined : image of the present blocks in the pupil form; True where transects were taken
+    passed_on : error of the pixels of a block that follows from the errors of the blocks around [W/mm²/sr]
     bent : estimated error of the interpolation on the pixels of a block [W/mm²/sr]
     peak : lower bound of the brightest block or pixel [W/mm²/sr]
     tolerance : rtol times `peak` [W/mm²/sr]
@@ -184,11 +185,13 @@ class _Picture:
         self.edge = _spread(self.edge, 1) | _small_bodies(self._seen(), self.blocks.window)
         pixel = self.quadrature.pixel
         self.bent = BEND_GAIN[pixel] * _bend(self.value, self.blocks.side, pixel)
+        self.passed_on = _propagated(self.error, self.blocks.side, pixel)
         # Near blurred edges four lines of sight are too few for a comparison.
         refined = np.zeros(self.own.shape, bool)
         self.grid.lay(self.refined, refined)
         whole = (-_spread(-self.coverage, 1) > 1 - COVERAGE_ROUNDING) & ~refined
-        number = np.flatnonzero(whole & ~self._beyond() & self.own)
+        compared = self.grid.flat(whole & ~self._beyond() & self.own)  # in the order in which rays are traced fastest
+        number = self.grid.place(self.grid.pixels(compared)).numpy().astype(np.int64)
         if number.size:
             off, edge = np.zeros(whole.shape), np.zeros(whole.shape, bool)
             off.ravel()[number], edge.ravel()[number] = self._compared(number)
@@ -207,7 +210,7 @@ class _Picture:
 
     def _left(self) -> Plane:
         """Error of the pixels of each block, (h, w): root of the summed squares of both contributions."""
-        return np.hypot(_propagated(self.error, self.blocks.side, self.quadrature.pixel), self.bent)
+        return np.hypot(self.passed_on, self.bent)
 
     def _compared(self, number: NDArray[np.int64]) -> tuple[Plane, Marks]:
         """Difference between one random pixel and the interpolated value on each of these blocks; True where the pixel
@@ -224,8 +227,7 @@ class _Picture:
         self.rays += 4 * number.size
         self.levels.append(f"{self.blocks}, one pixel each: {number.size} pixels")
         weights = part_weights(side, REACH, self.quadrature.pixel)
-        around = sliding_window_view(np.pad(self.value, REACH, mode="edge"), (2 * REACH + 1,) * 2)[row, column]
-        found = np.einsum("na,nab,nb->n", weights[i], around, weights[j], optimize=True)
+        found = np.einsum("na,nab,nb->n", weights[i], _around(self.value, row, column), weights[j], optimize=True)
         return np.abs(found - seen.value.numpy()), seen.coverage.numpy() < 1 - COVERAGE_ROUNDING
 
     def smaller(self, rough: Marks) -> Blocks:
@@ -252,21 +254,21 @@ class _Picture:
         self.error, self.own = _repeated(self.error, parts), _repeated(rough, parts)
         weights = part_weights(parts, REACH, self.quadrature.pixel if smaller.side == 1 else "area")
         self.value = np.maximum(means_of_parts(self.value, weights), 0)
-        inside = (self.coverage > COVERAGE_ROUNDING) & (self.coverage < 1 - COVERAGE_ROUNDING) & ~rough
+        inside = parted(self.coverage) & ~rough
+        weights, around = part_weights(parts, REACH), _around(self.coverage, *np.nonzero(inside))
         coverage = _repeated(self.coverage, parts)
-        if inside.any():
-            between = np.clip(means_of_parts(self.coverage, part_weights(parts, REACH)), 0, 1)
-            coverage = np.where(_repeated(inside, parts), between, coverage)
+        by_blocks = coverage.reshape(rough.shape[0], parts, -1, parts).swapaxes(1, 2)
+        by_blocks[inside] = np.clip(np.einsum("ia,nab,jb->nij", weights, around, weights, optimize=True), 0, 1)
         self.blocks, self.coverage = smaller, coverage
 
     def solution(self) -> Solution:
         """The picture of pixels."""
-        etendue = self.view.lens.etendue
+        etendue, window = self.view.lens.etendue, self.sizes[-1].window
         why = f"{', '.join(self.shares)} are computed for {self.own.size} pixels"
         findings = (Finding("smooth blocks", True, why), *self.findings)
-        images = (self.value * etendue, self.error * etendue, self.coverage)
-        whole = (self.sizes[-1].window.expand(image) for image in images)
-        return Solution(*whole, self.rays, tuple(self.levels), findings=findings)
+        power, error = (etendue * window.expand(image) for image in (self.value, self.error))
+        coverage = window.expand(self.coverage)
+        return Solution(power, error, coverage, self.rays, tuple(self.levels), findings=findings)
 
 
 def _refine_blurred(draft: Draft) -> tuple[mi.Float64, mi.Bool]:
@@ -340,6 +342,11 @@ def means_of_parts(cells: Plane, weights: Plane) -> Plane:
     return cells
 
 
+def _around(cells: Plane, row: NDArray[np.int64], column: NDArray[np.int64]) -> Plane:
+    """The cells within `REACH` of each of n cells (row, column), (n, 2 REACH + 1, 2 REACH + 1)."""
+    return sliding_window_view(np.pad(cells, REACH, mode="edge"), (2 * REACH + 1,) * 2)[row, column]
+
+
 def _propagated(errors: Plane, side: int, pixel: str) -> Plane:
     """Error of the parts of each cell, (h, w), that follows from independent errors of cells (h, w)."""
     share = np.square(part_weights(side, REACH, pixel)).max(axis=0)
@@ -354,9 +361,8 @@ def _bend(cells: Plane, side: int, pixel: str) -> Plane:
     """Largest change of a part of each cell and its neighbours from polynomials over five cells to seven, (h, w)."""
     parts = [0, side // 2, side - 1]  # corners, where it is largest, and the middle
     seven, five = (means_of_parts(cells, part_weights(side, reach, pixel)[parts]) for reach in (REACH + 1, REACH))
-    height, width = cells.shape
-    change = np.abs(seven - five).reshape(height, len(parts), width, len(parts)).max(axis=(1, 3))
-    return _spread(change, 1)
+    change, count = np.abs(seven - five), len(parts)
+    return _spread(reduce(np.maximum, (change[i::count, j::count] for i, j in np.ndindex(count, count))), 1)
 
 
 def _spread(image: NDArray, reach: int) -> NDArray:

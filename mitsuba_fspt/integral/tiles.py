@@ -67,10 +67,7 @@ class Mosaic:
     def put(self, tile: Window, part: Solution) -> None:
         """Lay the solution of a tile at its place."""
         here = self._place(tile)
-        if part.power.shape == self.power.shape and part.power.dtype == self.power.dtype:
-            self.power, self.error, self.coverage = part.power, part.error, part.coverage
-        else:
-            self.power[here], self.error[here], self.coverage[here] = part.power, part.error, part.coverage
+        self.power[here], self.error[here], self.coverage[here] = part.power, part.error, part.coverage
         self._rays += part.rays
         self._levels += part.levels
         self._findings += part.findings
@@ -107,7 +104,7 @@ class Mosaic:
         """`_steepest` on a tile, with what lies around it."""
         first = [max(0, side.start - REACH) for side in here]
         around = tuple(slice(start, side.stop + REACH) for start, side in zip(first, here, strict=True))
-        steepest = _steepest(self.power[around].astype(np.float64))
+        steepest = _steepest(self.power[around].astype(np.float64, copy=False))
         return steepest[tuple(slice(side.start - k, side.stop - k) for k, side in zip(first, here, strict=True))]
 
 

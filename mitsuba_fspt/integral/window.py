@@ -97,10 +97,13 @@ class Window:
         return inside[:, None] & (columns >= 0) & (columns < other.shape[1])
 
     def expand(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The crop window with `image` of this window in its place, 0 around it."""
-        whole = np.zeros(self.full)
+        """The crop window with `image` of this window in its place, 0 around it; a view if nothing is around it."""
         here, there = self._common()
-        whole[there] = image[here]
+        part = image[here]
+        if part.shape == self.full:
+            return part
+        whole = np.zeros(self.full)
+        whole[there] = part
         return whole
 
     def cut(self, image: NDArray[Any]) -> NDArray[Any]:
