@@ -1,6 +1,6 @@
 """Coverage of the intervals of `locate`: how often they contain the true position and power of a source.
 
-    python scripts/location_coverage.py [--seeds 100] [--edge 2] [--workers 2] [-o docs/location_coverage.csv]
+    python scripts/location_coverage.py [--seeds 60] [--edge 3] [--workers 2] [-o docs/location_coverage.csv]
 
 The phantom is that of scenes/nylon_cylinder.toml with a point source at (8, 0, -1) mm, or two; the camera that of
 scenes/nylon_cylinder.xml at f/2.8 with 64 x 64 pixels. J_n of the images is an exact series for the cylinder
@@ -137,8 +137,8 @@ def row(case: Case, results: list[tuple[Array, Array, float, float]]) -> Row:
 def main() -> None:
     """Write the table as CSV and print it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument("--edge", type=float, default=2.0, help="Of the tetrahedra [mm].")
+    parser.add_argument("--seeds", type=int, default=60)
+    parser.add_argument("--edge", type=float, default=3.0, help="Of the tetrahedra [mm].")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "location_coverage.csv")
     arguments = parser.parse_args()

@@ -48,17 +48,19 @@ def locate(
     from ..images.reduction import read_measured
     from ..inverse.locate import locate
     from ..inverse.transport_file import read_transport
+    from ..tissue.phantom_file import PhantomFile
 
+    described = PhantomFile.read(phantom)
     if output:
         require_writable(output, ".vtu", InversionError)
-        require_apart(output, [phantom, matrix, *images], error=InversionError)
+        require_apart(output, [phantom, *described.files, matrix, *images], error=InversionError)
     groups = _groups([matrix, *images], band or [])
     with progress_bar(quiet) as progress:
         quiet_mitsuba()
         matrices = {name: read_transport(paths[0]) for name, paths in groups.items()}
         planes = {name: [read_measured(path) for path in paths[1:]] for name, paths in groups.items()}
         found = locate(
-            phantom,
+            described,
             matrices if band else next(iter(matrices.values())),
             planes if band else next(iter(planes.values())),
             sources=sources,
@@ -75,12 +77,14 @@ def locate(
 
 def _groups(paths: list[Path], bands: list[str]) -> dict[str, list[Path]]:
     """Files of each band, a transport matrix first; raises InversionError where their numbers differ."""
-    starts = [k for k, path in enumerate(paths) if path.suffix.lower() == ".npz" or k == 0]
+    from ..inverse.transport_file import is_transport
+
+    starts = [k for k, path in enumerate(paths) if k == 0 or is_transport(path)]
     names = bands or [""]
     if len(starts) != len(names) or len(set(names)) != len(names):
         raise InversionError(
-            f"locate: {len(starts)} transport matrices (.npz) for the bands {', '.join(bands) or '(none)'}. Give "
-            "--band once for each matrix, with different names."
+            f"locate: {len(starts)} transport matrices for the bands {', '.join(bands) or '(none)'}. Give each matrix "
+            "before its images, and --band once for each, with different names."
         )
     ends = [*starts[1:], len(paths)]
     return {name: paths[start:end] for name, start, end in zip(names, starts, ends, strict=True)}
@@ -95,7 +99,7 @@ def _text(found: Location, output: Path | None) -> str:
             f"{name} {value:.5g} ({a:.5g} to {b:.5g})"
             for name, value, a, b in zip("xyz", source.position, low, high, strict=True)
         )
-        lines.append(f"source {number}: {place} mm, {source.power:.4g} W ({least:.4g} to {most:.4g} W)")
+        lines.append(f"source {number}: {place} mm, {source.power:.5g} W ({least:.5g} to {most:.5g} W)")
     lines.append(f"{100 * found.confidence:g} % intervals; chi2 {found.chi2:.3g} over {found.pixels} pixels")
     if output:
         lines.append(f"{output}: source density and sources")

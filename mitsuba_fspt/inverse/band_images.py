@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +21,11 @@ from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-# Largest distance of the matrix's surface from the tissue's border, over the edge of the tetrahedra. J_n there
-# is that of the border's nearest point, so that the sources are wrong by at most about that distance.
+LOG = logging.getLogger("mitsuba_fspt")
+# Distance of the matrix's surface from the tissue's border, over the edge of the tetrahedra: the largest, and the one
+# from which on it is told. The sources are wrong by about that distance, which the intervals do not contain.
 OFF_BORDER = 0.25
+TOLD = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,5 +124,11 @@ class BandImages:
         if away > OFF_BORDER * mesh.edge:
             raise InversionError(
                 f"locate: the surface of the matrix is up to {away:.3g} mm away from the phantom's border. Give the "
-                "matrix of this phantom's surface, and 'scene' in the frame of the phantom file."
+                "matrix of this phantom's surface; its mesh without to_world is in the frame of the phantom file."
+            )
+        if away > TOLD * mesh.edge:
+            LOG.warning(
+                "fspt: locate: the surface of the matrix is up to %.3g mm away from the phantom's border, which the "
+                "stated errors do not contain.",
+                away,
             )

@@ -5,12 +5,14 @@ J_n of a point source is the solution of the diffusion equation (see `tissue.dif
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from numpy.typing import ArrayLike
+from scipy.stats import norm
 
 from ..images.detector import Exposure
 from ..images.image import Image
@@ -31,6 +33,7 @@ Images: TypeAlias = (
     ArrayLike | Sequence[Image | Exposure | str | os.PathLike[str]] | Image | Exposure | os.PathLike[str]
 )
 MOST_SOURCES = 20
+LOG = logging.getLogger("mitsuba_fspt")
 
 
 def locate(
@@ -54,14 +57,14 @@ def locate(
         S.sources[0].position, S.sources[0].position_interval  # mm, in the frame of phantom.toml
 
     The intervals contain the noise of the images, the numerical error of the matrix and `gain_error`, not errors of the
-    optical coefficients, of the mesh or of the diffusion equation itself.
+    optical coefficients, of the shape or of the diffusion equation itself.
 
     Parameters
     ----------
     phantom : TOML file of `fspt flux solve`, or a PhantomFile: shape, optical coefficients, mesh; its own sources are
         not used
-    matrix : of `transport` or `read_transport`, for the surface of this phantom. The scene of the matrix, with its
-        default values, shows the phantom in the frame of the phantom file.
+    matrix : of `transport` or `read_transport`, for the surface of this phantom. The mesh in the scene's PLY file,
+        before `to_world`, is in the frame of the phantom file, as `fspt flux solve` writes it.
     images : one Image, Exposure or name of a file of either per view, in the order of the views; or an array of powers
         (views, h, w) [W] together with `error`
     sources : number of point sources, 1 … 20
@@ -72,7 +75,8 @@ def locate(
 
     Images in several bands of wavelengths: `matrix` and `images`, and `error` and `mask` if given, are dictionaries
     with the names of the tables [bands.NAME] of the phantom file, which hold the optical coefficients in a band and the
-    share of the sources' power that is emitted in it. `power` is that of all bands.
+    share of the sources' power that is emitted in it. `power` is that of all bands. Factors of the bands' images
+    (`gain_error`) are independent.
 
     Raises
     ------
@@ -85,7 +89,7 @@ def locate(
     """
     count, confidence = _checked(sources, confidence)
     given = _given(matrix, images, error, mask)
-    described = phantom if isinstance(phantom, PhantomFile) else PhantomFile.read(phantom)
+    described = _described(phantom)
     with reported(progress) as report:
         bands = _band_images(described, given, gain_error, scene, report)
         return _located(bands, count, confidence, settings or LocationSettings(), report)
@@ -155,14 +159,38 @@ def _located(
     bands: Sequence[BandImages], count: int, confidence: float, settings: LocationSettings, report: Progress
 ) -> Location:
     """Sources and density that fit the images of all bands."""
+    fit = SourceFit(bands, settings, report)
+    if len(fit.power) <= 4 * count:
+        raise InversionError(
+            f"locate: {len(fit.power)} pixels do not determine the {4 * count} numbers of {count} sources. Give more "
+            "pixels, or fewer sources."
+        )
     report("first positions", 0.0)
     grid = SourceGrid.of(bands)
-    fit = SourceFit(bands, settings, report)
-    found = fit.minimum(grid.positions(count))
-    covariance = fit.covariance(found)
+    found = fit.best(grid, count)
+    noise = fit.covariance(found)
+    covariance, z = noise + fit.by_factors(found, noise), float(norm.ppf((1 + confidence) / 2))
+    linear = fit.is_linear(found, noise, z)
+    if not linear:
+        LOG.warning(
+            "fspt: locate: the intervals are those of a linear approximation, which does not hold for changes as "
+            "large; they may be too narrow. Give fewer sources, or images with less noise."
+        )
     density = replace(grid, sigma=found.sigma).density(report)
     tell_misfit("locate", found.cost, fit.free(found))
-    return Location.of(fit, found, covariance, density, confidence)
+    return Location.of(fit, found, covariance, z, linear, density, confidence)
+
+
+def _described(phantom: object) -> PhantomFile:
+    """The phantom; InversionError where it is neither a PhantomFile nor the name of a file."""
+    if isinstance(phantom, PhantomFile):
+        return phantom
+    if not isinstance(phantom, (str, os.PathLike)):
+        raise InversionError(
+            f"locate: the phantom must be the name of a TOML file or a PhantomFile, got {type(phantom).__name__}. "
+            "Give for example 'phantom.toml'."
+        )
+    return PhantomFile.read(phantom)
 
 
 def _band_images(

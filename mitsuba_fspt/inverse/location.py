@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, InversionError
@@ -38,13 +37,11 @@ class LocatedSource:
     power_interval: tuple[float, float]
 
     @classmethod
-    def of(cls, position: Array, power: float, sd: Array, confidence: float) -> LocatedSource:
-        """Source with normal intervals; `sd`: (4,) of x, y, z and power."""
-        reach = float(norm.ppf((1 + confidence) / 2)) * sd
-        ends = (position - reach[:3], position + reach[:3])
-        return cls(
-            position, sd[:3], ends, power, float(sd[3]), (max(float(power - reach[3]), 0.0), float(power + reach[3]))
-        )
+    def of(cls, values: Array, sd: Array, z: float) -> LocatedSource:
+        """Source of x, y, z and power (4,) and their sd (4,), with intervals of z sd to both sides."""
+        low, high = values - z * sd, values + z * sd
+        interval = (max(float(low[3]), 0.0), float(high[3]))
+        return cls(values[:3], sd[:3], (low[:3], high[:3]), float(values[3]), float(sd[3]), interval)
 
     def summary(self) -> dict[str, Any]:
         """All numbers by name, ready for JSON."""
@@ -68,10 +65,11 @@ class Location:
     covariance : (4K, 4K) of x, y, z [mm] and power [W] of the sources, in their order (Eq. M.26)
     density : (V,) source density >= 0 [W/mm³] at the vertices of `mesh`
     mesh : tetrahedra of the phantom
-    chi2 : Σ (residual/σ)² over (pixels − 4K): about 1 where model and noise are right
+    chi2 : Σ (residual/σ)² over the pixels less the 4K parameters: about 1 where model and noise are right
     pixels : number of pixels fitted
     confidence : of the intervals
-    gain_error : relative uncertainty of a common factor, contained in the intervals of power
+    linear : False where the intervals may be too narrow, since the images do not change linearly within them
+    gain_error : relative uncertainty of a factor common to the images of a band, contained in the intervals
     measured, fitted, sigma : (views, height, width) [W], NaN where masked or outside the surface; by the names of the
         bands where the images were given so
     residual : (measured − fitted)/sigma, in the same form
@@ -84,6 +82,7 @@ class Location:
     chi2: float
     pixels: int
     confidence: float
+    linear: bool
     gain_error: float
     measured: Array | dict[str, Array]
     fitted: Array | dict[str, Array]
@@ -91,25 +90,32 @@ class Location:
     residual: Array | dict[str, Array]
 
     @classmethod
-    def of(cls, fit: SourceFit, found: PointSources, covariance: Array, density: Array, confidence: float) -> Location:
-        """Result of a fit."""
-        sd = np.sqrt(np.diag(covariance)).reshape(-1, 4)
+    def of(
+        cls,
+        fit: SourceFit,
+        found: PointSources,
+        covariance: Array,
+        z: float,
+        linear: bool,
+        density: Array,
+        confidence: float,
+    ) -> Location:
+        """Result of a fit, with intervals of z standard deviations to both sides."""
+        each = zip(found.values.reshape(-1, 4), np.sqrt(np.diag(covariance)).reshape(-1, 4), strict=True)
         return cls(
-            sources=tuple(
-                LocatedSource.of(position, float(power), own, confidence)
-                for position, power, own in zip(found.positions, found.powers, sd, strict=True)
-            ),
+            sources=tuple(LocatedSource.of(values, sd, z) for values, sd in each),
             covariance=covariance,
             density=density,
             mesh=fit.bands[0].tissue.mesh,
             chi2=found.cost / fit.free(found),
             pixels=len(fit.power),
             confidence=confidence,
-            gain_error=fit.gain_error,
+            linear=linear,
+            gain_error=max(band.measurement.gain_error for band in fit.bands),
             measured=fit.images(fit.power),
             fitted=fit.images(found.signal),
             sigma=fit.images(found.sigma),
-            residual=fit.images((fit.power - found.signal) / found.sigma),
+            residual=fit.images(found.residual(fit.power)),
         )
 
     def summary(self) -> dict[str, Any]:
@@ -119,6 +125,7 @@ class Location:
             "length_unit": "mm",
             "power_unit": "W",
             "confidence": self.confidence,
+            "linear": self.linear,
             "chi2": self.chi2,
             "pixels": self.pixels,
             "gain_error": self.gain_error,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from scipy.optimize import nnls
 from ..runtime.errors import FluxError, InversionError
 from ..runtime.progress_bar import Progress
 from .band_images import BandImages
+from .source_grid import SourceGrid
 
 Array = NDArray[np.float64]
 
@@ -25,8 +27,8 @@ class LocationSettings:
     """Accuracy of the fit.
 
     chi2 : fall of Σ (residual/σ)² by a step at which the fit ends: 1e-2 leaves parameters within 0.1 of their sd
-    step : of the differences for slopes, over the edge of the tetrahedra; the slopes are right to about 0.1 %
-    steps : most accepted steps;  damping : first factor of Levenberg and Marquardt
+    step : of the differences for slopes, over the edge of the tetrahedra; the slopes are right to about 1 %
+    steps : most accepted steps;  damping, least : first and least factor of Levenberg and Marquardt
     stuck : factor of damping at which no step is left: the minimum is at the border, or beyond
     apart : least singular value of the slopes with columns of length 1, over the largest; below it sources count as not
         determined separately
@@ -36,6 +38,7 @@ class LocationSettings:
     step: float = 0.01
     steps: int = 40
     damping: float = 1e-3
+    least: float = 1e-9
     stuck: float = 1e8
     apart: float = 1e-3
 
@@ -45,21 +48,42 @@ class PointSources:
     """Point sources and their images: positions (K, 3) [mm] and powers (K,) [W].
 
     exitance : of each band, (V, K) J_n per watt of each source [1/mm²]
-    columns : (N, K) power on the pixels of all bands per watt;  sigma : (N,) their noise [W]
-    cost : Σ (residual/σ)²
+    columns : (N, K) power on the pixels of all bands per watt;  gradients : (N, K, 3) its change per mm of x, y, z
+    sigma : (N,) noise of the pixels [W];  cost : Σ (residual/σ)²
     """
 
     positions: Array
     powers: Array
     exitance: tuple[Array, ...]
     columns: Array
+    gradients: Array
     sigma: Array
     cost: float
+
+    @property
+    def unlikelihood(self) -> float:
+        """-2 ln of the likelihood for normal noise, but for a constant: also compares fits with different σ."""
+        return float(self.cost + 2 * np.log(self.sigma).sum())
+
+    @property
+    def values(self) -> Array:
+        """(4K,) x, y, z [mm] and power [W] of each source in turn."""
+        return np.column_stack([self.positions, self.powers]).ravel()
 
     @property
     def signal(self) -> Array:
         """(N,) fitted power [W]."""
         return np.asarray(self.columns @ self.powers)
+
+    @property
+    def slopes(self) -> Array:
+        """(N, 4K) change of the fitted power over σ with the `values`."""
+        slopes = np.concatenate([self.powers[:, None] * self.gradients, self.columns[..., None]], axis=2)
+        return slopes.reshape(len(slopes), -1) / self.sigma[:, None]
+
+    def residual(self, power: Array) -> Array:
+        """(N,) (power − fitted power)/σ for the measured power (N,) [W]."""
+        return (power - self.signal) / self.sigma
 
     def sorted(self) -> PointSources:
         """The same, the source of the largest power first."""
@@ -70,6 +94,7 @@ class PointSources:
             powers=self.powers[order],
             exitance=tuple(values[:, order] for values in self.exitance),
             columns=self.columns[:, order],
+            gradients=self.gradients[:, order],
         )
 
 
@@ -80,12 +105,8 @@ class SourceFit:
         self.bands, self.settings = bands, settings
         self._report, self._share = report, 0.0  # of the steps that are done
         self.power = np.concatenate([band.power for band in bands])
-        self.edge = bands[0].tissue.mesh.edge
-
-    @property
-    def gain_error(self) -> float:
-        """Relative standard deviation of a factor common to all images."""
-        return max(band.measurement.gain_error for band in self.bands)
+        ends = np.cumsum([0, *(len(band.rows) for band in bands)])
+        self._parts = [slice(*part) for part in pairwise(ends)]
 
     def free(self, found: PointSources) -> int:
         """Number of pixels less that of the parameters, at least 1."""
@@ -96,68 +117,124 @@ class SourceFit:
 
         NaN on pixels that are masked or do not see the surface.
         """
-        parts = np.split(values, np.cumsum([len(band.rows) for band in self.bands])[:-1])
-        images = [band.image(part) for band, part in zip(self.bands, parts, strict=True)]
+        images = [band.image(values[own]) for band, own in zip(self.bands, self._parts, strict=True)]
         if self.bands[0].name is None:
             return images[0]
         return {str(band.name): image for band, image in zip(self.bands, images, strict=True)}
 
-    def minimum(self, positions: Array) -> PointSources:
-        """Sources of least Σ (residual/σ)² from these first positions (K, 3) [mm], the brightest first.
+    def best(self, grid: SourceGrid, count: int) -> PointSources:
+        """The most likely of the minima from several sets of first positions, the brightest source first.
 
-        σ is that of the last step. Raises InversionError where the fit does not end with sources inside the tissue.
+        The sets are those of the grid for flat noise and for the noise of the first minimum. Raises InversionError
+        where no fit ends with sources inside the tissue.
         """
+        starts, found, failed = grid.positions(count), list[PointSources](), None
+        tried = set[frozenset[tuple[float, ...]]]()
+        while starts:
+            start = starts.pop(0)
+            if (places := frozenset(map(tuple, start.tolist()))) in tried:
+                continue
+            tried.add(places)
+            try:
+                found.append(self._minimum(start))
+            except InversionError as error:
+                failed = error
+            else:
+                if len(found) == 1:
+                    starts += replace(grid, sigma=found[0].sigma).positions(count)
+        if failed and not found:
+            raise failed
+        return min(found, key=lambda one: one.unlikelihood).sorted()
+
+    def _minimum(self, positions: Array) -> PointSources:
+        """Sources of least Σ (residual/σ)² from these first positions; σ is that of the last step."""
         settings, damping = self.settings, self.settings.damping
-        found = self._fitted(positions, np.concatenate([band.flat_sigma() for band in self.bands]))
+        found = self._tried(positions, np.concatenate([band.flat_sigma() for band in self.bands]), np.inf)
         for step in range(settings.steps):
-            self._share = step / settings.steps
+            if found is None:
+                break
+            positions, self._share = found.positions, step / settings.steps
             found = self._weighted(found, self._sigma(found))
-            slopes = self._slopes(found)
-            residual = (self.power - found.signal) / found.sigma
-            normal, right = slopes.T @ slopes, slopes.T @ residual
-            if right @ np.linalg.solve(normal, right) < settings.chi2:
-                return found.sorted()
-            while True:
-                damped = normal + damping * np.diag(np.diag(normal))
-                moved = np.linalg.solve(damped, right)[: found.positions.size].reshape(-1, 3)
-                tried = self._tried(found.positions + moved, found.sigma)
-                if tried is not None and tried.cost < found.cost:
-                    break
-                damping *= 10
-                if damping > settings.stuck:
-                    raise self._endless(found)
-            found, damping = tried, max(damping / 10, 1e-12)
-        raise self._endless(found)
+            slopes = found.slopes
+            lengths = np.linalg.norm(slopes, axis=0)
+            normal = slopes.T @ slopes / np.outer(lengths, lengths)
+            right = slopes.T @ found.residual(self.power) / lengths
+            if right @ np.linalg.lstsq(normal, right)[0] < settings.chi2:
+                return found
+            tried = None
+            while tried is None and damping < settings.stuck:
+                moved = np.linalg.solve(normal + damping * np.eye(len(normal)), right) / lengths
+                tried = self._tried(positions + moved.reshape(-1, 4)[:, :3], found.sigma, found.cost)
+                damping *= 10 if tried is None else 0.1
+            found, damping = tried, max(damping, settings.least)
+        shown = "; ".join(f"({', '.join(f'{x:.4g}' for x in position)})" for position in positions)
+        raise InversionError(
+            f"locate: the fit does not end with sources inside the tissue; the last positions are {shown} mm. Give "
+            "fewer sources, or, for a source near the border, 'edge' in [mesh] of the phantom file shorter than its "
+            "depth."
+        )
 
     def covariance(self, found: PointSources) -> Array:
-        """(4K, 4K) of x, y, z [mm] and power [W] of each source in turn (Eq. M.26).
+        """(4K, 4K) of the `values` without uncertain factors: inverse of JᵀJ (Eq. M.26).
 
         Raises InversionError where the images do not determine the sources separately.
         """
-        slopes = self._slopes(found)
+        slopes = found.slopes
         lengths = np.linalg.norm(slopes, axis=0)
         singular = np.linalg.svd(slopes / lengths, compute_uv=False)
-        count = len(found.powers)
         if singular[-1] < self.settings.apart * singular[0]:
             raise InversionError(
-                f"locate: the images do not determine {count} sources separately (condition number "
+                f"locate: the images do not determine {len(found.powers)} sources separately (condition number "
                 f"{singular[0] / max(singular[-1], 1e-300):.3g}). Give fewer."
             )
-        # A factor common to all images changes the powers alone.
-        factor = np.concatenate([np.zeros(3 * count), self.gain_error * found.powers])
-        covariance = np.linalg.inv(slopes.T @ slopes) + np.outer(factor, factor)
-        order = np.column_stack([np.arange(3 * count).reshape(count, 3), 3 * count + np.arange(count)]).ravel()
-        return np.asarray(covariance[np.ix_(order, order)])
+        return np.asarray(np.linalg.inv(slopes.T @ slopes))
 
-    def _fitted(self, positions: Array, sigma: Array) -> PointSources:
-        """Sources at these positions with the powers >= 0 that fit best; raises FluxError as `BandImages.exitance`."""
-        exitance, columns = self._images(positions)
-        return self._weighted(PointSources(positions, np.zeros(len(positions)), exitance, columns, sigma, 0.0), sigma)
+    def by_factors(self, found: PointSources, covariance: Array) -> Array:
+        """(4K, 4K) covariance of the `values` by the uncertain factor of each band, `gain_error` (Eq. M.26)."""
+        slopes, total = found.slopes, np.zeros_like(covariance)
+        for band, own in zip(self.bands, self._parts, strict=True):
+            change = covariance @ (slopes[own].T @ (found.signal[own] / found.sigma[own]))
+            total += band.measurement.gain_error**2 * np.outer(change, change)
+        return total
 
-    def _tried(self, positions: Array, sigma: Array) -> PointSources | None:
-        """The same; None where the tissue has no solution for these positions."""
+    def is_linear(self, found: PointSources, covariance: Array, z: float) -> bool:
+        """True if Σ (residual/σ)² rises as for a linear model along the direction that the images determine least.
+
+        At both points z standard deviations away, with the other directions at their minimum, it must rise by z²/2 to
+        2 z²: the length of a normal interval is then wrong by less than the root of 2.
+        """
+        scale, slopes = np.sqrt(np.diag(covariance)), found.slopes
+        weakest = scale * np.linalg.eigh(covariance / np.outer(scale, scale))[1][:, -1]
+        weakest *= z / np.linalg.norm(slopes @ weakest)
+        along = slopes @ weakest / z
+        others = np.linalg.svd(slopes * scale - np.outer(along, along @ slopes * scale), full_matrices=False)[0][:, :-1]
+        for sign in (1, -1):
+            try:
+                residual = self._residual_at(found, found.values + sign * weakest)
+            except FluxError:  # beyond the border
+                return False
+            residual -= others @ (others.T @ residual)
+            if not 0.5 < (residual @ residual - found.cost) / z**2 < 2:
+                return False
+        return True
+
+    def _residual_at(self, found: PointSources, values: Array) -> Array:
+        """(N,) residual over the σ of `found` for other `values` (4K,); raises FluxError as `BandImages.exitance`."""
+        positions, powers = values.reshape(-1, 4)[:, :3], values.reshape(-1, 4)[:, 3]
+        return (self.power - self._images(positions)[1] @ powers) / found.sigma
+
+    def _tried(self, positions: Array, sigma: Array, below: float) -> PointSources | None:
+        """Sources at these positions with the powers > 0 that fit best.
+
+        None where the tissue has no solution there, a source gets no power, or Σ (residual/σ)² is not below `below`.
+        """
         try:
-            return self._fitted(positions, sigma)
+            exitance, columns = self._images(positions)
+            empty = PointSources(positions, np.zeros(len(positions)), exitance, columns, np.empty(0), sigma, 0.0)
+            tried = self._weighted(empty, sigma)
+            if not ((tried.powers > 0).all() and tried.cost < below):
+                return None
+            return replace(tried, gradients=np.stack([*map(self._gradient, positions, columns.T)], axis=1))
         except FluxError:
             return None
 
@@ -171,19 +248,12 @@ class SourceFit:
         each = zip(self.bands, found.exitance, strict=True)
         return np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each])
 
-    def _slopes(self, found: PointSources) -> Array:
-        """(N, 4K) slopes of the fitted power over σ: with all coordinates, then with all powers."""
-        length = self.settings.step * self.edge
-        slopes = []
-        for position, power, column in zip(found.positions, found.powers, found.columns.T, strict=True):
-            if not power > 0:
-                raise InversionError(
-                    f"locate: {len(found.powers)} sources are too many, one gets no power. Give fewer."
-                )
-            slopes += [power * self._slope(position, length * axis, column) / length for axis in np.eye(3)]
-        return np.column_stack([*slopes, *found.columns.T]) / found.sigma[:, None]
+    def _gradient(self, position: Array, column: Array) -> Array:
+        """(N, 3) change of a source's image, `column` (N,), per mm along x, y and z; raises FluxError at the border."""
+        length = self.settings.step * self.bands[0].tissue.mesh.edge
+        return np.column_stack([self._change(position, length * axis, column) / length for axis in np.eye(3)])
 
-    def _slope(self, position: Array, way: Array, column: Array) -> Array:
+    def _change(self, position: Array, way: Array, column: Array) -> Array:
         """Change (N,) of a source's image along a way, backwards where the tissue ends."""
         try:
             return self._images((position + way)[None])[1][:, 0] - column
@@ -196,11 +266,4 @@ class SourceFit:
         exitance = tuple(np.column_stack([band.exitance(position) for position in positions]) for band in self.bands)
         return exitance, np.concatenate(
             [band.transport @ values for band, values in zip(self.bands, exitance, strict=True)]
-        )
-
-    def _endless(self, found: PointSources) -> InversionError:
-        shown = "; ".join(f"({', '.join(f'{x:.4g}' for x in position)})" for position in found.positions)
-        return InversionError(
-            f"locate: the fit does not end with sources inside the tissue; the last positions are {shown} mm. Give "
-            f"fewer sources, or, near the border, a mesh edge below {self.edge:.3g} mm."
         )

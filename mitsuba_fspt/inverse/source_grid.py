@@ -28,20 +28,23 @@ from .nonnegative import Solve, factor
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+LEAST_LENGTH = 1e-9  # of an image, over the longest; sources with shorter ones are not seen
 
 
 @dataclass(frozen=True)
 class GridSettings:
     """Accuracy of the first positions and of the density.
 
-    probes : random vectors for the length of each vertex's image, known to (2/probes)^½: 18 %
-    tried : vertices of the largest estimated fit whose images are computed, so that the error of the estimate does not
-        decide which one is best
+    probes : random vectors for the length of each vertex's image, known to (2 · probes)^-½: 9 %
+    tried : vertices of the largest estimated fit whose images are computed, so that the error of the estimate does
+        not decide which one is best
+    exchanges : most times that each source is chosen again
     iterations : most iterations of the density
     """
 
     probes: int = 64
     tried: int = 64
+    exchanges: int = 5
     iterations: int = 300
 
 
@@ -64,12 +67,17 @@ class SourceGrid:
 
     @classmethod
     def of(cls, bands: Sequence[BandImages]) -> SourceGrid:
-        """Grid of the bands, with the noise of flat images."""
+        """Grid of the bands, with the noise of flat images; raises InversionError where no vertex is inside."""
         mesh = bands[0].tissue.mesh
-        border = np.unique(boundary(mesh.vertices, mesh.cells)[0])
+        inner = np.setdiff1d(np.unique(mesh.cells), boundary(mesh.vertices, mesh.cells)[0])
+        if not inner.size:
+            raise InversionError(
+                "locate: all vertices of the tetrahedra are on the border. Give a shorter 'edge' in [mesh] of the "
+                "phantom file, or tetrahedra with vertices inside."
+            )
         return cls(
             mesh,
-            np.setdiff1d(np.arange(len(mesh.vertices)), border),
+            inner,
             tuple(factor(csr_array(band.tissue.linear().system.matrix)) for band in bands),
             tuple(csr_array(band.share * band.from_fluence()) for band in bands),
             np.concatenate([band.power for band in bands]),
@@ -84,9 +92,10 @@ class SourceGrid:
 
     @cached_property
     def lengths(self) -> Array:
-        """(k,) estimated length of each inner vertex's image [1/W]."""
+        """(k,) estimated length of each inner vertex's image [1/W]; > 0 for vertices that no pixel sees, too."""
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(self.power), self.settings.probes))
-        return np.sqrt(np.mean(self.backward(probes) ** 2, axis=1))
+        lengths = np.sqrt(np.mean(self.backward(probes) ** 2, axis=1))
+        return lengths.clip(LEAST_LENGTH * lengths.max())
 
     def backward(self, values: Array) -> Array:
         """(k, …) transpose of `forward` applied to `values` (N, …)."""
@@ -105,35 +114,48 @@ class SourceGrid:
         image = np.concatenate([pixels @ solve(load) for solve, pixels in zip(self.solve, self.pixels, strict=True)])
         return np.asarray((image.T / self.sigma).T)
 
-    def positions(self, count: int) -> Array:
-        """(count, 3) [mm] of point sources that fit best, one after the other: orthogonal matching pursuit.
+    def positions(self, count: int) -> list[Array]:
+        """Two sets of positions (count, 3) [mm] of point sources that fit well, by orthogonal matching pursuit.
 
-        Raises InversionError where another source would not lower Σ (residual/σ)².
+        The first set is chosen one source after the other. For the second each in turn is chosen again with the others
+        in their places, until none changes. Raises InversionError where a source more would not lower Σ (residual/σ)².
         """
-        measured = self.power / self.sigma
-        chosen, columns = list[int](), np.empty((len(measured), 0))
-        residual = measured
+        chosen, columns = list[int](), np.empty((len(self.power), 0))
         for _ in range(count):
-            gain = np.maximum(self.backward(residual), 0) / self.lengths
-            best = np.argsort(gain)[-self.settings.tried :]
-            tried = self.forward(np.eye(len(self.inner))[:, best])
-            fit = np.maximum(residual @ tried, 0) / np.linalg.norm(tried, axis=0)
-            if not fit.max() > 0:
-                raise InversionError(
-                    f"locate: {len(chosen)} point sources fit all light of the images, 'sources' is {count}. "
-                    "Give fewer."
-                )
-            chosen.append(int(best[np.argmax(fit)]))
-            columns = np.column_stack([columns, tried[:, np.argmax(fit)]])
-            residual = measured - columns @ nnls(columns, measured)[0]
-        return self.mesh.vertices[self.inner[chosen]]
+            best, image = self._best(columns)
+            chosen, columns = [*chosen, best], np.column_stack([columns, image])
+        first, kept = list(chosen), 0
+        for _ in range(count * self.settings.exchanges):
+            best, image = self._best(columns[:, 1:])
+            kept = kept + 1 if best == chosen[0] else 0
+            chosen, columns = [*chosen[1:], best], np.column_stack([columns[:, 1:], image])
+            if kept == count:
+                break
+        return [self.mesh.vertices[self.inner[vertices]] for vertices in (first, chosen)]
+
+    def _best(self, columns: Array) -> tuple[int, Array]:
+        """Inner vertex whose source, beside those with the images `columns` (N, …), fits best, and its image (N,)."""
+        measured = self.power / self.sigma
+        residual = measured - columns @ nnls(columns, measured)[0] if columns.size else measured
+        basis = np.linalg.qr(columns)[0]
+        gain = np.maximum(self.backward(residual), 0) / self.lengths
+        best = np.argsort(gain)[-self.settings.tried :]
+        tried = self.forward(np.eye(len(self.inner))[:, best])
+        beside = tried - basis @ (basis.T @ tried)
+        fit = residual @ beside / np.linalg.norm(beside, axis=0).clip(LEAST_LENGTH * self.lengths.max())
+        if not fit.max() > 0:
+            raise InversionError(
+                f"locate: {columns.shape[1]} point sources fit all light of the images. Give fewer as 'sources'."
+            )
+        return int(best[np.argmax(fit)]), tried[:, np.argmax(fit)]
 
     def density(self, report: Progress) -> Array:
         """(W,) source density >= 0 [W/mm³] at the vertices, 0 on the border.
 
         The unknowns are the powers of the vertices times the lengths of their images, so that deep vertices count as
         much as shallow ones. Quasi-Newton iterations begin with none and end where Σ (residual/σ)² falls to the number
-        of pixels: a fit within the noise (discrepancy principle).
+        of pixels: a fit within the noise (discrepancy principle); or where it no longer falls, since the linear
+        elements are not accurate enough for so little noise.
         """
         scale, measured = self.lengths, self.power / self.sigma
         turn = 0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 
 from ..phantom.surface_mesh import face_areas, merge
-from ..rendering.provenance import same_mesh, scene_digest
+from ..rendering.provenance import own_frame, same_mesh, scene_digest
 from ..rendering.scene import load
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, SceneError
@@ -35,7 +35,7 @@ AREA_TOLERANCE = 1e-3  # relative: float32 positions may change an area of the m
 class Surface:
     """Triangles of all glowing meshes of a transport matrix, one after the other, in the order of its columns.
 
-    vertices : (V, 3) [mm], in the frame of the scene;  faces : (F, 3), indices of vertices
+    vertices : (V, 3) [mm], in the frame of their file: before `to_world`;  faces : (F, 3), indices of vertices
     parts : shape id → slice of columns;  on : 'vertex' or 'face', what a column is
     number : (n,) the point of each column: coincident vertices of one mesh are one point
     basis : (points, m) the functions ψ of the m unknowns at the points (Eq. M.30); None: each point is an unknown
@@ -71,8 +71,10 @@ class Surface:
         vertices, faces, number = [], [], []
         first = unknowns = 0
         for emitter in loaded.emitters():
-            positions, corners = (buffer.numpy() for buffer in triangles(emitter.get_shape()))
-            points, corner = positions.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3).astype(np.int64)
+            shape = emitter.get_shape()
+            positions, corners = (buffer.numpy() for buffer in triangles(shape))
+            points = own_frame(loaded, shape, positions.reshape(-1, 3).astype(np.float64))
+            corner = corners.reshape(-1, 3).astype(np.int64)
             own = np.arange(len(corner)) if matrix.on == "face" else _joined(points)
             vertices.append(points)
             faces.append(corner + first)
@@ -211,6 +213,11 @@ def _scene_of(matrix: TransportMatrix, scene: object) -> mi.Scene:
     digest = str(matrix.metadata["mesh_digest"])
     if scene is not None:
         whole: Any = load(scene) if isinstance(scene, (str, os.PathLike, Mapping)) else scene
+        if not hasattr(whole, "emitters"):
+            raise InversionError(
+                f"invert: 'scene' must be a scene, the name of its file, its text or a dictionary, got "
+                f"{type(scene).__name__}. Leave it out where the scene of the matrix has not moved."
+            )
         if not same_mesh(scene_digest(whole), digest):
             raise InversionError(
                 "invert: 'scene' has other meshes than the matrix. Give the scene that the matrix was made from."

@@ -69,6 +69,15 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
     return TransportMatrix(FileBlocks(path, meta), meta, areas, sensitivity)
 
 
+def is_transport(path: Path) -> bool:
+    """True if the file seems to be one of a transport matrix, intact or not."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return "meta.npy" in file.namelist()
+    except (zipfile.BadZipFile, OSError):
+        return False
+
+
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """Context manager that yields the arrays of an npz file by name, and closes it, damaged or not."""

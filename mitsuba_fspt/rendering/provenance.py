@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import polar
 
 from ..runtime.plugin_types import is_lens, is_surface
 from .scene_rules import is_number
@@ -17,6 +18,7 @@ from .scene_rules import is_number
 if TYPE_CHECKING:
     import mitsuba as mi
 
+Array = NDArray[np.float64]
 BLOCKS = 15  # number of sums of weighted edge lengths in a digest, each over the same number of consecutive edges
 TOLERANCE = 2e-5  # relative change of such a sum that float32 may cause when a mesh is moved
 
@@ -33,6 +35,24 @@ def remember_source(scene: mi.Scene, source: object, parameters: Mapping[str, ob
     for sensor in scene.sensors():
         if is_lens(sensor):
             sensor.source = source, dict(parameters)
+
+
+def remember_placements(scene: mi.Scene, placements: Mapping[str, Array]) -> None:
+    """Store `to_world` (4, 4) of the shapes, by their ids, with the scene's lenses."""
+    for sensor in scene.sensors():
+        if is_lens(sensor):
+            sensor.placements = dict(placements)
+
+
+def own_frame(scene: mi.Scene, shape: mi.Shape, vertices: Array) -> Array:
+    """Vertices (V, 3) [mm] of a mesh of the scene before the rigid motion of its `to_world`, as in the mesh's file.
+
+    Unchanged where the shape has no `to_world`, where that mirrors, and in scenes that `load` did not make.
+    """
+    kept = (getattr(sensor, "placements", {}).get(shape.id()) for sensor in scene.sensors())
+    to_world = next((one for one in kept if one is not None), np.eye(4))
+    rotation, _ = polar(to_world[:3, :3])  # without a scale, which is that of the file's unit of length
+    return (vertices - to_world[:3, 3]) @ rotation if np.linalg.det(rotation) > 0 else vertices
 
 
 def source_of(scene: mi.Scene) -> tuple[Any, dict[str, object]] | None:

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..runtime import backend
 from ..runtime.errors import SceneError
 from ..runtime.interrupt import ctrl_c_noted
-from .provenance import remember_defaults, remember_source
+from .provenance import remember_defaults, remember_placements, remember_source
 from .scene_rules import check_text
 from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 
@@ -28,6 +29,7 @@ COLOURS = {  # plugins of colours and of spectra
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    Array = NDArray[np.float64]
     Parser = Callable[[mi.parser.ParserConfig], mi.parser.ParserState]
 
 
@@ -58,11 +60,13 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
         config = _config()
         state = parse(config)
         _set_up(state, path, parameters)
+        placements = _placements(state)
         mi.parser.transform_all(config, state)
         loaded = mi.parser.instantiate(config, state)
     loaded = loaded[0] if isinstance(loaded, list) else loaded
     probe_beside(loaded)
     remember_defaults(loaded, values_of(scene, parameters))
+    remember_placements(loaded, placements)
     if not isinstance(scene, Mapping):
         remember_source(loaded, scene, parameters)
     return loaded
@@ -170,6 +174,17 @@ def _set_up(state: mi.parser.ParserState, path: Path, parameters: Mapping[str, o
     _refuse_colours(path, state)
     _name_children(state)
     _set_film_formats(state)
+
+
+def _placements(state: mi.parser.ParserState) -> dict[str, Array]:
+    """`to_world` (4, 4) of every shape that has one, by its id."""
+    import mitsuba as mi
+
+    return {
+        node.props.id(): np.array(node.props["to_world"].matrix, np.float64)
+        for node in state.nodes
+        if node.type == mi.ObjectType.Shape and "to_world" in node.props
+    }
 
 
 def loaded(scene: mi.Scene | str | os.PathLike[str] | Mapping[str, object]) -> mi.Scene:

@@ -59,7 +59,7 @@ def named(thing: str) -> Iterator[None]:
 
 @contextmanager
 def renamed(verb: str, other: str) -> Iterator[None]:
-    """Context manager: a message of an FsptError in its block that begins with `verb: ` begins with `other: `."""
+    """Context manager: `other: ` takes the place of the first `verb: ` in the message of an FsptError of its block."""
     try:
         yield
     except FsptError as error:

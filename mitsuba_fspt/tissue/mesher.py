@@ -49,7 +49,7 @@ def read_tetrahedra(
             )
         return tetrahedralize(points, raw.cells, edge)
     if labels is None:
-        return Tetrahedra(points, raw.cells)
+        return Tetrahedra(points, raw.cells).without_unused()
     found = [f for f in raw.fields if f.name == labels and f.values.shape == (len(raw.cells),)]
     if not found:
         names = ", ".join(f"'{f.name}'" for f in raw.fields) or "none"
@@ -59,7 +59,7 @@ def read_tetrahedra(
     values = found[0].values
     if not (values == np.round(values)).all():
         raise FluxError(f"geometry: the labels '{labels}' of '{path}' must be whole numbers. Name another field.")
-    return Tetrahedra(points, raw.cells, values.astype(np.int64))
+    return Tetrahedra(points, raw.cells, values.astype(np.int64)).without_unused()
 
 
 def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:

@@ -56,7 +56,7 @@ import numpy as np
 from ..optics.boundary import boundary_a
 from ..optics.media import Medium, Source
 from ..optics.shapes import Cylinder, Shape, Sphere
-from ..runtime.errors import FluxError
+from ..runtime.errors import FluxError, named
 from .cylinder_mesh import cylinder_tetrahedra
 from .diffusion import Progress, solve
 from .finite_elements import import_skfem
@@ -263,7 +263,9 @@ def _bands(table: Table, media: tuple[Medium, ...]) -> dict[str, Band]:
                 f"{own.name}: 'share' must be in (0, 1], got {share:g}. Give the part of a source's power that is "
                 "emitted in the band."
             )
-        bands[name] = Band(share, tuple(_medium(part, of.n) for part, of in zip([own, *regions], media, strict=True)))
+        with named(own.name):
+            found = tuple(_medium(part, of.n) for part, of in zip([own, *regions], media, strict=True))
+        bands[name] = Band(share, found)
         for part in (own, *regions):
             part.done()
     return bands

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -72,6 +72,11 @@ class Tetrahedra:
                 f"tetrahedra: {np.count_nonzero(flat)} of {len(cells)} cells have no volume, the first is "
                 f"cell {np.argmax(flat)}. Mesh again or remove the slivers."
             )
+
+    def without_unused(self) -> Tetrahedra:
+        """The same mesh without vertices of no cell, such as those that meshers leave of curves and surfaces."""
+        used, cells = np.unique(self.cells, return_inverse=True)
+        return replace(self, vertices=self.vertices[used], cells=cells.reshape(self.cells.shape))
 
     def cuts(self, edge: float) -> int:
         """Number of parts, >= 1, of each border edge for triangles with edges of about `edge` [mm].

@@ -9,7 +9,9 @@ import pytest
 from cylinder_views import cylinder_views, exact
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.images.reduction import read_measured
 from mitsuba_fspt.inverse.surface import Surface
+from mitsuba_fspt.tissue.phantom_file import PhantomFile
 
 pytest.importorskip("skfem")
 SOURCE = (2.5, 1.0, -1.0, 2e-12)  # x, y, z [mm], power [W]
@@ -55,6 +57,35 @@ def test_sources_in_one_band_and_in_two(run, folder, monkeypatch):
     assert out.startswith("source 1: x 2.")
     assert "90 % intervals; chi2" in out
     assert run("locate", "cylinder.toml", *red, "--band", "red", "--quiet") == (0, "", "")
+
+
+def test_the_output_is_none_of_the_inputs(run, folder, monkeypatch):
+    """The mesh file that the phantom file names is kept, too."""
+    meshio = pytest.importorskip("meshio")
+    monkeypatch.chdir(folder)
+    mesh = PhantomFile.read("cylinder.toml").mesh()
+    meshio.Mesh(mesh.vertices, [("tetra", mesh.cells)]).write("body.vtu")
+    text = (folder / "cylinder.toml").read_text()
+    old = text[: text.index("[optical]")]
+    (folder / "meshed.toml").write_text(text.replace(old, '[geometry]\nfile = "body.vtu"\n'))
+    before = (folder / "body.vtu").read_bytes()
+    code, out, err = run("locate", "meshed.toml", "T.npz", *names("red"), "-o", "body.vtu")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert (folder / "body.vtu").read_bytes() == before
+
+
+def test_images_as_npz(run, folder, monkeypatch):
+    """A file is a matrix by its content, not by its name."""
+    monkeypatch.chdir(folder)
+    for k, name in enumerate(names("red")):
+        read_measured(name).write(f"red_{k}.npz")
+    records = [
+        run("locate", "cylinder.toml", "T.npz", *files, "--band", "red", "--json")
+        for files in (names("red"), [f"red_{k}.npz" for k in range(4)])
+    ]
+    assert [code for code, _, _ in records] == [0, 0]
+    one, other = (json.loads(out)["sources"][0]["position"] for _, out, _ in records)
+    np.testing.assert_allclose(one, other, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -311,6 +311,7 @@ def test_bands(tmp_path: Path) -> None:
         ("share = 0.25", "", "'share' is missing"),
         ("[[bands.red.regions]]\nmua = 0.2\nmusp = 0.8\n", "", "0 tables .* for 1"),
         ("n = 1.4", "N = 1.4", "'N' means nothing here"),
+        ("mua = 0.01", "mua = -1", r"\[bands\] \[red\]: .*mua"),
         ("[bands.red]", "[bands.red]\nregion = 3", "'region' means nothing here"),
     ],
 )
@@ -318,3 +319,13 @@ def test_bad_bands(tmp_path: Path, old: str, new: str, words: str) -> None:
     assert old in BANDS
     with pytest.raises(FluxError, match=words):
         described(tmp_path, SMALL + BANDS.replace(old, new))
+
+
+def test_vertices_of_no_tetrahedron_are_left_out(tmp_path: Path) -> None:
+    meshio = pytest.importorskip("meshio")
+    mesh = cylinder_tetrahedra(6, 8, 2)
+    points = np.concatenate([[[9.0, 9, 9]], mesh.vertices])
+    meshio.Mesh(points, [("tetra", mesh.cells + 1)]).write(tmp_path / "body.vtu")
+    found = read_tetrahedra(tmp_path / "body.vtu", 2)
+    np.testing.assert_array_equal(found.vertices, mesh.vertices)
+    np.testing.assert_array_equal(np.sort(found.cells, axis=1), np.sort(mesh.cells, axis=1))
