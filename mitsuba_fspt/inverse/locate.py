@@ -9,8 +9,10 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import NoneType
 from typing import Any, TypeAlias
 
+import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import norm
 
@@ -33,6 +35,7 @@ Images: TypeAlias = (
     ArrayLike | Sequence[Image | Exposure | str | os.PathLike[str]] | Image | Exposure | os.PathLike[str]
 )
 MOST_SOURCES = 20
+CHANCE = 1e-3  # largest probability that noise alone looks like a source of which nothing is told
 LOG = logging.getLogger("mitsuba_fspt")
 
 
@@ -87,12 +90,12 @@ def locate(
     FluxError : the phantom file cannot be used, or has no such band.
     BackendError : scikit-fem, or the mesher that the phantom needs, is missing.
     """
-    count, confidence = _checked(sources, confidence)
+    count, confidence, accuracy = _checked(sources, confidence, settings)
     given = _given(matrix, images, error, mask)
     described = _described(phantom)
     with reported(progress) as report:
         bands = _band_images(described, given, gain_error, scene, report)
-        return _located(bands, count, confidence, settings or LocationSettings(), report)
+        return _located(bands, count, confidence, accuracy, report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,15 +114,20 @@ class _Given:
         return "locate" if self.name is None else f"locate, band '{self.name}'"
 
 
-def _checked(sources: int, confidence: float) -> tuple[int, float]:
-    """Number of sources and confidence; raises InversionError where one is outside its range."""
+def _checked(sources: int, confidence: float, settings: LocationSettings | None) -> tuple[int, float, LocationSettings]:
+    """Number of sources, confidence and accuracy; raises InversionError where one is outside its range."""
     count = whole("locate: 'sources'", sources, InversionError, "1")
     if not 1 <= count <= MOST_SOURCES:
         raise InversionError(f"locate: 'sources' must be in 1 … {MOST_SOURCES}, got {count}. Give their number.")
     confidence = number("locate: 'confidence'", confidence, InversionError, "0.9")
     if not 0 < confidence < 1:
         raise InversionError(f"locate: 'confidence' must be in (0, 1), got {confidence:g}. Give for example 0.9.")
-    return count, confidence
+    if not isinstance(settings, (LocationSettings, NoneType)):
+        raise InversionError(
+            f"locate: 'settings' must be LocationSettings, got {type(settings).__name__}. Leave it out for the usual "
+            "accuracy."
+        )
+    return count, confidence, settings or LocationSettings()
 
 
 def _given(matrix: TransportMatrix | Mapping[str, TransportMatrix], images: Any, error: Any, mask: Any) -> list[_Given]:
@@ -176,9 +184,18 @@ def _located(
             "fspt: locate: the intervals are those of a linear approximation, which does not hold for changes as "
             "large; they may be too narrow. Give fewer sources, or images with less noise."
         )
+    p_values = fit.p_values(found, len(grid.inner))
+    for k in np.flatnonzero(p_values > CHANCE):
+        LOG.warning(
+            "fspt: locate: the images do not show that source %d is there, noise alone may look like it (p = %.2g). "
+            "%s images with less noise.",
+            k + 1,
+            p_values[k],
+            "Give fewer sources, or" if count > 1 else "Give",
+        )
     density = replace(grid, sigma=found.sigma).density(report)
     tell_misfit("locate", found.cost, fit.free(found))
-    return Location.of(fit, found, covariance, z, linear, density, confidence)
+    return Location.of(fit, found, covariance, z, p_values, linear, density, confidence)
 
 
 def _described(phantom: object) -> PhantomFile:

@@ -27,6 +27,7 @@ class LocatedSource:
     position : (3,) [mm], in the frame of the phantom file;  position_sd : (3,) standard deviations [mm]
     position_interval : (low, high), each (3,) [mm]
     power : [W];  power_sd : [W];  power_interval : (low, high) [W]
+    p_value : probability, at most, that noise alone makes a source fit as well anywhere in the tissue
     """
 
     position: Array
@@ -35,13 +36,14 @@ class LocatedSource:
     power: float
     power_sd: float
     power_interval: tuple[float, float]
+    p_value: float
 
     @classmethod
-    def of(cls, values: Array, sd: Array, z: float) -> LocatedSource:
+    def of(cls, values: Array, sd: Array, z: float, p_value: float) -> LocatedSource:
         """Source of x, y, z and power (4,) and their sd (4,), with intervals of z sd to both sides."""
         low, high = values - z * sd, values + z * sd
         interval = (max(float(low[3]), 0.0), float(high[3]))
-        return cls(values[:3], sd[:3], (low[:3], high[:3]), float(values[3]), float(sd[3]), interval)
+        return cls(values[:3], sd[:3], (low[:3], high[:3]), float(values[3]), float(sd[3]), interval, float(p_value))
 
     def summary(self) -> dict[str, Any]:
         """All numbers by name, ready for JSON."""
@@ -52,6 +54,7 @@ class LocatedSource:
             "power": self.power,
             "power_sd": self.power_sd,
             "power_interval": list(self.power_interval),
+            "p_value": self.p_value,
         }
 
 
@@ -96,14 +99,15 @@ class Location:
         found: PointSources,
         covariance: Array,
         z: float,
+        p_values: Array,
         linear: bool,
         density: Array,
         confidence: float,
     ) -> Location:
         """Result of a fit, with intervals of z standard deviations to both sides."""
-        each = zip(found.values.reshape(-1, 4), np.sqrt(np.diag(covariance)).reshape(-1, 4), strict=True)
+        each = zip(found.values.reshape(-1, 4), np.sqrt(np.diag(covariance)).reshape(-1, 4), p_values, strict=True)
         return cls(
-            sources=tuple(LocatedSource.of(values, sd, z) for values, sd in each),
+            sources=tuple(LocatedSource.of(values, sd, z, p_value) for values, sd, p_value in each),
             covariance=covariance,
             density=density,
             mesh=fit.bands[0].tissue.mesh,

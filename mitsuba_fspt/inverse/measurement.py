@@ -91,8 +91,8 @@ class Measurement:
         if not (variance > 0).all():
             count = int(np.sum(~(variance > 0)))
             raise InversionError(
-                f"{verb}: {count} pixels that see the surface have no noise, σ = 0. Give error= > 0 there, a read "
-                "noise, or mask them."
+                f"{verb}: {count} pixels that see the surface have no noise, σ = 0. Give a read noise, or in Python "
+                "error= > 0 there or a mask."
             )
         return np.sqrt(variance)
 
@@ -100,6 +100,8 @@ class Measurement:
 def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
     """`values` as an array of this shape where it has it up to the axis of views, else unchanged for a later check."""
     try:
+        if np.iscomplexobj(values):
+            raise TypeError("they are complex")
         array = np.asarray(values, np.float64)
     except (TypeError, ValueError) as cause:
         raise InversionError(
@@ -160,7 +162,7 @@ def variances(
         if not isinstance(image, Image):
             raise InversionError(
                 f"{verb}: image {k} says nothing of its noise. Give images of 'fspt reduce'"
-                f"{', or error= [W]' if verb == 'invert' else ''}."
+                f"{', or in Python error= [W]' if verb == 'invert' else ''}."
             )
         if "electrons_per_watt" in image.metadata:
             per_watt, read, dark = (
@@ -179,7 +181,7 @@ def variances(
         else:
             raise InversionError(
                 f"{verb}: image {k} has neither 'electrons_per_watt' nor an error. Reduce it from its counts"
-                f"{', or give error= [W]' if verb == 'invert' else ''}."
+                f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
     return shot, other
 

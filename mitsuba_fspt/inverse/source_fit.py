@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.stats import chi2
 
 from ..runtime.errors import FluxError, InversionError
 from ..runtime.progress_bar import Progress
@@ -196,6 +197,21 @@ class SourceFit:
             change = covariance @ (slopes[own].T @ (found.signal[own] / found.sigma[own]))
             total += band.measurement.gain_error**2 * np.outer(change, change)
         return total
+
+    def p_values(self, found: PointSources, places: int) -> Array:
+        """(K,) probability, at most, that noise alone makes a source fit as well as each of these.
+
+        At each of `places` positions a source that is not there lowers Σ (residual/σ)² by chi-squared of 4 degrees of
+        freedom, position and power, with the other sources free; Bonferroni's bound over the positions.
+        """
+        slopes, residual = found.slopes, found.residual(self.power)
+        values = np.empty(len(found.powers))
+        for k, power in enumerate(found.powers):
+            others = np.linalg.qr(np.delete(slopes, np.s_[4 * k : 4 * k + 4], axis=1))[0]
+            without = residual + power * found.columns[:, k] / found.sigma
+            without -= others @ (others.T @ without)
+            values[k] = places * chi2.sf(without @ without - residual @ residual, 4)
+        return values.clip(max=1.0)
 
     def is_linear(self, found: PointSources, covariance: Array, z: float) -> bool:
         """True if Σ (residual/σ)² rises as for a linear model along the direction that the images determine least.
