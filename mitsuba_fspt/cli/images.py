@@ -86,7 +86,7 @@ def plot(
     )
     save_figure(figure, output)
     totals = [float(image.power.sum(dtype="float64")) for image in pictures]
-    record = {"output": str(output), "images": [*map(str, images)], "total_power": totals}
+    record = {"output": str(output), "images": [*map(str, images)], "total_power": totals, "power_unit": "W"}
     text = f"{output}: {len(images)} {'image' if len(images) == 1 else 'images'}"
     print_result(text, record, as_json=as_json, quiet=quiet)
 

@@ -180,6 +180,7 @@ def test_render_as_json_and_quiet(run, tmp_path):
         "output": "s.exr",
         "picture": "s.png",
         "total_power": pytest.approx(image.power.sum(dtype=float)),
+        "power_unit": "W",
         "peak": pytest.approx(image.power.max()),
         "unit": "W",
         "wall_time": image.metadata["wall_time"],
@@ -284,7 +285,8 @@ def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
     code, out, err = run("plot", *two_images, "--range", "1e-12,1e-7", "--json")
     assert (code, err) == (0, "")
     powers = [fspt.read(name).power.sum(dtype=float) for name in two_images]
-    assert json.loads(out) == {"output": "plot.png", "images": [*two_images], "total_power": pytest.approx(powers)}
+    record = {"output": "plot.png", "images": [*two_images], "total_power": pytest.approx(powers), "power_unit": "W"}
+    assert json.loads(out) == record
     assert run("plot", *two_images, "--log", "--per-panel", "-o", "b.png", "--quiet") == (0, "", "")
     assert set(os.listdir(tmp_path)) == {*two_images, "a.png", "b.png", "plot.png"}
 
