@@ -13,13 +13,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
-from scipy.optimize import least_squares, nnls
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
 
 from ..runtime.errors import InversionError
 
 Array = NDArray[np.float64]
 Pictures = Callable[[Array], tuple[Array, Array]]
+# Of Eq. M.27: steps of ln P; the number of groups for one variance, since the square of one standard error from eight
+# passes is wrong by a half; and the share of the brightest pixel below which pixels count as equally dark.
+ALIKE, GROUPS, FAINT = 0.05, 16, 1e-4
 
 
 @dataclass(frozen=True)
@@ -108,21 +112,21 @@ class Measured:
 def sampling_variance(signal: Array, squares: Array, used: NDArray[np.bool_]) -> Array:
     """Variance [W²] of Monte Carlo pixels, (views, h, w), as a function of the fitted signal P (Eq. M.27).
 
-        s² = a P (v − P) + b P² + c,    v the largest P of the 3 × 3 neighbourhood
-
-    The first term is that of samples which meet the surface or not, the second that of radiance and cos⁴θ over the
-    pixel. a, b, c >= 0 fit the `squares` of the standard errors, whose own errors are in proportion to them.
+    The variance depends on how P varies in the pixel: whether a silhouette crosses it, and how steep P is. Pixels are
+    grouped by P and by the largest and the least P of their 3 × 3 neighbourhood, in steps of `ALIKE`. The variance is
+    the mean of the `squares` of the standard errors in the `GROUPS` groups most alike, 0 where no pixel is used.
     """
     light = np.maximum(signal, 0)
-    brightest = maximum_filter(light, (1, 3, 3), mode="nearest")
-    scale = float(light.max()) or 1.0
-    terms = np.stack([light * (brightest - light), light**2, np.full_like(light, 1e-6 * scale**2)], axis=-1)
-    features, goal = terms[used] / scale**2, squares[used] / scale**2
-    model = np.full_like(goal, goal.mean())
-    for _ in range(10):
-        factors, _ = nnls(features / model[:, None], goal / model)
-        model = np.maximum(features @ factors, 1e-3 * goal.mean())
-    return np.maximum(terms @ factors, 1e-3 * scale**2 * goal.mean())
+    around = [light, *(pick(light, (1, 3, 3), mode="nearest") for pick in (maximum_filter, minimum_filter))]
+    least = FAINT * (float(light.max()) or 1.0)
+    steps = np.stack([np.rint(np.log(np.maximum(one, least) / least)[used] / ALIKE) for one in around], axis=-1)
+    _, first, group = np.unique(steps @ (1 << np.array([40, 20, 0])), return_index=True, return_inverse=True)
+    steps, count = steps[first], np.bincount(group)
+    total = np.bincount(group, squares[used])
+    near = cKDTree(steps).query(steps, np.arange(1, min(GROUPS, len(steps)) + 1))[1]
+    variance = np.zeros(signal.shape)
+    variance[used] = (total[near].sum(axis=1) / count[near].sum(axis=1))[group]
+    return variance
 
 
 @dataclass(frozen=True, eq=False)
