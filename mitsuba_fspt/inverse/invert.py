@@ -306,7 +306,7 @@ class Problem:
             state = replace(start, weight=state.weight)
         if weight is None:
             state = replace(state, weight=self._first_weight(sigma))
-        probes = np.random.default_rng(0).choice([-1.0, 1.0], (self.surface.unknowns, self.settings.probes))
+        probes = np.random.default_rng(1).choice([-1.0, 1.0], (len(self.rows), self.settings.probes))
         looser = self.settings.rough if rough else 1.0
         converged, tried = False, list[tuple[float, float]]()
         for turn in range(self.settings.rounds):
@@ -344,8 +344,7 @@ class Problem:
         start = Multipliers(solve, self.bounded).start(right[:, None], state.x)
         found = minimise(normal, right[:, None], start, self.bounded, solve, accuracy)
         x = found.x[:, 0]
-        determined = self._determined(normal, solve, state.weight, probes)
-        correction = self._correction(solve, state.sigma)
+        determined, correction = self._fitted_noise(solve, state.sigma, probes)
         if weight is None:  # Eq. M.25
             weight = determined / max(self.smoothness.energy(x - self.mean), 1e-300)
         numerical = self._numerical(x)
@@ -357,20 +356,17 @@ class Problem:
         trace = float((self.transport.multiply((1 / sigma)[:, None]) ** 2).sum())
         return max(self.settings.first * trace / float(self.smoothness.matrix.diagonal().sum()), 1e-300)
 
-    def _determined(self, normal: csr_array, solve: Solve, weight: float, probes: Array) -> float:
-        """γ, the number of unknowns that the data determine: tr((H + w Q)⁻¹ H), by random vectors."""
-        data = normal @ probes - weight * (self.smoothness.matrix @ probes)
-        return float(np.einsum("mk,mk->", probes, solve(data)) / probes.shape[1])
+    def _fitted_noise(self, solve: Solve, sigma: Array, probes: Array) -> tuple[float, Array]:
+        """γ, the number of unknowns that the data determine, and the correction of the data (N,) [W] (Eq. M.25, M.29).
 
-    def _correction(self, solve: Solve, sigma: Array) -> Array:
-        """Power [W] that variances of the fitted signal take from each pixel, (N,), by random vectors (Eq. M.29).
-
-        A pixel that is too bright by chance has too large a fitted signal, too large a variance, and counts less.
+        Both are of K = σ⁻¹ T (H + w Q)⁻¹ Tᵀ σ⁻¹, the change of the fitted pixels with the measured ones: γ = tr K, by
+        random vectors `probes` (N, k). A pixel that is too bright by chance has too large a fitted signal, too large a
+        variance, and counts less; the correction is the power that it loses so.
         """
-        probes = np.random.default_rng(1).choice([-1.0, 1.0], (len(self.rows), self.settings.probes))
         found = (self.transport @ solve(self.transport.T @ (probes / sigma[:, None]))) / sigma[:, None]
-        share = np.einsum("nk,nk->n", found, probes - found) / self.settings.probes
-        return np.asarray(self.measurement.shot[self.rows] * share)
+        count = probes.shape[1]
+        share = np.einsum("nk,nk->n", found, probes - found) / count
+        return float(np.einsum("nk,nk->", probes, found) / count), self.measurement.shot[self.rows] * share
 
     def _normal(self, sigma: Array, weight: float) -> tuple[csr_array, Solve]:
         """H + w Q with H = TᵀT/σ², and what solves it."""
