@@ -286,6 +286,7 @@ def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
     assert (code, err) == (0, "")
     powers = [fspt.read(name).power.sum(dtype=float) for name in two_images]
     record = {"output": "plot.png", "images": [*two_images], "total_power": pytest.approx(powers), "power_unit": "W"}
+    record["masked"] = [0, 0]
     assert json.loads(out) == record
     assert run("plot", *two_images, "--log", "--per-panel", "-o", "b.png", "--quiet") == (0, "", "")
     assert set(os.listdir(tmp_path)) == {*two_images, "a.png", "b.png", "plot.png"}
