@@ -186,7 +186,10 @@ def expose(
     from ..images.image import read
 
     require_image(output)
-    require_apart(output, [image], error=ImageError)
+    inputs = [image, detector] if detector else [image]
+    require_apart(output, inputs, error=ImageError)
+    if counts:
+        require_apart(counts, [*inputs, output], "--counts", ImageError)
     numbers: dict[str, Any] = {
         "quantum_efficiency": quantum_efficiency,
         "dark_current": dark_current,

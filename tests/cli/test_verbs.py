@@ -416,6 +416,21 @@ def test_expose_does_not_overwrite_the_power(run, two_images):
     assert fspt.read("a.exr").metadata == before
 
 
+@pytest.mark.parametrize("counts", ["e.tif", "./e.tif", "a.tif"])
+def test_expose_keeps_counts_apart_from_electrons_and_power(run, two_images, tmp_path, counts):
+    """Seen to fail: exit code 0, and counts in the place of the electrons or of the power."""
+    fspt.read("a.exr").write("a.tif")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    options = ["--exposure-time", "1", "--wavelength-nm", "600", "--counts", counts]
+    code, out, err = run("expose", "a.tif", "-o", "e.tif", *options)
+    assert (code, out) == (2, "")
+    name = counts.removeprefix("./")
+    assert err == (
+        f"fspt: output file '{name}': --counts would overwrite '{name}', which is needed too. Give another name.\n"
+    )
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 @pytest.mark.parametrize("output", ["", ".exr", "picture"])
 def test_render_wants_a_name_for_its_image(run, tmp_path, output):
     code, _, err = run("render", write_scene(tmp_path / "s.xml"), "-o", output)
