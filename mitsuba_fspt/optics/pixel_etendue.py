@@ -16,7 +16,9 @@ PARTS = 32  # squares along the side of a pixel that the border of an image-plan
 Plane = NDArray[np.float64]
 
 
-def pixel_etendues(lens: Lens, side: float, x: Plane, y: Plane, transmittance: float = 1.0) -> Plane:
+def pixel_etendues(
+    lens: Lens, side: float, x: Plane, y: Plane, transmittance: float = 1.0, pixel: str = "area"
+) -> Plane:
     """τ A_vd A_pupil/u² ⟨cos⁴θ⟩ [mm² sr] of virtual pixels, shape (h, w); 0 where no light passes.
 
     The mean is over the pixel and over the part of the pupil that the borders of the lens leave open (Eqs. 5, M.13);
@@ -26,14 +28,17 @@ def pixel_etendues(lens: Lens, side: float, x: Plane, y: Plane, transmittance: f
     side : of a virtual pixel [mm]
     x, y : centres of the columns (w,) and rows (h,) on the virtual detector plane, from the optical axis [mm]
     transmittance : τ of lens and filters
+    pixel : 'area': the mean over the pixel; 'centre': its centre times its area, as the integral's parameter `pixel`
     """
-    node = side / 2 / math.sqrt(3)  # Gauss rule of 2 × 2 nodes on a pixel
-    radii = [np.hypot(x[None, :] + i * node, y[:, None] + j * node) for i in (-1, 1) for j in (-1, 1)]
+    centre = pixel == "centre"
+    node = 0.0 if centre else side / 2 / math.sqrt(3)  # Gauss rule of 2 × 2 nodes on a pixel
+    steps = (0,) if centre else (-1, 1)
+    radii = [np.hypot(x[None, :] + i * node, y[:, None] + j * node) for i in steps for j in steps]
     table = np.linspace(0, max(float(radius.max()) for radius in radii), RADII)
     values = mean_cos4(lens, table)
     mean = np.mean([np.interp(radius, table, values) for radius in radii], axis=0)
     bare = transmittance * side**2 * math.pi * (lens.discs[0].radius / lens.focus_distance) ** 2
-    return bare * mean * _inside_stop(lens.seen_field, side, x, y)
+    return bare * mean * (radii[0] <= lens.seen_field if centre else _inside_stop(lens.seen_field, side, x, y))
 
 
 def mean_cos4(lens: Lens, radius: Plane) -> Plane:
