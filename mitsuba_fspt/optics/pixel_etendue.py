@@ -12,7 +12,6 @@ from .thin_lens import Lens
 
 RADII = 4097  # distances from the axis between which the étendue is interpolated; the error is 1e-6 on films of ±45°
 CHORDS, ALONG = 16, 6  # Gauss nodes across each part of the open pupil and along its chords
-PARTS = 32  # squares along the side of a pixel that the border of an image-plane stop crosses
 Plane = NDArray[np.float64]
 
 
@@ -93,10 +92,25 @@ def _inside_stop(field: float, side: float, x: Plane, y: Plane) -> Plane | float
     """Share of each virtual pixel (h, w) inside the image-plane stop of radius `field` on the virtual plane [mm]."""
     if math.isinf(field):
         return 1.0
-    radius = np.hypot(x[None, :], y[:, None])
-    share = (radius < field).astype(np.float64)
-    part = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-    for row, column in np.argwhere(np.abs(radius - field) < side):
-        inside = np.hypot(x[column] + side * part[None, :], y[row] + side * part[:, None]) < field
-        share[row, column] = inside.mean()
+    x, y, half = np.abs(x)[None, :] / field, np.abs(y)[:, None] / field, side / 2 / field  # by symmetry
+    inside = np.hypot(x + half, y + half) <= 1
+    cut = ~inside & (np.hypot(np.maximum(x - half, 0), np.maximum(y - half, 0)) < 1)
+    share = inside.astype(np.float64)
+    x, y = (np.broadcast_to(place, cut.shape)[cut] for place in (x, y))
+    right, left, top, bottom = x + half, x - half, y + half, y - half
+    area = _disc_area(right, top) - _disc_area(left, top) - _disc_area(right, bottom) + _disc_area(left, bottom)
+    share[cut] = np.clip(area / (2 * half) ** 2, 0, 1)
     return share
+
+
+def _disc_area(x: Plane, y: Plane) -> Plane:
+    """Area of the unit disc within the rectangle from its middle to (x, y); < 0 where one of x and y is negative."""
+    sign = np.sign(x) * np.sign(y)
+    x, y = np.minimum(np.abs(x), 1), np.minimum(np.abs(y), 1)
+    start = np.minimum(x, np.sqrt(1 - y**2))  # from there to x the disc's border lies below y
+    return sign * (start * y + _below_border(x) - _below_border(start))
+
+
+def _below_border(x: Plane) -> Plane:
+    """∫ √(1 − t²) dt from 0 to x."""
+    return (x * np.sqrt(1 - x**2) + np.arcsin(x)) / 2
