@@ -41,6 +41,8 @@ def compare(
         if image.error is None and other.error is not None:
             typer.echo(f"fspt: {path}: it has no plane of errors; its power is taken as exact.", err=True)
     result = compare(*images)
+    if result.masked:
+        typer.echo(f"fspt: compare: {result.masked} pixels masked in either image are left out.", err=True)
     if png:
         from ..images.picture import write_comparison_png
 
@@ -85,8 +87,11 @@ def plot(
         wavelength_nm=wavelength_nm,
     )
     save_figure(figure, output)
-    totals = [float(image.power.sum(dtype="float64")) for image in pictures]
+    if masked := [f"{image.masked} of {path}" for path, image in zip(images, pictures, strict=True) if image.masked]:
+        typer.echo(f"fspt: plot: total powers leave out masked pixels: {', '.join(masked)}.", err=True)
+    totals = [image.total_power for image in pictures]
     record = {"output": str(output), "images": [*map(str, images)], "total_power": totals, "power_unit": "W"}
+    record["masked"] = [image.masked for image in pictures]
     text = f"{output}: {len(images)} {'image' if len(images) == 1 else 'images'}"
     print_result(text, record, as_json=as_json, quiet=quiet)
 
@@ -124,6 +129,13 @@ def roi(
     for path in images:
         image = read(path)
         rows += [(str(path), name or "all", measure(image, name, wavelength_nm)) for name in regions]
+    for name, one, found in rows:
+        if found.masked:
+            typer.echo(
+                f"fspt: {name}, region {one}: {found.masked} masked pixels are left out; its numbers are those of the "
+                f"{found.pixels} others.",
+                err=True,
+            )
     table = csv_table(rows)
     if output:
         with atomic_path(output, ImageError) as temporary:
@@ -174,7 +186,10 @@ def expose(
     from ..images.image import read
 
     require_image(output)
-    require_apart(output, [image], error=ImageError)
+    inputs = [image, detector] if detector else [image]
+    require_apart(output, inputs, error=ImageError)
+    if counts:
+        require_apart(counts, [*inputs, output], "--counts", ImageError)
     numbers: dict[str, Any] = {
         "quantum_efficiency": quantum_efficiency,
         "dark_current": dark_current,

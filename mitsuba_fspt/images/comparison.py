@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..runtime.errors import ImageError
 from ..runtime.numbers import whole
 from .image import Image
-from .z_test import ZTest, error_bound, z_test
+from .z_test import ZTest, brightest, error_bound, z_test
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,7 @@ class Comparison:
     z_test : test of the differences against their errors; None if no image has a standard error above 0
     beyond : number of pixels at which the images differ by more than the sum of both integrals' errors; only if no
         image has a standard error, else None, as without any errors
+    masked : number of pixels masked in either image, which no number above counts; profiles show them as stored
     """
 
     me: float
@@ -55,6 +56,7 @@ class Comparison:
     profiles: tuple[Profile, ...] = field(repr=False)
     z_test: ZTest | None
     beyond: int | None = None
+    masked: int = 0
 
     def render_text(self) -> str:
         """The numbers as text, one a line with its meaning; without the profiles."""
@@ -72,6 +74,8 @@ class Comparison:
             lines.append(self.z_test.render_text())
         elif self.beyond is not None:
             lines.append(f"beyond {self.beyond}   pixels that differ by more than the errors of both together")
+        if self.masked:
+            lines.append(f"masked {self.masked}   pixels masked in either image, left out above")
         return "\n".join(lines)
 
     def _repr_png_(self) -> bytes | None:
@@ -98,7 +102,7 @@ class Comparison:
             }
             for profile in self.profiles
         ]
-        tests = {"z_test": self.z_test and asdict(self.z_test), "beyond": self.beyond}
+        tests = {"z_test": self.z_test and asdict(self.z_test), "beyond": self.beyond, "masked": self.masked}
         return numbers | tests | {"profiles": profiles}
 
 
@@ -117,37 +121,42 @@ def compare(
     rows, columns : indices of the profiles, one or several, in 0 … h − 1 and 0 … w − 1; if neither is given, the row
         and column through the standard's brightest pixel
 
+    Pixels that are masked in either image, such as saturated ones, are left out of all numbers.
+
     The z-test assumes that the errors of the two images are independent. It treats the error of the integral as a
     bound, that of Monte Carlo as a standard error estimated from few passes, and any other as a known standard
     deviation; see `ZTest`.
 
     Raises
     ------
-    ImageError : an argument is no `Image`, the shapes differ, an image has no positive power or is constant (ME or CF
-        is then undefined), or a row or column does not exist.
+    ImageError : an argument is no `Image`, the shapes differ, every pixel is masked, an image has no positive power or
+        is constant (ME or CF is then undefined), or a row or column does not exist.
     """
-    _check(calculated, standard)
-    p_cal, p_std = (image.power.astype(np.float64) for image in (calculated, standard))
+    kept = _checked(calculated, standard)
+    all_cal, all_std = (image.power.astype(np.float64) for image in (calculated, standard))
+    p_cal, p_std = all_cal[kept], all_std[kept]
     peak = p_std.max()
     normalised_cal, normalised_std = p_cal / p_cal.max(), p_std / peak
     difference = np.abs(p_cal - p_std)
     if rows is None and columns is None:
-        row, column = np.unravel_index(p_std.argmax(), p_std.shape)
+        row, column = brightest(standard, kept)
         rows, columns = [int(row)], [int(column)]
     test = z_test(calculated, standard)
     return Comparison(
         me=float(np.abs(normalised_cal - normalised_std).mean()),
-        cf=float(np.corrcoef(normalised_cal.ravel(), normalised_std.ravel())[0, 1]),
+        cf=float(np.corrcoef(normalised_cal, normalised_std)[0, 1]),
         max_error=float(difference.max() / peak),
         rms=float(np.sqrt(np.square(difference / peak).mean())),
         ratio=_ratio(float(p_cal.sum()), float(p_std.sum())),
-        profiles=_profiles(p_cal, p_std, () if rows is None else rows, () if columns is None else columns),
+        profiles=_profiles(all_cal, all_std, () if rows is None else rows, () if columns is None else columns),
         z_test=test,
-        beyond=None if test else _beyond(difference, calculated, standard),
+        beyond=None if test else _beyond(difference, error_bound(calculated, standard)[kept]),
+        masked=int(kept.size - kept.sum()),
     )
 
 
-def _check(calculated: Image, standard: Image) -> None:
+def _checked(calculated: Image, standard: Image) -> NDArray[np.bool_]:
+    """True (h, w) on the pixels to compare, those masked in neither image; ImageError for what `compare` refuses."""
     for image in (calculated, standard):
         if not isinstance(image, Image):
             raise ImageError(
@@ -158,22 +167,28 @@ def _check(calculated: Image, standard: Image) -> None:
             f"compare: the calculated image has {_size(calculated)} pixels, the standard {_size(standard)}. "
             "Render both with the same film."
         )
+    kept = calculated.kept & standard.kept
+    if not kept.any():
+        raise ImageError(
+            f"compare: every pixel is masked in one of the images, {calculated.masked} in the calculated one and "
+            f"{standard.masked} in the standard; nothing to compare. Expose for a shorter time."
+        )
     for name, image in (("calculated image", calculated), ("standard", standard)):
-        peak = image.power.max()
+        peak = image.power[kept].max()
         if not peak > 0:
             raise ImageError(
                 f"compare: the {name} is dark, its brightest pixel has {peak:g} W; nothing to normalise by. "
                 "Check that the camera sees the phantom."
             )
-        if image.power.min() == peak:
+        if image.power[kept].min() == peak:
             raise ImageError(
                 f"compare: every pixel of the {name} has {peak:g} W; the correlation with a constant (CF) is "
                 "not defined. Give an image with some structure."
             )
+    return kept
 
 
-def _beyond(difference: NDArray[np.float64], calculated: Image, standard: Image) -> int | None:
-    bound = error_bound(calculated, standard)
+def _beyond(difference: NDArray[np.float64], bound: NDArray[np.float64]) -> int | None:
     return int(np.count_nonzero(difference > bound)) if bound.any() else None
 
 

@@ -293,7 +293,8 @@ class Detector:
             part of the errors if `flat` is a stack. They are not if it is a single frame, which may be the mean of any
             number of frames: average enough of them to make its noise small compared with that of the counts
         cosmic_rays : also mask pixels that cosmic rays have hit
-        metadata : further entries for the image's metadata
+        metadata : further entries for the image's metadata, such as those of the rendered image that was exposed; what
+            tells how that one was computed, such as `method` and `rtol`, is left out
 
         The image's metadata hold `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (the variance of dark
         current, rounding and subtracted frames [e-²]) and `gain_error`. The noise of any signal follows from these. A

@@ -69,7 +69,7 @@ class Image:
 
     def __repr__(self) -> str:
         height, width = self.shape
-        total = self.power.sum(dtype=np.float64)
+        total = self.total_power
         error = "unknown" if self.error is None else f"at most {self.error.max(initial=0.0):.3g} W a pixel"
         return f"Image({width} x {height} pixels, {total:.6g} W in all, error {error})"
 
@@ -77,6 +77,21 @@ class Image:
     def shape(self) -> tuple[int, int]:
         """Height and width (h, w) [pixels]."""
         return self.power.shape
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """True (h, w) on the pixels that are not masked."""
+        return np.ones(self.shape, bool) if self.mask is None else ~self.mask
+
+    @property
+    def masked(self) -> int:
+        """Number of masked pixels, which totals and comparisons leave out."""
+        return 0 if self.mask is None else int(self.mask.sum())
+
+    @property
+    def total_power(self) -> float:
+        """Sum [W] over the pixels that are not masked."""
+        return float(self.power.sum(dtype=np.float64, where=self.kept))
 
     @property
     def electrons_per_watt(self) -> float | None:

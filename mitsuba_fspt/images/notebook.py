@@ -40,9 +40,10 @@ def image_html(image: Image) -> str:
     known, height, width = image.metadata, *image.shape
     rows = [
         ("pixels", f"{width} × {height}"),
-        ("total power", f"{image.power.sum(dtype=float):.6g} W"),
+        ("total power", f"{image.total_power:.6g} W"),
         ("brightest pixel", f"{image.power.max():.6g} W"),
     ]
+    rows += [("masked", f"{image.masked} pixels, left out of the total")] if image.masked else []
     if image.error is not None:
         rows.append(("largest error", f"{image.error.max():.3g} W"))
     if image.coverage is not None:

@@ -103,11 +103,14 @@ def caption(image: Image) -> str:
 
 
 def title(image: Image, name: str = "") -> str:
-    """Name, view and total power of an image in one line; the view is that of the scene's parameters, if any."""
+    """Name, view and total power of an image in one line; the view is that of the scene's parameters, if any.
+
+    Masked pixels are not part of the total.
+    """
     view = re.search(r"(?:^|\s)view=(\S+)", str(image.metadata.get("scene", "")))
     parts = [name] if name else []
     parts += [f"view {view[1]}°"] if view else []
-    return ", ".join([*parts, f"total {image.power.sum(dtype=np.float64):.4g} W"])
+    return ", ".join([*parts, f"total {image.total_power:.4g} W"])
 
 
 def plot_image(
@@ -314,7 +317,9 @@ def draw_picture(
 
 
 def _show_difference(axes: Axes, calculated: Image, standard: Image) -> None:
-    difference = calculated.power.astype(np.float64) - standard.power
+    """Draw the difference, white where a pixel of either image is masked."""
+    both = calculated.kept & standard.kept
+    difference = np.where(both, calculated.power.astype(np.float64) - standard.power, 0)
     scale, unit = scale_and_unit(difference)
     reach = float(np.abs(difference).max() / scale) or 1.0
     draw_picture(axes, difference / scale, standard, f"difference [{unit}]", (-reach, reach), DIFFERENCES)

@@ -107,7 +107,10 @@ def wavelength_of(image: Image, wavelength_nm: float | None) -> float:
 
 
 def etendue(image: Image) -> Plane:
-    """Étendue τ G ⟨cos⁴θ⟩ of every pixel, shape (h, w) [mm² sr]; ImageError if the metadata lack the lens."""
+    """Étendue τ G ⟨cos⁴θ⟩ of every pixel, shape (h, w) [mm² sr]; ImageError if the metadata lack the lens.
+
+    Of an image that the integral computed with `pixel` = centre, it is that of the centres, as in the integral.
+    """
     known = image.metadata
     if missing := [name for name in ("focal_length", "f_number", "focus_distance", "pixel_pitch") if name not in known]:
         raise ImageError(
@@ -124,4 +127,5 @@ def etendue(image: Image) -> Plane:
     except (OpticsError, ValueError) as cause:
         raise ImageError(f"image: its metadata describe no lens: {cause}") from cause
     axes = PixelAxes.of(image.shape, known | {"magnification": lens.magnification})
-    return pixel_etendues(lens, axes.step, axes.x, axes.y, float(known.get("transmittance", 1.0)))
+    passed, pixel = float(known.get("transmittance", 1.0)), str(known.get("pixel", "area"))
+    return pixel_etendues(lens, axes.step, axes.x, axes.y, passed, pixel)

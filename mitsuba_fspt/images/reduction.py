@@ -34,6 +34,13 @@ if TYPE_CHECKING:
 Frame = ArrayLike | str | os.PathLike[str]
 LOG = logging.getLogger("mitsuba_fspt")
 DARKER = 5.0  # standard deviations of a total below 0: noise makes more once in 3 million images
+REPLACED = ("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels")
+# Metadata of a rendered image that say how it was computed. They do not hold for counts of it, whose error is noise.
+COMPUTED = (
+    *("method", "rtol", "domain", "pixel", "max_nodes", "max_specular", "shortcuts_off", "nodes", "levels", "left_out"),
+    *("light_left_out", "light_left_out_error", "warnings", "wall_time", "variant", "versions"),
+    *("sampler", "spp", "passes", "seed"),
+)
 LEAST_FLAT = 0.05  # of the mean: pixels of a flat field darker than that are masked, their error is 20 times as large
 
 
@@ -329,7 +336,7 @@ def _image(
     variance = np.maximum(total * response, 0) + read**2 + independent + flat_noise * (total * response) ** 2
     error = np.sqrt(variance) / (per_watt * response)
     kept: Metadata = dict(metadata or {})
-    for name in ("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"):
+    for name in (*REPLACED, *COMPUTED):
         kept.pop(name, None)
     kept |= {
         "quantity": "power",

@@ -32,6 +32,7 @@ class Measurement:
     area : cm² on the virtual detector plane
     pixels : number of pixels
     power : W on the pixels
+    masked : number of the region's pixels that the image masks, such as saturated ones; no number above counts them
 
     The errors are None for an image without errors. Those of the integral are bounds and add up; standard errors of
     Monte Carlo add up in squares.
@@ -47,6 +48,7 @@ class Measurement:
     area: float
     pixels: int
     power: float
+    masked: int = 0
 
 
 HEADINGS = {
@@ -60,11 +62,12 @@ HEADINGS = {
     "area": "area [cm^2]",
     "pixels": "pixels",
     "power": "power [W]",
+    "masked": "masked [pixels left out]",
 }
 
 
 def measure(image: Image, region: str | Mask | None = None, wavelength_nm: float | None = None) -> Measurement:
-    """Radiometric quantities of the light from a region of an image.
+    """Radiometric quantities of the light from a region of an image, without its masked pixels.
 
     Parameters
     ----------
@@ -74,11 +77,15 @@ def measure(image: Image, region: str | Mask | None = None, wavelength_nm: float
 
     Raises
     ------
-    ImageError : no such region, no pixel in it, or as in `in_unit`.
+    ImageError : no such region, no pixel in it that is not masked, or as in `in_unit`.
     """
     mask = region_mask(image, region) if isinstance(region, str) else region
     mask = np.ones(image.shape, bool) if mask is None else mask
     _check_mask(image, mask, "region")
+    mask, masked = mask & image.kept, int(np.count_nonzero(mask & ~image.kept))
+    if not mask.any():
+        name = f"region '{region}'" if isinstance(region, str) else "region"
+        raise ImageError(f"{name}: all its {masked} pixels are masked. Give another one, or expose for a shorter time.")
     converted = in_unit(image, "p/s/cm2/sr", wavelength_nm)
     side = PixelAxes.of(image.shape, image.metadata).step
     area = side**2 / SQUARE_MM_PER_CM  # of a pixel
@@ -98,6 +105,7 @@ def measure(image: Image, region: str | Mask | None = None, wavelength_nm: float
         area=area * count,
         pixels=count,
         power=float(image.power[mask].sum(dtype=np.float64)),
+        masked=masked,
     )
 
 
@@ -106,7 +114,7 @@ def region_mask(image: Image, text: str) -> Mask:
 
     'x,y,width,height' : a rectangle, with the first pixel x, y
     'circle:x,y,radius' : the pixels whose centres lie in the circle; x, y of its centre from the image's corner
-    '25%' : the pixels with at least this share of the brightest pixel's power
+    '25%' : the pixels with at least this share of the brightest pixel's power, masked ones left out
     name of a TIFF file of the image's size : the pixels whose value there is not 0
 
     Raises
@@ -120,7 +128,8 @@ def region_mask(image: Image, text: str) -> Mask:
         (share,) = _numbers(text[:-1], text, 1)
         if not 0 < share <= 100:
             raise ImageError(f"region '{text}': a threshold is above 0% and at most 100%. Give for example 25%.")
-        mask = image.power >= share / 100 * image.power.max() if image.power.max() > 0 else np.zeros(image.shape, bool)
+        power = np.where(image.kept, image.power, 0)
+        mask = power >= share / 100 * power.max() if power.max() > 0 else np.zeros(image.shape, bool)
     elif text.startswith("circle:"):
         x, y, radius = _numbers(text.removeprefix("circle:"), text, 3)
         rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]

@@ -33,7 +33,8 @@ class ZTest:
         there are none
     p_value : probability that the smallest of `pixels` independent p_1 is at most the one found, p = 1 − (1 −
         p_1)^pixels (Šidák's correction), p_1 = erfc(|z|/√2); a small value means that the images differ
-    pixels : number of pixels with light in either image and a standard error above 0, which are tested
+    pixels : number of pixels with light in either image and a standard error above 0, masked in neither, which are
+        tested
     unjudged : number of pixels without a standard error that differ by more than the bound; they are not tested
     noisy : number of the tested pixels whose bound is at most half the standard error
     detectable : smallest difference on the standard's brightest pixel, over its power, for which p < 0.01; None if
@@ -72,6 +73,12 @@ def error_bound(*images: Image) -> Plane:
     return np.sum([np.zeros(images[0].shape), *given], axis=0, dtype=np.float64)
 
 
+def brightest(image: Image, kept: NDArray[np.bool_]) -> tuple[int, int]:
+    """Row and column of the brightest of the pixels `kept` (h, w)."""
+    row, column = np.unravel_index(np.where(kept, image.power, -np.inf).argmax(), image.shape)
+    return int(row), int(column)
+
+
 def differences(calculated: Image, standard: Image) -> Plane:
     """z of every pixel with the sign of P_cal − P_std, shape (h, w); NaN on pixels that are not tested."""
     return _Differences(calculated, standard).signed_z()
@@ -96,7 +103,7 @@ def z_test(calculated: Image, standard: Image) -> ZTest | None:
         pixels=pixels,
         unjudged=int(np.count_nonzero((found.error == 0) & (found.excess > 0))),
         noisy=int(noisy.sum()),
-        detectable=found.detectable(np.unravel_index(standard.power.argmax(), standard.shape), pixels),
+        detectable=found.detectable(brightest(standard, found.kept), pixels),
     )
 
 
@@ -104,7 +111,8 @@ class _Differences:
     """Difference of two images and its errors, arrays of shape (h, w).
 
     power : of the standard [W]
-    difference : P_cal − P_std [W]
+    kept : pixels masked in neither image
+    difference : P_cal − P_std [W]; 0 on masked pixels, like `error`
     bound : error of the deterministic images [W]
     excess : max(|difference| − bound, 0) [W]
     error : standard error s of the difference [W]
@@ -116,7 +124,8 @@ class _Differences:
 
     def __init__(self, calculated: Image, standard: Image) -> None:
         p_cal, self.power = (image.power.astype(np.float64) for image in (calculated, standard))
-        self.difference = p_cal - self.power
+        self.kept = calculated.kept & standard.kept
+        self.difference = np.where(self.kept, p_cal - self.power, 0)
         self.bound = error_bound(calculated, standard)
         self.excess = np.maximum(np.abs(self.difference) - self.bound, 0)
         variance, spread = np.zeros(self.power.shape), np.zeros(self.power.shape)
@@ -131,7 +140,7 @@ class _Differences:
             variance += own
             passes = int(image.metadata.get("passes", 0))
             spread += own * own / (passes - 1) if passes > 1 else 0.0
-        self.error = self.scale * np.sqrt(variance)
+        self.error = np.where(self.kept, self.scale * np.sqrt(variance), 0)
         self.freedom = np.divide(variance**2, spread, out=np.full_like(spread, np.inf), where=spread > 0)
         self.tested = (self.error > 0) & ((p_cal != 0) | (self.power != 0))
         self.missed = self._missed(calculated, standard)
@@ -167,7 +176,7 @@ class _Differences:
         tail = stdtr(np.where(finite, self.freedom, 1.0), -t)
         return np.where(finite, -ndtri(np.clip(tail, 1e-300, 0.5)), t)  # beyond 1e-300 z stays at 37
 
-    def detectable(self, pixel: tuple[np.intp, ...], pixels: int) -> float | None:
+    def detectable(self, pixel: tuple[int, int], pixels: int) -> float | None:
         """Difference on `pixel` over the standard's power there with p = `LEVEL` among so many pixels."""
         from scipy.special import ndtri, stdtrit
 

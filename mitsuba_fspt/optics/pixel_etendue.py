@@ -12,11 +12,12 @@ from .thin_lens import Lens
 
 RADII = 4097  # distances from the axis between which the étendue is interpolated; the error is 1e-6 on films of ±45°
 CHORDS, ALONG = 16, 6  # Gauss nodes across each part of the open pupil and along its chords
-PARTS = 32  # squares along the side of a pixel that the border of an image-plane stop crosses
 Plane = NDArray[np.float64]
 
 
-def pixel_etendues(lens: Lens, side: float, x: Plane, y: Plane, transmittance: float = 1.0) -> Plane:
+def pixel_etendues(
+    lens: Lens, side: float, x: Plane, y: Plane, transmittance: float = 1.0, pixel: str = "area"
+) -> Plane:
     """τ A_vd A_pupil/u² ⟨cos⁴θ⟩ [mm² sr] of virtual pixels, shape (h, w); 0 where no light passes.
 
     The mean is over the pixel and over the part of the pupil that the borders of the lens leave open (Eqs. 5, M.13);
@@ -26,14 +27,17 @@ def pixel_etendues(lens: Lens, side: float, x: Plane, y: Plane, transmittance: f
     side : of a virtual pixel [mm]
     x, y : centres of the columns (w,) and rows (h,) on the virtual detector plane, from the optical axis [mm]
     transmittance : τ of lens and filters
+    pixel : 'area': the mean over the pixel; 'centre': its centre times its area, as the integral's parameter `pixel`
     """
-    node = side / 2 / math.sqrt(3)  # Gauss rule of 2 × 2 nodes on a pixel
-    radii = [np.hypot(x[None, :] + i * node, y[:, None] + j * node) for i in (-1, 1) for j in (-1, 1)]
+    centre = pixel == "centre"
+    node = 0.0 if centre else side / 2 / math.sqrt(3)  # Gauss rule of 2 × 2 nodes on a pixel
+    steps = (0,) if centre else (-1, 1)
+    radii = [np.hypot(x[None, :] + i * node, y[:, None] + j * node) for i in steps for j in steps]
     table = np.linspace(0, max(float(radius.max()) for radius in radii), RADII)
     values = mean_cos4(lens, table)
     mean = np.mean([np.interp(radius, table, values) for radius in radii], axis=0)
     bare = transmittance * side**2 * math.pi * (lens.discs[0].radius / lens.focus_distance) ** 2
-    return bare * mean * _inside_stop(lens.seen_field, side, x, y)
+    return bare * mean * (radii[0] <= lens.seen_field if centre else _inside_stop(lens.seen_field, side, x, y))
 
 
 def mean_cos4(lens: Lens, radius: Plane) -> Plane:
@@ -88,10 +92,25 @@ def _inside_stop(field: float, side: float, x: Plane, y: Plane) -> Plane | float
     """Share of each virtual pixel (h, w) inside the image-plane stop of radius `field` on the virtual plane [mm]."""
     if math.isinf(field):
         return 1.0
-    radius = np.hypot(x[None, :], y[:, None])
-    share = (radius < field).astype(np.float64)
-    part = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-    for row, column in np.argwhere(np.abs(radius - field) < side):
-        inside = np.hypot(x[column] + side * part[None, :], y[row] + side * part[:, None]) < field
-        share[row, column] = inside.mean()
+    x, y, half = np.abs(x)[None, :] / field, np.abs(y)[:, None] / field, side / 2 / field  # by symmetry
+    inside = np.hypot(x + half, y + half) <= 1
+    cut = ~inside & (np.hypot(np.maximum(x - half, 0), np.maximum(y - half, 0)) < 1)
+    share = inside.astype(np.float64)
+    x, y = (np.broadcast_to(place, cut.shape)[cut] for place in (x, y))
+    right, left, top, bottom = x + half, x - half, y + half, y - half
+    area = _disc_area(right, top) - _disc_area(left, top) - _disc_area(right, bottom) + _disc_area(left, bottom)
+    share[cut] = np.clip(area / (2 * half) ** 2, 0, 1)
     return share
+
+
+def _disc_area(x: Plane, y: Plane) -> Plane:
+    """Area of the unit disc within the rectangle from its middle to (x, y); < 0 where one of x and y is negative."""
+    sign = np.sign(x) * np.sign(y)
+    x, y = np.minimum(np.abs(x), 1), np.minimum(np.abs(y), 1)
+    start = np.minimum(x, np.sqrt(1 - y**2))  # from there to x the disc's border lies below y
+    return sign * (start * y + _below_border(x) - _below_border(start))
+
+
+def _below_border(x: Plane) -> Plane:
+    """∫ √(1 − t²) dt from 0 to x."""
+    return (x * np.sqrt(1 - x**2) + np.arcsin(x)) / 2

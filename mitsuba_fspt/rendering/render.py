@@ -96,7 +96,7 @@ def render(
             *planes, how = _sample(scene, lens, integrator, spp, seed, report)
     how |= {"wall_time": time.perf_counter() - start}
     if not planes[0].any():
-        how["warnings"] = DARK
+        how["warnings"] = "; ".join(filter(None, [how.get("warnings"), DARK]))
     return Image(*planes, {**origin_of(scene, lens), "sensor": sensor, **how, **lens.numbers(), **_versions()})
 
 

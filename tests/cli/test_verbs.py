@@ -286,6 +286,7 @@ def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
     assert (code, err) == (0, "")
     powers = [fspt.read(name).power.sum(dtype=float) for name in two_images]
     record = {"output": "plot.png", "images": [*two_images], "total_power": pytest.approx(powers), "power_unit": "W"}
+    record["masked"] = [0, 0]
     assert json.loads(out) == record
     assert run("plot", *two_images, "--log", "--per-panel", "-o", "b.png", "--quiet") == (0, "", "")
     assert set(os.listdir(tmp_path)) == {*two_images, "a.png", "b.png", "plot.png"}
@@ -413,6 +414,21 @@ def test_expose_does_not_overwrite_the_power(run, two_images):
     assert code == 2
     assert "output file 'a.exr': -o would overwrite 'a.exr', which is needed too. Give another name." in err
     assert fspt.read("a.exr").metadata == before
+
+
+@pytest.mark.parametrize("counts", ["e.tif", "./e.tif", "a.tif"])
+def test_expose_keeps_counts_apart_from_electrons_and_power(run, two_images, tmp_path, counts):
+    """Seen to fail: exit code 0, and counts in the place of the electrons or of the power."""
+    fspt.read("a.exr").write("a.tif")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    options = ["--exposure-time", "1", "--wavelength-nm", "600", "--counts", counts]
+    code, out, err = run("expose", "a.tif", "-o", "e.tif", *options)
+    assert (code, out) == (2, "")
+    name = counts.removeprefix("./")
+    assert err == (
+        f"fspt: output file '{name}': --counts would overwrite '{name}', which is needed too. Give another name.\n"
+    )
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize("output", ["", ".exr", "picture"])

@@ -50,6 +50,28 @@ def test_a_stop_leaves_no_light_and_no_radiance_outside():
     assert radiance[HEIGHT // 2, WIDTH // 2] == pytest.approx(200 / math.pi * PER_JOULE, rel=1e-4)
 
 
+CUT = {
+    "stop": {"image_stop_diameter": 8.0},
+    "vignetting": {"f_number": 4.0, "lens_diameter": 18.0, "diaphragm_distance": 40.0, "pixel_pitch": 1.2},
+}
+
+
+@pytest.mark.parametrize("settings", CUT.values(), ids=CUT)
+def test_pixels_cut_by_a_border_have_the_radiance_of_the_others_at_their_centres(settings):
+    """With `pixel` = centre, L = J_n/π wherever light arrives, and no pixel without light has an étendue.
+
+    Seen to fail with the étendue of the pixel's area: up to 1.69 times J_n/π at the stop, 1.5 by vignetting, and
+    pixels with an étendue but no light.
+    """
+    scene = camera_scene(disk(165, 400.0), exitance=2.0, **settings)
+    image = fspt.render(scene, method="integral", rtol=1e-4, pixel="centre")
+    own = etendue(image)
+    lit = image.power > 1e-3 * image.power.max()
+    assert 0 < np.count_nonzero(lit) < lit.size
+    np.testing.assert_allclose(image.power[lit] / own[lit], 2.0 / math.pi, rtol=5e-4)
+    np.testing.assert_array_equal(own > 0, image.power > 0)
+
+
 def test_photons_and_watts():
     image = fspt.Image([[1e-9, 0.0]], [[1e-12, 0.0]], metadata={"f_number": 8.0})
     photons = in_unit(image, "photons/s", 660)

@@ -72,6 +72,30 @@ def test_an_image_stop_leaves_the_share_inside():
     x = side * (np.arange(count) + 0.5 - count / 2)
     found = pixel_etendues(of, side, x, -x)
     whole = math.pi * (of.pupil_radius / of.focus_distance) ** 2
-    assert found.sum() == pytest.approx(whole * math.pi * of.seen_field**2, rel=1e-3)
+    assert found.sum() == pytest.approx(whole * math.pi * of.seen_field**2, rel=1e-4)
     assert found[0, 0] == 0
     assert found.max() == pytest.approx(whole * side**2, rel=1e-4)
+
+
+@pytest.mark.parametrize("diameter", [0.2, 0.5, 0.513])
+@pytest.mark.parametrize("shift", [0.0, 0.013, 0.05])
+def test_the_share_inside_a_stop_is_exact(diameter, shift):
+    """Against strips of each pixel between the two borders of the stop's disc. Axes in pixels, on lines, and between.
+
+    Seen to fail with shares counted on 32 × 32 squares: off by up to 0.006, and by 2 to 6 % on thinly cut pixels.
+    """
+    of, side = lens(f_number=50.0, image_stop_diameter=diameter), 0.05
+    x, y = side * (np.arange(25) - 12) + shift, side * (12 - np.arange(24))
+    found = pixel_etendues(of, side, x, y) / pixel_etendues(lens(f_number=50.0), side, x, y)
+    angle = np.pi * (np.arange(20_000) + 0.5) / 20_000
+    expected = np.zeros(found.shape)
+    for column, middle in enumerate(x):
+        low, high = np.clip([middle - side / 2, middle + side / 2], -of.seen_field, of.seen_field)
+        strips = (low + high) / 2 - (high - low) / 2 * np.cos(angle)
+        weight = (high - low) / 2 * np.sin(angle) * np.pi / len(angle)
+        reach = np.sqrt(np.maximum(of.seen_field**2 - strips**2, 0))
+        for row, centre in enumerate(y):
+            height = np.minimum(reach, centre + side / 2) - np.maximum(-reach, centre - side / 2)
+            expected[row, column] = (weight * np.maximum(height, 0)).sum() / side**2
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-7)
+    assert ((0 < found) & (found < 0.999)).any()

@@ -10,7 +10,7 @@ from mitsuba_fspt.runtime import backend
 backend.ensure_variant()
 
 import mitsuba as mi  # noqa: E402
-from small_scenes import ball, lens, world_scene, write_scene  # noqa: E402
+from small_scenes import ball, camera_scene, disk, lens, world_scene, write_scene  # noqa: E402
 
 import mitsuba_fspt as fspt  # noqa: E402
 from mitsuba_fspt.rendering.monte_carlo import standard_error  # noqa: E402
@@ -261,3 +261,16 @@ def test_only_a_lens_makes_watts():
     for options in ({}, {"method": "path", "spp": 4}):
         with pytest.raises(SceneError, match=r"power on a pixel needs a lens. Use a sensor of type 'fspt_lens'"):
             fspt.render(scene, **options)
+
+
+def test_a_dark_picture_keeps_the_warning_of_light_left_out(mono):
+    """A surface that faces a wall behind it: no light comes straight, some by the wall, and both are told.
+
+    Seen to fail: that the picture is dark took the place of the light left out.
+    """
+    wall = {**disk(165, 100.0), "bsdf": {"type": "diffuse", "reflectance": 0.8}}
+    image = fspt.render(camera_scene(disk(120, 10.0, tilt=180), bodies=[wall]), method="integral")
+    assert not image.power.any()
+    left_out, dark = image.metadata["warnings"].split("; ")
+    assert "which Eq. 9 leaves out" in left_out
+    assert dark.startswith("the picture is dark")
