@@ -25,6 +25,7 @@ from ..jit.mesh_buffers import box_of, triangles
 from ..jit.plugin_objects import made
 from ..jit.spectra import at_one_wavelength, scalar
 from ..runtime.plugin_types import is_surface
+from .nested_bsdfs import blended_parts
 from .occlusion import hidden, ray_to_lens
 from .quadrature import Quadrature
 
@@ -32,6 +33,7 @@ SMOOTHEST = 1e-4  # roughness below which Mitsuba's rough conductor has the lobe
 FLAT = 1e-5  # of its size: how far a flat shape may leave its plane
 ROUNDING = 2e-6  # of the largest coordinate: margin of a box
 LIFT = 4e-7  # of a shape's largest coordinate: distance at which its sides differ in float32
+WHOLE = 0xFFFFFFFF  # Mitsuba's number for all components of a BSDF
 CODES = 4095  # numbers for a first surface, and for all later ones, that one float32 can encode
 DELTA = {
     "null": mi.BSDFFlags.Null,
@@ -55,6 +57,8 @@ class Specular:
     lobes : kinds of lobes that can lead to light, of 'null', 'transmission' and 'reflection'
     bending : boxes of the shapes that deviate lines of sight
     bsdf : Dr.Jit's number of a shape's BSDF; 0 where lines of sight end
+    parts : components of a shape's BSDF that are sampled one at a time; 0 for those of no blend
+    most_parts : largest of `parts`
     reach : box of all surfaces from which light can reach a shape, six numbers [mm]
     lift : distance from a shape at which the next leg of a line starts [mm]
     most : longest sequence of lobes that is followed
@@ -66,6 +70,8 @@ class Specular:
     lobes: tuple[str, ...]
     bending: tuple[Box, ...]
     bsdf: mi.UInt32
+    parts: mi.UInt32
+    most_parts: int
     reach: mi.Float
     lift: mi.Float
     most: int
@@ -92,10 +98,12 @@ class Specular:
             return None
         boxes = [_box(shape) for shape, _ in bent]
         count = 1 + max(map(shape_number, scene.shapes()))
-        bsdf, reach, lift = np.zeros(count, np.uint32), np.zeros((count, 6), np.float32), np.zeros(count, np.float32)
+        bsdf, parts = np.zeros((2, count), np.uint32)
+        reach, lift = np.zeros((count, 6), np.float32), np.zeros(count, np.float32)
         for shape, its in shapes:
             number = shape_number(shape)
             bsdf[number] = dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(its))[0]
+            parts[number] = blended_parts(its)
             others = [
                 box for (other, _), box in zip(bent, boxes, strict=True) if other is not shape or not _plane(shape)
             ]
@@ -106,6 +114,8 @@ class Specular:
             tuple(name for name in DELTA if name in lobes) or ("null",),
             tuple(boxes),
             mi.UInt32(bsdf),
+            mi.UInt32(parts),
+            int(parts.max()),
             mi.Float(reach.ravel()),
             mi.Float(lift),
             quadrature.max_specular,
@@ -131,12 +141,11 @@ def _key(value: object) -> object:
 
 
 def specular_bsdf(shape: mi.Shape) -> mi.BSDF | None:
-    """BSDF with the specular lobes of the shape's; None if it has none, or none separate from other lobes."""
+    """BSDF with the specular lobes of the shape's; None if it has none."""
     bsdf = shape.bsdf()
     if bsdf.class_name() == "RoughConductor" and (mirror := _mirror(bsdf)) is not None:
         return mirror
-    # Mitsuba draws one of the two parts of a blend at random, and gives no access to them.
-    return bsdf if lobes_of(bsdf) and bsdf.class_name() != "BlendBSDF" else None
+    return bsdf if lobes_of(bsdf) else None
 
 
 def lobes_of(bsdf: mi.BSDF) -> tuple[str, ...]:
@@ -438,15 +447,29 @@ def _lobes(
             weight = dr.select(goes_on, scalar(bsdf.eval_null_transmission(si, goes_on)), 0)
             lobes.append(_Lobe(_off(si, ray.d, lift), mi.Vector3f(ray.d), weight, mi.Float(1), mi.Bool(True)))
             continue
-        context = mi.BSDFContext()
-        context.type_mask = DELTA[name]
-        # 0: of a mask its nested BSDF, whose density is its opacity.
-        sample, value = bsdf.sample(context, si, 0.0, mi.Point2f(0.5), goes_on)
-        of_kind = goes_on & mi.has_flag(sample.sampled_type, DELTA[name])
-        weight = dr.select(of_kind, scalar(value) * sample.pdf, 0)
-        direction, indices = si.to_world(sample.wo), dr.select(of_kind, sample.eta, 1)
+        towards, weight, indices = _deviated(specular, name, bsdf, si, number, goes_on)
+        direction = si.to_world(towards)
         lobes.append(_Lobe(_off(si, direction, lift), direction, weight, indices, mi.Bool(False)))
     return lobes
+
+
+def _deviated(
+    specular: Specular, name: str, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, number: mi.UInt32, goes_on: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+    """Direction in the shading frame, weight and ratio of indices of the lobe `name`, summed over a blend's parts."""
+    context = mi.BSDFContext()
+    context.type_mask = DELTA[name] | mi.BSDFFlags.Null  # without null lobes a mask's nested BSDF is not sampled
+    towards, weight, indices = mi.Vector3f(0), mi.Float(0), mi.Float(1)
+    parts = dr.gather(mi.UInt32, specular.parts, number, goes_on) if specular.most_parts else mi.UInt32(0)
+    for part in (WHOLE, *range(specular.most_parts)):
+        context.component = part
+        active = goes_on & (parts == 0) if part == WHOLE else goes_on & (part < parts)
+        # 0: of a mask its nested BSDF, whose density is its opacity.
+        sample, value = bsdf.sample(context, si, 0.0, mi.Point2f(0.5), active)
+        of_kind = active & mi.has_flag(sample.sampled_type, DELTA[name])
+        weight += dr.select(of_kind, scalar(value) * sample.pdf, 0)
+        towards, indices = dr.select(of_kind, sample.wo, towards), dr.select(of_kind, sample.eta, indices)
+    return towards, weight, indices
 
 
 def _off(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, lift: mi.Float) -> mi.Point3f:

@@ -22,6 +22,7 @@ from ..integral.exitance_rows import Rows, kinds_of, sizes_of
 from ..integral.interpolated import Blocks, blocks_of
 from ..integral.left_out import LeftOut, light_left_out
 from ..integral.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
+from ..integral.nested_bsdfs import check_followed
 from ..integral.progress import Progress
 from ..integral.quadrature import Quadrature
 from ..integral.scene_checks import check_scene, check_surfaces_alone
@@ -111,6 +112,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         quadrature = quadrature or self.quadrature
         check_scene(scene, sensor)
         check_surfaces_alone(scene)
+        check_followed(scene)
         with recording(), dr.suspend_grad():
             specular = Specular.of(scene, sensor, quadrature, even_if_none=not quadrature.takes("specular"))
             bending = specular.bending if specular else ()

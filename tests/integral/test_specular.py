@@ -128,6 +128,55 @@ def test_a_mask_as_a_graded_filter():
     assert seen[HEIGHT // 2] / bare[HEIGHT // 2] == pytest.approx(expected, abs=1e-3)
 
 
+@pytest.mark.parametrize("share", [1.0, 0.5])
+@pytest.mark.parametrize("kind", ["mask", "blend", "twosided"])
+def test_a_mirror_in_another_bsdf_reflects_its_share(kind, share):
+    """What a mask or a blend leaves of a mirror shows the mirrored phantom as a mirror of that reflectance does."""
+    half = {"type": "blendbsdf", "weight": 1 - share, "a": PERFECT, "b": PERFECT | {"specular_reflectance": 0.2}}
+    inside = {
+        "mask": {"type": "mask", "opacity": share, "nested": PERFECT},
+        "blend": {"type": "blendbsdf", "weight": 1 - share, "a": PERFECT, "b": {"type": "null"}},
+        "twosided": {"type": "twosided", "nested": half},
+    }
+    reflectance = share + 0.2 * (1 - share) if kind == "twosided" else share
+    phantom = sphere(80, 5, x=70)
+    bare = PERFECT | {"specular_reflectance": reflectance}
+    seen, due = (power(camera_scene(phantom, bodies=(pane(80, b, tilt=45),)), rtol=1e-3) for b in (inside[kind], bare))
+    assert due.max() > 0
+    assert abs(seen - due).max() < 2e-3 * due.max()
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        {"type": "mask", "nested": PERFECT | {"specular_reflectance": 0.5}, "opacity": 0.6},
+        {"type": "mask", "nested": PANE, "opacity": 0.6},
+        {"type": "blendbsdf", "weight": 0.3, "a": PANE, "b": PERFECT},
+    ],
+    ids=["mask of a mirror", "mask of a pane", "blend of a pane and a mirror"],
+)
+def test_masks_and_blends_agree_with_the_path_tracer(bsdf):
+    splitter = pane(80, bsdf, size=40, tilt=45)
+    assert agrees_with_path(camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,))) > 1e-3
+
+
+GLASSES = {"a": {"type": "dielectric", "int_ior": 1.3}, "b": {"type": "dielectric"}}
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "fault"),
+    [
+        ({"type": "mask", "nested": {"type": "blendbsdf", "weight": 0.4, "a": PERFECT, "b": PERFECT}}, "and a 'mask'"),
+        ({"type": "blendbsdf", "weight": 0.4, **GLASSES}, "two glasses"),
+    ],
+)
+def test_blends_that_lines_of_sight_cannot_follow_are_refused(bsdf, fault):
+    scene = camera_scene(sphere(80, 5, x=70), bodies=(pane(80, bsdf, tilt=45),))
+    with pytest.raises(SceneError, match=rf"BSDF of shape '.*{fault}.*--method path --max-depth 9") as refused:
+        fspt.render(scene)
+    assert "\n" not in str(refused.value)
+
+
 def test_total_reflection_in_a_prism(tmp_path):
     """A right-angled prism turns the line of sight by 90°; Fresnel's loss is that of two faces."""
     n, half = 1.7, 16.0
