@@ -1,6 +1,6 @@
 """Coverage of the intervals of `calibrate`: how often value ± 1.645 sd holds the true value.
 
-    python scripts/calibrate_coverage.py [--seeds 120] [--direct 49] [-o docs/calibrate_coverage.csv]
+    python scripts/calibrate_coverage.py [--seeds 120] [--direct 24] [-o docs/calibrate_coverage.csv]
 
 The scene is scenes/nylon_cylinder.xml at f/2.8 on 32 x 32 pixels. View, distance and magnification are free; the fit
 starts 0.7 degrees, 0.3 mm and 5e-4 from the true values. The images are counts of 300 and 3000 electrons on the
@@ -146,7 +146,7 @@ def main() -> None:
     """Write the table as CSV and print it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=120)
-    parser.add_argument("--direct", type=int, default=49)
+    parser.add_argument("--direct", type=int, default=24)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "calibrate_coverage.csv")
     arguments = parser.parse_args()
     rows = table(arguments.seeds, arguments.direct)

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 def invert(
     matrix: Annotated[Path, typer.Argument(metavar="T.npz", help="Transport matrix of 'fspt matrix'.")],
     images: Annotated[
-        list[Path], typer.Argument(metavar="IMAGE...", help="One a view, of 'fspt reduce' or 'fspt expose'.")
+        list[Path],
+        typer.Argument(metavar="IMAGE...", help="One a view, in the order of T.npz."),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Mesh with J_n to write, .ply or .vtu.")],
     samples: Annotated[int, typer.Option(help="Random draws for the intervals; 0: none.")] = 0,

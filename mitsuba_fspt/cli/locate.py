@@ -23,7 +23,7 @@ def locate(
     matrix: Annotated[Path, typer.Argument(metavar="T.npz", help="Transport matrix of 'fspt matrix'.")],
     images: Annotated[
         list[Path],
-        typer.Argument(metavar="IMAGE...", help="One a view, of 'fspt reduce' or 'fspt expose'; T.npz of a next band."),
+        typer.Argument(metavar="IMAGE...", help="One a view, in the order of T.npz; T.npz of a next band."),
     ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Tetrahedra with the density to write, .vtu.")

@@ -223,6 +223,12 @@ def _band_images(
         read.append((surface, measurement, described.band(one.name)))
     report("tissue", 0.0)
     mesh = described.checked_mesh()
+    if described.bands and any(one.name is None for one in given):
+        LOG.warning(
+            "fspt: locate: no band is given, of the phantom file's %s: the powers are those in these images, with the "
+            "coefficients of [optical]. Give the band, where images are of one.",
+            ", ".join(described.bands),
+        )
     bands = []
     for one, (surface, measurement, optics) in zip(given, read, strict=True):
         tissue = Tissue(mesh, optics.media, a=described.a, order=described.order)

@@ -192,7 +192,7 @@ def tell_misfit(verb: str, chi2_sum: float, free: float) -> None:
     if chi2_sum > free + MISFIT * (2 * free) ** 0.5:
         LOG.warning(
             "fspt: %s: chi2 is %.3g, the images differ from the fit by more than their noise, which the stated errors "
-            "do not contain. Check pose, mesh, exit law, background and the detector's numbers.",
+            "do not contain. Check order of the views, pose, mesh, exit law, background and the detector's numbers.",
             verb,
             chi2_sum / free,
         )

@@ -174,6 +174,18 @@ def test_masked_pixels_do_not_count(case):
     assert front.total == pytest.approx((matrix.areas * front.solution)[front.seen].sum())
 
 
+@pytest.mark.parametrize("electrons", [10, 100])
+def test_few_pixels_with_much_noise_are_left(case, electrons):
+    """Dim pixels at the limb alone, as in overexposed images. Seen to fail with an exception, by γ < 0."""
+    matrix = case[0]
+    uniform = np.ones(matrix.shape[1])
+    power = matrix.forward(uniform)
+    dim = (power > 0) & (power < 0.1 * power.max())
+    found = fspt.invert(matrix, noisy(matrix, uniform, electrons, 0), mask=~dim)
+    assert np.isfinite(found.total)
+    assert found.pixels == dim.sum() > 30
+
+
 def test_weight_and_chi2(case):
     """The weight found gives χ² near 1 and is near the J_n that explains it: larger and smaller ones fit J_n worse."""
     matrix, exitance = case

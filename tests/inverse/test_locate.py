@@ -149,6 +149,16 @@ def test_bands(case):
     assert both.pixels == 2 * one.pixels
 
 
+def test_a_band_that_is_not_given_is_told(case, caplog):
+    """The phantom file has bands: images of one without its name would give the power in that band alone."""
+    whole = replace(case.described, bands={})
+    with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+        fspt.locate(whole, case.matrix, case.images(SOURCE), scene=case.surface)
+        assert not caplog.text
+        case.locate(case.images(SOURCE))
+    assert "no band is given, of the phantom file's red, green" in caplog.text
+
+
 def test_a_matrix_of_faces(case, tmp_path):
     """J_n of a face is the mean of its corners: the same source as from vertices."""
     matrix = cylinder_views(tmp_path, on="face")
@@ -372,7 +382,7 @@ def test_images_of_noise_alone_are_told(case, caplog):
         assert "Give images with less noise" in caplog.text
         caplog.clear()
         assert case.locate(case.images(SOURCE, electrons=30)).sources[0].p_value < 1e-100
-        assert not caplog.text
+        assert "do not show" not in caplog.text
 
 
 def test_a_source_at_the_border(case):
