@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import BackendError, ImageError
+from .formats import read_planes
 
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
@@ -64,6 +65,8 @@ def read_counts(path: str | os.PathLike[str]) -> Counts:
         raise ImageError(f"counts '{path}' do not exist. Check the name.")
     suffix = path.suffix.lower()
     exposure_time, binning = None, None
+    if suffix in (*TIFF, *FITS):
+        _require_counts(path)
     if suffix in TIFF:
         array = _tiff(path)
     elif suffix in FITS:
@@ -79,10 +82,23 @@ def read_counts(path: str | os.PathLike[str]) -> Counts:
     return Counts(found.values, found.frames, None, None, exposure_time, {}, found.highest, binning)
 
 
+def _require_counts(path: Path) -> None:
+    """Raise ImageError for an image of this package: its planes are power or electrons, no frames of counts."""
+    try:
+        planes, _ = read_planes(path)
+    except (ImageError, BackendError):
+        return
+    raise ImageError(
+        f"counts '{path}' are an image of fspt with {', '.join(planes)}. Reduce counts, as of 'fspt expose --counts'; "
+        "'fspt invert' and 'fspt locate' take such an image as it is."
+    )
+
+
 def counts_of(array: Any, name: str) -> Counts:
     """Counts of an array (h, w) or (frames, h, w), a file or argument `name`; ImageError for any other."""
     array = np.asarray(array)
-    if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or array.size == 0:
+    colour = array.ndim == 3 and array.shape[2] in (3, 4)  # the last axis of RGB and RGBA files
+    if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or array.size == 0 or colour:
         raise ImageError(
             f"counts '{name}' must be real numbers of shape (h, w) or (frames, h, w), got {array.dtype} of shape "
             f"{array.shape}. Save one channel of grey values."
@@ -112,10 +128,16 @@ def _fits(path: Path) -> tuple[NDArray[Any], float | None, int | None]:
     try:
         with fits.open(path, memmap=False) as file:
             unit = next(unit for unit in file if unit.data is not None)
-            time, sides = (unit.header.get(key, file[0].header.get(key)) for key in ("EXPTIME", "XBINNING"))
-            return np.asarray(unit.data), None if time is None else float(time), None if sides is None else int(sides)
+            keys = ("EXPTIME", "XBINNING", "YBINNING", "ROWORDER")
+            time, sides, rows, order = (unit.header.get(key, file[0].header.get(key)) for key in keys)
+            data = np.asarray(unit.data)
     except Exception as cause:
         raise ImageError(f"counts '{path}' are no readable FITS: {_line(cause)}. Copy the file again.") from cause
+    if None not in (sides, rows) and sides != rows:
+        raise ImageError(f"counts '{path}' are binned {sides} x {rows}. Give counts of square binning.")
+    if str(order).strip().upper() == "BOTTOM-UP":
+        data = np.flip(data, axis=-2)
+    return data, None if time is None else float(time), None if sides is None else int(sides)
 
 
 def _click(folder: Path) -> Counts:

@@ -77,10 +77,10 @@ def light_left_out(view: View, quadrature: Quadrature) -> LeftOut | None:
 
 def scattering_shapes(scene: mi.Scene) -> list[str]:
     """Ids of the shapes whose BSDF scatters light, those apart that Mitsuba gives to emitters without one: black."""
-    return [shape.id() for shape in scene.shapes() if _scatters(shape.bsdf())]
+    return [shape.id() for shape in scene.shapes() if scatters(shape.bsdf())]
 
 
-def _scatters(bsdf: mi.BSDF) -> bool:
+def scatters(bsdf: mi.BSDF) -> bool:
     """True for a BSDF with a lobe that is not specular, unless its reflectance is 0 everywhere."""
     if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth):
         return False

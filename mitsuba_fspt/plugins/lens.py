@@ -84,6 +84,7 @@ class FsptLens(mi.Sensor):
     def __init__(self, props: mi.Properties) -> None:
         own_film(props)
         default_sampler(props)
+        self.in_medium = any(isinstance(child, mi.Medium) for _, child in props.objects())
         super().__init__(props)
         names = (*number_names(), "pixel_pitch", *transmittance.NUMBERS)
         self._numbers = {n: number(props, n) for n in names if n in props}

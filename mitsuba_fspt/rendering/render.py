@@ -70,8 +70,8 @@ def render(
     seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
     progress : function called with the name of the stage and the share done, 0 … 1
 
-    If `rtol` was not reached, light after a scattering reflection is left out, or the image is dark, the metadata state
-    so in `warnings`.
+    If `rtol` was not reached, light after a scattering reflection is left out, the image is dark, or the method does
+    not treat a part of the scene, such as a medium, the metadata state so in `warnings`.
 
     Raises
     ------
@@ -95,9 +95,19 @@ def render(
             spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
             *planes, how = _sample(scene, lens, integrator, spp, seed, report)
     how |= {"wall_time": time.perf_counter() - start}
-    if not planes[0].any():
-        how["warnings"] = "; ".join(filter(None, [how.get("warnings"), DARK]))
+    how |= _warned(how, planes[0], scene, lens, integrator)
     return Image(*planes, {**origin_of(scene, lens), "sensor": sensor, **how, **lens.numbers(), **_versions()})
+
+
+def _warned(
+    how: dict, power: NDArray[np.float64], scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator
+) -> dict[str, str]:
+    """The warnings of metadata `how`, that the picture is dark, and those about the scene."""
+    from ..integral.scene_warnings import scene_warnings
+
+    dark = None if power.any() else DARK
+    warnings = [text for text in (how.get("warnings"), dark, *scene_warnings(scene, lens, integrator)) if text]
+    return {"warnings": "; ".join(warnings)} if warnings else {}
 
 
 def _integrator(
