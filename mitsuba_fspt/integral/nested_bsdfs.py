@@ -20,16 +20,21 @@ TURNS = ("BumpMap", "NormalMap")  # each turns the normal, so that lobes of one 
 def nested(thing: mi.Object) -> Iterator[mi.Object]:
     """A BSDF itself and all BSDFs and textures inside it, outermost first."""
     yield thing
-    inside: list[mi.Object] = []
+    for child in _children(thing):
+        yield from nested(child)
+
+
+def _children(thing: mi.Object) -> list[mi.Object]:
+    """BSDFs and textures that an object refers to itself."""
+    found: list[mi.Object] = []
 
     class Children(mi.TraversalCallback):
         def put(self, name: str, value: object, flags: object, cpptype: object = None) -> None:
             if isinstance(value, (mi.BSDF, mi.Texture)):
-                inside.append(value)
+                found.append(value)
 
     thing.traverse(Children())
-    for child in inside:
-        yield from nested(child)
+    return found
 
 
 def blended_parts(bsdf: mi.BSDF) -> int:
@@ -72,7 +77,7 @@ def check_textures(scene: mi.Scene) -> None:
 
 def _check_bumps(shape: mi.Shape, bumps: mi.BSDF) -> None:
     """Raise SceneError if the texture of a bump map has no gradient."""
-    for texture in nested(bumps):
+    for texture in _children(bumps):
         if not isinstance(texture, mi.Texture):
             continue
         try:
@@ -82,4 +87,3 @@ def _check_bumps(shape: mi.Shape, bumps: mi.BSDF) -> None:
                 f"scene: the bumpmap of shape '{shape.id()}' has a {texture.class_name()}, of which Mitsuba computes "
                 "no gradient. Give it a bitmap, or leave it out."
             ) from error
-        return

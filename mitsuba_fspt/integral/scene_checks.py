@@ -17,6 +17,7 @@ from ..emission.elements import elements_of
 from ..jit.mesh_buffers import box_of, triangles
 from ..runtime.errors import ExitanceError, SceneError
 from ..runtime.plugin_types import is_lens, is_surface
+from .nested_bsdfs import check_textures
 from .specular import specular_bsdf
 
 COARSEST = 0.1  # virtual pixels: the largest displacement of a line of sight by float32
@@ -37,11 +38,13 @@ def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
         raise SceneError("scene: nothing glows. Give a shape an emitter of type 'fspt_surface' with its 'exitance'.")
     for emitter in scene.emitters():
         if is_surface(emitter):
+            check_curve(emitter.get_shape())
             emitter.check()
             check_range(emitter, sensor)
             check_placement(emitter.get_shape())
             with dr.suspend_grad():
                 check_alone(scene, emitter)
+    check_textures(scene)
     check_outside(scene, sensor)
 
 
@@ -123,6 +126,15 @@ def check_placement(shape: mi.Shape) -> None:
         raise SceneError(
             f"scene: 'to_world' of {kind} '{shape.id()}' stretches or shears it, which it cannot follow. Give a "
             "rotation (about an axis of length 1), a translation and one scale, or a mesh."
+        )
+
+
+def check_curve(shape: mi.Shape) -> None:
+    """Raise SceneError for a glowing shape whose surface Mitsuba gives no points of."""
+    if shape.class_name() == "LinearCurve":
+        raise SceneError(
+            f"scene: shape '{shape.id()}' is a linearcurve, on whose surface Mitsuba gives no points to glow. Give a "
+            "bsplinecurve, cylinders or a mesh."
         )
 
 
