@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 FORMATS = (".ply", ".vtu")
+LOG = logging.getLogger("mitsuba_fspt")
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +189,12 @@ class Inversion:
             comments |= {"source": "fspt invert", "seen": "1 where the pictures determine it, else 0"}
             seen = {"seen_x": self.seen.astype(np.float64)}
             write_ply(path, self.surface.vertices, self.surface.faces, dark | seen, per, comments)
+            for name, scale in self.surface.scales.items():
+                LOG.warning(
+                    "fspt: invert: '%s' is in mm, 'to_world' of shape '%s' scales the mesh of its file by %.6g. Leave "
+                    "out the scale where the file takes its place.",
+                    *(path, name, scale),
+                )
             return
         try:
             import meshio

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 
 from ..phantom.surface_mesh import face_areas, merge
-from ..rendering.provenance import own_frame, same_mesh, scene_digest
+from ..rendering.provenance import own_frame, same_mesh, scale_of, scene_digest
 from ..rendering.scene import load
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, SceneError
@@ -39,6 +39,7 @@ class Surface:
     parts : shape id → slice of columns;  on : 'vertex' or 'face', what a column is
     number : (n,) the point of each column: coincident vertices of one mesh are one point
     basis : (points, m) the functions ψ of the m unknowns at the points (Eq. M.30); None: each point is an unknown
+    scales : shape id → length in the scene [mm] of a length of 1 in the file, where that is not 1
     """
 
     vertices: Array
@@ -47,6 +48,7 @@ class Surface:
     on: str
     number: NDArray[np.int64]
     basis: csr_array | None = None
+    scales: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, matrix: TransportMatrix, scene: object = None) -> Surface:
@@ -68,19 +70,22 @@ class Surface:
             scene._require_areas(matrix.areas)
             return scene
         loaded = _scene_of(matrix, scene)
-        vertices, faces, number = [], [], []
+        vertices, faces, number, scales = [], [], [], {}
         first = unknowns = 0
         for emitter in loaded.emitters():
             shape = emitter.get_shape()
             positions, corners = (buffer.numpy() for buffer in triangles(shape))
             points = own_frame(loaded, shape, positions.reshape(-1, 3).astype(np.float64))
+            if not np.isclose(scale := scale_of(loaded, shape), 1, rtol=1e-6):
+                scales[shape.id()] = scale
             corner = corners.reshape(-1, 3).astype(np.int64)
             own = np.arange(len(corner)) if matrix.on == "face" else _joined(points)
             vertices.append(points)
             faces.append(corner + first)
             number.append(own + unknowns)
             first, unknowns = first + len(points), unknowns + int(own.max()) + 1
-        found = cls(np.concatenate(vertices), np.concatenate(faces), matrix.parts, matrix.on, np.concatenate(number))
+        mesh = np.concatenate(vertices), np.concatenate(faces)
+        found = cls(*mesh, matrix.parts, matrix.on, np.concatenate(number), scales=scales)
         found._require_areas(matrix.areas)
         return found
 

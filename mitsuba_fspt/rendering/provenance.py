@@ -49,10 +49,20 @@ def own_frame(scene: mi.Scene, shape: mi.Shape, vertices: Array) -> Array:
 
     Unchanged where the shape has no `to_world`, where that mirrors, and in scenes that `load` did not make.
     """
-    kept = (getattr(sensor, "placements", {}).get(shape.id()) for sensor in scene.sensors())
-    to_world = next((one for one in kept if one is not None), np.eye(4))
+    to_world = _placement(scene, shape)
     rotation, _ = polar(to_world[:3, :3])  # without a scale, which is that of the file's unit of length
     return (vertices - to_world[:3, 3]) @ rotation if np.linalg.det(rotation) > 0 else vertices
+
+
+def scale_of(scene: mi.Scene, shape: mi.Shape) -> float:
+    """Length in the scene [mm] of a length of 1 in a mesh's file, by its `to_world`; 1 where `own_frame` knows none."""
+    return float(np.cbrt(np.abs(np.linalg.det(_placement(scene, shape)[:3, :3]))))
+
+
+def _placement(scene: mi.Scene, shape: mi.Shape) -> Array:
+    """`to_world` (4, 4) of a shape; the identity where it has none, and in scenes that `load` did not make."""
+    kept = (getattr(sensor, "placements", {}).get(shape.id()) for sensor in scene.sensors())
+    return next((one for one in kept if one is not None), np.eye(4))
 
 
 def source_of(scene: mi.Scene) -> tuple[Any, dict[str, object]] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 
 import numpy as np
 import pytest
@@ -359,6 +360,23 @@ def test_files(case, tmp_path):
     pytest.importorskip("matplotlib")
     r.report(tmp_path / "report.png")
     assert (tmp_path / "report.png").stat().st_size > 10_000
+
+
+def test_a_scale_in_the_scene_is_told(tmp_path, mono, caplog):
+    """A mesh in cm with a scale of 10: the PLY is in mm, and one line says to leave the scale out; else none."""
+    for scale in (1, 10):
+        sphere_views(tmp_path)
+        mesh = trimesh.load(tmp_path / "sphere.ply", process=False)
+        trimesh.Trimesh(mesh.vertices / scale, mesh.faces, process=False).export(tmp_path / "sphere.ply")
+        xml = (tmp_path / "sphere.xml").read_text()
+        (tmp_path / "sphere.xml").write_text(xml.replace('<rotate z="1"', f'<scale value="{scale}"/><rotate z="1"'))
+        matrix = fspt.transport(tmp_path / "sphere.xml", view=[0, 90, 180, 270], rtol=1e-3)
+        found = fspt.invert(matrix, noisy(matrix, np.ones(matrix.shape[1]), 1000, 1))
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+            found.write(tmp_path / "found.ply")
+        assert np.linalg.norm(fspt.Phantom.read(tmp_path / "found.ply").vertices, axis=1) == pytest.approx(RADIUS)
+        assert ("scales the mesh of its file by 10. Leave" in caplog.text) == (scale == 10)
 
 
 BAD = [
