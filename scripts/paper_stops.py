@@ -133,7 +133,7 @@ def _draw_curves(rows: Array, path: Path) -> None:
         axes.set(ylabel=f"{name} power [W/pixel]")
     right.semilogx(f, far * side, "o-", label=f"border: {BORDER:.0%} of the peak")
     right.semilogx(f, half * side, "s--", label=f"border: {HALF:.0%} of the peak")
-    right.set(ylabel="peak to border [mm, virtual detector plane]")
+    right.set(ylabel="peak to border [mm]")
     for axes in (left, middle, right):
         axes.set_xticks(f, [f"{n:g}" for n in f])
         axes.minorticks_off()
