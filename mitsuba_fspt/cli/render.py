@@ -241,8 +241,7 @@ def _summary(
     from ..images.radiometry import in_unit
 
     shown = in_unit(image, unit, wavelength_nm)
-    total = float(image.power.sum(dtype="float64"))
-    summary: dict[str, Any] = {"output": str(output), "total_power": total, "power_unit": "W"}
+    summary: dict[str, Any] = {"output": str(output), "total_power": image.total_power, "power_unit": "W"}
     summary |= {"peak": float(shown.values.max()), "unit": shown.unit, "wall_time": image.metadata["wall_time"]}
     if picture:
         summary["picture"] = str(picture)

@@ -271,8 +271,8 @@ def _refined(
 ) -> _Entries:
     """The same with entries of rough pixels as lines of sight find them, where enough of these meet the column.
 
-    Entries of pixels in `cut` are always replaced: the border of a stop crosses these pixels, and the surface form does
-    not know which part of a pixel lies inside it.
+    Entries of pixels in `cut` are always replaced: the border of a stop crosses these pixels, and the surface form
+    counts them whole.
     """
     pixels = np.flatnonzero(rough)
     lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2

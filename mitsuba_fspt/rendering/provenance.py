@@ -55,7 +55,7 @@ def own_frame(scene: mi.Scene, shape: mi.Shape, vertices: Array) -> Array:
 
 
 def scale_of(scene: mi.Scene, shape: mi.Shape) -> float:
-    """Length in the scene [mm] of a length of 1 in a mesh's file, by its `to_world`; 1 where `own_frame` knows none."""
+    """Factor by which `to_world` of a shape scales lengths; 1 without one, and in scenes that `load` did not make."""
     return float(np.cbrt(np.abs(np.linalg.det(_placement(scene, shape)[:3, :3]))))
 
 
