@@ -16,6 +16,7 @@ from .models import LensModel, model_named, model_names
 from .models.diaphragm import Diaphragm
 
 LARGEST = 1e30  # largest number of a lens, and largest inverse of one: squares stay finite
+LEAST_F_NUMBER = 1e-3  # of the model: no lens in air is below 0.5; far below 1e-3, stated errors are too small
 FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
 BORDERS = ("lens_diameter", "diaphragm_distance", "image_stop_diameter")
 NUMBERS = ("focal_length", "f_number", *FOCUS, *BORDERS)  # of `Lens.focused`, whatever the model
@@ -29,7 +30,7 @@ class Lens:
     Parameters
     ----------
     focal_length : F [mm], > 0
-    f_number : f_num = F/D (Eq. 3), > 0
+    f_number : f_num = F/D (Eq. 3), >= 0.001 (`LEAST_F_NUMBER`)
     focus_distance : u [mm], > F, from the lens plane to the virtual detector plane
     lens_diameter : the lens border [mm]; None leaves the diaphragm as the only border
     diaphragm_distance : from the lens plane to the diaphragm [mm]; > 0 behind the lens (detector side), < 0 in front
@@ -98,6 +99,11 @@ class Lens:
                 object.__setattr__(self, name, number(f"'{name}'", value, OpticsError, EXAMPLES[name]))
         _require_positive("focal_length", self.focal_length, "mm, for example 55")
         _require_positive("f_number", self.f_number, "f_number = F/D, for example 8")
+        if self.f_number < LEAST_F_NUMBER:
+            raise OpticsError(
+                f"'f_number' must be at least {LEAST_F_NUMBER:g}, got {self.f_number:g}: the diaphragm would be "
+                f"{self.diaphragm_diameter:g} mm wide. f_number = F/D, for example 8."
+            )
         _require_positive("focus_distance", self.focus_distance, "mm, for example 165")
         if self.focus_distance <= self.focal_length:
             raise OpticsError(

@@ -39,7 +39,7 @@ class FsptLens(mi.Sensor):
        - F > 0. Updatable.
      * - f_number
        - |float|
-       - f_num > 0; the diaphragm has the diameter D = F/f_num (Eq. 3). Updatable.
+       - f_num ≥ 0.001; the diaphragm has the diameter D = F/f_num (Eq. 3). Updatable.
      * - focus_distance, magnification, image_distance
        - |float| [mm, 1, mm]
        - Exactly one of u > F, t = v/u or v > F sets the focus: 1/F = 1/u + 1/v. The given one is updatable.

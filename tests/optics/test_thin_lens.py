@@ -100,6 +100,7 @@ def test_diaphragm_in_the_rear_focal_plane_stops_directions():
         ({"focal_length": math.nan}, "focal_length"),
         ({"f_number": -2.8}, "f_number"),
         ({"f_number": math.inf}, "f_number"),
+        ({"f_number": 9e-4}, "f_number"),
         ({"focus_distance": 55.0}, "focus_distance"),
         ({"focus_distance": 20.0}, "focus_distance"),
         ({"focus_distance": None}, "focus_distance"),
