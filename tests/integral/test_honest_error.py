@@ -86,7 +86,8 @@ def test_the_error_holds_where_two_levels_agree_by_chance(family, seed, rtol, pi
 
 @pytest.mark.parametrize("z", [210.0, 240.0])
 def test_light_too_weak_for_the_search_is_in_the_error(z):
-    """A dim spot 0.27 pixels wide behind the sharp plane; the surface form, which meets all of it, is the truth.
+    """A dim spot 0.27 pixels wide behind the virtual detector plane; the surface form, which meets all of it, is
+    the truth.
 
     Seen to fail with the weak light left out: 34 and 62 pixels of 0 W with an error of 0.
     """

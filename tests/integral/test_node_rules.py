@@ -88,7 +88,7 @@ def test_rule_is_exact_to_its_degree_and_not_beyond(name, degree, pupil_only):
 
 @pytest.mark.parametrize("blur", [0.0, 0.3, 1.0, -4.0])
 def test_four_nodes_over_the_area_are_exact_to_degree_3_in_what_blurs_like_a_picture(blur):
-    """Functions of blur · pupil + pixel: whatever the blur, before or behind the sharp plane.
+    """Functions of blur · pupil + pixel: whatever the blur, before or behind the virtual detector plane.
 
     Seen to fail with steps along the place on the pupil in place of across it.
     """

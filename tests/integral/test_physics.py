@@ -87,7 +87,8 @@ def miss_distance(centre, flat=(1, 1, 1)):
 
 @pytest.mark.parametrize("centre", [180.0, 230.0])
 def test_uniform_sphere_meets_the_closed_form_where_the_cone_is_filled(centre):
-    """Rationale: the shape does not matter; a sphere is curved and lies before, in and behind the sharp plane.
+    """Rationale: the shape does not matter; a sphere is curved and lies before, in and behind the virtual
+    detector plane.
 
     Expected: as for the disk at the pixels whose every line of sight meets the sphere.
     """
@@ -101,7 +102,7 @@ def test_uniform_sphere_meets_the_closed_form_where_the_cone_is_filled(centre):
 
 
 def test_uniform_cylinder_meets_the_closed_form_where_the_cone_is_filled():
-    """As the sphere, for an upright cylinder that the sharp plane cuts."""
+    """As the sphere, for an upright cylinder that the virtual detector plane cuts."""
     inside = miss_distance([1.0, 0.0, 168.0], flat=(1, 0, 1)) < 11.0 * 0.999
     x, y, width, height = crop = (10, 0, 17, HEIGHT)
     part = slice(y, y + height), slice(x, x + width)
@@ -273,7 +274,8 @@ def test_ripoll_s_detector_takes_the_same_cone_everywhere(aperture):
 
 
 def behind_two_circles(stop, lens, distance, x, y):
-    """∫ cos⁴θ dA / u² over what entrance pupil and lens border leave open to points (x, y) of the sharp plane.
+    """∫ cos⁴θ dA / u² over what entrance pupil and lens border leave open to points (x, y) of the virtual
+    detector plane.
 
     A diaphragm s behind the lens appears sF/(F − s) behind it, magnified F/(F − s); one in front as it is. A line from
     x meets the plane d behind the lens at a(1 + d/u) − x d/u, so that the lens border shows up there magnified.
