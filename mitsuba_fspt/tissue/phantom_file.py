@@ -1,48 +1,4 @@
-"""Description of a phantom in TOML, lengths in mm, powers in W.
-
-[geometry]
-shape = "cylinder"       # about the z axis, centred at the origin
-radius = 15
-height = 30
-# Or, in place of these three: tetrahedra or a closed surface in a file beside this one, any format of fspt flux import,
-# file = "mouse.vtu"
-# length_unit = "cm"     # mm where left out
-# labels = "tissue"      # the field of whole numbers that labels the tetrahedra
-
-[optical]
-mua = 0.0138             # absorption, 1/mm
-musp = 0.91              # reduced scattering, 1/mm
-n = 1.37                 # refractive index relative to outside
-a = "robin"              # boundary factor: robin, haskell or a number
-
-[[regions]]              # optional; sphere, cylinder, or label = 3 in place of a shape
-shape = "sphere"
-centre = [-5, 0, 0]
-radius = 3
-mua = 0.05
-musp = 1.2               # and n, where it is another
-
-[[sources]]              # shape: point, sphere or cylinder
-shape = "cylinder"
-centre = [8, 0, -1]
-radius = 1
-length = 1
-axis = [0, 0, 1]
-power = 1
-
-# [bands.red]            # optional: coefficients in a band of wavelengths, in place of those above
-# share = 0.3            # of a source's power that is emitted in the band, in (0, 1]
-# mua = 0.01
-# musp = 0.85            # and n; then, for each of the regions in their order, [[bands.red.regions]] with mua and musp
-
-[mesh]
-edge = 1.5               # of the tetrahedra
-order = 2                # 1 or 2
-
-[output]
-edge = 0.35              # of the triangles of the surface
-voxel = 0.4              # of the volume
-"""
+"""Description of a phantom in TOML: shape, optical coefficients and light sources (docs/phantom-file.md)."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from mitsuba_fspt.tissue import phantom_file
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import solve
 from mitsuba_fspt.tissue.mesher import read_tetrahedra, tetrahedralize
-from mitsuba_fspt.tissue.phantom_file import CylinderGeometry, PhantomFile, Region
+from mitsuba_fspt.tissue.phantom_file import Band, CylinderGeometry, PhantomFile, Region
 
 pytest.importorskip("skfem")
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -68,12 +69,22 @@ def test_the_papers_phantoms() -> None:
 
 
 def test_the_documented_example(tmp_path: Path) -> None:
-    """The docstring's file is one, and says what the defaults are."""
-    assert phantom_file.__doc__
-    phantom = described(tmp_path, phantom_file.__doc__.split("\n", 1)[1])
-    plain = PhantomFile(phantom.geometry, phantom.medium, phantom.sources, phantom.regions)
+    """docs/phantom-file.md has a file with every table, with the defaults as values; its tables say them, too."""
+    page = (SCENES.parent / "docs" / "phantom-file.md").read_text(encoding="utf-8")
+    phantom = described(tmp_path, page.split("```toml\n", 1)[1].split("```", 1)[0])
+    plain = PhantomFile(phantom.geometry, phantom.medium, phantom.sources, phantom.regions, bands=phantom.bands)
     assert phantom == plain
     assert phantom.regions[0].medium == Medium(0.05, 1.2, 1.37)
+    assert phantom.bands == {"red": Band(0.3, (Medium(0.01, 0.85, 1.37), Medium(0.04, 1.1, 1.37)))}
+    defaults = {name: value for name, value in re.findall(r"^\| `(.*?)` \|.* ([\d.]+) where left out", page, re.M)}
+    assert defaults == {
+        "n": f"{phantom.medium.n:g}",
+        "power": f"{phantom.sources[0].power:g}",
+        "[mesh] edge": f"{PhantomFile.edge:g}",
+        "[mesh] order": f"{PhantomFile.order:g}",
+        "[output] edge": f"{PhantomFile.surface_edge:g}",
+        "[output] voxel": f"{PhantomFile.voxel:g}",
+    }
 
 
 def test_everything_a_file_can_say(tmp_path: Path) -> None:
