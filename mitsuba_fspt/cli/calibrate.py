@@ -93,5 +93,5 @@ def calibrate(
 def _text(found: Calibration) -> str:
     """The result, a line a parameter."""
     lines = [f"{name} = {value:.8g} +- {found.sd[name]:.2g}" for name, value in found.values.items()]
-    last = f"chi2 {found.chi2:.3g} over {found.pixels} pixels, condition number {found.condition:.3g}"
-    return "\n".join([*lines, last])
+    last = f"chi2 {found.chi2:.3g} over {found.pixels} pixels, condition number {found.condition:.3g}; "
+    return "\n".join([*lines, f"{last}+- one standard deviation, units as in the scene"])

@@ -66,14 +66,17 @@ def plot(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Draw images with colour bar, axes in mm and total power; the scale is logarithmic where peaks differ a lot."""
-    from ..images.image import read
+    """Draw images, or electrons of 'fspt expose', with colour bar, axes in mm and total.
+
+    The scale is logarithmic where peaks differ a lot.
+    """
+    from ..images.detector import Exposure, read_image_or_exposure
     from ..images.picture import draw_panels, save_figure
 
     output = output or Path(f"{images[0].stem}.png" if len(images) == 1 else "plot.png")
     require_picture(output)
     require_apart(output, images, error=ImageError)
-    pictures = [read(path) for path in images]
+    pictures = [read_image_or_exposure(path) for path in images]
     ends = _range(limits) if limits is not None else None
     names = [path.stem for path in images]
     figure = draw_panels(
@@ -87,11 +90,15 @@ def plot(
         wavelength_nm=wavelength_nm,
     )
     save_figure(figure, output)
-    if masked := [f"{image.masked} of {path}" for path, image in zip(images, pictures, strict=True) if image.masked]:
-        typer.echo(f"fspt: plot: total powers leave out masked pixels: {', '.join(masked)}.", err=True)
-    totals = [image.total_power for image in pictures]
+    masked = [0 if isinstance(image, Exposure) else image.masked for image in pictures]
+    if any(masked):
+        counts = ", ".join(f"{count} of {path}" for count, path in zip(masked, images, strict=True) if count)
+        typer.echo(f"fspt: plot: total powers leave out masked pixels: {counts}.", err=True)
+    totals = [None if isinstance(image, Exposure) else image.total_power for image in pictures]
     record = {"output": str(output), "images": [*map(str, images)], "total_power": totals, "power_unit": "W"}
-    record["masked"] = [image.masked for image in pictures]
+    record["masked"] = masked
+    if any(isinstance(image, Exposure) for image in pictures):
+        record["total_electrons"] = [image.total if isinstance(image, Exposure) else None for image in pictures]
     text = f"{output}: {len(images)} {'image' if len(images) == 1 else 'images'}"
     print_result(text, record, as_json=as_json, quiet=quiet)
 

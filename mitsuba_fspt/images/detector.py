@@ -12,23 +12,26 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
-from .formats import Metadata, write_planes
-from .image import Image
+from .formats import Metadata, read_planes, write_planes
+from .image import Image, image_of
 from .pixel_axes import CROP
 from .radiometry import PLANCK_TIMES_LIGHT, wavelength_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
 # `pixel_pitch` is that of the pixels read out.
@@ -78,6 +81,26 @@ class Exposure:
     electrons: NDArray[np.float32]
     counts: NDArray[np.uint16]
     metadata: Metadata
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width (h, w) [pixels]."""
+        return self.electrons.shape  # type: ignore[return-value]
+
+    @property
+    def total(self) -> float:
+        """Sum over all pixels [e-]."""
+        return float(self.electrons.sum(dtype=np.float64))
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
+        """The electrons, shape (h, w) [e-], for `np.asarray(exposure)`."""
+        return np.array(self.electrons, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
+
+    def plot(self, axes: Axes | None = None, *, log: bool = False, limits: tuple[float, float] | None = None) -> Axes:
+        """Draw the electrons with colour bar and axes in mm; returns matplotlib's axes. See `Image.plot`."""
+        from .picture import plot_image
+
+        return plot_image(self, axes, log=log, limits=limits)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the electrons and the metadata; the suffix chooses the format, in an EXR the channel is `Y`.
@@ -430,3 +453,32 @@ def _require(name: str, value: float, holds: bool, rule: str) -> None:
     """Raise DetectorError unless `value` is finite and the `rule` holds."""
     if not (holds and math.isfinite(value)):
         raise DetectorError(f"detector: '{name}' must be finite and {rule}, got {value}.")
+
+
+def read_image_or_exposure(path: str | os.PathLike[str]) -> Image | Exposure:
+    """Image [W] or exposure [e-] from a file that fspt wrote. Raises as `image.read` and `image_or_exposure`."""
+    return image_or_exposure(path, *read_planes(path))
+
+
+def image_or_exposure(
+    path: str | os.PathLike[str], planes: Mapping[str, NDArray], metadata: Metadata
+) -> Image | Exposure:
+    """What the planes and metadata of a file are: an image in W, or electrons, whose counts follow from the detector.
+
+    Raises
+    ------
+    ImageError : neither, or values that are not finite.
+    DetectorError : the metadata of electrons lack a number of the detector.
+    """
+    if "electrons" not in planes:
+        return image_of(path, planes, metadata)
+    electrons = planes["electrons"].astype(np.float32)
+    if not np.isfinite(electrons).all():
+        raise ImageError(f"image file '{path}' has electrons that are NaN or inf. Expose it again.")
+    if missing := [name for name in ("gain", "bias", "bits") if name not in metadata]:
+        raise DetectorError(
+            f"'{path}': the electrons come without '{missing[0]}'. Reduce the counts with 'fspt reduce'."
+        )
+    counts = np.rint(float(metadata["bias"]) + electrons / float(metadata["gain"]))
+    top = 2 ** int(metadata["bits"]) - 1
+    return Exposure(electrons, np.clip(counts, 0, top).astype(np.uint16), metadata)

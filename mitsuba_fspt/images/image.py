@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -265,7 +266,11 @@ def read(path: str | os.PathLike[str]) -> Image:
         power, or holds values that are not finite or that are not power by its metadata.
     BackendError : the format needs a package that is not installed.
     """
-    planes, metadata = read_planes(path)
+    return image_of(path, *read_planes(path))
+
+
+def image_of(path: str | os.PathLike[str], planes: Mapping[str, NDArray], metadata: Metadata) -> Image:
+    """Image of the planes and metadata in a file; raises ImageError as `read`."""
     quantity = str(metadata.get("quantity", "power"))
     if quantity not in planes:
         raise ImageError(

@@ -20,6 +20,7 @@ from ..runtime.numbers import whole
 from .colour_scale import ColourScale
 from .colour_scale import scale_and_unit as scale_and_unit
 from .comparison import Comparison, Profile, compare
+from .detector import Exposure
 from .image import Image
 from .pixel_axes import PixelAxes
 from .radiometry import Converted, in_unit
@@ -89,7 +90,7 @@ def write_comparison_png(calculated: Image, standard: Image, path: str | os.Path
     save_figure(figure, path)
 
 
-def caption(image: Image) -> str:
+def caption(image: Image | Exposure) -> str:
     """Method and lens of an image in one line, from those keys that its metadata hold; may be empty."""
     forms = (
         ("method", "{}"),
@@ -102,19 +103,21 @@ def caption(image: Image) -> str:
     return ",  ".join(form.format(known[key]) for key, form in forms if key in known)
 
 
-def title(image: Image, name: str = "") -> str:
-    """Name, view and total power of an image in one line; the view is that of the scene's parameters, if any.
+def title(image: Image | Exposure, name: str = "") -> str:
+    """Name, view and total of an image in one line, in W or e-; the view is that of the scene's parameters, if any.
 
     Masked pixels are not part of the total.
     """
     view = re.search(r"(?:^|\s)view=(\S+)", str(image.metadata.get("scene", "")))
     parts = [name] if name else []
     parts += [f"view {view[1]}°"] if view else []
+    if isinstance(image, Exposure):
+        return ", ".join([*parts, f"total {image.total:.4g} e-"])
     return ", ".join([*parts, f"total {image.total_power:.4g} W"])
 
 
 def plot_image(
-    image: Image,
+    image: Image | Exposure,
     axes: Axes | None,
     *,
     log: bool = False,
@@ -123,8 +126,8 @@ def plot_image(
     unit: str = "W",
     wavelength_nm: float | None = None,
 ) -> Axes:
-    """As `Image.plot`."""
-    shown = in_unit(image, unit, wavelength_nm)
+    """As `Image.plot`, and of an exposure."""
+    shown = _shown(image, unit, wavelength_nm)
     scale = _scale([shown], log=log, limits=limits)
     axes = _own_axes(axes)
     draw_image(axes, image, scale, shown.values, outline=outline)
@@ -173,7 +176,7 @@ def _own_axes(axes: Axes | None) -> Axes:
 
 
 def draw_panels(
-    images: Sequence[Image],
+    images: Sequence[Image | Exposure],
     names: Sequence[str] = (),
     *,
     log: bool = False,
@@ -187,7 +190,7 @@ def draw_panels(
 
     Parameters
     ----------
-    images : power [W]; their titles state the view and the total power
+    images : power [W] or electrons [e-]; their titles state the view and the total
     names : of the images, for the titles; none if left out
     log, limits : of the colour scale, limits in the unit that is shown; see `ColourScale.over`
     per_panel : a colour scale for each image; False: one for all
@@ -204,7 +207,7 @@ def draw_panels(
         raise ImageError("picture: no images to draw. Give one or more.")
     if per_panel and limits is not None:
         raise ImageError("picture: one range for all panels and a scale for each exclude each other. Leave one out.")
-    shown = [in_unit(image, unit, wavelength_nm) for image in images]
+    shown = [_shown(image, unit, wavelength_nm) for image in images]
     scales = [_scale([one], log=log) for one in shown]
     if not per_panel:
         scales = [_scale(shown, log=log, limits=limits)] * len(images)
@@ -234,7 +237,7 @@ def draw_panels(
     return figure
 
 
-def _panel_grid(images: Sequence[Image], wide: bool) -> tuple[Figure, NDArray[np.object_]]:
+def _panel_grid(images: Sequence[Image | Exposure], wide: bool) -> tuple[Figure, NDArray[np.object_]]:
     """Empty figure and its axes, shape (rows, columns), with room for all images; `wide`: for a colour bar each too."""
     columns = len(images) if len(images) < COLUMNS else min(COLUMNS, math.ceil(len(images) ** 0.5))
     rows = -(-len(images) // columns)
@@ -244,8 +247,25 @@ def _panel_grid(images: Sequence[Image], wide: bool) -> tuple[Figure, NDArray[np
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def _shown(image: Image | Exposure, unit: str, wavelength_nm: float | None) -> Converted:
+    """Values of an image in a unit, see `radiometry.in_unit`; electrons of an exposure, whatever `unit` is "W"."""
+    if not isinstance(image, Exposure):
+        return in_unit(image, unit, wavelength_nm)
+    if unit != "W" or wavelength_nm is not None:
+        raise ImageError(
+            f"picture: electrons have no unit '{unit}' and no wavelength to choose. Leave both out, or draw the image "
+            "that was exposed."
+        )
+    return Converted(image.electrons.astype(np.float64), None, "electrons", "e-", None)
+
+
 def _scale(shown: Sequence[Converted], *, log: bool = False, limits: tuple[float, float] | None = None) -> ColourScale:
-    """Colour scale over images in one unit."""
+    """Colour scale over images; ImageError where their units differ."""
+    if len(units := sorted({one.unit for one in shown})) > 1:
+        raise ImageError(
+            f"picture: {' and '.join(units)} have no common colour scale. Draw a scale for each panel, or images of "
+            "one kind."
+        )
     unit = shown[0].unit + ("" if shown[0].quantity == "radiance" else "/pixel")
     values, quantity = [one.values for one in shown], shown[0].quantity.replace("_", " ")
     return ColourScale.over(values, log=log, limits=limits, quantity=quantity, unit=unit)
@@ -253,7 +273,7 @@ def _scale(shown: Sequence[Converted], *, log: bool = False, limits: tuple[float
 
 def draw_image(
     axes: Axes,
-    image: Image,
+    image: Image | Exposure,
     scale: ColourScale,
     values: NDArray | None = None,
     *,
@@ -264,7 +284,7 @@ def draw_image(
 
     values : (h, w) in the scale's unit; None: the image's power
     """
-    values = image.power if values is None else values
+    values = np.asarray(image) if values is None else values
     extent, axis_label = _extent(image)
     shown = axes.imshow(scale.values(values), cmap=COLOURS, norm=scale.norm(), extent=extent)
     axes.set(xlabel=axis_label, ylabel=axis_label)
@@ -275,9 +295,9 @@ def draw_image(
         draw_outline(axes, image)
 
 
-def draw_outline(axes: Axes, image: Image) -> None:
+def draw_outline(axes: Axes, image: Image | Exposure) -> None:
     """Draw the contour where half of a pixel's lines of sight meet the phantom; ImageError without coverage."""
-    if image.coverage is None:
+    if isinstance(image, Exposure) or image.coverage is None:
         raise ImageError(
             "picture: an image without coverage has no outline. Leave it out, or give one that 'fspt render' wrote."
         )
@@ -387,7 +407,7 @@ def _extend(planes: Sequence[NDArray], scale: ColourScale) -> Literal["neither",
     return "both" if below and above else "min" if below else "max" if above else "neither"
 
 
-def _extent(image: Image) -> tuple[tuple[float, float, float, float], str]:
+def _extent(image: Image | Exposure) -> tuple[tuple[float, float, float, float], str]:
     """(left, right, bottom, top) of the picture [mm or pixels], and the axis label with unit and plane."""
     axes = _axes_of(image)
     across, down = axes.step / 2, axes.down / 2
@@ -395,11 +415,11 @@ def _extent(image: Image) -> tuple[tuple[float, float, float, float], str]:
     return tuple(map(float, ends)), axes.label  # type: ignore[return-value]
 
 
-def _axes_of(image: Image) -> PixelAxes:
+def _axes_of(image: Image | Exposure) -> PixelAxes:
     return PixelAxes.of(image.shape, image.metadata)
 
 
-def _aspect(image: Image) -> float:
+def _aspect(image: Image | Exposure) -> float:
     """Height over width, limited to [0.5, 2] for the figure."""
     return min(2.0, max(0.5, image.shape[0] / image.shape[1]))
 

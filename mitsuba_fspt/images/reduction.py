@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from .counts import FITS, TIFF, Counts, counts_of, read_counts
-from .detector import PLANCK_TIMES_LIGHT, RECORDED, Detector, Exposure
+from .detector import PLANCK_TIMES_LIGHT, RECORDED, Detector, Exposure, image_or_exposure
 from .formats import Metadata, read_planes
-from .image import Image, read
+from .image import Image
 
 if TYPE_CHECKING:
     Array = NDArray[np.float64]
@@ -383,14 +383,6 @@ def read_measured(path: str | os.PathLike[str]) -> Image:
         if path.suffix.lower() in (*TIFF, *FITS):  # of another program
             raise DetectorError(counts_alone) from cause
         raise
-    if "electrons" not in planes:
-        return read(path)
-    electrons = planes["electrons"].astype(np.float32)
-    if not np.isfinite(electrons).all():
-        raise ImageError(f"image file '{path}' has electrons that are NaN or inf. Expose it again.")
+    found = image_or_exposure(path, planes, metadata)
     with named(f"'{path}'"):
-        if missing := [name for name in ("gain", "bias", "bits") if name not in metadata]:
-            raise DetectorError(f"the electrons come without '{missing[0]}'. Reduce the counts with 'fspt reduce'.")
-        counts = np.rint(float(metadata["bias"]) + electrons / float(metadata["gain"]))
-        top = 2 ** int(metadata["bits"]) - 1
-        return reduced(Exposure(electrons, np.clip(counts, 0, top).astype(np.uint16), metadata))
+        return measured(found)

@@ -312,6 +312,28 @@ def test_plots_that_cannot_be_drawn(run, two_images, tmp_path, options, message)
 EXPOSE = ("expose", "a.exr", "-o", "e.exr", "--exposure-time", "1", "--wavelength-nm", "600")
 
 
+def test_plot_draws_electrons(run, two_images, tmp_path):
+    assert run(*EXPOSE, "--quiet") == (0, "", "")
+    assert run("plot", "e.exr") == (0, "e.png: 1 image\n", "")
+    code, out, err = run("plot", "e.exr", "a.exr", "--per-panel", "--json")
+    assert (code, err) == (0, "")
+    record = json.loads(out)
+    total, power = fspt.read("a.exr").power.sum(dtype=float), record["total_power"]
+    assert power == [None, pytest.approx(total)]
+    with OpenEXR.File("e.exr", separate_channels=True) as file:
+        electrons = file.channels()["Y"].pixels.sum(dtype=float)
+    assert record["total_electrons"] == [pytest.approx(electrons), None]
+    for options, message in [
+        (("a.exr",), "W and e- have no common colour scale. Draw a scale for each panel"),
+        (("--unit", "photons/s", "--wavelength-nm", "600"), "electrons have no unit 'photons/s' and no wavelength"),
+        (("--outline",), "an image without coverage has no outline."),
+    ]:
+        code, out, err = run("plot", "e.exr", *options, "-o", "c.png")
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith(f"fspt: picture: {message}")
+    assert not (tmp_path / "c.png").exists()
+
+
 def test_expose_with_a_camera_of_ones_own(run, two_images, tmp_path):
     """An option replaces the file's number, and the file the typical camera's; the source's power scales all.
 

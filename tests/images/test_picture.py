@@ -10,6 +10,7 @@ import pytest
 from PIL import Image as Picture
 
 from mitsuba_fspt.images import picture
+from mitsuba_fspt.images.detector import Exposure
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.images.picture import caption, draw_panels, title, write_comparison_png, write_png
 from mitsuba_fspt.runtime.errors import BackendError, ImageError
@@ -55,6 +56,21 @@ def test_colour_bar_and_scale(drawn):
     assert shown.get_extent() == pytest.approx((-1.296, 1.296, -0.864, 0.864))
     assert axes.get_xlabel() == axes.get_ylabel() == "mm on the virtual detector plane"
     assert axes.get_title() == "total 2.5e-10 W\nintegral,  F = 55 mm,  f/2.8,  magnification 0.5"
+
+
+def test_electrons_have_their_unit_at_the_bar():
+    """2500 e- are 2.5 on a bar of 10^3 e-/pixel."""
+    pytest.importorskip("matplotlib")
+    electrons = np.zeros((8, 12), np.float32)
+    electrons[0, 0] = 2500
+    exposure = Exposure(electrons, np.zeros((8, 12), np.uint16), {"quantity": "electrons", "unit": "e-", **LENS})
+    (axes,) = draw_panels([exposure]).axes
+    (bar,) = axes.child_axes
+    assert axes.get_images()[0].get_array()[0, 0] == pytest.approx(2.5)
+    assert bar.get_ylabel() == "electrons [$10^{3}$ e-/pixel]"
+    assert axes.get_title() == "total 2500 e-\nintegral,  F = 55 mm,  f/2.8,  magnification 0.5"
+    assert exposure.plot().get_title() == axes.get_title()
+    np.testing.assert_array_equal(np.asarray(exposure), electrons)
 
 
 def test_axes_say_what_they_know(drawn):
