@@ -136,6 +136,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         quadrature = quadrature or self.quadrature
         with recording(), dr.suspend_grad():
             window = visible_window(scene, sensor)
+            if 0 in window.shape:  # no emitter is in the picture, but what it shines on may be
+                window = visible_window(scene, sensor, everywhere=True)
             if 0 in window.shape:
                 return None
             view = View.of(scene, sensor, window, None, Specular.of(scene, sensor, quadrature))

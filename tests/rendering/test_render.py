@@ -274,3 +274,17 @@ def test_a_dark_picture_keeps_the_warning_of_light_left_out(mono):
     left_out, dark = image.metadata["warnings"].split("; ")
     assert "which Eq. 9 leaves out" in left_out
     assert dark.startswith("the picture is dark")
+
+
+def test_a_wall_that_light_outside_the_picture_shines_on_is_told(mono):
+    """No emitter is in the picture: Monte Carlo shows the wall, the integral nothing, and says so.
+
+    Seen to fail: without a pixel that can see an emitter nothing was estimated.
+    """
+    wall = {**disk(165, 100.0), "bsdf": {"type": "diffuse", "reflectance": 0.8}}
+    scene = camera_scene({**ball(), "center": [90.0, 0.0, 140.0]}, bodies=[wall])
+    image = fspt.render(scene, method="integral")
+    assert not image.power.any()
+    assert image.metadata["light_left_out"] == 1
+    assert "which Eq. 9 leaves out" in image.metadata["warnings"]
+    assert fspt.render(scene, method="path", spp=16, max_depth=2).power.sum() > 0
