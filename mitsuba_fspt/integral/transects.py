@@ -259,8 +259,7 @@ def apply_transects(
     blurred = spread * dr.safe_sqrt(variance - trend) / number
     # A sharp edge slants: each transect crosses a part of its own. A second edge, or a corner, may lie between two.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
-    corner = estimator.corner * value / (number * number)
-    sharp = dr.maximum(dr.maximum(slant, corner), estimator.second_edge * between / number)
+    sharp = dr.maximum(slant, estimator.second_edge * between / number)
     return Means(
         value,
         coverage,
