@@ -242,24 +242,23 @@ def apply_transects(
 ) -> Means:
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
     index, table = draft.grid.pixels(where), mi.Float(rule.table)
-    images = [draft.grid.full(mi.Float64, 0) for _ in range(8)]
+    images = [draft.grid.full(mi.Float64, 0) for _ in range(7)]
     rays = 0
     for part in batches(index, len(rule)):
         *found, traced = _along_transects(draft, part, edges, rule, table, along)
-        columns = *_sums(part, edges, rule, table, found), _jumps_between(dr.width(part), len(rule), found[0])
-        for image, column in zip(images, columns, strict=True):
+        for image, column in zip(images, _sums(part, edges, rule, table, found), strict=True):
             dr.scatter(image, column, part)
         dr.eval(images)
         rays += int(dr.sum(traced)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
-    value, coverage, squares, trend, split, several, blur, between = images
+    value, coverage, squares, trend, split, several, blur = images
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = squares - value * value
     spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
     blurred = spread * dr.safe_sqrt(variance - trend) / number
-    # A sharp edge slants: each transect crosses a part of its own. A second edge, or a corner, may lie between two.
+    # A sharp edge slants: each transect crosses a part of its own, and a corner may lie between two.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
-    sharp = dr.maximum(slant, estimator.second_edge * between / number)
+    sharp = dr.maximum(slant, estimator.corner * value / (number * number))
     return Means(
         value,
         coverage,
@@ -328,21 +327,3 @@ def _sums(
     value, coverage, squares, split, several = sums
     trend = sum(map(dr.square, trends))
     return [value, coverage, squares, trend, split, several, mi.Float64(_most_blurred(ahead, behind))]
-
-
-def _jumps_between(pixels: int, count: int, value: mi.Float) -> PixelArray:
-    """Jump of the `value` from one transect to the next on each pixel, whose `count` transects follow each other.
-
-    In the order of transects across a sharp edge, their place along it increases. A second edge there gives two second
-    differences that are much larger than the others. Returned is √(Σd² − 2 (Σ|d|)²/n), or 0 if that is negative: √2
-    times one jump; 0 for differences that all vary alike, whose Σd² is less than 2 (Σ|d|)²/n.
-    """
-    first = dr.arange(mi.UInt32, pixels) * dr.opaque(mi.UInt32, count)
-
-    def add(k: mi.UInt32, squares: PixelArray, sizes: PixelArray) -> tuple[PixelArray, PixelArray]:
-        before, here, after = (dr.gather(mi.Float, value, first + k + n) for n in range(3))
-        size = mi.Float64(dr.abs(before - 2 * here + after))
-        return squares + size * size, sizes + size
-
-    squares, sizes = repeat(dr.opaque(mi.UInt32, count - 2), add, mi.Float64(0), mi.Float64(0))
-    return dr.safe_sqrt(squares - dr.opaque(mi.Float64, 2 / count) * sizes * sizes)
