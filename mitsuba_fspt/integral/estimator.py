@@ -43,7 +43,9 @@ class Estimator:
     spread, kink : remaining error of two transects over the deviation between them and their number; of more, over the
         deviation without its trend, as J_n may have a kink between two
     slant : the same of transects across a sharp edge, over their number to the power 3/2: the edge is slanted
-    corner : error of a corner of a sharp edge between transects, over the light and the squared number of transects
+    second_edge : error of a second edge between two transects across a sharp edge, over √2 times the jump between their
+        means and their number: at most 0.35. Where such an edge is nearly along many transects of a net, at most the
+        largest second difference of their means over their number counts
     step_ratio : remaining error over the change from one node rule to the next where no transect crosses a jump
     new_jump : remaining error over the tolerance where a jump is crossed for the first time, so that a level follows
     neighbour_share : share of a neighbour's remaining error that counts, as its edge may reach into the pixel; all of
@@ -76,7 +78,7 @@ class Estimator:
     spread: float = _bound(2.0, 0.0)
     kink: float = _bound(6.0, 0.0)
     slant: float = _bound(2.0, 0.0)
-    corner: float = _bound(1 / 8, 0.0)
+    second_edge: float = _bound(0.5, 0.0)
     step_ratio: float = _bound(2.0, 0.0)
     new_jump: float = _bound(1.5, 0.0)
     neighbour_share: float = _bound(0.5, 0.0)

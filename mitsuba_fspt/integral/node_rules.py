@@ -128,6 +128,7 @@ ACROSS = (2, 4, 6, 8, 16)
 # Directions of the other two coordinates from the middle, at each place across the pupil [degrees]. Levels with equal
 # coordinates would miss the same, such as a plate edge-on through the virtual detector plane.
 TURNS = {2: [[45], [225]], 8: [[30, 210], [120, 300]] * 2, 24: [[0, 90, 180, 270]] * 6}
+LEAST_NET = 256  # transects from which those across a sharp edge are a net
 # Generating vectors of the lattices of transects across a sharp edge: those of least centred discrepancy.
 STEPS = {2: (1, 1), 8: (3, 5), 24: (5, 11), 72: (19, 61)}
 TREND = 3  # degree across the pupil of the trend that is subtracted from the scatter
@@ -194,6 +195,11 @@ class Transects:
         return len(self.weight)
 
     @property
+    def is_net(self) -> bool:
+        """Whether `sharp` is a net: every box of its size holds one transect."""
+        return len(self) >= LEAST_NET
+
+    @property
     def phase(self) -> NDArray[np.float64]:
         """Even over any run of them (golden ratio).
 
@@ -226,7 +232,7 @@ def transects(count: int) -> Transects:
     if level == len(ACROSS):
         return Transects(_net(count), _net(count), np.full(count, 1 / count))
     blurred, weight = _across_the_pupil(count, ACROSS[level])
-    if count == 256:
+    if count >= LEAST_NET:
         return Transects(_net(count), blurred, weight)
     return Transects(_lattice(count, *STEPS[count]), blurred, weight)
 

@@ -14,6 +14,7 @@ from ..jit.loops import repeat
 from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
 from . import node_rules
 from .draft import Draft
+from .estimator import Estimator
 from .jumps import integrate_transect
 from .nodes import apply_nodes
 from .transect import transect
@@ -242,23 +243,24 @@ def apply_transects(
 ) -> Means:
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
     index, table = draft.grid.pixels(where), mi.Float(rule.table)
-    images = [draft.grid.full(mi.Float64, 0) for _ in range(7)]
+    images = [draft.grid.full(mi.Float64, 0) for _ in range(8)]
     rays = 0
     for part in batches(index, len(rule)):
         *found, traced = _along_transects(draft, part, edges, rule, table, along)
-        for image, column in zip(images, _sums(part, edges, rule, table, found), strict=True):
+        columns = *_sums(part, edges, rule, table, found), _second_edge(dr.width(part), rule, found[0], draft.estimator)
+        for image, column in zip(images, columns, strict=True):
             dr.scatter(image, column, part)
         dr.eval(images)
         rays += int(dr.sum(traced)[0])
     draft.count(f"{len(rule)} transects", dr.width(index), rays)
-    value, coverage, squares, trend, split, several, blur = images
+    value, coverage, squares, trend, split, several, blur, between = images
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = squares - value * value
     spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
     blurred = spread * dr.safe_sqrt(variance - trend) / number
-    # A sharp edge slants: each transect crosses a part of its own, and a corner may lie between two.
+    # A sharp edge slants: each transect crosses a part of its own. A second edge may lie between two of them.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
-    sharp = dr.maximum(slant, estimator.corner * value / (number * number))
+    sharp = dr.maximum(slant, between)
     return Means(
         value,
         coverage,
@@ -327,3 +329,25 @@ def _sums(
     value, coverage, squares, split, several = sums
     trend = sum(map(dr.square, trends))
     return [value, coverage, squares, trend, split, several, mi.Float64(_most_blurred(ahead, behind))]
+
+
+def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float, estimator: Estimator) -> PixelArray:
+    """Error of a second edge between two transects of each pixel, from the `value` of all transects, pixel by pixel.
+
+    In the order of transects across a sharp edge, their place along it increases, so that a second edge gives two
+    second differences d that are much larger than the others. √(Σd² − 2 (Σ|d|)²/n) is then √2 times the jump; it is 0
+    where all differences vary alike. On a net, where the edge is nearly along many transects, it cuts all but one of
+    them evenly: the error is at most the largest |d| over n.
+    """
+    count = len(rule)
+    first = dr.arange(mi.UInt32, pixels) * dr.opaque(mi.UInt32, count)
+
+    def add(k: mi.UInt32, squares: PixelArray, sizes: PixelArray, most: PixelArray) -> tuple[PixelArray, ...]:
+        before, here, after = (dr.gather(mi.Float, value, first + k + n) for n in range(3))
+        size = mi.Float64(dr.abs(before - 2 * here + after))
+        return squares + size * size, sizes + size, dr.maximum(most, size)
+
+    zero = mi.Float64(0)
+    squares, sizes, most = repeat(dr.opaque(mi.UInt32, count - 2), add, zero, zero, zero)
+    jumps = estimator.second_edge * dr.safe_sqrt(squares - dr.opaque(mi.Float64, 2 / count) * sizes * sizes)
+    return (dr.minimum(jumps, most) if rule.is_net else jumps) / dr.opaque(mi.Float64, count)

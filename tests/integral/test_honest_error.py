@@ -56,28 +56,31 @@ def test_a_shape_far_below_a_pixel_sends_what_its_area_says(shape, seed):
 
 
 @pytest.mark.parametrize(
-    ("family", "seed", "pixels"),
+    ("family", "seed", "rtol", "pixels"),
     [
-        pytest.param("bitmaps", 103, [(40, 33), (40, 34)], id="texels in focus"),
-        pytest.param("meshes", 105, [(29, 31)], id="corner of a mesh"),
-        pytest.param("bitmaps", 105, [(4, 14), (4, 15), (4, 18)], id="edges of texels along sides of pixels"),
+        pytest.param("bitmaps", 103, 1e-2, [(40, 33), (40, 34)], id="texels in focus"),
+        pytest.param("meshes", 105, 1e-2, [(29, 31)], id="corner of a mesh"),
+        pytest.param("bitmaps", 105, 1e-2, [(4, 14), (4, 15), (4, 18)], id="edges of texels along sides of pixels"),
+        pytest.param("plates", 112, 1e-3, [(19, 10)], id="edge along the transects"),
+        pytest.param("boxes", 122, 1e-3, [(36, 14)], id="edge of a box along the transects"),
     ],
 )
-def test_the_error_holds_where_two_levels_agree_by_chance(family, seed, pixels):
+def test_the_error_holds_where_two_levels_agree_by_chance(family, seed, rtol, pixels):
     """Pixels with several edges, on which two levels agree, against the float64 reference: within the stated error.
 
-    Seen to fail with an error of transects that falls as n^(-3/2) everywhere (up to 1.8 times that stated), and with
-    elements of the surface whose errors along a pixel's side are taken for independent (up to 6.3 times).
+    Seen to fail with an error of transects that falls as n^(-3/2) everywhere (up to 1.8 times that stated), with
+    elements of the surface whose errors along a pixel's side are taken for independent (up to 6.3 times), and without
+    the error of a second edge between transects (2.6 and 7 times).
     """
     made = random_scene(family, seed)
-    image = fspt.render(made.scene(), method="integral", rtol=1e-2, pixel=made.reference.pixel)
+    image = fspt.render(made.scene(), method="integral", rtol=rtol, pixel=made.reference.pixel)
     peak = image.power.max()
     left, top = made.crop[:2]
     index = np.array(pixels)
-    goal = np.full(len(index), 1e-3 * peak)
+    goal = np.full(len(index), 0.1 * rtol * peak)
     true, uncertain = made.reference.power(index + np.array([top, left]), goal, most=2048)
     rows, columns = index.T
-    assert (uncertain < 2e-3 * peak).all()
+    assert (uncertain < 0.5 * rtol * peak).all()
     assert (np.abs(image.power[rows, columns] - true) <= image.error[rows, columns] + uncertain).all()
 
 
