@@ -1,7 +1,7 @@
+from .detector.detector import Detector as Detector
 from .images.comparison import Comparison as Comparison
 from .images.comparison import compare as compare
-from .images.detector import Detector as Detector
-from .images.detector import Exposure as Exposure
+from .images.exposure import Exposure as Exposure
 from .images.image import Image as Image
 from .images.image import read as read
 from .inverse.calibrate import Calibration as Calibration

@@ -53,7 +53,7 @@ def calibrate(
     The scene's own values are the start. Parameters that the images do not
     determine separately are refused with the combination that stays free.
     """
-    from ..images.reduction import read_measured
+    from ..detector.reduction import read_measured
     from ..inverse.calibrate import GAIN, calibrate
     from ..inverse.calibrated_scene import require_files_found, require_own_defaults
     from ..inverse.calibration_fit import CalibrationSettings, UndeterminedError

@@ -70,7 +70,7 @@ def plot(
 
     The scale is logarithmic where peaks differ a lot.
     """
-    from ..images.detector import Exposure, read_image_or_exposure
+    from ..images.exposure import Exposure, read_image_or_exposure
     from ..images.picture import draw_panels, save_figure
 
     output = output or Path(f"{images[0].stem}.png" if len(images) == 1 else "plot.png")
@@ -189,7 +189,7 @@ def expose(
     The CCD is that of CAMERA.toml, or a typical cooled one (not a data sheet);
     options replace its numbers.
     """
-    from ..images.detector import Detector
+    from ..detector.detector import Detector
     from ..images.image import read
 
     require_image(output)

@@ -42,7 +42,7 @@ def invert(
     quiet: Quiet = False,
 ) -> None:
     """Infer J_n [W/mm2] on the surface from the images of all views, with intervals."""
-    from ..images.reduction import read_measured
+    from ..detector.reduction import read_measured
     from ..inverse.inversion import FORMATS
     from ..inverse.invert import invert
     from ..inverse.transport_file import read_transport

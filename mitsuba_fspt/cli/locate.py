@@ -45,7 +45,7 @@ def locate(
     In several bands: T.npz and images of each, one after the other, and
     --band for each, in the same order.
     """
-    from ..images.reduction import read_measured
+    from ..detector.reduction import read_measured
     from ..inverse.locate import locate
     from ..inverse.transport_file import read_transport
     from ..tissue.phantom_file import PhantomFile

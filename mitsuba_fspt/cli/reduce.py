@@ -15,10 +15,10 @@ from .options import AsJson, Quiet, require_image, require_writable
 from .terminal import print_result
 
 if TYPE_CHECKING:
-    from ..images.counts import Counts
-    from ..images.detector import Detector
+    from ..detector.counts import Counts
+    from ..detector.detector import Detector
+    from ..detector.reduction import Exposed
     from ..images.image import Image
-    from ..images.reduction import Exposed
     from ..optics.thin_lens import Lens
 
 Frame = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame or stack [DN]: .tif, .fits, .npy.")]
@@ -55,9 +55,9 @@ def reduce(
     camera's TOML with the quantum efficiency that it shows. The transmittance of
     [lens] is not part of it; without one there, that of the lens is.
     """
-    from ..images.counts import read_counts
-    from ..images.detector import Detector
-    from ..images.reduction import reduce_counts
+    from ..detector.counts import read_counts
+    from ..detector.detector import Detector
+    from ..detector.reduction import reduce_counts
 
     camera = Detector.from_toml(detector)
     given = dict(exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, pixel_pitch=pixel_pitch)
@@ -95,7 +95,7 @@ def _require_output(output: Path, calibrate: bool, source: bool) -> None:
 
 def _exposed(path: Path, counts: Counts, camera: Detector, given: dict[str, Any]) -> Exposed:
     """Circumstances of an exposure: the `given` ones, else those of the file; DetectorError without its time."""
-    from ..images.reduction import Exposed
+    from ..detector.reduction import Exposed
 
     if given["exposure_time"] is None and counts.exposure_time is None:
         raise DetectorError(f"'{path}' does not say its exposure time. Give --exposure-time, in s.")
@@ -118,7 +118,7 @@ def _calibrated(
     camera: Detector, images: list[Image], toml: Path, output: Path, radiance: float | None, error: float
 ) -> dict[str, Any]:
     """Write the calibrated camera, and say what changed."""
-    from ..images.reduction import Exposed, calibrated
+    from ..detector.reduction import Exposed, calibrated
     from ..optics.uniform_source import uniform_power
 
     if radiance is None or not 0 < radiance < np.inf:

@@ -1,1 +1,1 @@
-"""Images of power on pixels: the class, its files, comparison, PNG pictures, and the detector."""
+"""Images of power on pixels: the class, its files, comparison, PNG pictures, exposures."""

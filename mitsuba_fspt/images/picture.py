@@ -20,7 +20,7 @@ from ..runtime.numbers import whole
 from .colour_scale import ColourScale
 from .colour_scale import scale_and_unit as scale_and_unit
 from .comparison import Comparison, Profile, compare
-from .detector import Exposure
+from .exposure import Exposure
 from .image import Image
 from .pixel_axes import PixelAxes
 from .radiometry import Converted, in_unit

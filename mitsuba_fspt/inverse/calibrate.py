@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.detector import Exposure
+from ..detector.reduction import measured
+from ..images.exposure import Exposure
 from ..images.image import Image
-from ..images.reduction import measured
 from ..rendering.render import render
 from ..rendering.scene import load
 from ..rendering.scene_rules import is_number

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, diags_array
 
-from ..images.detector import Exposure
+from ..images.exposure import Exposure
 from ..images.image import Image
 from ..runtime.errors import InversionError
 from ..runtime.numbers import number, whole

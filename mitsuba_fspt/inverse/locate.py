@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import norm
 
-from ..images.detector import Exposure
+from ..images.exposure import Exposure
 from ..images.image import Image
 from ..runtime.errors import InversionError, renamed
 from ..runtime.numbers import number, whole

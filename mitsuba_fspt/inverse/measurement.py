@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..images.detector import Exposure
+from ..detector.reduction import measured, responses
+from ..images.exposure import Exposure
 from ..images.image import Image
-from ..images.reduction import measured, responses
 from ..runtime.errors import InversionError
 from ..runtime.numbers import number
 from .transport_matrix import TransportMatrix

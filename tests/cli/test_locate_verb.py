@@ -9,7 +9,7 @@ import pytest
 from cylinder_views import cylinder_views, exact
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.images.reduction import read_measured
+from mitsuba_fspt.detector.reduction import read_measured
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.tissue.phantom_file import PhantomFile
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.images.comparison import compare
-from mitsuba_fspt.images.detector import Detector
 from mitsuba_fspt.images.picture import title
 from mitsuba_fspt.images.regions import measure, region_mask
 from mitsuba_fspt.images.z_test import differences

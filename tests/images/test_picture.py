@@ -10,7 +10,7 @@ import pytest
 from PIL import Image as Picture
 
 from mitsuba_fspt.images import picture
-from mitsuba_fspt.images.detector import Exposure
+from mitsuba_fspt.images.exposure import Exposure
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.images.picture import caption, draw_panels, title, write_comparison_png, write_png
 from mitsuba_fspt.runtime.errors import BackendError, ImageError
@@ -274,7 +274,7 @@ def test_pictures_that_cannot_be_written(tmp_path, monkeypatch):
 
 
 def test_matplotlib_waits_until_it_is_needed():
-    imports = "import sys, mitsuba_fspt.images.picture, mitsuba_fspt.images.detector;"
+    imports = "import sys, mitsuba_fspt.images.picture, mitsuba_fspt.images.exposure, mitsuba_fspt.detector.detector;"
     found = subprocess.run(
         [sys.executable, "-c", imports + " print({'matplotlib', 'PIL'} & {*sys.modules})"],
         capture_output=True,

@@ -21,12 +21,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..images.exposure import Exposure, image_or_exposure
+from ..images.formats import Metadata, read_planes
+from ..images.image import Image
+from ..images.radiometry import PLANCK_TIMES_LIGHT
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from .counts import FITS, TIFF, Counts, counts_of, read_counts
-from .detector import PLANCK_TIMES_LIGHT, RECORDED, Detector, Exposure, image_or_exposure
-from .formats import Metadata, read_planes
-from .image import Image
+from .detector import RECORDED, Detector
 
 if TYPE_CHECKING:
     Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from mitsuba_fspt.images.detector import EXAMPLES, Detector
+from mitsuba_fspt.detector.detector import EXAMPLES, Detector
 from mitsuba_fspt.images.formats import read_planes
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.images.pixel_axes import PixelAxes

@@ -10,10 +10,10 @@ import pytest
 from small_scenes import camera_scene, disk
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.detector.detector import Detector
+from mitsuba_fspt.detector.reduction import calibrated, read_measured, reduced, responses
 from mitsuba_fspt.images.comparison import compare
-from mitsuba_fspt.images.detector import Detector
 from mitsuba_fspt.images.image import Image, read
-from mitsuba_fspt.images.reduction import calibrated, read_measured, reduced, responses
 from mitsuba_fspt.optics.thin_lens import Lens
 from mitsuba_fspt.optics.uniform_source import uniform_power
 from mitsuba_fspt.runtime.errors import DetectorError, ImageError
@@ -191,7 +191,7 @@ def test_files(tmp_path):
     (click / "ClickInfo.txt").write_text("Camera:\tIVIS\nLuminescent Exposure Seconds:\t60\n")
     pytest.importorskip("ccdproc")
     np.testing.assert_allclose(CCD.reduce(click, **SETTINGS).power, expected, atol=1e-22)
-    from mitsuba_fspt.images.counts import read_counts
+    from mitsuba_fspt.detector.counts import read_counts
 
     assert read_counts(click).exposure_time == 60
 
@@ -199,7 +199,7 @@ def test_files(tmp_path):
 def test_rows_of_fits_files(tmp_path):
     """ROWORDER = BOTTOM-UP turns the rows over, a binning that is not square is refused, and colour, too."""
     fits = pytest.importorskip("astropy.io.fits")
-    from mitsuba_fspt.images.counts import read_counts
+    from mitsuba_fspt.detector.counts import read_counts
 
     counts = np.arange(12, dtype=np.uint16).reshape(3, 4)
     for order, rows in (("TOP-DOWN", counts), ("BOTTOM-UP", counts[::-1])):
@@ -234,7 +234,7 @@ def test_images_of_this_package_are_no_counts(tmp_path, suffix):
 def test_click_info_of_the_luminescent_image(tmp_path):
     """Exposure and binning are those of its own section; photograph and bias frame, with others, come first."""
     tifffile = pytest.importorskip("tifffile")
-    from mitsuba_fspt.images.counts import read_counts
+    from mitsuba_fspt.detector.counts import read_counts
 
     tifffile.imwrite(tmp_path / "luminescent.TIF", np.full((4, 4), 1000, np.uint16))
     photo = "*** photographic image:\tphotograph.TIF\nBinning Factor:\t2\nExposure Time Sec:\t0.2\n"

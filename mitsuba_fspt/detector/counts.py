@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..images.formats import read_planes
 from ..runtime.errors import BackendError, ImageError
-from .formats import read_planes
 
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"

@@ -1,0 +1,133 @@
+"""One read-out of a detector: electrons and counts of every pixel, and their files."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ..runtime.atomic_files import atomic_path
+from ..runtime.errors import BackendError, DetectorError, ImageError
+from .formats import Metadata, read_planes, write_planes
+from .image import Image, image_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """One read-out of a detector.
+
+    Attributes
+    ----------
+    electrons : float32 array, shape (h, w) [e-], before the conversion to counts; at low light, read noise can make
+        them negative
+    counts : uint16 array, shape (h, w) [DN]
+    metadata : those of the image and the detector's parameters; `quantity` is electrons, `unit` e-
+    """
+
+    electrons: NDArray[np.float32]
+    counts: NDArray[np.uint16]
+    metadata: Metadata
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width (h, w) [pixels]."""
+        return self.electrons.shape  # type: ignore[return-value]
+
+    @property
+    def total(self) -> float:
+        """Sum over all pixels [e-]."""
+        return float(self.electrons.sum(dtype=np.float64))
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
+        """The electrons, shape (h, w) [e-], for `np.asarray(exposure)`."""
+        return np.array(self.electrons, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
+
+    def plot(self, axes: Axes | None = None, *, log: bool = False, limits: tuple[float, float] | None = None) -> Axes:
+        """Draw the electrons with colour bar and axes in mm; returns matplotlib's axes. See `Image.plot`."""
+        from .picture import plot_image
+
+        return plot_image(self, axes, log=log, limits=limits)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the electrons and the metadata; the suffix chooses the format, in an EXR the channel is `Y`.
+
+        Raises ImageError and BackendError as `Image.write`.
+        """
+        write_planes(path, {"electrons": self.electrons}, self.metadata)
+
+    def write_counts(self, path: str | os.PathLike[str]) -> None:
+        """Write the counts, unscaled, to a 16-bit greyscale PNG or TIFF; metadata as JSON in its description.
+
+        Raises
+        ------
+        ImageError : the suffix is neither .png nor .tif(f), or the file cannot be written.
+        BackendError : Pillow is not installed.
+        """
+        with self.counts_file(path):
+            pass
+
+    @contextmanager
+    def counts_file(self, path: str | os.PathLike[str]) -> Iterator[None]:
+        """Context manager that writes the file of `write_counts` before its block and renames it to `path` after it.
+
+        An exception in the block leaves `path` unchanged. Raises as `write_counts`.
+        """
+        path = Path(path)
+        if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+            raise ImageError(f"counts file '{path}': counts are written as PNG or TIFF. Give a .png or .tif.")
+        try:
+            from PIL import Image as Picture
+            from PIL.PngImagePlugin import PngInfo
+        except ImportError as cause:
+            raise BackendError(
+                "detector: Pillow, which writes counts, is not installed. pip install 'mitsuba-fspt[plot]'."
+            ) from cause
+        description = json.dumps(self.metadata | {"quantity": "counts", "unit": "DN"})
+        picture = Picture.fromarray(self.counts)
+        with atomic_path(path, ImageError) as temporary:
+            if path.suffix.lower() == ".png":
+                text = PngInfo()
+                text.add_text("Description", description)
+                picture.save(temporary, pnginfo=text)
+            else:
+                picture.save(temporary, description=description)
+            yield
+
+
+def read_image_or_exposure(path: str | os.PathLike[str]) -> Image | Exposure:
+    """Image [W] or exposure [e-] from a file that fspt wrote. Raises as `image.read` and `image_or_exposure`."""
+    return image_or_exposure(path, *read_planes(path))
+
+
+def image_or_exposure(
+    path: str | os.PathLike[str], planes: Mapping[str, NDArray], metadata: Metadata
+) -> Image | Exposure:
+    """What the planes and metadata of a file are: an image in W, or electrons, whose counts follow from the detector.
+
+    Raises
+    ------
+    ImageError : neither, or values that are not finite.
+    DetectorError : the metadata of electrons lack a number of the detector.
+    """
+    if "electrons" not in planes:
+        return image_of(path, planes, metadata)
+    electrons = planes["electrons"].astype(np.float32)
+    if not np.isfinite(electrons).all():
+        raise ImageError(f"image file '{path}' has electrons that are NaN or inf. Expose it again.")
+    if missing := [name for name in ("gain", "bias", "bits") if name not in metadata]:
+        raise DetectorError(
+            f"'{path}': the electrons come without '{missing[0]}'. Reduce the counts with 'fspt reduce'."
+        )
+    counts = np.rint(float(metadata["bias"]) + electrons / float(metadata["gain"]))
+    top = 2 ** int(metadata["bits"]) - 1
+    return Exposure(electrons, np.clip(counts, 0, top).astype(np.uint16), metadata)
