@@ -28,6 +28,7 @@ from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
+from ..runtime.wavelength import wavelength
 
 # Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
 # `pixel_pitch` is that of the pixels read out.
@@ -279,7 +280,7 @@ class Detector:
         ----------
         image : power [W], shape (h, w), monochromatic
         exposure_time : [s], 0 … 1e12 (0 gives a bias frame)
-        wavelength_nm : of the light in vacuum [nm], 1e-3 … 1e9
+        wavelength_nm : of the light in vacuum [nm], 200 … 2500
         binning : side of the square of pixels whose charge is summed before read-out, a divisor of h and w
         seed : of the shot and read noise, 0 … 2⁵³
 
@@ -351,12 +352,10 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
 
 
 def _time_and_wavelength(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
-    """Both as floats, or DetectorError. The bounds keep photons per watt finite: 0 W times infinity would be NaN."""
+    """Both as floats, or DetectorError. The bound keeps photons per watt finite: 0 W times infinity would be NaN."""
     time = number("detector: 'exposure_time'", exposure_time, DetectorError, "60")
-    wavelength = number("detector: 'wavelength_nm'", wavelength_nm, DetectorError, "650")
     _require("exposure_time", time, 0 <= time <= 1e12, "in 0 … 1e12 s, for example 60")
-    _require("wavelength_nm", wavelength, 1e-3 <= wavelength <= 1e9, "in 1e-3 … 1e9 nm, for example 650")
-    return time, wavelength
+    return time, wavelength("detector: 'wavelength_nm'", wavelength_nm, DetectorError)
 
 
 def _whole(name: str, value: int) -> int:

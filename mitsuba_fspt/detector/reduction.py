@@ -27,6 +27,7 @@ from ..images.image import Image
 from ..images.radiometry import PLANCK_TIMES_LIGHT
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
+from ..runtime.wavelength import wavelength
 from .counts import FITS, TIFF, Counts, counts_of, read_counts
 from .detector import RECORDED, Detector
 
@@ -59,13 +60,12 @@ class Exposed:
     pixel_pitch: float | None = None
 
     def __post_init__(self) -> None:
-        for name, example, least, most in (("exposure_time", "60", 0, 1e12), ("wavelength_nm", "650", 1e-3, 1e9)):
-            value = number(f"reduce: '{name}'", getattr(self, name), DetectorError, example)
-            object.__setattr__(self, name, value)
-            if not (least <= value <= most and value > 0):
-                raise DetectorError(
-                    f"reduce: '{name}' must be > 0 and at most {most:g}, got {value:g}. Give {example}."
-                )
+        time = number("reduce: 'exposure_time'", self.exposure_time, DetectorError, "60")
+        if not 0 < time <= 1e12:
+            raise DetectorError(f"reduce: 'exposure_time' must be > 0 and at most 1e12 s, got {time:g}. Give 60.")
+        object.__setattr__(self, "exposure_time", time)
+        nanometres = wavelength("reduce: 'wavelength_nm'", self.wavelength_nm, DetectorError)
+        object.__setattr__(self, "wavelength_nm", nanometres)
         if self.binning is not None:
             sides = whole("reduce: 'binning'", self.binning, DetectorError, "1")
             object.__setattr__(self, "binning", sides)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..optics.pixel_etendue import pixel_etendues
 from ..optics.thin_lens import Lens, number_names
 from ..runtime.errors import ImageError, OpticsError
-from ..runtime.numbers import number
+from ..runtime.wavelength import wavelength
 from .formats import Metadata, write_planes
 from .image import Image
 from .pixel_axes import PixelAxes
@@ -51,9 +51,11 @@ class Converted:
 
 
 def require_unit(unit: str, wavelength_nm: float | None) -> None:
-    """Raise ImageError for a unit that does not exist, and for a wavelength with watts."""
+    """Raise ImageError for a unit that does not exist, a wavelength outside 200 … 2500 nm, or one with watts."""
     if unit not in UNITS:
         raise ImageError(f"image: 'unit' must be one of {', '.join(UNITS)}, got '{unit}'. Give one of these.")
+    if wavelength_nm is not None:
+        wavelength("image: 'wavelength_nm'", wavelength_nm, ImageError)
     if unit == "W" and wavelength_nm is not None:
         raise ImageError(f"image: 'wavelength_nm' = {wavelength_nm:g} has no meaning for watts. Leave it out.")
 
@@ -66,21 +68,21 @@ def in_unit(image: Image, unit: str, wavelength_nm: float | None = None) -> Conv
 
     Raises
     ------
-    ImageError : there is no such unit; the wavelength is missing, not > 0, not the one that the image was rendered for,
-        or given for watts; the metadata do not describe the lens.
+    ImageError : there is no such unit; the wavelength is missing, not in 200 … 2500 nm, not the one that the image was
+        rendered for, or given for watts; the metadata do not describe the lens.
     """
     require_unit(unit, wavelength_nm)
     if unit == "W":  # without copies, to save memory
         return Converted(image.power, image.error, UNITS[unit], unit, None)
-    wavelength = wavelength_of(image, wavelength_nm)
-    factor: Plane | float = wavelength * 1e-9 / PLANCK_TIMES_LIGHT  # photons per joule
+    nanometres = wavelength_of(image, wavelength_nm)
+    factor: Plane | float = nanometres * 1e-9 / PLANCK_TIMES_LIGHT  # photons per joule
     if unit != "photons/s":
         etendues = etendue(image)
         inverse = np.divide(SQUARE_MM_PER_CM, etendues, out=np.zeros_like(etendues), where=etendues > 0)
         factor, unit = factor * inverse, RADIANCE
     quantity = "radiance" if unit == RADIANCE else UNITS[unit]
     error = None if image.error is None else (image.error * factor).astype(np.float64)
-    return Converted((image.power * factor).astype(np.float64), error, quantity, unit, wavelength)
+    return Converted((image.power * factor).astype(np.float64), error, quantity, unit, nanometres)
 
 
 def wavelength_of(image: Image, wavelength_nm: float | None) -> float:
@@ -88,16 +90,14 @@ def wavelength_of(image: Image, wavelength_nm: float | None) -> float:
 
     Raises
     ------
-    ImageError : there is none, it is not in 1e-3 … 1e9 nm, or the given one is not that of the filter.
+    ImageError : there is none, it is not in 200 … 2500 nm, or the given one is not that of the filter.
     """
     own = image.metadata.get("wavelength_nm")
     if wavelength_nm is None:
         if own is None:
             raise ImageError("image: photons need a wavelength, the image has none. Give wavelength_nm, say 660.")
-        return float(own)
-    found = number("image: 'wavelength_nm'", wavelength_nm, ImageError, "660")
-    if not 1e-3 <= found <= 1e9:
-        raise ImageError(f"image: 'wavelength_nm' must be in 1e-3 … 1e9 nm, got {found:g}. Give for example 660.")
+        return wavelength("image: 'wavelength_nm' of its metadata", own, ImageError)
+    found = wavelength("image: 'wavelength_nm'", wavelength_nm, ImageError)
     if own is not None and found != float(own):
         raise ImageError(
             f"image: 'wavelength_nm' = {found:g}, but the image was rendered for {float(own):g} nm, by its filter's "
@@ -111,7 +111,11 @@ def etendue(image: Image) -> Plane:
 
     Of an image that the integral computed with `pixel` = centre, it is that of the centres, as in the integral.
     """
-    known = image.metadata
+    return etendue_of(image.shape, image.metadata)
+
+
+def etendue_of(shape: tuple[int, int], known: Metadata) -> Plane:
+    """Étendue as of `etendue`, of an image of this shape (h, w) with the metadata `known`."""
     if missing := [name for name in ("focal_length", "f_number", "focus_distance", "pixel_pitch") if name not in known]:
         raise ImageError(
             f"image: its metadata have no '{missing[0]}', so that the étendue of its pixels is unknown. Give an image "
@@ -126,6 +130,6 @@ def etendue(image: Image) -> Plane:
         )
     except (OpticsError, ValueError) as cause:
         raise ImageError(f"image: its metadata describe no lens: {cause}") from cause
-    axes = PixelAxes.of(image.shape, known | {"magnification": lens.magnification})
+    axes = PixelAxes.of(shape, known | {"magnification": lens.magnification})
     passed, pixel = float(known.get("transmittance", 1.0)), str(known.get("pixel", "area"))
     return pixel_etendues(lens, axes.step, axes.x, axes.y, passed, pixel)

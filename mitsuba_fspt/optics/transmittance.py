@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import OpticsError
+from ..runtime.wavelength import LONGEST, SHORTEST, meant
+from ..runtime.wavelength import wavelength as checked
 
 NUMBERS = ("transmittance", "wavelength_nm")  # of `fspt_lens`
 
@@ -70,6 +72,11 @@ class Curve:
             )
         wavelengths, values = table[np.argsort(table[:, 0])].T
         _check(path, wavelengths, values)
+        if wavelengths[0] > LONGEST or wavelengths[-1] < SHORTEST:
+            raise OpticsError(
+                f"'transmittance_curve' = '{path}': wavelengths must be nm, of which {SHORTEST:g} … {LONGEST:g} are "
+                f"used, got {wavelengths[0]:g} … {wavelengths[-1]:g}. {meant(wavelengths[0])}"
+            )
         return cls(str(path), wavelengths, values)
 
     def at(self, wavelength_nm: float) -> float:
@@ -122,6 +129,7 @@ def transmittance_of(numbers: Mapping[str, float], curve: Curve | None) -> float
             raise OpticsError(f"'transmittance' = {given:g} and 'transmittance_curve' exclude each other. Give one.")
         if wavelength is None:
             raise OpticsError("'transmittance_curve' needs 'wavelength_nm'. Give it in nm, for example 660.")
+        wavelength = checked("'wavelength_nm'", wavelength, OpticsError)
         found, where = curve.at(wavelength), f" at {wavelength:g} nm in '{curve.file}'"
     if not 0 < found <= 1:
         raise OpticsError(f"'transmittance' must be > 0 and at most 1, got {found:g}{where}. Give for example 0.9.")

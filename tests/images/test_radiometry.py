@@ -116,7 +116,7 @@ def test_files_in_another_unit(tmp_path, suffix):
         ("lux", None, "'unit' must be one of W, photons/s, p/s/cm2/sr, got 'lux'"),
         ("W", 660, "'wavelength_nm' = 660 has no meaning for watts"),
         ("photons/s", None, "photons need a wavelength, the image has none"),
-        ("photons/s", -1, "'wavelength_nm' must be in 1e-3 … 1e9 nm, got -1"),
+        ("photons/s", -1, "'wavelength_nm' must be in 200 … 2500 nm, got -1"),
         ("photons/s", "red", "'wavelength_nm' must be a number, got 'red'"),
         ("p/s/cm2/sr", 660, "its metadata have no 'focal_length', so that the étendue"),
     ],

@@ -47,6 +47,7 @@ def test_no_value_beyond_the_curve(tmp_path, nm):
         ("500,-0.1\n", "must be in 0 … 1, got -0.1 at 500 nm"),
         ("500,nan\n", "must be in 0 … 1, got nan at 500 nm"),
         ("0,0.1\n", "wavelengths must be > 0 nm, got 0"),
+        ("0.5,0.2\n0.7,0.8\n", "are used, got 0.5 … 0.7. In µm it would be 500 nm: give that."),
         ("500,0.1\n500,0.2\n", "has 500 nm twice"),
     ],
 )
