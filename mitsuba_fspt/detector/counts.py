@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.formats import read_planes
+from ..images.tiff_pages import read_tiff
 from ..runtime.errors import BackendError, ImageError
+
+LOG = logging.getLogger("mitsuba_fspt")
 
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
@@ -68,13 +73,13 @@ def read_counts(path: str | os.PathLike[str]) -> Counts:
     if suffix in (*TIFF, *FITS):
         _require_counts(path)
     if suffix in TIFF:
-        array = _tiff(path)
+        array = read_tiff(path, f"counts '{path}'")
     elif suffix in FITS:
         array, exposure_time, binning = _fits(path)
     elif suffix == ".npy":
         try:
             array = np.load(path, allow_pickle=False)
-        except (ValueError, OSError, EOFError) as cause:
+        except Exception as cause:  # whatever a damaged file makes NumPy raise
             raise ImageError(f"counts '{path}' are no NPY file of numbers: {_line(cause)}. Save them again.") from cause
     else:
         raise ImageError(f"counts '{path}': '{suffix}' is not read. Give .tif, .fits, .npy or a click folder.")
@@ -109,35 +114,33 @@ def counts_of(array: Any, name: str) -> Counts:
     return Counts(stack) if stack.ndim == 2 else Counts(stack.mean(axis=0), len(stack), highest=stack.max(axis=0))
 
 
-def _tiff(path: Path) -> NDArray[Any]:
-    try:
-        import tifffile
-    except ImportError as cause:
-        raise BackendError(f"counts '{path}': tifffile is missing. pip install 'mitsuba-fspt[reduce]'.") from cause
-    try:
-        return tifffile.imread(path)
-    except Exception as cause:  # a damaged file raises anything
-        raise ImageError(f"counts '{path}' are no readable TIFF: {_line(cause)}. Copy the file again.") from cause
-
-
 def _fits(path: Path) -> tuple[NDArray[Any], float | None, int | None]:
     try:
         from astropy.io import fits
     except ImportError as cause:
         raise BackendError(f"counts '{path}': astropy is missing. pip install 'mitsuba-fspt[reduce]'.") from cause
     try:
-        with fits.open(path, memmap=False) as file:
+        with warnings.catch_warnings(record=True) as reports, fits.open(path, memmap=False) as file:
+            warnings.simplefilter("always")
             unit = next(unit for unit in file if unit.data is not None)
             keys = ("EXPTIME", "XBINNING", "YBINNING", "ROWORDER")
             time, sides, rows, order = (unit.header.get(key, file[0].header.get(key)) for key in keys)
             data = np.asarray(unit.data)
+            found_time = None if time is None else float(time)
+            found_sides = None if sides is None else int(sides)
     except Exception as cause:
         raise ImageError(f"counts '{path}' are no readable FITS: {_line(cause)}. Copy the file again.") from cause
+    texts = [_line(report.message) for report in reports]
+    for text in texts:
+        if "truncated" in text:  # astropy returns what there is
+            raise ImageError(f"counts '{path}' are an incomplete FITS: {text}. Copy the file again.")
+    if texts:
+        LOG.warning("fspt: counts '%s': astropy reports: %s. Check the picture.", path, texts[0])
     if None not in (sides, rows) and sides != rows:
         raise ImageError(f"counts '{path}' are binned {sides} x {rows}. Give counts of square binning.")
-    if str(order).strip().upper() == "BOTTOM-UP":
+    if str(order).strip().upper() == "BOTTOM-UP" and data.ndim > 1:
         data = np.flip(data, axis=-2)
-    return data, None if time is None else float(time), None if sides is None else int(sides)
+    return data, found_time, found_sides
 
 
 def _click(folder: Path) -> Counts:
@@ -145,12 +148,17 @@ def _click(folder: Path) -> Counts:
     files = {file.stem.lower(): file for file in sorted(folder.iterdir()) if file.is_file()}
     if CLICK not in files:
         raise ImageError(f"folder '{folder}' holds no luminescent.TIF. Give a click folder of an IVIS camera.")
-    found = {n: counts_of(_tiff(files[n]), str(files[n])).values for n in (BIAS, BACKGROUND) if n in files}
-    light = counts_of(_tiff(files[CLICK]), str(files[CLICK]))
+    found = {n: _picture(files[n]).values for n in (BIAS, BACKGROUND) if n in files}
+    light = _picture(files[CLICK])
     info = _click_info(files[INFO].read_text("utf-8", "replace")) if INFO in files else {}
     time, binning = _number(info, EXPOSURE), _number(info, BINNING)
     sides = None if binning is None else int(binning)
     return Counts(light.values, light.frames, found.get(BIAS), found.get(BACKGROUND), time, info, light.highest, sides)
+
+
+def _picture(file: Path) -> Counts:
+    """Counts of a TIFF of a click folder."""
+    return counts_of(read_tiff(file, f"counts '{file}'"), str(file))
 
 
 def _click_info(text: str) -> dict[str, str]:
@@ -185,5 +193,5 @@ def _number(info: dict[str, str], patterns: tuple[re.Pattern[str], ...]) -> floa
     return None
 
 
-def _line(cause: BaseException) -> str:
+def _line(cause: object) -> str:
     return " ".join(str(cause).split())[:200].rstrip(".") or type(cause).__name__

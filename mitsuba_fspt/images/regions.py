@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import ImageError
-from ..runtime.extras import require
 from .image import Image
 from .pixel_axes import PixelAxes
 from .radiometry import SQUARE_MM_PER_CM, in_unit
+from .tiff_pages import read_tiff
 from .z_test import is_deterministic
 
 Mask = NDArray[np.bool_]
@@ -153,13 +153,7 @@ def _mask_of_file(name: str) -> Mask:
     """Pixels of a TIFF file that are not 0."""
     if not os.path.isfile(name):
         raise ImageError(f"region '{name}': there is no such file. Give a mask, or {FORMS}.")
-    require("tifffile", f"region '{name}'")
-    import tifffile
-
-    try:
-        return np.asarray(tifffile.imread(name)) != 0
-    except Exception as cause:  # whatever a damaged file makes tifffile raise
-        raise ImageError(f"region '{name}' is damaged, or no TIFF file. Save it again.") from cause
+    return np.asarray(read_tiff(Path(name), f"region '{name}'")) != 0
 
 
 def _check_mask(image: Image, mask: Mask, what: str) -> None:

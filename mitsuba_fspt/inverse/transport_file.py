@@ -32,7 +32,7 @@ FORMAT = "fspt transport matrix 1"
 ARRAYS = ("values", "columns", "starts", "change", "row_error")
 IN_MEMORY = 2.25  # bytes of a matrix that is read, over those of its file, at the most
 KEPT_SHARE = 0.25  # of the free memory: a matrix up to that size stays in memory once it is read
-DAMAGED = (zipfile.BadZipFile, KeyError, ValueError, EOFError, OSError, json.JSONDecodeError)
+KINDS = {"columns": "iu", "starts": "iu"}  # of the numbers in the arrays, all others are floats
 
 
 def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
@@ -58,15 +58,15 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
                     f"transport matrix '{path}' has the format {meta.get('format')!r}, this version reads '{FORMAT}'. "
                     "Make it again with 'fspt matrix'."
                 )
-            areas, sensitivity = file["areas"], file["sensitivity"]
+            areas, sensitivity = (_numbers(file[name], name, meta["columns"]) for name in ("areas", "sensitivity"))
             missing = [f"{_name(k, a)}" for k in range(len(meta["views"])) for a in ARRAYS if _name(k, a) not in file]
-    except DAMAGED as cause:
-        if isinstance(cause, TransportError):
-            raise
+        if missing:
+            raise KeyError(missing[0])
+        return TransportMatrix(FileBlocks(path, meta), meta, areas, sensitivity)
+    except (TransportError, MemoryError):
+        raise
+    except Exception as cause:  # whatever a damaged file makes the libraries raise
         raise _damaged(path, cause) from cause
-    if missing:
-        raise _damaged(path, KeyError(missing[0]))
-    return TransportMatrix(FileBlocks(path, meta), meta, areas, sensitivity)
 
 
 def is_transport(path: Path) -> bool:
@@ -117,10 +117,12 @@ class FileBlocks(Sequence[Block]):
         try:
             with opened(self._path) as file:
                 arrays = {name: file[_name(number, name)] for name in ARRAYS}
-        except DAMAGED as cause:
+            _, height, width = self._meta["image_shape"]
+            block = _block((height, width), int(self._meta["columns"]), arrays)
+        except MemoryError:
+            raise
+        except Exception as cause:  # whatever a damaged file makes the libraries raise
             raise _damaged(self._path, cause) from cause
-        _, height, width = self._meta["image_shape"]
-        block = _block((height, width), int(self._meta["columns"]), arrays)
         if self._kept is not None:
             self._kept[number] = block
         return block
@@ -157,8 +159,30 @@ def _stored(block: Block) -> dict[str, Any]:
 
 
 def _block(shape: tuple[int, int], count: int, arrays: Mapping[str, NDArray[Any]]) -> Block:
-    """The view of these stored arrays."""
-    return Block(shape, count, **{**arrays, "columns": arrays["columns"].astype(np.int32, copy=False)})
+    """The view of these stored arrays; ValueError where they do not fit each other."""
+    entries, rows = len(arrays["values"]), shape[0] * shape[1]
+    lengths = dict.fromkeys(ARRAYS, entries) | {"starts": rows + 1, "row_error": rows}
+    checked = {name: _numbers(arrays[name], name, length, KINDS.get(name, "f")) for name, length in lengths.items()}
+    starts, columns = checked["starts"].astype(np.int64), checked["columns"]
+    if starts[0] != 0 or starts[-1] != entries or (np.diff(starts) < 0).any():
+        raise ValueError("starts of rows beyond the entries")
+    if entries and not 0 <= columns.min() <= columns.max() < count:  # SciPy would read beyond the end of J
+        raise ValueError(f"entries in columns up to {columns.max()} of {count}")
+    return Block(shape, count, **{**checked, "columns": columns.astype(np.int32, copy=False)})
+
+
+def _stored_block(file: Any) -> Block:
+    """The view of an opened file of one view, see `PartialFile`; raises anything for a damaged one."""
+    height, width, count = (int(n) for n in file["shape"])
+    return _block((height, width), count, {name: file[name] for name in ARRAYS})
+
+
+def _numbers(array: Any, name: str, length: int, kinds: str = "f") -> NDArray[Any]:
+    """`array` if it has so many numbers of these kinds of NumPy's; else ValueError."""
+    array = np.asarray(array)  # NumPy returns a member that is no array as bytes
+    if array.shape != (length,) or array.dtype.kind not in kinds:
+        raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {length} numbers")
+    return array
 
 
 def _name(number: int, array: str) -> str:
@@ -188,8 +212,8 @@ class PartialFile(Sequence[Block]):
         """True if a view of this fingerprint is there, whole."""
         try:
             with opened(self._view(number)) as file:
-                return str(file["fingerprint"]) == fingerprint and all(name in file for name in (*ARRAYS, "shape"))
-        except DAMAGED:
+                return str(file["fingerprint"]) == fingerprint and bool(_stored_block(file))
+        except Exception:  # whatever a damaged file makes the libraries raise
             return False
 
     def put(self, number: int, block: Block, fingerprint: str) -> None:
@@ -210,8 +234,7 @@ class PartialFile(Sequence[Block]):
         if not 0 <= number < self.views:
             raise IndexError(number)
         with opened(self._view(number)) as file:
-            height, width, count = (int(n) for n in file["shape"])
-            return _block((height, width), count, {name: file[name] for name in ARRAYS})
+            return _stored_block(file)
 
     def __iter__(self) -> Iterator[Block]:
         return (self[number] for number in range(self.views))

@@ -309,9 +309,10 @@ class Frame:
         """
         u, v = self.focal_length * (1 + 1 / magnification), self.focal_length * (1 + magnification)
         pupil = self.focal_length / self.f_number / 2
-        axis, radius = u + self.outline.radius, self.outline.radius
-        across = radius / math.sqrt(axis**2 - radius**2) + pupil * (1 / u - 1 / axis)
-        depths = axis - self.outline.radii
+        radius = self.outline.radius
+        axis = u + radius
+        across = radius / math.sqrt(u * (u + 2 * radius)) + pupil * (1 / u - 1 / axis)
+        depths = u + (radius - self.outline.radii)  # > 0 however far a vertex lies
         up = float((self.outline.heights / depths + pupil * (1 / u - 1 / depths)).max())
         half = {name: pixels * self.pixel_pitch / 2 for name, pixels in self.film.items()}
         return v * max(across / half["width"], up / half["height"])

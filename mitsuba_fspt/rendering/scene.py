@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..runtime import backend
 from ..runtime.errors import SceneError
 from ..runtime.interrupt import ctrl_c_noted
+from ..runtime.ply_file import require_whole
 from .provenance import remember_defaults, remember_placements, remember_source
 from .scene_rules import check_text
 from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
@@ -172,8 +173,21 @@ def _set_up(state: mi.parser.ParserState, path: Path, parameters: Mapping[str, o
     root["embree_use_robust_intersections"] = True
     root.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in _texts(parameters).items())]))
     _refuse_colours(path, state)
+    _require_whole_meshes(state)
     _name_children(state)
     _set_film_formats(state)
+
+
+def _require_whole_meshes(state: mi.parser.ParserState) -> None:
+    """Raise SceneError for a PLY that ends early, or is damaged such that Mitsuba would read beyond its vertices."""
+    import mitsuba as mi
+
+    for node in state.nodes:
+        props = node.props
+        if props.plugin_name() == "ply" and "filename" in props:
+            used, name = props.was_queried("filename"), str(props["filename"])
+            props.mark_queried("filename", used)  # as before this look-up
+            require_whole(Path(str(mi.file_resolver().resolve(name))), SceneError)
 
 
 def _placements(state: mi.parser.ParserState) -> dict[str, Array]:

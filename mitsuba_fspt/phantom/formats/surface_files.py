@@ -94,7 +94,7 @@ def _plain_off(path: Path) -> RawMesh | None:
     if not triangles or len(numbers) != 3 + 3 * points + 4 * triangles:
         return None
     cells = numbers[3 + 3 * points :].reshape(-1, 4)
-    if not np.array_equal(cells, np.floor(cells)) or (cells[:, 0] != 3).any():
+    if not np.array_equal(cells, np.floor(cells)) or (cells[:, 0] != 3).any() or not np.isfinite(cells).all():
         return None
     return RawMesh(numbers[3 : 3 + 3 * points].reshape(-1, 3), cells[:, 1:].astype(np.int64), path.name)
 
@@ -135,7 +135,9 @@ def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
 
     require_file(path)
     try:
-        mesh = trimesh.load_scene(path, process=False, **options).to_mesh()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # NumPy's at a corner that is no number
+            mesh = trimesh.load_scene(path, process=False, **options).to_mesh()
         count = len(mesh.faces)
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause

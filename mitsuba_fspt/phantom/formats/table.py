@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterable
 from io import StringIO
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,40 +191,34 @@ def _load_numpy(path: Path) -> NDArray | dict[str, NDArray]:
     try:
         with path.open("rb") as file:
             loaded = np.load(file, allow_pickle=False)
-            return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
+            if isinstance(loaded, np.ndarray):
+                return loaded
+            return {name: np.asarray(loaded[name]) for name in loaded.files}  # a member that is no array is bytes
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
-    except (ValueError, EOFError, BadZipFile) as cause:
+    except Exception as cause:  # whatever a damaged file makes NumPy raise
         raise FluxError(
             f"'{path}' cannot be read as a NumPy file: {one_line(cause)}. Save it anew by numpy.save."
         ) from cause
 
 
 def _read_mat(path: Path) -> dict[str, NDArray]:
-    """Variables of a MATLAB file by name; the member phi of a struct data is named data.phi."""
+    """Variables of a MATLAB file that are numbers, by name; the member phi of a struct data is named data.phi."""
     try:
-        from scipy.io import loadmat
-        from scipy.io.matlab import MatReadError
-        from scipy.sparse import issparse
+        import scipy.io  # noqa: F401
     except ImportError as cause:
         raise BackendError(
             "flux import: SciPy, which reads .mat files, is not installed. pip install 'mitsuba-fspt[tissue]'."
         ) from cause
-    try:
-        variables = loadmat(path, squeeze_me=False)
-    except NotImplementedError as cause:  # MATLAB 7.3 is HDF5
-        raise FluxError(f"'{path}' is a MATLAB 7.3 file. Save it with save(..., '-v7').") from cause
-    except (OSError, ValueError, MatReadError) as cause:
-        raise FluxError(f"'{path}' cannot be read as a MATLAB file: {one_line(cause)}. Save it anew.") from cause
-    arrays: dict[str, Any] = {}
-    for name, value in variables.items():
-        if name.startswith("__"):
-            continue
-        if not issparse(value) and value.dtype.names and value.size == 1:
-            arrays |= {f"{name}.{member}": value[member].item() for member in value.dtype.names}
-        else:
-            arrays[name] = value
-    return {name: value.toarray() if issparse(value) else np.asarray(value) for name, value in arrays.items()}
+    require_file(path)
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "arrays.npz"
+        program = [sys.executable, str(Path(__file__).with_name("mat_to_npz.py")), str(path), str(target)]
+        done = subprocess.run(program, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return {name.removeprefix("_"): array for name, array in read_npz(target).items()}
+    reason = done.stderr.strip().split("\n")[-1] if done.returncode == 1 else "SciPy crashes at it. Save it anew"
+    raise FluxError(f"'{path}' cannot be read as a MATLAB file: {reason}.")
 
 
 def require_file(path: Path) -> None:
