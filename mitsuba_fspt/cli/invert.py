@@ -36,6 +36,9 @@ def invert(
         str,
         typer.Option(help="smooth, or mlem: without penalty and intervals.", autocompletion=lambda: ["smooth", "mlem"]),
     ] = "smooth",
+    crease_angle: Annotated[
+        float, typer.Option(help="Angle of an edge [degree] above which J_n is not smoothed across it; 180: none.")
+    ] = 45.0,
     scene: Annotated[Path | None, typer.Option(metavar="SCENE.xml", help="Scene of T.npz, where it has moved.")] = None,
     report: Annotated[Path | None, typer.Option(help="Also a picture of images, residuals and J_n, .png.")] = None,
     as_json: AsJson = False,
@@ -64,6 +67,7 @@ def invert(
             seed=seed,
             confidence=confidence,
             method=method,
+            crease_angle=crease_angle,
             scene=scene,
             progress=progress,
         )
@@ -81,8 +85,9 @@ def _text(found: Inversion, output: Path) -> str:
     if "total_interval" in numbers:
         low, high = numbers["total_interval"]
         total += f" ({100 * found.confidence:g} %: {low:.5g} to {high:.5g} W)"
+    left_out = f" ({100 * numbers['left_out']:.2g} % of it, seen in part, left out)" if numbers["left_out"] else ""
     return (
-        f"{output}: {total} from the {100 * numbers['seen']:.3g} % of the surface that is seen, peak "
+        f"{output}: {total} from the {100 * numbers['seen']:.3g} % of the surface that is seen{left_out}, peak "
         f"{numbers['peak']:.4g} W/mm^2\n"
         f"chi2 {found.chi2:.3g} over {found.pixels} pixels, weight {found.weight:.3g} mm^2"
     )

@@ -3,7 +3,8 @@
     J_n at a vertex = Σ_k ψ_k c_k,   ψ >= 0,   Σ_k ψ_k = 1,   c_k = J_n at the k-th of the vertices chosen (Eq. M.30)
 
 The vertices chosen, no two of which are neighbours, have all others around them, and three of them that are next to
-each other are a triangle, in which the others get their barycentric coordinates.
+each other are a triangle, in which the others get their barycentric coordinates. Vertices on a crease lie between such
+of the same crease.
 """
 
 from __future__ import annotations
@@ -12,16 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 
+from .creases import CORNER, CREASE
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-def coarser(graph: csr_array, points: Array) -> tuple[csr_array, csr_array, Index]:
+def coarser(graph: csr_array, points: Array, kinds: Index | None = None) -> tuple[csr_array, csr_array, Index]:
     """ψ (n, k), the graph of the k vertices chosen, and which ones they are; k is n/2 to n/4.
 
-    graph : (n, n) entries > 0 for neighbours;  points : (n, 3) [mm]
+    graph : (n, n) entries > 0 for neighbours;  points : (n, 3) [mm];  kinds : (n,) see `creases`; None: no crease
     """
-    own, root = _aggregates(graph, points)
+    kinds = np.zeros(len(points), np.int64) if kinds is None else kinds
+    own, root = _aggregates(graph, points, kinds)
     size, count = len(own), int(root.sum())
     sums = csr_array((np.ones(size), (np.arange(size), own)), shape=(size, count))
     between = csr_array(sums.T @ graph @ sums)
@@ -32,6 +36,11 @@ def coarser(graph: csr_array, points: Array) -> tuple[csr_array, csr_array, Inde
     alone = ~np.isin(own, corners) & ~root  # around it are no three of them: it stays as it is
     chosen = np.concatenate([chosen, np.flatnonzero(alone)])
     columns, shares = _coordinates(points, points[chosen], own, corners)
+    creased = kinds == CREASE
+    shares[creased] *= kinds[chosen][columns[creased]] >= CREASE
+    total = shares.sum(axis=1)
+    columns[total <= 0, 0], shares[total <= 0, 0] = own[total <= 0], 1.0
+    shares /= shares.sum(axis=1, keepdims=True)
     number = np.full(size, -1)
     number[chosen] = np.arange(len(chosen))
     single = number >= 0
@@ -51,25 +60,28 @@ def neighbours(corners: Index, size: int) -> csr_array:
     return csr_array(both - diags_array(both.diagonal()))
 
 
-def _aggregates(graph: csr_array, points: Array) -> tuple[Index, NDArray[np.bool_]]:
+def _aggregates(graph: csr_array, points: Array, kinds: Index) -> tuple[Index, NDArray[np.bool_]]:
     """(n,) number of the chosen vertex that each belongs to, the nearest of its neighbours; and which are chosen.
 
     Chosen are the vertices of the highest random number among their neighbours that still wait (M. Luby, SIAM J.
-    Comput. 15, 1036, 1986).
+    Comput. 15, 1036, 1986), those on creases first, and all corners of creases. A vertex on a crease belongs to one on
+    a crease.
     """
     size = graph.shape[0]
     rows, columns = np.repeat(np.arange(size), np.diff(graph.indptr)), graph.indices
-    number = np.random.default_rng(0).permutation(size).astype(np.float64)
-    root, waiting = np.zeros(size, bool), np.ones(size, bool)
+    number = np.random.default_rng(0).permutation(size) + float(size) * kinds
+    takes = kinds[rows] >= kinds[columns]  # the vertex `rows`, once chosen, may have `columns` belong to it
+    root, waiting = kinds == CORNER, kinds != CORNER
+    waiting[columns[root[rows] & takes]] = False
     while waiting.any():
         highest = np.full(size, -1.0)
         np.maximum.at(highest, rows, np.where(waiting, number, -1.0)[columns])
         new = waiting & (number > highest)
         root |= new
         waiting &= ~new
-        waiting[columns[new[rows]]] = False
+        waiting[columns[new[rows] & takes]] = False
     own = np.cumsum(root) - 1
-    beside = root[columns] & ~root[rows]
+    beside = root[columns] & ~root[rows] & (kinds[columns] >= kinds[rows])
     way = np.linalg.norm(points[rows[beside]] - points[columns[beside]], axis=1)
     order = np.lexsort((-way, rows[beside]))  # the last one written is the nearest
     own[rows[beside][order]] = own[columns[beside][order]]

@@ -35,7 +35,8 @@ class Inversion:
     matrix, surface : the transport matrix and its mesh
     solution : (n,) J_n [W/mm²] on all columns, also those that are not seen, where it continues the others smoothly
     draws : (n, samples) random draws of it [W/mm²]
-    seen : (n,) bool, sensitivity per area at least 1 % of the largest
+    seen : (n,) bool, sensitivity per area at least 1 % of the largest, and pixels see at least half of the area
+    left_out : [mm²], area of the vertices that are not `seen` only because pixels see less than half of their area
     confidence : of the intervals
     weight, reference : of the penalty on roughness [mm²], [W/mm²] (Eq. M.23)
     determined : number γ of unknowns that the data determine
@@ -52,6 +53,7 @@ class Inversion:
     solution: Array
     draws: Array
     seen: NDArray[np.bool_]
+    left_out: float
     confidence: float
     weight: float
     reference: float
@@ -149,6 +151,7 @@ class Inversion:
             "total": self.total,
             "unit": "W",
             "seen": float(areas[self.seen].sum() / areas.sum()),
+            "left_out": float(self.left_out / areas.sum()),
             "peak": float(self.solution[self.seen].max()),
             "chi2": self.chi2,
             "pixels": self.pixels,

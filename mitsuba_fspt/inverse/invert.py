@@ -26,11 +26,13 @@ from .measurement import LOG, Measurement, tell_misfit
 from .mlem import MlemAccuracy, mlem
 from .multipliers import Multipliers
 from .nonnegative import Accuracy, Solve, factor, minimise
+from .seen_area import seen_share
 from .smoothness import Prior, Smoothness
-from .surface import Surface
+from .surface import CREASE_ANGLE, Surface
 from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
+MOST = 0.5  # of the area of a vertex: with less of it seen, J_n there says little about its power
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ def invert(
     seed: int = 0,
     confidence: float = 0.9,
     method: str = "smooth",
+    crease_angle: float = CREASE_ANGLE,
     scene: object = None,
     progress: Progress | None = None,
     settings: Settings | None = None,
@@ -101,8 +104,7 @@ def invert(
     Parameters
     ----------
     matrix : of `transport` or `read_transport`
-    images : one Image, Exposure or name of a file of either per view, in the order of the views; or an array of powers
-        (views, h, w) [W] together with `error`
+    images : one Image, Exposure or file of either per view, in their order; or powers (views, h, w) [W] with `error`
     error : standard error of the power [W], a number or (views, h, w); None: the noise stated by the images
     mask : (views, h, w), True for pixels to leave out, in addition to those that the images mask
     weight : of the penalty on roughness [mm²], >= 0; None: the weight that agrees with the roughness found (Eq. M.25)
@@ -111,6 +113,7 @@ def invert(
     samples, seed : number of random draws, from which the intervals follow (0: none), and their seed, 0 … 2⁵³
     confidence : of the intervals, in (0, 1)
     method : 'smooth', with the penalty; or 'mlem', maximum likelihood without penalty and intervals (Eq. M.28)
+    crease_angle : [degree], 0 … 180: J_n is not smoothed across edges of a larger one, such as a rim; 180: across all
     scene : scene with the meshes of the matrix, where its own cannot be read any more
     progress : function of the present step (text) and the share done (0 … 1); None: a bar in notebooks
     settings : accuracy
@@ -122,19 +125,25 @@ def invert(
     TransportError, DetectorError : images that do not fit the matrix, counts without their detector's numbers.
     ImageError : a file of an image cannot be read.
     """
-    if not isinstance(matrix, TransportMatrix):
-        raise InversionError(
-            f"invert: the first argument must be a transport matrix, got {type(matrix).__name__}. Make one with "
-            "fspt.transport, or read one with fspt.read_transport."
-        )
-    options = Options(weight, samples, seed, confidence, method)
+    _require_matrix(matrix)
+    options = Options(weight, samples, seed, confidence, method, crease_angle)
     measurement = Measurement.of(matrix, images, error, mask, gain_error)
-    problem = Problem.of(matrix, measurement, Surface.of(matrix, scene), prior or Prior(), settings or Settings())
+    surface = replace(Surface.of(matrix, scene), crease_angle=options.crease_angle)
+    problem = Problem.of(matrix, measurement, surface, prior or Prior(), settings or Settings())
     with reported(progress) as report:
         found = problem.solved(options, report)
     tell_misfit("invert", found.chi2_sum, found.pixels - found.determined)
     _report_unconverged(found, problem.settings.rounds)
     return found
+
+
+def _require_matrix(matrix: object) -> None:
+    """Raise InversionError where it is no transport matrix."""
+    if not isinstance(matrix, TransportMatrix):
+        raise InversionError(
+            f"invert: the first argument must be a transport matrix, got {type(matrix).__name__}. Make one with "
+            "fspt.transport, or read one with fspt.read_transport."
+        )
 
 
 @dataclass(frozen=True)
@@ -146,8 +155,16 @@ class Options:
     seed: int
     confidence: float
     method: str = "smooth"
+    crease_angle: float = CREASE_ANGLE
 
     def __post_init__(self) -> None:
+        angle = number("invert: 'crease_angle'", self.crease_angle, InversionError, "45")
+        if not 0 <= angle <= 180:
+            raise InversionError(
+                f"invert: 'crease_angle' must be in 0 … 180 degrees, got {angle:g}. Give 45, or 180 to smooth across "
+                "all edges."
+            )
+        object.__setattr__(self, "crease_angle", angle)
         if self.method not in ("smooth", "mlem"):
             raise InversionError(f"invert: 'method' must be 'smooth' or 'mlem', got {self.method!r}. Give one of them.")
         if self.method == "mlem" and (self.samples or self.weight):
@@ -438,7 +455,8 @@ class Problem:
         solution = spread @ fit.x
         areas = self.surface.point_areas
         per_area = self.sensitivity / np.where(areas > 0, areas, np.inf)
-        seen = per_area >= self.settings.seen * per_area.max()
+        lit = per_area >= self.settings.seen * per_area.max()
+        seen = lit & (seen_share(self.surface, self.sensitivity, self.settings.seen) >= MOST)
         fitted = (self.matrix @ solution).reshape(self.matrix.image_shape)
         residual = (self.measurement.power[self.rows] - self.transport @ fit.x) / fit.sigma
         sigma = np.full(self.matrix.shape[0], np.nan)
@@ -450,6 +468,7 @@ class Problem:
             solution=solution,
             draws=np.asarray(spread @ draws),
             seen=seen[self.surface.number] & self.matrix.seen,
+            left_out=float(areas[lit & ~seen].sum()),
             confidence=options.confidence,
             weight=fit.weight,
             reference=self.reference,

@@ -49,7 +49,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Smoothness:
-    """½ weight ∫ ((κ² − Δ)(J_n − mean)/ρ)² dS (Eq. M.23), without its weight, on the unknowns of a surface.
+    """½ weight ∫ ((κ² − Δ)(J_n − mean)/ρ)² dS (Eq. M.23, M.32), without its weight, on the unknowns of a surface.
 
     root : (m, m) [mm⁻¹], R with ‖R x‖² = ∫ ((κ² − Δ) x/r)² dS for x = (J_n − mean)/reference, r = ρ/reference
     matrix : (m, m) RᵀR [mm⁻²]
@@ -61,10 +61,9 @@ class Smoothness:
     @classmethod
     def of(cls, surface: Surface, correlation_length: float | None, relative: Array | float = 1.0) -> Smoothness:
         """Penalty with κ = 1/`correlation_length` [1/mm], or κ = 0 for None, and r = `relative` (m,) > 0."""
-        areas = surface.areas
-        mass = np.where(areas > 0, areas, areas.max())
+        rough, mass = surface.roughness
         kappa = 0.0 if correlation_length is None else 1 / correlation_length
-        operator = surface.stiffness + diags_array(kappa**2 * mass)
+        operator = rough + kappa**2 * diags_array(mass * (np.diff(rough.indptr) > 0))
         root = csr_array(diags_array(1 / (np.sqrt(mass) * relative)) @ operator)
         matrix = csr_array(root.T @ root)
         ridge = RIDGE * float(np.median(matrix.diagonal() / mass))

@@ -19,6 +19,7 @@ from ..rendering.scene import load
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, SceneError
 from .coarse_basis import coarser, neighbours
+from .creases import CREASE, Creases
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 SLIVER = 1e-6  # least sine of an angle: a triangle flatter than that counts as if it had this one
 LEAST = 500  # unknowns that are not made fewer
+CREASE_ANGLE = 45.0  # degrees
 AREA_TOLERANCE = 1e-3  # relative: float32 positions may change an area of the mesh by so much
 
 
@@ -40,6 +42,9 @@ class Surface:
     number : (n,) the point of each column: coincident vertices of one mesh are one point
     basis : (points, m) the functions ψ of the m unknowns at the points (Eq. M.30); None: each point is an unknown
     scales : shape id → length in the scene [mm] of a length of 1 in the file, where that is not 1
+    crease_angle : [degree] between the normals of two faces, above which J_n is not smoothed across their edge
+    kinds : (m,) of the unknowns, see `creases`; None where they are the points
+    nodes : with J_n on faces and a basis: the surface on vertices that has the same unknowns
     """
 
     vertices: Array
@@ -49,6 +54,9 @@ class Surface:
     number: NDArray[np.int64]
     basis: csr_array | None = None
     scales: Mapping[str, float] = field(default_factory=dict)
+    crease_angle: float = CREASE_ANGLE
+    kinds: NDArray[np.int64] | None = None
+    nodes: Surface | None = None
 
     @classmethod
     def of(cls, matrix: TransportMatrix, scene: object = None) -> Surface:
@@ -130,29 +138,78 @@ class Surface:
     @cached_property
     def stiffness(self) -> csr_array:
         """(m, m) of −Δ: ∫ ∇ψ_i · ∇ψ_j dS for vertices (Eq. M.22); over faces, lengths of edges over distances."""
-        found = self._of_faces() if self.on == "face" else self._of_vertices()
-        return found if self.basis is None else csr_array(self.basis.T @ found @ self.basis)
+        if self.nodes is not None:
+            return self.nodes.stiffness
+        return self._on_unknowns(self._of_faces() if self.on == "face" else self._of_vertices())
+
+    @cached_property
+    def roughness(self) -> tuple[csr_array, Array]:
+        """Operator R (m, m) and measure μ (m,) of −Δ J_n = R J_n/μ at the unknowns (Eq. M.32).
+
+        Off the creases R is the stiffness and μ the area [mm²]. On a crease they are those of the second derivative
+        along it, times the length [mm] of the crease that belongs to the unknown, so that μ is an area, too. Where
+        creases meet or bend away there is none: rows of 0.
+        """
+        if self.nodes is not None:
+            return self.nodes.roughness
+        kinds, ways = self._kinds_and_ways
+        if self.kinds is not None:
+            kinds = self.kinds
+        on, off = (kinds == CREASE).astype(float), (kinds < CREASE).astype(float)
+        inverse = ways.copy()
+        inverse.data = 1 / np.maximum(inverse.data, np.finfo(float).tiny)
+        along = self._on_unknowns(csr_array(diags_array(inverse.sum(axis=1)) - inverse))
+        length = np.asarray(ways.sum(axis=1)) / 2
+        length = length if self.basis is None else np.asarray(self.basis.T @ length)
+        mass = np.where(self.areas > 0, self.areas, self.areas.max())
+        operator = diags_array(off) @ self.stiffness + diags_array(on * length) @ along
+        operator.eliminate_zeros()
+        return csr_array(operator), np.where(kinds == CREASE, length**2, mass)
+
+    def _on_unknowns(self, operator: csr_array) -> csr_array:
+        """The operator (points, points) on the unknowns, (m, m)."""
+        return operator if self.basis is None else csr_array(self.basis.T @ operator @ self.basis)
+
+    @cached_property
+    def creases(self) -> Creases:
+        """Creases of the meshes."""
+        if self.on == "vertex":
+            corners, size = self._corners, self.points
+        else:
+            places, corners = merge(self.vertices, self.faces)
+            size = len(places)
+        return Creases(corners, self.vertices[self.faces], size, self.crease_angle)
+
+    @cached_property
+    def _kinds_and_ways(self) -> tuple[NDArray[np.int64], csr_array]:
+        """Kind of each point (points,), and ways [mm] between neighbours along creases (points, points)."""
+        return self.creases.of_faces() if self.on == "face" else self.creases.of_vertices()
 
     def coarser(self) -> list[Surface]:
         """This surface, and the same with fewer and fewer unknowns, a half to a quarter each time, to some hundred.
 
         Of J_n on faces the second has its unknowns on the vertices, whose mean is that of a face.
         """
-        found = [self]
         if self.on == "face":
             places, corners = merge(self.vertices, self.faces)
+            number = np.empty(len(self.vertices), np.int64)
+            number[self.faces] = corners
+            whole = replace(self, on="vertex", number=number, kinds=None)
             entries = np.full(corners.size, 1 / 3), (np.repeat(np.arange(len(corners)), 3), corners.ravel())
-            found.append(replace(self, basis=csr_array(entries, shape=(len(corners), len(places)))))
-        else:
-            places, corners = np.empty((self.points, 3)), self._corners
-            places[self.number] = self.vertices
-        graph = neighbours(corners, len(places))
+            mean = csr_array(entries, shape=(len(corners), len(places)))
+            levels = whole.coarser()
+            bases = [mean if one.basis is None else csr_array(mean @ one.basis) for one in levels]
+            return [self, *(replace(self, basis=b, nodes=one) for b, one in zip(bases, levels, strict=True))]
+        found, kinds = [self], self._kinds_and_ways[0]
+        places = np.empty((self.points, 3))
+        places[self.number] = self.vertices
+        graph = neighbours(self._corners, len(places))
         while len(places) > LEAST:
-            basis, graph, chosen = coarser(graph, places)
+            basis, graph, chosen = coarser(graph, places, kinds)
             if len(chosen) > 0.7 * len(places):  # pieces of few vertices, which stay as they are
                 break
-            places, finer = places[chosen], found[-1].basis
-            found.append(replace(self, basis=basis if finer is None else csr_array(finer @ basis)))
+            places, kinds, finer = places[chosen], kinds[chosen], found[-1].basis
+            found.append(replace(self, basis=basis if finer is None else csr_array(finer @ basis), kinds=kinds))
         return found
 
     @property
