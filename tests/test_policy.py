@@ -27,7 +27,7 @@ ARROWS = {
     "integral": {"runtime", "optics", "jit", "emission"},
     "plugins": {"runtime", "optics", "jit", "emission", "integral"},
     "rendering": {"runtime", "images", "jit", "emission", "integral"},
-    "detector": {"runtime", "images"},
+    "detector": {"runtime", "images", "rendering"},
     "validation": {"runtime", "optics", "jit", "emission", "integral", "rendering"},
     "studies": {"runtime", "optics", "images", "jit", "emission", "integral", "rendering", "validation"},
     "inverse": {

@@ -2,26 +2,69 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
+from ..rendering.scene_rules import is_number
 from ..runtime.atomic_files import require_apart
-from ..runtime.errors import DetectorError, ImageError
+from ..runtime.backend import quiet_mitsuba
+from ..runtime.errors import DetectorError, ImageError, SceneError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Quiet, require_image, require_writable
+from .options import AsJson, Parameters, Quiet, definitions, require_image, require_writable
 from .terminal import print_result
 
 if TYPE_CHECKING:
+    import mitsuba as mi
+
     from ..detector.counts import Counts
     from ..detector.detector import Detector
-    from ..detector.reduction import Exposed
+    from ..detector.reduction import Corrections, Exposed
     from ..images.image import Image
     from ..optics.thin_lens import Lens
 
-Frame = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame or stack [DN]: .tif, .fits, .npy.")]
+FILES = ".tif, .fits, .npy"
+Bias = Annotated[
+    Path | None, typer.Option(metavar="FILE", help=f"Frame or stack [DN], {FILES}, in place of the detector's bias.")
+]
+Dark = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="The same of the counts' exposure time, with the bias; no bias is needed then."),
+]
+Flat = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame or stack of a uniform light, with --flat-kind.")]
+FlatKind = Annotated[
+    str | None,
+    typer.Option(
+        metavar="lens|sensor",
+        help="lens: a screen through the lens of --scene, whose cos^4 and vignetting are divided out; sensor: no lens.",
+    ),
+]
+FlatDark = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|DN",
+        help="Frame of the flat's exposure time, with the bias, or a number, 0 for a flat free of both; without it "
+        "the bias is subtracted from a flat of unsigned integers, nothing from another one.",
+    ),
+]
+
+
+Time = Annotated[float | None, typer.Option(help="[s] of a frame; that of the file if left out.")]
+Binning = Annotated[
+    int | None, typer.Option(help="Side of the square of pixels read out as one; that of the file, else 1.")
+]
+Pitch = Annotated[
+    float | None, typer.Option(help="Of the pixels read out [mm]; detector's x binning, else that of the file.")
+]
+Scene = Annotated[Path | None, typer.Option(metavar="S.xml", help="Scene of the camera, for a flat by its lens.")]
+Frames = Annotated[int | None, typer.Option(metavar="N", help="That each single frame of counts is the mean of.")]
+BadPixels = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame that is not 0 on the pixels to mask.")]
+Calibrate = Annotated[
+    bool, typer.Option("--calibrate", help="The counts show a uniform source; write CALIBRATED.toml.")
+]
 
 
 def reduce(
@@ -29,20 +72,20 @@ def reduce(
     detector: Annotated[Path, typer.Option(metavar="CAMERA.toml", help="Camera with a table [detector].")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Image to write, .exr; of several OUT_0.exr, …")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
-    exposure_time: Annotated[float | None, typer.Option(help="[s] of a frame; that of the file if left out.")] = None,
-    binning: Annotated[
-        int | None, typer.Option(help="Side of the square of pixels read out as one; that of the file, else 1.")
-    ] = None,
-    pixel_pitch: Annotated[
-        float | None, typer.Option(help="Of the pixels read out [mm]; detector's x binning.")
-    ] = None,
-    bias: Frame = None,
-    dark: Frame = None,
-    flat: Frame = None,
+    exposure_time: Time = None,
+    binning: Binning = None,
+    pixel_pitch: Pitch = None,
+    bias: Bias = None,
+    dark: Dark = None,
+    flat: Flat = None,
+    flat_kind: FlatKind = None,
+    flat_dark: FlatDark = None,
+    scene: Scene = None,
+    define: Parameters = None,
+    frames: Frames = None,
+    bad_pixels: BadPixels = None,
     cosmic_rays: Annotated[bool, typer.Option("--cosmic-rays", help="Mask pixels that cosmic rays hit.")] = False,
-    calibrate: Annotated[
-        bool, typer.Option("--calibrate", help="The counts show a uniform source; write CALIBRATED.toml.")
-    ] = False,
+    calibrate: Calibrate = False,
     radiance: Annotated[float | None, typer.Option(help="Of that source [W/mm2/sr].")] = None,
     radiance_error: Annotated[float, typer.Option(help="Relative uncertainty of it.")] = 0.0,
     as_json: AsJson = False,
@@ -50,37 +93,76 @@ def reduce(
 ) -> None:
     """Reduce counts to power in W with its error; saturated pixels are masked.
 
+    Bias and dark frames are those of the counts. A flat field has its own:
+    see --flat-dark.
+
     With --calibrate and --radiance the counts show a uniform source, such as an
     integrating sphere, through the lens of the table [lens]: the output is the
     camera's TOML with the quantum efficiency that it shows. The transmittance of
     [lens] is not part of it; without one there, that of the lens is.
     """
-    from ..detector.counts import read_counts
     from ..detector.detector import Detector
-    from ..detector.reduction import reduce_counts
+    from ..detector.reduction import Corrections
 
     camera = Detector.from_toml(detector)
     given = dict(exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, pixel_pitch=pixel_pitch)
-    frames = {"bias": bias, "dark": dark, "flat": flat, "cosmic_rays": cosmic_rays}
+    level = float(flat_dark) if flat_dark is not None and is_number(flat_dark) else flat_dark
     _require_output(output, calibrate, radiance is not None or radiance_error != 0)
-    require_apart(output, [*counts, detector, *(p for p in (bias, dark, flat) if p)], error=ImageError)
-    images: list[Image] = []
-    with progress_bar(quiet) as report:
-        for number, path in enumerate(counts):
-            report(f"reducing {path.name}", number / len(counts))
-            found = read_counts(path)
-            exposed = _exposed(path, found, camera, given)
-            images.append(reduce_counts(camera, found, exposed, **frames))  # type: ignore[arg-type]
+    names = _outputs(output, len(counts))
+    inputs = [*counts, detector, *(Path(p) for p in (bias, dark, flat, flat_dark, bad_pixels, scene) if p)]
+    for name in names:
+        require_apart(name, inputs, error=ImageError)
+    corrections = Corrections(bias, dark, flat, flat_kind, level, _loaded(scene, define), bad_pixels, cosmic_rays)
+    images = _reduced(camera, counts, frames, given, corrections, quiet)
     if calibrate:
         record = _calibrated(camera, images, detector, output, radiance, radiance_error)
         print_result(_calibrated_text(record), record, as_json=as_json, quiet=quiet)
         return
-    names = [output] if len(images) == 1 else [output.with_stem(f"{output.stem}_{k}") for k in range(len(images))]
     for image, name in zip(images, names, strict=True):
         image.write(name)
     records = [_record(image, name) for image, name in zip(images, names, strict=True)]
-    lines = [f"{r['output']}: {r['power']:.6g} W in total, {r['masked_pixels']} pixels masked" for r in records]
-    print_result("\n".join(lines), {"images": records}, as_json=as_json, quiet=quiet)
+    print_result("\n".join(map(_text, records)), {"images": records}, as_json=as_json, quiet=quiet)
+
+
+def _reduced(
+    camera: Detector,
+    files: list[Path],
+    frames: int | None,
+    given: dict[str, Any],
+    corrections: Corrections,
+    quiet: bool,
+) -> list[Image]:
+    """Images of all files of counts, with one flat field; `given` as of `_exposed`."""
+    from ..detector.counts import read_counts
+    from ..detector.reduction import reduce_counts
+
+    images = []
+    with progress_bar(quiet) as report:
+        for number, path in enumerate(files):
+            report(f"reducing {path.name}", number / len(files))
+            found = read_counts(path, frames)
+            exposed = _exposed(path, found, camera, given)
+            corrections = replace(corrections, flat=corrections.flat_field(camera, found, exposed))
+            images.append(reduce_counts(camera, found, exposed, corrections))
+    return images
+
+
+def _outputs(output: Path, count: int) -> list[Path]:
+    """Names of the images: `output` of a single one, else OUT_00, OUT_01, …, which sort in their order."""
+    digits = len(str(count - 1))
+    return [output] if count == 1 else [output.with_stem(f"{output.stem}_{k:0{digits}d}") for k in range(count)]
+
+
+def _loaded(scene: Path | None, define: list[str] | None) -> mi.Scene | None:
+    """The scene with the values of its parameters, if one is given."""
+    from ..rendering.scene import load
+
+    if scene is None:
+        if define:
+            raise SceneError(f"-D {define[0]} goes with --scene, which is missing. Give both, or leave it out.")
+        return None
+    quiet_mitsuba()
+    return load(scene, **definitions(define))
 
 
 def _require_output(output: Path, calibrate: bool, source: bool) -> None:
@@ -100,18 +182,25 @@ def _exposed(path: Path, counts: Counts, camera: Detector, given: dict[str, Any]
     if given["exposure_time"] is None and counts.exposure_time is None:
         raise DetectorError(f"'{path}' does not say its exposure time. Give --exposure-time, in s.")
     found = given | {n: getattr(counts, n) for n in ("exposure_time", "binning") if given[n] is None}
-    if found["pixel_pitch"] is None and camera.pixel_pitch is not None:
-        found["pixel_pitch"] = camera.pixel_pitch * (found["binning"] or 1)
+    if found["pixel_pitch"] is None:
+        own = camera.pixel_pitch
+        found["pixel_pitch"] = counts.pixel_pitch if own is None else own * (found["binning"] or 1)
     return Exposed(**found)
 
 
 def _record(image: Image, name: Path) -> dict[str, Any]:
     """Numbers about a reduced image, ready for JSON."""
-    kept = ("electrons_per_watt", "read_noise", "gain_error", "masked_pixels")
+    kept = ("electrons_per_watt", "read_noise", "gain_error", "masked_pixels", "flat_masked_pixels")
     error = float(np.sqrt((image.error.astype(np.float64) ** 2).sum())) if image.error is not None else 0.0
     return {"output": str(name), "power": float(image.power.sum()), "error": error} | {
-        k: image.metadata[k] for k in kept
+        k: image.metadata[k] for k in kept if k in image.metadata
     }
+
+
+def _text(record: dict[str, Any]) -> str:
+    """A line about a reduced image."""
+    flat = f", {record['flat_masked_pixels']} of them by the flat field" if "flat_masked_pixels" in record else ""
+    return f"{record['output']}: {record['power']:.6g} W in total, {record['masked_pixels']} pixels masked{flat}"
 
 
 def _calibrated(

@@ -6,19 +6,21 @@ import logging
 import os
 import re
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
 from ..images.tiff_pages import read_tiff
-from ..runtime.errors import BackendError, ImageError
+from ..runtime.errors import BackendError, DetectorError, ImageError
+from ..runtime.numbers import whole
 
 LOG = logging.getLogger("mitsuba_fspt")
-
+Frame = ArrayLike | str | os.PathLike[str]
+UM_PER_MM = 1e3
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
 # Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
@@ -39,9 +41,12 @@ class Counts:
     """Raw counts (h, w) [DN], the mean of `frames` frames, with what the file states about them.
 
     highest : (h, w) the largest count of the frames, None for a single one
+    first : (h, w) the first of the frames, None for a single one
+    raw : True for unsigned integers, as a camera delivers them; False for floats and integers with a sign
     bias, background : frames (h, w) [DN] of a click folder, or None
     exposure_time : [s], None if the file does not state it
     binning : side of the square of pixels read out as one, None if the file does not state it
+    pixel_pitch : of the pixels read out [mm], None if the file does not state it
     info : `Key: value` lines of a click folder, those of the luminescent image first
     """
 
@@ -53,10 +58,32 @@ class Counts:
     info: dict[str, str] = field(default_factory=dict)
     highest: NDArray[np.float64] | None = None
     binning: int | None = None
+    first: NDArray[np.float64] | None = None
+    raw: bool = False
+    pixel_pitch: float | None = None
 
 
-def read_counts(path: str | os.PathLike[str]) -> Counts:
-    """Counts of a TIFF, FITS or NPY file, or of a click folder.
+def frame_of(given: Frame | Counts, name: str, frames: int | None = None) -> Counts:
+    """Counts of a file, of an array, the argument `name`, or as they are; `frames` as of `counts_of`."""
+    if isinstance(given, Counts):
+        return given
+    if isinstance(given, (str, os.PathLike)):
+        return read_counts(given, frames)
+    return counts_of(given, name, frames)
+
+
+def frame_like(given: Frame | Counts, name: str, shape: tuple[int, ...]) -> Counts:
+    """Counts as of `frame_of`; DetectorError unless their shape (h, w) is `shape`."""
+    found = frame_of(given, name)
+    if found.values.shape != shape:
+        raise DetectorError(
+            f"reduce: '{name}' has the shape {found.values.shape}, the counts {shape}. Give a frame of the same film."
+        )
+    return found
+
+
+def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Counts:
+    """Counts of a TIFF, FITS or NPY file, or of a click folder; `frames` as of `counts_of`.
 
     Raises
     ------
@@ -69,13 +96,13 @@ def read_counts(path: str | os.PathLike[str]) -> Counts:
     if not path.is_file():
         raise ImageError(f"counts '{path}' do not exist. Check the name.")
     suffix = path.suffix.lower()
-    exposure_time, binning = None, None
+    header: dict[str, Any] = {}
     if suffix in (*TIFF, *FITS):
         _require_counts(path)
     if suffix in TIFF:
         array = read_tiff(path, f"counts '{path}'")
     elif suffix in FITS:
-        array, exposure_time, binning = _fits(path)
+        array, header = _fits(path)
     elif suffix == ".npy":
         try:
             array = np.load(path, allow_pickle=False)
@@ -83,8 +110,7 @@ def read_counts(path: str | os.PathLike[str]) -> Counts:
             raise ImageError(f"counts '{path}' are no NPY file of numbers: {_line(cause)}. Save them again.") from cause
     else:
         raise ImageError(f"counts '{path}': '{suffix}' is not read. Give .tif, .fits, .npy or a click folder.")
-    found = counts_of(array, str(path))
-    return Counts(found.values, found.frames, None, None, exposure_time, {}, found.highest, binning)
+    return replace(counts_of(array, str(path), frames), **header)
 
 
 def _require_counts(path: Path) -> None:
@@ -99,8 +125,21 @@ def _require_counts(path: Path) -> None:
     )
 
 
-def counts_of(array: Any, name: str) -> Counts:
-    """Counts of an array (h, w) or (frames, h, w), a file or argument `name`; ImageError for any other."""
+def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
+    """Counts of an array (h, w) or (frames, h, w), a file or argument `name`.
+
+    frames : number of frames that an array (h, w) is the mean of, 1 if left out; of an array (frames, h, w), for which
+        it may be left out, the length of the first axis
+
+    Raises
+    ------
+    ImageError : the array is none of these, holds NaN, has another number of frames, or its last axis seems to be that
+        of the frames: the two others are more alike. `frames` says that it is not.
+    """
+    if frames is not None:
+        frames = whole("reduce: 'frames'", frames, ImageError, "10")
+        if frames < 1:
+            raise ImageError(f"reduce: 'frames' must be >= 1, got {frames}. Give for example 10.")
     array = np.asarray(array)
     colour = array.ndim == 3 and array.shape[2] in (3, 4)  # the last axis of RGB and RGBA files
     if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or array.size == 0 or colour:
@@ -111,10 +150,39 @@ def counts_of(array: Any, name: str) -> Counts:
     stack = array.astype(np.float64)
     if not np.isfinite(stack).all():
         raise ImageError(f"counts '{name}' hold {int(np.sum(~np.isfinite(stack)))} NaN or inf. Mask or replace them.")
-    return Counts(stack) if stack.ndim == 2 else Counts(stack.mean(axis=0), len(stack), highest=stack.max(axis=0))
+    raw = array.dtype.kind == "u"
+    if stack.ndim == 2:
+        return Counts(stack, frames or 1, raw=raw)
+    _require_frames_first(stack.shape, name, frames)
+    return Counts(stack.mean(axis=0), len(stack), highest=stack.max(axis=0), first=stack[0].copy(), raw=raw)
 
 
-def _fits(path: Path) -> tuple[NDArray[Any], float | None, int | None]:
+def _require_frames_first(shape: tuple[int, ...], name: str, frames: int | None) -> None:
+    """Raise ImageError for a stack of another number of frames, or of a shape (h, w, frames)."""
+    count, height, width = shape
+    if frames is not None and frames != count:
+        raise ImageError(
+            f"counts '{name}' of shape {shape} have {count} frames, 'frames' is {frames}. Give stacks as "
+            "(frames, h, w), and 'frames' of a single (h, w) that is their mean."
+        )
+    if frames is None and width < count and _elongation(count, height) < _elongation(height, width):
+        raise ImageError(
+            f"counts '{name}' of shape {shape} would be {count} frames of {width} × {height} pixels, and look like "
+            f"{width} frames of {height} × {count}. Give frames first, np.moveaxis(counts, -1, 0), or frames={count} "
+            "if they are."
+        )
+
+
+def _elongation(one: int, other: int) -> float:
+    """Ratio of the longer to the shorter side."""
+    return max(one, other) / min(one, other)
+
+
+def _fits(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Data of a FITS file, row 0 at the top, and what its header states, by names of `Counts`.
+
+    EXPTIME or EXPOSURE in s, XBINNING, and XPIXSZ, the side of a binned pixel in µm, as imaging programs write them.
+    """
     try:
         from astropy.io import fits
     except ImportError as cause:
@@ -123,11 +191,15 @@ def _fits(path: Path) -> tuple[NDArray[Any], float | None, int | None]:
         with warnings.catch_warnings(record=True) as reports, fits.open(path, memmap=False) as file:
             warnings.simplefilter("always")
             unit = next(unit for unit in file if unit.data is not None)
-            keys = ("EXPTIME", "XBINNING", "YBINNING", "ROWORDER")
-            time, sides, rows, order = (unit.header.get(key, file[0].header.get(key)) for key in keys)
+            keys = ("EXPTIME", "EXPOSURE", "XBINNING", "YBINNING", "ROWORDER", "XPIXSZ", "YPIXSZ")
+            time, other, sides, rows, order, wide, high = (
+                unit.header.get(key, file[0].header.get(key)) for key in keys
+            )
+            time = other if time is None else time
             data = np.asarray(unit.data)
-            found_time = None if time is None else float(time)
-            found_sides = None if sides is None else int(sides)
+            found: dict[str, Any] = {} if time is None else {"exposure_time": float(time)}
+            found |= {} if sides is None else {"binning": int(sides)}
+            found |= {} if wide is None or high not in (None, wide) else {"pixel_pitch": float(wide) / UM_PER_MM}
     except Exception as cause:
         raise ImageError(f"counts '{path}' are no readable FITS: {_line(cause)}. Copy the file again.") from cause
     texts = [_line(report.message) for report in reports]
@@ -140,7 +212,7 @@ def _fits(path: Path) -> tuple[NDArray[Any], float | None, int | None]:
         raise ImageError(f"counts '{path}' are binned {sides} x {rows}. Give counts of square binning.")
     if str(order).strip().upper() == "BOTTOM-UP" and data.ndim > 1:
         data = np.flip(data, axis=-2)
-    return data, found_time, found_sides
+    return data, found
 
 
 def _click(folder: Path) -> Counts:
@@ -153,7 +225,8 @@ def _click(folder: Path) -> Counts:
     info = _click_info(files[INFO].read_text("utf-8", "replace")) if INFO in files else {}
     time, binning = _number(info, EXPOSURE), _number(info, BINNING)
     sides = None if binning is None else int(binning)
-    return Counts(light.values, light.frames, found.get(BIAS), found.get(BACKGROUND), time, info, light.highest, sides)
+    bias, background = found.get(BIAS), found.get(BACKGROUND)
+    return replace(light, bias=bias, background=background, exposure_time=time, info=info, binning=sides)
 
 
 def _picture(file: Path) -> Counts:

@@ -14,10 +14,10 @@ import math
 import os
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..images.exposure import Exposure
 from ..images.formats import Metadata
@@ -29,6 +29,10 @@ from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
 from ..runtime.wavelength import wavelength
+
+if TYPE_CHECKING:
+    from .counts import Frame
+    from .flat_field import Scene
 
 # Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
 # `pixel_pitch` is that of the pixels read out.
@@ -204,51 +208,56 @@ class Detector:
 
     def reduce(
         self,
-        counts: ArrayLike | str | os.PathLike[str],
+        counts: Frame,
         *,
         exposure_time: float,
         wavelength_nm: float,
         binning: int | None = None,
         pixel_pitch: float | None = None,
-        bias: ArrayLike | str | os.PathLike[str] | None = None,
-        dark: ArrayLike | str | os.PathLike[str] | None = None,
-        flat: ArrayLike | str | os.PathLike[str] | None = None,
+        frames: int | None = None,
+        bias: Frame | None = None,
+        dark: Frame | None = None,
+        flat: Frame | None = None,
+        flat_kind: str | None = None,
+        flat_dark: Frame | float | None = None,
+        scene: Scene | None = None,
+        bad_pixels: Frame | None = None,
         cosmic_rays: bool = False,
         metadata: Metadata | None = None,
     ) -> Image:
-        """Image in W from raw counts, with its standard error and a mask of saturated pixels.
+        """Image in W from raw counts, with its standard error and a mask of saturated pixels; see docs/images.md.
 
         Parameters
         ----------
         counts : (h, w) or (frames, h, w) [DN], or the name of a .tif, .fits, .npy file or of a click folder
         exposure_time : [s] of one frame, > 0
-        wavelength_nm : of the light in vacuum [nm]
-        binning : side of the square of pixels that was read out as one; None: that of a FITS header or a click folder,
-            else 1
+        wavelength_nm : of the light in vacuum [nm], 200 … 2500
+        binning : side of the square of pixels that was read out as one; None: that of the file, else 1
         pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene
-        bias, dark, flat : frames or stacks [DN] in place of the numbers `bias` and `dark_current`; `dark` has the same
-            exposure time and contains the bias, `flat` is free of both. The shot and read noise of the flat field are
-            part of the errors if `flat` is a stack. They are not if it is a single frame, which may be the mean of any
-            number of frames: average enough of them to make its noise small compared with that of the counts
+        frames : number of frames that counts (h, w) are the mean of; None: 1; of a stack, its length
+        bias, dark : frames or stacks [DN] in place of `bias` and `dark_current`; `dark` contains the bias
+        flat, flat_kind : frame or stack [DN] of a uniform light, 'lens' through the lens of `scene`, or 'sensor'
+            without a lens (Eq. M.32); the noise of a stack, not that of a single frame, enters the errors
+        flat_dark : number, frame or stack [DN] to subtract from the flat; None: the bias, from unsigned integers alone
+        scene : for 'lens': what `render` takes, with the camera's lens, film and crop window
+        bad_pixels : (h, w) or its file, not 0 for pixels to mask
         cosmic_rays : also mask pixels that cosmic rays have hit
-        metadata : further entries for the image's metadata, such as those of the rendered image that was exposed; what
-            tells how that one was computed, such as `method` and `rtol`, is left out
+        metadata : further entries, such as those of the rendered image that was exposed, without how it was computed
 
-        The image's metadata hold `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (the variance of dark
-        current, rounding and subtracted frames [e-²]) and `gain_error`. The noise of any signal follows from these. A
-        pixel where the flat field is f has f times `electrons_per_watt`; `responses` recovers f from power and error.
+        The metadata hold `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (variance of dark current, rounding
+        and subtracted frames [e-²]) and `gain_error`; a pixel where `flat` is f has f times `electrons_per_watt`.
 
         Raises
         ------
-        DetectorError : a parameter outside its range, a frame of another size.
-        ImageError : a file cannot be read.
-        BackendError : ccdproc, tifffile or astropy is not installed.
+        DetectorError : a parameter outside its range, frames that do not fit, a flat without its kind.
+        ImageError : a file cannot be read, or a stack has the shape (h, w, frames).
+        SceneError, OpticsError, BackendError : the scene has no usable lens; a package is not installed.
         """
-        from .reduction import Exposed, reduce_counts
+        from .reduction import Corrections, Exposed, reduce_counts
 
         exposed = Exposed(exposure_time, wavelength_nm, binning, pixel_pitch)
-        frames = {"bias": bias, "dark": dark, "flat": flat}
-        return reduce_counts(self, counts, exposed, **frames, cosmic_rays=cosmic_rays, metadata=metadata)
+        corrections = Corrections(bias, dark, flat, flat_kind, flat_dark, scene, bad_pixels, cosmic_rays)
+        return reduce_counts(self, counts, exposed, corrections, frames=frames, metadata=metadata)
 
     def expected(self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1) -> Expectation:
         """Mean and variance of the electrons that `expose` draws, before the full well limits them.

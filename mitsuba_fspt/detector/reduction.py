@@ -4,8 +4,8 @@
     error² = (max(electrons, 0) + σ_read² + dark) / (flat · k)² + (P ε)²
 
 with the variance of the dark current and of the rounding in `dark_electrons`, and the relative error ε of the flat
-field. Frames are corrected by ccdproc. A pixel of a flat field below 1 collects fewer electrons per watt, flat · k:
-`responses` recovers flat from power and error.
+field. Frames are corrected by ccdproc. A pixel of a flat field below 1 collects fewer electrons per watt, flat · k;
+the image stores the flat field.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..images.exposure import Exposure, image_or_exposure
 from ..images.formats import Metadata, read_planes
@@ -28,13 +28,16 @@ from ..images.radiometry import PLANCK_TIMES_LIGHT
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from ..runtime.wavelength import wavelength
-from .counts import FITS, TIFF, Counts, counts_of, read_counts
+from .counts import FITS, TIFF, Counts, Frame, frame_like, frame_of
 from .detector import RECORDED, Detector
+from .flat_field import FlatField, flat_field, require_no_flat
+from .saturation import saturated, tell_ceiling, unknown_ceiling
 
 if TYPE_CHECKING:
+    from .flat_field import Scene
+
     Array = NDArray[np.float64]
 
-Frame = ArrayLike | str | os.PathLike[str]
 LOG = logging.getLogger("mitsuba_fspt")
 DARKER = 5.0  # standard deviations of a total below 0: noise makes more once in 3 million images
 REPLACED = ("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels")
@@ -44,7 +47,8 @@ COMPUTED = (
     *("light_left_out", "light_left_out_error", "warnings", "wall_time", "variant", "versions"),
     *("sampler", "spp", "passes", "seed"),
 )
-LEAST_FLAT = 0.05  # of the mean: pixels of a flat field darker than that are masked, their error is 20 times as large
+ROUNDING = 1e-6  # relative error of a variance from a file's float32 numbers
+SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
 
 
 @dataclass(frozen=True)
@@ -90,38 +94,113 @@ class Exposed:
         return dark_current * self.exposure_time * area
 
 
+@dataclass(frozen=True, eq=False)
+class Corrections:
+    """What corrects counts, see `Detector.reduce`: frames, the flat field with its kind, and pixels to leave out."""
+
+    bias: Frame | None = None
+    dark: Frame | None = None
+    flat: Frame | FlatField | None = None
+    flat_kind: str | None = None
+    flat_dark: Frame | float | None = None
+    scene: Scene | None = None
+    bad_pixels: Frame | None = None
+    cosmic_rays: bool = False
+
+    def flat_field(self, detector: Detector, counts: Counts, exposed: Exposed) -> FlatField | None:
+        """Flat field of the counts, or None; DetectorError for settings of one without it."""
+        if self.flat is None:
+            require_no_flat(flat_kind=self.flat_kind, flat_dark=self.flat_dark, scene=self.scene)
+            return None
+        shape = counts.values.shape
+        if isinstance(self.flat, FlatField):
+            if self.flat.response.shape != shape:
+                raise DetectorError(
+                    f"reduce: 'flat' has the shape {self.flat.response.shape}, the counts {shape}. Give a frame of the "
+                    "same film."
+                )
+            return self.flat
+        bias = counts.bias if self.bias is None else frame_like(self.bias, "bias", shape).values
+        return flat_field(
+            detector,
+            self.flat,
+            self.flat_kind,
+            self.scene,
+            shape,
+            flat_dark=self.flat_dark,
+            bias=bias,
+            pixel_pitch=exposed.pixel_pitch,
+        )
+
+    def bad(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        """True (h, w) on the pixels to leave out; DetectorError for a mask of another size."""
+        if self.bad_pixels is None:
+            return np.zeros(shape, bool)
+        given = self.bad_pixels
+        if not isinstance(given, (str, os.PathLike)):
+            given = np.asarray(given)
+            given = given.astype(np.uint8) if given.dtype == bool else given
+        return frame_like(given, "bad_pixels", shape).values != 0
+
+
 def reduce_counts(
     detector: Detector,
     counts: Frame | Counts,
     exposed: Exposed,
+    corrections: Corrections,
     *,
-    bias: Frame | None = None,
-    dark: Frame | None = None,
-    flat: Frame | None = None,
-    cosmic_rays: bool = False,
+    frames: int | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> Image:
     """Image in W of raw counts; see `Detector.reduce`."""
-    raw = counts if isinstance(counts, Counts) else _frame(counts, "counts")
+    raw = frame_of(counts, "counts", frames)
     if exposed.binning is None:
         exposed = replace(exposed, binning=raw.binning or 1)
-    full = saturated(detector, raw.values if raw.highest is None else raw.highest)
-    values, rays = _cleaned(detector, raw.values, full) if cosmic_rays else (raw.values, np.zeros_like(full))
-    level, charge, added = _background(detector, raw, exposed, bias, dark)
-    response, weak, noise = _response(detector, flat, values.shape)
-    electrons = _corrected(values, level, response) * detector.gain
+    _tell_time(raw, exposed)
+    shape = raw.values.shape
+    full = _full(detector, raw)
+    rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)
+    level, charge, added = _background(detector, raw, exposed, corrections.bias, corrections.dark)
+    flat = corrections.flat_field(detector, raw, exposed)
+    electrons = _corrected(raw.values, level, flat) * detector.gain
     independent = charge + detector.gain**2 / 12 + raw.frames * added  # gain²/12: variance of the rounding
-    flat_field = 1.0 if response is None else response
-    mask = full | rays | weak
-    image = _image(detector, electrons, flat_field, independent, raw.frames, mask, exposed, metadata, noise)
-    _report_darkness(image, mask)
+    mask = full | rays | corrections.bad(shape)
+    image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
+    _report_darkness(image)
     return image
 
 
-def _report_darkness(image: Image, mask: NDArray[np.bool_]) -> None:
+def _full(detector: Detector, raw: Counts) -> NDArray[np.bool_]:
+    """True (h, w) where counts are saturated, by the detector's numbers or at a largest count of their own."""
+    highest = raw.values if raw.highest is None else raw.highest
+    full = saturated(detector, highest)
+    if raw.first is None:
+        ceiling = unknown_ceiling(detector, raw.values, raw.frames)
+    else:  # the mean over frames has no such value; the first frame has, if none exceeds it
+        ceiling = unknown_ceiling(detector, raw.first)
+        ceiling = ceiling if ceiling == highest.max() else None
+    if ceiling is None or saturated(detector, np.array(ceiling)):
+        return full
+    reached = highest >= ceiling
+    tell_ceiling(detector, ceiling, int(reached.sum()))
+    return full | reached
+
+
+def _tell_time(raw: Counts, exposed: Exposed) -> None:
+    """Say in one line on stderr that the file of the counts states another exposure time than the given one."""
+    stated, given = raw.exposure_time, exposed.exposure_time
+    if stated is not None and abs(stated - given) > SAME_TIME * given:
+        LOG.warning(
+            "fspt: reduce: 'exposure_time' is %g s, the file of the counts states %g s. The given one is used.",
+            given,
+            stated,
+        )
+
+
+def _report_darkness(image: Image) -> None:
     """Say in one line on stderr that the power of all pixels is negative by more than noise makes it."""
     power, error = (np.asarray(plane, np.float64) for plane in (image.power, image.error))
-    total, noise = power.sum(), np.sqrt(np.square(error[~mask]).sum())
+    total, noise = power.sum(), np.sqrt(np.square(error[image.kept]).sum())
     if total < -DARKER * noise:
         LOG.warning(
             "fspt: reduce: the total is %.3g W, %.0f standard deviations below 0: the counts are darker than bias and "
@@ -157,16 +236,19 @@ def reduced(exposure: Exposure) -> Image:
     dark = exposed.dark(detector.dark_current, detector.pixel_pitch)
     electrons = exposure.electrons.astype(np.float64)
     full = (electrons >= detector.full_well) | saturated(detector, exposure.counts.astype(np.float64))
-    return _image(detector, electrons - dark, 1.0, dark, 1, full, exposed, found)
+    return _image(detector, electrons - dark, None, dark, 1, full, exposed, found)
 
 
 def responses(image: Image) -> Array:
     """Flat field f (h, w) of a reduced image: a pixel collects f times `electrons_per_watt`.
 
-    It follows from the power P, its error s, k = `electrons_per_watt` and the variance R of read-out and dark current
-    by s² = (max(P k f, 0) + R)/(k f)². It is 1 where the image has no error. If the noise of a stack of flat fields is
-    part of s, the result is smaller than f, such that k times it still gives the variance s².
+    It is the image's `flat`. An image of an earlier version has none; there it follows from the power P, its error s,
+    k = `electrons_per_watt` and the variance R of read-out and dark current by s² = (max(P k f, 0) + R)/(k f)². It is 1
+    where the image has no error. If the noise of a stack of flat fields is part of s, the result is smaller than f,
+    such that k times it still gives the variance s².
     """
+    if image.flat is not None:
+        return image.flat.astype(np.float64)
     shape, error = image.shape, image.error
     k = float(image.metadata["electrons_per_watt"])
     rest = float(image.metadata.get("read_noise", 0.0)) ** 2 + float(image.metadata.get("dark_electrons", 0.0))
@@ -178,10 +260,18 @@ def responses(image: Image) -> Array:
     return np.where((variance > 0) & (root > 0), root / np.maximum(2 * variance, 1e-300), 1.0)
 
 
-def saturated(detector: Detector, counts: Array) -> NDArray[np.bool_]:
-    """True (h, w) where a count has reached the largest value of the converter or the full well."""
-    top = 2**detector.bits - 1
-    return (counts >= top) | (counts >= detector.bias + detector.full_well / detector.gain - 0.5)
+def flat_variance(image: Image) -> Array | float:
+    """Variance [W²] of the power (h, w) by the noise of a stack of flat fields; 0 for an image without a flat field.
+
+    It is the part of the squared error beyond shot noise, read noise and dark current.
+    """
+    if image.flat is None or image.error is None:
+        return 0.0
+    each = float(image.metadata["electrons_per_watt"]) * responses(image)
+    rest = float(image.metadata.get("read_noise", 0.0)) ** 2 + float(image.metadata.get("dark_electrons", 0.0))
+    variance = image.error.astype(np.float64) ** 2
+    others = np.maximum(image.power.astype(np.float64), 0) / each + rest / each**2
+    return np.where(variance > others * (1 + ROUNDING), variance - others, 0.0)
 
 
 def calibrated(detector: Detector, image: Image, power: Array, error: float) -> Detector:
@@ -217,13 +307,6 @@ def calibrated(detector: Detector, image: Image, power: Array, error: float) -> 
     return replace(detector, quantum_efficiency=efficiency, gain_error=float(np.hypot(error, noise)))
 
 
-def _frame(given: Any, name: str) -> Counts:
-    """Counts of a file or an array."""
-    if isinstance(given, (str, os.PathLike)):
-        return read_counts(given)
-    return counts_of(given, name)
-
-
 def _background(
     detector: Detector, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | None
 ) -> tuple[Array | float, float, float]:
@@ -235,61 +318,36 @@ def _background(
     rounding = detector.gain**2 / 12
     frame = raw.background if dark is None and raw.background is not None else dark
     if frame is not None:
-        found = _like(frame, "dark", raw.values.shape)
+        found = frame_like(frame, "dark", raw.values.shape)
+        if found.exposure_time is not None and abs(found.exposure_time / exposed.exposure_time - 1) > SAME_TIME:
+            raise DetectorError(
+                f"reduce: 'dark' was exposed {found.exposure_time:g} s, the counts {exposed.exposure_time:g} s. Give "
+                "a dark frame of the same exposure time, or 'bias' alone."
+            )
         return found.values, charge, (charge + detector.read_noise**2 + rounding) / found.frames
     frame = raw.bias if bias is None and raw.bias is not None else bias
     if frame is not None:
-        found = _like(frame, "bias", raw.values.shape)
+        found = frame_like(frame, "bias", raw.values.shape)
         return found.values + charge / detector.gain, charge, (detector.read_noise**2 + rounding) / found.frames
     return detector.bias + charge / detector.gain, charge, 0.0
 
 
-def _response(
-    detector: Detector, flat: Frame | None, shape: tuple[int, ...]
-) -> tuple[Array | None, NDArray[np.bool_], Array | float]:
-    """Flat field divided by its mean, or None without one; the pixels where it is below `LEAST_FLAT`; its variance.
-
-    The variance is relative to its square. It is 0 for a single frame, which may be the mean of any number of frames.
-    """
-    if flat is None:
-        return None, np.zeros(shape, bool), 0.0
-    frame = _like(flat, "flat", shape)
-    found, frames = frame.values, frame.frames
-    if not found.mean() > 0:
-        raise DetectorError(f"reduce: the flat field has the mean {found.mean():g}, it must be > 0. Give another one.")
-    relative = found / found.mean()
-    weak = relative < LEAST_FLAT
-    electrons = np.where(weak, 1.0, found) * detector.gain * frames
-    variance = (electrons + detector.read_noise**2 * frames) / electrons**2 if frames > 1 else 0.0
-    return np.where(weak, 1.0, relative), weak, variance
-
-
-def _like(frame: Any, name: str, shape: tuple[int, ...]) -> Counts:
-    """Counts of a frame; DetectorError if its shape is another."""
-    found = _frame(frame, name)
-    if found.values.shape != shape:
-        raise DetectorError(
-            f"reduce: '{name}' has the shape {found.values.shape}, the counts {shape}. Give a frame of the same film."
-        )
-    return found
-
-
-def _corrected(values: Array, level: Array | float, response: Array | None) -> Array:
-    """(Counts − level)/response; by ccdproc if level or response are frames."""
-    if response is None and np.ndim(level) == 0:
+def _corrected(values: Array, level: Array | float, flat: FlatField | None) -> Array:
+    """(Counts − level)/response; by ccdproc if the level is a frame or there is a flat field."""
+    if flat is None and np.ndim(level) == 0:
         return values - level
     ccdproc, data_of = _ccdproc()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         frame = data_of(values, unit="adu")
         frame = ccdproc.subtract_bias(frame, data_of(np.broadcast_to(level, values.shape).copy(), unit="adu"))
-        if response is not None:
-            frame = ccdproc.flat_correct(frame, data_of(response, unit=""), norm_value=1.0)
+        if flat is not None:
+            frame = ccdproc.flat_correct(frame, data_of(flat.response, unit=""), norm_value=1.0)
     return np.asarray(frame.data, np.float64)
 
 
-def _cleaned(detector: Detector, values: Array, full: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """Counts, and the pixels that cosmic rays hit, by the Laplacian edge detection of ccdproc."""
+def _cosmic_rays(detector: Detector, values: Array, full: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels that cosmic rays hit, by the Laplacian edge detection of ccdproc."""
     ccdproc, data_of = _ccdproc()
     electrons = data_of((values - detector.bias) * detector.gain, unit="electron", mask=full)
     with warnings.catch_warnings():
@@ -297,8 +355,7 @@ def _cleaned(detector: Detector, values: Array, full: NDArray[np.bool_]) -> tupl
         found = ccdproc.cosmicray_lacosmic(
             electrons, readnoise=detector.read_noise, gain_apply=False, satlevel=detector.full_well, sigclip=6.0
         )
-    hit = np.asarray(found.mask, bool) & ~full
-    return values, hit
+    return np.asarray(found.mask, bool) & ~full
 
 
 def _ccdproc() -> tuple[Any, Any]:
@@ -317,22 +374,22 @@ def _ccdproc() -> tuple[Any, Any]:
 def _image(
     detector: Detector,
     electrons: Array,
-    response: Array | float,
+    flat: FlatField | None,
     dark: float,
     frames: int,
     mask: NDArray[np.bool_],
     exposed: Exposed,
     metadata: Mapping[str, Any] | None,
-    flat_noise: Array | float = 0.0,
 ) -> Image:
-    """Image in W from `electrons` (h, w), the mean over `frames` frames, divided by the flat field `response`.
+    """Image in W from `electrons` (h, w), the mean over `frames` frames, divided by the flat field.
 
-    `dark` is the variance [e-²] of one frame in addition to shot and read noise, `flat_noise` the relative variance of
-    `response`. The numbers in the metadata are those of the sum of the frames, whose shot noise is that of all its
-    electrons.
+    `dark` is the variance [e-²] of one frame in addition to shot and read noise. The numbers in the metadata are those
+    of the sum of the frames, whose shot noise is that of all its electrons.
     """
     per_watt = exposed.per_watt(detector.quantum_efficiency) * frames
     read = detector.read_noise * frames**0.5
+    response, flat_noise = (1.0, 0.0) if flat is None else (flat.response, flat.variance)
+    mask = mask if flat is None else mask | flat.mask
     total = np.where(mask, 0, electrons) * frames
     independent = dark * frames
     variance = np.maximum(total * response, 0) + read**2 + independent + flat_noise * (total * response) ** 2
@@ -353,11 +410,13 @@ def _image(
         "gain_error": detector.gain_error,
         "masked_pixels": int(mask.sum()),
     }
+    if flat is not None:
+        kept["flat_masked_pixels"] = int(flat.mask.sum())
     if exposed.pixel_pitch is not None:
         kept["pixel_pitch"] = exposed.pixel_pitch
     if detector.pixel_pitch is not None:
         kept[RECORDED["pixel_pitch"]] = detector.pixel_pitch
-    return Image(total / per_watt, error, metadata=kept, mask=mask)
+    return Image(total / per_watt, error, metadata=kept, mask=mask, flat=None if flat is None else flat.response)
 
 
 def measured(given: Image | Exposure | str | os.PathLike[str]) -> Image:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +32,8 @@ class Image:
         `fspt_surface`, or None
     metadata : text and numbers that record the origin of the image; `quantity` and `unit` are added
     mask : bool array, shape (h, w), True for pixels to leave out, such as saturated ones, or None
+    flat : array, shape (h, w), > 0: electrons per watt of each pixel relative to `electrons_per_watt`, of an image that
+        `Detector.reduce` corrected by a flat field, or None
 
     The arrays are stored as read-only views with at least 32-bit floats.
 
@@ -46,12 +48,13 @@ class Image:
     coverage: NDArray[np.floating] | None = None
     metadata: Metadata = field(default_factory=dict)
     mask: NDArray[np.bool_] | None = None
+    flat: NDArray[np.floating] | None = None
 
     def __post_init__(self) -> None:
         shape = np.shape(self.power)
         if self.mask is not None:
             object.__setattr__(self, "mask", _mask_plane(self.mask, shape))
-        for name in ("power", "error", "coverage"):
+        for name in ("power", "error", "coverage", "flat"):
             values = getattr(self, name)
             if values is None and name != "power":
                 continue
@@ -59,6 +62,8 @@ class Image:
             if plane.shape != shape:
                 raise ImageError(f"image: '{name}' must have the shape {shape} of 'power', got {plane.shape}. Crop it.")
             object.__setattr__(self, name, plane)
+        if self.flat is not None and not (self.flat > 0).all():
+            raise ImageError(f"image: 'flat' must be > 0, got {self.flat.min():g}. Mask such pixels, with 1 in 'flat'.")
         metadata: Metadata = {"quantity": "power", "unit": "W"}
         metadata |= {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
         if (metadata["quantity"], metadata["unit"]) != ("power", "W"):
@@ -133,7 +138,7 @@ class Image:
         metadata = self.metadata | {"source_power": watt}
         if "electrons_per_watt" in metadata:
             metadata["electrons_per_watt"] = float(metadata["electrons_per_watt"]) / watt
-        return Image(self.power.astype(np.float64) * watt, error, self.coverage, metadata, self.mask)
+        return replace(self, power=self.power.astype(np.float64) * watt, error=error, metadata=metadata)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
         """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
@@ -234,8 +239,8 @@ class Image:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a file of float32 planes and all metadata; its suffix chooses the format, see docs/images.md.
 
-        .exr has the channels `Y`, `error.Y`, `coverage.Y` and metadata under `fspt:`; .tif, .h5, .npz and .fits hold
-        the same.
+        .exr has the channels `Y`, `error.Y`, `coverage.Y`, `mask.Y` and `flat.Y`, as far as the image has them,
+        and metadata under `fspt:`; .tif, .h5, .npz and .fits hold the same.
         The file is written completely or not at all. Pixels below 1e-38 W, the smallest float32, may become 0; an image
         whose brightest pixel lies below it is refused.
 
@@ -250,7 +255,7 @@ class Image:
                 f"image: the brightest pixel has {peak:g} W, below what the file can hold (1.2e-38 W). "
                 "Scale the exitance up."
             )
-        planes = {"power": self.power, "error": self.error, "coverage": self.coverage}
+        planes = {"power": self.power, "error": self.error, "coverage": self.coverage, "flat": self.flat}
         planes["mask"] = None if self.mask is None else self.mask.astype(np.float32)
         write_planes(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
 
@@ -258,7 +263,7 @@ class Image:
 def read(path: str | os.PathLike[str]) -> Image:
     """Image from a file that `Image.write` wrote, or from any EXR file with a channel `Y`, which is taken as power [W].
 
-    `error`, `coverage` and `mask` are None if the file does not have them.
+    `error`, `coverage`, `mask` and `flat` are None if the file does not have them.
 
     Raises
     ------
@@ -279,7 +284,7 @@ def image_of(path: str | os.PathLike[str], planes: Mapping[str, NDArray], metada
         )
     try:
         mask = planes["mask"] != 0 if "mask" in planes else None
-        return Image(planes[quantity], planes.get("error"), planes.get("coverage"), metadata, mask)
+        return Image(planes[quantity], planes.get("error"), planes.get("coverage"), metadata, mask, planes.get("flat"))
     except ImageError as cause:
         raise ImageError(f"image file '{path}': {cause}") from cause
 

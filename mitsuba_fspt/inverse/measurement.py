@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..detector.reduction import measured, responses
+from ..detector.reduction import flat_variance, measured, responses
 from ..images.exposure import Exposure
 from ..images.image import Image
 from ..runtime.errors import InversionError
@@ -175,7 +175,7 @@ def variances(
                     "it again from its counts."
                 )
             each = per_watt * responses(image)
-            shot[k], other[k] = 1 / each, (read**2 + dark) / each**2
+            shot[k], other[k] = 1 / each, (read**2 + dark) / each**2 + flat_variance(image)
         elif image.error is not None:
             other[k] = image.error.astype(np.float64) ** 2
         else:

@@ -20,6 +20,7 @@ from mitsuba_fspt.runtime.errors import DetectorError, ImageError
 
 CCD = Detector.typical_ccd()
 SETTINGS = {"exposure_time": 60.0, "wavelength_nm": 650.0}
+SENSOR = {"flat_kind": "sensor", "flat_dark": 0}  # of a flat field free of bias
 PER_WATT = 0.85 * 60 * 650e-9 / (6.62607015e-34 * 299792458.0)
 
 
@@ -59,7 +60,7 @@ def test_stacks_and_frames():
     pattern = (20 * np.random.default_rng(1).standard_normal((64, 64))).astype(int)  # of the bias [DN]
     stack = pattern + np.array([CCD.expose(seen, 60, 650, seed=s).counts for s in range(5)])
     dark = pattern + np.array([CCD.expose(Image(0 * image.power), 60, 650, seed=90 + s).counts for s in range(5)])
-    found = CCD.reduce(stack, **SETTINGS, pixel_pitch=0.0135, dark=dark, flat=1e4 * flat)
+    found = CCD.reduce(stack, **SETTINGS, pixel_pitch=0.0135, dark=dark, flat=1e4 * flat, **SENSOR)
     chi2 = (((found.power - image.power) / found.error) ** 2)[8:].mean()
     assert chi2 == pytest.approx(1, abs=0.08)
     one = CCD.reduce(stack[0], **SETTINGS, pixel_pitch=0.0135)
@@ -74,10 +75,10 @@ def test_the_noise_of_a_stack_of_flat_fields_counts():
     pytest.importorskip("ccdproc")
     image = Image(np.full((64, 64), 5e4 / PER_WATT))
     flat = np.random.default_rng(7).poisson(1000, (2, 64, 64)) / CCD.gain
-    found = CCD.reduce(CCD.expose(image, 60, 650, seed=1).counts, **SETTINGS, flat=flat)
+    found = CCD.reduce(CCD.expose(image, 60, 650, seed=1).counts, **SETTINGS, flat=flat, **SENSOR)
     chi2 = ((found.power - image.power) / found.error) ** 2
     assert chi2.mean() == pytest.approx(1, abs=4 * math.sqrt(2 / chi2.size))
-    alone = CCD.reduce(CCD.expose(image, 60, 650, seed=1).counts, **SETTINGS, flat=flat.mean(axis=0))
+    alone = CCD.reduce(CCD.expose(image, 60, 650, seed=1).counts, **SETTINGS, flat=flat.mean(axis=0), **SENSOR)
     assert alone.error.mean() == pytest.approx(np.sqrt(5e4) / PER_WATT, rel=0.01)
 
 
@@ -93,7 +94,7 @@ def test_errors_follow_the_flat_field():
     thirds = []
     for seed in range(20):
         counts = CCD.expose(seen, 60, 650, seed=seed).counts
-        found = CCD.reduce(counts, **SETTINGS, pixel_pitch=0.0135, flat=1e4 * flat)
+        found = CCD.reduce(counts, **SETTINGS, pixel_pitch=0.0135, flat=1e4 * flat, **SENSOR)
         squares = ((found.power - image.power) / found.error) ** 2
         thirds.append([part.mean() for part in np.array_split(squares, 3, axis=1)])
     np.testing.assert_allclose(np.mean(thirds, axis=0), 1, atol=0.05)

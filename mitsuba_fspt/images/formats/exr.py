@@ -1,4 +1,4 @@
-"""OpenEXR: 32-bit float channels `Y`, `error.Y`, `coverage.Y`, `mask.Y`, metadata as attributes under `fspt:`."""
+"""OpenEXR: 32-bit float channels `Y`, `error.Y`, `coverage.Y`, `mask.Y`, `flat.Y`; metadata under `fspt:`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from ...runtime.errors import ImageError
-from . import Format, Metadata, Planes
+from . import BESIDE, Format, Metadata, Planes
 
 PREFIX = "fspt:"
 VALUES = "Y"  # channel of the power, or of the electrons
@@ -33,7 +33,7 @@ class Exr(Format):
 
     @classmethod
     def write(cls, path: Path, planes: Planes, metadata: Metadata) -> None:
-        """As `Format.write`; the plane that is neither error nor coverage becomes the channel Y."""
+        """As `Format.write`; the plane that is none of `BESIDE` becomes the channel Y."""
         header = {PREFIX + key: _attribute(value) for key, value in metadata.items()}
         header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         pixels = {_channel(name): OpenEXR.Channel(values) for name, values in planes.items()}
@@ -69,7 +69,7 @@ class Exr(Format):
 
 
 def _channel(plane: str) -> str:
-    return f"{plane}.{VALUES}" if plane in ("error", "coverage", "mask") else VALUES
+    return f"{plane}.{VALUES}" if plane in BESIDE else VALUES
 
 
 def _plane(channel: str, quantity: str) -> str:

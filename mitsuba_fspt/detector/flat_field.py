@@ -1,0 +1,202 @@
+"""Flat field: the response of each pixel relative to the mean one, from frames of a uniform light.
+
+    sensor   f = F/⟨F⟩            uniform light on the sensor, without the lens
+    lens     f = (F/U)/⟨F/U⟩      uniform screen through the scene's lens; U is its image by the model (Eq. M.6)
+
+F are the flat's counts less its bias and dark current, ⟨⟩ is the mean over the pixels that are kept. The matrix and
+every rendered image contain U, cos⁴θ and the borders of the lens among it: a flat field must not take it out again.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from ..images.radiometry import etendue_of
+from ..rendering.lens_numbers import lens_numbers
+from ..runtime.errors import DetectorError
+from ..runtime.numbers import number
+from .counts import Counts, Frame, frame_like
+from .detector import Detector
+from .saturation import saturated
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    Scene = mi.Scene | str | os.PathLike[str] | Mapping[str, object]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+LOG = logging.getLogger("mitsuba_fspt")
+KINDS = ("lens", "sensor")
+LEAST = 0.05  # of the median response, and of the screen's brightest pixel: the error of darker pixels is > 20 times it
+HOT = 2.0  # times the median of its 5 × 5 neighbours: an unmasked hot pixel of n changes the mean by less than 1/n
+NEIGHBOURS = 5  # pixels a side
+NORMALISED = 2.0  # largest median of a flat that was divided by its mean before; that of DN is larger
+SAME_PITCH = 1e-3  # relative difference of pixel pitches that rounding in files may cause
+
+
+@dataclass(frozen=True, eq=False)
+class FlatField:
+    """Response of the pixels (h, w).
+
+    response : f, relative to the mean of the pixels that are kept; 1 where masked
+    mask : True where the flat tells no response: dark, negative, saturated or hot pixels, and those without light
+    variance : relative variance of f by shot and read noise; 0 for a single frame, whose number of frames is unknown
+    """
+
+    response: Array
+    mask: Mask
+    variance: Array | float
+
+
+def flat_field(
+    detector: Detector,
+    flat: Frame,
+    kind: str | None,
+    scene: Scene | None,
+    shape: tuple[int, int],
+    *,
+    flat_dark: Frame | float | None = None,
+    bias: Array | None = None,
+    pixel_pitch: float | None = None,
+) -> FlatField:
+    """Flat field of counts of this `shape` (h, w); parameters as of `Detector.reduce`.
+
+    bias : frame [DN] in place of the detector's number, for a flat of raw counts without `flat_dark`
+    pixel_pitch : of the pixels read out [mm], or None
+
+    Raises
+    ------
+    DetectorError : the kind is missing or unknown, a scene is missing or has no meaning, sizes do not fit, or no pixel
+        is left.
+    SceneError, OpticsError : the scene has no lens that can be used.
+    """
+    _require_kind(kind, scene)
+    found = frame_like(flat, "flat", shape)
+    background, frames = _background(detector, found, flat_dark, bias, shape)
+    light = found.values - background
+    full = _full(detector, found, light, flat_dark)
+    screen = np.ones(shape) if scene is None else uniform_screen(scene, shape, pixel_pitch)
+    lit = screen > LEAST * screen.max()
+    usable = lit & ~full & (light > 0)
+    if not usable.any():
+        raise DetectorError(
+            f"reduce: the flat field has no usable pixel: {int(full.sum())} are saturated, {int((light <= 0).sum())} "
+            "not above its bias. Give another one."
+        )
+    relative = np.where(usable, light / np.where(lit, screen, 1), 0)
+    usable &= relative >= LEAST * np.median(relative[usable])
+    # A masked neighbour counts as the median pixel, so that it makes no other pixel hot.
+    filled = np.where(usable, relative, np.median(relative[usable]))
+    usable &= relative <= HOT * median_filter(filled, NEIGHBOURS, mode="nearest")
+    response = np.where(usable, relative / relative[usable].mean(), 1.0)
+    return FlatField(response, ~usable, _variance(detector, np.where(usable, light, 1.0), found.frames, frames))
+
+
+def uniform_screen(scene: Scene, shape: tuple[int, int], pixel_pitch: float | None = None) -> Array:
+    """Étendue [mm² sr] of the pixels read out, (h, w): the image of a uniform surface over its radiance (Eq. M.6).
+
+    It follows from the scene's lens, film and crop window, summed over the pixels of a bin, without a render.
+
+    Raises
+    ------
+    DetectorError : the film is no whole multiple of `shape`, or its pixels have not the `pixel_pitch` [mm].
+    SceneError, OpticsError : the scene has no lens that can be used.
+    """
+    numbers, film = lens_numbers(scene)
+    height, width = shape
+    binning = max(1, film[0] // height)
+    if (height * binning, width * binning) != film:
+        raise DetectorError(
+            f"reduce: the film of the 'scene' has {film[1]} × {film[0]} pixels, the counts {width} × {height}. Give "
+            "the scene of this camera, with its film and crop window."
+        )
+    own = float(numbers["pixel_pitch"]) * binning
+    if pixel_pitch is not None and abs(pixel_pitch - own) > SAME_PITCH * own:
+        raise DetectorError(
+            f"reduce: 'pixel_pitch' is {pixel_pitch:g} mm, the film of the 'scene' has {own:g} mm on the same pixels. "
+            "Give the scene of this camera."
+        )
+    return etendue_of(film, numbers).reshape(height, binning, width, binning).sum(axis=(1, 3))
+
+
+def _require_kind(kind: str | None, scene: Scene | None) -> None:
+    """Raise DetectorError for a flat without its kind, and for a scene that is missing or has no meaning."""
+    if kind not in KINDS:
+        given = "is missing" if kind is None else f"must be one of {', '.join(KINDS)}, got '{kind}'"
+        raise DetectorError(
+            f"reduce: 'flat_kind' {given}. Give 'lens' for a uniform screen seen through the camera's lens, with the "
+            "'scene' of that lens, whose cos⁴ and vignetting are then divided out; 'sensor' for uniform light on the "
+            "sensor without a lens."
+        )
+    if kind == "lens" and scene is None:
+        raise DetectorError("reduce: 'flat_kind' = lens needs the 'scene' with the camera's fspt_lens. Give its file.")
+    if kind == "sensor" and scene is not None:
+        raise DetectorError("reduce: 'scene' has no meaning for 'flat_kind' = sensor. Leave it out, or give 'lens'.")
+
+
+def _background(
+    detector: Detector, flat: Counts, flat_dark: Frame | float | None, bias: Array | None, shape: tuple[int, int]
+) -> tuple[Array | float, float]:
+    """Level to subtract from the flat [DN], and the number of frames that it is the mean of (inf for a number).
+
+    Says in one line on stderr what is assumed without `flat_dark`.
+    """
+    if flat_dark is not None:
+        if not isinstance(flat_dark, (str, os.PathLike)) and np.ndim(flat_dark) == 0:
+            level = number("reduce: 'flat_dark'", flat_dark, DetectorError, "0")
+            if not 0 <= level < np.inf:
+                raise DetectorError(f"reduce: 'flat_dark' must be >= 0 DN, got {level:g}. Give 0 for a flat without.")
+            return level, np.inf
+        frame = frame_like(flat_dark, "flat_dark", shape)
+        return frame.values, frame.frames
+    if flat.raw:
+        given = f"{detector.bias:g} DN" if bias is None else "frame"
+        LOG.warning(
+            "fspt: reduce: the flat field holds raw counts; the bias, %s, is subtracted, no dark current. Give "
+            "'flat_dark', a frame of the flat's exposure time that contains the bias, or 0.",
+            given,
+        )
+        return detector.bias if bias is None else bias, np.inf
+    if (middle := float(np.median(flat.values))) > NORMALISED:
+        LOG.warning(
+            "fspt: reduce: the flat field, median %.6g, holds no unsigned integers as raw counts are; it is taken as "
+            "free of bias and dark current. Give 'flat_dark', 0 if it is.",
+            middle,
+        )
+    return 0.0, np.inf
+
+
+def _full(detector: Detector, flat: Counts, light: Array, flat_dark: Frame | float | None) -> Mask:
+    """True where the flat is saturated; nowhere for one in other units than DN, such as a sum of frames."""
+    highest = flat.values if flat.highest is None else flat.highest
+    with_bias = flat.raw or (flat_dark is not None and np.any(light != flat.values))
+    level = highest if with_bias else highest + detector.bias
+    full = saturated(detector, level)
+    return full if flat.raw or full.mean() < 0.5 else np.zeros_like(full)
+
+
+def _variance(detector: Detector, light: Array, frames: int, dark_frames: float) -> Array | float:
+    """Relative variance of the mean of a stack of flats by shot and read noise, and by the read noise of its dark."""
+    if frames == 1:
+        return 0.0
+    electrons = light * detector.gain
+    read = detector.read_noise**2 * (1 / frames + 1 / dark_frames)
+    return (electrons / frames + read) / electrons**2
+
+
+def require_no_flat(**given: Any) -> None:
+    """Raise DetectorError for a given setting of a flat field without one."""
+    for name, value in given.items():
+        if value is not None:
+            raise DetectorError(
+                f"reduce: '{name}' has no meaning without 'flat'. Give the flat field, or leave it out."
+            )

@@ -1,0 +1,79 @@
+"""Saturated pixels: by the detector's numbers, and by a pile of counts at one largest value against the noise."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm, poisson
+
+from .detector import Detector
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+LOG = logging.getLogger("mitsuba_fspt")
+CHANCE = 1e-6  # of a false alarm in an image whose noise is that of the detector's numbers
+WINDOW = 2.0  # standard deviations to each side of a value, within which other counts of equal light lie
+
+
+def saturated(detector: Detector, counts: Array) -> Mask:
+    """True (h, w) where a count has reached the largest value of the converter or the full well."""
+    top = 2**detector.bits - 1
+    return (counts >= top) | (counts >= detector.bias + detector.full_well / detector.gain - 0.5)
+
+
+def unknown_ceiling(detector: Detector, counts: Array, frames: int = 1) -> float | None:
+    """The largest count [DN], if so many pixels have exactly this one that the camera saturates there; else None.
+
+    Of n pixels that reach the largest value M, all have exactly M by chance with the probability hⁿ. h is the share of
+    the value M in the tail from M on of a normal distribution with the standard deviation σ of shot and read noise at
+    M: h = 1 − Q(z + s/σ)/Q(z), Q(z) = n/N, with all N pixels and the step s of the counts. Fewer pixels of that light
+    lie less far in the tail, where h is smaller. At low light σ is below the step, h is near 1 and nothing is found.
+    Counts without noise, such as simulated ones, have such piles at other values as well; then nothing is found either.
+
+    counts : (h, w) [DN], of one frame or the mean of `frames` frames
+    """
+    largest = float(counts.max())
+    reached = int(np.count_nonzero(counts == largest))
+    step = 1.0 / frames
+    if not 2 <= reached < counts.size:
+        return None
+    depth = norm.isf(reached / counts.size)
+    share = 1 - norm.sf(depth + step / _sigma(detector, largest, frames)) / norm.sf(depth)
+    if reached * np.log(share) > np.log(CHANCE) or _without_noise(detector, counts[counts < largest], frames):
+        return None
+    return largest
+
+
+def _without_noise(detector: Detector, counts: Array, frames: int) -> bool:
+    """True if the most frequent of the counts (n,) [DN] is more frequent than the detector's noise lets it be.
+
+    Of normally distributed counts, the share of one value among those within `WINDOW` σ is largest at their mean. The
+    most frequent of all values is tried, hence a chance for each.
+    """
+    values, numbers = np.unique(counts, return_counts=True)
+    most = int(np.argmax(numbers))
+    sigma, step = _sigma(detector, values[most], frames), 1.0 / frames
+    beside = np.abs(values - values[most]) <= WINDOW * sigma + step / 2
+    inside = int(numbers[beside].sum())
+    share = min(1.0, (2 * norm.cdf(step / 2 / sigma) - 1) / (2 * norm.cdf(WINDOW) - 1))
+    return bool(numbers[most] > 1 and len(values) * poisson.sf(numbers[most] - 1, inside * share) < CHANCE)
+
+
+def _sigma(detector: Detector, counts: float, frames: int) -> float:
+    """Standard deviation [DN] of shot, read and rounding noise of the mean of `frames` frames at these counts [DN]."""
+    electrons = max(detector.gain * (counts - detector.bias), 0.0)
+    variance = (electrons + detector.read_noise**2) / detector.gain**2 + 1 / 12
+    return float(np.sqrt(variance / frames))
+
+
+def tell_ceiling(detector: Detector, ceiling: float, pixels: int) -> None:
+    """Say in one line on stderr that pixels at this largest count are masked."""
+    LOG.warning(
+        "fspt: reduce: %d pixels have exactly the largest count, %g DN, where noise would spread them: the camera "
+        "saturates there, below %d bits and full well. They are masked. Correct 'bits' or 'full_well'.",
+        pixels,
+        ceiling,
+        detector.bits,
+    )
