@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 METHODS = ("path", "ptracer")
-ALIKE = 3.0  # largest ratio of the errors of neighbouring pixels that see the same surfaces
+ALIKE = 3.0  # largest ratio of one missed sample to the scatter of samples that may have missed none
 FEW = 20  # events on a pixel, below which its own passes give a poor estimate of the variance
 Plane = NDArray[np.float64]
 
@@ -74,9 +74,9 @@ def standard_error(mean: Plane, mean_square: Plane, count: int, samples: int) ->
 
     (a) at most `FEW` events: s² is its mean over such pixels in the 3 × 3 neighbourhood, those without events left out;
     (b) no event: in addition s is at least the largest w in the neighbourhood;
-    (c) passes that agree, but a neighbour with s above `ALIKE` times this one: some samples of the neighbour miss the
-        light, so that samples of this pixel could miss it too. s is at least the smaller of ⟨P⟩/samples and the
-        neighbour's s.
+    (c) samples that agree, next to a pixel of another power: one sample more could have met what the neighbour sees. s
+        is Δ/samples where that is above `ALIKE` times the scatter, Δ the largest difference of ⟨P⟩ to the 3 × 3
+        neighbours. On a slope of ⟨P⟩ the samples themselves scatter by more.
     """
     from ..jit.pixel_grid import Grid
 
@@ -91,6 +91,5 @@ def standard_error(mean: Plane, mean_square: Plane, count: int, samples: int) ->
     few = mean * mean <= FEW * variance
     pooled = np.sqrt(grid.array(grid.mean_where(grid.flat(variance), grid.flat(few & met), 1)))  # (a)
     counted = np.where(met, pooled, np.maximum(pooled, largest_around(event)))  # (b)
-    near = largest_around(own)
-    missed = np.where(near > ALIKE * own, np.minimum(near, mean / samples), 0)  # (c)
-    return np.where(few, counted, np.maximum(own, missed))
+    missed = np.maximum(largest_around(mean) - mean, mean + largest_around(-mean)) / samples  # (c)
+    return np.where(few, counted, np.where(missed > ALIKE * own, missed, own))

@@ -156,6 +156,26 @@ def test_a_few_events_on_a_pixel_are_off_by_the_root_of_how_many_to_expect(expec
     assert np.abs(off / error).max() < 5
 
 
+@pytest.mark.parametrize("share", [1e-3, 4e-3])
+def test_a_dark_edge_that_no_sample_met_has_the_error_of_one_sample(share):
+    """The border of bright and dark checks cuts off a `share` of each pixel of a column; 256 samples a pixel.
+
+    Expected: no pixel is off by more than 5 errors, on either side of the border. Most pixels of the column have no sample
+    beyond the border, nor have their neighbours. Fails with the pixels' and neighbours' scatter alone, which is 0.
+    """
+    passes, each, draw = 32, 8, np.random.default_rng(2)
+    for first, second in ((1.0, 0.1), (0.1, 1.0)):
+        beyond = np.zeros((64, 64))
+        beyond[:, 32:], beyond[:, 31] = 1.0, share
+        met = draw.binomial(each, beyond, (passes, 64, 64)) / each
+        counts = first + (second - first) * met
+        mean = counts.mean(axis=0)
+        error = standard_error(mean, np.square(counts).mean(axis=0), passes, samples=passes * each)
+        off = np.abs(mean - (first + (second - first) * beyond))[:, 31]
+        assert off.max() > 0
+        assert (off < 5 * error[:, 31]).all()
+
+
 def test_samples_may_be_few(scene):
     image = fspt.render(scene, method="path", spp=2)
     assert image.metadata["passes"] == 2
