@@ -41,3 +41,11 @@ def noisy(matrix, exitance, electrons, seed, read_noise=3.5, **metadata):
     counted = rng.poisson(power * per_watt) + read_noise * rng.standard_normal(power.shape)
     metadata = {"electrons_per_watt": per_watt, "read_noise": read_noise} | metadata
     return [fspt.Image(plane / per_watt, metadata=metadata) for plane in counted]
+
+
+def passes_of(true, events, rng, passes=16):
+    """Mean and standard error of passes in which light arrives in `events` of random weight on the brightest pixel."""
+    weight = true.max() / events
+    met = rng.poisson(true / weight / passes, (passes, *true.shape))
+    each = weight * passes * rng.gamma(np.maximum(met, 1e-300), 1.0)
+    return each.mean(axis=0), each.std(axis=0, ddof=1) / passes**0.5

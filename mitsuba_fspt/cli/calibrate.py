@@ -11,11 +11,12 @@ from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import InversionError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Quiet, SceneFile, Sensor, require_writable, value_lists
+from .options import AsJson, Quiet, Sampled, SceneFile, Sensor, require_writable, value_lists
 from .terminal import print_result
 
 if TYPE_CHECKING:
     from ..inverse.calibrate import Calibration
+    from ..inverse.calibration_fit import UndeterminedError
 
 
 Views = Annotated[
@@ -45,6 +46,7 @@ def calibrate(
         float | None, typer.Option(help="Error of the integrals over the brightest pixel; from the noise if left out.")
     ] = None,
     sensor: Sensor = 0,
+    sampled: Sampled = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -74,20 +76,25 @@ def calibrate(
                 [read_measured(path) for path in images],
                 free=names,
                 sensor=sensor,
+                sampled=sampled,
                 settings=CalibrationSettings(rtol=rtol),
                 progress=progress,
                 **value_lists(define),
             )
         except UndeterminedError as error:
             if as_json:
-                refusal = {"determined": False, "condition": error.condition, "combinations": error.combinations}
-                print_result("", refusal, as_json=True, quiet=quiet)
+                print_result("", _refusal(error), as_json=True, quiet=quiet)
             raise
     record: dict[str, Any] = {"determined": True, **found.summary()}
     if output is not None:
         found.write(output)
         record["output"] = str(output)
     print_result(_text(found), record, as_json=as_json, quiet=quiet)
+
+
+def _refusal(error: UndeterminedError) -> dict[str, Any]:
+    """What the images do not determine, ready for JSON."""
+    return {"determined": False, "condition": error.condition, "combinations": error.combinations}
 
 
 def _text(found: Calibration) -> str:

@@ -11,7 +11,7 @@ from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import InversionError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Quiet, require_picture, require_writable
+from .options import AsJson, Quiet, Sampled, require_picture, require_writable
 from .terminal import print_result
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def invert(
     gain_error: Annotated[
         float | None, typer.Option(help="Relative uncertainty common to all pixels; that of the images if left out.")
     ] = None,
+    sampled: Sampled = False,
     method: Annotated[
         str,
         typer.Option(help="smooth, or mlem: without penalty and intervals.", autocompletion=lambda: ["smooth", "mlem"]),
@@ -63,6 +64,7 @@ def invert(
             [read_measured(path) for path in images],
             weight=weight,
             gain_error=gain_error,
+            sampled=sampled,
             samples=samples,
             seed=seed,
             confidence=confidence,

@@ -11,7 +11,7 @@ from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import InversionError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Quiet, require_writable
+from .options import AsJson, Quiet, Sampled, require_writable
 from .terminal import print_result
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ def locate(
     gain_error: Annotated[
         float | None, typer.Option(help="Relative uncertainty common to all pixels; that of the images if left out.")
     ] = None,
+    sampled: Sampled = False,
     scene: Annotated[Path | None, typer.Option(metavar="SCENE.xml", help="Scene of T.npz, where it has moved.")] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -66,6 +67,7 @@ def locate(
             sources=sources,
             confidence=confidence,
             gain_error=gain_error,
+            sampled=sampled,
             scene=scene,
             progress=progress,
         )

@@ -50,6 +50,9 @@ Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
 SourcePower = Annotated[
     float | None, typer.Option(metavar="W", help="Power of the light source [W], for a scene that is per 1 W of it.")
 ]
+Sampled = Annotated[
+    bool, typer.Option("--sampled", help="Images of a Monte Carlo: their errors come from the scatter of samples.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rows = Annotated[bool, typer.Option("--json", help="Print one JSON array of all rows.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print no results and no progress; warnings stay.")]

@@ -25,7 +25,7 @@ from ..studies.sweep_point import texts_of
 from .calibrated_scene import write_calibrated
 from .calibration_fit import CalibrationFit, CalibrationSettings, Fitted, Measured
 from .derivatives import scene_text, varied_value
-from .measurement import tell_misfit, variances
+from .measurement import noise_of, tell_misfit
 
 Array = NDArray[np.float64]
 Picture = Image | Exposure | str | os.PathLike[str]
@@ -85,6 +85,7 @@ def calibrate(
     *,
     free: Sequence[str],
     sensor: int = 0,
+    sampled: bool = False,
     settings: CalibrationSettings | None = None,
     progress: Progress | None = None,
     **parameters: object,
@@ -104,6 +105,9 @@ def calibrate(
         source's power that an image was scaled to
     free : names of parameters, common to all views, or `gain`, a factor on all powers
     sensor : number of the sensor
+    sampled : True for images of a Monte Carlo, whose errors the scatter of samples gave: the variance of a pixel is
+        then a smooth function of the fitted signal (Eq. M.27). Images whose metadata name `passes` are taken so by
+        themselves
     settings : accuracy
     progress : called with what is being done and the share done
     parameters : values of other `<default>` parameters; lists are multiplied out to views, the last one fastest
@@ -125,7 +129,7 @@ def calibrate(
         powers = [image.metadata.get("source_power") for image in found]
         pictures = _Pictures(scene, names, views, powers, sensor, settings.rtol or 1e-4, report)
         pictures(start)
-        data = measured_of(found, views, pictures.first, len(names))
+        data = measured_of(found, views, pictures.first, len(names), sampled)
         fitted = CalibrationFit(names, start, data, pictures, settings).solved()
     return _calibration(names, data, fitted, os.fspath(scene))
 
@@ -154,7 +158,7 @@ def _images(given: Any, views: int) -> list[Image]:
 def _calibration(names: tuple[str, ...], measured: Measured, fitted: Fitted, scene: str) -> Calibration:
     """The fitted numbers by name."""
     pixels = int(measured.used.sum())
-    tell_misfit("calibrate", fitted.chi2_sum, pixels - len(names))
+    tell_misfit("calibrate", fitted.chi2_sum, pixels, len(names), [fitted.noise])
     return Calibration(
         names,
         dict(zip(names, map(float, fitted.values), strict=True)),
@@ -239,7 +243,11 @@ class _Pictures:
 
 
 def measured_of(
-    images: Sequence[Image], views: Sequence[Mapping[str, str]], pictures: Sequence[Image], parameters: int
+    images: Sequence[Image],
+    views: Sequence[Mapping[str, str]],
+    pictures: Sequence[Image],
+    parameters: int,
+    sampled: bool = False,
 ) -> Measured:
     """Pixels of the images, after checks against the views and the scene's pictures."""
     for number, (image, picture) in enumerate(zip(images, pictures, strict=True)):
@@ -255,18 +263,18 @@ def measured_of(
                 "the same film."
             )
     _require_order(images, views)
-    shot, other = variances((len(images), *pictures[0].shape), images, verb="calibrate")
+    noise = noise_of((len(images), *pictures[0].shape), images, sampled=sampled, verb="calibrate")
     masks = np.stack([np.zeros(i.shape, bool) if i.mask is None else i.mask for i in images])
-    used = (shot + other > 0) & ~masks
+    lit = np.stack([picture.power for picture in pictures]) > 0  # no sample need have met such a pixel
+    used = ((noise.shot + noise.other > 0) | (noise.sampled[:, None, None] & lit)) & ~masks
     if used.sum() <= parameters:
         raise InversionError(
             f"calibrate: {int(used.sum())} pixels have an error > 0 and no mask, for {parameters} parameters. Give "
             "more, or expose for a shorter time."
         )
     power = np.stack([image.power for image in images]).astype(np.float64)
-    sampled = all("passes" in image.metadata for image in images)
     gain_error = max(float(image.metadata.get("gain_error", 0.0)) for image in images)
-    return Measured(power, shot, other, used, sampled, gain_error)
+    return Measured(power, noise, used, gain_error)
 
 
 def _require_order(images: Sequence[Image], views: Sequence[Mapping[str, str]]) -> None:

@@ -13,17 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.optimize import least_squares
-from scipy.spatial import cKDTree
 
 from ..runtime.errors import InversionError
+from .measurement import Chi2, Noise
 
 Array = NDArray[np.float64]
 Pictures = Callable[[Array], tuple[Array, Array]]
-# Of Eq. M.27: steps of ln P; the number of groups for one variance, since the square of one standard error from eight
-# passes is wrong by a half; and the share of the brightest pixel below which pixels count as equally dark.
-ALIKE, GROUPS, FAINT = 0.05, 16, 1e-4
 
 
 @dataclass(frozen=True)
@@ -84,58 +80,33 @@ class UndeterminedError(InversionError):
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Pixels of all views (views, h, w): power [W], variances `shot` [W] · signal + `other` [W²], which ones count.
+    """Pixels of all views (views, h, w): power [W], their noise, and which ones count.
 
-    sampled : images of Monte Carlo, whose `other` is the square of a standard error from the scatter of few passes
     gain_error : relative standard deviation of a factor common to all pixels
     """
 
     power: Array
-    shot: Array
-    other: Array
+    noise: Noise
     used: NDArray[np.bool_]
-    sampled: bool
     gain_error: float
 
     def sigma(self, signal: Array, numerical: Array) -> Array:
-        """Standard deviation of the pixels [W], for a fitted signal (Eq. M.24); 1 where they do not count.
+        """Standard deviation of the pixels [W], for a fitted signal (Eq. M.24, M.27); 1 where they do not count.
 
-        A pixel has at least the shot noise of one electron. Of Monte Carlo the pixels' own standard errors are not
-        taken one by one: on a silhouette a pixel that too few samples reached has too small a one, and would count
-        more.
+        A pixel has at least the shot noise of one electron.
         """
-        other = sampling_variance(signal, self.other, self.used) if self.sampled else self.other
-        variance = np.maximum(self.shot * np.maximum(signal, 0) + other, self.shot**2) + numerical**2
+        variance = np.maximum(self.noise.variance(signal, self.used), self.noise.shot**2) + numerical**2
         return np.where(self.used, np.sqrt(variance), 1.0)
-
-
-def sampling_variance(signal: Array, squares: Array, used: NDArray[np.bool_]) -> Array:
-    """Variance [W²] of Monte Carlo pixels, (views, h, w), as a function of the fitted signal P (Eq. M.27).
-
-    The variance depends on how P varies in the pixel: whether a silhouette crosses it, and how steep P is. Pixels are
-    grouped by P and by the largest and the least P of their 3 × 3 neighbourhood, in steps of `ALIKE`. The variance is
-    the mean of the `squares` of the standard errors in the `GROUPS` groups most alike, 0 where no pixel is used.
-    """
-    light = np.maximum(signal, 0)
-    around = [light, *(pick(light, (1, 3, 3), mode="nearest") for pick in (maximum_filter, minimum_filter))]
-    least = FAINT * (float(light.max()) or 1.0)
-    steps = np.stack([np.rint(np.log(np.maximum(one, least) / least)[used] / ALIKE) for one in around], axis=-1)
-    _, first, group = np.unique(steps @ (1 << np.array([40, 20, 0])), return_index=True, return_inverse=True)
-    steps, count = steps[first], np.bincount(group)
-    total = np.bincount(group, squares[used])
-    near = cKDTree(steps).query(steps, np.arange(1, min(GROUPS, len(steps)) + 1))[1]
-    variance = np.zeros(signal.shape)
-    variance[used] = (total[near].sum(axis=1) / count[near].sum(axis=1))[group]
-    return variance
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Values (p,), covariance (p, p), Σ (residual/σ)² and condition number."""
+    """Values (p,), covariance (p, p), Σ (residual/σ)², what the noise makes of it, and condition number."""
 
     values: Array
     covariance: Array
     chi2_sum: float
+    noise: Chi2
     condition: float
 
 
@@ -184,11 +155,12 @@ class CalibrationFit:
         slopes, condition = self._require_determined(y, sigma)
         used = self.measured.used
         residual = ((picture - self.measured.power) / sigma)[used]
+        noise = self.measured.noise.chi2(picture, sigma, used)
         inverse = np.linalg.inv(slopes.T @ slopes)
         factor = inverse @ (slopes.T @ (picture / sigma)[used])  # Eq. M.26
         covariance = inverse + self.measured.gain_error**2 * np.outer(factor, factor)
         scale = np.outer(self._steps, self._steps)
-        return Fitted(self._values(y), covariance * scale, float(residual @ residual), condition)
+        return Fitted(self._values(y), covariance * scale, float(residual @ residual), noise, condition)
 
     def _values(self, y: Array) -> Array:
         return self.start + self._steps * y

@@ -46,6 +46,7 @@ class Inversion:
     converged : False where variances or weight still changed in the last round
     gain_error : relative uncertainty of a common factor, contained in the intervals
     measured, fitted, sigma : (views, height, width) [W]; NaN where masked, or outside the surface
+    warnings : lines of stderr on what the residuals say of the model and of the stated errors
     """
 
     matrix: TransportMatrix
@@ -66,6 +67,7 @@ class Inversion:
     measured: Array
     fitted: Array
     sigma: Array
+    warnings: tuple[str, ...] = ()
 
     @cached_property
     def exitance(self) -> Array:
@@ -163,6 +165,7 @@ class Inversion:
             "converged": self.converged,
             "unknowns": self.surface.unknowns,
             "samples": self.draws.shape[1],
+            "warnings": list(self.warnings),
         }
         if self.draws.shape[1]:
             found |= {"confidence": self.confidence, "total_interval": list(self.total_interval)}

@@ -1,8 +1,8 @@
 """`invert`: the surface flux density J_n from pictures of several views, with intervals.
 
-The power on pixel i is T J, its noise normal with the variance of Eq. M.24 of docs/model.md, taken from the fitted
-signal. J >= 0 minimises half of χ² and the penalty of Eq. M.23. Samples are such minima for data and penalty with
-noise added (randomise then optimise: J. M. Bardsley et al., SIAM J. Sci. Comput. 36, A1895, 2014).
+The power on pixel i is T J, its noise normal with the variance of Eq. M.24 or M.27 of docs/model.md, taken from the
+fitted signal. J >= 0 minimises half of χ² and the penalty of Eq. M.23. Samples are such minima for data and penalty
+with noise added (randomise then optimise: J. M. Bardsley et al., SIAM J. Sci. Comput. 36, A1895, 2014).
 """
 
 from __future__ import annotations
@@ -88,6 +88,7 @@ def invert(
     weight: float | None = None,
     prior: Prior | None = None,
     gain_error: float | None = None,
+    sampled: bool = False,
     samples: int = 0,
     seed: int = 0,
     confidence: float = 0.9,
@@ -110,6 +111,9 @@ def invert(
     weight : of the penalty on roughness [mm²], >= 0; None: the weight that agrees with the roughness found (Eq. M.25)
     prior : mean, reference and correlation length of the penalty; None: roughness relative to J_n itself is penalised
     gain_error : relative uncertainty of a factor common to all pixels, in [0, 1); None: that of the images, else 0
+    sampled : True for images of a Monte Carlo, whose errors the scatter of samples gave: the variance of a pixel is
+        then a smooth function of the fitted signal (Eq. M.27), and errors of 0 are allowed. Images whose metadata name
+        `passes` are taken so by themselves
     samples, seed : number of random draws, from which the intervals follow (0: none), and their seed, 0 … 2⁵³
     confidence : of the intervals, in (0, 1)
     method : 'smooth', with the penalty; or 'mlem', maximum likelihood without penalty and intervals (Eq. M.28)
@@ -127,12 +131,11 @@ def invert(
     """
     _require_matrix(matrix)
     options = Options(weight, samples, seed, confidence, method, crease_angle)
-    measurement = Measurement.of(matrix, images, error, mask, gain_error)
+    measurement = Measurement.of(matrix, images, error, mask, gain_error, sampled)
     surface = replace(Surface.of(matrix, scene), crease_angle=options.crease_angle)
     problem = Problem.of(matrix, measurement, surface, prior or Prior(), settings or Settings())
     with reported(progress) as report:
         found = problem.solved(options, report)
-    tell_misfit("invert", found.chi2_sum, found.pixels - found.determined)
     _report_unconverged(found, problem.settings.rounds)
     return found
 
@@ -458,7 +461,9 @@ class Problem:
         lit = per_area >= self.settings.seen * per_area.max()
         seen = lit & (seen_share(self.surface, self.sensitivity, self.settings.seen) >= MOST)
         fitted = (self.matrix @ solution).reshape(self.matrix.image_shape)
-        residual = (self.measurement.power[self.rows] - self.transport @ fit.x) / fit.sigma
+        signal = self.transport @ fit.x
+        chi2_sum = float(np.sum(((self.measurement.power[self.rows] - signal) / fit.sigma) ** 2))
+        noise = self.measurement.chi2(self.rows, signal, fit.sigma)
         sigma = np.full(self.matrix.shape[0], np.nan)
         sigma[self.rows] = fit.sigma
         views = self.matrix.image_shape
@@ -477,7 +482,8 @@ class Problem:
             decrement=fit.decrement,
             converged=fit.converged,
             gain_error=self.measurement.gain_error,
-            chi2_sum=float(residual @ residual),
+            chi2_sum=chi2_sum,
+            warnings=tuple(tell_misfit("invert", chi2_sum, len(self.rows), fit.determined, [noise])),
             measured=np.where(self.measurement.mask, np.nan, self.measurement.power).reshape(views),
             fitted=fitted,
             sigma=sigma.reshape(views),

@@ -49,6 +49,7 @@ def locate(
     error: ArrayLike | Mapping[str, ArrayLike] | None = None,
     mask: ArrayLike | Mapping[str, ArrayLike] | None = None,
     gain_error: float | None = None,
+    sampled: bool = False,
     confidence: float = 0.9,
     scene: object = None,
     progress: Progress | None = None,
@@ -71,7 +72,7 @@ def locate(
     images : one Image, Exposure or name of a file of either per view, in the order of the views; or an array of powers
         (views, h, w) [W] together with `error`
     sources : number of point sources, 1 … 20
-    error, mask, gain_error, scene : as in `invert`
+    error, mask, gain_error, sampled, scene : as in `invert`
     confidence : of the intervals, in (0, 1)
     progress : function of the present step (text) and the share done (0 … 1); None: a bar in notebooks
     settings : accuracy
@@ -94,7 +95,7 @@ def locate(
     given = _given(matrix, images, error, mask)
     described = _described(phantom)
     with reported(progress) as report:
-        bands = _band_images(described, given, gain_error, scene, report)
+        bands = _band_images(described, given, gain_error, sampled, scene, report)
         return _located(bands, count, confidence, accuracy, report)
 
 
@@ -194,8 +195,8 @@ def _located(
             "Give fewer sources, or" if count > 1 else "Give",
         )
     density = replace(grid, sigma=found.sigma).density(report)
-    tell_misfit("locate", found.cost, fit.free(found))
-    return Location.of(fit, found, covariance, z, p_values, linear, density, confidence)
+    warnings = tell_misfit("locate", found.cost, len(fit.power), 4 * count, fit.noise(found))
+    return Location.of(fit, found, covariance, z, p_values, linear, density, confidence, warnings)
 
 
 def _described(phantom: object) -> PhantomFile:
@@ -211,7 +212,12 @@ def _described(phantom: object) -> PhantomFile:
 
 
 def _band_images(
-    described: PhantomFile, given: Sequence[_Given], gain_error: float | None, scene: object, report: Progress
+    described: PhantomFile,
+    given: Sequence[_Given],
+    gain_error: float | None,
+    sampled: bool,
+    scene: object,
+    report: Progress,
 ) -> list[BandImages]:
     """Images and tissue of each band, on the same tetrahedra."""
     report("images", 0.0)
@@ -219,7 +225,7 @@ def _band_images(
     for one in given:
         with renamed("invert", one.label):
             surface = Surface.of(one.matrix, scene)
-            measurement = Measurement.of(one.matrix, one.images, one.error, one.mask, gain_error)
+            measurement = Measurement.of(one.matrix, one.images, one.error, one.mask, gain_error, sampled)
         read.append((surface, measurement, described.band(one.name)))
     report("tissue", 0.0)
     mesh = described.checked_mesh()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,7 @@ class Location:
     measured, fitted, sigma : (views, height, width) [W], NaN where masked or outside the surface; by the names of the
         bands where the images were given so
     residual : (measured − fitted)/sigma, in the same form
+    warnings : lines of stderr on what the residuals say of the model and of the stated errors
     """
 
     sources: tuple[LocatedSource, ...]
@@ -91,6 +93,7 @@ class Location:
     fitted: Array | dict[str, Array]
     sigma: Array | dict[str, Array]
     residual: Array | dict[str, Array]
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -103,6 +106,7 @@ class Location:
         linear: bool,
         density: Array,
         confidence: float,
+        warnings: Sequence[str] = (),
     ) -> Location:
         """Result of a fit, with intervals of z standard deviations to both sides."""
         each = zip(found.values.reshape(-1, 4), np.sqrt(np.diag(covariance)).reshape(-1, 4), p_values, strict=True)
@@ -120,6 +124,7 @@ class Location:
             fitted=fit.images(found.signal),
             sigma=fit.images(found.sigma),
             residual=fit.images(found.residual(fit.power)),
+            warnings=tuple(warnings),
         )
 
     def summary(self) -> dict[str, Any]:
@@ -133,6 +138,7 @@ class Location:
             "chi2": self.chi2,
             "pixels": self.pixels,
             "gain_error": self.gain_error,
+            "warnings": list(self.warnings),
         }
 
     def write(self, path: str | os.PathLike[str]) -> None:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.spatial import cKDTree
 
 from ..detector.reduction import flat_variance, measured, responses
 from ..images.exposure import Exposure
@@ -21,6 +23,89 @@ from .transport_matrix import TransportMatrix
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
 MISFIT = 4.0  # standard deviations of Σ (residual/σ)² by chance: more happens in one fit of 30,000
+WIDE = 0.9  # chi2 from which on downwards errors that are stated too large are told: intervals are 5 % too wide
+# Of Eq. M.27: steps of ln P; the number of groups for one variance, since the square of one standard error from eight
+# passes is wrong by a half; and the share of the brightest pixel below which pixels count as equally dark.
+ALIKE, GROUPS, FAINT = 0.05, 16, 1e-4
+
+
+@dataclass(frozen=True)
+class Chi2:
+    """Σ (noise/σ)² of pixels as the stated noise alone makes it.
+
+    mean : without the numerical error of the fitted signal; with it at its bound, the number of pixels
+    variance : 2 a pixel for normal noise, more for few electrons
+    """
+
+    mean: float
+    variance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Variance of the pixels of all views, arrays (views, h, w): shot · signal + other (Eq. M.24, M.27).
+
+    shot : [W], variance of the shot noise over the power: 1/(electrons per watt), 0 where `other` holds all the noise
+    other : [W²], variance that does not depend on the signal: read-out, dark current, a given error
+    sampled : (views,) True for images of Monte Carlo: their `other` are squares of standard errors that the scatter of
+        samples gave, and the variance is a smooth function of the signal instead
+    """
+
+    shot: Array
+    other: Array
+    sampled: NDArray[np.bool_]
+
+    def variance(self, signal: Array, used: NDArray[np.bool_]) -> Array:
+        """Variance [W²] for a fitted signal [W], NaN where it is not known, of the pixels `used`; (views, h, w)."""
+        variance = self.shot * np.maximum(signal, 0) + self.other
+        if self.sampled.any():
+            drawn = used & self.sampled[:, None, None]
+            variance[drawn] = sampling_variance(signal, self.other, drawn)[drawn]
+        return variance
+
+    def chi2(self, signal: Array, sigma: Array, used: NDArray[np.bool_]) -> Chi2:
+        """Mean and variance of Σ (noise/σ)² over the pixels `used`; `sigma` [W] may contain more than noise (M.24)."""
+        variance = self.variance(signal, used)[used]
+        shot = np.where(self.sampled[:, None, None], 0, self.shot)[used] * np.maximum(signal[used], 0)
+        # Light in events of power w: the fourth moment of the noise is 3 v² + w² v for a variance v.
+        fourth = self.shot[used] ** 2 * shot
+        drawn = np.broadcast_to(self.sampled[:, None, None], used.shape)[used] & (signal[used] > 0)
+        fourth[drawn] = variance[drawn] ** 3 / signal[used][drawn] ** 2
+        square = sigma[used] ** 2
+        return Chi2(float((variance / square).sum()), float(((2 * variance**2 + fourth) / square**2).sum()))
+
+
+def sampling_variance(signal: Array, squares: Array, used: NDArray[np.bool_]) -> Array:
+    """Variance [W²] of Monte Carlo pixels, (views, h, w), as a function of the fitted signal P (Eq. M.27).
+
+    A pixel's own standard error is not taken: one that few samples met by chance is too dark, has too small an error,
+    and would count more. The variance depends on how P varies in the pixel: whether a silhouette crosses it, and how
+    steep P is. Pixels are grouped by P and by the largest and the least P of their 3 × 3 neighbourhood (NaN left out),
+    in steps of `ALIKE`. The variance is the mean of the `squares` of the standard errors in the `GROUPS` groups most
+    alike; where all of these are 0, since no sample met the pixels, the nearest group with an error counts, too. 0
+    where no pixel is used.
+    """
+    light = np.maximum(signal, 0)
+    darkest, brightest = (np.where(np.isnan(light), end, light) for end in (np.inf, -np.inf))
+    around = [
+        light,
+        maximum_filter(brightest, (1, 3, 3), mode="nearest"),
+        minimum_filter(darkest, (1, 3, 3), mode="nearest"),
+    ]
+    least = FAINT * (float(light[used].max(initial=0.0)) or 1.0)
+    steps = np.stack([np.rint(np.log(np.maximum(one[used], least) / least) / ALIKE) for one in around], axis=-1)
+    _, first, group = np.unique(steps @ (1 << np.array([40, 20, 0])), return_index=True, return_inverse=True)
+    steps, count = steps[first], np.bincount(group)
+    total = np.bincount(group, squares[used])
+    near = cKDTree(steps).query(steps, [*range(1, min(GROUPS, len(steps)) + 1)])[1] if len(steps) else np.empty((0, 0))
+    sums, counts = total[near].sum(axis=1), count[near].sum(axis=1)
+    dark, met = sums == 0, np.flatnonzero(total)
+    if dark.any() and len(met):
+        nearest = met[cKDTree(steps[met]).query(steps[dark])[1]]
+        sums[dark], counts[dark] = total[nearest], counts[dark] + count[nearest]
+    variance = np.zeros(signal.shape)
+    variance[used] = (sums / counts)[group]
+    return variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,17 +113,25 @@ class Measurement:
     """Images of all views, pixel by pixel in the order of the rows of the matrix, (N,).
 
     power : [W], 0 where masked
-    shot : [W], variance of the shot noise over the power: 1/(electrons per watt), 0 where `other` holds all the noise
-    other : [W²], variance that does not depend on the signal: read-out, dark current, a given error
+    noise : variance of the pixels, (views, height, width)
     mask : True where a pixel is left out
     gain_error : relative standard deviation of a factor common to all pixels
     """
 
     power: Array
-    shot: Array
-    other: Array
+    noise: Noise
     mask: NDArray[np.bool_]
     gain_error: float
+
+    @property
+    def shot(self) -> Array:
+        """(N,) [W], variance of the shot noise over the power."""
+        return self.noise.shot.ravel()
+
+    @property
+    def other(self) -> Array:
+        """(N,) [W²], variance that does not depend on the signal."""
+        return self.noise.other.ravel()
 
     @classmethod
     def of(
@@ -48,6 +141,7 @@ class Measurement:
         error: ArrayLike | None,
         mask: ArrayLike | None,
         gain_error: float | None,
+        sampled: bool = False,
     ) -> Measurement:
         """Measurement from images as `invert` takes them; a file of `fspt reduce` or `fspt expose` may stand for one.
 
@@ -66,8 +160,7 @@ class Measurement:
         if not listed:
             planes = np.where(masks, 0.0, _numbers(planes, masks.shape))
         power = matrix.images(planes)
-        shot, other = variances(matrix.image_shape, planes if listed else [], error)
-        shot = np.where(masks, 0, shot)
+        noise = noise_of(matrix.image_shape, planes if listed else [], error, sampled)
         found = (
             float("nan") if gain_error is None else number("invert: 'gain_error'", gain_error, InversionError, "0.05")
         )
@@ -80,14 +173,15 @@ class Measurement:
             raise InversionError(f"invert: 'gain_error' must be in [0, 1), got {found:g}. Give for example 0.05.")
         if masks.all():
             raise InversionError("invert: every pixel is masked or saturated. Expose for a shorter time.")
-        return cls(np.where(masks, 0, power).ravel(), shot.ravel(), other.ravel(), masks.ravel(), found)
+        return cls(np.where(masks, 0, power).ravel(), noise, masks.ravel(), found)
 
     def sigma(self, rows: NDArray[np.int64], signal: Array, numerical: Array, verb: str) -> Array:
         """Standard deviation [W] of the pixels `rows` for a fitted signal and its numerical error [W] (Eq. M.24).
 
         Raises InversionError, in the name of `verb`, for pixels without noise.
         """
-        variance = self.shot[rows] * np.maximum(signal, 0) + self.other[rows] + numerical**2
+        picture, used = self._picture(rows, signal)
+        variance = self.noise.variance(picture, used)[used] + numerical**2
         if not (variance > 0).all():
             count = int(np.sum(~(variance > 0)))
             raise InversionError(
@@ -95,6 +189,17 @@ class Measurement:
                 "error= > 0 there or a mask."
             )
         return np.sqrt(variance)
+
+    def chi2(self, rows: NDArray[np.int64], signal: Array, sigma: Array) -> Chi2:
+        """Σ (noise/σ)² of the pixels `rows` for a fitted signal [W] and its σ [W]."""
+        picture, used = self._picture(rows, signal)
+        return self.noise.chi2(picture, self._picture(rows, sigma)[0], used)
+
+    def _picture(self, rows: NDArray[np.int64], values: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """`values` of the ascending `rows` as (views, h, w), NaN where masked and 0 elsewhere; True on the rows."""
+        picture, used = np.where(self.mask, np.nan, 0.0), np.zeros(len(self.mask), bool)
+        picture[rows], used[rows] = values, True
+        return picture.reshape(self.noise.shot.shape), used.reshape(self.noise.shot.shape)
 
 
 def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
@@ -134,25 +239,28 @@ def _mask(matrix: TransportMatrix, images: Sequence[Any], mask: ArrayLike | None
     return whole
 
 
-def variances(
-    shape: tuple[int, int, int], images: Sequence[Any], error: ArrayLike | None = None, verb: str = "invert"
-) -> tuple[Array, Array]:
-    """`shot` [W] and `other` [W²], (views, height, width), of a Measurement: σ² = shot · signal + other.
+def noise_of(
+    shape: tuple[int, int, int],
+    images: Sequence[Any],
+    error: ArrayLike | None = None,
+    sampled: object = False,
+    verb: str = "invert",
+) -> Noise:
+    """Noise of images, one a view, or of an array with its standard `error`, for all views (views, height, width).
+
+    sampled : True for a Monte Carlo; images whose metadata name its `passes` are taken for one by themselves
 
     Raises InversionError, in the name of `verb`, for images without an error, or numbers outside their range.
     """
+    if not isinstance(sampled, (bool, np.bool_)):
+        raise InversionError(
+            f"{verb}: 'sampled' must be True or False, got {sampled!r}. Give True for images of a Monte Carlo."
+        )
     shot, other = np.zeros(shape), np.zeros(shape)
+    drawn = np.full(shape[0], bool(sampled))
     if error is not None:
-        try:
-            given = np.asarray(error, np.float64)
-            other[...] = given**2
-        except (TypeError, ValueError) as cause:
-            raise InversionError(
-                f"{verb}: 'error' must be a number or of shape {shape}, got {np.shape(error)}. Give W a pixel."
-            ) from cause
-        if not (np.isfinite(given).all() and (given >= 0).all()):
-            raise InversionError(f"{verb}: 'error' has values that are negative, NaN or infinite. Give W, >= 0.")
-        return shot, other
+        other[...] = _checked_error(error, shape, verb) ** 2
+        return Noise(shot, other, drawn)
     if not images:
         raise InversionError(
             f"{verb}: an array of power says nothing of its noise. Give error=, its standard error [W], or images of "
@@ -174,25 +282,62 @@ def variances(
                     f"{verb}: image {k} has {per_watt:g} electrons a watt and {read:g} electrons of read noise. Reduce "
                     "it again from its counts."
                 )
+            if sampled:
+                raise InversionError(
+                    f"{verb}: image {k} has the noise of electrons, not that of a Monte Carlo. Leave out 'sampled'."
+                )
             each = per_watt * responses(image)
             shot[k], other[k] = 1 / each, (read**2 + dark) / each**2 + flat_variance(image)
         elif image.error is not None:
             other[k] = image.error.astype(np.float64) ** 2
+            drawn[k] |= "passes" in image.metadata
         else:
             raise InversionError(
                 f"{verb}: image {k} has neither 'electrons_per_watt' nor an error. Reduce it from its counts"
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
-    return shot, other
+    return Noise(shot, other, drawn)
 
 
-def tell_misfit(verb: str, chi2_sum: float, free: float) -> None:
-    """Say in one line on stderr that Σ (residual/σ)² over `free` pixels is larger than noise makes it."""
-    free = max(free, 1.0)
-    if chi2_sum > free + MISFIT * (2 * free) ** 0.5:
-        LOG.warning(
-            "fspt: %s: chi2 is %.3g, the images differ from the fit by more than their noise, which the stated errors "
-            "do not contain. Check order of the views, pose, mesh, exit law, background and the detector's numbers.",
-            verb,
-            chi2_sum / free,
+def tell_misfit(verb: str, chi2_sum: float, pixels: int, fitted: float, noise: Sequence[Chi2]) -> list[str]:
+    """Say in one line on stderr that Σ (residual/σ)² is larger, or smaller, than the stated noise makes it.
+
+    chi2_sum : over the `pixels`, of which the fit of `fitted` numbers takes one each
+    noise : of the images of each band
+
+    Returns the lines, none where the sum agrees with the noise.
+    """
+    free, chance = max(pixels - fitted, 1.0), MISFIT * sum(one.variance for one in noise) ** 0.5
+    least, chi2, text = sum(one.mean for one in noise) - fitted, chi2_sum / free, ""
+    if chi2_sum > free + chance:
+        text = (
+            f"chi2 is {chi2:.3g}, the images differ from the fit by more than their noise, which the stated errors do "
+            "not contain. Check order of the views, pose, mesh, exit law, background and the detector's numbers."
         )
+    elif chi2_sum < least - chance and chi2_sum < WIDE * least:
+        text = (
+            f"chi2 is {chi2:.3g}, the images differ from the fit by less than their noise: it is stated too large, and "
+            f"intervals are about {(least / max(chi2_sum, 1e-300)) ** 0.5:.2g} times too wide. Check read noise and "
+            "gain of the detector, and whether images are means of several frames."
+        )
+    return told(verb, [text] if text else [])
+
+
+def _checked_error(error: ArrayLike, shape: tuple[int, int, int], verb: str) -> Array:
+    """Standard errors [W] that are finite, >= 0 and of this shape, or a part of it."""
+    try:
+        given = np.broadcast_to(np.asarray(error, np.float64), shape)
+    except (TypeError, ValueError) as cause:
+        raise InversionError(
+            f"{verb}: 'error' must be a number or of shape {shape}, got {np.shape(error)}. Give W a pixel."
+        ) from cause
+    if not (np.isfinite(given).all() and (given >= 0).all()):
+        raise InversionError(f"{verb}: 'error' has values that are negative, NaN or infinite. Give W, >= 0.")
+    return given
+
+
+def told(verb: str, lines: Sequence[str]) -> list[str]:
+    """The lines, each written to stderr as a warning of `verb`."""
+    for line in lines:
+        LOG.warning("fspt: %s: %s", verb, line)
+    return list(lines)

@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from ..runtime.errors import FluxError, InversionError
 from ..runtime.progress_bar import Progress
 from .band_images import BandImages
+from .measurement import Chi2
 from .source_grid import SourceGrid
 
 Array = NDArray[np.float64]
@@ -112,6 +113,11 @@ class SourceFit:
     def free(self, found: PointSources) -> int:
         """Number of pixels less that of the parameters, at least 1."""
         return max(len(self.power) - 4 * len(found.powers), 1)
+
+    def noise(self, found: PointSources) -> list[Chi2]:
+        """Σ (noise/σ)² of each band as its stated noise makes it."""
+        each = zip(self.bands, self._parts, strict=True)
+        return [b.measurement.chi2(b.rows, found.signal[own], found.sigma[own]) for b, own in each]
 
     def images(self, values: Array) -> Array | dict[str, Array]:
         """Values (N,) of the pixels as images, (views, height, width); by the names of the bands where they have names.

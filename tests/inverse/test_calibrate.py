@@ -10,13 +10,8 @@ from scipy.ndimage import binary_erosion
 from small_scenes import LENS_XML, SCENES, write_scene
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.inverse.calibration_fit import (
-    CalibrationFit,
-    CalibrationSettings,
-    Measured,
-    UndeterminedError,
-    sampling_variance,
-)
+from mitsuba_fspt.inverse.calibration_fit import CalibrationFit, CalibrationSettings, Measured, UndeterminedError
+from mitsuba_fspt.inverse.measurement import Noise, sampling_variance
 from mitsuba_fspt.runtime.errors import InversionError
 
 
@@ -93,8 +88,8 @@ def test_a_flat_view_does_not_determine_focus_magnification_and_gain(tmp_path, m
     assert min(map(abs, caught.value.combinations[0].values())) > 0.1
 
 
-@pytest.mark.parametrize(("apart", "noise"), [(3e-4, 0.0), (0.0, 1e-4)])
-def test_each_sign_of_a_degenerate_set_counts(apart, noise):
+@pytest.mark.parametrize(("apart", "rough"), [(3e-4, 0.0), (0.0, 1e-4)])
+def test_each_sign_of_a_degenerate_set_counts(apart, rough):
     """Pictures that are linear in two parameters with nearly the same slope; equal slopes under numerical noise.
 
     The first is seen by the condition number alone, the second by the slope that depends on the step alone.
@@ -104,15 +99,16 @@ def test_each_sign_of_a_degenerate_set_counts(apart, noise):
 
     def pictures(values):
         sign = np.random.default_rng(crc32(values.tobytes())).standard_normal(one.shape)
-        power = values[0] * one + values[1] * (one + apart * other) + noise * sign
+        power = values[0] * one + values[1] * (one + apart * other) + rough * sign
         return power, np.zeros_like(power)
 
     errors = np.full(one.shape, 1e-4)
-    data = Measured(2 * one, np.zeros_like(one), errors, np.ones(one.shape, bool), False, 0.0)
+    noise = Noise(np.zeros_like(one), errors, np.zeros(1, bool))
+    data = Measured(2 * one, noise, np.ones(one.shape, bool), 0.0)
     fit = CalibrationFit(("a", "b"), np.ones(2), data, pictures, CalibrationSettings().for_noise(1e-3))
     with pytest.raises(UndeterminedError, match="a, b separately") as caught:
         fit.solved()
-    assert (caught.value.condition > 1e3) == (noise == 0)
+    assert (caught.value.condition > 1e3) == (rough == 0)
 
 
 def test_variances_of_counts_follow_the_fitted_signal(scene):

@@ -160,8 +160,8 @@ def test_a_few_events_on_a_pixel_are_off_by_the_root_of_how_many_to_expect(expec
 def test_a_dark_edge_that_no_sample_met_has_the_error_of_one_sample(share):
     """The border of bright and dark checks cuts off a `share` of each pixel of a column; 256 samples a pixel.
 
-    Expected: no pixel is off by more than 5 errors, on either side of the border. Most pixels of the column have no sample
-    beyond the border, nor have their neighbours. Fails with the pixels' and neighbours' scatter alone, which is 0.
+    Expected: no pixel is off by more than 5 errors, on either side of the border. Most pixels of the column have no
+    sample beyond the border, nor have their neighbours. Fails with the scatter of pixels and neighbours alone, 0.
     """
     passes, each, draw = 32, 8, np.random.default_rng(2)
     for first, second in ((1.0, 0.1), (0.1, 1.0)):

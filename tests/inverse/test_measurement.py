@@ -1,0 +1,120 @@
+"""Noise of the pixels: images of a Monte Carlo, and what χ² of a fit says of the stated errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sphere_views import passes_of
+
+from mitsuba_fspt.images.image import Image
+from mitsuba_fspt.inverse.measurement import Noise, noise_of, tell_misfit
+from mitsuba_fspt.runtime.errors import InversionError
+
+
+def signal():
+    """(1, 32, 32) a spot on a disk, 0 around it."""
+    y, x = (np.mgrid[:32, :32] - 15.5) / 12
+    return (np.exp(-3 * ((x - 0.2) ** 2 + y**2)) * np.clip((1 - np.hypot(x, y)) * 12 + 0.5, 0, 1))[None]
+
+
+@pytest.mark.parametrize("events", [20, 200])
+def test_a_factor_from_images_of_a_monte_carlo(events):
+    """Least squares with the variance of Eq. M.27 find the factor 1 without bias: 40 images, mean z below 0.6, χ² 1.
+
+    Expected also where no sample met a pixel, whose error is 0. Seen to fail with each pixel's own standard error: the
+    factor is below 0.8, since pixels that few samples met are dark and have small errors.
+    """
+    true = signal()
+    used, z, chi2, own = true > 0, [], [], []
+    for seed in range(40):
+        power, error = passes_of(true, events, np.random.default_rng(seed))
+        noise, factor = Noise(0 * true, error**2, np.ones(1, bool)), 1.0
+        for _ in range(3):
+            variance = noise.variance(factor * true, used)[used]
+            length = (true[used] ** 2 / variance).sum()
+            factor = (true * power)[used] @ (1 / variance) / length
+        z.append((factor - 1) * length**0.5)
+        chi2.append(((power - factor * true)[used] ** 2 / variance).mean())
+        weight = 1 / np.maximum(error[used], error[error > 0].min()) ** 2
+        own.append((true * power)[used] @ weight / (true[used] ** 2 @ weight))
+    assert abs(np.mean(z)) < 0.6
+    assert 0.7 < np.std(z) < 1.35
+    assert np.mean(chi2) == pytest.approx(1, abs=0.1)
+    assert np.mean(own) < 0.8
+
+
+def test_pixels_that_no_sample_met_take_the_error_of_the_nearest():
+    """A dark half without any sample beside a bright half: variance > 0 everywhere."""
+    true = np.ones((1, 16, 16))
+    true[..., :8] = 1e-3
+    used = np.ones(true.shape, bool)
+    used[:, 0] = False
+    variance = Noise(0 * true, np.where(true == 1, 0.01, 0.0), np.ones(1, bool)).variance(true, used)
+    assert (variance[used] > 0).all()
+    assert variance[used].max() < 0.011
+
+
+def test_masked_pixels_are_no_neighbours():
+    """A masked pixel, NaN, does not change the neighbourhood of others. Seen to fail with 0 W there."""
+    true = np.ones((1, 16, 16))
+    noise = Noise(0 * true, np.full(true.shape, 0.01), np.ones(1, bool))
+    noise.other[:, 7:10, 7:10] = 1.0
+    used = np.ones(true.shape, bool)
+    used[:, 8, 8] = False
+    variance = noise.variance(np.where(used, true, np.nan), used)[used]
+    assert np.ptp(variance) < 1e-12
+
+
+def test_metadata_name_a_monte_carlo():
+    """Images with `passes` are taken as sampled by themselves, others on `sampled`; electrons are refused there."""
+    plane = np.ones((4, 4))
+    images = [Image(plane, plane, metadata=m) for m in ({"passes": 32}, {})]
+    shape = (2, 4, 4)
+    assert noise_of(shape, images).sampled.tolist() == [True, False]
+    assert noise_of(shape, images, sampled=True).sampled.all()
+    assert not noise_of(shape, [], error=plane).sampled.any()
+    assert noise_of(shape, [], error=plane, sampled=True).sampled.all()
+    counts = Image(plane, metadata={"electrons_per_watt": 1e9, "read_noise": 3.0})
+    with pytest.raises(InversionError, match="image 1 has the noise of electrons"):
+        noise_of(shape, [images[0], counts], sampled=True)
+    with pytest.raises(InversionError, match="'sampled' must be True or False, got 1"):
+        noise_of(shape, images, sampled=1)
+
+
+@pytest.mark.parametrize(("electrons", "read_noise"), [(0.02, 0.0), (0.5, 0.0), (3.0, 1.0), (1000.0, 3.5)])
+def test_the_right_noise_is_not_told(electrons, read_noise):
+    """100 images with the stated noise, of few electrons too: at most one is told, and Σ (noise/σ)² has the stated mean
+    and variance, to a fifth. Seen to fail (one of two told) with the variance 2 a pixel of normal noise, at 0.02.
+    """
+    rng, per_watt = np.random.default_rng(3), 1e3
+    true = electrons / per_watt * np.ones((1, 20, 20))
+    used = np.ones(true.shape, bool)
+    noise = Noise(
+        np.full(true.shape, 1 / per_watt), np.full(true.shape, (read_noise / per_watt) ** 2), np.zeros(1, bool)
+    )
+    sigma = np.sqrt(noise.variance(true, used))
+    expected, sums, lines = noise.chi2(true, sigma, used), [], 0
+    for _ in range(100):
+        power = (rng.poisson(true * per_watt) + read_noise * rng.standard_normal(true.shape)) / per_watt
+        sums.append((((power - true) / sigma) ** 2).sum())
+        lines += len(tell_misfit("invert", sums[-1], true.size, 0.0, [expected]))
+    assert lines <= 1
+    assert expected.mean == pytest.approx(true.size)
+    assert np.mean(sums) == pytest.approx(expected.mean, rel=0.1)
+    assert np.std(sums) == pytest.approx(expected.variance**0.5, rel=0.2)
+
+
+def test_noise_stated_too_large_is_told(caplog):
+    """χ² of 0.1, the mean of ten frames stated as one, and of 0.47 are told with the factor of the intervals' widths.
+
+    Half of a numerical error in σ is no noise: χ² of 0.5 is then not told, since the error is a bound.
+    """
+    shape, used = (1, 40, 40), np.ones((1, 40, 40), bool)
+    noise = Noise(np.zeros(shape), np.ones(shape), np.zeros(1, bool))
+    expected = noise.chi2(np.ones(shape), np.ones(shape), used)
+    assert "3.2 times too wide" in tell_misfit("invert", 0.1 * 1600, 1600, 0.0, [expected])[0]
+    assert "1.5 times too wide" in tell_misfit("locate", 0.47 * 1600, 1600, 4.0, [expected])[0]
+    assert "fspt: locate: chi2 is 0.4" in caplog.text
+    half = noise.chi2(np.ones(shape), np.full(shape, 2**0.5), used)
+    assert not tell_misfit("invert", 0.5 * 1600, 1600, 0.0, [half])
+    assert "by more than their noise" in tell_misfit("invert", 1.3 * 1600, 1600, 0.0, [expected])[0]
