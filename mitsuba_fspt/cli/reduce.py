@@ -182,9 +182,8 @@ def _exposed(path: Path, counts: Counts, camera: Detector, given: dict[str, Any]
     if given["exposure_time"] is None and counts.exposure_time is None:
         raise DetectorError(f"'{path}' does not say its exposure time. Give --exposure-time, in s.")
     found = given | {n: getattr(counts, n) for n in ("exposure_time", "binning") if given[n] is None}
-    if found["pixel_pitch"] is None:
-        own = camera.pixel_pitch
-        found["pixel_pitch"] = counts.pixel_pitch if own is None else own * (found["binning"] or 1)
+    if found["pixel_pitch"] is None and camera.pixel_pitch is not None:
+        found["pixel_pitch"] = camera.pixel_pitch * (found["binning"] or 1)
     return Exposed(**found)
 
 

@@ -233,7 +233,8 @@ class Detector:
         exposure_time : [s] of one frame, > 0
         wavelength_nm : of the light in vacuum [nm], 200 … 2500
         binning : side of the square of pixels that was read out as one; None: that of the file, else 1
-        pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene
+        pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene;
+            None: that of the file, if the detector has none of its own
         frames : number of frames that counts (h, w) are the mean of; None: 1; of a stack, its length
         bias, dark : frames or stacks [DN] in place of `bias` and `dark_current`; `dark` contains the bias
         flat, flat_kind : frame or stack [DN] of a uniform light, 'lens' through the lens of `scene`, or 'sensor'

@@ -156,6 +156,8 @@ def reduce_counts(
     raw = frame_of(counts, "counts", frames)
     if exposed.binning is None:
         exposed = replace(exposed, binning=raw.binning or 1)
+    if exposed.pixel_pitch is None and detector.pixel_pitch is None:
+        exposed = replace(exposed, pixel_pitch=raw.pixel_pitch)
     _tell_time(raw, exposed)
     shape = raw.values.shape
     full = _full(detector, raw)

@@ -7,13 +7,12 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..runtime.atomic_files import atomic_path
+from ..runtime.atomic_files import atomic_path, file_path
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from .formats import Metadata, read_planes, write_planes
 from .image import Image, image_of
@@ -82,7 +81,7 @@ class Exposure:
 
         An exception in the block leaves `path` unchanged. Raises as `write_counts`.
         """
-        path = Path(path)
+        path = file_path("counts file", path, ImageError, "counts.tif")
         if path.suffix.lower() not in (".png", ".tif", ".tiff"):
             raise ImageError(f"counts file '{path}': counts are written as PNG or TIFF. Give a .png or .tif.")
         try:
@@ -102,6 +101,16 @@ class Exposure:
             else:
                 picture.save(temporary, description=description)
             yield
+
+
+class Exposes(Protocol):
+    """What exposes itself to an image: a `Detector`."""
+
+    def expose(
+        self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
+    ) -> Exposure:
+        """One exposure; see `Detector.expose`."""
+        ...
 
 
 def read_image_or_exposure(path: str | os.PathLike[str]) -> Image | Exposure:

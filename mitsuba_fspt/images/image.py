@@ -14,10 +14,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
 from .formats import Metadata, read_planes, write_planes
+from .pixel_axes import PixelAxes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import DataArray, Dataset
+
+    from .exposure import Exposes, Exposure
+    from .regions import Measurement
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,6 +104,28 @@ class Image:
         return float(self.power.sum(dtype=np.float64, where=self.kept))
 
     @property
+    def x(self) -> NDArray[np.float64]:
+        """Centres of the columns (w,) [mm] on the virtual detector plane, to the right from the optical axis.
+
+        On the detector if the metadata have no `magnification`. Raises ImageError if they have no `pixel_pitch`.
+        """
+        return self._axes().x
+
+    @property
+    def y(self) -> NDArray[np.float64]:
+        """Centres of the rows (h,) [mm], upwards from the optical axis, the top row first; otherwise as `x`."""
+        return self._axes().y
+
+    def _axes(self) -> PixelAxes:
+        axes = PixelAxes.of(self.shape, self.metadata)
+        if axes.side is None:
+            raise ImageError(
+                "image: x and y are unknown, its metadata have no 'pixel_pitch'. Give it, in mm: "
+                "fspt.Image(power, metadata={'pixel_pitch': 0.0135})."
+            )
+        return axes
+
+    @property
     def electrons_per_watt(self) -> float | None:
         """Electrons per watt on a pixel, of an image that `Detector.reduce` made; None of any other."""
         return self._recorded("electrons_per_watt")
@@ -143,6 +169,60 @@ class Image:
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
         """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
         return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
+
+    def __getitem__(self, window: slice | tuple[slice, ...]) -> Image:
+        """Part of the image, `image[top:bottom, left:right]`, with all its planes.
+
+        The metadata state it as a crop window of the film (`film_width`, `crop_offset_x`, …), so that `x`, `y` and the
+        étendue of its pixels stay those of the whole image. Raises ImageError for steps, single pixels and no pixels.
+        """
+        from .crop_window import cropped
+
+        return cropped(self, window)
+
+    def __add__(self, other: object) -> Image:
+        """Power of both images, pixel by pixel, with its error.
+
+        Standard errors, which are taken as independent, add up in squares; the integral's, which are bounds, add up. Of
+        the metadata, entries remain that both have. The sum of two measured images with the same `electrons_per_watt`
+        keeps it, with the read noise of both. A pixel that one of them masks is masked.
+
+        Raises
+        ------
+        ImageError : the images have other pixels.
+        """
+        return self._combined(other, 1)
+
+    def __sub__(self, other: object) -> Image:
+        """Power of this image less that of the other; errors add up and metadata remain as in a sum."""
+        return self._combined(other, -1)
+
+    def _combined(self, other: object, sign: int) -> Image:
+        from .image_sum import combined
+
+        return combined(self, other, sign) if isinstance(other, Image) else NotImplemented
+
+    def roi(self, region: str | NDArray[np.bool_] | None = None, wavelength_nm: float | None = None) -> Measurement:
+        """Radiometric quantities of the light from a region, as `fspt roi` prints them.
+
+        Parameters
+        ----------
+        region : mask (h, w), or text 'x,y,width,height', 'circle:x,y,radius', '25%' or the name of a TIFF; None: all
+        wavelength_nm : of the light [nm]; None: that of the image's filter
+
+        Raises
+        ------
+        ImageError : there is no such region, all its pixels are masked, or lens or wavelength are unknown.
+        """
+        from .regions import measure
+
+        return measure(self, region, wavelength_nm)
+
+    def expose(
+        self, detector: Exposes, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
+    ) -> Exposure:
+        """Electrons and counts of one exposure of `detector`, a `Detector`, to this image; see `Detector.expose`."""
+        return detector.expose(self, exposure_time, wavelength_nm, binning=binning, seed=seed)
 
     def to_radiance(self, wavelength_nm: float | None = None) -> DataArray:
         """Apparent radiance [photons/s/cm²/sr] of a surface in focus, a DataArray with dimensions (y, x).

@@ -17,7 +17,8 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
 
     The temporary file lies beside `path` and keeps its suffix, for libraries that choose the format by it. If the
     block raises anything (an error, a full disk, Ctrl-C), the temporary file is removed and `path` is unchanged. An
-    OSError is raised again as `error`, any other exception as it is.
+    OSError is raised again as `error`, any other exception as it is. A symbolic link stays one: the file that it leads
+    to is written.
 
         with atomic_path("phantom.ply", FluxError) as temporary:
             mesh.export(temporary)
@@ -28,6 +29,9 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
     """
     path = Path(path)
     require_place(path, error)
+    if path.is_symlink():
+        path = Path(os.path.realpath(path))
+        require_place(path, error)
     # A long stem is cut, so that the temporary name is allowed wherever the final one is.
     temporary = path.with_name(f".{path.stem[:40]}-{secrets.token_hex(4)}{path.suffix}")
     try:
@@ -40,6 +44,13 @@ def atomic_path(path: str | os.PathLike[str], error: type[FsptError] = FsptError
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def file_path(thing: str, given: object, error: type[FsptError], example: str) -> Path:
+    """Name of a file as a path; `error` if `given`, which the message calls `thing`, is no name of a file."""
+    if isinstance(given, str) or (isinstance(given, os.PathLike) and isinstance(os.fspath(given), str)):
+        return Path(given)
+    raise error(f"{thing} must have a name, a text or path, got {given!r:.60}. Give for example '{example}'.")
 
 
 def require_place(path: Path, error: type[FsptError] = FsptError) -> None:

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...runtime.atomic_files import atomic_path
+from ...runtime.atomic_files import atomic_path, file_path
 from ...runtime.by_name import class_named, names_in
 from ...runtime.errors import FsptError, ImageError
 from ...runtime.extras import require
@@ -93,7 +93,7 @@ def write_planes(
     ImageError : no format has the suffix, a value cannot be stored, or the file cannot be written.
     BackendError : the format needs a package that is not installed.
     """
-    path = Path(path)
+    path = file_path("image file", path, ImageError, "image.exr")
     kind = format_of(path)
     stored = {key: _plain(key, value) for key, value in metadata.items()}
     floats = {name: _float32(name, values) for name, values in planes.items()}
@@ -113,7 +113,7 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], Metad
     ImageError : no format has the suffix, the file does not exist, is damaged or that of another program.
     BackendError : the format needs a package that is not installed.
     """
-    path = Path(path)
+    path = file_path("image file", path, ImageError, "image.exr")
     if not os.path.isfile(path):
         wrong = "is a folder" if os.path.isdir(path) else "does not exist"
         raise ImageError(f"image file '{path}' {wrong}. Give the path of an image that fspt wrote.")

@@ -20,10 +20,27 @@ UNITS = {  # as the standard spells them
     "photons/s/cm²/sr": "photon s-1 cm-2 sr-1",
 }
 KEY, VALUE = "KEY", "VALUE"
+# Keywords of imaging programs and observatories: name in the metadata, factor to the keyword's unit, comment.
+KEYWORDS = {
+    "EXPTIME": ("exposure_time", 1.0, "[s] exposure time of a frame"),
+    "XBINNING": ("binning", 1, "pixels read out as one, along x"),
+    "YBINNING": ("binning", 1, "pixels read out as one, along y"),
+    "XPIXSZ": ("pixel_pitch", 1e3, "[um] width of a pixel after binning"),
+    "YPIXSZ": ("pixel_pitch", 1e3, "[um] height of a pixel after binning"),
+    "FOCALLEN": ("focal_length", 1.0, "[mm] focal length"),
+    "FOCRATIO": ("f_number", 1.0, "f-number"),
+    "APTDIA": ("diaphragm_diameter", 1.0, "[mm] diameter of the diaphragm"),
+    "WAVELEN": ("wavelength_nm", 1.0, "[nm] wavelength of the light"),
+    "EGAIN": ("gain", 1.0, "[electron/adu] gain"),
+    "RDNOISE": ("read_noise", 1.0, "[electron] read noise"),
+    "INSTRUME": ("detector", 1, "detector"),
+}
 
 
 class Fits(Format):
     """HDUs POWER (or ELECTRONS), ERROR, COVERAGE, and METADATA, a table of keys and of values as JSON.
+
+    Lens and exposure are also in `KEYWORDS` of the headers, for other programs; `read` takes the table.
 
     The first row of the data is the top of the upright picture, as in every format, which ROWORDER = TOP-DOWN states;
     CDELT2 is negative, so that y points up.
@@ -48,6 +65,7 @@ class Fits(Format):
                 hdu.header[f"CTYPE{number}"], hdu.header[f"CUNIT{number}"] = letter, axes.unit
                 hdu.header[f"CRPIX{number}"], hdu.header[f"CRVAL{number}"] = 1.0, float(positions[0])
                 hdu.header[f"CDELT{number}"] = axes.step if letter == "X" else axes.down
+            hdu.header.update(_cards(metadata))
             hdus.append(hdu)
         texts = [np.array(list(metadata)), np.array([json.dumps(value) for value in metadata.values()])]
         columns = [
@@ -70,3 +88,15 @@ class Fits(Format):
             images = [hdu for hdu in hdus if hdu.name != TABLE and hdu.data is not None]
             planes = {hdu.name.lower(): np.ascontiguousarray(hdu.data, np.float32) for hdu in images}
         return planes, metadata
+
+
+def _cards(metadata: Metadata) -> dict[str, tuple[str | int | float, str]]:
+    """Value and comment of each of `KEYWORDS` that the metadata have; text in ASCII, which the standard asks for."""
+    cards: dict[str, tuple[str | int | float, str]] = {}
+    for keyword, (name, factor, comment) in KEYWORDS.items():
+        value = metadata.get(name)
+        if isinstance(value, str):
+            cards[keyword] = value.encode("ascii", "replace").decode(), comment
+        elif value is not None:
+            cards[keyword] = value * factor, comment
+    return cards

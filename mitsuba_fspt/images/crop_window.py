@@ -1,0 +1,47 @@
+"""Part of an image by slices, which stays at its place on the film."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from ..runtime.errors import ImageError
+from .image import Image
+
+
+def cropped(image: Image, key: Any) -> Image:
+    """Part of an image, as of `Image.__getitem__`."""
+    window = key if isinstance(key, tuple) else (key,)
+    if not 1 <= len(window) <= 2 or not all(isinstance(one, slice) for one in window):
+        raise _refused(key)
+    rows, columns = (*window, slice(None))[:2]
+    height, width = image.shape
+    (top, bottom), (left, right) = _ends(rows, height, key), _ends(columns, width, key)
+    known = dict(image.metadata)
+    known.setdefault("film_width", width)
+    known.setdefault("film_height", height)
+    known["crop_offset_x"] = known.get("crop_offset_x", 0) + left  # type: ignore[operator]  # a number of pixels
+    known["crop_offset_y"] = known.get("crop_offset_y", 0) + top  # type: ignore[operator]
+    planes = {name: getattr(image, name) for name in ("power", "error", "coverage", "mask", "flat")}
+    parts = {name: plane[top:bottom, left:right] for name, plane in planes.items() if plane is not None}
+    if "masked_pixels" in known and "mask" in parts:
+        known["masked_pixels"] = int(parts["mask"].sum())
+    return replace(image, **parts, metadata=known)
+
+
+def _ends(one: slice, length: int, key: Any) -> tuple[int, int]:
+    """First row or column of a slice and the one after its last; ImageError for steps and for none."""
+    try:
+        start, stop, step = one.indices(length)
+    except (TypeError, ValueError) as cause:
+        raise _refused(key) from cause
+    if step != 1 or stop <= start:
+        raise _refused(key)
+    return start, stop
+
+
+def _refused(key: Any) -> ImageError:
+    return ImageError(
+        f"image: a part of it is image[top:bottom, left:right], without steps and not empty, got {key!r}. Take single "
+        "pixels and others from image.power."
+    )

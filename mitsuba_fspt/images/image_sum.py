@@ -1,0 +1,80 @@
+"""Sum and difference of two images of one camera, with their errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.errors import ImageError
+from .formats import Metadata
+from .image import Image
+from .pixel_axes import PixelAxes
+from .z_test import is_deterministic
+
+NOISE = ("electrons_per_watt", "read_noise", "dark_electrons")  # by which the noise follows from the power
+
+
+def combined(one: Image, other: Image, sign: int) -> Image:
+    """Sum of two images for `sign` = 1, difference for -1, as of `Image.__add__`."""
+    _require_same_film(one, other)
+    mask = None if one.mask is None and other.mask is None else ~(one.kept & other.kept)
+    power = one.power.astype(np.float64) + sign * other.power.astype(np.float64)
+    if mask is not None:
+        power[mask] = 0
+    flat = one.flat if _same(one.flat, other.flat) else None
+    coverage = one.coverage if _same(one.coverage, other.coverage) else None
+    known = _metadata(one, other)
+    counted = sign == 1 and "electrons_per_watt" in known and _same(one.flat, other.flat)
+    if counted and all(name in image.metadata for name in NOISE for image in (one, other)):
+        read, dark = ([float(image.metadata[name]) for image in (one, other)] for name in NOISE[1:])
+        known |= {"read_noise": math.hypot(*read), "dark_electrons": sum(dark)}
+    else:  # no shot noise of the sum follows from its power: the error alone states it
+        flat = None
+        for name in NOISE:
+            known.pop(name, None)
+    if mask is not None:
+        known["masked_pixels"] = int(mask.sum())
+    return Image(power, _error(one, other), coverage, known, mask, flat)
+
+
+def _error(one: Image, other: Image) -> NDArray[np.float64] | None:
+    """Standard errors added in squares; bounds, of which the integral's are, added up. None where one is unknown."""
+    if one.error is None or other.error is None:
+        return None
+    first, second = one.error.astype(np.float64), other.error.astype(np.float64)
+    if is_deterministic(one) or is_deterministic(other):
+        return first + second
+    return np.sqrt(first**2 + second**2)
+
+
+def _metadata(one: Image, other: Image) -> Metadata:
+    """Entries that both have, and the warnings of either."""
+    known = {name: value for name, value in one.metadata.items() if other.metadata.get(name) == value}
+    told = dict.fromkeys(str(image.metadata["warnings"]) for image in (one, other) if "warnings" in image.metadata)
+    return known | ({"warnings": "; ".join(told)} if told else {})
+
+
+def _same(one: NDArray | None, other: NDArray | None) -> bool:
+    """True for equal planes, or none in both images."""
+    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+
+
+def _require_same_film(one: Image, other: Image) -> None:
+    """Raise ImageError unless both images have the same pixels."""
+    if one.shape != other.shape:
+        raise ImageError(f"image: {one.shape} and {other.shape} pixels cannot be added. Give images of one film.")
+    places = [_places(image.shape, image.metadata) for image in (one, other)]
+    if not all(np.allclose(first, second, rtol=1e-6, atol=1e-9) for first, second in zip(*places, strict=True)):
+        raise ImageError(
+            "image: the pixels of the two lie at different places on the film, or have another size or magnification. "
+            "Add images of one camera and crop window."
+        )
+
+
+def _places(shape: tuple[int, int], known: Mapping[str, object]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centres of the columns and rows."""
+    axes = PixelAxes.of(shape, known)
+    return axes.x, axes.y

@@ -1,0 +1,179 @@
+"""Images in Python: axes, parts, sums and differences, regions, exposures, and names that are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_scenes import camera_scene, disk
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.detector.reduction import responses
+from mitsuba_fspt.images.radiometry import etendue
+from mitsuba_fspt.inverse.measurement import variances
+from mitsuba_fspt.runtime.errors import ImageError
+
+CCD = fspt.Detector.typical_ccd()
+SETTINGS = {"exposure_time": 60.0, "wavelength_nm": 650.0}
+PER_WATT = 0.85 * 60 * 650e-9 / (6.62607015e-34 * 299792458.0)
+
+
+@pytest.fixture(scope="module")
+def image(mono):
+    """A disk that fills a part of the film of 40 × 32 pixels of 0.4 mm at magnification 1/2."""
+    return fspt.render(camera_scene(disk(165, 9.0)), rtol=1e-2)
+
+
+def test_axes_are_in_mm(image):
+    """By hand: 40 columns of 0.8 mm on the virtual detector plane, from -15.6 to 15.6 mm; the top row has y > 0."""
+    np.testing.assert_allclose(image.x, -15.6 + 0.8 * np.arange(40), atol=1e-6)
+    np.testing.assert_allclose(image.y, 12.4 - 0.8 * np.arange(32), atol=1e-6)
+    with pytest.raises(ImageError, match="have no 'pixel_pitch'"):
+        _ = fspt.Image([[1.0]]).x
+
+
+def test_a_part_stays_at_its_place(image, mono):
+    """Axes and étendue are those of the whole image, and a crop window's render has the same metadata of the film."""
+    part = image[10:26, 4:30]
+    assert part.shape == (16, 26)
+    np.testing.assert_array_equal(part.power, image.power[10:26, 4:30])
+    np.testing.assert_array_equal(part.coverage, image.coverage[10:26, 4:30])
+    np.testing.assert_array_equal(part.x, image.x[4:30])
+    np.testing.assert_array_equal(part.y, image.y[10:26])
+    np.testing.assert_allclose(etendue(part), etendue(image)[10:26, 4:30], rtol=1e-6)
+    rendered = fspt.render(camera_scene(disk(165, 9.0), crop=(4, 10, 26, 16)), rtol=1e-2)
+    names = ("film_width", "film_height", "crop_offset_x", "crop_offset_y")
+    assert [part.metadata[name] for name in names] == [rendered.metadata[name] for name in names]
+    again = part[2:, -6:-1]
+    np.testing.assert_array_equal(again.power, image.power[12:26, 24:29])
+    np.testing.assert_array_equal(again.x, image.x[24:29])
+    assert image[3:5].shape == (2, 40)
+
+
+@pytest.mark.parametrize(
+    "key", [3, (3, 4), slice(0, 10, 2), slice(5, 5), (slice(None), 3), None, slice("a", "b")], ids=str
+)
+def test_parts_that_are_none(image, key):
+    with pytest.raises(ImageError, match=r"a part of it is image\[top:bottom, left:right\]"):
+        image[key]
+
+
+def test_bounds_add_up_and_standard_errors_in_squares(image):
+    """Two renders by the integral, and Monte Carlo images of known errors."""
+    double = image + image
+    np.testing.assert_array_equal(double.power, 2 * image.power)
+    np.testing.assert_allclose(double.error, 2 * image.error)
+    assert double.metadata["method"] == "integral"
+    none = image - image
+    assert not none.power.any()
+    np.testing.assert_allclose(none.error, 2 * image.error)
+    plain = fspt.Image(np.full((2, 2), 3.0), np.full((2, 2), 0.3))
+    other = fspt.Image(np.full((2, 2), 1.0), np.full((2, 2), 0.4))
+    np.testing.assert_allclose((plain + other).error, 0.5)
+    np.testing.assert_allclose((plain - other).power, 2.0)
+    np.testing.assert_allclose((plain - other).error, 0.5)
+    assert (plain - fspt.Image(np.ones((2, 2)))).error is None
+
+
+def test_the_sum_of_two_exposures_has_the_noise_of_both():
+    """30 seeds, faint light, a flat field: χ² is 1 for sums and differences, and by `invert`'s variance of a sum.
+
+    Seen to fail with the error of one exposure (χ² 2) and with its read noise.
+    """
+    pytest.importorskip("ccdproc")
+    rng = np.random.default_rng(4)
+    flat = rng.normal(1, 0.05, (32, 32))
+    power = np.outer(np.linspace(0, 20, 32), np.ones(32)) / PER_WATT
+    squares = {"sum": [], "difference": [], "invert": []}
+    for seed in range(30):
+        counts = [CCD.expose(fspt.Image(power * flat), 60, 650, seed=2 * seed + k).counts for k in (0, 1)]
+        one, other = (CCD.reduce(c, **SETTINGS, flat=flat, flat_kind="sensor") for c in counts)
+        both, less = one + other, one - other
+        expected = 2 * power * flat.mean()
+        shot, rest = variances((1, 32, 32), [both])
+        squares["sum"].append(np.square((both.power - expected) / both.error)[4:].mean())
+        squares["difference"].append(np.square(less.power / less.error).mean())
+        squares["invert"].append(np.mean(np.square(both.power - expected) / (shot[0] * expected + rest[0])))
+        assert "electrons_per_watt" not in less.metadata
+        assert both.read_noise == pytest.approx(3.5 * 2**0.5)
+        np.testing.assert_array_equal(responses(both), one.flat)
+    for name, values in squares.items():
+        assert np.mean(values) == pytest.approx(1, abs=0.05), name
+
+
+def test_masks_unite_and_other_pixels_are_refused(image):
+    mask = np.zeros(image.shape, bool)
+    mask[3, 4] = True
+    one = fspt.Image(image.power, mask=mask, metadata=image.metadata)
+    two = fspt.Image(image.power, mask=np.roll(mask, 1), metadata=image.metadata)
+    assert (one + two).masked == 2
+    assert (one + two).power[3, 4] == 0
+    with pytest.raises(ImageError, match="cannot be added"):
+        image + image[1:]
+    with pytest.raises(ImageError, match="lie at different places on the film"):
+        image[1:] + image[:-1]
+    with pytest.raises(TypeError):
+        image + 3
+
+
+def test_a_region_and_an_exposure_are_those_of_the_verbs(image):
+    from mitsuba_fspt.images.regions import measure
+
+    assert image.roi("25%", 660) == measure(image, "25%", 660)
+    assert image.roi(wavelength_nm=660).pixels == 40 * 32
+    bright = image.scaled(1e4 / PER_WATT / image.power.max())
+    one = bright.expose(CCD, exposure_time=60, wavelength_nm=650, binning=2, seed=3)
+    np.testing.assert_array_equal(one.counts, CCD.expose(bright, 60, 650, binning=2, seed=3).counts)
+
+
+@pytest.mark.parametrize("name", [None, 7, b"a.exr", ["a.exr"]], ids=str)
+def test_names_that_are_none(image, name):
+    """Seen to fail: a TypeError from pathlib."""
+    for call in (fspt.read, image.write, CCD.expose(fspt.Image([[0.0]]), 1, 650).write):
+        with pytest.raises(ImageError, match="image file must have a name, a text or path, got "):
+            call(name)
+    with pytest.raises(ImageError, match="counts file must have a name"):
+        CCD.expose(fspt.Image([[0.0]]), 1, 650).write_counts(name)
+
+
+def test_a_link_stays_a_link(image, tmp_path):
+    """The file that it leads to is written, also where it does not exist yet. Seen to fail: the link was replaced."""
+    (tmp_path / "store").mkdir()
+    link = tmp_path / "link.exr"
+    link.symlink_to("store/real.exr")
+    for factor in (1, 2):
+        fspt.Image(image.power * factor).write(link)
+        assert link.is_symlink()
+        np.testing.assert_array_equal(
+            fspt.read(tmp_path / "store" / "real.exr").power, np.float32(image.power * factor)
+        )
+    assert [path.name for path in (tmp_path / "store").iterdir()] == ["real.exr"]
+    lost = tmp_path / "lost.exr"
+    lost.symlink_to("nowhere/real.exr")
+    with pytest.raises(ImageError, match=r"the folder '.*nowhere' does not exist"):
+        image.write(lost)
+
+
+def test_fits_headers_have_the_keywords_of_other_programs(image, tmp_path):
+    """Of a render, an exposure and a reduced image; counts with such a header are read with their numbers."""
+    fits = pytest.importorskip("astropy.io.fits")
+    from mitsuba_fspt.detector.counts import read_counts
+
+    image.write(tmp_path / "power.fits")
+    exposure = image.expose(CCD, **SETTINGS, binning=2)
+    exposure.write(tmp_path / "electrons.fits")
+    known = fits.getheader(tmp_path / "power.fits")
+    assert (known["FOCALLEN"], known["XPIXSZ"]) == (55, pytest.approx(400))
+    assert known["FOCRATIO"] == pytest.approx(2.8)
+    assert known["APTDIA"] == pytest.approx(55 / 2.8)
+    assert "EXPTIME" not in known
+    known = fits.getheader(tmp_path / "electrons.fits")
+    assert (known["EXPTIME"], known["XBINNING"], known["YBINNING"], known["WAVELEN"]) == (60, 2, 2, 650)
+    assert known["XPIXSZ"] == known["YPIXSZ"] == pytest.approx(800)
+    assert (known["EGAIN"], known["RDNOISE"]) == (1.6, 3.5)
+    assert known["INSTRUME"] == "typical, not a data sheet"
+    hdu = fits.PrimaryHDU(exposure.counts)
+    hdu.header.update({name: known[name] for name in ("EXPTIME", "XBINNING", "YBINNING", "XPIXSZ", "YPIXSZ")})
+    hdu.writeto(tmp_path / "counts.fits")
+    found = read_counts(tmp_path / "counts.fits")
+    assert (found.exposure_time, found.binning, found.pixel_pitch) == (60, 2, pytest.approx(0.8))
+    assert CCD.reduce(tmp_path / "counts.fits", **SETTINGS).metadata["binning"] == 2
