@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 LOG = logging.getLogger("mitsuba_fspt")
 CHANCE = 1e-6  # of a false alarm in an image whose noise is that of the detector's numbers
+MANY = 5  # pixels: fewer at the largest count are passed over
 WINDOW = 2.0  # standard deviations to each side of a value, within which other counts of equal light lie
 
 
@@ -34,29 +35,27 @@ def unknown_ceiling(detector: Detector, counts: Array, frames: int = 1) -> float
 
     counts : (h, w) [DN], of one frame or the mean of `frames` frames
     """
-    largest = float(counts.max())
-    reached = int(np.count_nonzero(counts == largest))
-    step = 1.0 / frames
-    if not 2 <= reached < counts.size:
+    values, numbers = np.unique(counts, return_counts=True)
+    reached = int(numbers[-1])
+    if reached < MANY or len(values) == 1:
         return None
+    step = float(np.diff(values).min())
     depth = norm.isf(reached / counts.size)
-    share = 1 - norm.sf(depth + step / _sigma(detector, largest, frames)) / norm.sf(depth)
-    if reached * np.log(share) > np.log(CHANCE) or _without_noise(detector, counts[counts < largest], frames):
+    share = 1 - norm.sf(depth + step / _sigma(detector, values[-1], frames)) / norm.sf(depth)
+    if reached * np.log(share) > np.log(CHANCE) or _without_noise(detector, values[:-1], numbers[:-1], step, frames):
         return None
-    return largest
+    return float(values[-1])
 
 
-def _without_noise(detector: Detector, counts: Array, frames: int) -> bool:
-    """True if the most frequent of the counts (n,) [DN] is more frequent than the detector's noise lets it be.
+def _without_noise(detector: Detector, values: Array, numbers: NDArray[np.int64], step: float, frames: int) -> bool:
+    """True if the most frequent of the `values` [DN] is more frequent than the detector's noise lets it be.
 
     Of normally distributed counts, the share of one value among those within `WINDOW` σ is largest at their mean. The
     most frequent of all values is tried, hence a chance for each.
     """
-    values, numbers = np.unique(counts, return_counts=True)
     most = int(np.argmax(numbers))
-    sigma, step = _sigma(detector, values[most], frames), 1.0 / frames
-    beside = np.abs(values - values[most]) <= WINDOW * sigma + step / 2
-    inside = int(numbers[beside].sum())
+    sigma = _sigma(detector, values[most], frames)
+    inside = int(numbers[np.abs(values - values[most]) <= WINDOW * sigma + step / 2].sum())
     share = min(1.0, (2 * norm.cdf(step / 2 / sigma) - 1) / (2 * norm.cdf(WINDOW) - 1))
     return bool(numbers[most] > 1 and len(values) * poisson.sf(numbers[most] - 1, inside * share) < CHANCE)
 

@@ -81,6 +81,15 @@ def test_ceilings_of_other_cameras_are_found(camera, top):
     assert unknown_ceiling(replace(camera, bits=16), counts.astype(float)) == top
 
 
+def test_counts_of_a_shifted_converter():
+    """14 bits shifted to 16: all counts are multiples of 4 DN. The limit 4 · 16383 is found, and no other."""
+    camera = replace(CCD, gain=0.4, full_well=1e6)
+    counts = [4.0 * exposed(SPOT, electrons, camera=replace(camera, gain=1.6)) for electrons in (50, 2000, 60000)]
+    for free in counts[:2]:
+        assert unknown_ceiling(camera, free) is None
+    assert unknown_ceiling(camera, np.minimum(counts[2], 4 * 16383)) == 4 * 16383
+
+
 def test_stacks_with_the_frames_last_are_refused():
     """(64, 64, 5) is no stack of 64 frames; (100, 32, 32) and (5, 64, 64) are stacks; `frames` says which it is."""
     counts = np.random.default_rng(1).poisson(500, (64, 64, 5))

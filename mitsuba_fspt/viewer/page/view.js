@@ -323,7 +323,7 @@ class View {
   }
 
   buildDisplay() {
-    this.nodes.wavelength = this.figure("wavelength", "wavelength", "nm", 1);
+    this.nodes.wavelength = this.figure("wavelength", "wavelength", "nm", 200);
     this.nodes.decades = this.figure("decades", "decades", "", 0.1);
     this.nodes.wavelength.hidden = this.nodes.decades.hidden = true;
     this.nodes.display.append(
