@@ -9,7 +9,7 @@ from small_scenes import camera_scene, disk
 import mitsuba_fspt as fspt
 from mitsuba_fspt.detector.reduction import responses
 from mitsuba_fspt.images.radiometry import etendue
-from mitsuba_fspt.inverse.measurement import variances
+from mitsuba_fspt.inverse.measurement import noise_of
 from mitsuba_fspt.runtime.errors import ImageError
 
 CCD = fspt.Detector.typical_ccd()
@@ -89,10 +89,12 @@ def test_the_sum_of_two_exposures_has_the_noise_of_both():
         one, other = (CCD.reduce(c, **SETTINGS, flat=flat, flat_kind="sensor") for c in counts)
         both, less = one + other, one - other
         expected = 2 * power * flat.mean()
-        shot, rest = variances((1, 32, 32), [both])
+        noise = noise_of((1, 32, 32), [both])
         squares["sum"].append(np.square((both.power - expected) / both.error)[4:].mean())
         squares["difference"].append(np.square(less.power / less.error).mean())
-        squares["invert"].append(np.mean(np.square(both.power - expected) / (shot[0] * expected + rest[0])))
+        squares["invert"].append(
+            np.mean(np.square(both.power - expected) / (noise.shot[0] * expected + noise.other[0]))
+        )
         assert "electrons_per_watt" not in less.metadata
         assert both.read_noise == pytest.approx(3.5 * 2**0.5)
         np.testing.assert_array_equal(responses(both), one.flat)
