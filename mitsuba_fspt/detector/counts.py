@@ -21,6 +21,7 @@ from ..runtime.numbers import whole
 LOG = logging.getLogger("mitsuba_fspt")
 Frame = ArrayLike | str | os.PathLike[str]
 UM_PER_MM = 1e3
+SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
 # Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
@@ -80,6 +81,18 @@ def frame_like(given: Frame | Counts, name: str, shape: tuple[int, ...]) -> Coun
             f"reduce: '{name}' has the shape {found.values.shape}, the counts {shape}. Give a frame of the same film."
         )
     return found
+
+
+def require_same_time(name: str, frame: Counts, other: str, time: float | None) -> None:
+    """Raise DetectorError if the file of the dark frame `name` states another exposure time than `time` [s] of `other`.
+
+    Passes where one of them is unknown.
+    """
+    stated = frame.exposure_time
+    if stated is not None and time is not None and abs(stated - time) > SAME_TIME * time:
+        raise DetectorError(
+            f"reduce: '{name}' was exposed {stated:g} s, the {other} {time:g} s. Give a dark frame of the same time."
+        )
 
 
 def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Counts:

@@ -23,9 +23,9 @@ from ..images.radiometry import etendue_of
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number
-from .counts import Counts, Frame, frame_like
+from .counts import Counts, Frame, frame_like, require_same_time
 from .detector import Detector
-from .saturation import saturated
+from .saturation import full_pixels, saturated
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -50,11 +50,13 @@ class FlatField:
     response : f, relative to the mean of the pixels that are kept; 1 where masked
     mask : True where the flat tells no response: dark, negative, saturated or hot pixels, and those without light
     variance : relative variance of f by shot and read noise; 0 for a single frame, whose number of frames is unknown
+    kind : 'lens' or 'sensor'
     """
 
     response: Array
     mask: Mask
     variance: Array | float
+    kind: str
 
 
 def flat_field(
@@ -83,7 +85,7 @@ def flat_field(
     found = frame_like(flat, "flat", shape)
     background, frames = _background(detector, found, flat_dark, bias, shape)
     light = found.values - background
-    full = _full(detector, found, light, flat_dark)
+    full = _full(detector, found, light)
     screen = np.ones(shape) if scene is None else uniform_screen(scene, shape, pixel_pitch)
     lit = screen > LEAST * screen.max()
     usable = lit & ~full & (light > 0)
@@ -98,7 +100,8 @@ def flat_field(
     filled = np.where(usable, relative, np.median(relative[usable]))
     usable &= relative <= HOT * median_filter(filled, NEIGHBOURS, mode="nearest")
     response = np.where(usable, relative / relative[usable].mean(), 1.0)
-    return FlatField(response, ~usable, _variance(detector, np.where(usable, light, 1.0), found.frames, frames))
+    variance = _variance(detector, np.where(usable, light, 1.0), found.frames, frames)
+    return FlatField(response, ~usable, variance, str(kind))
 
 
 def uniform_screen(scene: Scene, shape: tuple[int, int], pixel_pitch: float | None = None) -> Array:
@@ -157,6 +160,7 @@ def _background(
                 raise DetectorError(f"reduce: 'flat_dark' must be >= 0 DN, got {level:g}. Give 0 for a flat without.")
             return level, np.inf
         frame = frame_like(flat_dark, "flat_dark", shape)
+        require_same_time("flat_dark", frame, "flat", flat.exposure_time)
         return frame.values, frame.frames
     if flat.raw:
         given = f"{detector.bias:g} DN" if bias is None else "frame"
@@ -175,13 +179,14 @@ def _background(
     return 0.0, np.inf
 
 
-def _full(detector: Detector, flat: Counts, light: Array, flat_dark: Frame | float | None) -> Mask:
+def _full(detector: Detector, flat: Counts, light: Array) -> Mask:
     """True where the flat is saturated; nowhere for one in other units than DN, such as a sum of frames."""
+    if flat.raw:
+        return full_pixels(detector, flat, "flat field")
     highest = flat.values if flat.highest is None else flat.highest
-    with_bias = flat.raw or (flat_dark is not None and np.any(light != flat.values))
-    level = highest if with_bias else highest + detector.bias
-    full = saturated(detector, level)
-    return full if flat.raw or full.mean() < 0.5 else np.zeros_like(full)
+    with_bias = bool(np.any(light != flat.values))  # a dark frame has been subtracted
+    full = saturated(detector, highest if with_bias else highest + detector.bias)
+    return full if full.mean() < 0.5 else np.zeros_like(full)
 
 
 def _variance(detector: Detector, light: Array, frames: int, dark_frames: float) -> Array | float:

@@ -28,10 +28,10 @@ from ..images.radiometry import PLANCK_TIMES_LIGHT
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from ..runtime.wavelength import wavelength
-from .counts import FITS, TIFF, Counts, Frame, frame_like, frame_of
+from .counts import FITS, SAME_TIME, TIFF, Counts, Frame, frame_like, frame_of, require_same_time
 from .detector import RECORDED, Detector
 from .flat_field import FlatField, flat_field, require_no_flat
-from .saturation import saturated, tell_ceiling, unknown_ceiling
+from .saturation import full_pixels, saturated
 
 if TYPE_CHECKING:
     from .flat_field import Scene
@@ -40,7 +40,10 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("mitsuba_fspt")
 DARKER = 5.0  # standard deviations of a total below 0: noise makes more once in 3 million images
-REPLACED = ("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels")
+REPLACED = (
+    *("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"),
+    *("flat_kind", "flat_masked_pixels"),
+)
 # Metadata of a rendered image that say how it was computed. They do not hold for counts of it, whose error is noise.
 COMPUTED = (
     *("method", "rtol", "domain", "pixel", "max_nodes", "max_specular", "shortcuts_off", "nodes", "levels", "left_out"),
@@ -48,7 +51,6 @@ COMPUTED = (
     *("sampler", "spp", "passes", "seed"),
 )
 ROUNDING = 1e-6  # relative error of a variance from a file's float32 numbers
-SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ def reduce_counts(
         exposed = replace(exposed, pixel_pitch=raw.pixel_pitch)
     _tell_time(raw, exposed)
     shape = raw.values.shape
-    full = _full(detector, raw)
+    full = full_pixels(detector, raw, "counts")
     rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)
     level, charge, added = _background(detector, raw, exposed, corrections.bias, corrections.dark)
     flat = corrections.flat_field(detector, raw, exposed)
@@ -170,22 +172,6 @@ def reduce_counts(
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
     _report_darkness(image)
     return image
-
-
-def _full(detector: Detector, raw: Counts) -> NDArray[np.bool_]:
-    """True (h, w) where counts are saturated, by the detector's numbers or at a largest count of their own."""
-    highest = raw.values if raw.highest is None else raw.highest
-    full = saturated(detector, highest)
-    if raw.first is None:
-        ceiling = unknown_ceiling(detector, raw.values, raw.frames)
-    else:  # the mean over frames has no such value; the first frame has, if none exceeds it
-        ceiling = unknown_ceiling(detector, raw.first)
-        ceiling = ceiling if ceiling == highest.max() else None
-    if ceiling is None or saturated(detector, np.array(ceiling)):
-        return full
-    reached = highest >= ceiling
-    tell_ceiling(detector, ceiling, int(reached.sum()))
-    return full | reached
 
 
 def _tell_time(raw: Counts, exposed: Exposed) -> None:
@@ -321,11 +307,7 @@ def _background(
     frame = raw.background if dark is None and raw.background is not None else dark
     if frame is not None:
         found = frame_like(frame, "dark", raw.values.shape)
-        if found.exposure_time is not None and abs(found.exposure_time / exposed.exposure_time - 1) > SAME_TIME:
-            raise DetectorError(
-                f"reduce: 'dark' was exposed {found.exposure_time:g} s, the counts {exposed.exposure_time:g} s. Give "
-                "a dark frame of the same exposure time, or 'bias' alone."
-            )
+        require_same_time("dark", found, "counts", exposed.exposure_time)
         return found.values, charge, (charge + detector.read_noise**2 + rounding) / found.frames
     frame = raw.bias if bias is None and raw.bias is not None else bias
     if frame is not None:
@@ -413,7 +395,7 @@ def _image(
         "masked_pixels": int(mask.sum()),
     }
     if flat is not None:
-        kept["flat_masked_pixels"] = int(flat.mask.sum())
+        kept |= {"flat_kind": flat.kind, "flat_masked_pixels": int(flat.mask.sum())}
     if exposed.pixel_pitch is not None:
         kept["pixel_pitch"] = exposed.pixel_pitch
     if detector.pixel_pitch is not None:

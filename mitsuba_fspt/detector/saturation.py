@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, poisson
 
+from .counts import Counts
 from .detector import Detector
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 LOG = logging.getLogger("mitsuba_fspt")
 CHANCE = 1e-6  # of a false alarm in an image whose noise is that of the detector's numbers
+WHOLE = 1e-3  # deviation of a sum of frames from a whole number that rounding may cause
 MANY = 5  # pixels: fewer at the largest count are passed over
 WINDOW = 2.0  # standard deviations to each side of a value, within which other counts of equal light lie
 
@@ -22,6 +24,32 @@ def saturated(detector: Detector, counts: Array) -> Mask:
     """True (h, w) where a count has reached the largest value of the converter or the full well."""
     top = 2**detector.bits - 1
     return (counts >= top) | (counts >= detector.bias + detector.full_well / detector.gain - 0.5)
+
+
+def full_pixels(detector: Detector, counts: Counts, name: str) -> Mask:
+    """True (h, w) where counts are saturated in any frame: by the detector's numbers, or at an `unknown_ceiling`.
+
+    The latter is told in one line on stderr, which calls the counts `name`.
+    """
+    highest = counts.values if counts.highest is None else counts.highest
+    full = saturated(detector, highest)
+    if counts.first is None:
+        ceiling = unknown_ceiling(detector, counts.values, counts.frames)
+    else:  # the mean over frames has no such value; the first frame has, if no other frame exceeds it
+        ceiling = unknown_ceiling(detector, counts.first)
+        ceiling = ceiling if ceiling == highest.max() else None
+    if ceiling is None or saturated(detector, np.array(ceiling)):
+        return full
+    reached = highest >= ceiling
+    LOG.warning(
+        "fspt: reduce: %d pixels of the %s have exactly the largest value, %g DN, where noise would spread them: the "
+        "camera saturates there, below %d bits and full well. They are masked. Correct 'bits' or 'full_well'.",
+        int(reached.sum()),
+        name,
+        ceiling,
+        detector.bits,
+    )
+    return full | reached
 
 
 def unknown_ceiling(detector: Detector, counts: Array, frames: int = 1) -> float | None:
@@ -39,12 +67,23 @@ def unknown_ceiling(detector: Detector, counts: Array, frames: int = 1) -> float
     reached = int(numbers[-1])
     if reached < MANY or len(values) == 1:
         return None
-    step = float(np.diff(values).min())
+    step = _step(values, frames)
     depth = norm.isf(reached / counts.size)
     share = 1 - norm.sf(depth + step / _sigma(detector, values[-1], frames)) / norm.sf(depth)
     if reached * np.log(share) > np.log(CHANCE) or _without_noise(detector, values[:-1], numbers[:-1], step, frames):
         return None
     return float(values[-1])
+
+
+def _step(values: Array, frames: int) -> float:
+    """Step [DN] of which all distances of the ascending `values` (n,) are multiples; without one, the least distance.
+
+    It is 1/frames for means, and more where the converter's counts are shifted to more bits.
+    """
+    whole = np.rint(values * frames)
+    if np.abs(whole - values * frames).max() > WHOLE:
+        return float(np.diff(values).min())
+    return float(np.gcd.reduce(np.diff(whole).astype(np.int64))) / frames
 
 
 def _without_noise(detector: Detector, values: Array, numbers: NDArray[np.int64], step: float, frames: int) -> bool:
@@ -65,14 +104,3 @@ def _sigma(detector: Detector, counts: float, frames: int) -> float:
     electrons = max(detector.gain * (counts - detector.bias), 0.0)
     variance = (electrons + detector.read_noise**2) / detector.gain**2 + 1 / 12
     return float(np.sqrt(variance / frames))
-
-
-def tell_ceiling(detector: Detector, ceiling: float, pixels: int) -> None:
-    """Say in one line on stderr that pixels at this largest count are masked."""
-    LOG.warning(
-        "fspt: reduce: %d pixels have exactly the largest count, %g DN, where noise would spread them: the camera "
-        "saturates there, below %d bits and full well. They are masked. Correct 'bits' or 'full_well'.",
-        pixels,
-        ceiling,
-        detector.bits,
-    )

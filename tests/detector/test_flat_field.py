@@ -40,6 +40,7 @@ def test_bad_pixels_of_a_flat_are_masked_and_do_not_count(bad):
     flat[:, 10:13] = bad
     found = CCD.reduce(CCD.expose(image, 60, 650, seed=1).counts, **SETTINGS, flat=flat, **SENSOR)
     assert found.kept.sum() == 64 * 61
+    assert found.metadata["flat_kind"] == "sensor"
     assert found.metadata["flat_masked_pixels"] == found.metadata["masked_pixels"] == 64 * 3
     assert found.power[found.kept].mean() * PER_WATT == pytest.approx(2e4, rel=1e-3)
     chi2 = ((found.power - image.power)[found.kept] / found.error[found.kept]) ** 2
@@ -56,6 +57,36 @@ def test_a_hot_pixel_of_a_flat_is_masked(hot):
     assert found.mask[20, 30]
     assert found.mask[:, 50].all()
     assert found.power[found.kept].mean() * PER_WATT == pytest.approx(2e4, rel=1e-3)
+
+
+def test_a_flat_that_saturates_below_the_detector_s_numbers(caplog):
+    """12 bits in 16, overexposed in the middle: these pixels are masked, not taken for the mean response."""
+    rows, columns = np.indices((64, 64)) - 31.5
+    shade = 1 - (rows**2 + columns**2) / 6e3
+    flats = np.array([CCD.expose(fspt.Image(6200 * shade / PER_WATT), 60, 650, seed=s).counts for s in range(4)])
+    flats = np.minimum(flats, 4095)
+    found = CCD.reduce(
+        CCD.expose(level(2e4), 60, 650).counts, **SETTINGS, flat=flats, flat_kind="sensor", flat_dark=500
+    )
+    np.testing.assert_array_equal(found.mask, flats.max(axis=0) == 4095)
+    assert 100 < found.masked < 2000
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert "pixels of the flat field have exactly the largest value, 4095 DN" in told
+
+
+def test_dark_frames_of_another_time_are_refused(tmp_path):
+    """By EXPTIME of FITS headers, for counts and for the flat."""
+    fits = pytest.importorskip("astropy.io.fits")
+    for name, value, time in (("dark", 500, 30), ("flat", 20000, 2), ("flat_dark", 500, 60)):
+        hdu = fits.PrimaryHDU(np.full((64, 64), value, np.uint16))
+        hdu.header["EXPTIME"] = time
+        hdu.writeto(tmp_path / f"{name}.fits")
+    counts = CCD.expose(level(2e4), 60, 650).counts
+    with pytest.raises(DetectorError, match="'dark' was exposed 30 s, the counts 60 s"):
+        CCD.reduce(counts, **SETTINGS, dark=tmp_path / "dark.fits")
+    given = {"flat": tmp_path / "flat.fits", "flat_dark": tmp_path / "flat_dark.fits", "flat_kind": "sensor"}
+    with pytest.raises(DetectorError, match="'flat_dark' was exposed 60 s, the flat 2 s"):
+        CCD.reduce(counts, **SETTINGS, **given)
 
 
 def test_a_flat_without_any_light_is_refused():

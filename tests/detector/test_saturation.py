@@ -35,7 +35,7 @@ def test_twelve_bits_in_sixteen_are_found(caplog):
     assert (found.mask == (exposed(SPOT, 8000) >= 4095)).all()
     assert found.total_power == pytest.approx(image.power[found.kept].sum(), rel=2e-3)
     (told,) = [record.getMessage() for record in caplog.records]
-    assert f"{found.masked} pixels have exactly the largest count, 4095 DN" in told
+    assert f"{found.masked} pixels of the counts have exactly the largest value, 4095 DN" in told
     assert "Correct 'bits' or 'full_well'" in told
 
 
@@ -66,8 +66,9 @@ def test_noise_makes_no_ceiling(shape, camera):
         np.rint(500 + 3000 * SPOT),
         500 + 3000.0 * (np.hypot(ROWS, COLUMNS) < 20),
         np.where(ROWS > 0, 1000.0, 500.0),
+        np.rint(2000 + 15.2 * COLUMNS),
     ],
-    ids=["uniform", "spot", "disc", "halves"],
+    ids=["uniform", "spot", "disc", "halves", "ramp"],
 )
 def test_counts_without_noise_have_no_ceiling(counts):
     """Simulated counts repeat values anywhere."""
