@@ -8,7 +8,8 @@ import typer
 
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Domain, Parameters, Quiet, Rows, Rtol, SceneFile, Sensor, definitions
+from .given_scene import Camera, FNumber, FocalLength, SceneOrPhantom, View, framing_of, one_scene
+from .options import AsJson, Domain, Parameters, Quiet, Rows, Rtol, Sensor, definitions
 from .terminal import print_result
 
 
@@ -44,7 +45,11 @@ def stability(
 
 
 def explain(
-    scene: SceneFile,
+    scene: SceneOrPhantom,
+    view: View = None,
+    focal_length: FocalLength = None,
+    f_number: FNumber = None,
+    camera: Camera = None,
     define: Parameters = None,
     rtol: Rtol = None,
     domain: Domain = None,
@@ -52,12 +57,16 @@ def explain(
     as_json: Rows = False,
     quiet: Quiet = False,
 ) -> None:
-    """List the integral's shortcuts on a scene, with reason and time saved; 'render --no-shortcuts' takes none."""
+    """List the integral's shortcuts on a scene, with reason and time saved; 'render --no-shortcuts' takes none.
+
+    Of PHANTOM.ply, the scene is that of 'fspt render PHANTOM.ply'.
+    """
     with progress_bar(quiet):
         from ..rendering.scene import load
         from ..studies.explain import HEADER, explain
 
         quiet_mitsuba()
-        rows = explain(load(scene, **definitions(define)), sensor=sensor, rtol=rtol, domain=domain)
+        given = one_scene(scene, definitions(define), framing_of(view, focal_length, f_number, camera))
+        rows = explain(load(given.scene, **given.parameters), sensor=sensor, rtol=rtol, domain=domain)
     table = "\n".join([HEADER, *(row.render_text() for row in rows)])
     print_result(table, [row.to_dict() for row in rows], as_json=as_json, quiet=quiet)

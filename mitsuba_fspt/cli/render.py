@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from ..rendering.scene_rules import is_number
-from ..rendering.scene_xml import read_text, read_xml
+from ..rendering.scene_xml import read_xml
 from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
-from ..runtime.errors import ImageError, SceneError
+from ..runtime.errors import ImageError
 from ..runtime.progress_bar import progress_bar
+from .given_scene import Camera, FNumber, FocalLength, GivenScene, SceneOrPhantom, Views, framing_of, scenes_of
 from .options import (
     AsJson,
     Domain,
@@ -33,8 +33,6 @@ from .options import (
     definitions,
     require_image,
     require_picture,
-    several,
-    typed,
 )
 from .terminal import Interrupted, print_result
 
@@ -45,16 +43,12 @@ if TYPE_CHECKING:
 class Shot(NamedTuple):
     """One image to render.
 
-    scene : name of the scene file, or its text
-    parameters : values for its `<default>` parameters
+    given : the scene
     output : the image to write
-    origin : what the metadata call the scene, with its parameters; None leaves that to `load`
     """
 
-    scene: Path | str
-    parameters: dict[str, str]
+    given: GivenScene
     output: Path
-    origin: str | None = None
 
 
 class Output(NamedTuple):
@@ -83,20 +77,14 @@ class Output(NamedTuple):
 
 
 def render(
-    scene: Annotated[
-        Path, typer.Argument(metavar="SCENE.xml|PHANTOM.ply", help="Mitsuba scene with an fspt_lens, or a phantom.")
-    ],
+    scene: SceneOrPhantom,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Image to write: .exr, .tif, .h5, .npz or .fits.")
     ] = None,
-    view: Annotated[
-        str | None, typer.Option(metavar="0,90,...", help="Of a phantom: turns about +z [degrees], an image each.")
-    ] = None,
-    focal_length: Annotated[float | None, typer.Option(help="Before a phantom: F [mm], 50 if left out.")] = None,
-    f_number: Annotated[float | None, typer.Option(help="Before a phantom: F/D, 1.8 if left out.")] = None,
-    camera: Annotated[
-        Path | None, typer.Option(metavar="CAMERA.toml", help="Before a phantom: camera with a table [lens].")
-    ] = None,
+    view: Views = None,
+    focal_length: FocalLength = None,
+    f_number: FNumber = None,
+    camera: Camera = None,
     method: Method = None,
     rtol: Rtol = None,
     domain: Domain = None,
@@ -117,11 +105,11 @@ def render(
 
     Of PHANTOM.ply, as 'fspt flux' writes it, the camera stands on the +x
     axis, is focused on the front and sees the whole phantom, up is +z. The
-    images are OUT_view0.exr, OUT_view90.exr, one for each view; -D sets
-    the parameters of scene_xml.
+    images of several views are OUT_view0.exr, OUT_view90.exr; -D sets the
+    parameters of scene_xml.
     """
-    framing = {"view": view, "focal_length": focal_length, "f_number": f_number, "camera": camera}
-    shots = _shots(scene, output, definitions(define), {name: v for name, v in framing.items() if v is not None})
+    framing = framing_of(view, focal_length, f_number, camera)
+    shots = _shots(scene, output, scenes_of(scene, definitions(define), framing))
     _check_outputs(shots, [scene, camera] if camera else [scene], png)
     require_scaling(source_power, unit, wavelength_nm)
     settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
@@ -151,10 +139,10 @@ def _rendered(shots: list[Shot], settings: dict[str, Any], output: Output, quiet
 
         quiet_mitsuba()
         for shot in shots:
-            image = render(load(shot.scene, **shot.parameters), progress=progress, **settings)
+            image = render(load(shot.given.scene, **shot.given.parameters), progress=progress, **settings)
             image = image if output.source_power is None else image.scaled(output.source_power)
-            if shot.origin:
-                image = replace(image, metadata=image.metadata | {"scene": shot.origin})
+            if shot.given.origin:
+                image = replace(image, metadata=image.metadata | {"scene": shot.given.origin})
             output.write(image, shot.output, _picture(shot, output.png))
             images.append(image)
     return images
@@ -170,39 +158,13 @@ def require_scaling(source_power: float | None, unit: str, wavelength_nm: float 
     require_unit(unit, wavelength_nm)
 
 
-def _shots(scene: Path, output: Path | None, parameters: dict[str, str], framing: dict[str, Any]) -> list[Shot]:
-    """What to render: the scene, or every view of a phantom; SceneError for an option that does not go with it."""
+def _shots(scene: Path, output: Path | None, scenes: list[GivenScene]) -> list[Shot]:
+    """The scenes with the images to write: the name that was given, of several views with the view in the name."""
     output = output or Path((scene.stem or "image") + ".exr")
-    if scene.suffix.lower() == ".ply":
-        return _views(scene, output, parameters, framing)
-    if framing:
-        option = "--" + next(iter(framing)).replace("_", "-")
-        raise SceneError(
-            f"{option} goes with PHANTOM.ply, '{scene}' is a scene with parameters of its own. Give -D NAME=VALUE."
-        )
-    return [Shot(scene, parameters, output)]
-
-
-def _views(phantom: Path, output: Path, parameters: dict[str, str], framing: dict[str, Any]) -> list[Shot]:
-    """A phantom's views, in the order given; -D and options overrule the camera's file."""
-    from ..phantom.framed_scene import camera_lens, scene_xml
-
-    if twice := set(parameters) & set(framing):
-        name = min(twice)
-        raise SceneError(f"-D {name}={parameters[name]}: --{name.replace('_', '-')} gives it already. Give it once.")
-    numbers = typed({name: text for name, text in parameters.items() if name != "view"})
-    lens = camera_lens(framing.pop("camera")) if "camera" in framing else {}
-    views = several("view", framing.pop("view", parameters.get("view", "0")))
-    if wrong := [view for view in views if not is_number(view) or views.count(view) > 1]:
-        raise SceneError(f"--view: must be different numbers of degrees, got '{wrong[0]}'. Give for example 0,90,180.")
-    text = scene_xml(phantom, **lens | numbers | framing)
-    shots = []
-    for view in views:
-        values = read_text(text, {}).defaults | {"view": view}
-        origin = " ".join([str(phantom), *(f"{name}={value}" for name, value in values.items())])
-        image = output.with_name(f"{output.stem}_view{view}{output.suffix or '.exr'}")
-        shots.append(Shot(text, {"view": view}, image, origin))
-    return shots
+    if len(scenes) == 1:
+        return [Shot(scenes[0], output)]
+    suffix = output.suffix or ".exr"
+    return [Shot(one, output.with_name(f"{output.stem}_view{one.view}{suffix}")) for one in scenes]
 
 
 def _picture(shot: Shot, png: bool) -> Path | None:
@@ -217,7 +179,8 @@ def _check_outputs(shots: list[Shot], inputs: list[Path], png: bool) -> None:
         picture = _picture(shot, png)
         if picture:
             require_picture(picture)
-        read = read_xml(shot.scene, shot.parameters).sources() if isinstance(shot.scene, Path) else inputs
+        scene, parameters = shot.given.scene, shot.given.parameters
+        read = read_xml(scene, parameters).sources() if isinstance(scene, Path) else inputs
         for written in (shot.output, picture) if picture else (shot.output,):
             require_apart(written, read, error=ImageError)
 

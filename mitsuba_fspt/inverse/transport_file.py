@@ -178,10 +178,12 @@ def _stored_block(file: Any) -> Block:
 
 
 def _numbers(array: Any, name: str, length: int, kinds: str = "f") -> NDArray[Any]:
-    """`array` if it has so many numbers of these kinds of NumPy's; else ValueError."""
+    """`array` if it has so many finite numbers of these kinds of NumPy's; else ValueError."""
     array = np.asarray(array)  # NumPy returns a member that is no array as bytes
     if array.shape != (length,) or array.dtype.kind not in kinds:
         raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {length} numbers")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has NaN or infinite numbers")
     return array
 
 

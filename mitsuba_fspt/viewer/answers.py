@@ -25,6 +25,8 @@ from ..rendering.live_scene import LiveScene
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import FsptError, ViewerError
+from .faults import in_parameters
+from .origin import Origin
 from .sliders import sliders_of
 
 if TYPE_CHECKING:
@@ -103,17 +105,21 @@ class Answers:
     """Answers requests about one scene through its lens `sensor`, one at a time. Raises as `LiveScene`."""
 
     def __init__(
-        self, scene: mi.Scene | str | os.PathLike[str], parameters: Mapping[str, object], sensor: int = 0
+        self,
+        scene: mi.Scene | str | os.PathLike[str],
+        parameters: Mapping[str, object],
+        sensor: int = 0,
+        origin: Origin | None = None,
     ) -> None:
+        self._origin = origin
+        self._shown: dict[str, Mapping[str, str]] = {}  # values of the last picture of each lens
         self._live = LiveScene(scene, parameters, sensor)
         self._live.scene({})  # bad scenes are refused before a page opens
 
     def hello(self) -> Answer:
         """Initial data of a page: name of the scene, sliders, names of the lens models."""
-        source = self._live.source
-        name = "XML text" if is_text(source) else os.fspath(source)
         sliders = [slider.record() for slider in sliders_of(self._live.xml)]
-        return Answer({"kind": "hello", "scene": name, "sliders": sliders, "models": list(model_names())})
+        return Answer({"kind": "hello", "scene": self._name(), "sliders": sliders, "models": list(model_names())})
 
     def answer(self, request: Request, may_go_on: Callable[[], None] = lambda: None) -> Answer:
         """Answer to a request. An error of the scene becomes an answer of kind 'error' with its one-line message.
@@ -124,7 +130,7 @@ class Answers:
         try:
             return getattr(self, f"_{request.kind}")(request, given, may_go_on)
         except FsptError as error:
-            return Answer(given | {"kind": "error", "message": _one_line(error)})
+            return Answer(given | {"kind": "error", "message": self._in_parameters(_one_line(error), request)})
         except Superseded:
             raise
         except Exception as error:  # of the renderer or of this package: the page and its last image stay
@@ -140,6 +146,7 @@ class Answers:
             image = self._image(request, changed, may_go_on)
         else:
             image = self._live.draft(changed, request.model)
+        self._shown[request.slot] = request.values
         planes: dict[str, NDArray] = {"power": image.power, "error": image.error, "coverage": image.coverage}  # type: ignore[dict-item]
         known = image.metadata
         lacks = ""
@@ -182,6 +189,9 @@ class Answers:
         image = self._image(request, self._changed(request), may_go_on)
         if request.model:
             image = replace(image, metadata=image.metadata | {"model": request.model})
+        if self._origin:
+            texts = [f"{name}={text}" for name, text in self._values(self._changed(request)).items()]
+            image = replace(image, metadata=image.metadata | {"scene": " ".join([self._origin.name, *texts])})
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "picture.exr"
             image.write(path)
@@ -193,19 +203,45 @@ class Answers:
         before = xml.defaults | dict(xml.given)
         return {name: text for name, text in request.values.items() if not _same(text, before.get(name, ""))}
 
+    def _in_parameters(self, message: str, request: Request) -> str:
+        """The message in the words of the page, if the scene's file can still be read."""
+        try:
+            return in_parameters(message, self._live.xml, self._since_picture(request))
+        except FsptError:
+            return message
+
+    def _since_picture(self, request: Request) -> dict[str, str]:
+        """The request's values that differ from those of the last picture of its lens, or of the scene as given."""
+        shown = self._shown.get(request.slot)
+        if shown is None:
+            return self._changed(request)
+        return {name: text for name, text in request.values.items() if not _same(text, shown.get(name, ""))}
+
     def _file(self, request: Request) -> str:
         """Name for a file of the picture."""
-        source = self._live.source
-        stem = "scene" if is_text(source) else Path(source).stem
+        stem = Path(self._name()).stem if self._has_file() else "scene"
         return f"{stem}{'_second' if request.slot == 'b' else ''}.exr"
+
+    def _has_file(self) -> bool:
+        return self._origin is not None or not is_text(self._live.source)
+
+    def _name(self) -> str:
+        """Name of the scene's file, or that it is text."""
+        if self._origin:
+            return self._origin.name
+        return os.fspath(self._live.source) if self._has_file() else "XML text"
+
+    def _values(self, changed: Mapping[str, str]) -> dict[str, str]:
+        """Texts of the parameters that a command has to give: all of them where the text was made of a file."""
+        return (self._live.xml.defaults if self._origin else {}) | self._live.given | dict(changed)
 
     def _command(self, request: Request, changed: Mapping[str, str]) -> str:
         """Command that renders the image; empty for a scene given as text and for another lens model."""
-        if is_text(self._live.source) or request.model:
+        if not self._has_file() or request.model:
             return ""
-        words = ["fspt", "render", os.fspath(self._live.source)]
+        words = list(self._origin.command if self._origin else ("fspt", "render", self._name()))
         words += ["--sensor", str(self._live.sensor)] if self._live.sensor else []
-        for name, text in (self._live.given | dict(changed)).items():
+        for name, text in self._values(changed).items():
             words += ["-D", f"{name}={text}"]
         return shlex.join([*words, "-o", self._file(request)])
 

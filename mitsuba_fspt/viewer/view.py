@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from ..runtime.extras import require
 from ..runtime.progress_bar import in_notebook
 from .answers import Answers
+from .origin import Origin
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -21,6 +22,7 @@ def view(
     sensor: int = 0,
     port: int = 0,
     ready: Callable[[str], object] | None = None,
+    origin: Origin | None = None,
     **parameters: object,
 ) -> object:
     """Show a scene with sliders for the numbers among its `<default>` parameters; the image follows them.
@@ -33,6 +35,7 @@ def view(
     sensor : number of the lens, in a scene with several
     port : of the page; 0: any free one. Without effect in a notebook
     ready : function that is called with the page's address; None opens it in the browser
+    origin : file of which XML text was made, which the page names in place of the text
     parameters : values for `<default>` parameters
 
     Raises
@@ -45,10 +48,10 @@ def view(
         require("anywidget", "The viewer in a notebook")
         from .widget import widget
 
-        return widget(Answers(scene, parameters, sensor))
+        return widget(Answers(scene, parameters, sensor, origin))
     for module in ("starlette", "uvicorn", "websockets"):
         require(module, "The viewer")
     from .server import ViewServer
 
-    ViewServer(lambda: Answers(scene, parameters, sensor), port).run(ready or webbrowser.open)
+    ViewServer(lambda: Answers(scene, parameters, sensor, origin), port).run(ready or webbrowser.open)
     return None

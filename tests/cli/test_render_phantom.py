@@ -54,13 +54,42 @@ def test_a_file_for_each_view(run):
 
 
 def test_the_header_reproduces_the_file(run):
-    run("render", "phantom.ply", "--view", "30", "--focal-length", 35, *FEW, "-o", "a")
-    first = fspt.read("a_view30.exr")
+    run("render", "phantom.ply", "--view", "30", "--focal-length", 35, *FEW, "-o", "a.exr")
+    first = fspt.read("a.exr")
     scene, *parameters = first.metadata["scene"].split(" ")
     define = [word for parameter in parameters for word in ("-D", parameter)]
     assert run("render", scene, *define, "--rtol", first.metadata["rtol"], "-o", "b.exr")[0] == 0
-    assert files() == ["a_view30.exr", "b_view30.exr"]
-    np.testing.assert_array_equal(fspt.read("b_view30.exr").power, first.power)
+    assert files() == ["a.exr", "b.exr"]
+    np.testing.assert_array_equal(fspt.read("b.exr").power, first.power)
+
+
+def test_a_single_view_has_the_name_that_was_given(run):
+    """Seen to be written as mc_view90.exr."""
+    assert run("render", "phantom.ply", "--view", "90", *FEW, "-o", "mc.exr")[0] == 0
+    assert files() == ["mc.exr"]
+    assert run("render", "phantom.ply", *FEW)[0] == 0
+    assert files() == ["mc.exr", "phantom.exr"]
+    assert fspt.read("mc.exr").metadata["scene"].startswith("phantom.ply f_number=1.8 view=90 ")
+
+
+def test_explain_takes_a_phantom_like_render(run):
+    code, out, err = run("explain", "phantom.ply", "--view", "30", "--f-number", 8, *FEW)
+    assert (code, err) == (0, "")
+    assert "left out" in out
+    code, _, err = run("explain", "phantom.ply", "--view", "0,90", *FEW)
+    assert (code, "--view 0,90: must be one number of degrees here" in err) == (2, True)
+    code, _, err = run("explain", SCENES / "l_shape.xml", "--f-number", "8")
+    assert (code, "--f-number goes with PHANTOM.ply" in err) == (2, True)
+
+
+def test_a_focus_on_the_command_line_takes_the_place_of_that_of_the_camera(run):
+    """As -D of any other number does; seen to be refused as two focuses."""
+    with open("camera.toml", "w") as file:
+        file.write("[lens]\nfocal_length = 55\nf_number = 8\nfocus_distance = 200\n")
+    camera = ["phantom.ply", "--camera", "camera.toml", *FEW]
+    for focus, more in ((55 / (200 - 55), []), (0.5, ["-D", "magnification=0.5"])):
+        assert run("render", *camera, *more, "-o", "x.exr")[0] == 0
+        assert fspt.read("x.exr").metadata["magnification"] == pytest.approx(focus, rel=1e-6)
 
 
 def test_a_camera_file_options_and_a_range(run):

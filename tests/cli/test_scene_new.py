@@ -91,7 +91,7 @@ def test_a_mouse_is_the_phantom_that_render_frames(run):
     assert (code, json.loads(out), err) == (0, {"output": "my.xml"}, "")
     assert run("render", "my.xml", "-D", "view=90", "--quiet") == (0, "", "")
     assert run("render", "phantom.ply", "--view", "90", *FILM, "--quiet") == (0, "", "")
-    np.testing.assert_array_equal(fspt.read("my.exr").power, fspt.read("phantom_view90.exr").power)
+    np.testing.assert_array_equal(fspt.read("my.exr").power, fspt.read("phantom.exr").power)
 
 
 @pytest.mark.parametrize("name", STARTERS)

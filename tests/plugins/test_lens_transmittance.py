@@ -155,7 +155,7 @@ def test_a_camera_file_names_a_curve_beside_itself(tmp_path, run, monkeypatch):
     write_ply(tmp_path / "p.ply", corners, [(0, 1, 2), (0, 2, 3)], vertex=[1.0] * 4)
     monkeypatch.chdir(tmp_path)
     assert run("render", "p.ply", "--camera", "camera/c.toml", "--rtol", "0.1", "--quiet") == (0, "", "")
-    with_filter = fspt.read("p_view0.exr")
+    with_filter = fspt.read("p.exr")
     assert with_filter.metadata["transmittance"] == 0.2
     size = {"width": 8, "height": 8, "pixel_pitch": 3.456}
     clear = fspt.render(fspt.scene_xml("p.ply", **size), rtol=0.1)

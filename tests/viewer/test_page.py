@@ -172,6 +172,43 @@ def test_two_pages_and_a_reload(page, browser, served):
     other.close()
 
 
+def test_the_address_keeps_the_second_lens_and_the_display(page, browser):
+    """All of them were forgotten at a reload, but for the sliders of the first lens."""
+    page.get_by_label("log scale").check()
+    page.locator("select[name=unit]").select_option("photons")
+    page.get_by_label(re.compile("^wavelength")).fill("700")
+    page.get_by_label(re.compile("^wavelength")).press("Enter")
+    page.get_by_label("beside the first").check()
+    page.locator("select[name=model-b]").select_option("pinhole")
+    page.locator('input[type=range][name="b:f_number"]').evaluate(
+        "(node) => { node.value = Math.log(8); node.dispatchEvent(new Event('input')); }"
+    )
+    shows(page.locator("figcaption").nth(1), "(pinhole): F = 50 mm, f/8")
+    wait_for_picture(page)
+    page.wait_for_function("location.hash.includes('b%3Af_number=8')")
+    other = browser.new_page()
+    other.goto(page.url)
+    wait_for_picture(other)
+    shows(other.locator("figcaption").nth(1), "(pinhole): F = 50 mm, f/8")
+    assert other.locator("canvas.bar").first.get_attribute("data-log") == "true"
+    assert other.locator("select[name=unit]").input_value() == "photons"
+    assert other.get_by_label(re.compile("^wavelength")).input_value() == "700"
+    other.close()
+
+
+def test_a_field_shows_all_digits_and_an_emptied_one_its_value_again(page):
+    field = page.get_by_label(re.compile("^f_number")).first
+    narrow = field.bounding_box()["width"]
+    field.fill("")
+    field.press("Tab")
+    assert field.input_value() == "4"
+    set_number(page, "f_number", 4.0123456789)
+    field.press("Tab")
+    assert field.input_value() == "4.0123456789"
+    assert field.bounding_box()["width"] > 1.1 * narrow
+    assert field.evaluate("(node) => node.scrollWidth <= node.clientWidth")
+
+
 WIDGET = """async (address) => {
     const sent = [], found = {};
     const model = { on: (event, take) => { found.take = take; }, off: () => {}, send: (record) => sent.push(record) };

@@ -10,10 +10,13 @@ import urllib.request
 
 import numpy as np
 import pytest
+from small_scenes import write_ply
 from viewed_scene import SCENE, interrupt, serve
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.rendering.scene_xml import read_text
 from mitsuba_fspt.viewer.answers import Answers, Request, Superseded
+from mitsuba_fspt.viewer.faults import in_parameters
 from mitsuba_fspt.viewer.queue import RequestQueue
 
 client = pytest.importorskip("websockets.sync.client", reason="the extra 'view' is not installed")
@@ -157,3 +160,44 @@ def test_the_exr_of_the_page_is_that_of_the_command_line(mono, tmp_path):
     assert {k: v for k, v in saved.metadata.items() if k != "wall_time"} == {
         k: v for k, v in other.metadata.items() if k != "wall_time"
     }
+
+
+def test_a_phantom_is_shown_under_its_name_with_the_command_that_renders_it(mono, tmp_path, monkeypatch, run):
+    """The text of the scene fixes what the framing chose; the command gives all of it."""
+    monkeypatch.chdir(tmp_path)
+    corners = [(0, -9, -9), (0, 9, -9), (0, 9, 9), (0, -9, 9)]
+    write_ply(tmp_path / "p.ply", corners, [(0, 1, 2), (0, 2, 3)], vertex=[1.0] * 4)
+    (tmp_path / "c.toml").write_text("[lens]\nf_number = 4\nfocus_distance = 150\nlens_diameter = 30\n")
+    shown = {}
+    monkeypatch.setattr("mitsuba_fspt.viewer.view.view", lambda scene, **options: shown.update(options, scene=scene))
+    film = ("-D", "width=8", "-D", "height=8", "-D", "pixel_pitch=3.456")
+    assert run("view", "p.ply", "--view", "30", "--camera", "c.toml", *film)[0] == 0
+    answers = Answers(shown["scene"], {"view": shown["view"]}, 0, shown["origin"])
+    assert answers.hello().record["scene"] == "p.ply"
+    values = {"f_number": "8", "view": "30"}
+    words = answers.answer(Request("picture", "a", 1, values)).record["command"].split()
+    assert words[:5] == ["fspt", "render", "p.ply", "--camera", "c.toml"]
+    saved = answers.answer(Request("exr", "a", 2, values))
+    (tmp_path / "saved.exr").write_bytes(saved.data[0])
+    assert saved.record["name"] == "p.exr"
+    assert run(*words[1:-1], "again.exr")[0] == 0
+    one, other = fspt.read("saved.exr"), fspt.read("again.exr")
+    assert np.array_equal(one.power, other.power)
+    assert one.metadata["f_number"] == 8
+    assert one.metadata["scene"] == other.metadata["scene"]
+
+
+def test_an_error_names_the_parameters_of_the_page(mono, tmp_path):
+    """The lens's place is set by `distance`: seen to say 'to_world', which is on no page."""
+    scene = SCENE.replace('<default name="turn"', '<default name="away" value="160"/><default name="turn"')
+    (tmp_path / "box.xml").write_text(scene.replace('origin="160, 0, 0"', 'origin="$away, 0, 0"'))
+    answers = Answers(tmp_path / "box.xml", {})
+    bad = answers.answer(Request("picture", "a", 1, {"away": "60000000"})).record
+    assert bad["kind"] == "error"
+    assert bad["message"].endswith("Changed since the last picture: away = 60000000.")
+    assert answers.answer(Request("picture", "a", 2, {"turn": "30"})).record["kind"] == "picture"
+    bad = answers.answer(Request("picture", "a", 3, {"away": "0", "turn": "30"})).record["message"]
+    assert bad.endswith("Changed since the last picture: away = 0.")
+    xml = read_text(scene.replace("160, 0, 0", "$away, 0, 0"), {})
+    line = in_parameters("fspt_lens: the lens stands inside. Move it out with 'to_world'.", xml, {"away": "1"})
+    assert line == "fspt_lens: the lens stands inside. Move it out with 'away'."

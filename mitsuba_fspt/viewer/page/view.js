@@ -15,6 +15,11 @@ const UNITS = { W: "W/pixel", photons: "photons/s/pixel", radiance: "p/s/cm²/sr
 const POWER_IN = { W: "power", photons: "photon rate", radiance: "radiance" }; // what the power is called in each unit
 const MARKS = { cross: "#4fc3f7", region: "#7cff6b", disc: "#ffffff" };
 const PANELS = { a: "lens", b: "second lens", difference: "difference, lens − second lens" };
+// What the page's address keeps of the display: choices, switches and numbers, `:NAME=VALUE`; plain names are parameters.
+const CHOICES = { quantity: QUANTITIES, unit: UNITS, map: { inferno: "inferno", viridis: "viridis", grey: "grey" } };
+const SWITCHES = ["log", "each"];
+const NUMBERS = { wavelength: 200, decades: 0.1 }; // and the least value of each
+const DEFAULTS = { quantity: "power", unit: "W", wavelength: 660, map: "inferno", log: false, decades: 3, lock: false, each: false };
 const SUPERSCRIPTS = "⁰¹²³⁴⁵⁶⁷⁸⁹";
 
 let instances = 0;
@@ -239,7 +244,7 @@ class View {
     this.number = 0;
     this.faults = {};
     this.second = false;
-    this.options = { quantity: "power", unit: "W", wavelength: 660, map: "inferno", log: false, decades: 3, lock: false, each: false };
+    this.options = { ...DEFAULTS };
     this.cursor = null; // column and row under the crosshair
     this.region = null; // [column, row, columns, rows]
     this.limits = null;
@@ -317,18 +322,21 @@ class View {
   figure(name, label, unit, low) {
     const id = `${this.id}-${name}`;
     const field = make("input", { type: "number", id, name, min: low, step: "any", value: this.options[name],
-      onchange: () => { if (Number(field.value) >= low) this.setOption(name, Number(field.value)); } });
+      onchange: () => {
+        if (Number(field.value) >= low) this.setOption(name, Number(field.value));
+        else field.value = this.options[name];
+      } });
     const text = make("label", { for: id }, label, make("span", { class: "unit", text: unit ? ` [${unit}]` : "" }));
     return make("div", { class: "option" }, text, field);
   }
 
   buildDisplay() {
-    this.nodes.wavelength = this.figure("wavelength", "wavelength", "nm", 200);
-    this.nodes.decades = this.figure("decades", "decades", "", 0.1);
+    this.nodes.wavelength = this.figure("wavelength", "wavelength", "nm", NUMBERS.wavelength);
+    this.nodes.decades = this.figure("decades", "decades", "", NUMBERS.decades);
     this.nodes.wavelength.hidden = this.nodes.decades.hidden = true;
     this.nodes.display.append(
       this.choice("quantity", "show", QUANTITIES), this.choice("unit", "unit", UNITS), this.nodes.wavelength,
-      this.choice("map", "colours", { inferno: "inferno", viridis: "viridis", grey: "grey" }),
+      this.choice("map", "colours", CHOICES.map),
       this.check("log", "log scale"), this.nodes.decades, this.check("lock", "hold the scale"),
     );
   }
@@ -418,15 +426,16 @@ class View {
     const first = !this.sliders.length;
     this.sliders = record.sliders;
     const kept = new URLSearchParams(this.keepsHash ? location.hash.slice(1) : "");
-    for (const slider of this.sliders) {
-      const own = first ? kept.get(slider.name) ?? slider.value : this.values.a[slider.name] ?? slider.value;
-      this.values.a[slider.name] = Number.isFinite(Number(own)) ? Number(own) : slider.value;
-      this.values.b[slider.name] ??= this.values.a[slider.name];
+    const number = (text, other) => (text !== null && text !== "" && Number.isFinite(Number(text)) ? Number(text) : other);
+    for (const { name, value } of this.sliders) {
+      this.values.a[name] = first ? number(kept.get(name), value) : this.values.a[name] ?? value;
+      this.values.b[name] ??= number(kept.get(`b:${name}`), this.values.a[name]);
     }
     if (first) {
       this.nodes.sliders.append(...this.sliders.map((slider) => this.sliderRow(slider, "a")));
       if (!this.sliders.length) this.nodes.sliders.append(make("p", { text: "The scene has no numeric <default>." }));
       this.buildSecond();
+      this.restore(kept);
     }
     for (const slot of this.second ? ["a", "b"] : ["a"]) {
       this.draft(slot);
@@ -442,6 +451,7 @@ class View {
     const field = make("input", { type: "number", step: "any", "aria-label": `${slider.name}${slider.unit ? `, ${slider.unit}` : ""}` });
     const show = (number, source) => {
       if (source !== field) field.value = number;
+      field.style.width = `max(6.5em, ${field.value.length + 4}ch)`; // all digits
       if (source !== range) range.value = shape.position(number);
       range.setAttribute("aria-valuetext", `${digits(number)} ${slider.unit}`.trim());
     };
@@ -456,6 +466,7 @@ class View {
     field.addEventListener("input", () => {
       if (field.value !== "" && Number.isFinite(Number(field.value))) set(Number(field.value), field);
     });
+    field.addEventListener("change", () => show(this.values[slot][slider.name])); // in place of an empty field
     const label = make("label", { for: id }, slider.name, make("span", { class: "unit", text: slider.unit ? ` [${slider.unit}]` : "" }));
     return make("div", { class: "slider" }, label, field, range);
   }
@@ -502,6 +513,7 @@ class View {
       this.tell("");
     }
     if (on) this.changed("b");
+    this.keep();
     this.draw();
   }
 
@@ -511,6 +523,7 @@ class View {
     else if (["quantity", "unit", "log", "wavelength", "decades", "each"].includes(name)) this.limits = null;
     this.nodes.wavelength.hidden = this.options.unit === "W";
     this.nodes.decades.hidden = !this.options.log;
+    this.keep();
     const lacks = this.options.unit === "radiance" && Object.values(this.pictures).some((p) => !p.plane.etendue);
     if (lacks) for (const slot of Object.keys(this.pictures)) this.ask("picture", slot);
     this.draw();
@@ -528,10 +541,39 @@ class View {
     }, REST);
   }
 
+  /** Put values, the second lens and the display into the page's address, as far as they differ from the start. */
   keep() {
-    if (!this.keepsHash) return;
-    const changed = this.sliders.filter((s) => this.values.a[s.name] !== s.value).map((s) => [s.name, this.values.a[s.name]]);
-    history.replaceState(null, "", `#${new URLSearchParams(changed)}`);
+    if (!this.keepsHash || !this.sliders) return;
+    const kept = new URLSearchParams();
+    for (const { name, value } of this.sliders) if (this.values.a[name] !== value) kept.set(name, this.values.a[name]);
+    if (this.models.a) kept.set(":model-a", this.models.a);
+    if (this.second) {
+      kept.set(":second", 1);
+      for (const { name, lens } of this.sliders) if (lens && this.values.b[name] !== this.values.a[name]) kept.set(`b:${name}`, this.values.b[name]);
+      if (this.models.b) kept.set(":model-b", this.models.b);
+    }
+    for (const name of [...Object.keys(CHOICES), ...SWITCHES, ...Object.keys(NUMBERS)]) {
+      if (this.options[name] !== DEFAULTS[name]) kept.set(`:${name}`, SWITCHES.includes(name) ? 1 : this.options[name]);
+    }
+    history.replaceState(null, "", `#${kept}`);
+  }
+
+  /** Display, lens models and second lens as the page's address has them; values that make no sense are left out. */
+  restore(kept) {
+    const control = (name) => this.root.querySelector(`[name="${name}"]`);
+    for (const [name, entries] of Object.entries(CHOICES)) if (Object.hasOwn(entries, kept.get(`:${name}`))) this.options[name] = control(name).value = kept.get(`:${name}`);
+    for (const name of SWITCHES) if (kept.has(`:${name}`)) this.options[name] = control(name).checked = true;
+    for (const [name, low] of Object.entries(NUMBERS)) if (Number(kept.get(`:${name}`)) >= low) this.options[name] = control(name).value = Number(kept.get(`:${name}`));
+    for (const slot of ["a", "b"]) {
+      const model = kept.get(`:model-${slot}`);
+      if (this.allModels.includes(model)) this.models[slot] = control(`model-${slot}`).value = model;
+    }
+    this.nodes.wavelength.hidden = this.options.unit === "W";
+    this.nodes.decades.hidden = !this.options.log;
+    if (kept.has(":second")) {
+      control("second").checked = true;
+      this.setSecond(true);
+    }
   }
 
   // ---- requests and answers
@@ -879,26 +921,29 @@ class View {
       const [at, across, count] = along === "row" ? [row, column, width] : [column, row, height];
       const lines = curves.map(([slot, values]) =>
         [slot, Float64Array.from({ length: count }, (_, k) => values[along === "row" ? row * width + k : k * width + column])]);
-      this.paintProfile(this.nodes[along], lines, across);
+      this.paintProfile(this.nodes[along], lines, across, along);
       this.nodes[`${along}Title`].textContent = `Profile along ${along} ${at}`;
       const [low, high] = [Math.min, Math.max].map((end) => digits(lines.at(-1)[1].reduce((most, value) => end(most, value))));
       this.nodes[along].setAttribute("aria-label", `profile along ${along} ${at}: ${low} to ${high} ${this.unitText()}`);
     }
   }
 
-  /** Draw profiles, [slot, values] each, with their axes; `across`: number of the pixel under the crosshair. */
-  paintProfile(canvas, lines, across) {
+  /** Draw profiles, [slot, values] each, `along` a row or column, with axes in pixels and in mm; `across`: number of the
+   * pixel under the crosshair. */
+  paintProfile(canvas, lines, across, along) {
     const [context, wide, tall] = sharp(canvas);
     const style = getComputedStyle(this.root);
     const colour = { a: style.getPropertyValue("--accent"), b: style.getPropertyValue("--other") };
     const faint = style.getPropertyValue("--faint"), rule = style.getPropertyValue("--line");
-    const left = 38, right = 10, top = 22, bottom = 20, count = lines[0][1].length;
+    const { side } = this.pictures.a;
+    const left = 38, right = 10, top = 22, bottom = side ? 36 : 20, count = lines[0][1].length;
     const { log } = this.options;
     const [low, high] = this.scale("a", false);
     const { marks, factor } = axis(low, high, log);
     const share = (value) => (log ? (value > 0 ? Math.log(value / low) / Math.log(high / low) : -1) : (value - low) / (high - low));
     const y = (value) => tall - bottom - (tall - top - bottom) * Math.max(0, Math.min(1, share(value)));
-    const x = (k) => left + ((k + 0.5) / count) * (wide - left - right);
+    const edge = (k) => left + (k / count) * (wide - left - right); // left edge of a pixel
+    const x = (k) => edge(k + 0.5);
     context.font = "11px system-ui, sans-serif";
     context.textBaseline = "middle";
     for (const [value, text] of marks) {
@@ -909,8 +954,19 @@ class View {
       context.fillText(text, left - 5, y(value), left - 6);
     }
     context.textAlign = "center";
-    for (const k of ticks(0, count - 1, false).filter(Number.isInteger)) context.fillText(String(k), x(k), tall - bottom / 2 + 1);
+    const first = tall - bottom + 11, second = first + 15; // lines of the numbers below the axis
+    for (const k of ticks(0, count - 1, false).filter(Number.isInteger)) context.fillText(String(k), x(k), first);
+    if (side) {
+      const half = (count * side) / 2;
+      const place = (mm) => edge((along === "row" ? half + mm : half - mm) / side);
+      for (const mm of ticks(-half, half, false)) {
+        context.fillRect(place(mm), tall - bottom, 1, 4);
+        context.fillText(digits(mm, 3), place(mm), second);
+      }
+    }
     context.textAlign = "left";
+    context.fillText(along === "row" ? "column" : "row", 0, first, left - 2);
+    if (side) context.fillText(along === "row" ? "x [mm]" : "y [mm]", 0, second, left - 2);
     context.fillText(withUnit(this.quantityText(), factor, this.unitText()), 4, top / 2);
     context.fillStyle = MARKS.cross;
     context.fillRect(x(across) - 0.5, top, 1, tall - top - bottom);
