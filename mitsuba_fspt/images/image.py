@@ -202,7 +202,9 @@ class Image:
 
         return combined(self, other, sign) if isinstance(other, Image) else NotImplemented
 
-    def roi(self, region: str | NDArray[np.bool_] | None = None, wavelength_nm: float | None = None) -> Measurement:
+    def roi(
+        self, region: str | os.PathLike[str] | NDArray[np.bool_] | None = None, wavelength_nm: float | None = None
+    ) -> Measurement:
         """Radiometric quantities of the light from a region, as `fspt roi` prints them.
 
         Parameters

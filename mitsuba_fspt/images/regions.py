@@ -66,21 +66,26 @@ HEADINGS = {
 }
 
 
-def measure(image: Image, region: str | Mask | None = None, wavelength_nm: float | None = None) -> Measurement:
+def measure(
+    image: Image, region: str | os.PathLike[str] | Mask | None = None, wavelength_nm: float | None = None
+) -> Measurement:
     """Radiometric quantities of the light from a region of an image, without its masked pixels.
 
     Parameters
     ----------
     image : power [W]
-    region : mask (h, w), or text as of `region_mask`; None: all pixels
+    region : mask (h, w) of True and False, or text or a file's name as of `region_mask`; None: all pixels
     wavelength_nm : of the light [nm]; None: that of the image's filter
 
     Raises
     ------
     ImageError : no such region, no pixel in it that is not masked, or as in `in_unit`.
     """
-    mask = region_mask(image, region) if isinstance(region, str) else region
-    mask = np.ones(image.shape, bool) if mask is None else mask
+    if isinstance(region, os.PathLike):
+        region = os.fspath(region)
+    if region is None:
+        region = np.ones(image.shape, bool)
+    mask = region_mask(image, region) if isinstance(region, str) else np.asarray(region)
     _check_mask(image, mask, "region")
     mask, masked = mask & image.kept, int(np.count_nonzero(mask & ~image.kept))
     if not mask.any():

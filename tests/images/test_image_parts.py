@@ -122,6 +122,9 @@ def test_a_region_and_an_exposure_are_those_of_the_verbs(image):
 
     assert image.roi("25%", 660) == measure(image, "25%", 660)
     assert image.roi(wavelength_nm=660).pixels == 40 * 32
+    assert image.roi(image.power > 0, 660).pixels == np.count_nonzero(image.power)
+    with pytest.raises(ImageError, match=r"a mask of shape \(4,\) does not fit"):
+        image.roi((1, 2, 3, 4), 660)
     bright = image.scaled(1e4 / PER_WATT / image.power.max())
     one = bright.expose(CCD, exposure_time=60, wavelength_nm=650, binning=2, seed=3)
     np.testing.assert_array_equal(one.counts, CCD.expose(bright, 60, 650, binning=2, seed=3).counts)
