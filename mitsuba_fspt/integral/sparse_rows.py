@@ -39,7 +39,7 @@ ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further f
 UNREACHED = 0.5  # likewise, where the picture itself did not reach rtol
 ALL_LINES = 2048  # lines of sight a pixel at rtol 1e-3 where all rows are found by them
 ROW_LINES = 4096  # of these pixels at rtol 1e-3, more where they are few
-FEWEST_HITS = 64  # of them, on a column whose entry they determine better than the surface form does
+FEWEST_HITS = 64  # of them, on a column of which they determine the entry better than the surface form does
 TURNS = 6  # in which rows and columns are scaled to their sums
 LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
 ENTRY = 36  # bytes of an entry while columns become rows
@@ -269,10 +269,11 @@ def _by_lines(
 def _refined(
     scene: mi.Scene, lens: mi.Sensor, entries: _Entries, on: Sequence[str], rough: Mask, cut: Mask, rtol: float
 ) -> _Entries:
-    """The same with entries of rough pixels as lines of sight find them, where enough of these meet the column.
+    """The same with the bright entries of rough pixels as lines of sight find them, and the faint ones as they are.
 
-    Entries of pixels in `cut` are always replaced: the border of a stop crosses these pixels, and the surface form
-    counts them whole.
+    An entry is bright if the surface form or the lines of sight put it above a threshold; so each entry comes from
+    one of the two, also where one puts it just above and the other just below. In pixels in `cut` all entries are
+    bright: the border of a stop crosses these pixels, and the surface form counts them whole.
     """
     pixels = np.flatnonzero(rough)
     lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
@@ -281,15 +282,14 @@ def _refined(
     for some in places:
         rows = _rows(scene, lens, some, on, lines)
         threshold = np.where(cut[some], 0, FEWEST_HITS / (math.pi * lines))
-        many = rows.where(rows.light >= np.repeat(threshold, np.diff(rows.starts)))
-        found.append(many)
         sizes = np.diff(entries.starts)[some]
-        row = np.repeat(np.arange(len(some)), sizes)
+        row, met = (np.repeat(np.arange(len(some)), counts) for counts in (sizes, np.diff(rows.starts)))
         here = np.repeat(entries.starts[some] - np.cumsum(sizes) + sizes, sizes) + np.arange(len(row))
-        met = np.repeat(np.arange(len(some)), np.diff(many.starts)) * entries.count + many.columns
-        # Kept from the surface form: faint columns, but for those that the lines have found to be bright.
-        faint = entries.light[here] < threshold[row]
-        kept[here] = faint & ~np.isin(row * entries.count + entries.columns[here], met)
+        bright, bright_met = entries.light[here] >= threshold[row], rows.light >= threshold[met]
+        number_here = row * entries.count + entries.columns[here]
+        number_met = met * entries.count + rows.columns
+        kept[here] = ~bright & ~np.isin(number_here, number_met[bright_met])
+        found.append(rows.where(bright_met | np.isin(number_met, number_here[bright])))
     return entries.where(kept).joined(found, places)
 
 
