@@ -69,11 +69,12 @@ def flat_field(
     flat_dark: Frame | float | None = None,
     bias: Array | None = None,
     pixel_pitch: float | None = None,
+    binning: int | None = None,
 ) -> FlatField:
     """Flat field of counts of this `shape` (h, w); parameters as of `Detector.reduce`.
 
     bias : frame [DN] in place of the detector's number, for a flat of raw counts without `flat_dark`
-    pixel_pitch : of the pixels read out [mm], or None
+    pixel_pitch, binning : of the pixels read out [mm], and the pixels along their side, or None
 
     Raises
     ------
@@ -86,7 +87,7 @@ def flat_field(
     background, frames = _background(detector, found, flat_dark, bias, shape)
     light = found.values - background
     full = _full(detector, found, light)
-    screen = np.ones(shape) if scene is None else uniform_screen(scene, shape, pixel_pitch)
+    screen = np.ones(shape) if scene is None else uniform_screen(scene, shape, pixel_pitch, binning)
     lit = screen > LEAST * screen.max()
     usable = lit & ~full & (light > 0)
     if not usable.any():
@@ -104,31 +105,35 @@ def flat_field(
     return FlatField(response, ~usable, variance, str(kind))
 
 
-def uniform_screen(scene: Scene, shape: tuple[int, int], pixel_pitch: float | None = None) -> Array:
+def uniform_screen(
+    scene: Scene, shape: tuple[int, int], pixel_pitch: float | None = None, binning: int | None = None
+) -> Array:
     """Étendue [mm² sr] of the pixels read out, (h, w): the image of a uniform surface over its radiance (Eq. M.6).
 
-    It follows from the scene's lens, film and crop window, summed over the pixels of a bin, without a render.
+    It follows from the scene's lens, film and crop window, summed over the pixels of a bin, without a render. A film of
+    as many pixels as the counts has the pixels read out.
 
     Raises
     ------
-    DetectorError : the film is no whole multiple of `shape`, or its pixels have not the `pixel_pitch` [mm].
+    DetectorError : the film is no whole multiple of `shape`, its pixels have not the `pixel_pitch` [mm], or neither
+        that nor the `binning` says that several of them are read out as one.
     SceneError, OpticsError : the scene has no lens that can be used.
     """
     numbers, film = lens_numbers(scene)
     height, width = shape
-    binning = max(1, film[0] // height)
-    if (height * binning, width * binning) != film:
+    side = max(1, film[0] // height)
+    if (height * side, width * side) != film or (side > 1 and pixel_pitch is None and side != binning):
         raise DetectorError(
             f"reduce: the film of the 'scene' has {film[1]} × {film[0]} pixels, the counts {width} × {height}. Give "
-            "the scene of this camera, with its film and crop window."
+            "the scene of this camera, with its film and crop window, and 'pixel_pitch' or 'binning' of the counts."
         )
-    own = float(numbers["pixel_pitch"]) * binning
+    own = float(numbers["pixel_pitch"]) * side
     if pixel_pitch is not None and abs(pixel_pitch - own) > SAME_PITCH * own:
         raise DetectorError(
             f"reduce: 'pixel_pitch' is {pixel_pitch:g} mm, the film of the 'scene' has {own:g} mm on the same pixels. "
             "Give the scene of this camera."
         )
-    return etendue_of(film, numbers).reshape(height, binning, width, binning).sum(axis=(1, 3))
+    return etendue_of(film, numbers).reshape(height, side, width, side).sum(axis=(1, 3))
 
 
 def _require_kind(kind: str | None, scene: Scene | None) -> None:

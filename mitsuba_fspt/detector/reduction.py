@@ -132,6 +132,7 @@ class Corrections:
             flat_dark=self.flat_dark,
             bias=bias,
             pixel_pitch=exposed.pixel_pitch,
+            binning=exposed.binning or counts.binning,
         )
 
     def bad(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:

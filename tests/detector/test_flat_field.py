@@ -185,6 +185,9 @@ def test_the_screen_of_crop_windows_and_bins(mono):
     np.testing.assert_allclose(math.pi * binned, uniform_screen(scene, (5, 6), 4 * 0.64), rtol=1e-4)
     with pytest.raises(DetectorError, match="the film of the 'scene' has 24 × 20 pixels, the counts 7 × 5"):
         uniform_screen(scene, (5, 7))
+    np.testing.assert_array_equal(uniform_screen(scene, (5, 6), binning=4), uniform_screen(scene, (5, 6), 2.56))
+    with pytest.raises(DetectorError, match="and 'pixel_pitch' or 'binning' of the counts"):
+        uniform_screen(scene, (5, 6), binning=1)  # a part of the film, which is not binned
     with pytest.raises(DetectorError, match=r"'pixel_pitch' is 0\.64 mm, the film of the 'scene' has 2\.56 mm"):
         uniform_screen(scene, (5, 6), 0.64)
 

@@ -197,6 +197,20 @@ def test_files(tmp_path):
     assert read_counts(click).exposure_time == 60
 
 
+def test_another_exposure_time_in_the_file_is_told(tmp_path, caplog):
+    """EXPTIME of 60 s says nothing beside 60 s, and one line beside 30 s, which are used."""
+    fits = pytest.importorskip("astropy.io.fits")
+    hdu = fits.PrimaryHDU(CCD.expose(ramp(), 60, 650, seed=1).counts)
+    hdu.header["EXPTIME"] = 60.0
+    hdu.writeto(tmp_path / "a.fits")
+    CCD.reduce(tmp_path / "a.fits", **SETTINGS)
+    assert not caplog.records
+    found = CCD.reduce(tmp_path / "a.fits", exposure_time=30, wavelength_nm=650)
+    assert found.electrons_per_watt == pytest.approx(PER_WATT / 2)
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert "'exposure_time' is 30 s, the file of the counts states 60 s" in told
+
+
 def test_rows_of_fits_files(tmp_path):
     """ROWORDER = BOTTOM-UP turns the rows over, a binning that is not square is refused, and colour, too."""
     fits = pytest.importorskip("astropy.io.fits")
