@@ -59,7 +59,9 @@ Binning = Annotated[
 Pitch = Annotated[
     float | None, typer.Option(help="Of the pixels read out [mm]; detector's x binning, else that of the file.")
 ]
-Scene = Annotated[Path | None, typer.Option(metavar="S.xml", help="Scene of the camera, for a flat by its lens.")]
+Scene = Annotated[
+    Path | None, typer.Option(metavar="S.xml", help="Scene with the camera's lens and film, for --flat-kind lens.")
+]
 Frames = Annotated[int | None, typer.Option(metavar="N", help="That each single frame of counts is the mean of.")]
 BadPixels = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame that is not 0 on the pixels to mask.")]
 Calibrate = Annotated[

@@ -123,6 +123,7 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
             raise ImageError(f"counts '{path}' are no NPY file of numbers: {_line(cause)}. Save them again.") from cause
     else:
         raise ImageError(f"counts '{path}': '{suffix}' is not read. Give .tif, .fits, .npy or a click folder.")
+    array = array.astype(np.uint8) if array.dtype == bool else array  # a frame of bad pixels
     return replace(counts_of(array, str(path), frames), **header)
 
 

@@ -120,8 +120,9 @@ def test_bad_pixels_are_masked(tmp_path):
     """From an array of True and False and from a file; another size is refused."""
     bad = np.zeros((64, 64), bool)
     bad[3, 4] = bad[:, 10] = True
-    np.save(tmp_path / "bad.npy", bad.astype(np.uint8))
-    for given in (bad, tmp_path / "bad.npy"):
+    np.save(tmp_path / "bad.npy", bad)
+    np.save(tmp_path / "numbers.npy", bad.astype(np.uint8))
+    for given in (bad, tmp_path / "bad.npy", tmp_path / "numbers.npy"):
         np.testing.assert_array_equal(CCD.reduce(exposed(SPOT, 100), **SETTINGS, bad_pixels=given).mask, bad)
     with pytest.raises(ValueError, match="'bad_pixels' has the shape"):
         CCD.reduce(exposed(SPOT, 100), **SETTINGS, bad_pixels=bad[1:])
