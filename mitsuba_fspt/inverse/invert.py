@@ -8,7 +8,7 @@ with noise added (randomise then optimise: J. M. Bardsley et al., SIAM J. Sci. C
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -24,8 +24,9 @@ from ..runtime.progress_bar import Progress, reported
 from .inversion import Inversion
 from .measurement import LOG, Measurement, tell_misfit
 from .mlem import MlemAccuracy, mlem
+from .multipliers import MOST as MOST_BYTES
 from .multipliers import Multipliers
-from .nonnegative import Accuracy, Solve, factor, minimise
+from .nonnegative import Accuracy, Solve, factor, minimise, pivoted
 from .seen_area import seen_share
 from .smoothness import Prior, Smoothness
 from .surface import CREASE_ANGLE, Surface
@@ -54,6 +55,8 @@ class Settings:
     seen : of the largest sensitivity per area, the least at which a vertex counts as seen
     block : samples that are computed together
     threads : blocks that are computed at the same time
+    columns : for each right-hand side, unknowns at 0 up to which their columns of the inverse take less time than
+        factors of the matrix without them
     unknowns : most of them to begin with; of a finer mesh, J_n is linear between some of its vertices (Eq. M.30)
     resolved : least number of unknowns for each one that the data determine; with fewer, and a finer mesh, the fit
         begins anew with two to four times as many. What is finer than these unknowns makes up (2/π)/`resolved` of the
@@ -73,6 +76,7 @@ class Settings:
     seen: float = 0.01
     block: int = 25
     threads: int = 2
+    columns: int = 100
     unknowns: int = 6000
     resolved: float = 8.0
     rough: float = 10.0
@@ -268,10 +272,14 @@ class Problem:
         levels = self.surface.coarser() if many else [self.surface]
         while len(levels) > 1 and levels[-2].unknowns <= self.settings.unknowns:
             levels.pop()
-        for surface in reversed(levels):
-            problem, fit = self._with(surface).fitted(options, report)
-            if surface.unknowns >= self.settings.resolved * fit.determined:
+        problem, coarse = self._with(levels[-1]), None
+        while True:
+            problem, first, fit = problem.fitted(options, report, coarse)
+            levels.pop()
+            if not levels or problem.surface.unknowns >= self.settings.resolved * fit.determined:
                 break
+            coarse = problem.surface, first, fit
+            problem = self._with(levels[-1])
         draws = problem.draws(fit, options.samples, options.seed, report)
         return problem.result(fit, draws, options)
 
@@ -281,17 +289,25 @@ class Problem:
             return self
         return Problem.of(self.matrix, self.measurement, surface, self.prior, self.settings)
 
-    def fitted(self, options: Options, report: Progress) -> tuple[Problem, Fit]:
-        """The fit, and the problem with its penalty: relative to a first fit unless the prior has a reference.
+    def fitted(
+        self, options: Options, report: Progress, coarse: tuple[Surface, Fit, Fit] | None = None
+    ) -> tuple[Problem, Fit, Fit]:
+        """The problem with its penalty, relative to a first fit unless the prior has a reference; that fit; the fit.
 
         The first fit has no bounds: where its J_n is small or negative, the penalty is relative to the least ρ.
+        `coarse`: surface, first fit and fit with fewer unknowns, from which this one goes on.
         """
-        if options.weight == 0 or self.prior.reference is not None:
-            return self, self.fit(options.weight, report)
-        free = replace(self, bounded=np.zeros_like(self.bounded))
-        first = free.fit(None, report, rough=True)
-        problem = self.relative_to(first.x)
-        return problem, problem.fit(options.weight, report, first)
+        start = first = None
+        if coarse is not None:
+            first, start = (replace(one, x=self.surface.carried(one.x, coarse[0])) for one in coarse[1:])
+        problem = self
+        if options.weight != 0 and self.prior.reference is None:
+            if first is None:
+                free = replace(self, bounded=np.zeros_like(self.bounded))
+                first = free.fit(None, report, rough=True)
+            problem = self.relative_to(first.x)
+        fit = problem.fit(options.weight, report, start or first, again=start is not None)
+        return problem, first or fit, fit
 
     def _require_pixels(self) -> None:
         """Raise InversionError where fewer pixels than unknowns leave J_n undetermined without a penalty."""
@@ -312,10 +328,17 @@ class Problem:
         relative = np.where(self.bounded, light, 1.0)
         return replace(self, smoothness=Smoothness.of(self.surface, self.prior.correlation_length, relative))
 
-    def fit(self, weight: float | None, report: Progress, start: Fit | None = None, rough: bool = False) -> Fit:
+    def fit(
+        self,
+        weight: float | None,
+        report: Progress,
+        start: Fit | None = None,
+        rough: bool = False,
+        again: bool = False,
+    ) -> Fit:
         """Minimum with variances from its own signal and, where `weight` is None, the weight of Eq. M.25.
 
-        The weight is a fixed point, whose logarithm is sought by secants.
+        The weight is a fixed point, whose logarithm is sought by secants, from that of `start` if `again`.
         """
         power = self.measurement.power[self.rows]
         numerical = np.zeros_like(power)
@@ -325,7 +348,7 @@ class Problem:
         if start is not None:
             state = replace(start, weight=state.weight)
         if weight is None:
-            state = replace(state, weight=self._first_weight(sigma))
+            state = replace(state, weight=start.weight if start and again else self._first_weight(sigma))
         probes = np.random.default_rng(1).choice([-1.0, 1.0], (len(self.rows), self.settings.probes))
         looser = self.settings.rough if rough else 1.0
         converged, tried = False, list[tuple[float, float]]()
@@ -361,7 +384,7 @@ class Problem:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
         normal, solve = self._normal(state.sigma, state.weight)
         right = self._right(self.measurement.power[self.rows] + state.correction, state.sigma, state.weight)
-        start = Multipliers(solve, self.bounded).start(right[:, None], state.x)
+        start = self._started(normal, solve, 1)(right[:, None], state.x)
         found = minimise(normal, right[:, None], start, self.bounded, solve, accuracy)
         x = found.x[:, 0]
         determined, correction = self._fitted_noise(solve, state.sigma, probes)
@@ -397,6 +420,22 @@ class Problem:
             normal = csr_array(normal + ridge * diags_array(np.ones(normal.shape[0])))
         return normal, factor(normal)
 
+    def _started(self, normal: csr_array, solve: Solve, count: int) -> Callable[[Array, Array], Array]:
+        """Function that gives the minima (m, k), or near them, for right-hand sides (m, k) and an x near them (m,).
+
+        By the unknowns that are 0, whose columns serve all `count` right-hand sides; or by the others, where a column
+        more for each right-hand side than `columns` would be needed, or more memory.
+        """
+        multipliers = Multipliers(solve, self.bounded)
+
+        def started(right: Array, near: Array) -> Array:
+            zeros = int(np.count_nonzero(self.bounded & (near <= 0)))
+            if zeros <= self.settings.columns * count and 16 * zeros * len(near) <= MOST_BYTES:
+                return multipliers.start(right, near)
+            return np.stack([pivoted(normal, column, near, self.bounded) for column in right.T], axis=1)
+
+        return started
+
     def _right(self, power: Array, sigma: Array, weight: float) -> Array:
         """Tᵀ P/σ² + w Q mean for power (N,) or (N, k)."""
         over = power / sigma**2 if power.ndim == 1 else power / sigma[:, None] ** 2
@@ -417,13 +456,13 @@ class Problem:
         if not count:
             return np.empty((self.surface.unknowns, 0))
         normal, solve = self._normal(fit.sigma, fit.weight)
-        multipliers = Multipliers(solve, self.bounded)
+        started = self._started(normal, solve, count)
         sizes = [min(self.settings.block, count - k) for k in range(0, count, self.settings.block)]
         seeds = np.random.SeedSequence(seed).spawn(len(sizes))
 
         def block(size: int, sequence: np.random.SeedSequence) -> Array:
             right, factors = self._drawn(fit, size, np.random.default_rng(sequence))
-            found = minimise(normal, right, multipliers.start(right, fit.x), self.bounded, solve, self.settings.drawn)
+            found = minimise(normal, right, started(right, fit.x), self.bounded, solve, self.settings.drawn)
             return found.x * factors
 
         found = []

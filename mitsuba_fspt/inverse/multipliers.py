@@ -2,9 +2,10 @@
 
     x = A⁻¹ (r + λ),   x >= 0,   λ >= 0,   λᵀx = 0
 
-Only the few unknowns at their bound have λ > 0. With the columns of A⁻¹ that belong to them, which all right-hand sides
-share, λ is the minimum of ½ λᵀ(A⁻¹)λ + λᵀA⁻¹r for λ >= 0: a dense problem of their number, by the active sets of Lawson
-and Hanson, in place of sparse ones of all unknowns.
+Only unknowns at their bound have λ > 0. With the columns of A⁻¹ that belong to them, which all right-hand sides share,
+λ follows from a dense problem of their number, in place of sparse ones of all unknowns. The set of them is changed as a
+whole until none has λ < 0 and no other unknown is < 0 (block pivoting: J. J. Júdice and F. M. Pires, Comput. Oper. Res.
+21, 587, 1994).
 """
 
 from __future__ import annotations
@@ -14,12 +15,11 @@ from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cholesky, solve_triangular
-from scipy.optimize import nnls
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-ROUNDS = 40  # of active sets: they are final after some ten; what is not goes on from there in `nonnegative`
+ROUNDS = 40  # of active sets: they are final after some five; what is not goes on from there in `nonnegative`
 MOST = 2**28  # bytes of columns of the inverse, 256 MB: unknowns beyond are left to `nonnegative`
 
 
@@ -36,28 +36,29 @@ class Multipliers:
     def start(self, right: Array, near: Array) -> Array:
         """x (m, k) >= 0 for right-hand sides (m, k): the minimum, or near it where active sets did not become final.
 
-        near : (m,), whose zeros are the first active set
+        near : (m,), whose values <= 0 are the first active set
         """
-        free, first = self._solve(right), np.flatnonzero(self._bounded & (near == 0))
+        free, first = self._solve(right), np.flatnonzero(self._bounded & (near <= 0))
         return np.stack([self._one(column, first) for column in free.T], axis=1)
 
     def _one(self, free: Array, first: Index) -> Array:
-        """x (m,) from the minimum without bounds: exact on a set of unknowns that grows until no other one is < 0."""
-        x, among = free, np.empty(0, np.int64)
+        """x (m,) from the minimum without bounds `free`, beginning with the unknowns `first` at their bound."""
+        x, at_bound = free, first
         slack = 1e-12 * float(np.abs(free).max())
         for _ in range(ROUNDS):
-            below = np.flatnonzero(self._bounded & (x < -slack))
-            grown = np.union1d(among if len(among) else first, below)
-            if len(grown) == len(among) or (columns := self._inverse(grown)) is None:
+            at_bound = np.union1d(at_bound, np.flatnonzero(self._bounded & (x < -slack)))
+            if (columns := self._inverse(at_bound)) is None:
                 break
-            among = grown
-            try:  # ½ λᵀSλ + λᵀx is ½ |Lᵀλ + L⁻¹x|² but for a constant, S = LLᵀ
-                lower = cholesky(columns[among], lower=True)
-                multipliers, _ = nnls(lower.T, -solve_triangular(lower, free[among], lower=True))
-            except (LinAlgError, RuntimeError):  # numerically singular, or nnls has not ended
+            try:
+                multipliers = cho_solve(cho_factor(columns[at_bound], lower=True), -free[at_bound])
+            except LinAlgError:  # numerically singular
                 break
             x = free + columns @ multipliers
-            x[among[multipliers > 0]] = 0  # exactly, not to rounding
+            x[at_bound] = 0  # exactly, not to rounding
+            held = multipliers >= 0
+            if held.all() and not (self._bounded & (x < -slack)).any():
+                break
+            at_bound = at_bound[held]
         return np.where(self._bounded, np.maximum(x, 0), x)
 
     def _inverse(self, unknowns: Index) -> Array | None:

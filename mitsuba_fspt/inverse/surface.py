@@ -43,7 +43,7 @@ class Surface:
     basis : (points, m) the functions ψ of the m unknowns at the points (Eq. M.30); None: each point is an unknown
     scales : shape id → length in the scene [mm] of a length of 1 in the file, where that is not 1
     crease_angle : [degree] between the normals of two faces, above which J_n is not smoothed across their edge
-    kinds : (m,) of the unknowns, see `creases`; None where they are the points
+    kinds, chosen : (m,) of the unknowns, their kind, see `creases`, and their point; None where they are the points
     nodes : with J_n on faces and a basis: the surface on vertices that has the same unknowns
     """
 
@@ -56,6 +56,7 @@ class Surface:
     scales: Mapping[str, float] = field(default_factory=dict)
     crease_angle: float = CREASE_ANGLE
     kinds: NDArray[np.int64] | None = None
+    chosen: NDArray[np.int64] | None = None
     nodes: Surface | None = None
 
     @classmethod
@@ -194,7 +195,7 @@ class Surface:
             places, corners = merge(self.vertices, self.faces)
             number = np.empty(len(self.vertices), np.int64)
             number[self.faces] = corners
-            whole = replace(self, on="vertex", number=number, kinds=None)
+            whole = replace(self, on="vertex", number=number)
             entries = np.full(corners.size, 1 / 3), (np.repeat(np.arange(len(corners)), 3), corners.ravel())
             mean = csr_array(entries, shape=(len(corners), len(places)))
             levels = whole.coarser()
@@ -208,9 +209,19 @@ class Surface:
             basis, graph, chosen = coarser(graph, places, kinds)
             if len(chosen) > 0.7 * len(places):  # pieces of few vertices, which stay as they are
                 break
-            places, kinds, finer = places[chosen], kinds[chosen], found[-1].basis
-            found.append(replace(self, basis=basis if finer is None else csr_array(finer @ basis), kinds=kinds))
+            places, kinds, last = places[chosen], kinds[chosen], found[-1]
+            whole = basis if last.basis is None else csr_array(last.basis @ basis)
+            points = chosen if last.chosen is None else last.chosen[chosen]
+            found.append(replace(self, basis=whole, kinds=kinds, chosen=points))
         return found
+
+    def carried(self, x: Array, coarse: Surface) -> Array:
+        """(m,) the unknowns of this surface from those of a coarser one of the same list of `coarser`."""
+        if self.on == "face" and self.basis is None:
+            return x if coarse.basis is None else np.asarray(coarse.basis @ x)
+        fine, source = self.nodes or self, coarse.nodes or coarse
+        values = x if source.basis is None else np.asarray(source.basis @ x)
+        return values if fine.chosen is None else values[fine.chosen]
 
     @property
     def _corners(self) -> NDArray[np.int64]:

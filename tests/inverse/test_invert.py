@@ -14,7 +14,7 @@ from sphere_views import RADIUS, noisy, sphere_views
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse import multipliers
-from mitsuba_fspt.inverse.nonnegative import Accuracy, factor, minimise
+from mitsuba_fspt.inverse.nonnegative import Accuracy, factor, minimise, pivoted
 from mitsuba_fspt.inverse.smoothness import Prior, Smoothness
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.runtime.errors import DetectorError, InversionError, TransportError
@@ -108,6 +108,20 @@ def test_multipliers_give_the_minimum(monkeypatch):
     monkeypatch.setattr(multipliers, "MOST", 0)
     cut = multipliers.Multipliers(solve, np.ones(40, bool)).start(right, np.ones(40))
     np.testing.assert_allclose(cut, np.maximum(solve(right), 0))
+
+
+def test_block_pivoting_gives_the_minimum():
+    """The same minima from factors of the unknowns off their bound, with bounds on all or on half of the unknowns."""
+    rng = np.random.default_rng(4)
+    dense = rng.standard_normal((90, 40))
+    data = rng.standard_normal((90, 5)) + dense @ np.maximum(rng.standard_normal((40, 5)), 0)
+    normal, right = csr_array(dense.T @ dense), dense.T @ data
+    for bounded in (np.ones(40, bool), np.arange(40) < 20):
+        least = np.where(bounded, 0, -np.inf)
+        for column, values in zip(right.T, data.T, strict=True):
+            expected = lsq_linear(dense, values, (least, np.inf), method="bvls").x
+            found = pivoted(normal, column, np.linalg.solve(normal.toarray(), column), bounded)
+            np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
 # --- recovery ---
