@@ -8,9 +8,9 @@ with noise added (randomise then optimise: J. M. Bardsley et al., SIAM J. Sci. C
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,12 +21,13 @@ from ..images.image import Image
 from ..runtime.errors import InversionError
 from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
+from .fit_settings import Settings
 from .inversion import Inversion
 from .measurement import LOG, Measurement, tell_misfit
-from .mlem import MlemAccuracy, mlem
-from .multipliers import MOST as MOST_BYTES
-from .multipliers import Multipliers
-from .nonnegative import Accuracy, Solve, factor, minimise, pivoted
+from .mlem import mlem
+from .multipliers import Minima
+from .nonnegative import Accuracy, Solve, factor, minimise
+from .outlook import is_hopeless
 from .seen_area import seen_share
 from .smoothness import Prior, Smoothness
 from .surface import CREASE_ANGLE, Surface
@@ -34,52 +35,6 @@ from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
 MOST = 0.5  # of the area of a vertex: with less of it seen, J_n there says little about its power
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Accuracy of `invert`.
-
-    accuracy : of the minimum
-    mlem : of the maximum likelihood
-    drawn : of the minima of random draws, and while variances and weight are sought; a decrement of 0.01 widens an
-        interval by at most 0.5 %
-    reweighted : relative change of the standard deviations, root mean square, at which they count as converged; it
-        changes χ² by as much
-    rounds : most rounds of variances and weight
-    weight : change of log(weight) at which it counts as converged: 1/10 of its own uncertainty for 200 determined
-        unknowns
-    probes : random vectors for the number of determined unknowns, whose relative error is about (2/(probes γ))^½
-    first : weight to begin with, over that at which data and penalty have the same trace
-    darkest : of the reference, the least ρ of the penalty: below it J_n is no better known than its noise
-    seen : of the largest sensitivity per area, the least at which a vertex counts as seen
-    block : samples that are computed together
-    threads : blocks that are computed at the same time
-    columns : for each right-hand side, unknowns at 0 up to which their columns of the inverse take less time than
-        factors of the matrix without them
-    unknowns : most of them to begin with; of a finer mesh, J_n is linear between some of its vertices (Eq. M.30)
-    resolved : least number of unknowns for each one that the data determine; with fewer, and a finer mesh, the fit
-        begins anew with two to four times as many. What is finer than these unknowns makes up (2/π)/`resolved` of the
-        variance of a vertex, which intervals then lack: 8 %, or 4 % of their width.
-    rough : times the bounds of variances and weight, the bounds of the first fit, whose J_n only scales the penalty
-    """
-
-    accuracy: Accuracy = field(default_factory=Accuracy)
-    mlem: MlemAccuracy = field(default_factory=MlemAccuracy)
-    drawn: Accuracy = field(default_factory=lambda: Accuracy(decrement=0.01, inner=0.1))
-    reweighted: float = 1e-3
-    rounds: int = 40
-    weight: float = 0.01
-    probes: int = 8
-    first: float = 100.0
-    darkest: float = 0.05
-    seen: float = 0.01
-    block: int = 25
-    threads: int = 2
-    columns: int = 100
-    unknowns: int = 6000
-    resolved: float = 8.0
-    rough: float = 10.0
 
 
 def invert(
@@ -140,7 +95,7 @@ def invert(
     problem = Problem.of(matrix, measurement, surface, prior or Prior(), settings or Settings())
     with reported(progress) as report:
         found = problem.solved(options, report)
-    _report_unconverged(found, problem.settings.rounds)
+    _report_unconverged(found)
     return found
 
 
@@ -268,20 +223,29 @@ class Problem:
             return self.result(self.most_likely(report), np.empty((self.surface.unknowns, 0)), options)
         if options.weight == 0:
             self._require_pixels()
-        many = options.weight != 0 and self.surface.unknowns > self.settings.unknowns
-        levels = self.surface.coarser() if many else [self.surface]
+        whole, levels = self, self.surface.coarser() if options.weight != 0 else [self.surface]
+        if is_hopeless(self, levels, self.settings.hopeless, report):
+            rounds = min(self.settings.rounds, self.settings.hopeless.rounds)
+            whole, levels = replace(self, settings=replace(self.settings, rounds=rounds)), levels[-2:]
+        elif self.surface.unknowns <= self.settings.unknowns:
+            levels = [self.surface]
         while len(levels) > 1 and levels[-2].unknowns <= self.settings.unknowns:
             levels.pop()
-        problem, coarse = self._with(levels[-1]), None
+        problem, coarse = whole._with(levels[-1]), None
         while True:
             problem, first, fit = problem.fitted(options, report, coarse)
             levels.pop()
-            if not levels or problem.surface.unknowns >= self.settings.resolved * fit.determined:
+            if not levels or not fit.converged or problem.surface.unknowns >= self.settings.resolved * fit.determined:
                 break
             coarse = problem.surface, first, fit
-            problem = self._with(levels[-1])
+            problem = whole._with(levels[-1])
         draws = problem.draws(fit, options.samples, options.seed, report)
         return problem.result(fit, draws, options)
+
+    def free_on(self, surface: Surface) -> Problem:
+        """The same problem with other unknowns, none of which is bounded."""
+        found = self._with(surface)
+        return replace(found, bounded=np.zeros_like(found.bounded))
 
     def _with(self, surface: Surface) -> Problem:
         """The same problem with other unknowns."""
@@ -303,8 +267,7 @@ class Problem:
         problem = self
         if options.weight != 0 and self.prior.reference is None:
             if first is None:
-                free = replace(self, bounded=np.zeros_like(self.bounded))
-                first = free.fit(None, report, rough=True)
+                first = self.free_on(self.surface).fit(None, report, rough=True)
             problem = self.relative_to(first.x)
         fit = problem.fit(options.weight, report, start or first, again=start is not None)
         return problem, first or fit, fit
@@ -352,8 +315,9 @@ class Problem:
         probes = np.random.default_rng(1).choice([-1.0, 1.0], (len(self.rows), self.settings.probes))
         looser = self.settings.rough if rough else 1.0
         converged, tried = False, list[tuple[float, float]]()
-        for turn in range(self.settings.rounds):
-            report("fit", turn / self.settings.rounds)
+        rounds = min(self.settings.roughly, self.settings.rounds) if rough else self.settings.rounds
+        for turn in range(rounds):
+            report("fit", turn / rounds)
             before, state = state, self._improved(state, probes, weight, self.settings.drawn)
             drift = float(np.sqrt(np.mean((state.sigma / before.sigma - 1) ** 2)))
             changed = abs(np.log(state.weight / before.weight)) if weight is None else 0.0
@@ -384,7 +348,7 @@ class Problem:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
         normal, solve = self._normal(state.sigma, state.weight)
         right = self._right(self.measurement.power[self.rows] + state.correction, state.sigma, state.weight)
-        start = self._started(normal, solve, 1)(right[:, None], state.x)
+        start = Minima(normal, solve, self.bounded, self.settings.columns).near(right[:, None], state.x)
         found = minimise(normal, right[:, None], start, self.bounded, solve, accuracy)
         x = found.x[:, 0]
         determined, correction = self._fitted_noise(solve, state.sigma, probes)
@@ -420,22 +384,6 @@ class Problem:
             normal = csr_array(normal + ridge * diags_array(np.ones(normal.shape[0])))
         return normal, factor(normal)
 
-    def _started(self, normal: csr_array, solve: Solve, count: int) -> Callable[[Array, Array], Array]:
-        """Function that gives the minima (m, k), or near them, for right-hand sides (m, k) and an x near them (m,).
-
-        By the unknowns that are 0, whose columns serve all `count` right-hand sides; or by the others, where a column
-        more for each right-hand side than `columns` would be needed, or more memory.
-        """
-        multipliers = Multipliers(solve, self.bounded)
-
-        def started(right: Array, near: Array) -> Array:
-            zeros = int(np.count_nonzero(self.bounded & (near <= 0)))
-            if zeros <= self.settings.columns * count and 16 * zeros * len(near) <= MOST_BYTES:
-                return multipliers.start(right, near)
-            return np.stack([pivoted(normal, column, near, self.bounded) for column in right.T], axis=1)
-
-        return started
-
     def _right(self, power: Array, sigma: Array, weight: float) -> Array:
         """Tᵀ P/σ² + w Q mean for power (N,) or (N, k)."""
         over = power / sigma**2 if power.ndim == 1 else power / sigma[:, None] ** 2
@@ -456,13 +404,13 @@ class Problem:
         if not count:
             return np.empty((self.surface.unknowns, 0))
         normal, solve = self._normal(fit.sigma, fit.weight)
-        started = self._started(normal, solve, count)
+        minima = Minima(normal, solve, self.bounded, self.settings.columns * count)
         sizes = [min(self.settings.block, count - k) for k in range(0, count, self.settings.block)]
         seeds = np.random.SeedSequence(seed).spawn(len(sizes))
 
         def block(size: int, sequence: np.random.SeedSequence) -> Array:
             right, factors = self._drawn(fit, size, np.random.default_rng(sequence))
-            found = minimise(normal, right, started(right, fit.x), self.bounded, solve, self.settings.drawn)
+            found = minimise(normal, right, minima.near(right, fit.x), self.bounded, solve, self.settings.drawn)
             return found.x * factors
 
         found = []
@@ -541,12 +489,11 @@ def _secant(tried: Sequence[tuple[float, float]]) -> float:
     return x + (found - x) / (1 - slope)
 
 
-def _report_unconverged(found: Inversion, rounds: int) -> None:
+def _report_unconverged(found: Inversion) -> None:
     """Say in one line on stderr that the rounds were too few for variances and weight."""
     if not found.converged:
         LOG.warning(
-            "fspt: invert: variances and weight still change after %d rounds; the last ones are kept. Give a weight, "
-            "for example %.3g.",
-            rounds,
+            "fspt: invert: variances and weight still change after the last round, and are kept as they are. Give a "
+            "weight, for example %.3g.",
             found.weight,
         )

@@ -10,12 +10,14 @@ whole until none has λ < 0 and no other unknown is < 0 (block pivoting: J. J. J
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import csr_array
+
+from .nonnegative import Solve, pivoted
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -23,10 +25,28 @@ ROUNDS = 40  # of active sets: they are final after some five; what is not goes 
 MOST = 2**28  # bytes of columns of the inverse, 256 MB: unknowns beyond are left to `nonnegative`
 
 
+class Minima:
+    """Minima for right-hand sides of one matrix, or near them, from an x near them.
+
+    By the unknowns that are 0 in it, where they are at most `columns` and fit into memory; else by the others.
+    """
+
+    def __init__(self, matrix: csr_array, solve: Solve, bounded: NDArray[np.bool_], columns: int) -> None:
+        self._matrix, self._bounded, self._columns = matrix, bounded, columns
+        self._multipliers = Multipliers(solve, bounded)
+
+    def near(self, right: Array, near: Array) -> Array:
+        """x (m, k) >= 0 for right-hand sides (m, k); near : (m,)."""
+        zeros = int(np.count_nonzero(self._bounded & (near <= 0)))
+        if zeros <= self._columns and 16 * zeros * len(near) <= MOST:  # draws have up to twice as many
+            return self._multipliers.start(right, near)
+        return np.stack([pivoted(self._matrix, column, near, self._bounded) for column in right.T], axis=1)
+
+
 class Multipliers:
     """Active sets of one matrix A, given by its `solve`; x >= 0 holds where `bounded` (m,) is True."""
 
-    def __init__(self, solve: Callable[[Array], Array], bounded: NDArray[np.bool_]) -> None:
+    def __init__(self, solve: Solve, bounded: NDArray[np.bool_]) -> None:
         self._solve, self._bounded = solve, bounded
         self._place = np.full(len(bounded), -1, np.int64)  # of each unknown among the columns
         self._columns = np.empty((len(bounded), 0), order="F")

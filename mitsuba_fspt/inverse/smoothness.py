@@ -49,7 +49,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Smoothness:
-    """½ weight ∫ ((κ² − Δ)(J_n − mean)/ρ)² dS (Eq. M.23, M.32), without its weight, on the unknowns of a surface.
+    """½ weight ∫ ((κ² − Δ)(J_n − mean)/ρ)² dS (Eq. M.23, M.33), without its weight, on the unknowns of a surface.
 
     root : (m, m) [mm⁻¹], R with ‖R x‖² = ∫ ((κ² − Δ) x/r)² dS for x = (J_n − mean)/reference, r = ρ/reference
     matrix : (m, m) RᵀR [mm⁻²]

@@ -145,7 +145,7 @@ class Surface:
 
     @cached_property
     def roughness(self) -> tuple[csr_array, Array]:
-        """Operator R (m, m) and measure μ (m,) of −Δ J_n = R J_n/μ at the unknowns (Eq. M.32).
+        """Operator R (m, m) and measure μ (m,) of −Δ J_n = R J_n/μ at the unknowns (Eq. M.33).
 
         Off the creases R is the stiffness and μ the area [mm²]. On a crease they are those of the second derivative
         along it, times the length [mm] of the crease that belongs to the unknown, so that μ is an area, too. Where

@@ -1,0 +1,58 @@
+"""Accuracy of `invert`: the bounds of its minima, of variances and weight, and of the number of unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from .mlem import MlemAccuracy
+from .nonnegative import Accuracy
+from .outlook import Hopeless
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Accuracy of `invert`.
+
+    accuracy : of the minimum
+    mlem : of the maximum likelihood
+    drawn : of the minima of random draws, and while variances and weight are sought; a decrement of 0.01 widens an
+        interval by at most 0.5 %
+    reweighted : relative change of the standard deviations, root mean square, at which they count as converged; it
+        changes χ² by as much
+    rounds, roughly : most rounds of variances and weight, and of those of a first fit
+    weight : change of log(weight) at which it counts as converged: 1/10 of its own uncertainty for 200 determined
+        unknowns
+    probes : random vectors for the number of determined unknowns, whose relative error is about (2/(probes γ))^½
+    first : weight to begin with, over that at which data and penalty have the same trace
+    darkest : of the reference, the least ρ of the penalty: below it J_n is no better known than its noise
+    seen : of the largest sensitivity per area, the least at which a vertex counts as seen
+    block : samples that are computed together
+    threads : blocks that are computed at the same time
+    columns : for each right-hand side, unknowns at 0 up to which their columns of the inverse take less time than
+        factors of the matrix without them
+    unknowns : most of them to begin with; of a finer mesh, J_n is linear between some of its vertices (Eq. M.30)
+    resolved : least number of unknowns for each one that the data determine; with fewer, and a finer mesh, the fit
+        begins anew with two to four times as many. What is finer than these unknowns makes up (2/π)/`resolved` of the
+        variance of a vertex, which intervals then lack: 8 %, or 4 % of their width.
+    hopeless : when the images count as not those of the surface, after a first fit on few unknowns
+    rough : times the bounds of variances and weight, the bounds of the first fit, whose J_n only scales the penalty
+    """
+
+    accuracy: Accuracy = field(default_factory=Accuracy)
+    mlem: MlemAccuracy = field(default_factory=MlemAccuracy)
+    drawn: Accuracy = field(default_factory=lambda: Accuracy(decrement=0.01, inner=0.1))
+    reweighted: float = 1e-3
+    rounds: int = 20
+    roughly: int = 8
+    weight: float = 0.01
+    probes: int = 8
+    first: float = 100.0
+    darkest: float = 0.05
+    seen: float = 0.01
+    block: int = 25
+    threads: int = 2
+    columns: int = 100
+    unknowns: int = 6000
+    resolved: float = 8.0
+    hopeless: Hopeless = field(default_factory=Hopeless)
+    rough: float = 10.0
