@@ -95,7 +95,6 @@ def invert(
     problem = Problem.of(matrix, measurement, surface, prior or Prior(), settings or Settings())
     with reported(progress) as report:
         found = problem.solved(options, report)
-    _report_unconverged(found)
     return found
 
 
@@ -240,6 +239,7 @@ class Problem:
             coarse = problem.surface, first, fit
             problem = whole._with(levels[-1])
         draws = problem.draws(fit, options.samples, options.seed, report)
+        _report_unconverged(fit, problem.settings.rounds)
         return problem.result(fit, draws, options)
 
     def free_on(self, surface: Surface) -> Problem:
@@ -489,11 +489,12 @@ def _secant(tried: Sequence[tuple[float, float]]) -> float:
     return x + (found - x) / (1 - slope)
 
 
-def _report_unconverged(found: Inversion) -> None:
+def _report_unconverged(found: Fit, rounds: int) -> None:
     """Say in one line on stderr that the rounds were too few for variances and weight."""
     if not found.converged:
         LOG.warning(
-            "fspt: invert: variances and weight still change after the last round, and are kept as they are. Give a "
-            "weight, for example %.3g.",
+            "fspt: invert: variances and weight still change after %d rounds; the last ones are kept. Give a weight, "
+            "for example %.3g.",
+            rounds,
             found.weight,
         )
