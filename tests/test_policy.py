@@ -24,7 +24,7 @@ ARROWS = {
     "tissue": {"runtime", "optics", "phantom"},
     "jit": set(),
     "emission": {"runtime", "optics", "jit"},
-    "integral": {"runtime", "optics", "jit", "emission"},
+    "integral": {"runtime", "optics", "phantom", "jit", "emission"},
     "plugins": {"runtime", "optics", "jit", "emission", "integral"},
     "rendering": {"runtime", "images", "jit", "emission", "integral"},
     "detector": {"runtime", "images", "rendering"},

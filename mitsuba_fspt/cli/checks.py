@@ -10,7 +10,7 @@ from ..runtime.backend import quiet_mitsuba
 from ..runtime.progress_bar import progress_bar
 from .given_scene import Camera, FNumber, FocalLength, SceneOrPhantom, View, framing_of, one_scene
 from .options import AsJson, Domain, Parameters, Quiet, Rows, Rtol, Sensor, definitions
-from .terminal import print_result
+from .terminal import print_result, print_warnings
 
 
 def doctor(as_json: AsJson = False, quiet: Quiet = False) -> None:
@@ -62,11 +62,15 @@ def explain(
     Of PHANTOM.ply, the scene is that of 'fspt render PHANTOM.ply'.
     """
     with progress_bar(quiet):
+        from ..rendering.render import warnings_of
         from ..rendering.scene import load
         from ..studies.explain import HEADER, explain
 
         quiet_mitsuba()
         given = one_scene(scene, definitions(define), framing_of(view, focal_length, f_number, camera))
-        rows = explain(load(given.scene, **given.parameters), sensor=sensor, rtol=rtol, domain=domain)
+        loaded = load(given.scene, **given.parameters)
+        rows = explain(loaded, sensor=sensor, rtol=rtol, domain=domain)
+        warnings = warnings_of(loaded, sensor)
     table = "\n".join([HEADER, *(row.render_text() for row in rows)])
     print_result(table, [row.to_dict() for row in rows], as_json=as_json, quiet=quiet)
+    print_warnings(scene, warnings)

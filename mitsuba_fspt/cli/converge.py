@@ -10,7 +10,7 @@ import typer
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.progress_bar import progress_bar
 from .options import AsJson, Parameters, Quiet, SceneFile, definitions, require_writable
-from .terminal import print_result
+from .terminal import print_result, print_warnings
 
 
 def converge(
@@ -41,12 +41,15 @@ def converge(
     require_writable(sheet, ".csv")
     require_matplotlib()
     with progress_bar(quiet) as progress, empty_kernel_cache() as kernels:
+        from ..rendering.render import warnings_of
         from ..rendering.scene import load
 
         quiet_mitsuba()
         loaded = load(scene, **definitions(define))
         found = converge(loaded, rounds=rounds, budget=budget, reference=reference, kernels=kernels, progress=progress)
+        warnings = warnings_of(loaded)
     with png_file(found, figure):  # both files or none
         write_csv(found, sheet)
     text = f"{found.render_text()}\n\n{sheet}: every setting; {figure}: the same as a figure"
     print_result(text, found.to_dict(), as_json=as_json, quiet=quiet)
+    print_warnings(scene, warnings)

@@ -14,7 +14,7 @@ from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import TransportError
 from ..runtime.progress_bar import progress_bar
 from .options import AsJson, ParameterLists, Quiet, SceneFile, require_picture, require_writable, value_lists
-from .terminal import Interrupted, print_result
+from .terminal import Interrupted, print_result, print_warnings
 
 if TYPE_CHECKING:
     from ..inverse.transport_matrix import TransportMatrix
@@ -70,7 +70,7 @@ def matrix(
         summary["picture"] = str(picture)
     if "warnings" in found.metadata:
         summary["warnings"] = found.metadata["warnings"]
-        typer.echo(f"fspt: {file}: {summary['warnings']}.", err=True)
+        print_warnings(file, [summary["warnings"]])
     print_result(_text(summary), summary, as_json=as_json, quiet=quiet)
 
 

@@ -34,7 +34,7 @@ from .options import (
     require_image,
     require_picture,
 )
-from .terminal import Interrupted, print_result
+from .terminal import Interrupted, print_result, print_warnings
 
 if TYPE_CHECKING:
     from ..images.image import Image
@@ -127,7 +127,7 @@ def render(
     print_result(text, {"images": summaries}, as_json=as_json, quiet=quiet)
     for summary in summaries:
         if "warnings" in summary:
-            typer.echo(f"fspt: {summary['output']}: {summary['warnings']}.", err=True)
+            print_warnings(summary["output"], [summary["warnings"]])
 
 
 def _rendered(shots: list[Shot], settings: dict[str, Any], output: Output, quiet: bool) -> list[Image]:

@@ -14,7 +14,7 @@ from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import BackendError
 from ..runtime.progress_bar import progress_bar
 from .options import AsJson, Method, ParameterLists, Quiet, Rtol, SceneFile, Seed, Sensor, SourcePower, Spp, value_lists
-from .terminal import Interrupted, print_result
+from .terminal import Interrupted, print_result, print_warnings
 
 if TYPE_CHECKING:
     from ..studies.sweep import SweepRow
@@ -76,6 +76,9 @@ def sweep(
     )
     points = [asdict(row) | {"file": str(row.file)} for row in rows]
     print_result(text, record | {"points": points}, as_json=as_json, quiet=quiet)
+    for warning in dict.fromkeys(row.warnings for row in rows if row.warnings):
+        first, *others = (row.file for row in rows if row.warnings == warning)
+        print_warnings(f"{first}{f' and {len(others)} more' if others else ''}", [warning])
 
 
 @contextmanager

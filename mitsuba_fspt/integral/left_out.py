@@ -25,15 +25,11 @@ SURE = 2.0  # standard errors above which a share is significant
 
 @dataclass
 class LeftOut:
-    """Share of a picture's power that Eq. 9 leaves out, its standard error, and ids of the shapes that scatter.
-
-    reported : True once the warning has been given
-    """
+    """Share of a picture's power that Eq. 9 leaves out, its standard error, and ids of the shapes that scatter."""
 
     share: float
     error: float
     bodies: tuple[str, ...]
-    reported: bool = False
 
     def warning(self, rtol: float) -> str | None:
         """One line about it; None where it is below `rtol` or not significant."""

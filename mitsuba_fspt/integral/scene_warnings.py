@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from .left_out import scatters
+from .mesh_faults import mesh_faults
 from .nested_bsdfs import BENDS, blended_parts
 
 VOLUMETRIC = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator"}
@@ -16,7 +17,7 @@ def scene_warnings(scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator
     found = [None if kinds & VOLUMETRIC else _media(scene, sensor), _blends(scene)]
     if "PathIntegrator" in kinds:
         found.append(_glowing_windows(scene))
-    return [text for text in found if text]
+    return [text for text in found if text] + mesh_faults(scene, sensor)
 
 
 def _media(scene: mi.Scene, sensor: mi.Sensor) -> str | None:

@@ -7,14 +7,14 @@ import itertools
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..rendering.provenance import defaults_of, same_mesh, value_of
-from ..rendering.render import sensor_of
+from ..rendering.render import sensor_of, warnings_of
 from ..rendering.scene import load
 from ..rendering.scene_xml import is_text
 from ..runtime import backend
@@ -58,12 +58,13 @@ class ViewTask:
 
 @dataclass(frozen=True)
 class ViewResult:
-    """A computed view: its rows, the columns, the numbers of its lens, and all `<default>` values of its scene."""
+    """A computed view: its rows, the columns, the numbers of its lens, `<default>` values of its scene, warnings."""
 
     block: Block | None
     parts: list[Part]
     lens: dict[str, Any]
     defaults: dict[str, Any]
+    warnings: tuple[str, ...]
 
 
 def transport(
@@ -95,7 +96,8 @@ def transport(
     parameters : values for `<default>` parameters of the scene; lists are multiplied out, the last one fastest
 
     As Eq. 9 does, T leaves out the light that surfaces scatter on to the lens; `render` tells its share.
-    The metadata say in `warnings` on how many pixels `rtol` was not reached, if on any; `error` has by how much.
+    The metadata say in `warnings` on how many pixels `rtol` was not reached, if on any; `error` has by how much. They
+    also say what is odd about the scene, such as a mesh whose faces turn both ways.
 
     Raises
     ------
@@ -171,7 +173,7 @@ def _results(
         if partial is not None and result.block is not None:
             with ctrl_c_held():
                 partial.put(k, result.block, tasks[k].fingerprint)
-            result = ViewResult(None, result.parts, result.lens, result.defaults)
+            result = replace(result, block=None)
         done += 1
         report(f"{done} of {len(tasks)} views", done / len(tasks))
         yield k, result
@@ -234,7 +236,7 @@ def computed(task: ViewTask, progress: Callable[[float], None] | None = None) ->
         raise TransportError(
             f"transport: {task.label} {DARK}. Check the lens's 'to_world' and that the faces' normals point outwards."
         )
-    return ViewResult(block, found.parts, found.lens, found.defaults)
+    return replace(found, block=block)
 
 
 def described(task: ViewTask) -> ViewResult:
@@ -260,7 +262,8 @@ def _described(scene: mi.Scene, lens: mi.Sensor, task: ViewTask) -> ViewResult:
     numbers = lens.numbers()
     numbers["film"] = [int(n) for n in (*film.crop_size(), *film.crop_offset(), *film.size())]
     numbers["to_world"] = [float(n) for n in lens.placement]
-    return ViewResult(None, parts_of(scene, task.on), numbers, defaults_of(lens))
+    warnings = tuple(warnings_of(scene, task.sensor))
+    return ViewResult(None, parts_of(scene, task.on), numbers, defaults_of(lens), warnings)
 
 
 def _joined(
@@ -302,10 +305,10 @@ def _joined(
         "versions": versions(),
         "fingerprints": [task.fingerprint for task in tasks],
     }
-    if unreached:
-        meta["warnings"] = (
-            f"rtol {rtol:g} not reached on {unreached} pixels (largest error {largest:.1e} of the peak for J = 1)"
-        )
+    off = f"rtol {rtol:g} not reached on {unreached} pixels (largest error {largest:.1e} of the peak for J = 1)"
+    told = dict.fromkeys(text for result in ordered for text in result.warnings)
+    if warnings := [*([off] if unreached else []), *told]:
+        meta["warnings"] = "; ".join(warnings)
     if partial is None:
         return TransportMatrix(blocks, meta, areas, sensitivity)
     partial.finish(meta, areas, sensitivity)

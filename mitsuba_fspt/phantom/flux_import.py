@@ -11,7 +11,7 @@ from ..optics.boundary import boundary_a
 from ..runtime.errors import ExitanceError, FluxError
 from ..runtime.numbers import number
 from .formats import MeshLike, RawMesh, SurfaceValues, ValuesLike, read_mesh, surface_values
-from .formats.length_unit import millimetres, own_unit, unit_warning
+from .length_unit import millimetres, own_unit, unit_warning
 from .phantom import UNIT, Phantom, require_finite, require_single, shares
 from .surface_mesh import closure, face_areas
 

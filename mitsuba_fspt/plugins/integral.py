@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +25,7 @@ from ..integral.nested_bsdfs import check_followed
 from ..integral.progress import Progress
 from ..integral.quadrature import Quadrature
 from ..integral.scene_checks import check_scene, check_surfaces_alone
+from ..integral.scene_warnings import scene_warnings
 from ..integral.shortcuts import SHORTCUTS, Finding
 from ..integral.solution import Solution
 from ..integral.specular import Specular
@@ -34,6 +34,7 @@ from ..integral.window import Boxes, Window, glowing_boxes, visible_window, wind
 from ..jit.mesh_buffers import box_of, buffers
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
+from ..runtime.cached_value import CachedValue
 from ..runtime.errors import SceneError, named
 from ..runtime.plugin_types import is_surface
 
@@ -86,7 +87,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         # Results for the last scene. A reference to the scene itself would be a cycle: this integrator is its child.
         self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
         self._robust: RobustCopy | None = None
-        self._window, self._narrow, self._faces, self._left_out, self._rows = (CachedValue() for _ in range(5))
+        self._window, self._narrow, self._faces, self._warnings, self._rows = (CachedValue() for _ in range(5))
+        self._logged: set[str] = set()
         self._grid_of_blocks = CachedValue()
 
     def solve(
@@ -292,7 +294,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         if asked and kinds_of(scene, asked, self.quadrature) is None:
             self._refuse_specular(scene, sensor)
         solution = self.solve(scene, sensor)
-        self._warn_of_light_left_out(scene, sensor)
+        self._log_warnings(scene, sensor)
         return mi.TensorXf(solution.power[..., None].astype(np.float32))
 
     def render_forward(
@@ -389,15 +391,23 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 ", which gradients do not follow. Leave them out, or render without gradients."
             )
 
-    def _warn_of_light_left_out(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
-        """Log a warning about light that is left out; once, until shapes or lens change."""
+    def _log_warnings(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Log what a picture does not show and what is odd about the scene: each line once, when shapes or lens change.
+
+        `mitsuba_fspt.render` has the same lines in its metadata.
+        """
         shapes = scene.shapes()
         state = ([shape_number(shape) for shape in shapes], [_pose(shape) for shape in shapes], _view(sensor))
-        found = self._left_out.recall(state, lambda: self.light_left_out(scene, sensor))
-        warning = found.warning(self.quadrature.rtol) if found else None
-        if warning and not found.reported:
-            mi.Log(mi.LogLevel.Warn, f"fspt_integral: {warning}.")
-            found.reported = True
+
+        def find() -> list[str]:
+            left_out = self.light_left_out(scene, sensor)
+            found = [left_out.warning(self.quadrature.rtol)] if left_out else []
+            return [text for text in (*found, *scene_warnings(scene, sensor, self)) if text]
+
+        for text in self._warnings.recall(state, find):
+            if text not in self._logged:
+                mi.Log(mi.LogLevel.Warn, f"fspt_integral: {text}.")
+                self._logged.add(text)
 
     def to_string(self) -> str:
         return f"FsptIntegral[{self.quadrature}]"
@@ -451,21 +461,6 @@ class RobustCopy:
     scene: mi.Scene
     state: tuple[list[object], list[tuple[int, tuple[float, ...]]]]
     positions: tuple[mi.Float, ...]
-
-
-class CachedValue:
-    """Cache of one result, which is valid while the `state` that it depends on is unchanged."""
-
-    def __init__(self) -> None:
-        self._state: object = None
-        self._found: Any = None
-
-    def recall(self, state: object, find: Callable[[], Any]) -> Any:
-        """Result of `find` for this state, computed if the state has changed."""
-        if state != self._state:
-            self._found = find()
-            self._state = state
-        return self._found
 
 
 def _view(lens: mi.Sensor) -> tuple[object, ...]:

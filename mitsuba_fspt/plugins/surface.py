@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -72,6 +73,7 @@ class FsptSurface(mi.Emitter):
         self._probe: Probe | None = None
         self._source: exitance.ExitanceState | None = None  # data of J_n at the last `check`
         self.single_faces: tuple[mi.Float, ...] = ()  # buffers of the mesh for which no face was found twice
+        self.winding: tuple[Any, ...] = ()  # what `integral.mesh_faults` found, with the buffers of that mesh
         self.brightest = 0.0  # largest J_n [W/mm²], set by `check`
         # For caches: `mark` identifies this emitter, `edition` counts the changes of J_n. A cache must not hold the
         # emitter itself: Dr.Jit would record it even after its shape has been deleted.

@@ -110,6 +110,13 @@ def _warned(
     return {"warnings": "; ".join(warnings)} if warnings else {}
 
 
+def warnings_of(scene: mi.Scene, sensor: int = 0) -> list[str]:
+    """What is odd about a scene, or not treated by the integral: one line each, as in the metadata of its image."""
+    from ..integral.scene_warnings import scene_warnings
+
+    return scene_warnings(scene, sensor_of(scene, sensor), integrator_of(scene, "integral"))
+
+
 def _integrator(
     scene: mi.Scene, lens: mi.Sensor, method: str | None, accuracy: dict, sampling: dict, max_depth: int | None
 ) -> mi.Integrator:

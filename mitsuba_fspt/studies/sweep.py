@@ -46,6 +46,7 @@ class SweepRow:
     largest_error : largest error of a pixel [W]; None where the image has no error
     wall_time : time of the rendering [s]
     reused : True if the image existed before and was not rendered again
+    warnings : what the image's metadata warn of, in one line; empty without a warning
     """
 
     parameters: dict[str, str | int | float]
@@ -55,6 +56,7 @@ class SweepRow:
     largest_error: float | None
     wall_time: float
     reused: bool = field(default=False, compare=False)
+    warnings: str = ""
 
 
 def sweep(
@@ -242,7 +244,9 @@ def _row(point: SweepPoint, folder: Path, image: Image) -> SweepRow:
     error = None if image.error is None else float(image.error.astype(np.float32).max())
     total, peak = float(power.sum(dtype=np.float64)), float(power.max())
     values = {name: _value(text) for name, text in point.parameters.items()}
-    return SweepRow(values, folder / point.file, total, peak, error, float(image.metadata["wall_time"]))
+    warnings = str(image.metadata.get("warnings", ""))
+    wall_time = float(image.metadata["wall_time"])
+    return SweepRow(values, folder / point.file, total, peak, error, wall_time, warnings=warnings)
 
 
 def _value(text: str) -> str | int | float:

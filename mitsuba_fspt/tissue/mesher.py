@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from trimesh.remesh import subdivide_to_size
 
 from ..phantom.formats import read_mesh
-from ..phantom.formats.length_unit import millimetres
+from ..phantom.length_unit import millimetres
 from ..phantom.surface_mesh import boundary, closure
 from ..runtime.errors import BackendError, FluxError
 from .border_surface import nearest_points

@@ -1,10 +1,20 @@
 """Closed, open, twisted and nested surfaces, and the boundary of tetrahedra."""
 
+import time
+
 import numpy as np
 import pytest
 import trimesh
 
-from mitsuba_fspt.phantom.surface_mesh import _multiplicity, boundary, closure, merge
+from mitsuba_fspt.phantom.surface_mesh import (
+    Closure,
+    _multiplicity,
+    boundary,
+    closure,
+    face_areas,
+    merge,
+    turned_share,
+)
 
 
 def joined(*meshes):
@@ -85,3 +95,27 @@ def test_counting_triples_of_large_numbers():
     """Above 2²¹ points three numbers do not fit in one integer; the way around it counts the same."""
     triples = np.sort(np.random.default_rng(1).integers(0, 6, (500, 3)), axis=1)
     assert np.array_equal(_multiplicity(triples, 6), _multiplicity(triples + 3_000_000, 3_000_010))
+
+
+def test_share_of_the_area_that_is_turned():
+    """On a closed surface by its volume, on an open one the smaller part; whatever side the first face has."""
+    points, faces = joined(sphere(), sphere(at=(5, 0, 0)))
+    areas = face_areas(points, faces)
+    turned = np.random.default_rng(2).random(len(faces)) < 0.7
+    mixed = np.where(turned[:, None], faces[:, ::-1], faces)
+    assert turned_share(points, mixed) == pytest.approx(areas[turned].sum() / areas.sum())
+    assert turned_share(points, mixed[:, ::-1]) == pytest.approx(areas[~turned].sum() / areas.sum())
+    rim = np.ones(len(faces), bool)
+    rim[[0, -1]] = False  # both pieces are open
+    mixed = np.where(turned[:, None] & (np.arange(len(faces)) < len(faces) / 2)[:, None], faces[:, ::-1], faces)[rim]
+    right, half = ~turned[: len(faces) // 2][1:], areas[: len(faces) // 2][1:]
+    assert turned_share(points, mixed) == pytest.approx(half[right].sum() / areas[rim].sum())
+
+
+def test_a_mesh_of_a_million_faces_is_examined_in_less_than_a_second():
+    """Of an idle core; measured 0.55 s. Five seconds are allowed here."""
+    mesh = trimesh.creation.icosphere(subdivisions=7)  # 328,000 faces
+    points, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    start = time.process_time()
+    assert closure(points, faces) == Closure(True, 0, 0, 1)
+    assert time.process_time() - start < 5 * len(faces) / 1e6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...runtime.errors import FluxError
+from ..runtime.errors import FluxError
 
 IN_METRES = (".glb", ".gltf")  # by the standard of glTF 2.0
 # Usual diagonals of the bounding box of phantoms and small animals [mm]. For any other a warning suggests the unit with
@@ -26,15 +26,25 @@ def own_unit(mesh: object) -> str:
     return "m" if isinstance(mesh, str | Path) and Path(mesh).suffix.lower() in IN_METRES else "mm"
 
 
+def is_usual(diagonal: float) -> bool:
+    """True for a diagonal of the bounding box [mm] that a phantom may have."""
+    return PASSED[0] <= diagonal <= PASSED[1]
+
+
+def likelier_unit(length: float) -> str | None:
+    """The unit in which a length without one is usual for the diagonal of a phantom; None if there is none."""
+    return next((unit for unit, factor in MILLIMETRES.items() if USUAL[0] <= length * factor <= USUAL[1]), None)
+
+
 def unit_warning(diagonal: float, length_unit: str) -> str | None:
     """Warning of a mesh that is too small or too large for a phantom, with a more likely unit; None for a usual size.
 
     diagonal : of the bounding box [mm], with the mesh in `length_unit`
     """
-    if PASSED[0] <= diagonal <= PASSED[1]:
+    if is_usual(diagonal):
         return None
     raw = diagonal / MILLIMETRES[length_unit]
-    better = next((unit for unit, factor in MILLIMETRES.items() if USUAL[0] <= raw * factor <= USUAL[1]), None)
+    better = likelier_unit(raw)
     found = f"the mesh is {diagonal:.3g} mm from corner to corner if its unit is {length_unit}"
     if better is None:
         return f"{found}, unusual for a phantom. Check --length-unit, or scale the mesh."
