@@ -14,10 +14,22 @@ VOLUMETRIC = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpat
 def scene_warnings(scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator) -> list[str]:
     """Warnings about a picture of a scene by this integrator."""
     kinds = {integrator.class_name(), type(integrator).__name__}
-    found = [None if kinds & VOLUMETRIC else _media(scene, sensor), _blends(scene)]
+    found = [None if kinds & VOLUMETRIC else _media(scene, sensor), _blends(scene), diffraction(sensor)]
     if "PathIntegrator" in kinds:
         found.append(_glowing_windows(scene))
     return [text for text in found if text] + mesh_faults(scene, sensor)
+
+
+def diffraction(lens: mi.Sensor) -> str | None:
+    """Diffraction at the diaphragm, which no method contains, where it spreads a point over a pixel or more."""
+    pixels = lens.airy_radius / lens.pixel_pitch
+    if pixels < 1:
+        return None
+    return (
+        f"diffraction is left out: at f/{lens.optics.f_number:g} the Airy disc has a radius of {pixels:.3g} pixels "
+        f"({lens.airy_radius:.3g} mm on the film at {lens.airy_wavelength_nm:g} nm), over which a real camera spreads "
+        "each point"
+    )
 
 
 def _media(scene: mi.Scene, sensor: mi.Sensor) -> str | None:

@@ -15,6 +15,7 @@ from .discs import Disc
 from .models import LensModel, model_named, model_names
 from .models.diaphragm import Diaphragm
 
+MM_PER_NM = 1e-6
 LARGEST = 1e30  # largest number of a lens, and largest inverse of one: squares stay finite
 LEAST_F_NUMBER = 1e-3  # of the model: no lens in air is below 0.5; far below 1e-3, stated errors are too small
 FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
@@ -149,6 +150,15 @@ class Lens:
     def discs(self) -> tuple[Disc, ...]:
         """The one or two discs of the lens plane that a line of sight has to pass; their overlap is the open pupil."""
         return self.model.discs(self)
+
+    def airy_radius(self, wavelength_nm: float) -> float:
+        """Radius [mm] of the Airy disc on the detector, of light of this wavelength from a point in focus (Eq. M.32).
+
+        1.22 λ N (1 + t) where the diaphragm is in the lens: the first dark ring of the diffraction at the pupil, which
+        lines of sight leave out. It is that on the axis, of the narrower one of two borders.
+        """
+        radius = min(disc.radius for disc in self.discs)
+        return 0.61 * wavelength_nm * MM_PER_NM * self.image_distance / radius
 
     def numbers(self) -> dict[str, float | str]:
         """By name: the model, all numbers that are given or follow from the lens law, and D; lengths in mm."""

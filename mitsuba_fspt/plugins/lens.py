@@ -20,6 +20,7 @@ from ..runtime.errors import OpticsError, named
 from .film import default_sampler, number, own_film
 
 REQUIRED = ("focal_length", "f_number", "pixel_pitch")
+NOMINAL_NM = 600.0  # wavelength of the Airy disc where the lens has no filter
 STRETCH = 1e-5  # deviation of a rotation's matrix from orthonormality that float32 may cause
 CLEAR, MOST_CLEAR = 0.999, 0.9  # shares of the nearest depth of the scene and of u; rays start at the smaller product
 EPSILON = 2.0**-23  # float32's rounding error of a length, relative to the largest length it is computed from
@@ -170,6 +171,16 @@ class FsptLens(mi.Sensor):
         if self._curve:
             light |= {"transmittance_curve": self._curve.file, "wavelength_nm": self._wavelength}
         return self.optics.numbers() | light | {"pixel_pitch": self.pixel_pitch} | self._crop()
+
+    @property
+    def airy_wavelength_nm(self) -> float:
+        """Wavelength [nm] of `airy_radius`: that of the lens's filter, or a nominal one."""
+        return self._wavelength or NOMINAL_NM
+
+    @property
+    def airy_radius(self) -> float:
+        """Radius of the Airy disc on the film [mm] (Eq. M.32), which the image does not contain."""
+        return self.optics.airy_radius(self.airy_wavelength_nm)
 
     def _crop(self) -> dict[str, int]:
         """Size of the film and first pixel of its crop window, if it has one."""

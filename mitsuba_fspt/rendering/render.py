@@ -96,7 +96,8 @@ def render(
             *planes, how = _sample(scene, lens, integrator, spp, seed, report)
     how |= {"wall_time": time.perf_counter() - start}
     how |= _warned(how, planes[0], scene, lens, integrator)
-    return Image(*planes, {**origin_of(scene, lens), "sensor": sensor, **how, **lens.numbers(), **_versions()})
+    origin, numbers = origin_of(scene, lens), {**lens.numbers(), "airy_radius": lens.airy_radius}
+    return Image(*planes, {**origin, "sensor": sensor, **how, **numbers, **_versions()})
 
 
 def _warned(

@@ -106,7 +106,7 @@ def explain(
         rows.append(_row(finding, *saved))
     if (left_out := integrator.light_left_out(scene, lens, quadrature)) is not None:
         rows.append(_scattered(left_out))
-    return rows + _never_done(scene, variant)
+    return [*rows, _diffraction(lens), *_never_done(scene, variant)]
 
 
 def _saved(
@@ -134,6 +134,13 @@ def _scattered(left_out: LeftOut) -> Explanation:
     share, error = 100 * left_out.share, 100 * left_out.error
     why = f"about {share:.2g} % (± {error:.1g} %) of the power, from {', '.join(left_out.bodies) or 'points and beams'}"
     return Explanation("light after a scattering reflection", True, why)
+
+
+def _diffraction(lens: mi.Sensor) -> Explanation:
+    """Row for the diffraction at the diaphragm."""
+    radius, nm = lens.airy_radius, lens.airy_wavelength_nm
+    why = f"Airy radius {radius:.2g} mm on the film, {radius / lens.pixel_pitch:.2g} pixels, at {nm:g} nm"
+    return Explanation("diffraction", True, why)
 
 
 def _never_done(scene: mi.Scene, variant: str) -> list[Explanation]:

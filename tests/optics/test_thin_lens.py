@@ -7,6 +7,8 @@ import re
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.special import j0
 
 from mitsuba_fspt.optics.discs import Disc
 from mitsuba_fspt.optics.thin_lens import Lens, configuration_factor, number_names
@@ -168,3 +170,28 @@ def test_what_is_no_number_is_refused_with_one_that_would_do(name):
     with pytest.raises(OpticsError, match=f"'{name}' must be a number, got '8'") as caught:
         Lens.focused(**good | {name: "8"})
     Lens.focused(**good | {name: float(re.search(r"Give for example (.*)\.$", str(caught.value))[1])})
+
+
+@pytest.mark.parametrize(
+    ("borders", "distance"),
+    [
+        ({}, 82.5),
+        ({"model": "pinhole"}, 82.5),
+        ({"diaphragm_distance": 5.0, "lens_diameter": 60.0}, 77.5),  # the diaphragm is as far from the detector
+    ],
+)
+def test_airy_radius_is_the_first_dark_ring(borders, distance):
+    """Of ∫ J₀(k ρ r/distance) ρ dρ over the diaphragm, found numerically: 1.22 λ N (1 + t). The limit of 5e-4 is that
+    of 1.22 for 1.2197. Seen to fail without 1 + t, and with the lens for the diaphragm.
+    """
+    lens = Lens.focused(55.0, 8.0, magnification=0.5, **borders)
+    k = 2 * math.pi / 660e-6
+    rho = (np.arange(2000) + 0.5) / 2000 * 55.0 / 8 / 2
+
+    def amplitude(r):
+        return float((j0(k * rho * r / distance) * rho).sum())
+
+    dark = brentq(amplitude, 1e-3, 15e-3)
+    assert lens.airy_radius(660.0) == pytest.approx(dark, rel=5e-4)
+    if not borders:
+        assert lens.airy_radius(600.0) == pytest.approx(1.22 * 600e-6 * 8 * 1.5, rel=1e-12)

@@ -72,3 +72,20 @@ def test_a_glowing_surface_that_lets_light_pass_is_told_for_path(bsdf):
     assert "shape_0 glows and lets light pass" in told(scene, method="path", spp=4)
     assert told(scene) == ""
     assert fspt.render(scene).power == pytest.approx(fspt.render(bare).power, rel=1e-3)
+
+
+@pytest.mark.parametrize("settings", [{"rtol": 0.1}, {"method": "path", "spp": 4}])
+def test_diffraction_is_told_from_one_pixel_on(settings):
+    """On pixels of 1.8 mm, 1.22 · 600 nm · N · 1.5 is one pixel at f/1639."""
+    for f_number, pixels in ((1600, 0.976), (1700, 1.037)):
+        image = fspt.render(world_scene(ball(), sensor=lens(**SMALL, f_number=f_number)), **settings)
+        assert image.metadata["airy_radius"] / 1.8 == pytest.approx(pixels, rel=1e-3)
+        line = "diffraction is left out: at f/1700 the Airy disc has a radius of 1.04 pixels (1.87 mm on the film at 600 nm)"
+        assert (line in image.metadata.get("warnings", "")) == (pixels > 1)
+
+
+def test_explain_has_the_airy_radius_at_the_wavelength_of_the_filter(tmp_path):
+    (tmp_path / "filter.csv").write_text("500,0.2\n700,0.5\n")
+    light = {"transmittance_curve": str(tmp_path / "filter.csv"), "wavelength_nm": 660.0}
+    rows = {row.what: row.why for row in fspt.explain(world_scene(ball(), sensor=lens(**SMALL, **light)), rtol=0.1)}
+    assert rows["diffraction"] == "Airy radius 0.0097 mm on the film, 0.0054 pixels, at 660 nm"
