@@ -30,6 +30,35 @@ class Profile:
     standard: NDArray[np.float64]
 
 
+SURE = 2.0  # standard errors above which a difference of the light that two images contain is significant
+LEAST_LIGHT = 1e-5  # of the power: smaller differences are rounding errors
+
+
+@dataclass(frozen=True)
+class LightOfOne:
+    """Light that one of two images contains and the other leaves out, such as that of a white table.
+
+    image : 'calculated' or 'standard', the image that contains it
+    share, error : of all power, and its standard error, as estimated when the images were rendered
+    ratio, ratio_error : of the total powers, calculated over standard, that follows if both are right
+    """
+
+    image: str
+    share: float
+    error: float
+    ratio: float
+    ratio_error: float
+
+    def render_text(self) -> str:
+        """One line."""
+        percent = f"{100 * self.share:.2g} % (± {100 * self.error:.1g} %)"
+        expected = f"the expected ratio is {self.ratio:.4f} ± {self.ratio_error:.1g}"
+        return (
+            f"light  only the {self.image} contains {percent} of the power, of paths that the other image does not "
+            f"follow: {expected}, and the pixels are not tested"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Result of `compare`.
@@ -42,9 +71,11 @@ class Comparison:
     rms : √(Σ(P_cal − P_std)² / N) / max P_std, likewise absolute
     ratio : Σ P_cal / Σ P_std of the absolute powers; None if it is not finite, as for Σ P_std = 0
     profiles : power along rows and columns
-    z_test : test of the differences against their errors; None if no image has a standard error above 0
+    light_of_one : light that only one of the images contains; None where both follow the same paths
+    z_test : test of the differences against their errors; None if no image has a standard error above 0, or with
+        `light_of_one`, which the test would take for an error
     beyond : number of pixels at which the images differ by more than the sum of both integrals' errors; only if no
-        image has a standard error, else None, as without any errors
+        image has a standard error and both contain the same light, else None, as without any errors
     masked : number of pixels masked in either image, which no number above counts; profiles show them as stored
     """
 
@@ -57,6 +88,7 @@ class Comparison:
     z_test: ZTest | None
     beyond: int | None = None
     masked: int = 0
+    light_of_one: LightOfOne | None = None
 
     def render_text(self) -> str:
         """The numbers as text, one a line with its meaning; without the profiles."""
@@ -70,7 +102,9 @@ class Comparison:
             f"RMS    {self.rms:.3e}   over the standard's peak",
             f"ratio  {ratio}",
         ]
-        if self.z_test:
+        if self.light_of_one:
+            lines.append(self.light_of_one.render_text())
+        elif self.z_test:
             lines.append(self.z_test.render_text())
         elif self.beyond is not None:
             lines.append(f"beyond {self.beyond}   pixels that differ by more than the errors of both together")
@@ -102,7 +136,8 @@ class Comparison:
             }
             for profile in self.profiles
         ]
-        tests = {"z_test": self.z_test and asdict(self.z_test), "beyond": self.beyond, "masked": self.masked}
+        light, test = (part and asdict(part) for part in (self.light_of_one, self.z_test))
+        tests = {"light_of_one": light, "z_test": test, "beyond": self.beyond, "masked": self.masked}
         return numbers | tests | {"profiles": profiles}
 
 
@@ -121,7 +156,9 @@ def compare(
     rows, columns : indices of the profiles, one or several, in 0 … h − 1 and 0 … w − 1; if neither is given, the row
         and column through the standard's brightest pixel
 
-    Pixels that are masked in either image, such as saturated ones, are left out of all numbers.
+    Pixels that are masked in either image, such as saturated ones, are left out of all numbers. Where the metadata of
+    the images state that one contains light which the other leaves out (`light_left_out`), that is said, and the pixels
+    are not tested.
 
     The z-test assumes that the errors of the two images are independent. It treats the error of the integral as a
     bound, that of Monte Carlo as a standard error estimated from few passes, and any other as a known standard
@@ -141,7 +178,8 @@ def compare(
     if rows is None and columns is None:
         row, column = brightest(standard, kept)
         rows, columns = [int(row)], [int(column)]
-    test = z_test(calculated, standard)
+    light = _light_of_one(calculated, standard)
+    test = None if light else z_test(calculated, standard)
     return Comparison(
         me=float(np.abs(normalised_cal - normalised_std).mean()),
         cf=float(np.corrcoef(normalised_cal, normalised_std)[0, 1]),
@@ -150,9 +188,29 @@ def compare(
         ratio=_ratio(float(p_cal.sum()), float(p_std.sum())),
         profiles=_profiles(all_cal, all_std, () if rows is None else rows, () if columns is None else columns),
         z_test=test,
-        beyond=None if test else _beyond(difference, error_bound(calculated, standard)[kept]),
+        beyond=None if test or light else _beyond(difference, error_bound(calculated, standard)[kept]),
         masked=int(kept.size - kept.sum()),
+        light_of_one=light,
     )
+
+
+def _light_of_one(calculated: Image, standard: Image) -> LightOfOne | None:
+    """The light that the metadata say only one of the images contains; None where that is not significant."""
+    images = {"calculated": calculated, "standard": standard}
+    if not all("method" in image.metadata for image in images.values()):  # a measured image contains all light
+        return None
+    left, errors = (
+        [float(image.metadata.get(key, 0)) for image in images.values()]
+        for key in ("light_left_out", "light_left_out_error")
+    )
+    error = math.hypot(*errors)
+    if abs(left[0] - left[1]) <= max(SURE * error, LEAST_LIGHT) or left[1] >= 1:
+        return None
+    # With shares l of all power W left out, the images contain (1 - l) W.
+    ratio = (1 - left[0]) / (1 - left[1])
+    ratio_error = math.hypot(errors[0], ratio * errors[1]) / (1 - left[1])
+    image = "standard" if left[0] > left[1] else "calculated"
+    return LightOfOne(image, abs(left[0] - left[1]), error, ratio, ratio_error)
 
 
 def _checked(calculated: Image, standard: Image) -> NDArray[np.bool_]:

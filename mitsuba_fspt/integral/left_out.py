@@ -1,7 +1,8 @@
-"""Light that Eq. 9 leaves out: what reaches the lens after a scattering reflection, or from points and beams.
+"""Light that a method leaves out: what reaches the lens after a scattering reflection, or from points and beams.
 
 Eq. 9 sums what surfaces send to the lens themselves, and specular surfaces lead on. A white table, a second phantom or
-a dent of the phantom itself reflects some of the light once more; a short Monte Carlo run estimates how much.
+a dent of the phantom itself reflects some of the light once more; Monte Carlo follows it as far as its `max_depth`. A
+short Monte Carlo run estimates how much of the power is missing.
 """
 
 from __future__ import annotations
@@ -11,12 +12,16 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..jit.plugin_objects import made
+from ..jit.recording import recording
 from ..jit.spectra import at_one_wavelength, scalar
 from .eq9 import View, etendue_from_pixel
 from .occlusion import hides_nothing
 from .quadrature import Quadrature
+from .specular import Specular
+from .window import visible_window
 
 PATHS = 1 << 14  # standard error of a share of 5 %: about 0.1 %
 BOUNCES = 2  # scattering reflections that are counted: further ones are weaker by the albedo each
@@ -25,50 +30,95 @@ SURE = 2.0  # standard errors above which a share is significant
 
 @dataclass
 class LeftOut:
-    """Share of a picture's power that Eq. 9 leaves out, its standard error, and ids of the shapes that scatter."""
+    """Share of a picture's power that a method leaves out, its standard error, and ids of the shapes that send it on.
+
+    depth : segments of light paths that the method follows; None: the integral
+    needed : segments that contain what is counted
+    """
 
     share: float
     error: float
     bodies: tuple[str, ...]
+    depth: int | None
+    needed: int
 
-    def warning(self, rtol: float) -> str | None:
-        """One line about it; None where it is below `rtol` or not significant."""
-        if not self.share > max(rtol, SURE * self.error):
+    def warning(self, least: float) -> str | None:
+        """One line about it; None where it is below `least`, such as rtol, or not significant."""
+        if not self.share > max(least, SURE * self.error):
             return None
-        named = f"{', '.join(self.bodies)} scatters light" if self.bodies else "emitters other than surfaces shine"
+        sends = "scatters light" if self.depth is None else "scatters or leads light on"
+        named = f"{', '.join(self.bodies)} {sends}" if self.bodies else "emitters other than surfaces shine"
+        power = f"about {100 * self.share:.2g} % (± {100 * self.error:.1g} %) of the power reaches the lens after"
+        if self.depth is None:
+            fix = f"Render with method path and max_depth {self.needed} to see it"
+            return f"{named}: {power} a further reflection, which Eq. 9 leaves out. {fix}"
         return (
-            f"{named}: about {100 * self.share:.2g} % (± {100 * self.error:.1g} %) of the power reaches the lens after "
-            "a further reflection, which Eq. 9 leaves out. Render with method path and max_depth 3 to see it"
+            f"{named}: {power} more than max_depth = {self.depth} segments, which are left out. Give max_depth = "
+            f"{self.needed} to see it"
         )
 
 
-def light_left_out(view: View, quadrature: Quadrature) -> LeftOut | None:
-    """Share of the power on the crop window that the integral leaves out; None where nothing can be."""
-    scene = view.scene
+def light_left_out(
+    scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, depth: int | None = None
+) -> LeftOut | None:
+    """Share of the power on the crop window that a method leaves out; None where nothing can be.
+
+    depth : segments of the paths that a Monte Carlo follows; None: the integral
+    """
+    with recording(), dr.suspend_grad():
+        window = visible_window(scene, lens)
+        if 0 in window.shape:  # no emitter is in the picture, but what it shines on may be
+            window = visible_window(scene, lens, everywhere=True)
+        if 0 in window.shape:
+            return None
+        view = View.of(scene, lens, window, None, Specular.of(scene, lens, quadrature))
+        return _left_out_of(view, quadrature, depth)
+
+
+def _left_out_of(view: View, quadrature: Quadrature, depth: int | None) -> LeftOut | None:
+    scene, leads_on = view.scene, view.specular.names if view.specular else ()
     bodies = scattering_shapes(scene)
     others = [e for e in scene.emitters() if not mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
-    if not (bodies or others) or (not others and hides_nothing(scene)):
+    scattered = others or (bodies and not hides_nothing(scene))
+    needed = 1 + (BOUNCES if scattered else 0) + (quadrature.max_specular if leads_on else 0)
+    if not scattered and (depth is None or depth >= needed):
         return None
-    depth = 1 + BOUNCES + (quadrature.max_specular if view.specular else 0)
-    path = made("path", max_depth=depth, rr_depth=depth)
-    sampler = made("independent")
-    sampler.seed(0, PATHS)
-    lens, film = view.lens, view.lens.film()
-    position = sampler.next_2d() * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
-    pupil = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
-    on_open, open_share = lens.open_pupil(position, pupil)
-    ray, cos_theta, passes = lens.line_of_sight(position, on_open, view.start)
-    at_one_wavelength(ray)
-    radiance = scalar(path.sample(scene, sampler, mi.RayDifferential3f(ray), None, passes)[0])
-    etendue = etendue_from_pixel(cos_theta, passes, open_share)
-    counted = view.integrand(position, pupil).integrand
-    dr.eval(radiance, etendue, counted)
-    total, counted = (column.numpy().astype(np.float64) for column in (radiance * etendue, counted))
+    if depth is not None:
+        bodies += [name for name in leads_on if name not in bodies]
+        if depth >= needed:
+            return LeftOut(0.0, 0.0, tuple(bodies), depth, needed)
+    total, counted = _sampled(view, needed, depth)
     missing, whole = total - counted, total.sum()
     if not whole > 0:
-        return LeftOut(0.0, 0.0, tuple(bodies))
+        return LeftOut(0.0, 0.0, tuple(bodies), depth, needed)
     error = float(missing.std() * np.sqrt(len(missing)) / whole)
-    return LeftOut(max(0.0, float(missing.sum() / whole)), error, tuple(bodies))
+    return LeftOut(max(0.0, float(missing.sum() / whole)), error, tuple(bodies), depth, needed)
+
+
+def _sampled(view: View, needed: int, depth: int | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Power on `PATHS` random lines of sight over paths of `needed` segments, and what the method counts of it.
+
+    Both paths of a line use the same random numbers, so that their first segments are the same.
+    """
+
+    def radiance(segments: int) -> tuple[mi.Float, mi.Float, mi.Point2f, mi.Point2f]:
+        path = made("path", max_depth=segments, rr_depth=needed)
+        sampler = made("independent")
+        sampler.seed(0, PATHS)
+        lens, film = view.lens, view.lens.film()
+        position = sampler.next_2d() * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
+        pupil = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
+        on_open, open_share = lens.open_pupil(position, pupil)
+        ray, cos_theta, passes = lens.line_of_sight(position, on_open, view.start)
+        at_one_wavelength(ray)
+        found = scalar(path.sample(view.scene, sampler, mi.RayDifferential3f(ray), None, passes)[0])
+        etendue = etendue_from_pixel(cos_theta, passes, open_share)
+        dr.eval(found, etendue)
+        return found, etendue, position, pupil
+
+    total, etendue, position, pupil = radiance(needed)
+    counted = view.integrand(position, pupil).integrand if depth is None else radiance(depth)[0] * etendue
+    return tuple(column.numpy().astype(np.float64) for column in (total * etendue, counted))
 
 
 def scattering_shapes(scene: mi.Scene) -> list[str]:

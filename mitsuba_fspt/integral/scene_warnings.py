@@ -13,11 +13,15 @@ VOLUMETRIC = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpat
 
 def scene_warnings(scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator) -> list[str]:
     """Warnings about a picture of a scene by this integrator."""
-    kinds = {integrator.class_name(), type(integrator).__name__}
-    found = [None if kinds & VOLUMETRIC else _media(scene, sensor), _blends(scene), diffraction(sensor)]
-    if "PathIntegrator" in kinds:
+    found = [None if treats_media(integrator) else _media(scene, sensor), _blends(scene), diffraction(sensor)]
+    if integrator.class_name() == "PathIntegrator":
         found.append(_glowing_windows(scene))
     return [text for text in found if text] + mesh_faults(scene, sensor)
+
+
+def treats_media(integrator: mi.Integrator) -> bool:
+    """True for an integrator that follows light through participating media."""
+    return bool({integrator.class_name(), type(integrator).__name__} & VOLUMETRIC)
 
 
 def diffraction(lens: mi.Sensor) -> str | None:

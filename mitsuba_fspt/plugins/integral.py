@@ -30,7 +30,7 @@ from ..integral.shortcuts import SHORTCUTS, Finding
 from ..integral.solution import Solution
 from ..integral.specular import Specular
 from ..integral.tiles import Mosaic
-from ..integral.window import Boxes, Window, glowing_boxes, visible_window, window_of
+from ..integral.window import Boxes, Window, glowing_boxes, window_of
 from ..jit.mesh_buffers import box_of, buffers
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
@@ -135,15 +135,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None
     ) -> LeftOut | None:
         """Light that Eq. 9 leaves out in a scene that `solve` can render; None if there can be none."""
-        quadrature = quadrature or self.quadrature
-        with recording(), dr.suspend_grad():
-            window = visible_window(scene, sensor)
-            if 0 in window.shape:  # no emitter is in the picture, but what it shines on may be
-                window = visible_window(scene, sensor, everywhere=True)
-            if 0 in window.shape:
-                return None
-            view = View.of(scene, sensor, window, None, Specular.of(scene, sensor, quadrature))
-            return light_left_out(view, quadrature)
+        return light_left_out(scene, sensor, quadrature or self.quadrature)
 
     def _fill(
         self,

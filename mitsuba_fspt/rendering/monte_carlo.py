@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
@@ -49,6 +50,16 @@ def tracer(method: str, scene: mi.Scene, lens: mi.Sensor, max_depth: int | None 
     if max_depth < 1:
         raise SceneError(f"render: 'max_depth' must be >= 1, got {max_depth}. Give 1 for light straight to the lens.")
     return mi.load_dict({"type": method, "max_depth": max_depth})
+
+
+def depth_of(integrator: mi.Integrator) -> int | None:
+    """Segments of light paths that a Monte Carlo follows at most, -1 without a limit; None where it does not say."""
+    if integrator.class_name() == "DirectIntegrator":
+        return 2
+    found = re.search(r"\bmax_depth = (-?\d+)", str(integrator))  # only its description states it
+    if found is None:
+        return None
+    return int(found[1]) if 0 <= int(found[1]) < 1 << 31 else -1  # -1 is stated as 2³² - 1
 
 
 def passes(

@@ -200,10 +200,31 @@ def _sample(
         "passes": count,
         "seed": seed,
     }
+    how |= _followed(scene, lens, integrator)
     error = monte_carlo.standard_error(mean, squares / count, count, samples)
     with recording():
         met = coverage(scene, lens)
     return mean, np.where((mean > 0) | _can_see(scene, lens), error, 0), met, how
+
+
+def _followed(scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator) -> dict[str, object]:
+    """Metadata of the paths that a Monte Carlo follows: `max_depth`, and the share of the light that it leaves out."""
+    from ..integral.left_out import light_left_out
+    from ..integral.quadrature import Quadrature
+    from ..integral.scene_warnings import treats_media
+
+    depth = monte_carlo.depth_of(integrator)
+    if depth is None:
+        return {}
+    how: dict[str, object] = {"max_depth": depth}
+    if depth < 0 or treats_media(integrator):  # whose light takes other paths
+        return how
+    own = getattr(scene.integrator(), "quadrature", Quadrature())
+    if (left_out := light_left_out(scene, lens, own, depth)) is not None:
+        how |= {"light_left_out": left_out.share, "light_left_out_error": left_out.error}
+        if warning := left_out.warning(own.rtol):
+            how["warnings"] = warning
+    return how
 
 
 def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
