@@ -39,6 +39,12 @@ def run(capfd):
     return run
 
 
+@pytest.fixture(autouse=True)
+def no_lines_of_progress(monkeypatch):
+    """On a slow machine a command would tell its progress on stderr after a minute."""
+    monkeypatch.setattr("mitsuba_fspt.runtime.progress_bar.LINE_EVERY", 1e6)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def no_scene_of_another_file():
     """Kernels record every living emitter, and one of a scene that was meant to be bad refuses."""

@@ -33,6 +33,9 @@ def matrix(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
     ] = None,
+    max_time: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Begin no view that would end later; run again to go on.")
+    ] = None,
     as_json: AsJson = False,
     png: Annotated[bool, typer.Option("--png", help="Also a picture of the sensitivity in the views.")] = False,
     quiet: Quiet = False,
@@ -59,6 +62,7 @@ def matrix(
             sensor=None if sensor is None else _numbers(sensor),
             file=file,
             scheduler=scheduler,
+            max_time=max_time,
             progress=progress,
             **value_lists(define),
         )
@@ -80,6 +84,8 @@ def _resumable(file: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as cause:
+        if not Path(f"{file}.views").is_dir():
+            raise
         raise Interrupted(
             f"interrupted; finished views stay in {file}.views, the same command goes on from there."
         ) from cause

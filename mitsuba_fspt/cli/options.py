@@ -45,6 +45,9 @@ Spp = Annotated[int | None, typer.Option(help="Monte Carlo samples a pixel.")]
 MaxDepth = Annotated[
     int | None, typer.Option(metavar="N", help="Legs of light that path and ptracer follow; what the scene needs.")
 ]
+MaxTime = Annotated[
+    float | None, typer.Option(metavar="SECONDS", help="Stop refining then: the best image so far, with its errors.")
+]
 Sensor = Annotated[int, typer.Option(metavar="K", help="Number of the scene's sensor, counted from 0.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
 SourcePower = Annotated[

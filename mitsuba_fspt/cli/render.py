@@ -13,13 +13,15 @@ import typer
 from ..rendering.scene_xml import read_xml
 from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
-from ..runtime.errors import ImageError
+from ..runtime.deadline import LEAST_TIME, Deadline, required_time
+from ..runtime.errors import ImageError, SceneError
 from ..runtime.progress_bar import progress_bar
 from .given_scene import Camera, FNumber, FocalLength, GivenScene, SceneOrPhantom, Views, framing_of, scenes_of
 from .options import (
     AsJson,
     Domain,
     MaxDepth,
+    MaxTime,
     Method,
     Parameters,
     Quiet,
@@ -98,6 +100,7 @@ def render(
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write the image as a PNG picture.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
+    max_time: MaxTime = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -117,6 +120,7 @@ def render(
         shots,
         settings | {"max_depth": max_depth, "sensor": sensor},
         Output(source_power, unit, wavelength_nm, png),
+        required_time("render", max_time, SceneError),
         quiet,
     )
     summaries = [
@@ -130,16 +134,25 @@ def render(
             print_warnings(summary["output"], [summary["warnings"]])
 
 
-def _rendered(shots: list[Shot], settings: dict[str, Any], output: Output, quiet: bool) -> list[Image]:
-    """Images of all shots, each written as soon as it is there; `settings` as of `rendering.render`."""
+def _rendered(
+    shots: list[Shot], settings: dict[str, Any], output: Output, max_time: float | None, quiet: bool
+) -> list[Image]:
+    """Images of all shots, each written as soon as it is there; `settings` as of `rendering.render`.
+
+    max_time : of all of them [s]; each gets an equal part of what is left
+    """
     images: list[Image] = []
+    deadline = Deadline(max_time)
     with _kept(shots, images), progress_bar(quiet) as progress:
         from ..rendering.render import render
         from ..rendering.scene import load
 
         quiet_mitsuba()
-        for shot in shots:
-            image = render(load(shot.given.scene, **shot.given.parameters), progress=progress, **settings)
+        for number, shot in enumerate(shots):
+            scene = load(shot.given.scene, **shot.given.parameters)
+            if deadline.is_set:
+                settings["max_time"] = max(deadline.left / (len(shots) - number), LEAST_TIME)
+            image = render(scene, progress=progress, **settings)
             image = image if output.source_power is None else image.scaled(output.source_power)
             if shot.given.origin:
                 image = replace(image, metadata=image.metadata | {"scene": shot.given.origin})

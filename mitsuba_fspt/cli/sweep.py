@@ -13,7 +13,20 @@ import typer
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import BackendError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Method, ParameterLists, Quiet, Rtol, SceneFile, Seed, Sensor, SourcePower, Spp, value_lists
+from .options import (
+    AsJson,
+    MaxTime,
+    Method,
+    ParameterLists,
+    Quiet,
+    Rtol,
+    SceneFile,
+    Seed,
+    Sensor,
+    SourcePower,
+    Spp,
+    value_lists,
+)
 from .terminal import Interrupted, print_result, print_warnings
 
 if TYPE_CHECKING:
@@ -44,13 +57,15 @@ def sweep(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS|local", help="Scheduler of a dask.distributed cluster.")
     ] = None,
+    max_time: MaxTime = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Render all combinations of values: an image each, index.csv and a contact sheet.
 
-    Run again, it renders only what is missing or was made from something
-    else: another scene, data file, value, setting or version.
+    Run again, it renders only what is missing, was stopped by --max-time or
+    made from something else: another scene, data file, value, setting or
+    version.
     """
     from ..studies.sweep import INDEX, sweep
 
@@ -66,6 +81,7 @@ def sweep(
                 "format": format,
                 "jobs": jobs,
                 "scheduler": scheduler,
+                "max_time": max_time,
                 "progress": progress,
             }
             rows = sweep(scene, values, folder, **settings)
@@ -83,10 +99,12 @@ def sweep(
 
 @contextmanager
 def _resumable(folder: Path) -> Iterator[None]:
-    """Ctrl-C in the block raises `Interrupted`, which says that the same command continues the sweep."""
+    """Ctrl-C after the first image raises `Interrupted`, which says that the same command continues the sweep."""
     try:
         yield
     except KeyboardInterrupt as cause:
+        if not folder.is_dir():
+            raise
         raise Interrupted(
             f"interrupted; finished images stay in {folder}, the same command goes on from there."
         ) from cause

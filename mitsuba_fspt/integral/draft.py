@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
+from ..runtime.plugin_types import is_surface
 from . import node_rules
 from .eq9 import View, most_radiance
 from .progress import SILENT, Progress
@@ -116,6 +117,10 @@ class Draft:
             # The few lines of sight of a pixel may miss a surface that those of a neighbour meet.
             lost = self.grid.spread_max(self.lost, self.reach(self.nodes)[1])
             error += lost * dr.opaque(mi.Float64, most_radiance(self.view.scene))
+        if self.progress.deadline.cut and all(map(is_surface, self.view.scene.emitters())):
+            # No more than is possible: estimates for few lines of sight may be a hundred times as large.
+            most = dr.opaque(mi.Float64, most_radiance(self.view.scene))
+            error = dr.minimum(error, dr.maximum(self.value, most - self.value))
         coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))
         etendue = dr.opaque(mi.Float64, self.lens.etendue)
         power, error = etendue * self.value, etendue * dr.select(self.outside, 0, error)

@@ -281,7 +281,8 @@ def _refine_blurred(draft: Draft) -> tuple[mi.Float64, mi.Bool]:
     rough = first_nodes(draft, np.zeros(draft.grid.shape))
     quadrature, enough = draft.quadrature, dr.opaque(mi.Float64, BLURRED)
     levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)[:LEVELS]
-    rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
+    if not draft.progress.deadline.passed():
+        rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
     least = -draft.grid.spread_max(-draft.least_blur)
     inside = ~(draft.outline | parted(draft.coverage))
     blurred = (least >= enough) | (inside & (dr.abs(edges_of(draft).blur) >= enough))

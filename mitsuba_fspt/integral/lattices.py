@@ -43,14 +43,16 @@ def refine_by_lattices(draft: Draft) -> None:
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
     if most < FIRST or not dr.any(above):
         return
-    tolerance = draft.tolerance
+    deadline, tolerance = draft.progress.deadline, draft.tolerance
     brightest = dr.select(
         draft.computed, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
     )
     means, points = Means.none(draft.grid.pixels(above)), 0
-    while points < most:
+    while points < most and not deadline.passed():
         more = min(GROWTH * points or FIRST, most)
         means, points = means.refined(draft, points, more), more
+        if not dr.width(means.pixels):  # the deadline left no time for the first of them
+            break
         unmet = dr.opaque(mi.Float64, draft.estimator.missed_share / (points * SHIFTS)) * dr.gather(
             mi.Float64, brightest, means.pixels
         )
@@ -108,22 +110,32 @@ class Means:
         return Means(dr.gather(mi.UInt32, self.pixels, number), *columns)
 
     def refined(self, draft: Draft, points: int, more: int) -> Means:
-        """Means over `more` points, given these over the first `points`; both are powers of two."""
+        """Means over `more` points, given these over the first `points`; both are powers of two.
+
+        After the deadline only those of the pixels for which there was time.
+        """
         sums = [dr.zeros(mi.Float64, dr.width(self.pixels) * SHIFTS) for _ in range(2)]
-        runs = (more - points) // FIRST
+        runs, done = (more - points) // FIRST, 0
         lanes = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS * runs)
-        for part in batches(lanes, FIRST):
+        for part in batches(lanes, FIRST, draft.progress.batch):
+            if done and draft.progress.deadline.passed():
+                break
+            done += dr.width(part)
             shift, run = part // runs, part % runs
             for total, column in zip(sums, _run(draft, self.pixels, shift, points + run * FIRST), strict=True):
                 dr.scatter_add(total, column, shift)
             dr.eval(sums)
-        draft.count(f"{SHIFTS} lattices of {more}", dr.width(self.pixels), (more - points) * dr.width(sums[0]))
+        whole = done // (SHIFTS * runs)  # lanes of one pixel follow one another
+        draft.count(f"{SHIFTS} lattices of {more}", whole, done * FIRST)
         old, new = (dr.opaque(mi.Float64, share) for share in (points / more, 1 / more))
         radiance, coverage = (
             old * before + new * total for before, total in zip((self.radiance, self.coverage), sums, strict=True)
         )
         dr.eval(radiance, coverage)
-        return replace(self, radiance=radiance, coverage=coverage)
+        found = replace(self, radiance=radiance, coverage=coverage)
+        if whole == dr.width(self.pixels):
+            return found
+        return found.of(dr.arange(mi.UInt32, dr.width(self.pixels)) < whole)
 
 
 def _run(draft: Draft, pixels: mi.UInt32, shift: mi.UInt32, first: mi.UInt32) -> tuple[PixelArray, PixelArray]:

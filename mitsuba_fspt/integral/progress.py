@@ -1,9 +1,14 @@
-"""Share of the integral's levels that are done, reported after each of them."""
+"""Share of the integral's levels that are done, reported after each of them, and the time until which they begin."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from ..jit.batches import BATCH
+from ..runtime.deadline import Deadline
+
+TIMED_BATCHES = 16  # times as many batches with a deadline, by one of which it is exceeded
 
 
 @dataclass(frozen=True)
@@ -11,11 +16,13 @@ class Progress:
     """Reports shares of a part of the work as shares of the whole: `start` … `stop` of it, in [0, 1].
 
     report : called with the share of the whole that is done; None: nothing is reported
+    deadline : after which no further level or batch of lines of sight begins
     """
 
     report: Callable[[float], None] | None = None
     start: float = 0.0
     stop: float = 1.0
+    deadline: Deadline = field(default_factory=Deadline)
 
     def __call__(self, done: float) -> None:
         """Report that the share `done`, in [0, 1], of this part is done."""
@@ -25,7 +32,12 @@ class Progress:
     def part(self, number: int, count: int) -> Progress:
         """The part of this `number`, from 0, of `count` equal parts."""
         width = (self.stop - self.start) / count
-        return Progress(self.report, self.start + number * width, self.start + (number + 1) * width)
+        return Progress(self.report, self.start + number * width, self.start + (number + 1) * width, self.deadline)
+
+    @property
+    def batch(self) -> int:
+        """Most lines of sight of a batch."""
+        return BATCH // TIMED_BATCHES if self.deadline.is_set else BATCH
 
 
 SILENT = Progress()  # reports nothing

@@ -66,7 +66,7 @@ def refine(draft: Draft, light: NDArray[np.float64]) -> None:
     rough = first_nodes(draft, light)
     levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
     progress(1 / (2 + len(levels)))
-    if quadrature.max_nodes >= BOTH:
+    if quadrature.max_nodes >= BOTH and not progress.deadline.passed():
         rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
     progress(2 / (2 + len(levels)))
     if not levels:

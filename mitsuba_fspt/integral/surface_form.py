@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..jit.pixel_grid import Grid
 from ..jit.spectra import scalar
+from ..runtime.deadline import Deadline
 from . import pupil_cells
 from .eq9 import eq9, etendue_from_surface, most_radiance
 from .footprint import Canvas
@@ -103,7 +104,10 @@ class _Refinement:
         recent, grid = None, Grid(self.window.shape)
         while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
             progress(len(self.levels) / levels)
-            value, coverage = self._level(lines, mark)
+            found = None if progress.deadline.passed() else self._level(lines, mark, progress.deadline)
+            if found is None:
+                break
+            value, coverage = found
             change = np.where(mark, np.abs(value - self.value), 0)
             recent, last = SAFETY * grid.array(grid.spread_max(grid.flat(change))), recent
             estimate = recent if last is None else np.maximum(recent, CARRIED * last)
@@ -111,6 +115,8 @@ class _Refinement:
             self.error[mark], self.value[mark], self.coverage[mark] = estimate[mark], value[mark], coverage[mark]
             mark = self.error > self._tolerance(least_peak)
             mark = shown & (mark | where & (self.coverage == 0) & (lines < DARK_LINES))
+        if recent is None and mark.any():  # no time for a second level: the change from nothing
+            self.error = SAFETY * grid.array(grid.spread_max(grid.flat(self.value)))
         error = np.maximum(self.error, self.quadrature.least_error * self.window.brightest(self.value))
         error[self.coverage == 0] = self.error[self.coverage == 0]
         power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
@@ -140,14 +146,19 @@ class _Refinement:
             Finding("dark", dark > 0, f"{dark} of {count} elements are dark"),
         )
 
-    def _level(self, lines: int, mark: NDArray[np.bool_]) -> list[Plane]:
-        """Value and coverage from all elements with light on a marked pixel, at so many lines of sight a pixel."""
+    def _level(self, lines: int, mark: NDArray[np.bool_], deadline: Deadline | None = None) -> list[Plane] | None:
+        """Value and coverage from all elements with light on a marked pixel, at so many lines of sight a pixel.
+
+        None where the deadline passes before all of them are summed.
+        """
         while True:
             quanta = (self.peak * RESOLUTION, COVERAGE_QUANTUM)
             canvas = Canvas(self.window.shape, quanta, self.quadrature.pixel == "centre")
             peak, rays = 0.0, 0
             for glow in self.glows:
                 for batch in glow.batches(lines, mark):
+                    if deadline and deadline.passed():
+                        return None
                     peak = max(peak, self._lay(canvas, batch))
                     rays += int(batch.lines.sum())
             self.rays += rays

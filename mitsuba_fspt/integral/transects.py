@@ -38,6 +38,10 @@ def integrate_by_transects(
     for level, (count, along) in enumerate(levels):
         if not dr.any(refinement.where):
             break
+        if draft.progress.deadline.passed():
+            if level == 0:
+                draft.spread_error(rough)
+            break
         refinement.refine(level, node_rules.transects(count), along)
         draft.progress((3 + level) / (2 + len(levels)))  # after two steps of nodes
 
@@ -69,6 +73,10 @@ class _Refinement:
         if self.means:
             self.edges.update(draft, self.means, self.has_jump, across=level % 2 == 0)
         self.means = means = apply_transects(draft, where, self.edges, rule, along)
+        if means.done is not None:  # the other pixels keep the value and the error of the level before
+            if level == 0:
+                draft.spread_error(where & ~means.done)
+            self.where = where = where & means.done
         # The outline of a dark body counts only where some lines of sight meet light.
         lit = means.value > dr.opaque(mi.Float64, self.estimator.faint) * draft.peak
         first_met = where & means.jumps & lit & ~self.has_jump
@@ -228,6 +236,7 @@ class Means:
     several : True where a share of the transects, `several_share`, crosses more than one
     scatter : error of the value that follows from the differences between transects [W/mm²/sr]
     blur : signed radius of the most blurred edge that a transect crosses, 0 without one [pixels]
+    done : False on pixels that the deadline left out; None if there are none
     """
 
     value: PixelArray
@@ -236,6 +245,7 @@ class Means:
     several: Mask
     scatter: PixelArray
     blur: PixelArray
+    done: Mask | None = None
 
 
 def apply_transects(
@@ -244,15 +254,22 @@ def apply_transects(
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
     index, table = draft.grid.pixels(where), mi.Float(rule.table)
     images = [draft.grid.full(mi.Float64, 0) for _ in range(8)]
-    rays = 0
-    for part in batches(index, len(rule)):
+    rays = count = 0
+    for part in batches(index, len(rule), draft.progress.batch):
+        if count and draft.progress.deadline.passed():
+            break
         *found, traced = _along_transects(draft, part, edges, rule, table, along)
         columns = *_sums(part, edges, rule, table, found), _second_edge(dr.width(part), rule, found[0], draft.estimator)
         for image, column in zip(images, columns, strict=True):
             dr.scatter(image, column, part)
         dr.eval(images)
         rays += int(dr.sum(traced)[0])
-    draft.count(f"{len(rule)} transects", dr.width(index), rays)
+        count += dr.width(part)
+    draft.count(f"{len(rule)} transects", count, rays)
+    done = None
+    if count < dr.width(index):
+        done = draft.grid.full(mi.Bool, False)
+        dr.scatter(done, mi.Bool(True), dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, count)))
     value, coverage, squares, trend, split, several, blur, between = images
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = squares - value * value
@@ -268,6 +285,7 @@ def apply_transects(
         several >= estimator.several_share * number,
         dr.select(edges.sharp, sharp, blurred),
         blur,
+        done,
     )
 
 

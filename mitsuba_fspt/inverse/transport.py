@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import json
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from ..rendering.render import sensor_of, warnings_of
 from ..rendering.scene import load
 from ..rendering.scene_xml import is_text
 from ..runtime import backend
+from ..runtime.deadline import Deadline, required_time
 from ..runtime.errors import BackendError, FsptError, SceneError, TransportError
 from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import whole
@@ -76,6 +78,7 @@ def transport(
     sensor: int | Sequence[int] | None = None,
     file: str | os.PathLike[str] | None = None,
     scheduler: str | None = None,
+    max_time: float | None = None,
     progress: Progress | None = None,
     **parameters: object,
 ) -> TransportMatrix:
@@ -92,6 +95,9 @@ def transport(
     sensor : number of the sensor, or several, one view each
     file : npz file to which the views are written one at a time; a second call goes on where the first was interrupted
     scheduler : address of a dask.distributed scheduler or 'local', as in `sweep`; the scene must be a file
+    max_time : [s], needs `file`: no further view begins that would end later, as the views so far were; at least one is
+        computed. A matrix of half its rows would be none: TransportError says how many views are in the file, and a
+        second call goes on from there
     progress : called with what is being done and the share done; without it a notebook shows a bar
     parameters : values for `<default>` parameters of the scene; lists are multiplied out, the last one fastest
 
@@ -107,17 +113,36 @@ def transport(
     SceneError, OpticsError, ExitanceError, BackendError : as `load` and `render`.
     """
     on, rtol = required_on(on), required_rtol(rtol)
+    deadline = _required_deadline(max_time, file, scheduler)
     tasks = _tasks(scene, parameters, sensor, on, rtol)
     partial = None if file is None else PartialFile(file)
     with reported(progress) as report:
         try:
-            return _joined(tasks, _results(tasks, partial, scheduler, report), partial)
-        except BackendError:  # the scheduler is gone: a later call goes on with the views that are missing
+            return _joined(tasks, _results(tasks, partial, scheduler, report, deadline), partial)
+        except (BackendError, TimeIsUp):  # a later call goes on with the views that are missing
             raise
         except FsptError:  # no later call could go on from there
             if partial is not None:
                 partial.discard()
             raise
+
+
+class TimeIsUp(TransportError):
+    """`max_time` has passed; the views that are finished are in the file."""
+
+
+def _required_deadline(max_time: float | None, file: object, scheduler: str | None) -> Deadline:
+    """The deadline; TransportError for a time that no file or this scheduler goes with."""
+    seconds = required_time("transport", max_time, TransportError)
+    if seconds is not None and file is None:
+        raise TransportError(
+            f"transport: 'max_time' = {seconds:g} needs 'file', which keeps the views that are finished. Give its name."
+        )
+    if seconds is not None and scheduler is not None:
+        raise TransportError(
+            f"transport: 'max_time' = {seconds:g} has no meaning for the scheduler '{scheduler}'. Leave one out."
+        )
+    return Deadline(seconds)
 
 
 def _tasks(
@@ -162,13 +187,21 @@ def _origin(scene: Any, given: dict[str, str], digests: dict[Path, str]) -> str:
 
 
 def _results(
-    tasks: list[ViewTask], partial: PartialFile | None, scheduler: str | None, report: Progress
+    tasks: list[ViewTask],
+    partial: PartialFile | None,
+    scheduler: str | None,
+    report: Progress,
+    deadline: Deadline,
 ) -> Iterator[tuple[int, ViewResult]]:
-    """Number and result of every view; with a `partial` file its rows are there, and not in the result."""
+    """Number and result of every view; with a `partial` file its rows are there, and not in the result.
+
+    Raises TimeIsUp where a further view would not end before the deadline.
+    """
     missing = [k for k, task in enumerate(tasks) if partial is None or not partial.has(k, task.fingerprint)]
     done = len(tasks) - len(missing)
     for k in sorted(set(range(len(tasks))) - set(missing)):
         yield k, described(tasks[k])
+    longest, began = 0.0, time.monotonic()
     for k, result in _computed(tasks, missing, scheduler, report):
         if partial is not None and result.block is not None:
             with ctrl_c_held():
@@ -177,6 +210,13 @@ def _results(
         done += 1
         report(f"{done} of {len(tasks)} views", done / len(tasks))
         yield k, result
+        now = time.monotonic()
+        longest, began = max(longest, now - began), now
+        if done < len(tasks) and deadline.left < longest:
+            raise TimeIsUp(
+                f"transport: stopped by max_time, as another view takes some {longest:.2g} s; {done} of {len(tasks)} "
+                f"views are in {'memory' if partial is None else partial.folder}. Call it again to go on from there."
+            )
 
 
 def _computed(

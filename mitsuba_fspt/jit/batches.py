@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 BATCH = 1 << 22  # most lines of sight in one kernel, which bounds the memory for images of any size
 
 
-def batches(index: mi.UInt32, lines_each: int = 1) -> list[mi.UInt32]:
-    """Parts of the array `index`, each with at most `BATCH` lines of sight, if an entry has `lines_each` of them."""
-    size, count = max(1, BATCH // lines_each), dr.width(index)
+def batches(index: mi.UInt32, lines_each: int = 1, most: int = BATCH) -> list[mi.UInt32]:
+    """Parts of the array `index`, each with at most `most` lines of sight, if an entry has `lines_each` of them."""
+    size, count = max(1, most // lines_each), dr.width(index)
     if count <= size:
         return [index] if count else []
     starts = range(0, count, size)

@@ -35,6 +35,7 @@ from ..jit.mesh_buffers import box_of, buffers
 from ..jit.recording import recording
 from ..jit.robust_tracing import robust_scene
 from ..runtime.cached_value import CachedValue
+from ..runtime.deadline import Deadline
 from ..runtime.errors import SceneError, named
 from ..runtime.plugin_types import is_surface
 
@@ -99,12 +100,15 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         progress: Callable[[float], None] | None = None,
         *,
         narrow: bool = True,
+        deadline: Deadline | None = None,
     ) -> Solution:
         """Power, error and coverage of the sensor's crop window, by `quadrature` or the integrator's own.
 
         A large film is solved in tiles; `progress` is called with the share done, 0 … 1, after every level of each
         tile. With `narrow` = False, objects and spots that lines of sight may miss are neither searched for nor
-        contained in the error; that is meant for drafts of an image that is computed in full afterwards.
+        contained in the error; that is meant for drafts of an image that is computed in full afterwards. After the
+        `deadline` no pixel is refined further: its error is that of the level it has reached. Every pixel takes four
+        lines of sight in any case.
 
         Raises
         ------
@@ -125,7 +129,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
                 traced = self._traced(scene, sensor)
                 faces = self._faces_of(traced) if quadrature.takes("record") else None
                 view = View.of(traced, sensor, window, faces, specular)
-                self._fill(mosaic, view, quadrature, Progress(progress), narrow)
+                self._fill(mosaic, view, quadrature, Progress(progress, deadline=deadline or Deadline()), narrow)
             # Smaller displacements are random.
             rounding = sensor.rounding if sensor.rounding >= LEAST_DISPLACEMENT else 0.0
             solution = mosaic.solution(quadrature.least_error, rounding)
@@ -191,12 +195,13 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             peak = max(narrow.brightest / 2, least_peak)
         if specular and specular.bending:  # the surface form contains only light that goes straight to the lens
             where = np.zeros(window.shape, bool)
-        if where.any():
+        if where.any() and not progress.deadline.passed():
             known = surface_form.solve(scene, lens, window, quadrature, where, peak, progress.part(0, 2), specular)
             known = _with_dark_coverage(known, view, window)
             rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak, progress.part(1, 2))
             solution = known.completed_by(rest)
         else:
+            where = np.zeros(window.shape, bool)
             solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, None, least_peak, progress)
         findings = (Finding("smooth blocks", False, why), *solution.findings)
         if not narrow.on_pixels.any():

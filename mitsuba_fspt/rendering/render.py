@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..images.image import Image
 from ..integral.shortcuts import SHORTCUTS
 from ..runtime import backend
+from ..runtime.deadline import Deadline, required_time
 from ..runtime.errors import SceneError, named
 from ..runtime.numbers import whole
 from ..runtime.plugin_types import is_integral
@@ -52,6 +53,7 @@ def render(
     spp: int | None = None,
     max_depth: int | None = None,
     seed: int | None = None,
+    max_time: float | None = None,
     progress: Progress | None = None,
 ) -> Image:
     """Image of a scene, power in W on every pixel, with its error and coverage.
@@ -68,6 +70,9 @@ def render(
     max_depth : segments of light paths that path and ptracer follow (default: 1, or 1 + max_specular in a scene with
         specular surfaces)
     seed : of the Monte Carlo, 0 … 2³² - 1 (default 0)
+    max_time : [s], after which no further batch of lines of sight, or pass, begins; None: no limit. The image is the
+        best so far, with the errors of the level that each pixel has reached, and `warnings` and `stopped_after` [s]
+        say so. Every pixel takes four lines of sight in any case, or two passes
     progress : function called with the name of the stage and the share done, 0 … 1
 
     If `rtol` was not reached, light after a scattering reflection is left out, the image is dark, or the method does
@@ -83,21 +88,37 @@ def render(
     scene = loaded(scene)
     backend.ensure_variant()
     sensor = whole("render: 'sensor'", sensor, SceneError, "0")
+    deadline = Deadline(max_time := required_time("render", max_time, SceneError))
     lens = sensor_of(scene, sensor)
     accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes, "max_specular": max_specular}
     accuracy["shortcuts_off"] = None if shortcuts else frozenset(SHORTCUTS)
     integrator = _integrator(scene, lens, method, accuracy, {"spp": spp, "seed": seed}, max_depth)
-    start = time.perf_counter()
     with reported(progress) as report:
-        if is_integral(integrator):
-            *planes, how = _integrate(scene, lens, integrator, accuracy, report)
-        else:
-            spp, seed = 256 if spp is None else spp, 0 if seed is None else seed
-            *planes, how = _sample(scene, lens, integrator, spp, seed, report)
-    how |= {"wall_time": time.perf_counter() - start}
+        *planes, how = _timed(scene, lens, integrator, accuracy, (spp, seed), report, deadline)
+    how |= {} if max_time is None else {"max_time": max_time}
     how |= _warned(how, planes[0], scene, lens, integrator)
     origin, numbers = origin_of(scene, lens), {**lens.numbers(), "airy_radius": lens.airy_radius}
     return Image(*planes, {**origin, "sensor": sensor, **how, **numbers, **_versions()})
+
+
+def _timed(
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    integrator: mi.Integrator,
+    accuracy: dict,
+    sampling: tuple[int | None, int | None],
+    progress: Progress,
+    deadline: Deadline,
+) -> tuple:
+    """Power, error [W] and coverage, shape (h, w), by an integrator, and metadata with the time that it took [s]."""
+    start = time.perf_counter()
+    if is_integral(integrator):
+        *planes, how = _integrate(scene, lens, integrator, accuracy, progress, deadline)
+    else:
+        spp, seed = (default if given is None else given for given, default in zip(sampling, (256, 0), strict=True))
+        *planes, how = _sample(scene, lens, integrator, spp, seed, progress, deadline)
+    how |= {"wall_time": time.perf_counter() - start}
+    return *planes, how | ({"stopped_after": how["wall_time"]} if deadline.cut else {})
 
 
 def _warned(
@@ -136,21 +157,33 @@ def _integrator(
 
 
 def _integrate(
-    scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator, accuracy: dict, progress: Progress
+    scene: mi.Scene,
+    lens: mi.Sensor,
+    integrator: mi.Integrator,
+    accuracy: dict,
+    progress: Progress,
+    deadline: Deadline,
 ) -> tuple:
     """Power, error [W] and coverage, shape (h, w), by the deterministic integral, and metadata."""
+    from ..integral.scene_checks import check_scene, check_surfaces_alone
+
     with named("fspt_integral"):
         quadrature = replace(integrator.quadrature, **{k: value for k, value in accuracy.items() if value is not None})
-    solution = integrator.solve(scene, lens, quadrature, partial(progress, "integrating"))
+    check_scene(scene, lens)
+    check_surfaces_alone(scene)
+    left_out = integrator.light_left_out(scene, lens, quadrature)  # first, as it takes its time in any case
+    solution = integrator.solve(scene, lens, quadrature, partial(progress, "integrating"), deadline=deadline)
     how = {"method": "integral", **quadrature.metadata(), "nodes": solution.rays, "levels": "; ".join(solution.levels)}
     how["left_out"] = "; ".join(str(finding) for finding in solution.findings if finding.taken) or "nothing"
     warnings = []
     pixels, largest = solution.beyond(quadrature.rtol)
     if pixels:
+        stopped = "stopped by max_time: " if deadline.cut else ""
         warnings.append(
-            f"rtol {quadrature.rtol:g} not reached on {pixels} pixels (largest error {largest:.1e} of the peak)"
+            f"{stopped}rtol {quadrature.rtol:g} not reached on {pixels} pixels (largest error {largest:.1e} of the "
+            "peak)"
         )
-    if (left_out := integrator.light_left_out(scene, lens, quadrature)) is not None:
+    if left_out is not None:
         how["light_left_out"], how["light_left_out_error"] = left_out.share, left_out.error
         warnings += filter(None, [left_out.warning(quadrature.rtol)])
     if warnings:
@@ -165,6 +198,7 @@ def _sample(
     spp: int,
     seed: int,
     progress: Progress,
+    deadline: Deadline,
 ) -> tuple:
     """Mean and standard error [W] of Monte Carlo passes and coverage, shape (h, w), in double precision; metadata."""
     from ..emission.face_probe import probe_beside
@@ -180,6 +214,7 @@ def _sample(
     if not 0 <= seed < 1 << 32:
         raise SceneError(f"render: 'seed' must be in 0 … 2^32 - 1, got {seed}. Give for example 1.")
     probe_beside(scene)
+    followed = _followed(scene, lens, integrator)  # first, as it takes its time in any case
     pixels = math.prod(int(n) for n in lens.film().crop_size())
     count = max(min(PASSES, spp), math.ceil(spp * pixels / SAMPLES_IN_FLIGHT))
     lens.sampler().set_sample_count(math.ceil(spp / count))
@@ -191,6 +226,9 @@ def _sample(
     for k, (power, taken) in enumerate(monte_carlo.passes(scene, lens, integrator, seeds, each), 1):
         total, squares, samples = total + power, squares + power * power, samples + taken
         progress("sampling", k / count)
+        if 2 <= k < count and deadline.passed():
+            break
+    wanted, count = count, k
     mean = total / count
     name = {"PathIntegrator": "path", "ParticleTracerIntegrator": "ptracer", "VolumetricPathIntegrator": "volpath"}
     how = {
@@ -200,7 +238,10 @@ def _sample(
         "passes": count,
         "seed": seed,
     }
-    how |= _followed(scene, lens, integrator)
+    how |= followed
+    if count < wanted:
+        stopped = f"stopped by max_time after {count} of {wanted} passes"
+        how["warnings"] = "; ".join([stopped, *([how["warnings"]] if "warnings" in how else [])])
     error = monte_carlo.standard_error(mean, squares / count, count, samples)
     with recording():
         met = coverage(scene, lens)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ from ..rendering.provenance import remember_defaults
 from ..rendering.render import render
 from ..rendering.scene import load
 from ..runtime.backend import ensure_variant
+from ..runtime.deadline import LEAST_TIME
 from ..runtime.errors import FsptError
 from .sweep_point import SweepPoint
 
@@ -42,11 +44,16 @@ class SceneCache:
             with self._one_at_a_time:
                 settings = dict(point.settings)
                 watt = settings.pop("source_power")
-                image = render(self._set_up(point), **settings)  # type: ignore[arg-type]
+                start = time.monotonic()
+                scene = self._set_up(point)
+                taken = time.monotonic() - start
+                left = None if point.max_time is None else max(point.max_time - taken, LEAST_TIME)
+                image = render(scene, max_time=left, **settings)  # type: ignore[arg-type]
             image = image if watt is None else image.scaled(watt)  # type: ignore[arg-type]
         except FsptError as error:
             raise type(error)(f"{point.label}: {error}") from error
-        origin = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint}
+        stopped = " stopped" if "stopped_after" in image.metadata else ""  # a later sweep renders it anew
+        origin = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint + stopped}
         return replace(image, metadata=image.metadata | origin)
 
     def image_or_error(self, point: SweepPoint) -> Image | FsptError:

@@ -20,6 +20,7 @@ from ..images.pixel_axes import virtual_pitch
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.atomic_files import atomic_path
+from ..runtime.deadline import Deadline, required_time
 from ..runtime.errors import FsptError, ImageError, SceneError
 from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import number, whole
@@ -73,6 +74,7 @@ def sweep(
     format: str = "exr",
     jobs: int | None = None,
     scheduler: str | None = None,
+    max_time: float | None = None,
     progress: Progress | None = None,
 ) -> list[SweepRow]:
     """Rows of the index, one for every combination of the values, the last parameter changing fastest.
@@ -97,6 +99,8 @@ def sweep(
         imports the script that calls: keep the call behind `if __name__ == "__main__":`
     scheduler : address of a dask.distributed scheduler, for example 'tcp://10.0.0.1:8786', or 'local' to start one
         on this machine; needs the extra `cluster`. Workers must find the scene under the same path.
+    max_time : [s] for all points, each of which gets an equal part of what is left; None: no limit. The images are the
+        best so far, as of `render`; a second call renders those anew that were stopped
     progress : called with the name of the stage and the share done, 0 … 1; without it a notebook shows a bar
 
     Raises
@@ -106,19 +110,16 @@ def sweep(
     ImageError : the folder cannot be written.
     BackendError : no such scheduler, dask is missing, one point ended its worker process three times, no LLVM.
     """
-    folder = Path(folder)
-    jobs = None if jobs is None else whole("sweep: 'jobs'", jobs, SceneError, "2")
+    folder, jobs = Path(folder), None if jobs is None else whole("sweep: 'jobs'", jobs, SceneError, "2")
     _check_jobs(jobs, scheduler)
-    if f".{format}" not in suffixes():
-        known = ", ".join(suffix[1:] for suffix in suffixes())
-        raise ImageError(f"sweep: 'format' must be one of {known}, got '{format}'. Give for example exr.")
-    format_of(f"sweep.{format}")
+    _check_format(format)
     settings = _settings(method, rtol, spp, seed, sensor, source_power)
+    deadline = Deadline(required_time("sweep", max_time, SceneError))
     wanted = points(_path_of(scene), parameters, settings, f".{format}")
     _check_names(wanted)
     _check_folder(folder)
     with reported(progress) as report:
-        return _completed(wanted, folder, jobs, scheduler, report)
+        return _completed(wanted, folder, jobs, scheduler, report, deadline)
 
 
 def _path_of(scene: object) -> Path:
@@ -154,7 +155,12 @@ def _settings(
 
 
 def _completed(
-    wanted: list[SweepPoint], folder: Path, jobs: int | None, scheduler: str | None, progress: Progress
+    wanted: list[SweepPoint],
+    folder: Path,
+    jobs: int | None,
+    scheduler: str | None,
+    progress: Progress,
+    deadline: Deadline,
 ) -> list[SweepRow]:
     """Rows of all points; renders those whose image is missing, and writes the index, after an interrupt too."""
     rows = {point.file: row for point in wanted if (row := _finished(point, folder)) is not None}
@@ -167,7 +173,7 @@ def _completed(
 
     report()
     try:
-        with closing(_images(missing, jobs, scheduler)) as images:
+        with closing(_images(missing, jobs, scheduler, deadline)) as images:
             for point, image in images:
                 if isinstance(image, FsptError):
                     failed[point.label] = image
@@ -198,10 +204,13 @@ def _require_all(wanted: list[SweepPoint], failed: Mapping[str, FsptError]) -> N
     raise type(error)(f"{error} {len(labels)} of {len(wanted)} points failed; the others: {named}.") from error
 
 
-def _images(missing: list[SweepPoint], jobs: int | None, scheduler: str | None) -> Images:
+def _images(missing: list[SweepPoint], jobs: int | None, scheduler: str | None, deadline: Deadline) -> Images:
     """Points with their images or errors in the order they are finished, by this process, others or a cluster."""
     if not missing:
         return
+    if deadline.is_set:  # of a cluster: for as many workers as are asked for, at least one
+        at_a_time = min(jobs or (os.cpu_count() or 1 if scheduler == "local" else 1), len(missing))
+        missing = [point.within(deadline.left * at_a_time / len(missing)) for point in missing]
     if scheduler is not None:
         from .sweep_workers import images_of_cluster
 
@@ -214,8 +223,9 @@ def _images(missing: list[SweepPoint], jobs: int | None, scheduler: str | None) 
         from .scene_cache import SceneCache
 
         cache = SceneCache()
-        for point in missing:
-            yield point, cache.image_or_error(point)
+        for k, point in enumerate(missing):
+            timed = point.within(deadline.left / (len(missing) - k)) if deadline.is_set else point
+            yield point, cache.image_or_error(timed)
 
 
 def _by_geometry(missing: Iterable[SweepPoint]) -> list[SweepPoint]:
@@ -271,6 +281,14 @@ def _check_jobs(jobs: int | None, scheduler: str | None) -> None:
         raise SceneError(f"sweep: 'jobs' must be >= 1, got {jobs}. Give a number of processes, for example 2.")
     if jobs is not None and scheduler not in (None, "local"):
         raise SceneError(f"sweep: 'jobs' = {jobs} has no meaning for the scheduler '{scheduler}'. Leave it out.")
+
+
+def _check_format(format: str) -> None:
+    """Raise ImageError for an unknown format, BackendError where it needs a missing package."""
+    if f".{format}" not in suffixes():
+        known = ", ".join(suffix[1:] for suffix in suffixes())
+        raise ImageError(f"sweep: 'format' must be one of {known}, got '{format}'. Give for example exr.")
+    format_of(f"sweep.{format}")
 
 
 def _check_names(wanted: list[SweepPoint]) -> None:

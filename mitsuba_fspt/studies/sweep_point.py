@@ -11,7 +11,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..optics.thin_lens import Lens, number_names
@@ -19,6 +19,7 @@ from ..optics.transmittance import NUMBERS as LIGHT
 from ..rendering.scene import check_parameters, parameter_text
 from ..rendering.scene_rules import REFERENCE, check_values, is_number
 from ..rendering.scene_xml import read_xml
+from ..runtime.deadline import LEAST_TIME
 from ..runtime.errors import SceneError, named
 from ..runtime.versions import version
 
@@ -39,6 +40,7 @@ class SweepPoint:
     geometry : hash of the scene without its lens; points of equal `geometry` can use the same loaded scene
     fingerprint : hash of the scene's files, the parameters, the settings and the versions
     suffix : of the image's file, which chooses its format
+    max_time : for the rendering [s]; None: no limit. An image that was stopped has another fingerprint
     """
 
     scene: str
@@ -49,6 +51,11 @@ class SweepPoint:
     geometry: str
     fingerprint: str
     suffix: str = ".exr"
+    max_time: float | None = None
+
+    def within(self, seconds: float) -> SweepPoint:
+        """The same point with so much time [s] for its rendering, or the least that may be given."""
+        return replace(self, max_time=max(seconds, LEAST_TIME))
 
     @property
     def label(self) -> str:

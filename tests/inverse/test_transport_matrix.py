@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import signal
 import time
 from dataclasses import replace
@@ -411,3 +412,25 @@ def test_the_verb(scene_file, tmp_path, run, monkeypatch):
     assert "rigid motion" in err
     assert len(err.splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["T.npz", "body.ply", "body.xml"]
+
+
+def test_a_matrix_stops_between_views_and_goes_on(scene_file, tmp_path, run, monkeypatch):
+    """In no time at least one view is computed; each call adds one, and the last gives the matrix."""
+    monkeypatch.chdir(tmp_path)
+    command = ("matrix", scene_file, "-D", "view=0,90", "-o", "T.npz")
+    code, out, err = run(*command, "--max-time", "1e-3")
+    assert (code, out) == (2, "")
+    assert re.fullmatch(
+        r"fspt: transport: stopped by max_time, as another view takes some [\d.e+]+ s; 1 of 2 views are in "
+        r"T.npz.views. Call it again to go on from there.\n",
+        err,
+    )
+    assert not Path("T.npz").exists()
+    code, _, err = run(*command, "--max-time", "1e-3")
+    assert (code, err) == (0, "")
+    whole = fspt.transport(scene_file, view=[0, 90])
+    assert np.array_equal(fspt.read_transport("T.npz").matrix.data, whole.matrix.data)
+    with pytest.raises(TransportError, match="'max_time' = 10 needs 'file'"):
+        fspt.transport(scene_file, max_time=10)
+    with pytest.raises(TransportError, match="'max_time' must be > 0 s"):
+        fspt.transport(scene_file, file="U.npz", max_time=0)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 import signal
+import time
 
 import pytest
 from rich.console import Console
@@ -32,6 +34,34 @@ def test_a_terminal_shows_what_is_done_and_a_pipe_nothing(screen, monkeypatch, c
     with progress_bar() as report:
         report("sampling", 0.5)
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_terminal_shows_the_time_left(screen, monkeypatch):
+    """As if the rest took its share: a quarter in 100 s leaves 300 s. Seen to fail with the time passed for it."""
+    clock = iter([0.0, 0.0, *[100.0] * 1000])
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    with progress_bar() as report:
+        report("sampling", 0.25)
+    assert "about 0:05:00 left" in screen.getvalue()
+
+
+def test_a_pipe_shows_a_line_now_and_then(monkeypatch, capsys):
+    """A line after each interval, none before the first and none if quiet."""
+    monkeypatch.setattr(module, "LINE_EVERY", 0.2)
+    with progress_bar(quiet=True) as report:
+        report("sampling", 0.5)
+        time.sleep(0.5)
+    assert capsys.readouterr().err == ""
+    with progress_bar() as report:
+        report("sampling", 0.5)
+        assert capsys.readouterr().err == ""
+        time.sleep(0.7)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert 1 <= err.count("\n") <= 3
+    assert re.fullmatch(r"fspt: sampling, 50 % after 0:00:0\d, about 0:00:0\d left", err.splitlines()[0])
+    time.sleep(0.5)
+    assert capsys.readouterr().err == ""
 
 
 def test_quiet_and_short_work_show_nothing(screen):

@@ -591,7 +591,8 @@ def test_no_process_outlives_the_one_at_the_top(tmp_path, number):
     assert out == ""
     if number == signal.SIGTERM:
         assert process.returncode == 130
-        assert err == "fspt: interrupted; finished images stay in o, the same command goes on from there.\n"
+        done = "finished images stay in o, the same command goes on from there"
+        assert err == f"fspt: interrupted; {done if (tmp_path / 'o').exists() else 'nothing was written'}.\n"
 
 
 def _runs(process):
@@ -642,3 +643,44 @@ def test_a_run_after_ctrl_c_renders_the_rest(scene, calls):
     assert len(rendered) == 2
     fspt.sweep(scene, VALUES, "o")
     assert sorted(rendered) == sorted(f"f_number={f} distance={d}" for f, d in product(F_NUMBERS, DISTANCES))
+
+
+def test_images_that_were_stopped_are_rendered_anew(scene, calls):
+    """No time is left for any refinement; without a limit both are completed, and stay."""
+    values = {"f_number": F_NUMBERS}
+    stopped = sweep.sweep(scene, values, "o", max_time=1e-3)
+    assert ["stopped by max_time" in row.warnings for row in stopped] == [True, True]
+    whole = sweep.sweep(scene, values, "o")
+    assert [row.reused for row in whole] == [False, False]
+    assert [row.warnings for row in whole] == ["", ""]
+    assert all(after.largest_error < 0.1 * before.largest_error for before, after in zip(stopped, whole, strict=True))
+    assert [row.reused for row in sweep.sweep(scene, values, "o", max_time=60)] == [True, True]
+    assert len(calls[0]) == 4
+
+
+def test_each_point_gets_its_part_of_the_time(scene, monkeypatch):
+    """Of 80 s the first of four points gets 20; the others share what it leaves. Two processes have 40 for each."""
+    given = []
+
+    def instant(self, point):
+        given.append(point.max_time)
+        raise SceneError("not rendered")
+
+    monkeypatch.setattr(scene_cache.SceneCache, "image", instant)
+    with pytest.raises(SceneError):
+        sweep.sweep(scene, VALUES, "o", max_time=80)
+    assert given == pytest.approx([20, 80 / 3, 40, 80], abs=2)
+    monkeypatch.setattr(sweep_workers, "images_of_processes", lambda missing, jobs: ((p, p.max_time) for p in missing))
+    points = [point for point, _ in sweep._images(sweep.points(scene, VALUES, {}), 2, None, sweep.Deadline(80))]
+    assert [point.max_time for point in points] == pytest.approx([40] * 4, abs=1)
+
+
+def test_ctrl_c_before_the_first_image_names_no_folder(run, scene, monkeypatch):
+    """Seen to fail: 'finished images stay in o', which did not exist."""
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep, "_images", interrupted)
+    assert run("sweep", scene, *DEFINE, "-o", "o") == (130, "", "fspt: interrupted; nothing was written.\n")
+    assert not Path("o").exists()
