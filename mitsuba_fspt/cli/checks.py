@@ -70,7 +70,7 @@ def explain(
         given = one_scene(scene, definitions(define), framing_of(view, focal_length, f_number, camera))
         loaded = load(given.scene, **given.parameters)
         rows = explain(loaded, sensor=sensor, rtol=rtol, domain=domain)
-        warnings = warnings_of(loaded, sensor)
+        warnings = [*warnings_of(loaded, sensor), *filter(None, [given.warning])]
     table = "\n".join([HEADER, *(row.render_text() for row in rows)])
     print_result(table, [row.to_dict() for row in rows], as_json=as_json, quiet=quiet)
     print_warnings(scene, warnings)

@@ -34,12 +34,14 @@ class GivenScene(NamedTuple):
     parameters : values for its `<default>` parameters
     view : turn of a phantom [degrees], as it was given; '' of a scene file
     origin : what metadata and the page call the scene; None leaves that to `load`
+    warning : about the camera that was chosen for a phantom
     """
 
     scene: Path | str
     parameters: dict[str, str]
     view: str = ""
     origin: str | None = None
+    warning: str | None = None
 
 
 def framing_of(
@@ -78,7 +80,7 @@ def one_scene(scene: Path, parameters: dict[str, str], framing: dict[str, Any]) 
 
 def _views(phantom: Path, parameters: dict[str, str], framing: dict[str, Any]) -> list[GivenScene]:
     """A phantom's views."""
-    from ..phantom.framed_scene import camera_lens, scene_xml
+    from ..phantom.framed_scene import camera_lens, front_behind_focus, text_and_outline
 
     if twice := set(parameters) & set(framing):
         name = min(twice)
@@ -90,10 +92,12 @@ def _views(phantom: Path, parameters: dict[str, str], framing: dict[str, Any]) -
     views = several("view", framing.pop("view", parameters.get("view", "0")))
     if wrong := [view for view in views if not is_number(view) or views.count(view) > 1]:
         raise SceneError(f"--view: must be different numbers of degrees, got '{wrong[0]}'. Give for example 0,90,180.")
-    text = scene_xml(phantom, **lens | numbers | framing)
+    text, outline = text_and_outline(phantom, **lens | numbers | framing)
     scenes = []
     for view in views:
         values = read_text(text, {}).defaults | {"view": view}
         origin = " ".join([str(phantom), *(f"{name}={value}" for name, value in values.items())])
-        scenes.append(GivenScene(text, {"view": view}, view, origin))
+        placed = {name: float(number) for name, number in values.items()}
+        warning = front_behind_focus(outline, placed, float(view))
+        scenes.append(GivenScene(text, {"view": view}, view, origin, warning))
     return scenes

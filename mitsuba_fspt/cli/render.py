@@ -156,6 +156,9 @@ def _rendered(
             image = image if output.source_power is None else image.scaled(output.source_power)
             if shot.given.origin:
                 image = replace(image, metadata=image.metadata | {"scene": shot.given.origin})
+            if shot.given.warning:
+                warnings = filter(None, [image.metadata.get("warnings"), shot.given.warning])
+                image = replace(image, metadata=image.metadata | {"warnings": "; ".join(map(str, warnings))})
             output.write(image, shot.output, _picture(shot, output.png))
             images.append(image)
     return images

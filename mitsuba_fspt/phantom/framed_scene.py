@@ -108,8 +108,10 @@ def scene_xml(
 
     The lens is on the +x axis and looks at the centre of the phantom's bounding box, which is moved to the origin; up
     is +z. It is focused on the front: on the vertical plane that touches the phantom in the view in which it is
-    nearest. Magnification and distance are such that in every view the whole phantom, its blur included, lies within
-    0.9 of the film's width and height, and reaches this limit along one of them in the widest view.
+    nearest. Of a flat phantom the front may lie behind that plane in the view given; a comment in the text then says
+    by how much, and which magnification at the same distance focuses on it. Magnification and distance are such that in
+    every view the whole phantom, its blur included, lies within 0.9 of the film's width and height, and reaches this
+    limit along one of them in the widest view.
 
     Parameters
     ----------
@@ -133,19 +135,25 @@ def scene_xml(
     OpticsError : a lens that cannot exist.
     SceneError : another value that cannot be used, or a camera that stands in the phantom.
     """
+    settings = {"focal_length": focal_length, "f_number": f_number, "magnification": magnification} | lens
+    settings |= {"distance": distance, "pixel_pitch": pixel_pitch, "width": width, "height": height}
+    return text_and_outline(phantom, rtol=rtol, view=view, **settings)[0]
+
+
+def text_and_outline(phantom: str | os.PathLike[str], **settings: Any) -> tuple[str, Outline]:
+    """Text of `scene_xml`, whose keywords these are, and the outline of the phantom."""
     path = Path(phantom)
     if "$" in str(path.absolute()):
         raise SceneError(f"scene: '{path}' has a $ in its path, which marks a parameter in a scene file. Rename it.")
     mesh = Phantom.read(path)
-    camera = {"focal_length": focal_length, "f_number": f_number, "magnification": magnification, "distance": distance}
-    film = {"pixel_pitch": pixel_pitch, "width": width, "height": height}
     shape = PLY.format(
         filename=quoteattr(str(path.absolute())),
         shift=tuple(-float(c) + 0.0 for c in (mesh.bounds[0] + mesh.bounds[1]) / 2),
         attribute=f"{mesh.per}_{mesh.attribute}",
     )
     title = f"The phantom {path.name.replace('--', '- -')}"
-    return framed_text(Outline.of(mesh), title, shape, **camera, **film, rtol=rtol, view=view, **lens)  # type: ignore[arg-type]
+    outline = Outline.of(mesh)
+    return framed_text(outline, title, shape, **settings), outline
 
 
 def framed_text(
@@ -182,6 +190,8 @@ def framed_text(
     frame = Frame(outline, focal_length, f_number, numbers["pixel_pitch"], film, lens)
     found = dict(zip(("magnification", "distance"), frame.placed(magnification, distance), strict=True))
     values = numbers | found | film | dict(parameters or {})
+    if notes == FOCUSED and (behind := front_behind_focus(outline, values, numbers["view"])):
+        notes += f"\n          {behind}."
     size = " x ".join(f"{side:.4g}" for side in outline.size)
     camera = {"focal_length": values["focal_length"], "f_number": values["f_number"]}
     names = (*ORDER, *(parameters or ()))
@@ -190,6 +200,26 @@ def framed_text(
         defaults="\n".join(f'    <default name="{name}" value="{values[name]:.10g}"/>' for name in names),
         borders="".join(_property(name, value) for name, value in lens.items() if name not in FOCUS),
         shapes=shapes,
+    )
+
+
+def front_behind_focus(outline: Outline, values: Mapping[str, float], view: float) -> str | None:
+    """That the front is out of focus in a view [degrees], by how much, and the remedy; None where its blur is small.
+
+    values : of the text's `<default>` parameters; a blur radius of one pixel counts as small
+    """
+    focal_length, distance = values["focal_length"], values["distance"]
+    u, z = focal_length * (1 + 1 / values["magnification"]), distance - outline.front(view)
+    if not z > u:
+        return None
+    v = focal_length * (1 + values["magnification"])
+    blur = focal_length / values["f_number"] / 2 * v * (1 / u - 1 / z) / values["pixel_pitch"]
+    if blur <= 1:
+        return None
+    sharp = focal_length / (z - focal_length)
+    return (
+        f"In view {view:g} the front lies {z - u:.3g} mm behind the virtual detector plane, blurred over a radius of "
+        f"{blur:.2g} pixels; magnification = {sharp:.4g} with distance = {distance:.6g} focuses on it"
     )
 
 
@@ -220,24 +250,34 @@ class Outline:
 
     centre, size : of the bounding box (3,) [mm]
     radii, heights : of each vertex, its distance from that axis and from the middle plane (V,) [mm]
+    across : of each vertex, x and y from that axis (V, 2) [mm]; None of a body that is round about it
     """
 
     centre: NDArray[np.float64]
     size: NDArray[np.float64]
     radii: NDArray[np.float64]
     heights: NDArray[np.float64]
+    across: NDArray[np.float64] | None = None
 
     @classmethod
     def of(cls, phantom: Phantom) -> Outline:
         """Outline of a phantom."""
         low, high = phantom.bounds
         points = phantom.vertices[np.unique(phantom.faces)] - (low + high) / 2
-        return cls((low + high) / 2, high - low, np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2]))
+        across, heights = points[:, :2], np.abs(points[:, 2])
+        return cls((low + high) / 2, high - low, np.hypot(*across.T), heights, across)
 
     @property
     def radius(self) -> float:
         """Largest distance of a vertex from the axis [mm]."""
         return float(self.radii.max())
+
+    def front(self, view: float) -> float:
+        """Distance of the front from the axis [mm], in the view that is turned counterclockwise by so many degrees."""
+        if self.across is None:
+            return self.radius
+        angle = math.radians(view)
+        return float((self.across @ (math.cos(angle), -math.sin(angle))).max())
 
 
 @dataclass(frozen=True)

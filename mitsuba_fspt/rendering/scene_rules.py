@@ -16,6 +16,7 @@ LISTS = {  # attributes that hold one or several numbers, by element
     **dict.fromkeys(("point", "vector", "translate", "scale", "rotate", "matrix"), ("value",)),
     "lookat": ("origin", "target", "up"),
 }
+OF_THE_LENS = ("f_number", "magnification", "image_distance", "pixel_pitch", "lens_diameter", "diaphragm_distance")
 NEEDED = {"bitmap": ("filename", "data", "bitmap"), "volume": ("volume",)}  # without one, the texture crashes Mitsuba
 
 
@@ -26,6 +27,7 @@ def check_text(path: Path, scene: SceneXml) -> None:
         _check_duplicates(path, node)
         _check_source(path, node, scene)
         _check_parents(path, node)
+        _check_sensor(path, node, scene)
 
 
 def check_values(path: Path, scene: SceneXml) -> None:
@@ -79,6 +81,24 @@ def _check_source(path: Path, node: ElementTree.Element, scene: SceneXml) -> Non
     needed = NEEDED.get(kind, ()) if node.tag == "texture" else ()
     if needed and not any(child.get("name") in needed for child in node):
         raise SceneError(f"{path}: a texture '{kind}' has no '{needed[0]}'. Give it one.")
+
+
+def _check_sensor(path: Path, node: ElementTree.Element, scene: SceneXml) -> None:
+    """Raise SceneError for a parameter of `fspt_lens` in another sensor: Mitsuba may say that its type is wrong."""
+    kind = scene.fill_in(node.get("type", "")) if node.tag == "sensor" else "fspt_lens"
+    if kind == "fspt_lens":
+        return
+    # Mitsuba's own cameras have a `focal_length`, too, as a text such as 50mm.
+    left = [
+        name
+        for child in node
+        if (name := child.get("name", "")) in OF_THE_LENS or (child.tag, name) == ("float", "focal_length")
+    ]
+    if left:
+        raise SceneError(
+            f"{path}: the sensor '{kind}' has '{left[0]}', a parameter of fspt_lens. Use a sensor of type 'fspt_lens', "
+            "or leave that out."
+        )
 
 
 def _check_parents(path: Path, node: ElementTree.Element) -> None:

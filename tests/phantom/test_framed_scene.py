@@ -174,3 +174,27 @@ def test_camera_files_that_cannot_be_used(tmp_path, content, message):
         path.write_text(content)
     with pytest.raises(SceneError, match=re.escape(message)):
         camera_lens(path)
+
+
+def test_a_front_out_of_focus_is_said(tmp_path, run):
+    """A plate 60 mm wide and 8 thick: in view 0 its front is 26.3 mm behind the plane through its edges, 30.3 mm from
+    the axis. With the magnification that the line gives, a point of the front is imaged to a point.
+    """
+    path, film = box(tmp_path / "plate.ply", (8, 60, 6)), {"width": 120, "height": 80, "pixel_pitch": 0.2}
+    text = fspt.scene_xml(path, **film)
+    told = re.search(
+        r"In view 0 the front lies ([\d.]+) mm behind .* magnification = (\S+) with distance = (\S+) f", text
+    )
+    gap, magnification, distance = map(float, told.groups())
+    assert gap == pytest.approx(np.hypot(30, 4) - 4, abs=0.05)
+    assert distance == pytest.approx(defaults(text)["distance"])
+    sharp = fspt.scene_xml(path, **film, magnification=magnification, distance=distance)
+    assert "In view" not in sharp
+    lens = fspt.load(sharp).sensors()[0].optics
+    assert lens.focus_distance == pytest.approx(distance - 4, rel=1e-3)
+    assert "In view" not in fspt.scene_xml(path, **film, view=90)
+    options = [text for name, value in film.items() for text in ("-D", f"{name}={value}")]
+    options += ["-D", "rtol=0.5", "--view", "0,90"]
+    code, _, err = run("render", path, *options, "-o", tmp_path / "o.npz", "--quiet")
+    assert code == 0
+    assert re.fullmatch(r"fspt: \S+o_view0.npz: In view 0 the front lies 26.3 mm behind the virtual .*\n", err)

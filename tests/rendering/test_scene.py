@@ -189,6 +189,16 @@ def test_texts_and_dictionaries_that_are_no_scene(scene, given, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("left", ['<float name="focal_length" value="50"/>', '<float name="f_number" value="8"/>'])
+def test_a_parameter_of_the_lens_in_another_sensor_is_refused(tmp_path, left):
+    """Mitsuba says that the focal length must be a string."""
+    name = left.split('"')[1]
+    sensor = f'<sensor type="perspective"><float name="fov" value="20"/>{left}<film type="hdrfilm"/></sensor>'
+    message = f"the sensor 'perspective' has '{name}', a parameter of fspt_lens. Use a sensor of type 'fspt_lens'"
+    with pytest.raises(SceneError, match=message):
+        fspt.load(write_scene(tmp_path / "s.xml", sensor=sensor))
+
+
 def test_unnamed_shapes_and_sensors_get_names_that_stay(tmp_path):
     path = write_scene(tmp_path / "s.xml", shapes=BALL_XML * 2 + BALL_XML.replace("<shape", '<shape id="mouse"'))
     keys = [set(mi.traverse(fspt.load(path)).keys()) for _ in range(2)]
