@@ -28,7 +28,16 @@ from ..runtime.versions import version, versions
 from ..studies.sweep_point import SceneSource, point_of, texts_of
 from .transport_file import FORMAT, PartialFile, read_transport
 from .transport_matrix import TransportMatrix
-from .view_block import Block, Part, block_of, glowing_meshes, parts_of, required_on, required_rtol
+from .view_block import (
+    Block,
+    Part,
+    block_of,
+    glowing_meshes,
+    light_left_out_of,
+    parts_of,
+    required_on,
+    required_rtol,
+)
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -60,13 +69,17 @@ class ViewTask:
 
 @dataclass(frozen=True)
 class ViewResult:
-    """A computed view: its rows, the columns, the numbers of its lens, `<default>` values of its scene, warnings."""
+    """A computed view: its rows, the columns, the numbers of its lens, `<default>` values of its scene, warnings.
+
+    left_out : share of the power that T leaves out, for J = 1, and the line about it; None where that is too little
+    """
 
     block: Block | None
     parts: list[Part]
     lens: dict[str, Any]
     defaults: dict[str, Any]
     warnings: tuple[str, ...]
+    left_out: tuple[float, str] | None
 
 
 def transport(
@@ -101,9 +114,9 @@ def transport(
     progress : called with what is being done and the share done; without it a notebook shows a bar
     parameters : values for `<default>` parameters of the scene; lists are multiplied out, the last one fastest
 
-    As Eq. 9 does, T leaves out the light that surfaces scatter on to the lens; `render` tells its share.
-    The metadata say in `warnings` on how many pixels `rtol` was not reached, if on any; `error` has by how much. They
-    also say what is odd about the scene, such as a mesh whose faces turn both ways.
+    As Eq. 9 does, T leaves out the light that surfaces scatter on to the lens; a warning tells the largest share of a
+    view, for J = 1. The metadata also say in `warnings` on how many pixels `rtol` was not reached, if on any, and what
+    is odd about the scene, such as a mesh whose faces turn both ways; `error` has by how much pixels are off.
 
     Raises
     ------
@@ -303,7 +316,8 @@ def _described(scene: mi.Scene, lens: mi.Sensor, task: ViewTask) -> ViewResult:
     numbers["film"] = [int(n) for n in (*film.crop_size(), *film.crop_offset(), *film.size())]
     numbers["to_world"] = [float(n) for n in lens.placement]
     warnings = tuple(warnings_of(scene, task.sensor))
-    return ViewResult(None, parts_of(scene, task.on), numbers, defaults_of(lens), warnings)
+    left_out = light_left_out_of(scene, lens, task.rtol)
+    return ViewResult(None, parts_of(scene, task.on), numbers, defaults_of(lens), warnings, left_out)
 
 
 def _joined(
@@ -347,6 +361,8 @@ def _joined(
     }
     off = f"rtol {rtol:g} not reached on {unreached} pixels (largest error {largest:.1e} of the peak for J = 1)"
     told = dict.fromkeys(text for result in ordered for text in result.warnings)
+    if of_views := [result.left_out for result in ordered if result.left_out]:
+        told[f"{max(of_views)[1]} (for J = 1)"] = None
     if warnings := [*([off] if unreached else []), *told]:
         meta["warnings"] = "; ".join(warnings)
     if partial is None:

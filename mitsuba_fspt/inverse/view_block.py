@@ -194,6 +194,18 @@ def block_of(
     return Block(**{field.name: getattr(rows, field.name) for field in fields(rows)})
 
 
+def light_left_out_of(scene: mi.Scene, lens: mi.Sensor, rtol: float) -> tuple[float, str] | None:
+    """Share of the power for J = 1 that Eq. 9 leaves out of a view, and a line about it; None below `rtol`."""
+    from ..rendering.render import integrator_of
+
+    with ExitStack() as stack:
+        for emitter in glowing_meshes(scene):
+            stack.enter_context(emitter.shining(1.0))
+        found = integrator_of(scene, "integral").light_left_out(scene, lens, Quadrature(rtol=rtol))
+    warning = found.warning(rtol) if found else None
+    return (found.share, warning) if warning else None
+
+
 def required_on(on: object) -> str:
     """`on` as one of `ON`; TransportError for anything else."""
     if on not in ON:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -17,6 +19,7 @@ from small_scenes import (
     glow,
     lens,
     look_at_crop,
+    mi,
     world_scene,
     write_ply,
 )
@@ -302,6 +305,20 @@ def square_at(x, y, turn, bsdf, size=60.0):
 
     place = mi.ScalarTransform4f().translate([x, y, 0]).rotate([0, 0, 1], turn).rotate([0, 1, 0], 90).scale(size)
     return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+
+
+def test_light_by_a_white_wall_is_told(tmp_path):
+    """The largest share of any view, once, for J = 1; the same as that of an image of J_n = 1."""
+    wall = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, -9]).scale(30),
+        "bsdf": {"type": "diffuse", "reflectance": 0.8},
+    }
+    scene = body_scene(tmp_path, extra=[wall])
+    told = fspt.transport(scene, rtol=1e-2).metadata["warnings"]
+    assert re.fullmatch(r"shape_1 scatters light: about .* to see it \(for J = 1\)", told)
+    assert told.startswith(fspt.render(scene, rtol=1e-2).metadata["warnings"])
+    assert "warnings" not in fspt.transport(body_scene(tmp_path), rtol=1e-2).metadata
 
 
 SILVERED = {"type": "conductor", "material": "none", "specular_reflectance": 0.9}
