@@ -84,7 +84,8 @@ def run(arguments: list[str]) -> int:
         return _fail(str(error))
     except TyperException as error:
         message = getattr(error, "format_message", error.__str__)() or "Missing command"
-        return _fail(f"{message.rstrip('.')}. See 'fspt --help'.")
+        context = getattr(error, "ctx", None)
+        return _fail(f"{message.rstrip('.')}. See '{context.command_path if context else 'fspt'} --help'.")
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted; nothing was written.", INTERRUPTED)
     except BrokenPipeError:

@@ -36,11 +36,14 @@ def compare(
     from ..images.comparison import compare
     from ..images.image import read
 
+    if png:
+        require_picture(png)
+        require_apart(png, [calculated, standard], "--png", ImageError)
     images = read(calculated), read(standard)
+    result = compare(*images)
     for path, image, other in zip((calculated, standard), images, images[::-1], strict=True):
         if image.error is None and other.error is not None:
             typer.echo(f"fspt: {path}: it has no plane of errors; its power is taken as exact.", err=True)
-    result = compare(*images)
     if result.masked:
         typer.echo(f"fspt: compare: {result.masked} pixels masked in either image are left out.", err=True)
     if png:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import re
 import warnings
@@ -118,7 +119,9 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
         array, header = _fits(path)
     elif suffix == ".npy":
         try:
-            array = np.load(path, allow_pickle=False)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # NumPy's of an odd header, which it reads or refuses
+                array = np.load(path, allow_pickle=False)
         except Exception as cause:  # whatever a damaged file makes NumPy raise
             raise ImageError(f"counts '{path}' are no NPY file of numbers: {_line(cause)}. Save them again.") from cause
     else:
@@ -275,8 +278,8 @@ def _number(info: dict[str, str], patterns: tuple[re.Pattern[str], ...]) -> floa
     """Number of the first key that the first of the patterns matches, None where none does."""
     for pattern in patterns:
         for key, value in info.items():
-            if pattern.search(key) and (number := NUMBER.search(value)):
-                return float(number[0])
+            if pattern.search(key) and (text := NUMBER.search(value)) and math.isfinite(number := float(text[0])):
+                return number
     return None
 
 

@@ -28,7 +28,7 @@ from ..images.radiometry import PLANCK_TIMES_LIGHT
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from ..runtime.wavelength import wavelength
-from .counts import FITS, SAME_TIME, TIFF, Counts, Frame, frame_like, frame_of, require_same_time
+from .counts import CLICK, FITS, SAME_TIME, TIFF, Counts, Frame, frame_like, frame_of, require_same_time
 from .detector import RECORDED, Detector
 from .flat_field import FlatField, flat_field, require_no_flat
 from .saturation import full_pixels, saturated
@@ -421,6 +421,8 @@ def read_measured(path: str | os.PathLike[str]) -> Image:
     """
     path = Path(path)
     counts_alone = f"'{path}' holds counts without their detector's numbers. Reduce it with 'fspt reduce'."
+    if path.is_dir() and not any(file.stem.lower() == CLICK for file in path.iterdir()):
+        raise ImageError(f"image file '{path}' is a folder. Give the path of an image that fspt wrote.")
     if path.suffix.lower() in (".npy", ".png") or path.is_dir():
         raise DetectorError(counts_alone)
     try:

@@ -137,6 +137,10 @@ def image_or_exposure(
         raise DetectorError(
             f"'{path}': the electrons come without '{missing[0]}'. Reduce the counts with 'fspt reduce'."
         )
-    counts = np.rint(float(metadata["bias"]) + electrons / float(metadata["gain"]))
+    gain = float(metadata["gain"])
+    if not gain > 0:
+        raise DetectorError(f"'{path}': its gain must be > 0 e-/DN, it is {gain:g}. Expose the image again.")
+    with np.errstate(over="ignore"):  # beyond the converter's range
+        counts = np.rint(float(metadata["bias"]) + electrons / gain)
     top = 2 ** int(metadata["bits"]) - 1
     return Exposure(electrons, np.clip(counts, 0, top).astype(np.uint16), metadata)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +94,12 @@ def wavelength_of(image: Image, wavelength_nm: float | None) -> float:
     ------
     ImageError : there is none, it is not in 200 … 2500 nm, or the given one is not that of the filter.
     """
-    own = image.metadata.get("wavelength_nm")
+    return wavelength_by(image.metadata, wavelength_nm)
+
+
+def wavelength_by(metadata: Mapping[str, object], wavelength_nm: float | None) -> float:
+    """Wavelength [nm] of an image with these metadata, or of a lens with these numbers; raises as `wavelength_of`."""
+    own: Any = metadata.get("wavelength_nm")
     if wavelength_nm is None:
         if own is None:
             raise ImageError("image: photons need a wavelength, the image has none. Give wavelength_nm, say 660.")

@@ -7,15 +7,19 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.extras import require
 
+if TYPE_CHECKING:
+    from tifffile import TiffFile
+
 LOG = logging.getLogger("mitsuba_fspt")
 TAG = re.compile(r"TiffTag (\d+)")
+SMALLEST_PAGE = 18  # bytes of a page with one tag
 PRIVATE = 32768  # least number of a private tag, which says nothing about the pixels
 
 
@@ -36,6 +40,8 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
 
     try:
         with _reports() as reports, tifffile.TiffFile(path) as file:
+            if _has_page(file, path.stat().st_size // SMALLEST_PAGE + 1):
+                raise ValueError("its pages follow each other in a circle")
             series = file.series[0]
             pictures = series.asarray()
             missing = sum(page is None for page in series.pages)
@@ -51,6 +57,15 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
         more = f" (and {len(texts) - 1} more)" if len(texts) > 1 else ""
         LOG.warning("fspt: %s: tifffile reports: %s%s. Check the picture.", thing, texts[0][:200].rstrip("."), more)
     return pictures
+
+
+def _has_page(file: TiffFile, number: int) -> bool:
+    """True if the chain of pages is longer than `number`."""
+    try:
+        file.pages.get(number)
+    except IndexError:
+        return False
+    return True
 
 
 def _is_of_private_tag(text: str) -> bool:

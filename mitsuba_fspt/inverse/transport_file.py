@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -62,6 +63,8 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
             missing = [f"{_name(k, a)}" for k in range(len(meta["views"])) for a in ARRAYS if _name(k, a) not in file]
         if missing:
             raise KeyError(missing[0])
+        if (areas[sensitivity > 0] <= 0).any():
+            raise ValueError("light from vertices or faces without area")
         return TransportMatrix(FileBlocks(path, meta), meta, areas, sensitivity)
     except (TransportError, MemoryError):
         raise
@@ -85,7 +88,8 @@ def opened(path: Path) -> Iterator[Any]:
         if not zipfile.is_zipfile(raw):  # of which NumPy says that it may be unsafe to load
             raise zipfile.BadZipFile("no zip archive")
         raw.seek(0)
-        with np.load(raw, allow_pickle=False) as file:
+        with warnings.catch_warnings(), np.load(raw, allow_pickle=False) as file:
+            warnings.simplefilter("ignore")  # NumPy's of an odd header, which it reads or refuses
             yield file
 
 

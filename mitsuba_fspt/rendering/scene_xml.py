@@ -96,6 +96,13 @@ def _add(root: ElementTree.Element, path: Path, scene: SceneXml, outer: tuple[Pa
                 _read(inner, scene, (*outer, path))
 
 
+def _instead(path: Path) -> str:
+    """What to give in place of a file that is no scene."""
+    if path.suffix.lower() == ".ply":
+        return f"Write one for this phantom by 'fspt scene new mouse --phantom {path} -o scene.xml'."
+    return "Give the name of one, or write one by 'fspt scene new'."
+
+
 def _root(path: Path, text: str | None = None) -> ElementTree.Element:
     """Root element of an XML file, or of a text; SceneError if it cannot be read."""
     try:
@@ -105,4 +112,6 @@ def _root(path: Path, text: str | None = None) -> ElementTree.Element:
     except LookupError as error:
         raise SceneError(f"{path}: {error}. Save the scene file as UTF-8, and say so in its first line.") from error
     except ElementTree.ParseError as error:
+        if text is None and not path.read_bytes()[:1024].lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+            raise SceneError(f"{path}: no scene, which is XML and begins with '<'. {_instead(path)}") from error
         raise SceneError(f"{path}: not valid XML: {error}. Fix that line.") from error

@@ -39,6 +39,17 @@ class Header:
     size: int
 
 
+def require_ply(path: Path, error: type[FsptError]) -> None:
+    """Raise `error` for a file that begins otherwise than a PLY; one that cannot be opened is left to its reader."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(3)
+    except OSError:
+        return
+    if start != b"ply":
+        raise error(f"'{path}' is no PLY file, which begins with 'ply'. Give a phantom as 'fspt flux' writes it.")
+
+
 def require_whole(path: Path, error: type[FsptError]) -> None:
     """Raise `error` for a PLY that ends early, or with a face that names a vertex which does not exist.
 
@@ -126,7 +137,7 @@ def _text_corners(path: Path, content: bytes, header: Header, error: type[FsptEr
             f"'{path}' ends early: its header tells of {total} {what} lines, there are {count}. Copy or save the file "
             "again."
         )
-    if body.rstrip(b" \t")[-1:] not in (b"\n", b"\r"):
+    if lines and body.rstrip(b" \t")[-1:] not in (b"\n", b"\r"):
         raise error(
             f"'{path}' ends without a line break, so that its last number may be cut off. Copy or save the file again, "
             "or, if it is whole, put a line break at its end."

@@ -76,3 +76,11 @@ def test_a_whole_ply_is_read(tmp_path, content):
     (tmp_path / "m.ply").write_bytes(content)
     assert len(fspt.Phantom.read(tmp_path / "m.ply").faces) == 8
     fspt.load(write_scene(tmp_path / "s.xml", shapes=SHAPE))
+
+
+def test_a_vertex_far_away_is_framed_or_refused(tmp_path):
+    """Seen to divide by zero: its distance from the axis was lost in that of the lens."""
+    far = text_ply().replace(b"3 0 0 1e-3", b"3e30 0 0 1e-3")
+    (tmp_path / "m.ply").write_bytes(far)
+    with pytest.raises(fspt.FsptError, match="no magnification from 1e-06 to 1e\\+06 fills the film"):
+        fspt.scene_xml(tmp_path / "m.ply")

@@ -67,6 +67,8 @@ def read_mesh(mesh: MeshLike, values: ValuesLike | None, field: str | None, form
         format = "nirfast"
     if not os.path.exists(path) and format != "nirfast":  # a NIRFAST name may lack the suffix
         raise FluxError(f"mesh '{path}' does not exist. Check the name.")
+    if format == "auto" and path.is_dir():
+        raise FluxError(f"mesh '{path}' cannot be read: it is a folder. Check the name.")
     if format == "auto":
         format = _detect(path)
     if format == "mmc":

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...runtime.errors import FluxError
+from .table import whole_numbers
 
 Tags = NDArray[np.int64]
 # Number of nodes by Gmsh's type of element. Other types are refused before.
@@ -132,7 +133,9 @@ class _Reader:
     def _column(self, kind: str, values: int, count: int) -> Tags:
         """Tags of `count` rows, each of a tag and `values` real numbers."""
         if not self.binary:
-            return self._numbers("f8", count * (1 + values)).reshape(count, -1)[:, 0].astype(np.int64)
+            return whole_numbers(
+                self._numbers("f8", count * (1 + values)).reshape(count, -1)[:, 0], "tags of Gmsh's values"
+            )
         return np.fromfile(self.file, [("tag", kind), ("values", "f8", (values,))], count)["tag"].astype(np.int64)
 
     def _numbers(self, kind: str, count: int) -> NDArray:

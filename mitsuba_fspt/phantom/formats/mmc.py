@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...runtime.errors import FluxError
 from ..surface_mesh import Indices, Points, boundary
 from .raw import Field, RawMesh
-from .table import read_table
+from .table import read_table, whole_numbers
 
 TEXT = (".dat", ".txt")
 
@@ -41,7 +41,7 @@ def read_mmc(mesh: Path, values: Path | None) -> RawMesh:
         )
     # MMC does not reorder the elements if it finds one of these files beside them.
     kept = any(mesh.with_name(f"{part}_{session}.dat").exists() for part in ("facenb", "velem"))
-    tetrahedra = elements[:, 1:5].astype(np.int64)
+    tetrahedra = whole_numbers(elements[:, 1:5], f"MMC: node numbers of the elements of '{mesh}'")
     return mmc_mesh(nodes[:, 1:], tetrahedra, _read_dref(values), f"MMC {values.name}", turn=not kept)
 
 

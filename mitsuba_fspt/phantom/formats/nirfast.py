@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...runtime.errors import FluxError
 from ..surface_mesh import Indices, Points
 from .raw import RawMesh
-from .table import read_table
+from .table import read_table, whole_numbers
 
 # Columns of a .param by its kind; the third one is n.
 COLUMNS = {"stnd": 3, "blt": 3, "fluor": 8}
@@ -43,7 +43,9 @@ def read_nirfast(mesh: Path) -> RawMesh:
             "in the plane and bare surfaces have no exitance to render."
         )
     index = _index(stem.with_name(f"{stem.name}.param"), len(nodes))
-    return nirfast_mesh(nodes[:, 1:], elements.astype(np.int64), f"NIRFAST {stem.name}", index)
+    return nirfast_mesh(
+        nodes[:, 1:], whole_numbers(elements, f"NIRFAST: node numbers of '{stem}.elem'"), f"NIRFAST {stem.name}", index
+    )
 
 
 def nirfast_mesh(nodes: Points, elements: Indices, source: str, index: NDArray[np.float64] | None = None) -> RawMesh:

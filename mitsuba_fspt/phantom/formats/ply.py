@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...runtime.atomic_files import atomic_path
 from ...runtime.errors import FluxError
-from ...runtime.ply_file import require_whole
+from ...runtime.ply_file import require_ply, require_whole
 from ..surface_mesh import Indices, Points
 from .raw import Field, RawMesh, scalars
 from .surface_files import load_triangles
@@ -30,6 +30,7 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
     ------
     FluxError : the file cannot be read, ends early, or holds no triangles.
     """
+    require_ply(path, FluxError)
     require_whole(path, FluxError)
     # Texture coordinates would make trimesh split the vertices.
     mesh = load_triangles(path, "ply", fix_texture=False, skip_materials=True)

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterable
 from io import StringIO
 from pathlib import Path
@@ -15,6 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...runtime.errors import BackendError, FluxError
+
+# Longest time to read a MATLAB file, and least speed; an idle machine takes 0.5 s and reads 100 MB/s.
+MAT_TIME, MAT_SPEED = 30.0, 1e6  # s, bytes/s
 
 
 def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
@@ -189,7 +193,8 @@ def read_npz(path: Path) -> dict[str, NDArray]:
 def _load_numpy(path: Path) -> NDArray | dict[str, NDArray]:
     """Array of a `.npy` file, or arrays by name of a `.npz`; the content decides, not the suffix."""
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy's of an odd header, which it reads or refuses
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.ndarray):
                 return loaded
@@ -214,11 +219,27 @@ def _read_mat(path: Path) -> dict[str, NDArray]:
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "arrays.npz"
         program = [sys.executable, str(Path(__file__).with_name("mat_to_npz.py")), str(path), str(target)]
-        done = subprocess.run(program, capture_output=True, text=True, check=False)
+        seconds = MAT_TIME + path.stat().st_size / MAT_SPEED
+        try:
+            done = subprocess.run(program, capture_output=True, text=True, check=False, timeout=seconds)
+        except subprocess.TimeoutExpired as cause:
+            raise FluxError(
+                f"'{path}' cannot be read as a MATLAB file: SciPy comes to no end in {seconds:.0f} s. Save it anew."
+            ) from cause
         if done.returncode == 0:
             return {name.removeprefix("_"): array for name, array in read_npz(target).items()}
     reason = done.stderr.strip().split("\n")[-1] if done.returncode == 1 else "SciPy crashes at it. Save it anew"
     raise FluxError(f"'{path}' cannot be read as a MATLAB file: {reason}.")
+
+
+def whole_numbers(table: NDArray, where: str) -> NDArray[np.int64]:
+    """`table` of real numbers as integers; FluxError if one of them is not whole."""
+    with np.errstate(invalid="ignore"):
+        found = table.astype(np.int64)
+    if not np.array_equal(found, table):
+        wrong = table[found != table].ravel()[0]
+        raise FluxError(f"{where} must be whole numbers, one is {wrong:g}. Save the file anew.")
+    return found
 
 
 def require_file(path: Path) -> None:
