@@ -16,7 +16,7 @@ from mitsuba_fspt.runtime.deadline import Deadline
 from mitsuba_fspt.runtime.errors import SceneError
 
 # How often work may be left out before it is: between the levels, or between batches of a thousand lines of sight.
-BETWEEN_LEVELS, BETWEEN_BATCHES = (0, 1, 2, 3, 5, 9, 30), (4, 12)
+BETWEEN_LEVELS, BETWEEN_BATCHES = (0, 1, 2, 3, 5, 9, 30), (3, 5, 12)
 
 
 class After(Deadline):
