@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +96,12 @@ class BandImages:
         """
         x, y, z = (float(value) for value in position)
         solution = self.tissue.solve([Source(Sphere((x, y, z)))])
-        return self.share * solution.exitance_at(self.surface.vertices)
+        return self.share * solution.exitance_at(self.surface.vertices, self._places)
+
+    @cached_property
+    def _places(self) -> tuple[Index, Array]:
+        """Where the surface's vertices are in the tetrahedra."""
+        return self.tissue.places(self.surface.vertices)
 
     def from_fluence(self) -> csr_array:
         """(N, W) power on the pixels from the fluence at the W vertices of the tetrahedra: J_n = φ/(2A) [mm²]."""

@@ -35,7 +35,6 @@ Images: TypeAlias = (
     ArrayLike | Sequence[Image | Exposure | str | os.PathLike[str]] | Image | Exposure | os.PathLike[str]
 )
 MOST_SOURCES = 20
-CHANCE = 1e-3  # largest probability that noise alone looks like a source of which nothing is told
 LOG = logging.getLogger("mitsuba_fspt")
 
 
@@ -186,7 +185,7 @@ def _located(
             "large; they may be too narrow. Give fewer sources, or images with less noise."
         )
     p_values = fit.p_values(found, len(grid.inner))
-    for k in np.flatnonzero(p_values > CHANCE):
+    for k in np.flatnonzero(p_values > settings.chance):
         LOG.warning(
             "fspt: locate: the images do not show that source %d is there, noise alone may look like it (p = %.2g). "
             "%s images with less noise.",
@@ -237,7 +236,7 @@ def _band_images(
         )
     bands = []
     for one, (surface, measurement, optics) in zip(given, read, strict=True):
-        tissue = Tissue(mesh, optics.media, a=described.a, order=described.order)
+        tissue = Tissue(mesh, optics.media, a=described.a, order=described.order, repeated=True)
         with renamed("locate", one.label):
             bands.append(BandImages.of(one.name, one.matrix, surface, measurement, tissue, optics.share))
     return bands

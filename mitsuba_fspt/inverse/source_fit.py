@@ -31,6 +31,9 @@ class LocationSettings:
     chi2 : fall of Σ (residual/σ)² by a step at which the fit ends: 1e-2 leaves parameters within 0.1 of their sd
     step : of the differences for slopes, over the edge of the tetrahedra; the slopes are right to about 1 %
     steps : most accepted steps;  damping, least : first and least factor of Levenberg and Marquardt
+    flat, patience : fall of Σ (residual/σ)² below which a step counts as one along a valley, and steps in a row after
+        which the fit ends there: the images do not determine the place along it, which the intervals and p-values say
+    chance : largest probability that noise alone looks like a source of which nothing is told
     stuck : factor of damping at which no step is left: the minimum is at the border, or beyond
     apart : least singular value of the slopes with columns of length 1, over the largest; below it sources count as not
         determined separately
@@ -41,6 +44,9 @@ class LocationSettings:
     steps: int = 40
     damping: float = 1e-3
     least: float = 1e-9
+    flat: float = 0.5
+    patience: int = 3
+    chance: float = 1e-3
     stuck: float = 1e8
     apart: float = 1e-3
 
@@ -147,7 +153,7 @@ class SourceFit:
             except InversionError as error:
                 failed = error
             else:
-                if len(found) == 1:
+                if len(found) == 1 and (self.p_values(found[0], len(grid.inner)) <= self.settings.chance).all():
                     starts += replace(grid, sigma=found[0].sigma).positions(count)
         if failed and not found:
             raise failed
@@ -157,6 +163,7 @@ class SourceFit:
         """Sources of least Σ (residual/σ)² from these first positions; σ is that of the last step."""
         settings, damping = self.settings, self.settings.damping
         found = self._tried(positions, np.concatenate([band.flat_sigma() for band in self.bands]), np.inf)
+        flat = 0
         for step in range(settings.steps):
             if found is None:
                 break
@@ -166,13 +173,14 @@ class SourceFit:
             lengths = np.linalg.norm(slopes, axis=0)
             normal = slopes.T @ slopes / np.outer(lengths, lengths)
             right = slopes.T @ found.residual(self.power) / lengths
-            if right @ np.linalg.lstsq(normal, right)[0] < settings.chi2:
+            if flat == settings.patience or right @ np.linalg.lstsq(normal, right)[0] < settings.chi2:
                 return found
             tried = None
             while tried is None and damping < settings.stuck:
                 moved = np.linalg.solve(normal + damping * np.eye(len(normal)), right) / lengths
                 tried = self._tried(positions + moved.reshape(-1, 4)[:, :3], found.sigma, found.cost)
                 damping *= 10 if tried is None else 0.1
+            flat = flat + 1 if tried is not None and found.cost - tried.cost < settings.flat else 0
             found, damping = tried, max(damping, settings.least)
         shown = "; ".join(f"({', '.join(f'{x:.4g}' for x in position)})" for position in positions)
         raise InversionError(

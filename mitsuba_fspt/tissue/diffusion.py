@@ -19,16 +19,19 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..optics.boundary import boundary_a
 from ..optics.media import Medium, Source
 from ..runtime.errors import FluxError
-from .finite_elements import System
+from .finite_elements import Solved, System
 from .free_field import FreeField
 from .solution import DiffusionSolution
 from .tetrahedra import OUTSIDE, Tetrahedra, depth
 
 Progress = Callable[[str], None]
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 LARGEST_IMBALANCE = 1e-5
 
@@ -69,7 +72,7 @@ def solve(
 class Tissue:
     """Tissue without sources: mesh, media, boundary factors and the finite elements, which serve any sources.
 
-    Arguments as of `solve`.
+    Arguments as of `solve`; `repeated`: it will be solved for many sources, see `System`.
 
     Raises
     ------
@@ -77,7 +80,15 @@ class Tissue:
     BackendError : scikit-fem or SciPy is missing.
     """
 
-    def __init__(self, mesh: Tetrahedra, media: Sequence[Medium], *, a: str | float = "robin", order: int = 2) -> None:
+    def __init__(
+        self,
+        mesh: Tetrahedra,
+        media: Sequence[Medium],
+        *,
+        a: str | float = "robin",
+        order: int = 2,
+        repeated: bool = False,
+    ) -> None:
         if order not in (1, 2):
             raise FluxError(f"solve: 'order' must be 1 or 2, got {order}.")
         if mesh.region.min() < 0 or mesh.region.max() >= len(media):
@@ -87,11 +98,18 @@ class Tissue:
             )
         self.mesh, self.media, self._a = mesh, tuple(media), a
         self.factors = tuple(boundary_a(a, medium.n) for medium in media)
-        self.system = System(mesh, order, [m.diffusion for m in media], [m.mua for m in media], self.factors)
+        self.system = System(mesh, order, [m.diffusion for m in media], [m.mua for m in media], self.factors, repeated)
 
     def linear(self) -> Tissue:
         """The same tissue with finite elements of order 1."""
         return Tissue(self.mesh, self.media, a=self._a, order=1)
+
+    def places(self, points: Array) -> tuple[Index, Array]:
+        """Cells (N,) and local coordinates (N, 3) of `points` (N, 3) [mm], for `exitance_at` of any solution."""
+        nothing = Solved(np.zeros(self.system.basis.N), 0.0, 0.0, 0)
+        return DiffusionSolution(self.mesh, self.system.basis, self.media, self.factors, (), 0.0, nothing).places(
+            points
+        )
 
     def solve(self, sources: Sequence[Source]) -> DiffusionSolution:
         """Solution for these sources; raises FluxError as `solve`."""

@@ -72,12 +72,12 @@ class DiffusionSolution:
         For points just outside, w is that of a nearby point of the border. Closer than `core` [mm] to a point source φ
         is set constant; with core 0 it is infinite at the source.
         """
-        cells, local = self._locate(points)
+        cells, local = self.places(points)
         return self._fluence(points, cells, local, core)
 
-    def exitance_at(self, points: Array) -> Array:
-        """J_n = φ/(2A) [W/mm²] at `points` (N, 3) [mm] of the border, shape (N,)."""
-        cells, local = self._locate(points)
+    def exitance_at(self, points: Array, places: tuple[Index, Array] | None = None) -> Array:
+        """J_n = φ/(2A) [W/mm²] at `points` (N, 3) [mm] of the border, shape (N,); `places` of them, where known."""
+        cells, local = places or self.places(points)
         factor = np.asarray(self.factors)[self.mesh.region[cells]]
         return self._fluence(points, cells, local, 0.0) / (2 * factor)
 
@@ -145,7 +145,7 @@ class DiffusionSolution:
 
     def _continued(self, points: Array, nearest: Array) -> Array:
         """φ [W/mm²] at `points` outside the tissue, from the `nearest` points of the border."""
-        cells, local = self._locate(nearest)
+        cells, local = self.places(nearest)
         region = self.mesh.region[cells]
         length = np.array([2 * a * m.diffusion for a, m in zip(self.factors, self.media, strict=True)])[region]
         distance = np.linalg.norm(points - nearest, axis=1)
@@ -170,7 +170,7 @@ class DiffusionSolution:
         """Basis functions of a cell at local coordinates (N, 3), each of shape (N,)."""
         return [self.basis.elem.lbasis(local.T, i)[0] for i in range(self.basis.Nbfun)]
 
-    def _locate(self, points: Array) -> tuple[Index, Array]:
+    def places(self, points: Array) -> tuple[Index, Array]:
         """Cells and local coordinates of points, the coordinates clamped to the cell."""
         cells, local = self._curved(points, *self.mesh.locate(points))
         rest = np.maximum(1 - local.sum(axis=1, keepdims=True), 0)
