@@ -27,10 +27,6 @@ if TYPE_CHECKING:
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
-# Largest power by which the error falls with the number of points where the integrand jumps at a smooth edge:
-# 1/2 + 1/(2 d) if the edge depends on d coordinates, d = 2 in focus. A pixel is given up where `MOST` points would not
-# suffice at that rate.
-ORDER = 0.75
 
 
 def refine_by_lattices(draft: Draft) -> None:
@@ -64,9 +60,7 @@ def refine_by_lattices(draft: Draft) -> None:
             dr.scatter(image, column, means.pixels, better)
         dr.eval(images)
         draft.value, draft.coverage, draft.error = images
-        share = points / most
-        reached = dr.maximum(dr.opaque(mi.Float64, share**ORDER) * scatter, dr.opaque(mi.Float64, share) * unmet)
-        left = (error > tolerance) & (reached <= tolerance)
+        left = error > tolerance
         if not dr.any(left):
             break
         means = means.of(left)

@@ -54,7 +54,8 @@ class _Refinement:
     edges : direction and blur of the edge on each pixel
     has_jump : True where a transect has crossed a jump
     smooth : True where no transect has crossed one, so that node rules may converge
-    remaining : error of each pixel that follows from its own transects [W/mm²/sr]
+    value, remaining : of the last level of each pixel, and the error that follows from its own transects [W/mm²/sr]
+    own : the same error of the value in `draft`, that of an earlier level if it is smaller there [W/mm²/sr]
     count, means : number of transects of the last level, and their means
     """
 
@@ -63,7 +64,8 @@ class _Refinement:
         self.estimator = draft.estimator
         self.where = rough & self.wanted
         self.has_jump, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
-        self.remaining = draft.grid.full(mi.Float64, 0)
+        self.value = draft.value
+        self.remaining, self.own = (draft.grid.full(mi.Float64, 0) for _ in range(2))
         self.count = 0
         self.means: Means | None = None
 
@@ -83,7 +85,7 @@ class _Refinement:
         self.has_jump |= first_met
         self.smooth = self.smooth & where & ~self.has_jump
         value, coverage = self._smooth_by_nodes(level)
-        change = dr.abs(value - draft.value)
+        change = dr.abs(value - self.value)
         if level == 0:
             remaining, around = self._after_first(first_met, change, parted(coverage))
         else:
@@ -91,17 +93,30 @@ class _Refinement:
             self.smooth = self.smooth & (value > 0)  # where all is dark, only transects detect a small body
         # An edge may reach into pixels around whose transects have crossed no jump.
         around = dr.select((self.has_jump & where) | ~draft.computed, 0, around)
-        self.remaining = dr.select(where, remaining, self.remaining)
         replaced = where if level else first_met  # without a jump, nodes are more accurate than two transects
-        draft.value = dr.select(replaced, value, draft.value)
-        draft.set_coverage(dr.select(replaced, coverage, draft.coverage))
-        error = dr.maximum(self.remaining, self._by_neighbours(self.has_jump & ~first_met))
+        self.value = dr.select(replaced, value, self.value)
+        self.remaining = dr.select(where, remaining, self.remaining)
+        kept = self._earlier_is_better(remaining, first_met) if level else mi.Bool(False)
+        self.own = dr.select(where & ~kept, remaining, self.own)
+        draft.value = dr.select(replaced & ~kept, value, draft.value)
+        draft.set_coverage(dr.select(replaced & ~kept, coverage, draft.coverage))
+        error = dr.maximum(self.own, self._by_neighbours(self.has_jump & ~first_met))
         draft.error = dr.maximum(dr.select(where, error, draft.error), around)
         tolerance = draft.tolerance
         dark = (tolerance <= 0) & dr.opaque(mi.Bool, level + 1 < DARK_LEVELS)
         self.where = (where | (around > 0)) & ((draft.error > tolerance) | dark) & self.wanted
         self.count = len(rule)
-        dr.eval(draft.value, draft.error, self.has_jump, self.smooth, self.remaining, self.where)
+        dr.eval(draft.value, draft.error, self.has_jump, self.smooth, self.where)
+        dr.eval(self.value, self.remaining, self.own)
+
+    def _earlier_is_better(self, remaining: PixelArray, first_met: Mask) -> Mask:
+        """Pixels whose value in the draft has a smaller error than that of this level, which lies within that error.
+
+        A value beyond it contradicts the earlier error, which was too small, and so does a jump that is new. Without an
+        earlier level the error is 0.
+        """
+        agrees = dr.abs(self.value - self.draft.value) <= self.own
+        return agrees & (self.own > 0) & (self.own < remaining) & ~first_met
 
     def _smooth_by_nodes(self, level: int) -> tuple[PixelArray, PixelArray]:
         """Value and coverage of the level: by a node rule on smooth pixels, by transects on the others."""
@@ -122,7 +137,7 @@ class _Refinement:
         `neighbour_share` of a neighbour's error; all of it where the edge is sharp, or where the neighbour's transects
         have crossed a jump and those of the pixel had not (`met_before`).
         """
-        near, with_jump = self.draft.grid.spread_all((self.remaining, dr.select(self.has_jump, self.remaining, 0)))
+        near, with_jump = self.draft.grid.spread_all((self.own, dr.select(self.has_jump, self.own, 0)))
         share = dr.opaque(mi.Float64, self.estimator.neighbour_share)
         blurred = dr.maximum(share * near, dr.select(met_before, 0, with_jump))
         return dr.select(self.edges.sharp, near, blurred)
