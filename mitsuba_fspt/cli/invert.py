@@ -11,7 +11,7 @@ from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import InversionError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Quiet, Sampled, require_picture, require_writable
+from .options import AsJson, GainError, GainPerView, Quiet, Sampled, require_picture, require_writable
 from .terminal import print_result
 
 if TYPE_CHECKING:
@@ -29,9 +29,8 @@ def invert(
     seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
     confidence: Annotated[float, typer.Option(help="Of the intervals.")] = 0.9,
     weight: Annotated[float | None, typer.Option(help="Of the penalty on roughness [mm2]; found if left out.")] = None,
-    gain_error: Annotated[
-        float | None, typer.Option(help="Relative uncertainty common to all pixels; that of the images if left out.")
-    ] = None,
+    gain_error: GainError = None,
+    gain_per_view: GainPerView = 0.0,
     sampled: Sampled = False,
     method: Annotated[
         str,
@@ -64,6 +63,7 @@ def invert(
             [read_measured(path) for path in images],
             weight=weight,
             gain_error=gain_error,
+            gain_per_view=gain_per_view,
             sampled=sampled,
             samples=samples,
             seed=seed,

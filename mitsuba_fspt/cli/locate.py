@@ -11,7 +11,7 @@ from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import InversionError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Quiet, Sampled, require_writable
+from .options import AsJson, GainError, GainPerView, Quiet, Sampled, require_writable
 from .terminal import print_result
 
 if TYPE_CHECKING:
@@ -33,9 +33,8 @@ def locate(
         list[str] | None, typer.Option(help="Name of [bands.NAME] in PHANTOM.toml; one for each T.npz.")
     ] = None,
     confidence: Annotated[float, typer.Option(help="Of the intervals.")] = 0.9,
-    gain_error: Annotated[
-        float | None, typer.Option(help="Relative uncertainty common to all pixels; that of the images if left out.")
-    ] = None,
+    gain_error: GainError = None,
+    gain_per_view: GainPerView = 0.0,
     sampled: Sampled = False,
     scene: Annotated[Path | None, typer.Option(metavar="SCENE.xml", help="Scene of T.npz, where it has moved.")] = None,
     as_json: AsJson = False,
@@ -67,6 +66,7 @@ def locate(
             sources=sources,
             confidence=confidence,
             gain_error=gain_error,
+            gain_per_view=gain_per_view,
             sampled=sampled,
             scene=scene,
             progress=progress,

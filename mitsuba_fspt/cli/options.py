@@ -53,6 +53,12 @@ Seed = Annotated[int | None, typer.Option(help="Seed of the Monte Carlo.")]
 SourcePower = Annotated[
     float | None, typer.Option(metavar="W", help="Power of the light source [W], for a scene that is per 1 W of it.")
 ]
+GainError = Annotated[
+    float | None, typer.Option(help="Relative uncertainty common to all pixels; that of the images if left out.")
+]
+GainPerView = Annotated[
+    float, typer.Option(metavar="SD", help="Relative uncertainty of a factor of each view, fitted along; 0: none.")
+]
 Sampled = Annotated[
     bool, typer.Option("--sampled", help="Images of a Monte Carlo: their errors come from the scatter of samples.")
 ]

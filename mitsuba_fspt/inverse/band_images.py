@@ -86,8 +86,21 @@ class BandImages:
 
     def sigma(self, exitance: Array) -> Array:
         """Noise (N,) [W] for J_n (V,) [W/mm²], with the numerical error of the matrix (Eq. M.24)."""
-        numerical = self.matrix.error(self.surface.from_vertices @ exitance).ravel()[self.rows]
-        return self.measurement.sigma(self.rows, self.transport @ exitance, numerical, "locate")
+        return self.measurement.sigma(self.rows, self.transport @ exitance, self.numerical(exitance), "locate")
+
+    def numerical(self, exitance: Array) -> Array:
+        """Numerical error (N,) [W] of the power for J_n (V,) [W/mm²]."""
+        return self.matrix.error(self.surface.from_vertices @ exitance).ravel()[self.rows]
+
+    @property
+    def view(self) -> Index:
+        """(N,) number of the view of each pixel."""
+        return self.rows // int(np.prod(self.matrix.image_shape[1:]))
+
+    def places(self) -> Array:
+        """(N, 3) mean point of the surface [mm] that each pixel sees."""
+        seen = np.asarray(self.transport.sum(axis=1)).ravel()
+        return np.asarray(self.transport @ self.surface.vertices) / seen[:, None]
 
     def exitance(self, position: Array) -> Array:
         """(V,) J_n [1/mm²] at the surface's vertices in this band, per watt of a point source over all bands.

@@ -30,6 +30,10 @@ LOG = logging.getLogger("mitsuba_fspt")
 class Inversion:
     """Surface flux density J_n from pictures, on the columns of a transport matrix.
 
+    The intervals contain the noise, the numerical error of the matrix and a common factor. They leave out errors of the
+    model: pose, lens, mesh, exit law, flat field, factors of single views. `warnings` say what the residuals show of
+    these, by χ² and by structure over the views (Eq. M.34).
+
     Attributes
     ----------
     matrix, surface : the transport matrix and its mesh
@@ -45,6 +49,8 @@ class Inversion:
         gap of the log-likelihood
     converged : False where variances or weight still changed in the last round
     gain_error : relative uncertainty of a common factor, contained in the intervals
+    gain_per_view : relative standard deviation of a factor of each view, fitted along and contained in the intervals
+    view_factors : (views,) these factors, which `fitted` contains;  view_factor_draws : (views, samples) draws of them
     measured, fitted, sigma : (views, height, width) [W]; NaN where masked, or outside the surface
     warnings : lines of stderr on what the residuals say of the model and of the stated errors
     """
@@ -63,6 +69,9 @@ class Inversion:
     decrement: float
     converged: bool
     gain_error: float
+    gain_per_view: float
+    view_factors: Array
+    view_factor_draws: Array
     chi2_sum: float
     measured: Array
     fitted: Array
@@ -129,6 +138,12 @@ class Inversion:
         low, high = self._between(given @ self._drawn())
         return float(low), float(high)
 
+    @property
+    def view_factor_sd(self) -> Array:
+        """(views,) standard deviation of the factor of each view; 0 without `gain_per_view`."""
+        self._drawn()
+        return self.view_factor_draws.std(axis=1, ddof=1)
+
     def _between(self, draws: Array) -> Array:
         """Ends of the interval of draws (..., samples): the next draw lies within it with the `confidence`.
 
@@ -167,8 +182,12 @@ class Inversion:
             "samples": self.draws.shape[1],
             "warnings": list(self.warnings),
         }
+        if self.gain_per_view:
+            found |= {"gain_per_view": self.gain_per_view, "view_factors": self.view_factors.tolist()}
         if self.draws.shape[1]:
             found |= {"confidence": self.confidence, "total_interval": list(self.total_interval)}
+        if self.draws.shape[1] and self.gain_per_view:
+            found |= {"view_factor_sd": self.view_factor_sd.tolist()}
         return found
 
     def write(self, path: str | os.PathLike[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from .inversion import Inversion
 
 RESIDUAL = 4.0  # standard deviations at the ends of the colour scale
+LINE = 150  # characters of a line of warnings
 
 
 def exitance_images(inversion: Inversion) -> NDArray[np.float64]:
@@ -57,6 +59,9 @@ def draw(inversion: Inversion) -> Figure:
         bar = figure.colorbar(drawn, ax=list(axes[:, column]), location="bottom", shrink=0.9, pad=0.02)
         bar.ax.locator_params(axis="x", nbins=5)
         bar.ax.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3))
+    if inversion.warnings:
+        told = "\n".join(fill(line, LINE) for line in inversion.warnings)
+        figure.suptitle(told, fontsize="small", color="firebrick")
     return figure
 
 

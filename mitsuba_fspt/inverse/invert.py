@@ -14,24 +14,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import block_diag, csr_array, diags_array, hstack
 
 from ..images.exposure import Exposure
 from ..images.image import Image
 from ..runtime.errors import InversionError
-from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
 from .fit_settings import Settings
 from .inversion import Inversion
-from .measurement import LOG, Measurement, tell_misfit
+from .invert_options import Options, require_matrix
+from .measurement import LOG, Measurement, tell_misfit, told
 from .mlem import mlem
 from .multipliers import Minima
 from .nonnegative import Accuracy, Solve, factor, minimise
 from .outlook import is_hopeless
+from .patterns import Patterns, views_of
 from .seen_area import seen_share
+from .sensitivity_picture import view_labels
 from .smoothness import Prior, Smoothness
+from .structure import common_errors, structure
 from .surface import CREASE_ANGLE, Surface
 from .transport_matrix import TransportMatrix
+from .view_factors import ViewFactors
+from .weight_search import secant
 
 Array = NDArray[np.float64]
 MOST = 0.5  # of the area of a vertex: with less of it seen, J_n there says little about its power
@@ -47,6 +52,7 @@ def invert(
     weight: float | None = None,
     prior: Prior | None = None,
     gain_error: float | None = None,
+    gain_per_view: float = 0.0,
     sampled: bool = False,
     samples: int = 0,
     seed: int = 0,
@@ -70,16 +76,15 @@ def invert(
     weight : of the penalty on roughness [mm²], >= 0; None: the weight that agrees with the roughness found (Eq. M.25)
     prior : mean, reference and correlation length of the penalty; None: roughness relative to J_n itself is penalised
     gain_error : relative uncertainty of a factor common to all pixels, in [0, 1); None: that of the images, else 0
-    sampled : True for images of a Monte Carlo, whose errors the scatter of samples gave: the variance of a pixel is
-        then a smooth function of the fitted signal (Eq. M.27), and errors of 0 are allowed. Images whose metadata name
-        `passes` are taken so by themselves
+    gain_per_view : relative standard deviation of a factor of each view, fitted along (Eq. M.35), in [0, 1); 0: none
+    sampled : True for images of a Monte Carlo, whose variance is then a smooth function of the fitted signal (Eq. M.27)
+        and whose errors may be 0; images whose metadata name `passes` are taken so by themselves
     samples, seed : number of random draws, from which the intervals follow (0: none), and their seed, 0 … 2⁵³
-    confidence : of the intervals, in (0, 1)
     method : 'smooth', with the penalty; or 'mlem', maximum likelihood without penalty and intervals (Eq. M.28)
     crease_angle : [degree], 0 … 180: J_n is not smoothed across edges of a larger one, such as a rim; 180: across all
     scene : scene with the meshes of the matrix, where its own cannot be read any more
     progress : function of the present step (text) and the share done (0 … 1); None: a bar in notebooks
-    settings : accuracy
+    confidence, settings : of the intervals, in (0, 1); accuracy of the fit
 
     Raises
     ------
@@ -88,71 +93,20 @@ def invert(
     TransportError, DetectorError : images that do not fit the matrix, counts without their detector's numbers.
     ImageError : a file of an image cannot be read.
     """
-    _require_matrix(matrix)
-    options = Options(weight, samples, seed, confidence, method, crease_angle)
+    require_matrix(matrix)
+    options = Options(weight, samples, seed, confidence, method, crease_angle, gain_per_view)
     measurement = Measurement.of(matrix, images, error, mask, gain_error, sampled)
     surface = replace(Surface.of(matrix, scene), crease_angle=options.crease_angle)
-    problem = Problem.of(matrix, measurement, surface, prior or Prior(), settings or Settings())
+    settings, prior = settings or Settings(), prior or Prior()
+    problem = Problem.of(matrix, measurement, surface, prior, settings, options.gain_per_view)
     with reported(progress) as report:
         found = problem.solved(options, report)
     return found
 
 
-def _require_matrix(matrix: object) -> None:
-    """Raise InversionError where it is no transport matrix."""
-    if not isinstance(matrix, TransportMatrix):
-        raise InversionError(
-            f"invert: the first argument must be a transport matrix, got {type(matrix).__name__}. Make one with "
-            "fspt.transport, or read one with fspt.read_transport."
-        )
-
-
-@dataclass(frozen=True)
-class Options:
-    """Checked arguments of `invert`; InversionError for one outside its range."""
-
-    weight: float | None
-    samples: int
-    seed: int
-    confidence: float
-    method: str = "smooth"
-    crease_angle: float = CREASE_ANGLE
-
-    def __post_init__(self) -> None:
-        angle = number("invert: 'crease_angle'", self.crease_angle, InversionError, "45")
-        if not 0 <= angle <= 180:
-            raise InversionError(
-                f"invert: 'crease_angle' must be in 0 … 180 degrees, got {angle:g}. Give 45, or 180 to smooth across "
-                "all edges."
-            )
-        object.__setattr__(self, "crease_angle", angle)
-        if self.method not in ("smooth", "mlem"):
-            raise InversionError(f"invert: 'method' must be 'smooth' or 'mlem', got {self.method!r}. Give one of them.")
-        if self.method == "mlem" and (self.samples or self.weight):
-            raise InversionError("invert: method 'mlem' has no weight and no intervals. Leave out weight and samples.")
-        if self.weight is not None:
-            weight = number("invert: 'weight'", self.weight, InversionError, "1.0")
-            if not 0 <= weight < np.inf:
-                raise InversionError(
-                    f"invert: 'weight' must be finite and >= 0 mm², got {weight:g}. Give 1.0, or None."
-                )
-            object.__setattr__(self, "weight", weight)
-        confidence = number("invert: 'confidence'", self.confidence, InversionError, "0.9")
-        if not 0 < confidence < 1:
-            raise InversionError(f"invert: 'confidence' must be in (0, 1), got {confidence:g}. Give for example 0.9.")
-        object.__setattr__(self, "confidence", confidence)
-        for name, most in (("samples", 1_000_000), ("seed", 1 << 53)):
-            value = whole(f"invert: '{name}'", getattr(self, name), InversionError, "200")
-            if not 0 <= value <= most:
-                raise InversionError(f"invert: '{name}' must be in 0 … {most}, got {value}. Give for example 200.")
-            object.__setattr__(self, name, value)
-        if self.samples == 1:
-            raise InversionError("invert: 'samples' = 1 gives no interval. Give for example 200, or 0 for none.")
-
-
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """State of the fit: x = J_n/reference (m,), standard deviations (N,) [W], the weight, determined unknowns γ.
+    """State of the fit: x = J_n/reference (m,) and unknowns of factors, σ (N,) [W], weight, determined unknowns γ.
 
     correction : (N,) [W], added to the data: what variances of the fitted signal take from it (Eq. M.29)
     converged : False where variances or weight still changed in the last round
@@ -175,6 +129,7 @@ class Problem:
     rows : numbers of these pixels;  transport : (N, m) [W], the power of x = 1
     sensitivity : (points,) of the mesh to these pixels [mm²]
     bounded : (m,) unknowns that some pixel sees: J_n >= 0 holds there, the others only continue them
+    factors : of the views, unknowns after those of J_n
     """
 
     matrix: TransportMatrix
@@ -188,6 +143,7 @@ class Problem:
     reference: float
     prior: Prior
     settings: Settings
+    factors: ViewFactors
 
     @classmethod
     def of(
@@ -197,6 +153,7 @@ class Problem:
         surface: Surface,
         prior: Prior,
         settings: Settings,
+        gain_per_view: float = 0.0,
     ) -> Problem:
         rows = np.flatnonzero((np.diff(matrix.matrix.indptr) > 0) & ~measurement.mask)
         if not len(rows):
@@ -214,12 +171,32 @@ class Problem:
         smooth = Smoothness.of(surface, prior.correlation_length)
         part = csr_array(part * reference)
         bounded = part.sum(axis=0) > 0
-        return cls(matrix, surface, measurement, rows, part, sensitivity, bounded, smooth, reference, prior, settings)
+        views, height, width = matrix.image_shape
+        own = reference, prior, settings, ViewFactors(gain_per_view, rows // (height * width), views)
+        return cls(matrix, surface, measurement, rows, part, sensitivity, bounded, smooth, *own)
+
+    def signal(self, x: Array) -> Array:
+        """(N,) power on the pixels [W], with the factors of the views."""
+        count = self.surface.unknowns
+        return np.asarray((self.transport @ x[:count]) * self.factors.of(x[count:])[self.factors.view])
+
+    def design(self, x: Array) -> csr_array:
+        """(N, m + factors) slopes of the power [W] with J_n, and with the factors of the views at x."""
+        if not self.factors.count:
+            return self.transport
+        columns = self.factors.columns(self.transport @ x[: self.surface.unknowns])
+        return csr_array(hstack([self.transport, columns], format="csr"))
+
+    @property
+    def bounds(self) -> NDArray[np.bool_]:
+        """(m + factors,) unknowns that are >= 0."""
+        return np.concatenate([self.bounded, np.zeros(self.factors.count, bool)])
 
     def solved(self, options: Options, report: Progress) -> Inversion:
         """Fit and draws, with more unknowns where the data determine too many of them."""
         if options.method == "mlem":
-            return self.result(self.most_likely(report), np.empty((self.surface.unknowns, 0)), options)
+            none = np.empty((self.surface.unknowns + self.factors.views, 0))
+            return self.result(self.most_likely(report), none, options)
         if options.weight == 0:
             self._require_pixels()
         whole, levels = self, self.surface.coarser() if options.weight != 0 else [self.surface]
@@ -242,6 +219,10 @@ class Problem:
         _report_unconverged(fit, problem.settings.rounds)
         return problem.result(fit, draws, options)
 
+    def _carried(self, x: Array, coarse: Surface) -> Array:
+        """Unknowns of a fit on a coarser surface as those of this problem."""
+        return np.concatenate([self.surface.carried(x[: coarse.unknowns], coarse), x[coarse.unknowns :]])
+
     def free_on(self, surface: Surface) -> Problem:
         """The same problem with other unknowns, none of which is bounded."""
         found = self._with(surface)
@@ -251,7 +232,7 @@ class Problem:
         """The same problem with other unknowns."""
         if surface is self.surface:
             return self
-        return Problem.of(self.matrix, self.measurement, surface, self.prior, self.settings)
+        return Problem.of(self.matrix, self.measurement, surface, self.prior, self.settings, self.factors.sd)
 
     def fitted(
         self, options: Options, report: Progress, coarse: tuple[Surface, Fit, Fit] | None = None
@@ -263,7 +244,7 @@ class Problem:
         """
         start = first = None
         if coarse is not None:
-            first, start = (replace(one, x=self.surface.carried(one.x, coarse[0])) for one in coarse[1:])
+            first, start = (replace(one, x=self._carried(one.x, coarse[0])) for one in coarse[1:])
         problem = self
         if options.weight != 0 and self.prior.reference is None:
             if first is None:
@@ -287,7 +268,7 @@ class Problem:
 
     def relative_to(self, x: Array) -> Problem:
         """The same problem with a penalty relative to a first fit x: ρ = J_n, at least a share of the reference."""
-        light = np.maximum(x, self.settings.darkest)
+        light = np.maximum(x[: self.surface.unknowns], self.settings.darkest)
         relative = np.where(self.bounded, light, 1.0)
         return replace(self, smoothness=Smoothness.of(self.surface, self.prior.correlation_length, relative))
 
@@ -307,7 +288,8 @@ class Problem:
         numerical = np.zeros_like(power)
         # A start that no bright or dark pixel leads astray: the same noise on all of them.
         sigma = self._sigma(np.full_like(power, np.maximum(power, 0).mean()), numerical)
-        state = Fit(np.ones(self.surface.unknowns), sigma, numerical, 0 * numerical, weight or 0.0, np.nan, np.nan)
+        x = np.concatenate([np.ones(self.surface.unknowns), np.zeros(self.factors.count)])
+        state = Fit(x, sigma, numerical, 0 * numerical, weight or 0.0, np.nan, np.nan)
         if start is not None:
             state = replace(start, weight=state.weight)
         if weight is None:
@@ -326,7 +308,7 @@ class Problem:
                 break
             if weight is None:
                 tried = [*tried[-1:], (float(np.log(before.weight)), float(np.log(state.weight)))]
-                state = replace(state, weight=float(np.exp(_secant(tried))))
+                state = replace(state, weight=float(np.exp(secant(tried))))
         if not rough and state.decrement > self.settings.accuracy.decrement:
             state = self._improved(state, probes, weight, self.settings.accuracy)
         return replace(state, converged=converged)
@@ -342,20 +324,22 @@ class Problem:
         power = self.measurement.power[self.rows]
         x, gap = mlem(self.transport, power, 1 / shot, background, self.settings.mlem, lambda s: report("fit", s))
         numerical = self._numerical(x)
-        return Fit(x, self._sigma(self.transport @ x, numerical), numerical, 0 * numerical, 0.0, 0.0, 2 * gap)
+        return Fit(x, self._sigma(self.signal(x), numerical), numerical, 0 * numerical, 0.0, 0.0, 2 * gap)
 
     def _improved(self, state: Fit, probes: Array, weight: float | None, accuracy: Accuracy) -> Fit:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
-        normal, solve = self._normal(state.sigma, state.weight)
-        right = self._right(self.measurement.power[self.rows] + state.correction, state.sigma, state.weight)
-        start = Minima(normal, solve, self.bounded, self.settings.columns).near(right[:, None], state.x)
-        found = minimise(normal, right[:, None], start, self.bounded, solve, accuracy)
+        design, count = self.design(state.x), self.surface.unknowns
+        normal, solve = self._normal(design, state.sigma, state.weight)
+        right = self._right(design, self.measurement.power[self.rows] + state.correction, state.sigma, state.weight)
+        start = Minima(normal, solve, self.bounds, self.settings.columns).near(right[:, None], state.x)
+        found = minimise(normal, right[:, None], start, self.bounds, solve, accuracy)
         x = found.x[:, 0]
-        determined, correction = self._fitted_noise(solve, state.sigma, probes)
-        if weight is None:  # Eq. M.25
-            weight = determined / max(self.smoothness.energy(x - self.mean), 1e-300)
+        determined, correction = self._fitted_noise(design, solve, state.sigma, probes)
+        if weight is None:  # Eq. M.25, of J_n
+            rough = max(self.smoothness.energy(x[:count] - self.mean), 1e-300)
+            weight = max(determined - self._determined_factors(solve), 1e-3 * determined) / rough
         numerical = self._numerical(x)
-        sigma = self._sigma(self.transport @ x, numerical)
+        sigma = self._sigma(self.signal(x), numerical)
         return Fit(x, sigma, numerical, correction, weight, determined, float(found.decrement[0]))
 
     def _first_weight(self, sigma: Array) -> float:
@@ -363,32 +347,48 @@ class Problem:
         trace = float((self.transport.multiply((1 / sigma)[:, None]) ** 2).sum())
         return max(self.settings.first * trace / float(self.smoothness.matrix.diagonal().sum()), 1e-300)
 
-    def _fitted_noise(self, solve: Solve, sigma: Array, probes: Array) -> tuple[float, Array]:
+    def _determined_factors(self, solve: Solve) -> float:
+        """Number of factors of views that the data determine: their count less the trace of their covariance."""
+        count, own = self.factors.count, np.arange(self.factors.count)
+        if not count:
+            return 0.0
+        unit = np.zeros((self.surface.unknowns + count, count))
+        unit[self.surface.unknowns + own, own] = 1
+        return count - float(np.trace(solve(unit)[self.surface.unknowns :]))
+
+    def _fitted_noise(self, design: csr_array, solve: Solve, sigma: Array, probes: Array) -> tuple[float, Array]:
         """γ, the number of unknowns that the data determine, and the correction of the data (N,) [W] (Eq. M.25, M.29).
 
         Both are of K = σ⁻¹ T (H + w Q)⁻¹ Tᵀ σ⁻¹, the change of the fitted pixels with the measured ones: γ = tr K, by
         random vectors `probes` (N, k). A pixel that is too bright by chance has too large a fitted signal, too large a
         variance, and counts less; the correction is the power that it loses so.
         """
-        found = (self.transport @ solve(self.transport.T @ (probes / sigma[:, None]))) / sigma[:, None]
+        found = (design @ solve(design.T @ (probes / sigma[:, None]))) / sigma[:, None]
         count = probes.shape[1]
         share = np.einsum("nk,nk->n", found, probes - found) / count
         return float(np.einsum("nk,nk->", probes, found) / count), self.measurement.shot[self.rows] * share
 
-    def _normal(self, sigma: Array, weight: float) -> tuple[csr_array, Solve]:
+    def _normal(self, design: csr_array, sigma: Array, weight: float) -> tuple[csr_array, Solve]:
         """H + w Q with H = TᵀT/σ², and what solves it."""
-        scaled = csr_array(diags_array(1 / sigma) @ self.transport)
-        normal = csr_array(scaled.T @ scaled + weight * self.smoothness.matrix)
+        normal = self._hessian(design, sigma, weight)
+        return normal, factor(normal)
+
+    def _hessian(self, design: csr_array, sigma: Array, weight: float) -> csr_array:
+        """H + w Q with H = TᵀT/σ², T the design, and the unit variance of the factors of views."""
+        scaled = csr_array(diags_array(1 / sigma) @ design)
+        prior = block_diag([weight * self.smoothness.matrix, diags_array(np.ones(self.factors.count))], format="csr")
+        normal = csr_array(scaled.T @ scaled + prior)
         if weight == 0:
             ridge = 1e-12 * normal.diagonal().max()
             normal = csr_array(normal + ridge * diags_array(np.ones(normal.shape[0])))
-        return normal, factor(normal)
+        return normal
 
-    def _right(self, power: Array, sigma: Array, weight: float) -> Array:
-        """Tᵀ P/σ² + w Q mean for power (N,) or (N, k)."""
+    def _right(self, design: csr_array, power: Array, sigma: Array, weight: float) -> Array:
+        """Tᵀ P/σ² + w Q mean for power (N,) or (N, k), T the design."""
         over = power / sigma**2 if power.ndim == 1 else power / sigma[:, None] ** 2
         flat = weight * self.mean * (self.smoothness.matrix @ np.ones(self.surface.unknowns))
-        return self.transport.T @ over + (flat if power.ndim == 1 else flat[:, None])
+        flat = np.concatenate([flat, np.zeros(self.factors.count)])
+        return design.T @ over + (flat if power.ndim == 1 else flat[:, None])
 
     def _sigma(self, signal: Array, numerical: Array) -> Array:
         """Standard deviation of each pixel [W] for a fitted signal (Eq. M.24)."""
@@ -396,22 +396,46 @@ class Problem:
 
     def _numerical(self, x: Array) -> Array:
         """Numerical error of T J [W] on the pixels."""
-        exitance = self.surface.spread @ (x * self.reference)
+        exitance = self.surface.spread @ (x[: self.surface.unknowns] * self.reference)
         return self.matrix.error(exitance).ravel()[self.rows]
 
+    def _told(self, fit: Fit, signal: Array, chi2_sum: float) -> list[str]:
+        """Warnings about the residuals, each told on stderr: their χ², and their structure, but for `mlem`."""
+        noise = self.measurement.chi2(self.rows, signal, fit.sigma)
+        if not fit.determined > 0:  # mlem follows the noise: its χ² may be small
+            noise = replace(noise, mean=0.0)
+        lines = tell_misfit("invert", chi2_sum, len(self.rows), fit.determined, [noise])
+        if not fit.determined > 0:
+            return lines
+        picture = self.measurement.picture(self.rows, signal)[0]
+        views = views_of(view_labels(self.matrix), picture, self.rows, fit.sigma)
+        free, design = ~self.bounds | (fit.x > 0), self.design(fit.x)
+        found = structure(
+            (self.measurement.power[self.rows] - signal) / fit.sigma,
+            csr_array((diags_array(1 / fit.sigma) @ design)[:, free]),
+            factor(csr_array(self._hessian(design, fit.sigma, fit.weight)[free][:, free])),
+            Patterns.of(views),
+            common_errors(fit.numerical / fit.sigma, views),
+        )
+        return [*lines, *told("invert", found.lines())]
+
     def draws(self, fit: Fit, count: int, seed: int, report: Progress) -> Array:
-        """x of `count` random draws, (m, count)."""
+        """x of `count` random draws, (m, count), followed by the factors of the views, (views, count)."""
         if not count:
-            return np.empty((self.surface.unknowns, 0))
-        normal, solve = self._normal(fit.sigma, fit.weight)
-        minima = Minima(normal, solve, self.bounded, self.settings.columns * count)
+            return np.empty((self.surface.unknowns + self.factors.views, 0))
+        design = self.design(fit.x)
+        normal, solve = self._normal(design, fit.sigma, fit.weight)
+        minima = Minima(normal, solve, self.bounds, self.settings.columns * count)
         sizes = [min(self.settings.block, count - k) for k in range(0, count, self.settings.block)]
         seeds = np.random.SeedSequence(seed).spawn(len(sizes))
 
         def block(size: int, sequence: np.random.SeedSequence) -> Array:
-            right, factors = self._drawn(fit, size, np.random.default_rng(sequence))
-            found = minimise(normal, right, minima.near(right, fit.x), self.bounded, solve, self.settings.drawn)
-            return found.x * factors
+            rng = np.random.default_rng(sequence)
+            right, gain = self._drawn(design, fit, size, rng)
+            found = minimise(normal, right, minima.near(right, fit.x), self.bounds, solve, self.settings.drawn).x
+            common = 1 + self.factors.common * rng.standard_normal(size)
+            own = slice(self.surface.unknowns, None)
+            return np.concatenate([found[: own.start] * gain * common, self.factors.of(found[own]) / common])
 
         found = []
         with ThreadPoolExecutor(self.settings.threads) as pool:
@@ -425,40 +449,42 @@ class Problem:
                 raise
         return np.concatenate(found, axis=1)
 
-    def _drawn(self, fit: Fit, size: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Right-hand sides (m, size) with noise on data and penalty, and factors of gain (size,).
+    def _drawn(self, design: csr_array, fit: Fit, size: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Right-hand sides (m + factors, size) with noise on data and priors, and factors of gain (size,).
 
         The numerical error of a view has one sign: it does not average out over pixels.
         """
         power = self.measurement.power[self.rows] + fit.correction
         noise = np.sqrt(np.maximum(fit.sigma**2 - fit.numerical**2, 0))[:, None]
-        views, height, width = self.matrix.image_shape
-        common = rng.standard_normal((views, size))[self.rows // (height * width)]
+        common = rng.standard_normal((self.factors.views, size))[self.factors.view]
         data = power[:, None] + noise * rng.standard_normal((len(power), size)) + fit.numerical[:, None] * common
-        right = self._right(data, fit.sigma, fit.weight)
+        right = self._right(design, data, fit.sigma, fit.weight)
         rough = self.smoothness.root.T @ rng.standard_normal((self.surface.unknowns, size))
-        return right + np.sqrt(fit.weight) * rough, 1 + self.measurement.gain_error * rng.standard_normal(size)
+        gain = 1 + self.measurement.gain_error * rng.standard_normal(size)
+        prior = np.concatenate([np.sqrt(fit.weight) * rough, rng.standard_normal((self.factors.count, size))])
+        return right + prior, gain
 
     def result(self, fit: Fit, draws: Array, options: Options) -> Inversion:
         """What the fit and the draws say, on the columns of the matrix."""
         spread = self.surface.spread * self.reference
-        solution = spread @ fit.x
+        count, views = self.surface.unknowns, self.matrix.image_shape
+        solution, factors = spread @ fit.x[:count], self.factors.of(fit.x[count:])
         areas = self.surface.point_areas
         per_area = self.sensitivity / np.where(areas > 0, areas, np.inf)
         lit = per_area >= self.settings.seen * per_area.max()
         seen = lit & (seen_share(self.surface, self.sensitivity, self.settings.seen) >= MOST)
-        fitted = (self.matrix @ solution).reshape(self.matrix.image_shape)
-        signal = self.transport @ fit.x
+        fitted = (self.matrix @ solution).reshape(views) * factors[:, None, None]
+        signal = self.signal(fit.x)
         chi2_sum = float(np.sum(((self.measurement.power[self.rows] - signal) / fit.sigma) ** 2))
-        noise = self.measurement.chi2(self.rows, signal, fit.sigma)
         sigma = np.full(self.matrix.shape[0], np.nan)
         sigma[self.rows] = fit.sigma
-        views = self.matrix.image_shape
         return Inversion(
             matrix=self.matrix,
             surface=self.surface,
             solution=solution,
-            draws=np.asarray(spread @ draws),
+            draws=np.asarray(spread @ draws[:count]),
+            view_factors=factors,
+            view_factor_draws=draws[count:],
             seen=seen[self.surface.number] & self.matrix.seen,
             left_out=float(areas[lit & ~seen].sum()),
             confidence=options.confidence,
@@ -469,24 +495,13 @@ class Problem:
             decrement=fit.decrement,
             converged=fit.converged,
             gain_error=self.measurement.gain_error,
+            gain_per_view=self.factors.sd,
             chi2_sum=chi2_sum,
-            warnings=tuple(tell_misfit("invert", chi2_sum, len(self.rows), fit.determined, [noise])),
+            warnings=tuple(self._told(fit, signal, chi2_sum)),
             measured=np.where(self.measurement.mask, np.nan, self.measurement.power).reshape(views),
             fitted=fitted,
             sigma=sigma.reshape(views),
         )
-
-
-def _secant(tried: Sequence[tuple[float, float]]) -> float:
-    """Next estimate of the solution of g(x) = x from the last pairs (x, g(x)), by the secant method.
-
-    The slope of the secant is limited to -1 … 0.8, which bounds the step to five times g(x) - x.
-    """
-    x, found = tried[-1]
-    slope = 0.0
-    if len(tried) > 1 and abs(x - tried[-2][0]) > 1e-12:
-        slope = float(np.clip((found - tried[-2][1]) / (x - tried[-2][0]), -1.0, 0.8))
-    return x + (found - x) / (1 - slope)
 
 
 def _report_unconverged(found: Fit, rounds: int) -> None:

@@ -25,11 +25,12 @@ from ..tissue.diffusion import Tissue
 from ..tissue.phantom_file import PhantomFile
 from .band_images import BandImages
 from .location import Location
-from .measurement import Measurement, tell_misfit
+from .measurement import Measurement, tell_misfit, told
 from .source_fit import LocationSettings, SourceFit
 from .source_grid import SourceGrid
 from .surface import Surface
 from .transport_matrix import TransportMatrix
+from .view_factors import checked_factor
 
 Images: TypeAlias = (
     ArrayLike | Sequence[Image | Exposure | str | os.PathLike[str]] | Image | Exposure | os.PathLike[str]
@@ -48,6 +49,7 @@ def locate(
     error: ArrayLike | Mapping[str, ArrayLike] | None = None,
     mask: ArrayLike | Mapping[str, ArrayLike] | None = None,
     gain_error: float | None = None,
+    gain_per_view: float = 0.0,
     sampled: bool = False,
     confidence: float = 0.9,
     scene: object = None,
@@ -60,7 +62,8 @@ def locate(
         S.sources[0].position, S.sources[0].position_interval  # mm, in the frame of phantom.toml
 
     The intervals contain the noise of the images, the numerical error of the matrix and `gain_error`, not errors of the
-    optical coefficients, of the shape or of the diffusion equation itself.
+    optical coefficients, of the shape, of inclusions left out, of pose and lens, or of the diffusion equation itself.
+    `warnings` name what the residuals show of these: their χ², and structure over views and around the sources (M.34).
 
     Parameters
     ----------
@@ -71,10 +74,9 @@ def locate(
     images : one Image, Exposure or name of a file of either per view, in the order of the views; or an array of powers
         (views, h, w) [W] together with `error`
     sources : number of point sources, 1 … 20
-    error, mask, gain_error, sampled, scene : as in `invert`
-    confidence : of the intervals, in (0, 1)
+    error, mask, gain_error, gain_per_view, sampled, scene : as in `invert`
+    confidence, settings : of the intervals, in (0, 1); accuracy of the fit
     progress : function of the present step (text) and the share done (0 … 1); None: a bar in notebooks
-    settings : accuracy
 
     Images in several bands of wavelengths: `matrix` and `images`, and `error` and `mask` if given, are dictionaries
     with the names of the tables [bands.NAME] of the phantom file, which hold the optical coefficients in a band and the
@@ -91,11 +93,12 @@ def locate(
     BackendError : scikit-fem, or the mesher that the phantom needs, is missing.
     """
     count, confidence, accuracy = _checked(sources, confidence, settings)
+    factors = checked_factor("locate", gain_per_view)
     given = _given(matrix, images, error, mask)
     described = _described(phantom)
     with reported(progress) as report:
         bands = _band_images(described, given, gain_error, sampled, scene, report)
-        return _located(bands, count, confidence, accuracy, report)
+        return _located(bands, count, confidence, accuracy, factors, report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +167,15 @@ def _given(matrix: TransportMatrix | Mapping[str, TransportMatrix], images: Any,
 
 
 def _located(
-    bands: Sequence[BandImages], count: int, confidence: float, settings: LocationSettings, report: Progress
+    bands: Sequence[BandImages],
+    count: int,
+    confidence: float,
+    settings: LocationSettings,
+    gain_per_view: float,
+    report: Progress,
 ) -> Location:
     """Sources and density that fit the images of all bands."""
-    fit = SourceFit(bands, settings, report)
+    fit = SourceFit(bands, settings, report, gain_per_view)
     if len(fit.power) <= 4 * count:
         raise InversionError(
             f"locate: {len(fit.power)} pixels do not determine the {4 * count} numbers of {count} sources. Give more "
@@ -193,8 +201,10 @@ def _located(
             p_values[k],
             "Give fewer sources, or" if count > 1 else "Give",
         )
-    density = replace(grid, sigma=found.sigma).density(report)
+    power = fit.power / fit.factors(found)[fit.view]
+    density = replace(grid, sigma=found.sigma, power=power).density(report)
     warnings = tell_misfit("locate", found.cost, len(fit.power), 4 * count, fit.noise(found))
+    warnings += told("locate", fit.structure(found).lines())
     return Location.of(fit, found, covariance, z, p_values, linear, density, confidence, warnings)
 
 

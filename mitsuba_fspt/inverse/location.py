@@ -77,6 +77,8 @@ class Location:
     measured, fitted, sigma : (views, height, width) [W], NaN where masked or outside the surface; by the names of the
         bands where the images were given so
     residual : (measured − fitted)/sigma, in the same form
+    gain_per_view : relative standard deviation of a factor of each view, fitted along and contained in the intervals
+    view_factors : (views,) these factors, of all bands one after the other; `fitted` contains them
     warnings : lines of stderr on what the residuals say of the model and of the stated errors
     """
 
@@ -93,6 +95,8 @@ class Location:
     fitted: Array | dict[str, Array]
     sigma: Array | dict[str, Array]
     residual: Array | dict[str, Array]
+    gain_per_view: float
+    view_factors: Array
     warnings: tuple[str, ...] = ()
 
     @classmethod
@@ -121,9 +125,11 @@ class Location:
             linear=linear,
             gain_error=max(band.measurement.gain_error for band in fit.bands),
             measured=fit.images(fit.power),
-            fitted=fit.images(found.signal),
+            fitted=fit.images(fit.fitted(found)),
             sigma=fit.images(found.sigma),
-            residual=fit.images(found.residual(fit.power)),
+            residual=fit.images((fit.power - fit.fitted(found)) / found.sigma),
+            gain_per_view=fit.gain_per_view,
+            view_factors=fit.factors(found),
             warnings=tuple(warnings),
         )
 
@@ -138,6 +144,8 @@ class Location:
             "chi2": self.chi2,
             "pixels": self.pixels,
             "gain_error": self.gain_error,
+            "gain_per_view": self.gain_per_view,
+            "view_factors": self.view_factors.tolist(),
             "warnings": list(self.warnings),
         }
 

@@ -180,7 +180,7 @@ class Measurement:
 
         Raises InversionError, in the name of `verb`, for pixels without noise.
         """
-        picture, used = self._picture(rows, signal)
+        picture, used = self.picture(rows, signal)
         variance = self.noise.variance(picture, used)[used] + numerical**2
         if not (variance > 0).all():
             count = int(np.sum(~(variance > 0)))
@@ -192,10 +192,10 @@ class Measurement:
 
     def chi2(self, rows: NDArray[np.int64], signal: Array, sigma: Array) -> Chi2:
         """Σ (noise/σ)² of the pixels `rows` for a fitted signal [W] and its σ [W]."""
-        picture, used = self._picture(rows, signal)
-        return self.noise.chi2(picture, self._picture(rows, sigma)[0], used)
+        picture, used = self.picture(rows, signal)
+        return self.noise.chi2(picture, self.picture(rows, sigma)[0], used)
 
-    def _picture(self, rows: NDArray[np.int64], values: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def picture(self, rows: NDArray[np.int64], values: Array) -> tuple[Array, NDArray[np.bool_]]:
         """`values` of the ascending `rows` as (views, h, w), NaN where masked and 0 elsewhere; True on the rows."""
         picture, used = np.where(self.mask, np.nan, 0.0), np.zeros(len(self.mask), bool)
         picture[rows], used[rows] = values, True

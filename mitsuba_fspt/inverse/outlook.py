@@ -91,5 +91,5 @@ def _first(problem: Problem, surface: Surface, report: Progress) -> tuple[Proble
     """A first fit on the unknowns of a surface, without bounds: problem, fit, residual over σ (N,), and χ²."""
     part = problem.free_on(surface)
     fit = part.fit(None, report, rough=True)
-    residual = (part.measurement.power[part.rows] - part.transport @ fit.x) / fit.sigma
+    residual = (part.measurement.power[part.rows] - part.signal(fit.x)) / fit.sigma
     return part, fit, residual, float(residual @ residual) / max(len(residual) - fit.determined, 1.0)

@@ -13,13 +13,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.sparse import block_diag, csr_array, hstack
 from scipy.stats import chi2
 
 from ..runtime.errors import FluxError, InversionError
 from ..runtime.progress_bar import Progress
 from .band_images import BandImages
 from .measurement import Chi2
+from .patterns import Patterns, Seen, views_of
+from .sensitivity_picture import view_labels
 from .source_grid import SourceGrid
+from .structure import Structure, common_errors, structure
+from .view_factors import PixelNoise
 
 Array = NDArray[np.float64]
 
@@ -57,7 +62,7 @@ class PointSources:
 
     exitance : of each band, (V, K) J_n per watt of each source [1/mm²]
     columns : (N, K) power on the pixels of all bands per watt;  gradients : (N, K, 3) its change per mm of x, y, z
-    sigma : (N,) noise of the pixels [W];  cost : Σ (residual/σ)²
+    noise : of the pixels, with the factors of views;  cost : Σ of squares of the residual over it
     """
 
     positions: Array
@@ -65,13 +70,18 @@ class PointSources:
     exitance: tuple[Array, ...]
     columns: Array
     gradients: Array
-    sigma: Array
+    noise: PixelNoise
     cost: float
+
+    @property
+    def sigma(self) -> Array:
+        """(N,) standard deviation of the pixels without the factors of views [W]."""
+        return self.noise.sigma
 
     @property
     def unlikelihood(self) -> float:
         """-2 ln of the likelihood for normal noise, but for a constant: also compares fits with different σ."""
-        return float(self.cost + 2 * np.log(self.sigma).sum())
+        return self.cost + self.noise.log_determinant
 
     @property
     def values(self) -> Array:
@@ -84,14 +94,19 @@ class PointSources:
         return np.asarray(self.columns @ self.powers)
 
     @property
+    def changes(self) -> Array:
+        """(N, 4K) change of the fitted power [W] with the `values`."""
+        changes = np.concatenate([self.powers[:, None] * self.gradients, self.columns[..., None]], axis=2)
+        return changes.reshape(len(changes), -1)
+
+    @property
     def slopes(self) -> Array:
-        """(N, 4K) change of the fitted power over σ with the `values`."""
-        slopes = np.concatenate([self.powers[:, None] * self.gradients, self.columns[..., None]], axis=2)
-        return slopes.reshape(len(slopes), -1) / self.sigma[:, None]
+        """(N, 4K) change of the fitted power over the noise with the `values`."""
+        return self.noise.over(self.changes)
 
     def residual(self, power: Array) -> Array:
-        """(N,) (power − fitted power)/σ for the measured power (N,) [W]."""
-        return (power - self.signal) / self.sigma
+        """(N,) power − fitted power, over the noise, for the measured power (N,) [W]."""
+        return self.noise.over(power - self.signal)
 
     def sorted(self) -> PointSources:
         """The same, the source of the largest power first."""
@@ -109,12 +124,24 @@ class PointSources:
 class SourceFit:
     """Fit of point sources to the images of all bands, their pixels one after the other, (N,)."""
 
-    def __init__(self, bands: Sequence[BandImages], settings: LocationSettings, report: Progress) -> None:
-        self.bands, self.settings = bands, settings
+    def __init__(
+        self, bands: Sequence[BandImages], settings: LocationSettings, report: Progress, gain_per_view: float = 0.0
+    ) -> None:
+        self.bands, self.settings, self.gain_per_view = bands, settings, gain_per_view
         self._report, self._share = report, 0.0  # of the steps that are done
         self.power = np.concatenate([band.power for band in bands])
         ends = np.cumsum([0, *(len(band.rows) for band in bands)])
         self._parts = [slice(*part) for part in pairwise(ends)]
+        first = np.cumsum([0, *(band.matrix.image_shape[0] for band in bands)])
+        self.view = np.concatenate([band.view + start for band, start in zip(bands, first, strict=False)])
+
+    def factors(self, found: PointSources) -> Array:
+        """(views,) most likely factors of the views, of all bands one after the other."""
+        return 1 + self.gain_per_view * found.noise.unknowns((self.power - found.signal) / found.sigma)
+
+    def fitted(self, found: PointSources) -> Array:
+        """(N,) fitted power [W], with the factors of the views."""
+        return np.asarray(found.signal * self.factors(found)[self.view])
 
     def free(self, found: PointSources) -> int:
         """Number of pixels less that of the parameters, at least 1."""
@@ -124,6 +151,29 @@ class SourceFit:
         """Σ (noise/σ)² of each band as its stated noise makes it."""
         each = zip(self.bands, self._parts, strict=True)
         return [b.measurement.chi2(b.rows, found.signal[own], found.sigma[own]) for b, own in each]
+
+    def structure(self, found: PointSources) -> Structure:
+        """Test of the residuals for structure: over each view of each band, and around each source."""
+        views, known, light = list[Seen](), [], found.columns * found.powers / found.sigma[:, None]
+        for band, own, exitance in zip(self.bands, self._parts, found.exitance, strict=True):
+            picture = band.measurement.picture(band.rows, found.signal[own])[0]
+            names = [label if band.name is None else f"{band.name}: {label}" for label in view_labels(band.matrix)]
+            seen = views_of(names, picture, band.rows, found.sigma[own])
+            numerical = band.numerical(exitance @ found.powers) / found.sigma[own]
+            factor = band.measurement.gain_error * csr_array((found.signal[own] / found.sigma[own])[:, None])
+            known.append(hstack([common_errors(numerical, seen), factor]))
+            views += seen
+        places = np.concatenate([band.places() for band in self.bands])
+        rings = [(light[:, k], np.linalg.norm(places - at, axis=1)) for k, at in enumerate(found.positions)]
+        slopes = found.changes / found.sigma[:, None]
+        prior = np.zeros(slopes.shape[1])
+        if self.gain_per_view:
+            slopes = np.column_stack([slopes, found.noise.columns.toarray()])
+            prior = np.concatenate([prior, np.ones(slopes.shape[1] - len(prior))])
+        inverse = np.linalg.inv(slopes.T @ slopes + np.diag(prior))
+        errors = csr_array(block_diag(known, format="csr"))
+        residual = (self.power - self.fitted(found)) / found.sigma
+        return structure(residual, slopes, lambda x: inverse @ x, Patterns.of(views, rings), errors)
 
     def images(self, values: Array) -> Array | dict[str, Array]:
         """Values (N,) of the pixels as images, (views, height, width); by the names of the bands where they have names.
@@ -162,13 +212,13 @@ class SourceFit:
     def _minimum(self, positions: Array) -> PointSources:
         """Sources of least Σ (residual/σ)² from these first positions; σ is that of the last step."""
         settings, damping = self.settings, self.settings.damping
-        found = self._tried(positions, np.concatenate([band.flat_sigma() for band in self.bands]), np.inf)
-        flat = 0
+        even = np.concatenate([band.flat_sigma() for band in self.bands])
+        found, flat = self._tried(positions, PixelNoise(even, np.zeros_like(even), self.view), np.inf), 0
         for step in range(settings.steps):
             if found is None:
                 break
             positions, self._share = found.positions, step / settings.steps
-            found = self._weighted(found, self._sigma(found))
+            found = self._weighted(found, self._noise(found))
             slopes = found.slopes
             lengths = np.linalg.norm(slopes, axis=0)
             normal = slopes.T @ slopes / np.outer(lengths, lengths)
@@ -178,7 +228,7 @@ class SourceFit:
             tried = None
             while tried is None and damping < settings.stuck:
                 moved = np.linalg.solve(normal + damping * np.eye(len(normal)), right) / lengths
-                tried = self._tried(positions + moved.reshape(-1, 4)[:, :3], found.sigma, found.cost)
+                tried = self._tried(positions + moved.reshape(-1, 4)[:, :3], found.noise, found.cost)
                 damping *= 10 if tried is None else 0.1
             flat = flat + 1 if tried is not None and found.cost - tried.cost < settings.flat else 0
             found, damping = tried, max(damping, settings.least)
@@ -208,7 +258,9 @@ class SourceFit:
         """(4K, 4K) covariance of the `values` by the uncertain factor of each band, `gain_error` (Eq. M.26)."""
         slopes, total = found.slopes, np.zeros_like(covariance)
         for band, own in zip(self.bands, self._parts, strict=True):
-            change = covariance @ (slopes[own].T @ (found.signal[own] / found.sigma[own]))
+            signal = np.zeros_like(found.signal)
+            signal[own] = found.signal[own]
+            change = covariance @ (slopes.T @ found.noise.over(signal))
             total += band.measurement.gain_error**2 * np.outer(change, change)
         return total
 
@@ -222,7 +274,7 @@ class SourceFit:
         values = np.empty(len(found.powers))
         for k, power in enumerate(found.powers):
             others = np.linalg.qr(np.delete(slopes, np.s_[4 * k : 4 * k + 4], axis=1))[0]
-            without = residual + power * found.columns[:, k] / found.sigma
+            without = residual + power * found.noise.over(found.columns[:, k])
             without -= others @ (others.T @ without)
             values[k] = places * chi2.sf(without @ without - residual @ residual, 4)
         return values.clip(max=1.0)
@@ -251,32 +303,33 @@ class SourceFit:
     def _residual_at(self, found: PointSources, values: Array) -> Array:
         """(N,) residual over the σ of `found` for other `values` (4K,); raises FluxError as `BandImages.exitance`."""
         positions, powers = values.reshape(-1, 4)[:, :3], values.reshape(-1, 4)[:, 3]
-        return (self.power - self._images(positions)[1] @ powers) / found.sigma
+        return found.noise.over(self.power - self._images(positions)[1] @ powers)
 
-    def _tried(self, positions: Array, sigma: Array, below: float) -> PointSources | None:
+    def _tried(self, positions: Array, noise: PixelNoise, below: float) -> PointSources | None:
         """Sources at these positions with the powers > 0 that fit best.
 
         None where the tissue has no solution there, a source gets no power, or Σ (residual/σ)² is not below `below`.
         """
         try:
             exitance, columns = self._images(positions)
-            empty = PointSources(positions, np.zeros(len(positions)), exitance, columns, np.empty(0), sigma, 0.0)
-            tried = self._weighted(empty, sigma)
+            empty = PointSources(positions, np.zeros(len(positions)), exitance, columns, np.empty(0), noise, 0.0)
+            tried = self._weighted(empty, noise)
             if not ((tried.powers > 0).all() and tried.cost < below):
                 return None
             return replace(tried, gradients=np.stack([*map(self._gradient, positions, columns.T)], axis=1))
         except FluxError:
             return None
 
-    def _weighted(self, found: PointSources, sigma: Array) -> PointSources:
-        """The same positions with the powers >= 0 that fit best for another noise (N,) [W]."""
-        powers, length = nnls(found.columns / sigma[:, None], self.power / sigma)
-        return replace(found, powers=powers, sigma=sigma, cost=length**2)
+    def _weighted(self, found: PointSources, noise: PixelNoise) -> PointSources:
+        """The same positions with the powers >= 0 that fit best for another noise."""
+        powers, length = nnls(noise.over(found.columns), noise.over(self.power))
+        return replace(found, powers=powers, noise=noise, cost=length**2)
 
-    def _sigma(self, found: PointSources) -> Array:
-        """Noise of the pixels (N,) [W] for the fitted signal, with the numerical error of the matrices (Eq. M.24)."""
+    def _noise(self, found: PointSources) -> PixelNoise:
+        """Noise of the pixels for the fitted signal, with the numerical error of the matrices (Eq. M.24)."""
         each = zip(self.bands, found.exitance, strict=True)
-        return np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each])
+        sigma = np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each])
+        return PixelNoise(sigma, self.gain_per_view * found.signal / sigma, self.view)
 
     def _gradient(self, position: Array, column: Array) -> Array:
         """(N, 3) change of a source's image, `column` (N,), per mm along x, y and z; raises FluxError at the border."""

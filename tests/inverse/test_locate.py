@@ -278,6 +278,33 @@ def test_a_misfit_is_told(case, caplog):
 # --- results ---
 
 
+def test_structure_of_the_residuals_is_told(case, caplog):
+    """The right images are not told; one view 10 % too bright is, by its name, in `warnings` and in the summary."""
+    images = case.images(SOURCE, electrons=3000)
+    with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+        assert case.locate(images).warnings == ()
+        assert "structure" not in caplog.text
+        images[3] = fspt.Image(1.1 * images[3].power, metadata=images[3].metadata)
+        found = case.locate(images)
+    line = next(one for one in found.warnings if "structure" in one)
+    assert "a factor in view=270, 1." in line
+    assert found.summary()["warnings"] == list(found.warnings)
+
+
+def test_factors_of_views_are_fitted(case):
+    """Views with factors of 5 % scatter: the source within 4 sd, χ² 1, no warning. Without them it is 8 sd off."""
+    images = case.images(SOURCE, electrons=1000)
+    for k, factor in enumerate((0.942, 1.014, 1.039, 1.027)):
+        metadata = images[k].metadata | {"electrons_per_watt": images[k].metadata["electrons_per_watt"] / factor}
+        images[k] = fspt.Image(images[k].power * factor, metadata=metadata)
+    found = case.locate(images, gain_per_view=0.05)
+    assert np.abs(ratios(found, SOURCE)).max() < 4
+    assert found.view_factors == pytest.approx([0.942, 1.014, 1.039, 1.027], abs=0.08)
+    assert 0.02 < found.sources[0].power_sd / SOURCE[3] < 0.05
+    assert 0.8 < found.chi2 < 1.2
+    assert found.warnings == ()
+
+
 def test_summary_and_file(case, tmp_path):
     meshio = pytest.importorskip("meshio")
     steps = []

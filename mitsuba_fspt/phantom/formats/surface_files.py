@@ -94,7 +94,7 @@ def _plain_off(path: Path) -> RawMesh | None:
     if not triangles or len(numbers) != 3 + 3 * points + 4 * triangles:
         return None
     cells = numbers[3 + 3 * points :].reshape(-1, 4)
-    if not np.array_equal(cells, np.floor(cells)) or (cells[:, 0] != 3).any() or not (cells < 1 << 53).all():
+    if not np.array_equal(cells, np.floor(cells)) or (cells[:, 0] != 3).any() or not np.isfinite(cells).all():
         return None
     return RawMesh(numbers[3 : 3 + 3 * points].reshape(-1, 3), cells[:, 1:].astype(np.int64), path.name)
 

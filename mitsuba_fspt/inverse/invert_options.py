@@ -1,0 +1,70 @@
+"""Arguments of `invert` that are numbers and names, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..runtime.errors import InversionError
+from ..runtime.numbers import number, whole
+from .surface import CREASE_ANGLE
+from .transport_matrix import TransportMatrix
+from .view_factors import checked_factor
+
+
+@dataclass(frozen=True)
+class Options:
+    """Checked arguments of `invert`; InversionError for one outside its range."""
+
+    weight: float | None
+    samples: int
+    seed: int
+    confidence: float
+    method: str = "smooth"
+    crease_angle: float = CREASE_ANGLE
+    gain_per_view: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gain_per_view", checked_factor("invert", self.gain_per_view))
+        angle = number("invert: 'crease_angle'", self.crease_angle, InversionError, "45")
+        if not 0 <= angle <= 180:
+            raise InversionError(
+                f"invert: 'crease_angle' must be in 0 … 180 degrees, got {angle:g}. Give 45, or 180 to smooth across "
+                "all edges."
+            )
+        object.__setattr__(self, "crease_angle", angle)
+        if self.method not in ("smooth", "mlem"):
+            raise InversionError(f"invert: 'method' must be 'smooth' or 'mlem', got {self.method!r}. Give one of them.")
+        if self.method == "mlem" and (self.samples or self.weight or self.gain_per_view):
+            raise InversionError(
+                "invert: method 'mlem' has no weight and no intervals, nor factors of views. Leave out weight, samples "
+                "and gain_per_view."
+            )
+        if self.weight is not None:
+            weight = number("invert: 'weight'", self.weight, InversionError, "1.0")
+            if not 0 <= weight < np.inf:
+                raise InversionError(
+                    f"invert: 'weight' must be finite and >= 0 mm², got {weight:g}. Give 1.0, or None."
+                )
+            object.__setattr__(self, "weight", weight)
+        confidence = number("invert: 'confidence'", self.confidence, InversionError, "0.9")
+        if not 0 < confidence < 1:
+            raise InversionError(f"invert: 'confidence' must be in (0, 1), got {confidence:g}. Give for example 0.9.")
+        object.__setattr__(self, "confidence", confidence)
+        for name, most in (("samples", 1_000_000), ("seed", 1 << 53)):
+            value = whole(f"invert: '{name}'", getattr(self, name), InversionError, "200")
+            if not 0 <= value <= most:
+                raise InversionError(f"invert: '{name}' must be in 0 … {most}, got {value}. Give for example 200.")
+            object.__setattr__(self, name, value)
+        if self.samples == 1:
+            raise InversionError("invert: 'samples' = 1 gives no interval. Give for example 200, or 0 for none.")
+
+
+def require_matrix(matrix: object) -> None:
+    """Raise InversionError where it is no transport matrix."""
+    if not isinstance(matrix, TransportMatrix):
+        raise InversionError(
+            f"invert: the first argument must be a transport matrix, got {type(matrix).__name__}. Make one with "
+            "fspt.transport, or read one with fspt.read_transport."
+        )
