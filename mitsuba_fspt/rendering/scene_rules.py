@@ -17,6 +17,7 @@ LISTS = {  # attributes that hold one or several numbers, by element
     "lookat": ("origin", "target", "up"),
 }
 OF_THE_LENS = ("f_number", "magnification", "image_distance", "pixel_pitch", "lens_diameter", "diaphragm_distance")
+CAMERAS = ("perspective", "thinlens", "orthographic")  # of Mitsuba
 NEEDED = {"bitmap": ("filename", "data", "bitmap"), "volume": ("volume",)}  # without one, the texture crashes Mitsuba
 
 
@@ -84,9 +85,9 @@ def _check_source(path: Path, node: ElementTree.Element, scene: SceneXml) -> Non
 
 
 def _check_sensor(path: Path, node: ElementTree.Element, scene: SceneXml) -> None:
-    """Raise SceneError for a parameter of `fspt_lens` in another sensor: Mitsuba may say that its type is wrong."""
-    kind = scene.fill_in(node.get("type", "")) if node.tag == "sensor" else "fspt_lens"
-    if kind == "fspt_lens":
+    """Raise SceneError for a parameter of `fspt_lens` in another camera: Mitsuba may say that its type is wrong."""
+    kind = scene.fill_in(node.get("type", "")) if node.tag == "sensor" else ""
+    if kind not in CAMERAS:
         return
     # Mitsuba's own cameras have a `focal_length`, too, as a text such as 50mm.
     left = [
