@@ -2,6 +2,7 @@
 
     python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
     python scripts/audit.py --ablate all|kink,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
+    python scripts/audit.py --matrix [--scenes 10] [--seed 0] [--family boxes,meshes] [--rtol 1e-3] [--out docs]
 
 Scenes of every family of `validation/random_scenes.py` are rendered by `fspt_integral`. `fan_reference` computes the
 power, with an error of its own, on 24 pixels of each: 16 where errors are likely (large stated errors, edges, strong
@@ -10,6 +11,10 @@ the reference's error. Writes audit.csv, one row per scene, and prints the table
 
 With `--ablate` the same pixels are evaluated without each threshold of `integral/estimator.py` in turn: how many are
 beyond `rtol` and beyond the stated error, and what it costs. Writes ablation.csv.
+
+With `--matrix` the product of the transport matrix and J_n takes the place of the image, and `T.error(J)` that of its
+error, in scenes of `MESH_FAMILIES`. J_n is random on every vertex or face, or has one bright spot (`_exitance`). Writes
+audit_matrix.csv.
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ import argparse
 import csv
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import markdown_tables
@@ -29,13 +34,16 @@ from mitsuba_fspt.integral.estimator import Estimator
 from mitsuba_fspt.integral.quadrature import Quadrature
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.runtime.atomic_files import atomic_path
-from mitsuba_fspt.validation.random_scenes import FAMILIES, RandomScene, random_scene
+from mitsuba_fspt.validation.random_scenes import FAMILIES, MESH_FAMILIES, RandomScene, linear_on, random_scene
+from mitsuba_fspt.validation.reference_bodies import Triangles
 
 LIKELY, RANDOM = 16, 8  # pixels of each scene
 SLOW = 2.0  # s: rendered once more, as kernels may have been compiled
 GOAL, LEAST_GOAL = 0.15, 1e-5  # error of the reference: over the stated error, and over the brightest pixel
+MATRIX_GOAL = 0.05  # likewise over rtol, for products of the matrix: in its scenes lines of sight cross many faces
 LEAST_TRUE = 1e-7  # of the brightest pixel: smaller errors are rounding
 WIDE = 0.1  # of rtol: least stated error of pixels for which stated over true error is evaluated
+FILLED = 0.9  # of the largest sum of a row of the matrix: with less, an edge may cross the pixel
 HEAD = (
     "scenes",
     "beyond rtol, likely",
@@ -87,14 +95,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=10, help="of each family")
     parser.add_argument("--seed", type=int, default=0, help="of the first scene of a family")
-    parser.add_argument("--family", default=",".join(FAMILIES))
+    parser.add_argument("--family", help="names of families, with commas; all by default")
+    parser.add_argument("--likely", type=int, default=LIKELY, help="pixels of each scene where errors are likely")
+    parser.add_argument("--random", type=int, default=RANDOM, help="random pixels of each scene")
     parser.add_argument("--rtol", type=float, default=1e-3)
     parser.add_argument("--finer", type=int, default=1, help="times as many pixels along each side of the film")
     parser.add_argument("--ablate", help="thresholds to do without, one by one, or all")
+    parser.add_argument("--matrix", action="store_true", help="products of the transport matrix in place of images")
     parser.add_argument("--out", type=Path, default=Path("docs"))
-    parser.add_argument("--readme", type=Path, help="file whose table 'audit' is replaced")
+    parser.add_argument("--readme", type=Path, help="file whose table 'audit', or 'audit_matrix', is replaced")
     arguments = parser.parse_args()
-    seeds, names = range(arguments.seed, arguments.seed + arguments.scenes), arguments.family.split(",")
+    seeds = range(arguments.seed, arguments.seed + arguments.scenes)
+    names = arguments.family.split(",") if arguments.family else list(MESH_FAMILIES if arguments.matrix else FAMILIES)
     arguments.out.mkdir(exist_ok=True)
     if arguments.ablate:
         wanted = (
@@ -104,20 +116,36 @@ def main() -> None:
         return
     audits = []
     for family in names:
-        audits += [audited(family, seed, arguments.rtol, finer=arguments.finer) for seed in seeds]
+        pixels = arguments.likely, arguments.random
+        audits += [
+            audited(family, seed, arguments.rtol, *pixels, finer=arguments.finer, matrix=arguments.matrix)
+            for seed in seeds
+        ]
         print(_row(family, [audit for audit in audits if audit.family == family], arguments.rtol), flush=True)
-    with atomic_path(arguments.out / "audit.csv") as temporary, open(temporary, "w", newline="") as file:
+    name = "audit_matrix" if arguments.matrix else "audit"
+    with atomic_path(arguments.out / f"{name}.csv") as temporary, open(temporary, "w", newline="") as file:
         sheet = csv.DictWriter(file, list(asdict(audits[0])))
         sheet.writeheader()
         sheet.writerows({name: _text(value) for name, value in asdict(audit).items()} for audit in audits)
     text = table(audits, arguments.rtol)
     print(f"\n{text}")
     if arguments.readme:
-        markdown_tables.write(arguments.readme, "audit", text)
+        markdown_tables.write(arguments.readme, name, text)
 
 
-def audited(family: str, seed: int, rtol: float, likely: int = LIKELY, random: int = RANDOM, finer: int = 1) -> Audit:
-    """One scene of a family, rendered on a film of `finer` times as many pixels a side, and compared."""
+def audited(
+    family: str,
+    seed: int,
+    rtol: float,
+    likely: int = LIKELY,
+    random: int = RANDOM,
+    finer: int = 1,
+    matrix: bool = False,
+) -> Audit:
+    """One scene of a family, rendered on a film of `finer` times as many pixels a side, and compared.
+
+    matrix : the image is the product of the transport matrix and J_n of `_exitance`
+    """
     backend.ensure_variant()
     import mitsuba as mi
 
@@ -125,10 +153,11 @@ def audited(family: str, seed: int, rtol: float, likely: int = LIKELY, random: i
     mi.set_log_level(mi.LogLevel.Error)
     try:
         made = random_scene(family, seed, finer)
-        image, seconds = _rendered(made, rtol)
+        made, image, seconds = _multiplied(made, seed, rtol) if matrix else (made, *_rendered(made, rtol))
     finally:
         mi.set_log_level(level)
-    stated, difference, reference = _compared(made, image, rtol, likely, random)
+    least = MATRIX_GOAL * rtol if matrix else LEAST_GOAL
+    stated, difference, reference = _compared(made, image, likely, random, least)
     beyond = difference - reference > rtol
     missed = difference - reference > stated
     wide = stated > WIDE * rtol
@@ -168,14 +197,50 @@ def _rendered(made: RandomScene, rtol: float) -> tuple[fspt.Image, float]:
     return image, seconds
 
 
+def _multiplied(made: RandomScene, seed: int, rtol: float) -> tuple[RandomScene, fspt.Image, float]:
+    """The scene with J_n of `_exitance`, its image by the transport matrix, and the run time of the matrix [s].
+
+    J_n is on vertices for even seeds, else on faces; it is random in two scenes, and has a spot in the next two.
+    """
+    on, scene, began = ("vertex", "face")[seed % 2], made.scene(), time.perf_counter()
+    transport = fspt.transport(scene, on=on, rtol=rtol)
+    seconds = time.perf_counter() - began
+    generator, bodies, exitance = np.random.default_rng([2, seed]), [], []
+    for body in made.reference.bodies:
+        if isinstance(body.shape, Triangles) and body.exitance is not None:
+            values = _exitance(body.shape, on, bool(seed // 2 % 2), generator)
+            corners = values[body.shape.faces] if on == "vertex" else np.repeat(values[:, None], 3, axis=1)
+            exitance.append(values)
+            body = replace(body, exitance=linear_on(body.shape.vertices, body.shape.faces, corners), most=values.max())
+        bodies.append(body)
+    given = np.concatenate(exitance)
+    filled = transport.forward(np.ones(len(given)))[0]
+    image = fspt.Image(
+        transport.forward(given)[0], transport.error(given)[0], np.minimum(filled / (FILLED * filled.max()), 1), {}
+    )
+    return replace(made, reference=replace(made.reference, bodies=bodies)), image, seconds
+
+
+def _exitance(mesh: Triangles, on: str, spot: bool, generator: np.random.Generator) -> np.ndarray:
+    """J_n on the vertices or faces of a mesh [W/mm²]: a spot of half its size, or random over two decades."""
+    places = mesh.vertices if on == "vertex" else mesh.vertices[mesh.faces].mean(axis=1)
+    if not spot:
+        return 10 ** generator.uniform(-2, 0, len(places))
+    squared = ((places - places[generator.integers(len(places))]) ** 2).sum(axis=1)
+    return 1e-3 + np.exp(-4 * squared / squared.max())
+
+
 def _compared(
-    made: RandomScene, image: fspt.Image, rtol: float, likely: int, random: int
+    made: RandomScene, image: fspt.Image, likely: int, random: int, least: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stated error, difference and error of the reference on checked pixels, over the brightest pixel, each (n,)."""
+    """Stated error, difference and error of the reference on checked pixels, over the brightest pixel, each (n,).
+
+    least : smallest error at which the reference is aimed, over the brightest pixel
+    """
     peak = image.power.max() or 1.0
     picked = _picked(image, likely, random)
     stated = image.error.ravel()[picked] / peak
-    power, error = _reference(made, picked, peak * np.maximum(GOAL * stated, LEAST_GOAL))
+    power, error = _reference(made, picked, peak * np.maximum(GOAL * stated, least))
     return stated, np.abs(image.power.ravel()[picked] - power) / peak, error / peak
 
 

@@ -6,8 +6,8 @@ each of its columns, linear over the triangle, is distributed exactly over the p
 sizes of face and pixel. Only the pupil is sampled. Of a face much smaller than its blur disc not the face but the pupil
 is laid: the images of the pupil's cells through the middle of a piece, which tile the blur disc.
 
-All columns are computed twice, with the cells and pieces of `ColumnRule` and with half of them; the difference of the
-two shows what is left.
+All columns are computed twice, with the cells and pieces of `ColumnRule` and with half of them. The error is of second
+order in both, so that a third of the difference is left.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ LEAST_HEIGHT = 2.0**-5  # pixels: over a flatter image the density is taken as c
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
 MOST_WORK = 1 << 23  # entries of windows that are accumulated at a time
+LEFT = 1 / 3  # error over the change by twice the cells and pieces, of second order
 MOST_CHANGE = 6e4  # relative, that float16 holds
 
 Array = NDArray[np.float64]
@@ -46,7 +47,7 @@ Mask = NDArray[np.bool_]
 @dataclass(frozen=True)
 class Columns:
     """Light of the columns of one mesh on the film: of every entry the column, the pixel, row by row from the first of
-    the crop window, the light, and by how much half the cells and pieces change it, over it; in any order.
+    the crop window, the light, and by how much many more cells and pieces would change it, over it; in any order.
 
     Light is over that of a pixel whose pupil is filled by 1 W/mm²/sr, for J_n = 1 W/mm²: 1/π at the most for Lambert's
     law; times the pixel's étendue it is an entry of T [mm²]. `exact` (n,): columns of which no face is hidden in part,
@@ -138,7 +139,7 @@ def _kept(
     for a in GAUSS if some.size else ():
         for b in GAUSS:
             even += falloff(lens, mi.Point2f(left + a, top + b)).numpy() / len(GAUSS) ** 2
-    change = np.clip((fine - coarse) / fine, -MOST_CHANGE, MOST_CHANGE)
+    change = np.clip(LEFT * (fine - coarse) / fine, -MOST_CHANGE, MOST_CHANGE)
     return column, (y * shape[1] + x).astype(np.int32), (even * fine).astype(np.float32), change.astype(np.float16)
 
 

@@ -39,6 +39,7 @@ ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further f
 UNREACHED = 0.5  # likewise, where the picture itself did not reach rtol
 ALL_LINES = 2048  # lines of sight a pixel at rtol 1e-3 where all rows are found by them
 ROW_LINES = 4096  # of these pixels at rtol 1e-3, more where they are few
+LINES_LEFT = 1.5  # error over the change by twice the lines: 1/(2^(3/4) - 1), at an edge in focus
 FEWEST_HITS = 64  # of them, on a column of which they determine the entry better than the surface form does
 TURNS = 6  # in which rows and columns are scaled to their sums
 LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
@@ -59,7 +60,7 @@ class SparseRows:
 
     count : number n of columns, those of one mesh after the other
     values : entries [mm²];  columns, starts : their columns, and the first entry of each row, as in a csr_array
-    change : by how much half the cells and pieces change each entry, over the entry
+    change : by how much many more cells, pieces or lines of sight would change each entry, over the entry
     row_error : error of each row's sum [mm²], (h · w)
     """
 
@@ -319,7 +320,7 @@ def _rows(
     lines: int,
     specular: Specular | None = None,
 ) -> _Entries:
-    """Rows of these pixels by lines of sight; the change is what half of the lines make of them."""
+    """Rows of these pixels by lines of sight; their change follows from half of the lines."""
     found: list[tuple[Any, ...]] = []
     first, emitters = 0, scene.emitters()
     for emitter, kind, row in zip(emitters, on, rows_of(scene, lens, emitters, pixels, lines, specular), strict=True):
@@ -336,13 +337,15 @@ def _rows(
     place, column, light, half = (np.concatenate(values) for values in zip(*found, strict=True))
     both = csr_array((light + 1j * half, (place, column)), shape=(len(pixels), first))  # sums both at once
     both.eliminate_zeros()
-    relative = np.divide(both.data.imag, both.data.real, out=np.ones(both.nnz), where=both.data.real > 0)
+    relative = LINES_LEFT * (
+        1 - np.divide(both.data.imag, both.data.real, out=np.ones(both.nnz), where=both.data.real > 0)
+    )
     return _Entries(
         first,
         both.indptr,
         both.indices.astype(np.int32),
         both.data.real.astype(np.float32),
-        np.clip(1 - relative, -MOST_CHANGE, MOST_CHANGE).astype(np.float16),
+        np.clip(relative, -MOST_CHANGE, MOST_CHANGE).astype(np.float16),
     )
 
 

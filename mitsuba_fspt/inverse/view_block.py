@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 ON = ("vertex", "face")
-SAFETY = 2.0  # half the cells and pieces change an entry by some three times what is left; neighbours may err alike
+SAFETY = 2.0  # error over the largest change of a pixel and its neighbours, of which one may be small by chance
 NEIGHBOURS = 3  # pixels across that share their errors
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ class Block:
 
     values : entries [mm²], float32
     columns, starts : their columns, and the first entry of each row, as in a csr_array
-    change : by how much half the cells and pieces change each entry, over the entry, float16
+    change : by how much many more cells, pieces or lines of sight would change each entry, over the entry, float16
     row_error : error of each row's sum [mm²], (h · w), float32
     """
 

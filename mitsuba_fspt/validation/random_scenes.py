@@ -105,6 +105,11 @@ class _Maker:
             matrix[:, [0, 2]] *= -1
         return matrix
 
+    @property
+    def law(self) -> dict[str, Any]:
+        """Parameters of the exit law."""
+        return {} if self.index is None else {"emission": "fresnel", "int_ior": self.index}
+
     def exitance(self) -> float:
         """Random J_n [W/mm²], from two decades."""
         return float(10 ** self.random.uniform(-2, 0))
@@ -113,8 +118,7 @@ class _Maker:
         """Add a body for Mitsuba and for the reference; `glow`: parameters of its emitter."""
         if isinstance(what, dict):
             if glow is not None:
-                law = {} if self.index is None else {"emission": "fresnel", "int_ior": self.index}
-                what = {**what, "emitter": {"type": "fspt_surface", "exitance": glow, **law}}
+                what = {**what, "emitter": {"type": "fspt_surface", "exitance": glow, **self.law}}
             else:
                 what = {"bsdf": DARK, **what}
         self.objects[f"body_{len(self.objects)}"] = what
@@ -166,13 +170,11 @@ class _Maker:
         self.add(tube, Body(shape, lambda p, f: np.full(len(p), level), self.index, most=level), level)
         for k, end in enumerate(ends):
             cap = _matrix(turn * np.array([1, 1 if k else -1, 1 if k else -1]) * radius, end)
-            law = {} if self.index is None else {"emission": "fresnel", "int_ior": self.index}
-            emitter = {"type": "fspt_surface", "exitance": level, **law}
+            emitter = {"type": "fspt_surface", "exitance": level, **self.law}
             self.objects[f"cap_{len(self.objects)}"] = {"type": "disk", "to_world": cap, "emitter": emitter}
 
     def mesh(self, box: bool) -> None:
         """A box with one J_n, or the convex hull of random points with J_n on its vertices."""
-        import mitsuba as mi
         import trimesh
 
         if box:
@@ -182,17 +184,31 @@ class _Maker:
             points = self.random.normal(size=(int(self.random.integers(6, 30)), 3))
             points /= np.linalg.norm(points, axis=1)[:, None]
             solid = trimesh.convex.convex_hull(points * self.random.uniform(2, 12, 3))
+        self.solid(solid, even=box)
+
+    def ellipsoid(self) -> None:
+        """An ellipsoid of 80 to 1280 faces with J_n on its vertices."""
+        import trimesh
+
+        solid = trimesh.creation.icosphere(int(self.random.integers(1, 4)))
+        solid.apply_scale(self.random.uniform(2, 12, 3))
+        self.solid(solid, even=False)
+
+    def solid(self, solid: Any, even: bool) -> None:
+        """A mesh of trimesh at a random place, with one J_n if that is `even`, else with J_n on its vertices."""
+        import mitsuba as mi
+
         radius = float(np.linalg.norm(solid.vertices, axis=1).max())
         centre, turn = self.place(radius), self.turn(False)
         if centre is None:
             return
         vertices = (np.asarray(solid.vertices) @ turn.T + centre).astype(np.float32).astype(np.float64)
         faces = np.asarray(solid.faces, np.int64)
-        level = np.full(len(vertices), self.exitance()) if box else 10 ** self.random.uniform(-2, 0, len(vertices))
+        level = np.full(len(vertices), self.exitance()) if even else 10 ** self.random.uniform(-2, 0, len(vertices))
         level = level.astype(np.float32).astype(np.float64)
         shape = Triangles(vertices, faces, np.arange(len(faces)))
-        built = mesh(vertices, faces, level)(mi.ScalarTransform4f())
-        self.add(built, Body(shape, _linear_on(vertices, faces, level), most=float(level.max())))
+        built = mesh(vertices, faces, level, self.law)(mi.ScalarTransform4f())
+        self.add(built, Body(shape, linear_on(vertices, faces, level[faces]), self.index, most=float(level.max())))
 
     def bitmap(self) -> None:
         """A plate with random texels, nearest or bilinear."""
@@ -275,9 +291,24 @@ def _several(*kinds: str, most: int = 5, **how: Any) -> Callable[[_Maker], None]
     return fill
 
 
-def _occluders(maker: _Maker) -> None:
+def _in_turn(*steps: Callable[[_Maker], None]) -> Callable[[_Maker], None]:
+    """A family made by several steps."""
+
+    def fill(maker: _Maker) -> None:
+        for step in steps:
+            step(maker)
+
+    return fill
+
+
+def _behind(maker: _Maker) -> None:
+    """Glowing bodies behind the virtual detector plane."""
     for _ in range(int(maker.random.integers(1, 4))):
         getattr(maker, str(maker.random.choice(["sphere", "plate", "disk"])))(depth=(0, 40))
+
+
+def _occluders(maker: _Maker) -> None:
+    """Dark bodies in front of it."""
     for _ in range(int(maker.random.integers(1, 4))):
         getattr(maker, str(maker.random.choice(["sphere", "plate", "disk"])))(dark=True, depth=(-80, -20))
 
@@ -293,28 +324,26 @@ def _stops(maker: _Maker) -> None:
     if kind:
         side = maker.lens["pixel_pitch"] * min(maker.size)
         maker.stops["image_stop_diameter"] = float(side * r.uniform(0.3, 1.2))
-    _several("sphere", "plate", "disk", "cylinder", most=4)(maker)
 
 
-def _laws(maker: _Maker) -> None:
+def _fresnel(maker: _Maker) -> None:
     maker.index = FRESNEL_INDEX
-    _several("sphere", "plate", "disk", "cylinder", most=4)(maker)
 
 
-def _centres(maker: _Maker) -> None:
+def _centre(maker: _Maker) -> None:
     maker.centre = True
-    _several("sphere", "plate", "disk", "cylinder", most=4)(maker)
 
 
-def _crops(maker: _Maker) -> None:
+def _crop(maker: _Maker) -> None:
     maker.crops = True
-    _several("sphere", "plate", "disk", "cylinder")(maker)
 
 
-def _panes(maker: _Maker) -> None:
+def _pane(maker: _Maker) -> None:
     maker.pane(mirror=bool(maker.random.random() < 0.5))
-    _several("sphere", "plate", "disk", most=3)(maker)
 
+
+_FOUR = _several("sphere", "plate", "disk", "cylinder", most=4)
+_ELLIPSOIDS = _several("ellipsoid", most=2)
 
 FAMILIES: dict[str, Callable[[_Maker], None]] = {
     "spheres": _several("sphere"),
@@ -322,23 +351,36 @@ FAMILIES: dict[str, Callable[[_Maker], None]] = {
     "cylinders": _several("cylinder", most=3),
     "boxes": _several("mesh", box=True, most=3),
     "meshes": _several("mesh", box=False, most=2),
-    "occluders": _occluders,
+    "occluders": _in_turn(_behind, _occluders),
     "bitmaps": _several("bitmap", most=2),
-    "exit laws": _laws,
-    "stops": _stops,
-    "centre": _centres,
-    "crops": _crops,
-    "panes and mirrors": _panes,
+    "exit laws": _in_turn(_fresnel, _FOUR),
+    "stops": _in_turn(_stops, _FOUR),
+    "centre": _in_turn(_centre, _FOUR),
+    "crops": _in_turn(_crop, _several("sphere", "plate", "disk", "cylinder")),
+    "panes and mirrors": _in_turn(_pane, _several("sphere", "plate", "disk", most=3)),
+}
+# Families all of whose glowing bodies are meshes, for the transport matrix.
+MESH_FAMILIES: dict[str, Callable[[_Maker], None]] = {
+    "boxes": FAMILIES["boxes"],
+    "meshes": FAMILIES["meshes"],
+    "ellipsoids": _ELLIPSOIDS,
+    "hidden ellipsoids": _in_turn(_occluders, _ELLIPSOIDS),
+    "Fresnel ellipsoids": _in_turn(_fresnel, _ELLIPSOIDS),
+    "stopped ellipsoids": _in_turn(_stops, _ELLIPSOIDS),
+    "cropped ellipsoids": _in_turn(_crop, _ELLIPSOIDS),
 }
 
 
 def random_scene(family: str, seed: int, finer: int = 1) -> RandomScene:
-    """The scene of a family of `FAMILIES` with this seed, on a film of `finer` times as many pixels along each side."""
+    """The scene of a family of `FAMILIES` or `MESH_FAMILIES` with this seed, on a film of `finer` times as many pixels
+    along each side.
+    """
+    families = {**FAMILIES, **MESH_FAMILIES}
     for attempt in itertools.count():
-        maker = _Maker(np.random.default_rng([seed, list(FAMILIES).index(family), attempt]))
+        maker = _Maker(np.random.default_rng([seed, list(families).index(family), attempt]))
         maker.size = finer * maker.size[0], finer * maker.size[1]
         maker.lens["pixel_pitch"] /= finer
-        FAMILIES[family](maker)
+        families[family](maker)
         if any(body.exitance is not None for body in maker.bodies):
             return maker.finish(f"{family} {seed}")
     raise AssertionError
@@ -352,8 +394,8 @@ def _matrix(linear: Array, centre: Array) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(matrix.tolist())
 
 
-def _linear_on(vertices: Array, faces: Indices, level: Array) -> Callable[[Array, Indices], Array]:
-    """J_n that is linear on faces between its values `level` on vertices."""
+def linear_on(vertices: Array, faces: Indices, level: Array) -> Callable[[Array, Indices], Array]:
+    """J_n that is linear on faces, from its values `level` (F, 3) at their corners."""
 
     def exitance(points: Array, face: Indices) -> Array:
         a, b, c = (vertices[faces[face, k]] for k in range(3))
@@ -362,7 +404,7 @@ def _linear_on(vertices: Array, faces: Indices, level: Array) -> Callable[[Array
         d1, d2 = np.einsum("nk,nk->n", w, e1), np.einsum("nk,nk->n", w, e2)
         share = g11 * g22 - g12**2
         p, q = (g22 * d1 - g12 * d2) / share, (g11 * d2 - g12 * d1) / share
-        own = level[faces[face]]
+        own = level[face]
         return own[:, 0] * (1 - p - q) + own[:, 1] * p + own[:, 2] * q
 
     return exitance

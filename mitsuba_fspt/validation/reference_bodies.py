@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 Indices = NDArray[np.int64]
 MOST_SPECULAR = 6  # mirrors and panes that a line meets one after the other
+MOST_PAIRS = 1 << 18  # of lines of sight and triangles that are tested at a time
 BEYOND = 1e-9  # of a line's length: an intersection nearer than this is with the surface where the line starts
 
 
@@ -288,20 +289,29 @@ class Triangles:
     closed: bool = True
 
     def meet(self, origin: Array, direction: Array) -> tuple[Array, Indices]:
-        """First positive parameters (n,), inf for none, and numbers of the faces in the whole mesh."""
+        """First positive parameters (n,), inf for none, and numbers of the faces in the whole mesh.
+
+        A line passes a triangle where it passes all three sides on the same side (products of Plücker coordinates).
+        """
         best, face = np.full(len(origin), np.inf), np.zeros(len(origin), int)
+        if not len(self.faces):
+            return best, face
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        for k in range(len(self.faces)):  # few faces, each with some 10⁵ lines
-            e1, e2 = b[k] - a[k], c[k] - a[k]
-            normal = np.cross(e1, e2)
-            slope = direction @ normal
-            w = origin - a[k]
+        normal = np.cross(b - a, c - a)
+        sides = [np.concatenate([np.cross(p, q), q - p], axis=1).T for p, q in ((a, b), (b, c), (c, a))]
+        for first in range(0, len(origin), some := max(MOST_PAIRS // len(self.faces), 1)):
+            part = slice(first, first + some)
+            line = np.concatenate([direction[part], np.cross(origin[part], direction[part])], axis=1)
+            turns = [line @ side for side in sides]
+            hit = np.logical_and.reduce([t >= 0 for t in turns]) | np.logical_and.reduce([t <= 0 for t in turns])
+            row, column = np.nonzero(hit)
             with np.errstate(divide="ignore", invalid="ignore"):
-                s = -(w @ normal) / slope
-                turn = np.cross(w, direction)
-                p, q = -(turn @ e2) / slope, (turn @ e1) / slope
-            hit = (s > 0) & (s < best) & (p >= 0) & (q >= 0) & (p + q <= 1)
-            best[hit], face[hit] = s[hit], self.number[k]
+                s = dot(a[column] - origin[part][row], normal[column]) / dot(direction[part][row], normal[column])
+            ahead = np.full(hit.shape, np.inf)
+            ahead[row, column] = np.where(s > 0, s, np.inf)
+            nearest = ahead.argmin(axis=1)
+            best[part] = ahead[np.arange(len(nearest)), nearest]
+            face[part] = self.number[nearest]
         return best, face
 
     def outward(self, points: Array, face: Indices) -> Array:

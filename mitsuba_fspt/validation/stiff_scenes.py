@@ -6,7 +6,7 @@ the cases of other films. Lengths in mm, J_n in W/mm², powers in W; errors have
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -122,8 +122,13 @@ def plate(z: float, thickness: float, index: float) -> SceneObject:
     return shape_at
 
 
-def mesh(vertices: ArrayLike, faces: ArrayLike, exitance: float | Plane = 1.0) -> SceneObject:
-    """Triangles with vertices (V, 3) and faces (F, 3); `exitance` is one number, or of shape (V,) or (F,)."""
+def mesh(
+    vertices: ArrayLike, faces: ArrayLike, exitance: float | Plane = 1.0, law: Mapping[str, Any] | None = None
+) -> SceneObject:
+    """Triangles with vertices (V, 3) and faces (F, 3); `exitance` is one number, or of shape (V,) or (F,).
+
+    law : parameters of the emitter's exit law
+    """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.uint32)
 
     def shape_at(pose: mi.ScalarTransform4f) -> mi.Mesh:
@@ -137,7 +142,7 @@ def mesh(vertices: ArrayLike, faces: ArrayLike, exitance: float | Plane = 1.0) -
         if np.ndim(exitance):
             texture = {"type": "mesh_attribute", "name": f"{kind}_exitance"}
         props = mi.Properties()
-        props["glow"] = mi.load_dict({"type": "fspt_surface", "exitance": texture})
+        props["glow"] = mi.load_dict({"type": "fspt_surface", "exitance": texture, **(law or {})})
         built = mi.Mesh("mesh", len(vertices), len(faces), props=props)
         if np.ndim(exitance):
             built.add_attribute(f"{kind}_exitance", 1, np.asarray(exitance, np.float32))
