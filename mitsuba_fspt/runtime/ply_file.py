@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from .errors import FsptError
 
+LOG = logging.getLogger("mitsuba_fspt")
 LONGEST_HEADER = 1 << 16  # bytes
 END = re.compile(rb"^end_header[ \t]*\r?\n", re.MULTILINE)
 TYPES = {
@@ -53,8 +55,8 @@ def require_ply(path: Path, error: type[FsptError]) -> None:
 def require_whole(path: Path, error: type[FsptError]) -> None:
     """Raise `error` for a PLY that ends early, or with a face that names a vertex which does not exist.
 
-    A text has to end with a line break: without it, its last number may be cut off. A file that cannot be opened, or
-    with elements other than vertices and triangles, is left to its reader.
+    A text without a line break at its end, whose last number may be cut off, is told in one line on stderr. A file that
+    cannot be opened, or with elements other than vertices and triangles, is left to its reader.
     """
     try:
         content = path.read_bytes()
@@ -138,9 +140,10 @@ def _text_corners(path: Path, content: bytes, header: Header, error: type[FsptEr
             "again."
         )
     if lines and body.rstrip(b" \t")[-1:] not in (b"\n", b"\r"):
-        raise error(
-            f"'{path}' ends without a line break, so that its last number may be cut off. Copy or save the file again, "
-            "or, if it is whole, put a line break at its end."
+        LOG.warning(
+            "fspt: '%s' ends without a line break: its last number may be cut off. Copy or save the file again, or, if "
+            "it is whole, put a line break at its end.",
+            path,
         )
     try:
         numbers = np.array(b" ".join(lines[header.counts[0] : declared]).split(), np.float64)
