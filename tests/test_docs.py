@@ -66,6 +66,16 @@ def test_places_in_the_code_exist():
             assert name in text or name.rpartition(".")[2] in text, name
 
 
+def test_equations_have_numbers_of_their_own():
+    """Equations M.1, M.2, … of docs/model.md: each number stands once, and what the code cites exists."""
+    numbers = [
+        int(n) for n in re.findall(r"\\tag\{M\.(\d+)\}", (ROOT / "docs" / "model.md").read_text(encoding="utf-8"))
+    ]
+    assert sorted(numbers) == list(range(1, len(numbers) + 1))
+    cited = {int(n) for n in re.findall(r"\bM\.(\d+)\b", SOURCES + text_of(ROOT / "README.md"))}
+    assert cited <= set(numbers)
+
+
 @pytest.mark.parametrize(
     ("heading", "column"),
     [

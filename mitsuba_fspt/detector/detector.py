@@ -238,7 +238,7 @@ class Detector:
         frames : number of frames that counts (h, w) are the mean of; None: 1; of a stack, its length
         bias, dark : frames or stacks [DN] in place of `bias` and `dark_current`; `dark` contains the bias
         flat, flat_kind : frame or stack [DN] of a uniform light, 'lens' through the lens of `scene`, or 'sensor'
-            without a lens (Eq. M.32); the noise of a stack, not that of a single frame, enters the errors
+            without a lens (Eq. M.36); the noise of a stack, not that of a single frame, enters the errors
         flat_dark : number, frame or stack [DN] to subtract from the flat; None: the bias, from unsigned integers alone
         scene : for 'lens': what `render` takes, with the camera's lens, film and crop window
         bad_pixels : (h, w) or its file, not 0 for pixels to mask

@@ -198,8 +198,8 @@ def test_no_entry_is_lost_between_the_surface_form_and_lines_of_sight(tmp_path):
     """The limb of an ellipsoid in focus: an entry that one of the two puts just above the threshold for lines of sight,
     the other just below it.
 
-    Expected: a share of a row above 0.3 % is in the matrix at another rtol as well; the row's picture is that of the
-    float64 reference, within `error`. Seen to fail, with 0.5 % of a row lost and its picture 3 times `error` too dark,
+    Expected: a share of a row above 0.3 % is in the matrix at another rtol as well; the power of the rows is that of
+    `render` within both errors. Seen to fail, with 0.5 % of a row lost and its picture 3 times `error` too dark,
     where such an entry was in neither of the two.
     """
     body = trimesh.creation.icosphere(4)
