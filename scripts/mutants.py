@@ -1,0 +1,447 @@
+"""Mutation test of the physics: each factor of a law is dropped in a copy of the package, and a test must fail.
+
+    scripts/mutants                                   # all of them; the table goes to docs/mutants.csv
+    scripts/mutants --only "cos4" -o out/mutants.csv  # those whose name contains a text
+
+A mutant replaces one piece of text in one file. Its tests run until the first one fails, in the order of the list. The
+table names that test. The exit code is 1 if a mutant survives its tests, or if its tests do not run at all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+
+ROOT = Path(__file__).parents[1]
+COPIED = ("mitsuba_fspt", "tests", "scenes", "examples", "scripts", "docs", "pyproject.toml", "README.md")
+FAILED = 1  # exit code of pytest for tests that fail; others mean that they did not run
+TIMEOUT = 1200  # seconds for the tests of one mutant: one that never ends counts as caught
+
+LENS, SURFACE = "tests/plugins/test_lens.py", "tests/plugins/test_surface.py"
+PHYSICS, FORMS = "tests/integral/test_physics.py", "tests/integral/test_surface_form.py"
+LAWS, DETECTOR = "tests/emission/test_laws.py", "tests/detector/test_detector.py"
+REDUCTION, RADIOMETRY = "tests/detector/test_reduction.py", "tests/images/test_radiometry.py"
+TISSUE, INVERT = "tests/tissue/test_diffusion.py", "tests/inverse/test_invert.py"
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A factor or sign that is wrong.
+
+    name : the law or factor
+    file : of the package;  old, new : text that occurs there once, and what replaces it
+    tests : files or node ids of tests, the first of which are the most likely to fail
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+    def applied(self, text: str) -> str:
+        """`text` of the file with the replacement; ValueError where `old` does not occur exactly once."""
+        if (count := text.count(self.old)) != 1:
+            raise ValueError(f"mutant '{self.name}': its text occurs {count} times in {self.file}. Correct the list.")
+        return text.replace(self.old, self.new)
+
+
+MUTANTS = (
+    # Optics and Eq. 9
+    Mutant("cos4 of Eq. M.5", "integral/eq9.py", "dr.square(dr.square(cos_theta))", "dr.square(cos_theta)", (PHYSICS,)),
+    Mutant(
+        "1/u2 of the etendue", "integral/eq9.py", "(pupil_radius / focus_distance) ** 2", "pupil_radius**2", (PHYSICS,)
+    ),
+    Mutant("square of the virtual pixel", "integral/eq9.py", "side**2 * math.pi", "side * math.pi", (PHYSICS,)),
+    Mutant("cos of the surface form", "integral/eq9.py", "return cos_s * arrival", "return arrival", (FORMS,)),
+    Mutant(
+        "1/pi of a pupil cell", "integral/eq9.py", "cell / (dr.pi * virtual_pixel)", "cell / virtual_pixel", (FORMS,)
+    ),
+    Mutant(
+        "cos of the arrival",
+        "plugins/lens.py",
+        "dr.square(growth * self._u / distance) * cos_theta",
+        "dr.square(growth * self._u / distance)",
+        (LENS, FORMS),
+    ),
+    Mutant(
+        "growth of the pupil disc",
+        "plugins/lens.py",
+        "dr.square(growth * self._u / distance)",
+        "dr.square(self._u / distance)",
+        (LENS, FORMS),
+    ),
+    Mutant(
+        "image-plane stop",
+        "plugins/lens.py",
+        "dr.squared_norm(x) <= dr.square(self._stop_radius)",
+        "dr.squared_norm(x) >= 0",
+        ("tests/integral/test_image_stop.py", LENS),
+    ),
+    Mutant(
+        "second border of Eq. 5",
+        "integral/pupil.py",
+        "passes &= dr.squared_norm(a - shift * x) <= dr.square(radius)",
+        "passes &= dr.square(radius) > 0",
+        (LENS, "tests/integral/test_pupil.py"),
+    ),
+    Mutant(
+        "rows of the film",
+        "plugins/lens.py",
+        "mi.Point2f(self._middle - position) * self._pitch",
+        "mi.Point2f(self._middle.x - position.x, position.y - self._middle.y) * self._pitch",
+        (LENS, PHYSICS),
+    ),
+    Mutant(
+        "transmittance of the integral",
+        "plugins/lens.py",
+        "self.etendue = passed * bare",
+        "self.etendue = bare",
+        ("tests/plugins/test_lens_transmittance.py",),
+    ),
+    Mutant(
+        "transmittance of ptracer",
+        "plugins/lens.py",
+        "dr.opaque(mi.Float, passed * flat_share())",
+        "dr.opaque(mi.Float, flat_share())",
+        ("tests/plugins/test_lens_transmittance.py",),
+    ),
+    Mutant(
+        "lens law",
+        "optics/thin_lens.py",
+        "focal_length * (1 + 1 / value)",
+        "focal_length / value",
+        ("tests/optics/test_thin_lens.py",),
+    ),
+    Mutant(
+        "D = F/f_num of Eq. 3",
+        "optics/thin_lens.py",
+        "return self.focal_length / self.f_number",
+        "return self.focal_length / self.f_number**2",
+        ("tests/optics/test_thin_lens.py",),
+    ),
+    Mutant(
+        "place of the entrance pupil",
+        "optics/models/diaphragm.py",
+        "Disc(-depth / (u - depth)",
+        "Disc(depth / (u - depth)",
+        ("tests/optics/test_thin_lens.py", LENS),
+    ),
+    Mutant(
+        "magnification of the entrance pupil",
+        "optics/models/diaphragm.py",
+        "abs(radius * focal / (focal - s))",
+        "radius",
+        ("tests/optics/test_thin_lens.py", LENS),
+    ),
+    Mutant(
+        "cos4 of the etendue map",
+        "optics/pixel_etendue.py",
+        "_off(offset, pupil, h, s) / u**2) ** -2.0",
+        "_off(offset, pupil, h, s) / u**2) ** -1.0",
+        ("tests/optics/test_pixel_etendue.py",),
+    ),
+    Mutant(
+        "pose of OpenCV's camera",
+        "optics/opencv_camera.py",
+        "to_world[:3, 3] = -rotation.T @ shift",
+        "to_world[:3, 3] = -rotation @ shift",
+        ("tests/optics/test_opencv_camera.py",),
+    ),
+    # Emission
+    Mutant("1/pi of Lambert's law", "emission/laws/lambert.py", "mi.Float(dr.inv_pi)", "mi.Float(1)", (LAWS,)),
+    Mutant("n2 of Fresnel's law", "emission/laws/fresnel.py", "dr.square(self._n)", "self._n", (LAWS,)),
+    Mutant(
+        "3 mu of Fresnel's law", "emission/laws/fresnel.py", "3 * dr.abs(cos_inner)", "2 * dr.abs(cos_inner)", (LAWS,)
+    ),
+    Mutant(
+        "refraction of the last flight",
+        "emission/laws/last_flight.py",
+        "(direction - mu * si.n) / self._n",
+        "(direction - mu * si.n)",
+        (LAWS,),
+    ),
+    Mutant(
+        "hemisphere integral of the last flight",
+        "emission/laws/last_flight.py",
+        "mu, ring = x**2, 2 * np.pi",
+        "mu, ring = x**2, np.pi",
+        (LAWS,),
+    ),
+    Mutant(
+        "moment of Haskell's A",
+        "optics/boundary.py",
+        "2 - (3 * inner * flux).sum()",
+        "2 - (2 * inner * flux).sum()",
+        ("tests/optics/test_boundary.py",),
+    ),
+    Mutant(
+        "critical angle of robin A",
+        "optics/boundary.py",
+        "- 1 + critical**3) / (1 - critical**2)",
+        "- 1 + critical**2) / (1 - critical**2)",
+        ("tests/optics/test_boundary.py",),
+    ),
+    Mutant("pi of an emitted ray", "plugins/surface.py", "(dr.pi * _rcp(pdf))", "_rcp(pdf)", (SURFACE,)),
+    Mutant("r2 of a density", "plugins/surface.py", "pdf * dr.square(ds.dist)", "pdf * ds.dist", (SURFACE,)),
+    Mutant(
+        "outward side",
+        "plugins/surface.py",
+        "(dr.dot(si.n, direction) > 0)",
+        "(dr.dot(si.n, direction) > -2)",
+        (SURFACE,),
+    ),
+    # Windows and mirrors
+    Mutant(
+        "weight of a specular course",
+        "integral/specular.py",
+        "found.radiance + course.weight * radiance",
+        "found.radiance + radiance",
+        ("tests/integral/test_specular.py",),
+    ),
+    Mutant(
+        "apparent depth behind glass",
+        "integral/specular.py",
+        "dr.select(met, pi.t, 0) * cosine / course.index",
+        "dr.select(met, pi.t, 0) * cosine",
+        ("tests/integral/test_specular.py",),
+    ),
+    # Detector and counts
+    Mutant(
+        "quantum efficiency",
+        "detector/detector.py",
+        "charge = self.quantum_efficiency * photons",
+        "charge = photons",
+        (DETECTOR,),
+    ),
+    Mutant(
+        "energy of a photon",
+        "detector/detector.py",
+        "PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)",
+        "PLANCK_TIMES_LIGHT / 650e-9",
+        (DETECTOR,),
+    ),
+    Mutant(
+        "area of the dark current",
+        "detector/detector.py",
+        "(float(pitch) / self.pixel_pitch) ** 2",
+        "float(pitch) / self.pixel_pitch",
+        (DETECTOR,),
+    ),
+    Mutant(
+        "sign of the dark charge",
+        "detector/reduction.py",
+        "detector.bias + charge / detector.gain, charge",
+        "detector.bias - charge / detector.gain, charge",
+        (REDUCTION,),
+    ),
+    Mutant(
+        "square of the read noise", "detector/reduction.py", "read**2 + independent", "read + independent", (REDUCTION,)
+    ),
+    Mutant(
+        "frames of a stack",
+        "detector/reduction.py",
+        "detector.quantum_efficiency) * frames",
+        "detector.quantum_efficiency)",
+        (REDUCTION,),
+    ),
+    Mutant(
+        "photons of an image", "images/radiometry.py", "factor * inverse", "factor * np.sqrt(inverse)", (RADIOMETRY,)
+    ),
+    Mutant(
+        "mean of a flat's kept pixels",
+        "detector/flat_field.py",
+        "relative / relative[usable].mean()",
+        "relative / relative.mean()",
+        ("tests/detector/test_flat_field.py",),
+    ),
+    Mutant(
+        "bias of a raw flat",
+        "detector/flat_field.py",
+        "light = found.values - background",
+        "light = found.values",
+        ("tests/detector/test_flat_field.py",),
+    ),
+    Mutant(
+        "screen of a flat by the lens",
+        "detector/flat_field.py",
+        "light / np.where(lit, screen, 1)",
+        "light",
+        ("tests/detector/test_flat_field.py",),
+    ),
+    # Tissue
+    Mutant(
+        "diffusion coefficient", "optics/media.py", "1 / (3 * (self.mua + self.musp))", "1 / (3 * self.musp)", (TISSUE,)
+    ),
+    Mutant(
+        "2 A of the boundary condition",
+        "tissue/finite_elements.py",
+        "u * v / (2 * self.factor)",
+        "u * v / self.factor",
+        (TISSUE,),
+    ),
+    Mutant(
+        "4 pi of the free field",
+        "tissue/free_field.py",
+        "inflation / (4 * np.pi * self.diffusion)",
+        "inflation / (2 * np.pi * self.diffusion)",
+        (TISSUE,),
+    ),
+    # Matrix, inversion, comparison
+    Mutant(
+        "two columns of the matrix swapped",
+        "inverse/transport_matrix.py",
+        "x = self._exitance(np.ravel(x))\n",
+        "x = self._exitance(np.ravel(x))[::-1]\n",
+        ("tests/inverse/test_transport_matrix.py", "tests/inverse/test_transport.py"),
+    ),
+    Mutant(
+        "transpose of the matrix",
+        "inverse/transport_matrix.py",
+        'parts = np.asarray(_finite("images", np.asarray(x, np.float64))).reshape(len(self.views), -1)',
+        'parts = np.asarray(_finite("images", np.asarray(x, np.float64))).reshape(len(self.views), -1)[::-1]',
+        ("tests/inverse/test_transport_matrix.py", "tests/inverse/test_transport.py"),
+    ),
+    Mutant(
+        "share of a face's area at a vertex",
+        "inverse/view_block.py",
+        "np.repeat(area / 3, 3)",
+        "np.repeat(area / 2, 3)",
+        ("tests/inverse/test_transport.py",),
+    ),
+    Mutant(
+        "variance of like pixels, M.27",
+        "inverse/measurement.py",
+        "variance[drawn] = sampling_variance(signal, self.other, drawn)[drawn]",
+        "variance[drawn] = self.other[drawn]",
+        ("tests/inverse/test_measurement.py",),
+    ),
+    Mutant(
+        "edge that no sample met",
+        "rendering/monte_carlo.py",
+        "np.where(missed > ALIKE * own, missed, own)",
+        "own",
+        ("tests/rendering/test_render.py",),
+    ),
+    Mutant(
+        "smoothness across a crease",
+        "inverse/creases.py",
+        "> self.angle",
+        "> 180 + self.angle",
+        ("tests/inverse/test_creases.py",),
+    ),
+    Mutant(
+        "area of a vertex that is seen",
+        "inverse/invert.py",
+        ">= MOST)",
+        ">= 0)",
+        ("tests/inverse/test_creases.py", "tests/inverse/test_invert.py"),
+    ),
+    Mutant(
+        "gain in the intervals of invert",
+        "inverse/invert.py",
+        "1 + self.measurement.gain_error * rng",
+        "1 + 0 * rng",
+        (INVERT,),
+    ),
+    Mutant(
+        "noise of the draws",
+        "inverse/invert.py",
+        "noise * rng.standard_normal((len(power), size))",
+        "0.5 * noise * rng.standard_normal((len(power), size))",
+        (INVERT,),
+    ),
+    Mutant(
+        "gain in the covariance of calibrate",
+        "inverse/calibration_fit.py",
+        "self.measured.gain_error**2 * np.outer",
+        "self.measured.gain_error * np.outer",
+        ("tests/inverse/test_calibrate.py",),
+    ),
+    Mutant(
+        "y axis of an image",
+        "images/pixel_axes.py",
+        "return cls(x, -y, side",
+        "return cls(x, y, side",
+        ("tests/images/test_image.py", "tests/images/test_regions.py", "tests/images/test_radiometry.py"),
+    ),
+    Mutant(
+        "length unit",
+        "phantom/length_unit.py",
+        '"cm": 10.0',
+        '"cm": 100.0',
+        ("tests/phantom/test_flux_units.py", "tests/phantom/test_flux_import.py"),
+    ),
+)
+
+
+def tried(mutant: Mutant, copy: Path) -> tuple[str, str]:
+    """Result of the tests on the mutant in a `copy` of the project: 'caught', 'survived' or 'not run', and by what."""
+    path = copy / "mitsuba_fspt" / mutant.file
+    original = path.read_text(encoding="utf-8")
+    path.write_text(mutant.applied(original), encoding="utf-8")
+    environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    options = ("-x", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=no", "-rf")
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "pytest", *options, *mutant.tests],
+            cwd=copy,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT,
+        )
+    except subprocess.TimeoutExpired:
+        return "caught", f"no end in {TIMEOUT} s"
+    finally:
+        path.write_text(original, encoding="utf-8")
+    if done.returncode == 0:
+        return "survived", ""
+    failed = re.search(r"^FAILED (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+    if done.returncode != FAILED or failed is None:
+        return "not run", (done.stdout + done.stderr).strip().splitlines()[-1]
+    return "caught", failed[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="", help="text that the name contains")
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs/mutants.csv")
+    options = parser.parse_args()
+    chosen = [mutant for mutant in MUTANTS if options.only in mutant.name]
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "project"
+        copy.mkdir()
+        for name in COPIED:
+            source = ROOT / name
+            ignored = shutil.ignore_patterns("__pycache__", "*.npz")
+            shutil.copytree(source, copy / name, ignore=ignored) if source.is_dir() else shutil.copy(
+                source, copy / name
+            )
+        for mutant in chosen:
+            start = monotonic()
+            result, by = tried(mutant, copy)
+            print(f"{result:9} {monotonic() - start:6.0f} s  {mutant.name}: {by}", flush=True)
+            rows.append((mutant.name, mutant.file, mutant.old, mutant.new, result, by))
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    with options.output.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("law", "file", "text", "mutant", "result", "test"))
+        writer.writerows(rows)
+    lost = [row[0] for row in rows if row[4] != "caught"]
+    print(f"{len(rows) - len(lost)} of {len(rows)} mutants caught" + (f"; not: {', '.join(lost)}" if lost else ""))
+    sys.exit(1 if lost or not rows else 0)
+
+
+if __name__ == "__main__":
+    main()
