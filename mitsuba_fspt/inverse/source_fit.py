@@ -37,7 +37,8 @@ class LocationSettings:
     step : of the differences for slopes, over the edge of the tetrahedra; the slopes are right to about 1 %
     steps : most accepted steps;  damping, least : first and least factor of Levenberg and Marquardt
     flat, patience : fall of Σ (residual/σ)² below which a step counts as one along a valley, and steps in a row after
-        which the fit ends there: the images do not determine the place along it, which the intervals and p-values say
+        which the fit ends there: the images do not determine the place along it, which the intervals and p-values say;
+        steps that only the border of the tissue shortens lead to no minimum inside
     chance : largest probability that noise alone looks like a source of which nothing is told
     stuck : factor of damping at which no step is left: the minimum is at the border, or beyond
     apart : least singular value of the slopes with columns of length 1, over the largest; below it sources count as not
@@ -213,9 +214,10 @@ class SourceFit:
         """Sources of least Σ (residual/σ)² from these first positions; σ is that of the last step."""
         settings, damping = self.settings, self.settings.damping
         even = np.concatenate([band.flat_sigma() for band in self.bands])
-        found, flat = self._tried(positions, PixelNoise(even, np.zeros_like(even), self.view), np.inf), 0
+        found, _ = self._tried(positions, PixelNoise(even, np.zeros_like(even), self.view), np.inf)
+        flat, border = 0, False
         for step in range(settings.steps):
-            if found is None:
+            if found is None or (flat == settings.patience and border):
                 break
             positions, self._share = found.positions, step / settings.steps
             found = self._weighted(found, self._noise(found))
@@ -225,10 +227,11 @@ class SourceFit:
             right = slopes.T @ found.residual(self.power) / lengths
             if flat == settings.patience or right @ np.linalg.lstsq(normal, right)[0] < settings.chi2:
                 return found
-            tried = None
+            tried, border = None, False
             while tried is None and damping < settings.stuck:
                 moved = np.linalg.solve(normal + damping * np.eye(len(normal)), right) / lengths
-                tried = self._tried(positions + moved.reshape(-1, 4)[:, :3], found.noise, found.cost)
+                tried, inside = self._tried(positions + moved.reshape(-1, 4)[:, :3], found.noise, found.cost)
+                border |= not inside
                 damping *= 10 if tried is None else 0.1
             flat = flat + 1 if tried is not None and found.cost - tried.cost < settings.flat else 0
             found, damping = tried, max(damping, settings.least)
@@ -305,20 +308,20 @@ class SourceFit:
         positions, powers = values.reshape(-1, 4)[:, :3], values.reshape(-1, 4)[:, 3]
         return found.noise.over(self.power - self._images(positions)[1] @ powers)
 
-    def _tried(self, positions: Array, noise: PixelNoise, below: float) -> PointSources | None:
-        """Sources at these positions with the powers > 0 that fit best.
+    def _tried(self, positions: Array, noise: PixelNoise, below: float) -> tuple[PointSources | None, bool]:
+        """Sources at these positions with the powers > 0 that fit best; False where the tissue has no solution there.
 
-        None where the tissue has no solution there, a source gets no power, or Σ (residual/σ)² is not below `below`.
+        The sources are None then, and where one gets no power or Σ (residual/σ)² is not below `below`.
         """
         try:
             exitance, columns = self._images(positions)
             empty = PointSources(positions, np.zeros(len(positions)), exitance, columns, np.empty(0), noise, 0.0)
             tried = self._weighted(empty, noise)
             if not ((tried.powers > 0).all() and tried.cost < below):
-                return None
-            return replace(tried, gradients=np.stack([*map(self._gradient, positions, columns.T)], axis=1))
+                return None, True
+            return replace(tried, gradients=np.stack([*map(self._gradient, positions, columns.T)], axis=1)), True
         except FluxError:
-            return None
+            return None, False
 
     def _weighted(self, found: PointSources, noise: PixelNoise) -> PointSources:
         """The same positions with the powers >= 0 that fit best for another noise."""
