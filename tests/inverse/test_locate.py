@@ -94,7 +94,7 @@ def test_intervals_hold(case):
 def test_images_of_a_monte_carlo(case):
     """Values within 4 sd, the power's below 3 %, and χ² about 1, though no sample met a quarter of the pixels.
 
-    Seen to fail with each pixel's own standard error: no source inside fits, or its power is 18 % too low.
+    Seen to fail with each pixel's own standard error: no source inside fits.
     """
     true = case.power(SOURCE)
     power, error = passes_of(true, 60, np.random.default_rng(0))
