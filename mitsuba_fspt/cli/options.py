@@ -57,7 +57,7 @@ GainError = Annotated[
     float | None, typer.Option(help="Relative uncertainty common to all pixels; that of the images if left out.")
 ]
 GainPerView = Annotated[
-    float, typer.Option(metavar="SD", help="Relative uncertainty of a factor of each view, fitted along; 0: none.")
+    float, typer.Option(metavar="SD", help="Relative uncertainty of a factor of each view, fitted as well; 0: none.")
 ]
 Sampled = Annotated[
     bool, typer.Option("--sampled", help="Images of a Monte Carlo: their errors come from the scatter of samples.")

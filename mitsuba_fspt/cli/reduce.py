@@ -32,7 +32,7 @@ Bias = Annotated[
 ]
 Dark = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="The same of the counts' exposure time, with the bias; no bias is needed then."),
+    typer.Option(metavar="FILE", help="Dark frame or stack of the counts' exposure time; contains the bias."),
 ]
 Flat = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame or stack of a uniform light, with --flat-kind.")]
 FlatKind = Annotated[
@@ -52,17 +52,17 @@ FlatDark = Annotated[
 ]
 
 
-Time = Annotated[float | None, typer.Option(help="[s] of a frame; that of the file if left out.")]
+Time = Annotated[float | None, typer.Option(help="Exposure time of a frame [s]; that of the file if left out.")]
 Binning = Annotated[
     int | None, typer.Option(help="Side of the square of pixels read out as one; that of the file, else 1.")
 ]
 Pitch = Annotated[
-    float | None, typer.Option(help="Of the pixels read out [mm]; detector's x binning, else that of the file.")
+    float | None, typer.Option(help="Side of a pixel read out [mm]; detector's x binning, else that of the file.")
 ]
 Scene = Annotated[
     Path | None, typer.Option(metavar="S.xml", help="Scene with the camera's lens and film, for --flat-kind lens.")
 ]
-Frames = Annotated[int | None, typer.Option(metavar="N", help="That each single frame of counts is the mean of.")]
+Frames = Annotated[int | None, typer.Option(metavar="N", help="Number of frames that a single one is the mean of.")]
 BadPixels = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame that is not 0 on the pixels to mask.")]
 Calibrate = Annotated[
     bool, typer.Option("--calibrate", help="The counts show a uniform source; write CALIBRATED.toml.")

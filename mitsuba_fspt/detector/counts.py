@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
 from ..images.tiff_pages import read_tiff
-from ..runtime.errors import BackendError, DetectorError, ImageError
+from ..runtime.errors import LONGEST_TEXT, BackendError, DetectorError, ImageError, one_line
 from ..runtime.numbers import whole
 
 LOG = logging.getLogger("mitsuba_fspt")
@@ -101,7 +101,7 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
 
     Raises
     ------
-    ImageError : the file cannot be read, or holds no picture of real numbers, or NaN.
+    ImageError : the file cannot be read, holds no real numbers, or holds NaN.
     BackendError : tifffile or astropy, which read TIFF and FITS, is not installed.
     """
     path = Path(path)
@@ -123,7 +123,9 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
                 warnings.simplefilter("ignore")  # NumPy's of an odd header, which it reads or refuses
                 array = np.load(path, allow_pickle=False)
         except Exception as cause:  # whatever a damaged file makes NumPy raise
-            raise ImageError(f"counts '{path}' are no NPY file of numbers: {_line(cause)}. Save them again.") from cause
+            raise ImageError(
+                f"counts '{path}' are no NPY file of numbers: {one_line(cause, LONGEST_TEXT)}. Save them again."
+            ) from cause
     else:
         raise ImageError(f"counts '{path}': '{suffix}' is not read. Give .tif, .fits, .npy or a click folder.")
     array = array.astype(np.uint8) if array.dtype == bool else array  # a frame of bad pixels
@@ -218,13 +220,15 @@ def _fits(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
             found |= {} if sides is None else {"binning": int(sides)}
             found |= {} if wide is None or high not in (None, wide) else {"pixel_pitch": float(wide) / UM_PER_MM}
     except Exception as cause:
-        raise ImageError(f"counts '{path}' are no readable FITS: {_line(cause)}. Copy the file again.") from cause
-    texts = [_line(report.message) for report in reports]
+        raise ImageError(
+            f"counts '{path}' are no readable FITS: {one_line(cause, LONGEST_TEXT)}. Copy the file again."
+        ) from cause
+    texts = [one_line(report.message, LONGEST_TEXT) for report in reports]
     for text in texts:
         if "truncated" in text:  # astropy returns what there is
             raise ImageError(f"counts '{path}' are an incomplete FITS: {text}. Copy the file again.")
     if texts:
-        LOG.warning("fspt: counts '%s': astropy reports: %s. Check the picture.", path, texts[0])
+        LOG.warning("fspt: counts '%s': astropy reports: %s. Check the image.", path, texts[0])
     if None not in (sides, rows) and sides != rows:
         raise ImageError(f"counts '{path}' are binned {sides} x {rows}. Give counts of square binning.")
     if str(order).strip().upper() == "BOTTOM-UP" and data.ndim > 1:
@@ -237,8 +241,8 @@ def _click(folder: Path) -> Counts:
     files = {file.stem.lower(): file for file in sorted(folder.iterdir()) if file.is_file()}
     if CLICK not in files:
         raise ImageError(f"folder '{folder}' holds no luminescent.TIF. Give a click folder of an IVIS camera.")
-    found = {n: _picture(files[n]).values for n in (BIAS, BACKGROUND) if n in files}
-    light = _picture(files[CLICK])
+    found = {n: _click_counts(files[n]).values for n in (BIAS, BACKGROUND) if n in files}
+    light = _click_counts(files[CLICK])
     info = _click_info(files[INFO].read_text("utf-8", "replace")) if INFO in files else {}
     time, binning = _number(info, EXPOSURE), _number(info, BINNING)
     sides = None if binning is None else int(binning)
@@ -246,7 +250,7 @@ def _click(folder: Path) -> Counts:
     return replace(light, bias=bias, background=background, exposure_time=time, info=info, binning=sides)
 
 
-def _picture(file: Path) -> Counts:
+def _click_counts(file: Path) -> Counts:
     """Counts of a TIFF of a click folder."""
     return counts_of(read_tiff(file, f"counts '{file}'"), str(file))
 
@@ -281,7 +285,3 @@ def _number(info: dict[str, str], patterns: tuple[re.Pattern[str], ...]) -> floa
             if pattern.search(key) and (text := NUMBER.search(value)) and math.isfinite(number := float(text[0])):
                 return number
     return None
-
-
-def _line(cause: object) -> str:
-    return " ".join(str(cause).split())[:200].rstrip(".") or type(cause).__name__

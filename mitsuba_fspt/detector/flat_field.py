@@ -3,8 +3,8 @@
     sensor   f = F/⟨F⟩            uniform light on the sensor, without the lens
     lens     f = (F/U)/⟨F/U⟩      uniform screen through the scene's lens; U is its image by the model (Eq. M.6)
 
-F are the flat's counts less its bias and dark current, ⟨⟩ is the mean over the pixels that are kept. The matrix and
-every rendered image contain U, cos⁴θ and the borders of the lens among it: a flat field must not take it out again.
+F are the flat's counts less its bias and dark current, ⟨⟩ is the mean over the pixels that are kept. U includes cos⁴θ
+and the vignetting by the borders of the lens. The matrix and every rendered image contain it, so f must not.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 LOG = logging.getLogger("mitsuba_fspt")
 KINDS = ("lens", "sensor")
-LEAST = 0.05  # of the median response, and of the screen's brightest pixel: the error of darker pixels is > 20 times it
+LEAST = 0.05  # of the median response, and of the screen's brightest pixel: darker ones have > 20 times the noise
 HOT = 2.0  # times the median of its 5 × 5 neighbours: an unmasked hot pixel of n changes the mean by less than 1/n
 NEIGHBOURS = 5  # pixels a side
 NORMALISED = 2.0  # largest median of a flat that was divided by its mean before; that of DN is larger
@@ -48,7 +48,7 @@ class FlatField:
     """Response of the pixels (h, w).
 
     response : f, relative to the mean of the pixels that are kept; 1 where masked
-    mask : True where the flat tells no response: dark, negative, saturated or hot pixels, and those without light
+    mask : True where the flat gives no response: dark, negative, saturated or hot pixels, and those without light
     variance : relative variance of f by shot and read noise; 0 for a single frame, whose number of frames is unknown
     kind : 'lens' or 'sensor'
     """

@@ -1,4 +1,4 @@
-"""Saturated pixels: by the detector's numbers, and by a pile of counts at one largest value against the noise."""
+"""Saturated pixels: by the detector's numbers, and by more pixels at exactly the largest count than noise explains."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def unknown_ceiling(detector: Detector, counts: Array, frames: int = 1) -> float
     the value M in the tail from M on of a normal distribution with the standard deviation σ of shot and read noise at
     M: h = 1 − Q(z + s/σ)/Q(z), Q(z) = n/N, with all N pixels and the step s of the counts. Fewer pixels of that light
     lie less far in the tail, where h is smaller. At low light σ is below the step, h is near 1 and nothing is found.
-    Counts without noise, such as simulated ones, have such piles at other values as well; then nothing is found either.
+    Counts without noise, such as simulated ones, repeat other values as often; then nothing is found either.
 
     counts : (h, w) [DN], of one frame or the mean of `frames` frames
     """

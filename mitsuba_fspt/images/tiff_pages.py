@@ -1,4 +1,4 @@
-"""TIFF files of other programs: their pictures, and what is wrong with them."""
+"""TIFF files of other programs: their images, and what is wrong with them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from ..runtime.errors import ImageError
+from ..runtime.errors import LONGEST_TEXT, ImageError, one_line
 from ..runtime.extras import require
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ PRIVATE = 32768  # least number of a private tag, which says nothing about the p
 
 
 def read_tiff(path: Path, thing: str) -> NDArray[Any]:
-    """Pictures of a TIFF file, (h, w) or (pages, h, w, …) as they are stored.
+    """Images of a TIFF file, (h, w) or (pages, h, w, …) as they are stored.
 
     What tifffile reports about tags that do not matter is one line on stderr.
 
@@ -43,10 +43,10 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
             if _has_page(file, path.stat().st_size // SMALLEST_PAGE + 1):
                 raise ValueError("its pages follow each other in a circle")
             series = file.series[0]
-            pictures = series.asarray()
+            images = series.asarray()
             missing = sum(page is None for page in series.pages)
     except Exception as cause:  # whatever a damaged file makes tifffile raise
-        raise _damaged(thing, str(cause) or type(cause).__name__) from cause
+        raise _damaged(thing, cause) from cause
     if missing:
         raise _damaged(thing, f"{missing} of its {len(series.pages)} pages are missing")
     texts = [" ".join(report.getMessage().split()) for report in reports]
@@ -55,8 +55,8 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
             raise _damaged(thing, text)
     if texts:
         more = f" (and {len(texts) - 1} more)" if len(texts) > 1 else ""
-        LOG.warning("fspt: %s: tifffile reports: %s%s. Check the picture.", thing, texts[0][:200].rstrip("."), more)
-    return pictures
+        LOG.warning("fspt: %s: tifffile reports: %s%s. Check the image.", thing, one_line(texts[0], LONGEST_TEXT), more)
+    return images
 
 
 def _has_page(file: TiffFile, number: int) -> bool:
@@ -73,8 +73,8 @@ def _is_of_private_tag(text: str) -> bool:
     return tag is not None and int(tag[1]) >= PRIVATE
 
 
-def _damaged(thing: str, reason: str) -> ImageError:
-    line = " ".join(reason.split())[:200].rstrip(".")
+def _damaged(thing: str, reason: object) -> ImageError:
+    line = one_line(reason, LONGEST_TEXT)
     return ImageError(f"{thing}: the file is damaged, or no TIFF file: {line}. Copy or save it again.")
 
 

@@ -118,7 +118,7 @@ class Draft:
             lost = self.grid.spread_max(self.lost, self.reach(self.nodes)[1])
             error += lost * dr.opaque(mi.Float64, most_radiance(self.view.scene))
         if self.progress.deadline.cut and all(map(is_surface, self.view.scene.emitters())):
-            # No more than is possible: estimates for few lines of sight may be a hundred times as large.
+            # The radiance is between 0 and the largest of the scene; estimates from few lines of sight exceed that.
             most = dr.opaque(mi.Float64, most_radiance(self.view.scene))
             error = dr.minimum(error, dr.maximum(self.value, most - self.value))
         coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))

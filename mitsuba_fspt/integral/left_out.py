@@ -30,7 +30,7 @@ SURE = 2.0  # standard errors above which a share is significant
 
 @dataclass
 class LeftOut:
-    """Share of a picture's power that a method leaves out, its standard error, and ids of the shapes that send it on.
+    """Share of an image's power that a method leaves out, its standard error, and ids of the shapes that send it on.
 
     depth : segments of light paths that the method follows; None: the integral
     needed : segments that contain what is counted
@@ -67,7 +67,7 @@ def light_left_out(
     """
     with recording(), dr.suspend_grad():
         window = visible_window(scene, lens)
-        if 0 in window.shape:  # no emitter is in the picture, but what it shines on may be
+        if 0 in window.shape:  # no emitter is in the image, but what it shines on may be
             window = visible_window(scene, lens, everywhere=True)
         if 0 in window.shape:
             return None

@@ -1,6 +1,6 @@
-"""Faults of the meshes that glow: faces that turn both ways, surfaces inside out, and a size unusual for a phantom.
+"""Faults of the meshes that glow: inconsistent orientations, surfaces inside out, and a size unusual for a phantom.
 
-Such a scene gives a picture, but not that of the phantom: a face emits on its outward side alone.
+The image of such a scene lacks light of the phantom: a face emits on its outward side alone.
 """
 
 from __future__ import annotations

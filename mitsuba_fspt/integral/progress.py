@@ -1,4 +1,4 @@
-"""Share of the integral's levels that are done, reported after each of them, and the time until which they begin."""
+"""Share of the integral's levels that are done, reported after each, and the deadline after which none begins."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from ..jit.batches import BATCH
 from ..runtime.deadline import Deadline
 
-TIMED_BATCHES = 16  # times as many batches with a deadline, by one of which it is exceeded
+TIMED_BATCHES = 16  # times as many batches with a deadline, which is exceeded by one of them at most
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Inversion:
         gap of the log-likelihood
     converged : False where variances or weight still changed in the last round
     gain_error : relative uncertainty of a common factor, contained in the intervals
-    gain_per_view : relative standard deviation of a factor of each view, fitted along and contained in the intervals
+    gain_per_view : relative standard deviation of a factor of each view, fitted as well and contained in the intervals
     view_factors : (views,) these factors, which `fitted` contains;  view_factor_draws : (views, samples) draws of them
     measured, fitted, sigma : (views, height, width) [W]; NaN where masked, or outside the surface
     warnings : lines of stderr on what the residuals say of the model and of the stated errors

@@ -76,7 +76,7 @@ def invert(
     weight : of the penalty on roughness [mm²], >= 0; None: the weight that agrees with the roughness found (Eq. M.25)
     prior : mean, reference and correlation length of the penalty; None: roughness relative to J_n itself is penalised
     gain_error : relative uncertainty of a factor common to all pixels, in [0, 1); None: that of the images, else 0
-    gain_per_view : relative standard deviation of a factor of each view, fitted along (Eq. M.35), in [0, 1); 0: none
+    gain_per_view : relative standard deviation of a factor of each view, fitted with J_n (Eq. M.35), in [0, 1); 0: none
     sampled : True for images of a Monte Carlo, whose variance is then a smooth function of the fitted signal (Eq. M.27)
         and whose errors may be 0; images whose metadata name `passes` are taken so by themselves
     samples, seed : number of random draws, from which the intervals follow (0: none), and their seed, 0 … 2⁵³
@@ -407,8 +407,8 @@ class Problem:
         lines = tell_misfit("invert", chi2_sum, len(self.rows), fit.determined, [noise])
         if not fit.determined > 0:
             return lines
-        picture = self.measurement.picture(self.rows, signal)[0]
-        views = views_of(view_labels(self.matrix), picture, self.rows, fit.sigma)
+        fitted = self.measurement.as_images(self.rows, signal)[0]
+        views = views_of(view_labels(self.matrix), fitted, self.rows, fit.sigma)
         free, design = ~self.bounds | (fit.x > 0), self.design(fit.x)
         found = structure(
             (self.measurement.power[self.rows] - signal) / fit.sigma,

@@ -77,7 +77,7 @@ class Location:
     measured, fitted, sigma : (views, height, width) [W], NaN where masked or outside the surface; by the names of the
         bands where the images were given so
     residual : (measured − fitted)/sigma, in the same form
-    gain_per_view : relative standard deviation of a factor of each view, fitted along and contained in the intervals
+    gain_per_view : relative standard deviation of a factor of each view, fitted as well and contained in the intervals
     view_factors : (views,) these factors, of all bands one after the other; `fitted` contains them
     warnings : lines of stderr on what the residuals say of the model and of the stated errors
     """

@@ -23,7 +23,7 @@ from .transport_matrix import TransportMatrix
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
 MISFIT = 4.0  # standard deviations of Σ (residual/σ)² by chance: more happens in one fit of 30,000
-WIDE = 0.9  # chi2 from which on downwards errors that are stated too large are told: intervals are 5 % too wide
+WIDE = 0.9  # chi2 below which a warning says that errors are stated too large: intervals are > 5 % too wide
 # Of Eq. M.27: steps of ln P; the number of groups for one variance, since the square of one standard error from eight
 # passes is wrong by a half; and the share of the brightest pixel below which pixels count as equally dark.
 ALIKE, GROUPS, FAINT = 0.05, 16, 1e-4
@@ -180,8 +180,8 @@ class Measurement:
 
         Raises InversionError, in the name of `verb`, for pixels without noise.
         """
-        picture, used = self.picture(rows, signal)
-        variance = self.noise.variance(picture, used)[used] + numerical**2
+        images, used = self.as_images(rows, signal)
+        variance = self.noise.variance(images, used)[used] + numerical**2
         if not (variance > 0).all():
             count = int(np.sum(~(variance > 0)))
             raise InversionError(
@@ -192,14 +192,14 @@ class Measurement:
 
     def chi2(self, rows: NDArray[np.int64], signal: Array, sigma: Array) -> Chi2:
         """Σ (noise/σ)² of the pixels `rows` for a fitted signal [W] and its σ [W]."""
-        picture, used = self.picture(rows, signal)
-        return self.noise.chi2(picture, self.picture(rows, sigma)[0], used)
+        images, used = self.as_images(rows, signal)
+        return self.noise.chi2(images, self.as_images(rows, sigma)[0], used)
 
-    def picture(self, rows: NDArray[np.int64], values: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def as_images(self, rows: NDArray[np.int64], values: Array) -> tuple[Array, NDArray[np.bool_]]:
         """`values` of the ascending `rows` as (views, h, w), NaN where masked and 0 elsewhere; True on the rows."""
-        picture, used = np.where(self.mask, np.nan, 0.0), np.zeros(len(self.mask), bool)
-        picture[rows], used[rows] = values, True
-        return picture.reshape(self.noise.shot.shape), used.reshape(self.noise.shot.shape)
+        images, used = np.where(self.mask, np.nan, 0.0), np.zeros(len(self.mask), bool)
+        images[rows], used[rows] = values, True
+        return images.reshape(self.noise.shot.shape), used.reshape(self.noise.shot.shape)
 
 
 def _numbers(values: Any, shape: tuple[int, ...]) -> Array:

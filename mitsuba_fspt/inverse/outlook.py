@@ -43,10 +43,9 @@ class Hopeless:
 
 
 def is_hopeless(problem: Problem, levels: list[Surface], bounds: Hopeless, report: Progress) -> bool:
-    """True where more unknowns do not explain the images either, or pixels by themselves hold most of χ².
+    """True where more unknowns do not explain the images either, or single pixels hold most of χ²; told on stderr.
 
-    One line on stderr says so. levels : the surface and coarser ones, as from `Surface.coarser`; False where there is
-    no coarser one
+    levels : the surface and coarser ones, as from `Surface.coarser`; without a coarser one the result is False
     """
     if len(levels) < 2:
         return False

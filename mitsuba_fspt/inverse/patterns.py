@@ -1,6 +1,6 @@
 """Patterns in the residuals of images that a cause outside the model makes, of unit length in units of the noise.
 
-Of each view: a factor, an additive background, a gradient, a shift, a scale of the picture about its centre, and low
+Of each view: a factor, an additive background, a gradient, a shift, a scale of the image about its centre, and low
 cosines over the film times the signal; a shift and a scale that all views have in common; of each source inside: powers
 of the distance from it times its light.
 """
@@ -35,16 +35,16 @@ class Seen:
     sigma: Array
 
 
-def views_of(names: Sequence[str], picture: Array, rows: NDArray[np.int64], sigma: Array) -> list[Seen]:
+def views_of(names: Sequence[str], signal: Array, rows: NDArray[np.int64], sigma: Array) -> list[Seen]:
     """What each view shows.
 
-    picture : (views, h, w) fitted signal [W], NaN where masked
+    signal : (views, h, w) fitted signal [W], NaN where masked
     rows, sigma : (N,) ascending numbers of the pixels of all views that are fitted, and their noise [W]
     """
-    size = picture[0].size
+    size = signal[0].size
     view = rows // size
     return [
-        Seen(name or f"image {k + 1}", picture[k], rows[view == k] - k * size, sigma[view == k])
+        Seen(name or f"image {k + 1}", signal[k], rows[view == k] - k * size, sigma[view == k])
         for k, name in enumerate(names)
     ]
 

@@ -39,7 +39,7 @@ class LocationSettings:
     flat, patience : fall of Σ (residual/σ)² below which a step counts as one along a valley, and steps in a row after
         which the fit ends there: the images do not determine the place along it, which the intervals and p-values say;
         steps that only the border of the tissue shortens lead to no minimum inside
-    chance : largest probability that noise alone looks like a source of which nothing is told
+    chance : p-value of a source above which a warning says that noise alone may look like it
     stuck : factor of damping at which no step is left: the minimum is at the border, or beyond
     apart : least singular value of the slopes with columns of length 1, over the largest; below it sources count as not
         determined separately
@@ -157,9 +157,9 @@ class SourceFit:
         """Test of the residuals for structure: over each view of each band, and around each source."""
         views, known, light = list[Seen](), [], found.columns * found.powers / found.sigma[:, None]
         for band, own, exitance in zip(self.bands, self._parts, found.exitance, strict=True):
-            picture = band.measurement.picture(band.rows, found.signal[own])[0]
+            fitted = band.measurement.as_images(band.rows, found.signal[own])[0]
             names = [label if band.name is None else f"{band.name}: {label}" for label in view_labels(band.matrix)]
-            seen = views_of(names, picture, band.rows, found.sigma[own])
+            seen = views_of(names, fitted, band.rows, found.sigma[own])
             numerical = band.numerical(exitance @ found.powers) / found.sigma[own]
             factor = band.measurement.gain_error * csr_array((found.signal[own] / found.sigma[own])[:, None])
             known.append(hstack([common_errors(numerical, seen), factor]))

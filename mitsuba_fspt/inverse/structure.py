@@ -41,8 +41,8 @@ class StructureSettings:
     """Thresholds of the test.
 
     chance : probability of a false alarm by noise, of all patterns together, and of the most likely one
-    noise : least share of a direction's variance that is noise of the images. The rest is how much the penalty's prior
-        says that J_n is smoothed away; of directions with more of it, the test would be one of that prior
+    noise : least share of a direction's variance that is noise of the images. The rest is variance of J_n
+        that the penalty smooths away; in directions with more of it, the test would be one of the prior
     absorbed : least share of a direction that the fit leaves in the residuals; below it rounding counts
     named : most causes that are named
     """

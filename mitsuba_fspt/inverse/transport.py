@@ -116,7 +116,7 @@ def transport(
 
     As Eq. 9 does, T leaves out the light that surfaces scatter on to the lens; a warning tells the largest share of a
     view, for J = 1. The metadata also say in `warnings` on how many pixels `rtol` was not reached, if on any, and what
-    is odd about the scene, such as a mesh whose faces turn both ways; `error` has by how much pixels are off.
+    is odd about the scene, such as a mesh of inconsistent orientations; `error` estimates the errors of the pixels.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Uncertain factors of the views, normal about 1, which are fitted along with J_n (Eq. M.35 of docs/model.md)."""
+"""Uncertain factors of the views, normal about 1, which are fitted together with J_n (Eq. M.35 of docs/model.md)."""
 
 from __future__ import annotations
 
@@ -27,8 +27,9 @@ def checked_factor(verb: str, value: object) -> float:
 class ViewFactors:
     """Factors of views: their ratios as unknowns g of unit variance, and what they have in common.
 
-    A common factor is one of J_n, which no image determines; only the penalty would, which J_n ∝ 0 lowers. The V − 1
-    unknowns are therefore those of f = 1 + δ E g with orthonormal columns E whose sums over the views are 0.
+    No image tells a factor common to all views from a factor of J_n; only the penalty, which is lower for smaller J_n,
+    would determine it. The V − 1 unknowns are therefore those of f = 1 + δ E g, with orthonormal columns E whose sums
+    over the views are 0.
 
     sd : δ, relative standard deviation of the factor of each view; 0: no unknowns
     view : (N,) number of the view of each pixel;  views : their number V
@@ -50,7 +51,7 @@ class ViewFactors:
 
     @cached_property
     def basis(self) -> Array:
-        """(V, count) E."""
+        """(V, count) orthonormal columns E, whose sums over the views are 0."""
         return np.linalg.qr(np.column_stack([np.ones(self.views), np.eye(self.views)[:, 1:]]))[0][:, 1:][
             :, : self.count
         ]
@@ -102,5 +103,5 @@ class PixelNoise:
 
     @property
     def log_determinant(self) -> float:
-        """Of the covariance."""
+        """ln of the determinant of the covariance, σ in W."""
         return float(2 * np.log(self.sigma).sum() + np.log1p(self.squares).sum())

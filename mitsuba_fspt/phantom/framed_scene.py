@@ -250,7 +250,7 @@ class Outline:
 
     centre, size : of the bounding box (3,) [mm]
     radii, heights : of each vertex, its distance from that axis and from the middle plane (V,) [mm]
-    across : of each vertex, x and y from that axis (V, 2) [mm]; None of a body that is round about it
+    across : of each vertex, x and y from that axis (V, 2) [mm]; None for a body of revolution about it
     """
 
     centre: NDArray[np.float64]

@@ -161,7 +161,7 @@ def turned_share(points: Points, faces: Indices) -> float:
 
 
 def _bounding(points: Points, faces: Indices) -> Indices:
-    """The faces that bound a volume, by one of the points at each position: no lines and no points."""
+    """The faces with corners at equal positions merged, without those that are a line or a point."""
     points = np.ascontiguousarray(points + 0.0)  # -0 becomes 0
     place = np.zeros(len(points), np.uint64)
     for bits in points.view(np.uint64 if points.dtype == np.float64 else np.uint32).T:
@@ -177,7 +177,7 @@ def _bounding(points: Points, faces: Indices) -> Indices:
 
 
 def _mixed(number: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """A number of 64 bits that looks random, of each number; different ones of different numbers."""
+    """Pseudo-random 64-bit number for each number; different numbers have different ones."""
     for factor in (0xBF58476D1CE4E5B9, 0x94D049BB133111EB):
         number = (number ^ (number >> np.uint64(31))) * np.uint64(factor)
     return number ^ (number >> np.uint64(29))

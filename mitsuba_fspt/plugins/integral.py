@@ -389,7 +389,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             )
 
     def _log_warnings(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
-        """Log what a picture does not show and what is odd about the scene: each line once, when shapes or lens change.
+        """Log what an image does not show and what is odd about the scene: each line once, when shapes or lens change.
 
         `mitsuba_fspt.render` has the same lines in its metadata.
         """

@@ -1,4 +1,4 @@
-"""Numbers of the lens of a scene, without a picture of it."""
+"""Numbers of the lens of a scene, without rendering it."""
 
 from __future__ import annotations
 

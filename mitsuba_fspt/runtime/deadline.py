@@ -12,28 +12,28 @@ LEAST_TIME = 1e-3  # s: what a part of the work gets when no time is left
 
 
 class Deadline:
-    """Moment from which on work that may be left out is left out.
+    """Time limit, after which work that is not indispensable is skipped.
 
-    cut : True once work was left out
+    cut : True once work has been skipped
     """
 
     def __init__(self, seconds: float | None = None) -> None:
-        """`seconds` from now; None: never."""
+        """`seconds` from now; None: no limit."""
         self.end = math.inf if seconds is None else time.monotonic() + seconds
         self.cut = False
 
     @property
     def is_set(self) -> bool:
-        """True unless it is never."""
+        """True if there is a limit."""
         return self.end < math.inf
 
     @property
     def left(self) -> float:
-        """Time until then [s], negative afterwards; inf if it is never."""
+        """Time left [s], negative after the limit; inf without one."""
         return self.end - time.monotonic()
 
     def passed(self) -> bool:
-        """True from that moment on. Ask where work can be left out, and leave it out then: `cut` becomes True."""
+        """True after the limit, which also sets `cut`: call it only where work is then skipped."""
         if self.left > 0:
             return False
         self.cut = True

@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+LONGEST_TEXT = 200  # characters of another library's message within one of ours
+
 
 class FsptError(ValueError):
     """Base class of the package's exceptions; the command line prints the message as one line and exits with code 2."""
@@ -64,3 +66,8 @@ def renamed(verb: str, other: str) -> Iterator[None]:
         yield
     except FsptError as error:
         raise type(error)(str(error).replace(f"{verb}: ", f"{other}: ", 1)) from error
+
+
+def one_line(cause: object, longest: int | None = None) -> str:
+    """Text of an exception, else the name of its class, on one line without full stop; at most `longest` characters."""
+    return " ".join(str(cause).split())[:longest].rstrip(".") or type(cause).__name__

@@ -66,4 +66,4 @@ def test_a_private_tag_that_is_wrong_is_one_line(tmp_path, caplog):
     np.testing.assert_array_equal(read_tiff(path, "counts 'counts.tif'"), FRAMES[0])
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.startswith("fspt: counts 'counts.tif': tifffile reports: ")
-    assert line.endswith("Check the picture.")
+    assert line.endswith("Check the image.")

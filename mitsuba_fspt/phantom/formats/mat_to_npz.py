@@ -26,7 +26,7 @@ def main(source: str, target: str) -> None:
             found[name] = value
     arrays = {name: np.asarray(value.toarray() if issparse(value) else value) for name, value in found.items()}
     numbers: dict[str, Any] = {f"_{name}": array for name, array in arrays.items() if array.dtype.kind in "fiuc"}
-    np.savez(target, **numbers)  # which has arguments of other names, such as 'file'
+    np.savez(target, **numbers)  # '_' keeps names apart from arguments of savez, such as 'file'
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ...runtime.errors import BackendError, FluxError
+from ...runtime.errors import BackendError, FluxError, one_line
 from .gmsh import put_in_order
 from .raw import Field, RawMesh, scalars
-from .table import one_line, require_file
+from .table import require_file
 
 FORMATS = {
     ".vtu": "vtu",

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...runtime.errors import BackendError, FluxError
+from ...runtime.errors import BackendError, FluxError, one_line
 from ..surface_mesh import merge
 from .raw import Field, RawMesh, scalars
-from .table import one_line, read_npz, require_file
+from .table import read_npz, require_file
 
 if TYPE_CHECKING:
     import trimesh

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...runtime.errors import BackendError, FluxError
+from ...runtime.errors import BackendError, FluxError, one_line
 
 # Longest time to read a MATLAB file, and least speed; an idle machine takes 0.5 s and reads 100 MB/s.
 MAT_TIME, MAT_SPEED = 30.0, 1e6  # s, bytes/s
@@ -224,7 +224,7 @@ def _read_mat(path: Path) -> dict[str, NDArray]:
             done = subprocess.run(program, capture_output=True, text=True, check=False, timeout=seconds)
         except subprocess.TimeoutExpired as cause:
             raise FluxError(
-                f"'{path}' cannot be read as a MATLAB file: SciPy comes to no end in {seconds:.0f} s. Save it anew."
+                f"'{path}' cannot be read as a MATLAB file: SciPy takes more than {seconds:.0f} s. Save it anew."
             ) from cause
         if done.returncode == 0:
             return {name.removeprefix("_"): array for name, array in read_npz(target).items()}
@@ -247,8 +247,3 @@ def require_file(path: Path) -> None:
     if not os.path.isfile(path):
         reason = "it is a folder" if os.path.isdir(path) else "there is no such file"
         raise FluxError(f"'{path}' cannot be read: {reason}. Check the name.")
-
-
-def one_line(cause: BaseException) -> str:
-    """Text of an exception, or the name of its class, on one line without full stop."""
-    return " ".join(str(cause).split()).rstrip(".") or type(cause).__name__
