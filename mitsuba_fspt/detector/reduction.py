@@ -48,7 +48,7 @@ REPLACED = (
 COMPUTED = (
     *("method", "rtol", "domain", "pixel", "max_nodes", "max_specular", "shortcuts_off", "nodes", "levels", "left_out"),
     *("light_left_out", "light_left_out_error", "warnings", "wall_time", "variant", "versions"),
-    *("sampler", "spp", "passes", "seed"),
+    *("sampler", "spp", "passes", "seed", "max_depth", "max_time", "stopped_after"),
 )
 ROUNDING = 1e-6  # relative error of a variance from a file's float32 numbers
 

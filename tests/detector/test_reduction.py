@@ -304,6 +304,7 @@ def test_a_reduced_image_is_no_rendered_one(mono, how):
         "focal_length",
         "f_number",
         "focus_distance",
+        "airy_radius",
     }
     kept |= {"magnification", "image_distance", "t_stop", "diaphragm_distance", "diaphragm_diameter", "transmittance"}
     by_hand = CCD.reduce(exposure.counts, **SETTINGS, pixel_pitch=0.4, metadata=image.metadata)
