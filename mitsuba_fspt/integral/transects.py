@@ -96,7 +96,7 @@ class _Refinement:
         replaced = where if level else first_met  # without a jump, nodes are more accurate than two transects
         self.value = dr.select(replaced, value, self.value)
         self.remaining = dr.select(where, remaining, self.remaining)
-        kept = self._earlier_is_better(remaining, first_met) if level else mi.Bool(False)
+        kept = self._earlier_is_better(remaining, first_met) if level > 1 else mi.Bool(False)
         self.own = dr.select(where & ~kept, remaining, self.own)
         draft.value = dr.select(replaced & ~kept, value, draft.value)
         draft.set_coverage(dr.select(replaced & ~kept, coverage, draft.coverage))
@@ -113,7 +113,8 @@ class _Refinement:
         """Pixels whose value in the draft has a smaller error than that of this level, which lies within that error.
 
         A value beyond it contradicts the earlier error, which was too small, and so does a jump that is new. Without an
-        earlier level the error is 0.
+        earlier level the error is 0. The error of the first level, which nothing but its own few transects and a node
+        rule tell, keeps no value.
         """
         agrees = dr.abs(self.value - self.draft.value) <= self.own
         return agrees & (self.own > 0) & (self.own < remaining) & ~first_met

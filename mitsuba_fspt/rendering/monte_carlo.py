@@ -80,14 +80,17 @@ def standard_error(mean: Plane, mean_square: Plane, count: int, samples: int) ->
     """Standard error s [W], shape (h, w), of the `mean` ⟨P⟩ of `count` passes with `samples` per pixel in total.
 
     `mean` [W] and `mean_square` ⟨P²⟩ [W²] have the shape (h, w). s² = (⟨P²⟩ - ⟨P⟩²)/(count - 1) where the passes
-    determine it. If light arrives in events of power w each, s² = w ⟨P⟩, and ⟨P⟩²/s² is the number of events. In three
+    determine it. If light arrives in events of power w each, s² = w ⟨P⟩, and ⟨P⟩²/s² is the number of events. In four
     cases a pixel's own passes do not determine s:
 
     (a) at most `FEW` events: s² is its mean over such pixels in the 3 × 3 neighbourhood, those without events left out;
     (b) no event: in addition s is at least the largest w in the neighbourhood;
     (c) samples that agree, next to a pixel of another power: one sample more could have met what the neighbour sees. s
         is Δ/samples where that is above `ALIKE` times the scatter, Δ the largest difference of ⟨P⟩ to the 3 × 3
-        neighbours. On a slope of ⟨P⟩ the samples themselves scatter by more.
+        neighbours. On a slope of ⟨P⟩ the samples themselves scatter by more;
+    (d) passes that agree, next to a pixel with s above `ALIKE` times this one: some samples of the neighbour miss the
+        light, as in a mask, so that samples of this pixel could miss it too. s is at least the smaller of ⟨P⟩/samples
+        and the neighbour's s.
     """
     from ..jit.pixel_grid import Grid
 
@@ -103,4 +106,6 @@ def standard_error(mean: Plane, mean_square: Plane, count: int, samples: int) ->
     pooled = np.sqrt(grid.array(grid.mean_where(grid.flat(variance), grid.flat(few & met), 1)))  # (a)
     counted = np.where(met, pooled, np.maximum(pooled, largest_around(event)))  # (b)
     missed = np.maximum(largest_around(mean) - mean, mean + largest_around(-mean)) / samples  # (c)
-    return np.where(few, counted, np.where(missed > ALIKE * own, missed, own))
+    near = largest_around(own)
+    hidden = np.where(near > ALIKE * own, np.minimum(near, mean / samples), 0)  # (d)
+    return np.where(few, counted, np.maximum(np.where(missed > ALIKE * own, missed, own), hidden))
