@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from ..runtime.errors import DetectorError
 from ..runtime.numbers import number
 from .counts import Counts, Frame, frame_like, require_same_time
 from .detector import Detector
-from .saturation import full_pixels, saturated
+from .saturation import full_pixels
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -101,7 +101,7 @@ def flat_field(
     filled = np.where(usable, relative, np.median(relative[usable]))
     usable &= relative <= HOT * median_filter(filled, NEIGHBOURS, mode="nearest")
     response = np.where(usable, relative / relative[usable].mean(), 1.0)
-    variance = _variance(detector, np.where(usable, light, 1.0), found.frames, frames)
+    variance = _variance(detector, np.where(usable, light, 1.0), found.frames, frames) if _is_in_dn(found) else 0.0
     return FlatField(response, ~usable, variance, str(kind))
 
 
@@ -184,13 +184,29 @@ def _background(
     return 0.0, np.inf
 
 
+def _is_in_dn(flat: Counts) -> bool:
+    """False for a flat over its own mean; for a stack of such, one line on stderr tells that its noise is left out."""
+    if flat.raw or float(np.median(flat.values)) > NORMALISED:
+        return True
+    if flat.frames > 1:
+        LOG.warning(
+            "fspt: reduce: the %d frames of the flat field are not in DN, their noise is not part of the errors. Give "
+            "frames of counts.",
+            flat.frames,
+        )
+    return False
+
+
 def _full(detector: Detector, flat: Counts, light: Array) -> Mask:
     """True where the flat is saturated; nowhere for one in other units than DN, such as a sum of frames."""
     if flat.raw:
         return full_pixels(detector, flat, "flat field")
-    highest = flat.values if flat.highest is None else flat.highest
+    if float(np.median(flat.values)) <= NORMALISED:
+        return np.zeros(flat.values.shape, bool)
     with_bias = bool(np.any(light != flat.values))  # a dark frame has been subtracted
-    full = saturated(detector, highest if with_bias else highest + detector.bias)
+    more = 0.0 if with_bias else detector.bias
+    highest, first = (None if one is None else one + more for one in (flat.highest, flat.first))
+    full = full_pixels(detector, replace(flat, values=flat.values + more, highest=highest, first=first), "flat field")
     return full if full.mean() < 0.5 else np.zeros_like(full)
 
 

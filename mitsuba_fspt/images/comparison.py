@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.numbers import whole
+from .formats import Metadata
 from .image import Image
+from .pixel_axes import CROP
 from .z_test import ZTest, brightest, error_bound, z_test
 
 
@@ -225,6 +227,12 @@ def _checked(calculated: Image, standard: Image) -> NDArray[np.bool_]:
             f"compare: the calculated image has {_size(calculated)} pixels, the standard {_size(standard)}. "
             "Render both with the same film."
         )
+    windows: list[Metadata] = [{k: i.metadata[k] for k in CROP if k in i.metadata} for i in (calculated, standard)]
+    if all(windows) and windows[0] != windows[1]:
+        raise ImageError(
+            f"compare: the images are different crop windows of the film, {_window(windows[0])} and "
+            f"{_window(windows[1])}. Give the same part of both."
+        )
     kept = calculated.kept & standard.kept
     if not kept.any():
         raise ImageError(
@@ -266,6 +274,11 @@ def _profiles(
                 raise ImageError(f"compare: {line} {index} does not exist. Give one in 0 … {len(std) - 1}.")
             profiles.append(Profile(line, index, cal[index], std[index]))
     return tuple(profiles)
+
+
+def _window(crop: Metadata) -> str:
+    """First pixel of a crop window and the size of its film, for messages."""
+    return "x = {}, y = {} of {} × {} pixels".format(*(crop.get(k) for k in (*CROP[2:], *CROP[:2])))
 
 
 def _size(image: Image) -> str:

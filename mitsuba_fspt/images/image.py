@@ -230,7 +230,7 @@ class Image:
         """Apparent radiance [photons/s/cm²/sr] of a surface in focus, a DataArray with dimensions (y, x).
 
         P/(τ G ⟨cos⁴θ⟩) of every pixel, with its étendue and the transmittance τ of the lens (Eq. M.6); 0 where no light
-        passes. `error` and `coverage` are coordinates of the array, x and y are as of `to_xarray`.
+        passes, NaN on masked pixels. `error` and `coverage` are coordinates, x and y are as of `to_xarray`.
 
         Parameters
         ----------
@@ -249,7 +249,7 @@ class Image:
         """Dataset of `power`, `error` and `coverage`, dimensions (y, x), with `units` and the metadata as attributes.
 
         Coordinates are the pixels' centres [mm] on the virtual detector plane, x to the right and y up: the first row
-        has the largest y.
+        has the largest y. Masked pixels are NaN.
 
         Raises
         ------

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..runtime.extras import require
 from .formats import units
 from .image import Image
@@ -22,7 +25,7 @@ def dataset(image: Image) -> Dataset:
     import xarray as xr
 
     given = {name: getattr(image, name) for name in ("power", "error", "coverage")}
-    planes = {name: plane for name, plane in given.items() if plane is not None}
+    planes = {name: _without_masked(image, plane) for name, plane in given.items() if plane is not None}
     arrays = {name: (DIMENSIONS, planes[name], {"units": unit}) for name, unit in units(planes, image.metadata).items()}
     return xr.Dataset(arrays, coords=_coordinates(image), attrs=dict(image.metadata))
 
@@ -35,10 +38,18 @@ def radiance_array(image: Image, wavelength_nm: float | None) -> DataArray:
     found = in_unit(image, "p/s/cm2/sr", wavelength_nm)
     beside = {"error": (found.error, found.unit), "coverage": (image.coverage, "1")}
     coordinates = {
-        name: (DIMENSIONS, plane, {"units": unit}) for name, (plane, unit) in beside.items() if plane is not None
+        name: (DIMENSIONS, _without_masked(image, plane), {"units": unit})
+        for name, (plane, unit) in beside.items()
+        if plane is not None
     }
     attributes = {"units": found.unit, "wavelength_nm": found.wavelength_nm}
-    return xr.DataArray(found.values, {**_coordinates(image), **coordinates}, DIMENSIONS, found.quantity, attributes)
+    values = _without_masked(image, found.values)
+    return xr.DataArray(values, {**_coordinates(image), **coordinates}, DIMENSIONS, found.quantity, attributes)
+
+
+def _without_masked(image: Image, plane: NDArray) -> NDArray:
+    """`plane` (h, w) with NaN on the pixels that the image masks, which means over arrays leave out."""
+    return plane if image.mask is None else np.where(image.mask, np.nan, plane).astype(plane.dtype)
 
 
 def _coordinates(image: Image) -> dict[str, tuple]:

@@ -154,6 +154,9 @@ class Measurement:
         """
         if isinstance(images, (Image, Exposure, str, os.PathLike)):
             images = [images]
+        if isinstance(images, np.ma.MaskedArray):
+            mask = np.ma.getmaskarray(images) | (False if mask is None else np.asarray(mask))
+            images = images.filled(0)
         listed = isinstance(images, (list, tuple))
         planes: Any = [measured(image) for image in images] if listed else images  # type: ignore[union-attr,arg-type]
         masks = _mask(matrix, planes if listed else [], mask)
@@ -324,8 +327,10 @@ def tell_misfit(verb: str, chi2_sum: float, pixels: int, fitted: float, noise: S
 
 
 def _checked_error(error: ArrayLike, shape: tuple[int, int, int], verb: str) -> Array:
-    """Standard errors [W] that are finite, >= 0 and of this shape, or a part of it."""
+    """Standard errors [W] that are finite, >= 0 and of this shape, that of one view, or one number."""
     try:
+        if np.shape(error) not in ((), shape, shape[1:]):
+            raise ValueError("another shape")
         given = np.broadcast_to(np.asarray(error, np.float64), shape)
     except (TypeError, ValueError) as cause:
         raise InversionError(

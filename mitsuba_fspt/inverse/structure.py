@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.sparse import csr_array
+from scipy.special import gammaln
 from scipy.stats import chi2
 
 from .patterns import Pattern, Patterns, Seen
@@ -143,7 +144,7 @@ def structure(
     score = white.T @ (z.T @ residual)
     effect = white.T @ mean * patterns.lengths
     total, count = float(score @ score), len(score)
-    log_p = float(chi2.logsf(total, count)) if count else 0.0
+    log_p = _ln_tail(total, count) if count else 0.0
     return Structure(total, count, log_p, tuple(_causes(score, effect, patterns.causes, log_p, settings)))
 
 
@@ -207,4 +208,15 @@ def _chance(left: Array, beside: Array, own: Array) -> float:
     if not fresh.any():
         return 0.0
     basis = _span(beside[:, fresh])
-    return float(chi2.logsf(np.sum((basis.T @ left) ** 2), basis.shape[1]))
+    return _ln_tail(float(np.sum((basis.T @ left) ** 2)), basis.shape[1])
+
+
+def _ln_tail(total: float, count: int) -> float:
+    """ln of the probability that chi-squared of `count` degrees of freedom exceeds `total`, also where that is 0 in
+    double precision: Γ(a, t) ≈ tᵃ e⁻ᵗ/(t + 1 − a) with a = count/2, t = total/2, to a share of a/t².
+    """
+    found = float(chi2.logsf(total, count))
+    if np.isfinite(found):
+        return found
+    a, t = count / 2, total / 2
+    return float(a * np.log(t) - t - np.log(t + 1 - a) - gammaln(a))

@@ -15,6 +15,7 @@ from scipy.sparse import csr_array, vstack
 from scipy.sparse.linalg import LinearOperator
 
 from ..images.image import Image
+from ..images.pixel_axes import CROP
 from ..rendering.provenance import same_mesh
 from ..runtime.errors import TransportError
 from .view_block import Block
@@ -223,6 +224,12 @@ def _differences(
         raise TransportError(
             f"transport: image {number} has a pixel pitch of {float(pitch):g} mm, the matrix {lens['pixel_pitch']:g} "
             "mm. Give images of the same film."
+        )
+    window = {key: float(metadata[key]) for key in CROP if key in metadata}
+    if window and any(abs(float(lens.get(key, value)) - value) > 1e-6 for key, value in window.items()):
+        raise TransportError(
+            f"transport: image {number} is another crop window of the film than its view of the matrix, "
+            f"{_text(window)}. Give the same part of the film."
         )
     notes = []
     own = float(metadata.get("detector_pixel_pitch", np.nan)) * float(metadata.get("binning", 1))

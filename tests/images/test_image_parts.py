@@ -182,3 +182,13 @@ def test_fits_headers_have_the_keywords_of_other_programs(image, tmp_path):
     found = read_counts(tmp_path / "counts.fits")
     assert (found.exposure_time, found.binning, found.pixel_pitch) == (60, 2, pytest.approx(0.8))
     assert CCD.reduce(tmp_path / "counts.fits", **SETTINGS).metadata["binning"] == 2
+
+
+def test_parts_of_different_places_are_not_compared(image):
+    """Seen to pass with a ratio of 0.74: two halves of an image."""
+    upper, lower = image[8:16], image[16:24]
+    with pytest.raises(
+        ImageError, match="different crop windows of the film, x = 0, y = 8 of 40 × 32 pixels and x = 0"
+    ):
+        fspt.compare(upper, lower)
+    assert fspt.compare(upper, image[8:16]).ratio == pytest.approx(1)

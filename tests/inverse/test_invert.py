@@ -179,6 +179,10 @@ def test_masked_pixels_do_not_count(case):
     options = {"weight": 10.0, "prior": Prior(reference=1e-3)}
     one, other = fspt.invert(matrix, images, mask=mask, **options), fspt.invert(matrix, bad, **options)
     np.testing.assert_allclose(one.exitance, other.exitance, rtol=1e-9)
+    hidden = np.ma.array(np.stack([i.power for i in bad]), mask=mask)
+    error = np.full(matrix.image_shape, 0.01 * max(i.power.max() for i in images))
+    one, other = fspt.invert(matrix, hidden, error=error), fspt.invert(matrix, hidden.data, error=error, mask=mask)
+    np.testing.assert_array_equal(one.exitance, other.exitance)
     mask = np.zeros(matrix.image_shape, bool)
     mask[1:] = True
     front = fspt.invert(matrix, images, mask=mask, **options)

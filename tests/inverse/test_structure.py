@@ -10,7 +10,7 @@ from sphere_views import RADIUS, noisy, sphere_views
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.patterns import Patterns, views_of
-from mitsuba_fspt.inverse.structure import common_errors, structure
+from mitsuba_fspt.inverse.structure import _ln_tail, common_errors, structure
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.runtime.errors import InversionError
 
@@ -119,6 +119,25 @@ def test_a_factor_of_a_view_is_told(sphere, caplog, tmp_path):
     assert wrong.summary()["warnings"] == list(wrong.warnings)
     figure = wrong.report(tmp_path / "report.png")
     assert "view=180" in figure.get_suptitle()
+
+
+def test_a_very_unlikely_cause_is_named(sphere):
+    """Seen to fail: with a probability below 1e-308 all causes counted as equally unlikely, and the first was named."""
+    matrix, surface, exitance = sphere
+    images = noisy(matrix, exitance, 1e6, seed=1)
+    images[2] = fspt.Image(1.2 * images[2].power, metadata=images[2].metadata)
+    found = fspt.invert(matrix, images, scene=surface)
+    line = next(one for one in found.warnings if "structure" in one)
+    assert ": a factor in view=180, 1.2" in line or ": a factor in view=180, 1.1" in line
+    assert "inf" not in line
+
+
+def test_the_tail_of_chi_squared_goes_on_beyond_double_precision():
+    """ln of the tail falls by 1/2 - (a - 1)/x a unit for large x, a half of the 30 degrees of freedom, on both sides of
+    where the tail underflows.
+    """
+    expected = -100 + 14 * np.log(1600 / 1400)
+    assert _ln_tail(1600.0, 30) - _ln_tail(1400.0, 30) == pytest.approx(expected, abs=0.01)
 
 
 def test_factors_of_views_are_fitted(sphere):
