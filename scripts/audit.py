@@ -4,10 +4,10 @@
     python scripts/audit.py --ablate all|kink,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
     python scripts/audit.py --matrix [--scenes 10] [--seed 0] [--family boxes,meshes] [--rtol 1e-3] [--out docs]
 
-Scenes of every family of `validation/random_scenes.py` are rendered by `fspt_integral`. `fan_reference` computes the
-power, with an error of its own, on 24 pixels of each: 16 where errors are likely (large stated errors, edges, strong
-curvature of the image) and 8 random ones. A pixel counts as beyond a limit only if it exceeds the limit by more than
-the reference's error. Writes audit.csv, one row per scene, and prints the table by family.
+Scenes of every family of tests/references/random_scenes.py are rendered by `fspt_integral`. tests/references/fans.py
+computes the power, with an error of its own, on 24 pixels of each: 16 where errors are likely (large stated errors,
+edges, strong curvature of the image) and 8 random ones. A pixel counts as beyond a limit only if it exceeds the limit
+by more than the reference's error. Writes audit.csv, one row per scene, and prints the table by family.
 
 With `--ablate` the same pixels are evaluated without each threshold of `integral/estimator.py` in turn: how many are
 beyond `rtol` and beyond the stated error, and what it costs. Writes ablation.csv.
@@ -28,14 +28,15 @@ from pathlib import Path
 
 import markdown_tables
 import numpy as np
+import tests_folder  # noqa: F401
+from references.bodies import Triangles
+from references.random_scenes import FAMILIES, MESH_FAMILIES, RandomScene, linear_on, random_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.integral.estimator import Estimator
 from mitsuba_fspt.integral.quadrature import Quadrature
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.runtime.atomic_files import atomic_path
-from mitsuba_fspt.validation.random_scenes import FAMILIES, MESH_FAMILIES, RandomScene, linear_on, random_scene
-from mitsuba_fspt.validation.reference_bodies import Triangles
 
 LIKELY, RANDOM = 16, 8  # pixels of each scene
 SLOW = 2.0  # s: rendered once more, as kernels may have been compiled

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -24,6 +23,8 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import tests_folder  # noqa: F401
+from cylinder_diffusion import Phantom, exitance
 from numpy.typing import NDArray
 
 import mitsuba_fspt as fspt
@@ -32,8 +33,6 @@ from mitsuba_fspt.optics.media import Medium
 from mitsuba_fspt.tissue.phantom_file import Band, PhantomFile
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-from cylinder_diffusion import Phantom, exitance  # noqa: E402
 
 Array = NDArray[np.float64]
 Row = dict[str, object]

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -25,6 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tests_folder  # noqa: F401
+from cylinder_views import TOML, cylinder_views, exact
 from interval_calibration import READ_NOISE, SCENE, case, fixed
 from numpy.typing import NDArray
 
@@ -38,9 +39,6 @@ from mitsuba_fspt.tissue.diffusion import Tissue
 from mitsuba_fspt.tissue.phantom_file import PhantomFile
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-from cylinder_views import TOML, cylinder_views, exact  # noqa: E402
-
 Array = NDArray[np.float64]
 Row = dict[str, object]
 SOURCE = (2.5, 1.0, -1.0, 2.0)  # x, y, z [mm], power [W]

@@ -4,11 +4,11 @@
 
 Two glowing spheres, the near one before the far one, as in scenes/two_spheres.xml. On the pixels whose four nodes a
 silhouette parts: four and twelve nodes, ever more transects, as many on every pixel and each looked into as for rtol
-1e-5, and lattices of ever more points. The reference is that of `validation` in float64, which finds the edges exactly
-and shares no code with the integral, on so many random pixels of each kind; the RMS of its own standard error stands
-above each table. Errors are relative to the brightest pixel. The order p of error ∝ lines of sight^-p is fitted where
-one edge crosses a pixel from twelve nodes to 24 transects, beyond which rounding is visible, where two do from two
-transects on. Writes silhouettes.csv and prints the tables.
+1e-5, and lattices of ever more points. The reference, tests/references/fans.py in float64, finds the edges exactly and
+shares no code with the integral; it is computed on so many random pixels of each kind, and the RMS of its own standard
+error stands above each table. Errors are relative to the brightest pixel. The order p of error ∝ lines of sight^-p is
+fitted where one edge crosses a pixel from twelve nodes to 24 transects, beyond which rounding is visible, where two do
+from two transects on. Writes silhouettes.csv and prints the tables.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import tests_folder  # noqa: F401
+from references.bodies import Body, Simple
+from references.camera import ReferenceCamera, Stops
+from references.fans import CERTAIN, FanReference
+from references.shapes import Sphere
 
 from mitsuba_fspt.integral import node_rules
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.runtime.atomic_files import atomic_path
 from mitsuba_fspt.studies.convergence import fitted_order
-from mitsuba_fspt.validation.fan_reference import CERTAIN, FanReference, Stops
-from mitsuba_fspt.validation.reference import Camera
-from mitsuba_fspt.validation.reference_bodies import Body, Simple
-from mitsuba_fspt.validation.reference_shapes import Sphere
 
 if TYPE_CHECKING:
     from mitsuba_fspt.integral.draft import Draft
@@ -122,7 +123,7 @@ def on_film(draft: Draft, values: object) -> np.ndarray:
 
 def reference(f_number: float, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean radiance on film [W/mm²/sr] of pixels, numbered row by row, and its standard error, both in float64."""
-    camera = Camera(**LENS, f_number=f_number, width=SIZE, height=SIZE)
+    camera = ReferenceCamera(**LENS, f_number=f_number, width=SIZE, height=SIZE)
     bodies = [
         Body(Simple(Sphere(centre, radius)), lambda points, _, j=exitance: np.full(len(points), j), most=exitance)
         for centre, radius, exitance in SPHERES.values()

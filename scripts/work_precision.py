@@ -20,11 +20,12 @@ from pathlib import Path
 
 import markdown_tables
 import numpy as np
+import tests_folder  # noqa: F401
+from references.camera import ReferenceCamera, look_at
+from references.meshes import load_ply, mesh_truth
 
 from mitsuba_fspt.cli.app import run
 from mitsuba_fspt.runtime.atomic_files import atomic_path
-from mitsuba_fspt.validation.reference import Camera, look_at
-from mitsuba_fspt.validation.reference_mesh import load_ply, mesh_truth
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -56,7 +57,7 @@ def main() -> None:
 def write_truth(path: Path) -> None:
     """The reference's picture and its stated error, as a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    camera = Camera(55, 2.8, 165, 0.108, 256, 256, look_at([180, 0, 0], [0, 0, 0], [0, 0, 1]))
+    camera = ReferenceCamera(55, 2.8, 165, 0.108, 256, 256, look_at([180, 0, 0], [0, 0, 0], [0, 0, 1]))
     power, error = mesh_truth(camera, load_ply(ROOT / "scenes" / "nylon_cylinder.ply"))
     with atomic_path(path) as temporary:
         np.savez_compressed(temporary, power=power, error=error)

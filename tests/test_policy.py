@@ -57,7 +57,7 @@ ARROWS = {
         "viewer",
     },
 }
-# Beside tests, only these import the independent truths of `validation`.
+# Only these import `validation`: no result depends on it.
 IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
 # Rooms of Dr.Jit code. Others import the renderer inside functions alone, and only these do.
 DRJIT_ROOMS = {"jit", "emission", "integral", "plugins"}
@@ -160,7 +160,7 @@ def test_every_listed_arrow_exists():
     assert {(room, other) for room, others in ARROWS.items() for other in others} <= found
 
 
-def test_only_some_import_the_independent_truths():
+def test_only_some_import_the_validation():
     wrong = [name for name in NAMES if "validation" in imported_rooms(name)]
     assert not [name for name in wrong if not name.startswith(tuple(IMPORTS_VALIDATION))]
 

@@ -10,7 +10,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from row_reference import Sphere, truth
+from references.camera import ReferenceCamera, look_at
+from references.meshes import TriangleMesh, load_ply, mesh_truth
+from references.rows import Sphere, truth
 from small_scenes import (
     FOCAL,
     FOCUS,
@@ -30,8 +32,6 @@ from small_scenes import (
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.validation import stiff_scenes as far_away
-from mitsuba_fspt.validation.reference import Camera, look_at
-from mitsuba_fspt.validation.reference_mesh import TriangleMesh, load_ply, mesh_truth
 
 pytestmark = pytest.mark.usefixtures("mono")
 
@@ -59,7 +59,7 @@ def pictures(name, view, f_number, part):
 def reference(name, view, f_number, part):
     """Power on a part of the film and its standard error [W], from the scene's description alone."""
     place = look_at([175 if name == "two_spheres" else 180, 0, 0], [0, 0, 0], [0, 0, 1])
-    camera = Camera(FOCAL, f_number, FOCUS, 256 * 0.108 / HEIGHT, WIDTH, HEIGHT, place)
+    camera = ReferenceCamera(FOCAL, f_number, FOCUS, 256 * 0.108 / HEIGHT, WIDTH, HEIGHT, place)
     cosine, sine = np.cos(np.radians(view)), np.sin(np.radians(view))
     turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     if name == "nylon_cylinder":
@@ -144,7 +144,7 @@ def on_axis(depth, radius, f_number, pitch, side=12):
     """Power of a sphere on the axis and its standard error [W] by the reference; all of it is on the middle pixels."""
     planes = np.zeros((2, HEIGHT, WIDTH))
     x, y = (WIDTH - side) // 2, (HEIGHT - side) // 2
-    camera = Camera(FOCAL, f_number, FOCUS, pitch, WIDTH, HEIGHT)
+    camera = ReferenceCamera(FOCAL, f_number, FOCUS, pitch, WIDTH, HEIGHT)
     part = truth(camera, Sphere((0, 0, depth), radius), nodes=1 << 14, part=(x, y, side, side))
     assert not np.any([part[0][[0, -1]], part[0][:, [0, -1]].T])
     planes[:, y : y + side, x : x + side] = part
@@ -158,7 +158,7 @@ def test_error_knows_what_float32_makes_of_far_places():
     of sight left out of the error (89 of 100) and with cos⁴θ → cos³θ.
     """
     here, there = (fspt.render(far_away.scene(far_away.ball(), at=far_away.moved(*at)())) for at in ((0,), (1e5, 50)))
-    camera = Camera(FOCAL, far_away.F_NUMBER, FOCUS, PITCH, far_away.WIDTH, far_away.HEIGHT)
+    camera = ReferenceCamera(FOCAL, far_away.F_NUMBER, FOCUS, PITCH, far_away.WIDTH, far_away.HEIGHT)
     expected, error = truth(camera, Sphere((1.5, -1.0, 168.0), 6.0))
     off = np.abs(there.power - expected)
     assert error.max() < here.error.max()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from references.random_scenes import random_scene
 from small_scenes import (
     FOCUS,
     RADIUS,
@@ -21,7 +22,6 @@ from small_scenes import (
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.runtime.errors import SceneError
-from mitsuba_fspt.validation.random_scenes import random_scene
 
 pytestmark = pytest.mark.usefixtures("mono")
 

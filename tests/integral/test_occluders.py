@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from row_reference import Disk, truth
+from references.camera import ReferenceCamera
+from references.meshes import TriangleMesh, mesh_truth
+from references.rows import Disk, truth
 from small_scenes import attribute, glow, lens, mi, world_scene, write_ply
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.validation.reference import Camera
-from mitsuba_fspt.validation.reference_mesh import TriangleMesh, mesh_truth
 
 FOCUS, WIDTH, HEIGHT, PITCH = 180.0, 14, 12, 0.55
 COUNTED = 3e-3  # of the brightest pixel: what the reference may be off by
@@ -35,7 +35,7 @@ def seen_past(glowing, dark, f_number, dim):
 @cache
 def power_past(glowing, dark, f_number):
     """Power [W] on every pixel, (h, w)."""
-    camera = Camera(55.0, f_number, FOCUS, PITCH, WIDTH, HEIGHT)
+    camera = ReferenceCamera(55.0, f_number, FOCUS, PITCH, WIDTH, HEIGHT)
     disks = Disk(dark[:3], dark[3], 0.0), Disk(glowing[:3], glowing[3])
     power, error = truth(camera, *disks, nodes=1 << 14)
     assert error.max() < COUNTED * power.max()
@@ -175,7 +175,7 @@ def test_pixels_that_converged_by_chance_are_refined_beside_unexpected_changes(t
     both = TriangleMesh(
         np.concatenate([behind.vertices, before.vertices]), faces, np.concatenate([behind.exitance, before.exitance])
     )
-    camera = Camera(55.0, f_number, 55 * (1 + 1 / magnification), pitch, width, height)
+    camera = ReferenceCamera(55.0, f_number, 55 * (1 + 1 / magnification), pitch, width, height)
     expected, error = (
         plane[part].reshape(5, 5) for plane in mesh_truth(camera, both, levels=((1024, 4),), region=part, replicas=4)
     )

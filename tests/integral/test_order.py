@@ -2,7 +2,7 @@
 
 Work is `Solution.rays`, the lines of sight of all pixels together; the error is the RMS over all pixels, relative to
 the brightest one. The truth is float64 NumPy: the closed form of the filled cone, Gauss's rule where all is smooth, and
-tests/row_reference.py at silhouettes. A fit ends above three times the truth's own error or, where that is less, the
+references/rows.py at silhouettes. A fit ends above three times the truth's own error or, where that is less, the
 FLOAT32 floor.
 """
 
@@ -12,12 +12,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-import row_reference as rows
+from references import rows
+from references.camera import ReferenceCamera
+from references.sampled import pupil_form
+from references.shapes import Rectangle
 from small_scenes import F_NUMBER, FOCAL, FOCUS, PITCH, camera_scene, configuration_factor, disk, glow, sphere
 
 from mitsuba_fspt.integral.quadrature import Quadrature
-from mitsuba_fspt.validation.reference import Camera, pupil_form
-from mitsuba_fspt.validation.reference_shapes import Rectangle
 
 pytestmark = pytest.mark.usefixtures("mono")
 
@@ -72,7 +73,7 @@ def rippled(depth, wave, half=13.0, texels=512):
     texture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp", "accel": False}
     to_world = mi.ScalarTransform4f().translate([0, 0, depth]).rotate([0, 1, 0], 180).scale(half)
     sheet = {"type": "rectangle", "to_world": to_world, "emitter": glow(texture)}
-    camera = Camera(FOCAL, F_NUMBER, FOCUS, PITCH, WIDTH, HEIGHT)
+    camera = ReferenceCamera(FOCAL, F_NUMBER, FOCUS, PITCH, WIDTH, HEIGHT)
     exact = Rectangle([0, 0, depth], [0, half, 0], [half, 0, 0])
     truth, error = pupil_form(camera, [exact], lambda points, _: np.interp(points[:, 0], place, values), 10)
     assert error.max() < 5 * FLOAT32 * truth.max()
@@ -140,7 +141,7 @@ def edged_truth(name):
     pitch, nodes, *objects = EDGED[name]
     make = {"disk": rows.Disk, "sphere": rows.Sphere}
     exact = [make[kind](centre, radius) for kind, centre, radius in objects]
-    truth, error = rows.truth(Camera(FOCAL, F_NUMBER, FOCUS, pitch, WIDTH, HEIGHT), *exact, nodes=nodes)
+    truth, error = rows.truth(ReferenceCamera(FOCAL, F_NUMBER, FOCUS, pitch, WIDTH, HEIGHT), *exact, nodes=nodes)
     return truth, np.sqrt(np.mean(error**2)) / truth.max()
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from references.sampled import lattice
+from references.shapes import unit_disc
 from small_scenes import (
     FOCUS,
     HEIGHT,
@@ -28,8 +30,6 @@ from small_scenes import (
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.runtime.errors import SceneError
-from mitsuba_fspt.validation.reference import lattice
-from mitsuba_fspt.validation.reference_shapes import unit_disc
 
 pytestmark = pytest.mark.usefixtures("mono")
 

@@ -12,7 +12,11 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from reference_cases import rms
+from references.camera import ReferenceCamera
+from references.cases import rms
+from references.meshes import TriangleMesh, mesh_truth
+from references.sampled import pupil_form
+from references.shapes import Sphere
 from scipy.stats import t as student
 from small_scenes import (
     F_NUMBER,
@@ -31,9 +35,6 @@ from small_scenes import (
 )
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.validation.reference import Camera, pupil_form
-from mitsuba_fspt.validation.reference_mesh import TriangleMesh, mesh_truth
-from mitsuba_fspt.validation.reference_shapes import Sphere
 
 pytestmark = pytest.mark.usefixtures("mono")
 
@@ -157,7 +158,7 @@ MIDDLE = (WIDTH // 2 - 6, HEIGHT // 2 - 5, 12, 10)
 
 
 def camera(width, height):
-    return Camera(FOCAL, F_NUMBER, FOCUS, PITCH, width, height)
+    return ReferenceCamera(FOCAL, F_NUMBER, FOCUS, PITCH, width, height)
 
 
 def test_integral_agrees_with_the_reference_where_one_body_hides_another():

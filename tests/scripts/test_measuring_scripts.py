@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from references.meshes import mesh_truth
 from small_scenes import write_scene
 
 from mitsuba_fspt.studies import converge, converge_methods
-from mitsuba_fspt.validation.reference_mesh import mesh_truth
 
 pytestmark = pytest.mark.usefixtures("mono")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))

@@ -1,108 +1,25 @@
-"""Eq. 9 in float64 NumPy by brute force: the reference for the plugins, in tests and in figures of scripts/.
+"""Eq. 9 in float64 NumPy by brute force, sampled over pixel × pupil or over pixel × surface.
 
-It shares no code with the plugins. Camera frame: lens plane z = 0, +z towards the object, +x to the left of the
-image, +y up; virtual detector plane z = u. Lengths in mm, exitance J_n in W/mm², results in W on each
-pixel, shape (height, width), row 0 at the top. `reference_mesh` has the same integral over triangle meshes.
+Frame and lengths are those of `camera`; exitance J_n in W/mm², results in W on each pixel, shape (height, width),
+row 0 at the top. `meshes` has the same integral over triangle meshes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..runtime.errors import OpticsError
-from .reference_shapes import Array, Shape, dot, unit_disc
+from .camera import ReferenceCamera
+from .shapes import Array, Shape, dot, unit_disc
 
 Pixel = Literal["area", "centre"]
 Exitance = Callable[[Array, int], Array]  # (points (n, 3) of shape number i, i) -> (n,) [W/mm²]
 BLOCK = 2_000_000  # lines of sight at a time: limits the memory to about half a gigabyte
 # Two independent shifts of a lattice, away from its points of symmetry, where the fold would map nodes onto each other.
 SHIFT, OTHER_SHIFT = (0.137, 0.419, 0.683, 0.911), (0.271, 0.833, 0.059, 0.547)
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Thin lens with a diaphragm in the lens plane and a film of width × height pixels (paper, section 2).
-
-    Parameters
-    ----------
-    focal_length : F [mm]
-    f_number : F/D (Eq. 3)
-    focus_distance : u [mm], > F, from the lens plane to the virtual detector plane
-    pixel_pitch : p [mm] on the detector
-    width, height : pixels
-    to_world : (4, 4) rigid motion of the camera frame into the world
-
-    Raises
-    ------
-    OpticsError : u ≤ F, or `to_world` is not a rigid motion.
-    """
-
-    focal_length: float
-    f_number: float
-    focus_distance: float
-    pixel_pitch: float
-    width: int
-    height: int
-    to_world: Array = field(default_factory=lambda: np.eye(4))
-
-    def __post_init__(self) -> None:
-        if not self.focus_distance > self.focal_length:
-            raise OpticsError(
-                f"reference camera: focus_distance {self.focus_distance} must exceed focal_length"
-                f" {self.focal_length}. Focus further away."
-            )
-        axes = self.to_world[:3, :3]
-        if not (np.allclose(axes.T @ axes, np.eye(3), atol=1e-12) and np.linalg.det(axes) > 0):
-            raise OpticsError(f"reference camera: to_world {axes.tolist()} must be a rotation. Remove scale or mirror.")
-
-    @property
-    def magnification(self) -> float:
-        """t = v/u, with the image distance v of the lens law 1/F = 1/u + 1/v."""
-        return self.focal_length / (self.focus_distance - self.focal_length)
-
-    @property
-    def pupil_radius(self) -> float:
-        """D/2 [mm]."""
-        return self.focal_length / self.f_number / 2
-
-    @property
-    def pixel_side(self) -> float:
-        """p/t [mm], the side of a virtual pixel."""
-        return self.pixel_pitch / self.magnification
-
-    @property
-    def scale(self) -> float:
-        """Pupil area × virtual pixel area / (π u²) [mm²]: the power in W when J_n cos⁴θ averages 1 W/mm²."""
-        return (self.pupil_radius * self.pixel_side / self.focus_distance) ** 2
-
-    def centres(self) -> Array:
-        """Centres (x, y) of the virtual pixels on z = u, row by row, shape (height·width, 2) [mm]."""
-        row, column = np.divmod(np.arange(self.width * self.height), self.width)
-        x = (self.width / 2 - column - 0.5) * self.pixel_side
-        return np.stack([x, (self.height / 2 - row - 0.5) * self.pixel_side], axis=1)
-
-    def from_world(self, points: Array) -> Array:
-        """World points in the camera frame, shape (n, 3)."""
-        return (points - self.to_world[:3, 3]) @ self.to_world[:3, :3]
-
-    def in_world(self, points: Array) -> Array:
-        """Camera frame points in the world, shape (n, 3)."""
-        return points @ self.to_world[:3, :3].T + self.to_world[:3, 3]
-
-
-def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
-    """`to_world` (4, 4) of a camera at `origin` with `target` in the middle of the image and `up` pointing upwards."""
-    forward = np.subtract(target, origin) / np.linalg.norm(np.subtract(target, origin))
-    left = np.cross(np.asarray(up), forward)
-    left /= np.linalg.norm(left)
-    to_world = np.eye(4)
-    to_world[:3] = np.stack([left, np.cross(forward, left), forward, np.asarray(origin)], axis=1)
-    return to_world
 
 
 @dataclass(frozen=True)
@@ -158,7 +75,7 @@ def lattice(n: int, shift: Sequence[float] | Array) -> Array:
 
 
 def pupil_form(
-    camera: Camera,
+    camera: ReferenceCamera,
     shapes: Sequence[Shape],
     exitance: Exitance,
     n: int,
@@ -183,7 +100,7 @@ def pupil_form(
 
 
 def surface_form(
-    camera: Camera, shape: Shape, exitance: Exitance, n: int, pixel: Pixel = "centre"
+    camera: ReferenceCamera, shape: Shape, exitance: Exitance, n: int, pixel: Pixel = "centre"
 ) -> tuple[Array, Array]:
     """Power on each pixel and its error [W], (height, width) each: Eq. 9 as printed, for one convex body.
 
@@ -200,7 +117,7 @@ def surface_form(
     return power, np.abs(power - half)
 
 
-def collected_power(camera: Camera, shape: Shape, exitance: Exitance, n: int) -> float:
+def collected_power(camera: ReferenceCamera, shape: Shape, exitance: Exitance, n: int) -> float:
     """∫_S J_n f dS [W], the power of one convex body that passes the diaphragm, whatever the focus (Eq. M.9).
 
     f is the configuration factor from a surface element to the pupil. `n` lattice points cover surface × pupil.
@@ -217,7 +134,7 @@ def collected_power(camera: Camera, shape: Shape, exitance: Exitance, n: int) ->
     return float(total * area * np.pi * camera.pupil_radius**2)
 
 
-def _average(camera: Camera, shapes: Sequence[Shape], exitance: Exitance, rule: Rule) -> Array:
+def _average(camera: ReferenceCamera, shapes: Sequence[Shape], exitance: Exitance, rule: Rule) -> Array:
     """Σ weight · J_n cos⁴θ, in watts, over the lines of sight of every pixel."""
     centres = camera.centres()
     power = np.zeros(len(centres))
@@ -247,7 +164,7 @@ def _seen(shapes: Sequence[Shape], exitance: Exitance, origin: Array, direction:
     return seen
 
 
-def _surface_sum(camera: Camera, shape: Shape, exitance: Exitance, nodes: Array, pixel: Pixel) -> Array:
+def _surface_sum(camera: ReferenceCamera, shape: Shape, exitance: Exitance, nodes: Array, pixel: Pixel) -> Array:
     """The surface form over one set of nodes: two coordinates on the surface, two in the pixel."""
     u = camera.focus_distance
     world, area = shape.surface(nodes[:, :2])

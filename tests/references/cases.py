@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import trimesh
 
-from mitsuba_fspt.validation.reference import Camera
-from mitsuba_fspt.validation.reference_shapes import Rectangle
+from .camera import ReferenceCamera
+from .shapes import Rectangle
 
 EXITANCE = 3e-7  # W/mm²
 
 
-def camera(**changes) -> Camera:
+def camera(**changes) -> ReferenceCamera:
     """55 mm f/2.8 at magnification 1/2 before 6 × 5 coarse pixels, unless changed."""
-    return dataclasses.replace(Camera(55.0, 2.8, 165.0, 1.0, 6, 5), **changes)
+    return dataclasses.replace(ReferenceCamera(55.0, 2.8, 165.0, 1.0, 6, 5), **changes)
 
 
 def pose() -> np.ndarray:

@@ -3,7 +3,7 @@
 For one point of the pupil and one height y on the virtual detector plane, the lines of sight that meet a sphere or a
 disk are those between two known x. So the silhouettes are exact along x; the three other coordinates, two of the pupil
 and y, are sampled, and what is left is continuous in them: it converges much faster than samples of all four. It shares
-no code with the integral. Camera frame and units as in `validation.reference`.
+no code with the integral. Camera frame and units as in `sampled`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsuba_fspt.validation.reference import Camera, lattice
-from mitsuba_fspt.validation.reference_shapes import unit_disc
+from .camera import ReferenceCamera
+from .sampled import lattice
+from .shapes import unit_disc
 
 Array = NDArray[np.float64]
 LINES = 1 << 15  # lines of sight at a time: what fits into the cache
@@ -45,11 +46,11 @@ class Sphere:
         """J_n at the first point of lines from (ax, ay, 0) along `line` (x, y, z), which meet it."""
         if not callable(self.exitance):
             return self.exitance
-        start, line = (np.stack(np.broadcast_arrays(*parts), axis=-1) for parts in ((ax, ay, 0.0), line))
+        start, along = (np.stack(np.broadcast_arrays(*parts), axis=-1) for parts in ((ax, ay, 0.0), line))
         away = start - np.asarray(self.centre)
-        a, b, c = (np.sum(n, axis=-1) for n in (line**2, away * line, away**2))
+        a, b, c = (np.sum(n, axis=-1) for n in (along**2, away * along, away**2))
         s = -(b + np.sqrt(np.maximum(b**2 - a * (c - self.radius**2), 0))) / a
-        return self.exitance(start + s[..., None] * line)
+        return self.exitance(start + s[..., None] * along)
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Disk:
 
 
 def truth(
-    camera: Camera,
+    camera: ReferenceCamera,
     *objects: Sphere | Disk,
     nodes: int = 1 << 13,
     along: int = 16,

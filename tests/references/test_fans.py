@@ -7,12 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from mitsuba_fspt.validation.fan_reference import FanReference, Stops
-from mitsuba_fspt.validation.reference import Camera, pupil_form
-from mitsuba_fspt.validation.reference_bodies import Body, Simple, Triangles, fresnel_profile
-from mitsuba_fspt.validation.reference_shapes import Cylinder, Disc, Rectangle, Sphere
+from references.bodies import Body, Simple, Triangles, fresnel_profile
+from references.camera import ReferenceCamera, Stops
+from references.fans import FanReference
+from references.sampled import pupil_form
+from references.shapes import Cylinder, Disc, Rectangle, Sphere
 
-CAMERA = Camera(55.0, 2.8, 165.0, 0.8, 12, 10)
+CAMERA = ReferenceCamera(55.0, 2.8, 165.0, 0.8, 12, 10)
 PIXELS = np.array([(4, 3), (5, 6), (2, 9)])
 
 

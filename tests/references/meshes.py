@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..runtime.errors import ExitanceError, SceneError
-from .reference import Camera, lattice
-from .reference_shapes import Array, unit_disc
+from .camera import ReferenceCamera
+from .sampled import lattice
+from .shapes import Array, unit_disc
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -36,7 +36,7 @@ class TriangleMesh:
 
     Raises
     ------
-    ExitanceError : the shape of `exitance` is not that of `faces`.
+    ValueError : the shape of `exitance` is not that of `faces`.
     """
 
     vertices: Array
@@ -45,7 +45,7 @@ class TriangleMesh:
 
     def __post_init__(self) -> None:
         if self.exitance.shape != self.faces.shape:
-            raise ExitanceError(
+            raise ValueError(
                 f"reference mesh: exitance of shape {self.exitance.shape} must have the faces' shape"
                 f" {self.faces.shape}. Give its values at the corners."
             )
@@ -65,7 +65,7 @@ class TriangleMesh:
 def load_ply(path: str | Path) -> TriangleMesh:
     """Mesh of a PLY file whose vertices or faces carry the property `exitance_x` [W/mm²].
 
-    Raises SceneError for a file that cannot be read as triangles, ExitanceError for one without the property.
+    Raises ValueError for a file that cannot be read as triangles, ValueError for one without the property.
     """
     import trimesh
 
@@ -73,7 +73,7 @@ def load_ply(path: str | Path) -> TriangleMesh:
         mesh = trimesh.load_mesh(path, process=False)
         raw = mesh.metadata["_ply_raw"]
     except (OSError, ValueError, KeyError, AttributeError) as error:
-        raise SceneError(f"{path}: no PLY triangle mesh ({error}). Give a PLY file.") from error
+        raise ValueError(f"{path}: no PLY triangle mesh ({error}). Give a PLY file.") from error
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     for element in ("vertex", "face"):
         data = raw[element]["data"]
@@ -81,11 +81,11 @@ def load_ply(path: str | Path) -> TriangleMesh:
             values = np.asarray(data["exitance_x"], np.float64).ravel()
             corners = values[faces] if element == "vertex" else np.repeat(values[:, None], 3, axis=1)
             return TriangleMesh(vertices, faces, corners)
-    raise ExitanceError(f"{path}: no property 'exitance_x' on vertices or faces. Write J_n [W/mm²] under that name.")
+    raise ValueError(f"{path}: no property 'exitance_x' on vertices or faces. Write J_n [W/mm²] under that name.")
 
 
 def mesh_truth(
-    camera: Camera,
+    camera: ReferenceCamera,
     mesh: TriangleMesh,
     levels: Sequence[tuple[int, int]] = ((64, 4), (2048, 4)),
     tolerance: float = 3e-6,
@@ -106,7 +106,7 @@ def mesh_truth(
 
     Raises
     ------
-    SceneError : the mesh reaches the lens plane.
+    ValueError : the mesh reaches the lens plane.
 
     Notes
     -----
@@ -135,17 +135,17 @@ def mesh_truth(
 class _View:
     """Faces in the camera frame: `corners` (xyz, corner, F), `exitance` (corner, F); `closed` as in the mesh."""
 
-    camera: Camera
+    camera: ReferenceCamera
     corners: Array
     exitance: Array
     closed: bool
 
     @classmethod
-    def of(cls, camera: Camera, mesh: TriangleMesh) -> _View:
+    def of(cls, camera: ReferenceCamera, mesh: TriangleMesh) -> _View:
         corners = np.ascontiguousarray(camera.from_world(mesh.vertices)[mesh.faces].T)
         nearest = corners[2].min()
         if not nearest > 0:
-            raise SceneError(
+            raise ValueError(
                 f"reference mesh: reaches z = {nearest:g} mm, must stay in front of the lens plane z = 0."
                 " Move the camera back."
             )

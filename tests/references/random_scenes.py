@@ -1,4 +1,4 @@
-"""Random scenes of several families, each for Mitsuba and for `fan_reference`, reproducible from family and seed.
+"""Random scenes of several families, each for Mitsuba and for `fans`, reproducible from family and seed.
 
 Camera frame: the lens is at the origin and looks along +z. Bodies lie around the virtual detector plane, of which a
 film of 24 to 64 pixels a side sees some 30 to 60 mm. Blur discs measure from a hundredth of a pixel to tens of pixels.
@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .fan_reference import FanReference, Stops
-from .reference import Camera
-from .reference_bodies import Body, Fan, Simple, Triangles, rectangle_lines
-from .reference_shapes import Array, Cylinder, Disc, Rectangle, Sphere
-from .stiff_scenes import mesh
+from mitsuba_fspt.validation.stiff_scenes import mesh
+
+from .bodies import Body, Fan, Simple, Triangles, rectangle_lines
+from .camera import ReferenceCamera, Stops
+from .fans import FanReference
+from .shapes import Array, Cylinder, Disc, Rectangle, Sphere
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -267,7 +268,7 @@ class _Maker:
         if self.crops:
             w, h = (int(self.random.integers(side // 3, side + 1)) for side in self.size)
             crop = (int(self.random.integers(0, width - w + 1)), int(self.random.integers(0, height - h + 1)), w, h)
-        camera = Camera(**self.lens, width=width, height=height)
+        camera = ReferenceCamera(**self.lens, width=width, height=height)
         stops = Stops.of(
             camera,
             self.stops.get("lens_diameter", math.inf),

@@ -1,4 +1,4 @@
-"""Bodies of `fan_reference`: intersection with lines of sight, radiance, and the edges that fans of lines meet."""
+"""Bodies of `fans`: intersection with lines of sight, radiance, and the edges that fans of lines meet."""
 
 from __future__ import annotations
 
@@ -6,16 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .reference_shapes import Array, Cylinder, Disc, Rectangle, Sphere, dot
-
-if TYPE_CHECKING:
-    from .fan_reference import Stops
-    from .reference import Camera
+from .camera import ReferenceCamera, Stops
+from .shapes import Array, Cylinder, Disc, Rectangle, Sphere, dot
 
 Indices = NDArray[np.int64]
 MOST_SPECULAR = 6  # mirrors and panes that a line meets one after the other
@@ -84,7 +81,7 @@ class Body:
         profile = 1 / math.pi if self.index is None else fresnel_profile(np.maximum(cosine, 0), self.index)
         return np.where(cosine > 0, exitance * profile, 0.0)
 
-    def near(self, camera: Camera, stops: Stops, centre: Array) -> Body | None:
+    def near(self, camera: ReferenceCamera, stops: Stops, centre: Array) -> Body | None:
         """The body's part that lines of sight of the pixel about `centre` [mm] may meet; None if there is none.
 
         The lines of a pixel lie between cones about the line from the middle of the pupil.
@@ -213,7 +210,7 @@ def _limb(w: Array, start: Array, step: Array, radius: float) -> Array:
 
 @dataclass(frozen=True)
 class Simple:
-    """A sphere, disc, rectangle or closed cylinder of `reference_shapes`."""
+    """A sphere, disc, rectangle or closed cylinder of `shapes`."""
 
     shape: Sphere | Disc | Rectangle | Cylinder
 

@@ -3,7 +3,7 @@
 Lines of sight through one point of the pupil and a segment of the pixel form a fan. The positions at which a fan meets
 edges of bodies, stops and texels follow from linear and quadratic equations; between them Gauss's rule integrates. The
 result is smooth in the other three coordinates, over which randomly shifted lattices of growing size integrate. The
-scatter over the shifts gives the error. Frame and units are those of `reference`. No integration is shared with that
+scatter over the shifts gives the error. Frame and units are those of `sampled`. No integration is shared with that
 module, and no code with the plugins.
 """
 
@@ -17,9 +17,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .reference import Camera, lattice
-from .reference_bodies import Body, Fan, reflected, roots, seen_along
-from .reference_shapes import Array, dot, unit_disc
+from .bodies import Body, Fan, reflected, roots, seen_along
+from .camera import ReferenceCamera, Stops
+from .sampled import lattice
+from .shapes import Array, dot, unit_disc
 
 Indices = NDArray[np.int64]
 SHIFTS = 16
@@ -34,37 +35,6 @@ SHORTEST = 1e-13  # of a fan's length: shorter pieces are left out
 
 
 @dataclass(frozen=True)
-class Stops:
-    """Borders that a line of sight has to pass: entrance pupil, border of the lens and image-plane stop.
-
-    Parameters
-    ----------
-    pupil_depth : depth z_p of the entrance pupil [mm], negative behind the lens plane (Eq. M.11)
-    pupil_radius : R_p [mm]
-    lens_radius : of the border in the lens plane [mm]
-    field_radius : of the image-plane stop, on the virtual detector plane [mm]
-    """
-
-    pupil_depth: float
-    pupil_radius: float
-    lens_radius: float = math.inf
-    field_radius: float = math.inf
-
-    @classmethod
-    def of(
-        cls, camera: Camera, lens_diameter: float = math.inf, distance: float = 0.0, image_stop: float = math.inf
-    ) -> Stops:
-        """From `lens_diameter`, `diaphragm_distance` and `image_stop_diameter` [mm] of a lens."""
-        focal, half = camera.focal_length, camera.focal_length / camera.f_number / 2
-        depth, radius = 0.0, half
-        if distance > 0:
-            depth, radius = distance * focal / (distance - focal), half * focal / abs(distance - focal)
-        elif distance < 0:
-            depth = -distance
-        return cls(depth, radius, lens_diameter / 2, image_stop / 2 / camera.magnification)
-
-
-@dataclass(frozen=True)
 class FanReference:
     """Scene, and its reference on single pixels.
 
@@ -76,7 +46,7 @@ class FanReference:
     pixel : 'area' or 'centre'
     """
 
-    camera: Camera
+    camera: ReferenceCamera
     stops: Stops
     bodies: Sequence[Body]
     pixel: Literal["area", "centre"] = "area"
