@@ -30,6 +30,7 @@ LENS, SURFACE = "tests/plugins/test_lens.py", "tests/plugins/test_surface.py"
 PHYSICS, FORMS = "tests/integral/test_physics.py", "tests/integral/test_surface_form.py"
 LAWS, DETECTOR = "tests/emission/test_laws.py", "tests/detector/test_detector.py"
 REDUCTION, RADIOMETRY = "tests/detector/test_reduction.py", "tests/images/test_radiometry.py"
+CAMERAS = "tests/detector/test_cameras.py"
 TISSUE, INVERT = "tests/tissue/test_diffusion.py", "tests/inverse/test_invert.py"
 
 
@@ -219,8 +220,8 @@ MUTANTS = (
     Mutant(
         "quantum efficiency",
         "detector/detector.py",
-        "charge = self.quantum_efficiency * photons",
-        "charge = photons",
+        "_binned(self.quantum_efficiency * photons, binning)",
+        "_binned(photons, binning)",
         (DETECTOR,),
     ),
     Mutant(
@@ -232,20 +233,61 @@ MUTANTS = (
     ),
     Mutant(
         "area of the dark current",
-        "detector/detector.py",
-        "(float(pitch) / self.pixel_pitch) ** 2",
-        "float(pitch) / self.pixel_pitch",
+        "detector/parameters.py",
+        "(pixel_pitch / self.pixel_pitch) ** 2",
+        "pixel_pitch / self.pixel_pitch",
         (DETECTOR,),
     ),
     Mutant(
         "sign of the dark charge",
         "detector/reduction.py",
-        "detector.bias + charge / detector.gain, charge",
-        "detector.bias - charge / detector.gain, charge",
+        'detector.on_pixels("bias", shape) + charge / gain, charge',
+        'detector.on_pixels("bias", shape) - charge / gain, charge',
         (REDUCTION,),
     ),
     Mutant(
-        "square of the read noise", "detector/reduction.py", "read**2 + independent", "read + independent", (REDUCTION,)
+        "square of the read noise",
+        "images/noise_model.py",
+        "math.hypot(read, math.sqrt(dark))",
+        "math.sqrt(read + dark)",
+        (REDUCTION,),
+    ),
+    Mutant("excess noise of the register", "detector/detector.py", "self.excess - 1", "self.excess * 0", (CAMERAS,)),
+    Mutant("excess noise of an image", "images/noise_model.py", "cls(excess / each", "cls(1 / each", (CAMERAS,)),
+    Mutant(
+        "excess noise of the dark charge",
+        "detector/reduction.py",
+        "independent = detector.excess * charge",
+        "independent = charge",
+        (CAMERAS,),
+    ),
+    Mutant(
+        "gain of the register in counts",
+        "detector/reduction.py",
+        'gain = detector.on_pixels("gain", shape) / detector.em_gain\n    electrons',
+        'gain = detector.on_pixels("gain", shape)\n    electrons',
+        (CAMERAS,),
+    ),
+    Mutant(
+        "read noise after the register",
+        "detector/reduction.py",
+        "electrons.shape) / detector.em_gain * frames**0.5",
+        "electrons.shape) * frames**0.5",
+        (CAMERAS,),
+    ),
+    Mutant(
+        "spurious charge of a bias frame",
+        "detector/reduction.py",
+        "found.values + dark_charge / gain",
+        "found.values + charge / gain",
+        (CAMERAS,),
+    ),
+    Mutant(
+        "error of the response",
+        "images/noise_model.py",
+        "+ (self.relative * light) ** 2",
+        "",
+        (CAMERAS, "tests/detector/test_flat_field.py"),
     ),
     Mutant(
         "frames of a stack",
@@ -274,8 +316,8 @@ MUTANTS = (
     Mutant(
         "screen of a flat by the lens",
         "detector/flat_field.py",
-        "light / np.where(lit, screen, 1)",
-        "light",
+        "electrons / np.where(lit, screen, 1)",
+        "electrons",
         ("tests/detector/test_flat_field.py",),
     ),
     # Tissue

@@ -16,8 +16,9 @@ from ..runtime.interrupt import ctrl_c_noted, terminated_as_by_ctrl_c
 from .calibrate import calibrate
 from .checks import doctor, explain, stability
 from .converge import converge
+from .expose import expose
 from .flux import app as flux
-from .images import compare, expose, plot, roi
+from .images import compare, plot, roi
 from .invert import invert
 from .locate import locate
 from .matrix import matrix

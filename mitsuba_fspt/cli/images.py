@@ -1,11 +1,10 @@
-"""`fspt plot`, `compare`, `roi` and `expose`: pictures of images, comparison, regions, a detector's response."""
+"""`fspt plot`, `compare` and `roi`: pictures of images, comparison, regions."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -15,10 +14,8 @@ from .options import (
     AsJson,
     Quiet,
     Rows,
-    SourcePower,
     Unit,
     WavelengthNm,
-    require_image,
     require_picture,
     require_writable,
 )
@@ -161,61 +158,3 @@ def _range(text: str) -> tuple[float, float]:
     except ValueError as cause:
         raise ImageError(f"--range {text}: must be two numbers A,B in W/pixel, for example --range 0,1e-9.") from cause
     return low, high
-
-
-def expose(
-    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Power image, as 'fspt render' writes it.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Electrons to write: .exr, .tif, .h5, .npz or .fits.")],
-    exposure_time: Annotated[float, typer.Option(help="Exposure time [s].")],
-    wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
-    source_power: SourcePower = None,
-    binning: Annotated[int, typer.Option(help="Pixels per side binned before read-out.")] = 1,
-    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
-    counts: Annotated[Path | None, typer.Option(help="Also write the counts [DN], 16-bit .png or .tif.")] = None,
-    detector: Annotated[
-        Path | None,
-        typer.Option(metavar="CAMERA.toml", help="Camera with a table [detector]; a typical cooled CCD if left out."),
-    ] = None,
-    quantum_efficiency: Annotated[float | None, typer.Option(help="Electrons per photon, in (0, 1].")] = None,
-    dark_current: Annotated[float | None, typer.Option(help="[e-/px/s], of a pixel of --pixel-pitch.")] = None,
-    read_noise: Annotated[float | None, typer.Option(help="Of one read-out [e-].")] = None,
-    full_well: Annotated[float | None, typer.Option(help="Of a read-out pixel, binned or not [e-].")] = None,
-    gain: Annotated[float | None, typer.Option(help="[e-/DN]; 1/K in EMVA 1288.")] = None,
-    bias: Annotated[float | None, typer.Option(help="[DN].")] = None,
-    bits: Annotated[int | None, typer.Option(help="Of the converter, 1 to 16.")] = None,
-    pixel_pitch: Annotated[float | None, typer.Option(help="Of the detector's own pixels [mm].")] = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
-    """Expose a CCD to an image: electrons, and with --counts counts.
-
-    The CCD is that of CAMERA.toml, or a typical cooled one (not a data sheet);
-    options replace its numbers.
-    """
-    from ..detector.detector import Detector
-    from ..images.image import read
-
-    require_image(output)
-    inputs = [image, detector] if detector else [image]
-    require_apart(output, inputs, error=ImageError)
-    if counts:
-        require_apart(counts, [*inputs, output], "--counts", ImageError)
-    numbers: dict[str, Any] = {
-        "quantum_efficiency": quantum_efficiency,
-        "dark_current": dark_current,
-        "read_noise": read_noise,
-    }
-    numbers |= {"full_well": full_well, "gain": gain, "bias": bias, "bits": bits, "pixel_pitch": pixel_pitch}
-    camera = Detector.from_toml(detector) if detector else Detector.typical_ccd()
-    camera = replace(camera, **{name: value for name, value in numbers.items() if value is not None})
-    power = read(image)
-    power = power if source_power is None else power.scaled(source_power)
-    exposure = camera.expose(
-        power, exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, seed=seed
-    )
-    with exposure.counts_file(counts) if counts else nullcontext():  # both files or none
-        exposure.write(output)
-    peak, saturated = float(exposure.electrons.max()), exposure.metadata["saturated_pixels"]
-    record = {"output": str(output), "counts": counts and str(counts), "peak": peak, "saturated_pixels": saturated}
-    text = f"{output}: brightest pixel {peak:.6g} electrons, {saturated} pixels saturated"
-    print_result(text, record, as_json=as_json, quiet=quiet)

@@ -229,7 +229,7 @@ def _calibrated(
         "output": str(output),
         "quantum_efficiency": found.quantum_efficiency,
         "gain_error": found.gain_error,
-        "watts_per_dn": found.gain / frame.per_watt(found.quantum_efficiency),
+        "watts_per_dn": found.mean("gain") / found.em_gain / frame.per_watt(found.quantum_efficiency),
         "masked_pixels": image.metadata["masked_pixels"],
     }
 

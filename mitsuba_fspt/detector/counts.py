@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import re
-import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
+from ..images.frame_file import FITS, TIFF, read_frame
 from ..images.tiff_pages import read_tiff
-from ..runtime.errors import LONGEST_TEXT, BackendError, DetectorError, ImageError, one_line
+from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
 
-LOG = logging.getLogger("mitsuba_fspt")
 Frame = ArrayLike | str | os.PathLike[str]
-UM_PER_MM = 1e3
 SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
-TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
 # Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
 EXPOSURE = tuple(
@@ -109,25 +105,9 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
         return _click(path)
     if not path.is_file():
         raise ImageError(f"counts '{path}' do not exist. Check the name.")
-    suffix = path.suffix.lower()
-    header: dict[str, Any] = {}
-    if suffix in (*TIFF, *FITS):
+    if path.suffix.lower() in (*TIFF, *FITS):
         _require_counts(path)
-    if suffix in TIFF:
-        array = read_tiff(path, f"counts '{path}'")
-    elif suffix in FITS:
-        array, header = _fits(path)
-    elif suffix == ".npy":
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # NumPy's of an odd header, which it reads or refuses
-                array = np.load(path, allow_pickle=False)
-        except Exception as cause:  # whatever a damaged file makes NumPy raise
-            raise ImageError(
-                f"counts '{path}' are no NPY file of numbers: {one_line(cause, LONGEST_TEXT)}. Save them again."
-            ) from cause
-    else:
-        raise ImageError(f"counts '{path}': '{suffix}' is not read. Give .tif, .fits, .npy or a click folder.")
+    array, header = read_frame(path, f"counts '{path}'")
     array = array.astype(np.uint8) if array.dtype == bool else array  # a frame of bad pixels
     return replace(counts_of(array, str(path), frames), **header)
 
@@ -195,45 +175,6 @@ def _require_frames_first(shape: tuple[int, ...], name: str, frames: int | None)
 def _elongation(one: int, other: int) -> float:
     """Ratio of the longer to the shorter side."""
     return max(one, other) / min(one, other)
-
-
-def _fits(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Data of a FITS file, row 0 at the top, and what its header states, by names of `Counts`.
-
-    EXPTIME or EXPOSURE in s, XBINNING, and XPIXSZ, the side of a binned pixel in µm, as imaging programs write them.
-    """
-    try:
-        from astropy.io import fits
-    except ImportError as cause:
-        raise BackendError(f"counts '{path}': astropy is missing. pip install 'mitsuba-fspt[reduce]'.") from cause
-    try:
-        with warnings.catch_warnings(record=True) as reports, fits.open(path, memmap=False) as file:
-            warnings.simplefilter("always")
-            unit = next(unit for unit in file if unit.data is not None)
-            keys = ("EXPTIME", "EXPOSURE", "XBINNING", "YBINNING", "ROWORDER", "XPIXSZ", "YPIXSZ")
-            time, other, sides, rows, order, wide, high = (
-                unit.header.get(key, file[0].header.get(key)) for key in keys
-            )
-            time = other if time is None else time
-            data = np.asarray(unit.data)
-            found: dict[str, Any] = {} if time is None else {"exposure_time": float(time)}
-            found |= {} if sides is None else {"binning": int(sides)}
-            found |= {} if wide is None or high not in (None, wide) else {"pixel_pitch": float(wide) / UM_PER_MM}
-    except Exception as cause:
-        raise ImageError(
-            f"counts '{path}' are no readable FITS: {one_line(cause, LONGEST_TEXT)}. Copy the file again."
-        ) from cause
-    texts = [one_line(report.message, LONGEST_TEXT) for report in reports]
-    for text in texts:
-        if "truncated" in text:  # astropy returns what there is
-            raise ImageError(f"counts '{path}' are an incomplete FITS: {text}. Copy the file again.")
-    if texts:
-        LOG.warning("fspt: counts '%s': astropy reports: %s. Check the image.", path, texts[0])
-    if None not in (sides, rows) and sides != rows:
-        raise ImageError(f"counts '{path}' are binned {sides} x {rows}. Give counts of square binning.")
-    if str(order).strip().upper() == "BOTTOM-UP" and data.ndim > 1:
-        data = np.flip(data, axis=-2)
-    return data, found
 
 
 def _click(folder: Path) -> Counts:

@@ -1,20 +1,20 @@
-"""CCD behind the lens, in the terms of EMVA 1288: from power on a pixel to electrons and counts.
+"""Detector behind the lens, in the terms of EMVA 1288: from power on a pixel to electrons and counts.
 
     photons    μ_p = P t λ / (h c)
-    electrons  μ_e = η μ_p + I_dark t,  summed over the pixels of a bin,  σ_e² = μ_e + σ_read²
-    counts     y   = bias + round(electrons / gain)
+    charge     n   = Poisson(Σ (f η μ_p + I_dark t + c)),  over the pixels of a bin
+    electrons  x   = G n,  by a multiplying register;  ⟨x⟩ = g n,  σ_x² = g² (F² − 1) n for a charge n
+    counts     y   = bias + round((x + normal(σ_read)) / gain)
 
-The charge of a bin is Poisson distributed with mean μ_e (shot noise); its read-out adds normal noise, σ_read.
+f is the response of a pixel relative to the mean one (PRNU), c the spurious charge. Without a register g = F² = 1 and
+x = n. σ_read, full well and gain are those of the electrons after the register (Eq. M.37).
 """
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from dataclasses import MISSING, dataclass, fields
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,68 +24,38 @@ from ..images.formats import Metadata
 from ..images.image import Image
 from ..images.pixel_axes import CROP
 from ..images.radiometry import PLANCK_TIMES_LIGHT, wavelength_of
-from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
-from ..runtime.toml_file import read_toml
 from ..runtime.wavelength import wavelength
+from .parameters import RECORDED, DetectorParameters
+from .reduction import Corrections, Exposed, reduce_counts
 
 if TYPE_CHECKING:
     from .counts import Frame
     from .flat_field import Scene
 
-# Parameters of a detector, each with an example for messages, and their keys in an exposure's metadata, where
-# `pixel_pitch` is that of the pixels read out.
-EXAMPLES = {
-    "quantum_efficiency": "0.85",
-    "dark_current": "1e-3",
-    "read_noise": "3.5",
-    "full_well": "1e5",
-    "gain": "1.6",
-    "bias": "500",
-    "bits": "16",
-    "pixel_pitch": "0.0135",
-}
-TABLES = ("detector", "lens")  # of a camera's TOML file; this file reads the first one only
-COMMENTS = {
-    "quantum_efficiency": "electrons per photon, η of EMVA 1288",
-    "dark_current": "e-/px/s",
-    "read_noise": "e-, temporal dark noise of EMVA 1288",
-    "full_well": "e-, saturation capacity of EMVA 1288",
-    "gain": "e-/DN, 1/K of EMVA 1288",
-    "bias": "DN",
-    "bits": "of the converter",
-    "pixel_pitch": "mm, of the pixel of the dark current",
-    "gain_error": "relative standard uncertainty common to all pixels",
-}
-# Names of EMVA 1288 that a TOML may use instead; the overall system gain K is in DN/e-.
-EMVA_1288 = {
-    "temporal_dark_noise": "read_noise",
-    "saturation_capacity": "full_well",
-    "overall_system_gain": "gain",
-}
-RECORDED = {name: name for name in EXAMPLES} | {"pixel_pitch": "detector_pixel_pitch"}
+Array = NDArray[np.float64]
+NOT_A_SHEET = "typical, not a data sheet"
 
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
     """Mean [e-] and variance [e-²] of the electrons of each pixel read out, shape (h, w), ignoring the full well."""
 
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    mean: Array
+    variance: Array
 
 
-@dataclass(frozen=True)
-class Detector:
-    """CCD described by the parameters of EMVA 1288, which are the same for all its pixels.
+class Detector(DetectorParameters):
+    """Detector described by the parameters of EMVA 1288: a CCD, an EMCCD, or with maps of its pixels an sCMOS.
 
     Parameters
     ----------
     quantum_efficiency : η, electrons per photon, in (0, 1]
     dark_current : [e-/px/s], >= 0
-    read_noise : σ_read [e-] of one read-out, >= 0
-    full_well : [e-], in (0, 1e15]; the most electrons that a read-out pixel, binned or not, delivers
-    gain : [e-/DN], > 0; 1/K in EMVA 1288
+    read_noise : σ_read [e-] of one read-out, >= 0, after the multiplying register if there is one
+    full_well : [e-], in (0, 1e15]; the most electrons that a read-out pixel, binned or not, delivers, after a register
+    gain : [e-/DN], > 0, electrons after the register; 1/K in EMVA 1288
     bias : [DN], >= 0
     bits : of the converter, 1 … 16; the largest count is 2^bits − 1
     pixel_pitch : [mm], > 0, of the pixel to which `dark_current` refers; for an image with another `pixel_pitch` in
@@ -93,22 +63,22 @@ class Detector:
     name : label in the files
     gain_error : relative standard uncertainty, in [0, 1), of a factor common to all pixels, such as that of a
         calibration
+    em_gain : electrons after the multiplying register of an EMCCD per electron before it, >= 1; 1 without a register
+    excess_noise : F² of the register, 1 … 2.5: variance of the electrons over that of a noiseless register; None: 2,
+        and 1 where `em_gain` is 1
+    spurious_charge : clock-induced charge [e-/px/frame] before the register, >= 0, scaled by area as `dark_current`
+    prnu : relative standard deviation of the response of the detector's own pixels, 0 … 0.1. `expose` draws the
+        response from it, the same for all exposures of a `name` and size; reduced images without a flat field have it
+        in their errors
+
+    `read_noise`, `gain`, `bias`, `dark_current` and `prnu` may each be the name of a map in place of a number: a FITS,
+    TIFF or NPY file with the values on the pixels read out, row 0 at the top. A map for `prnu` is the response of each
+    pixel, about 1, or its deviation from 1, about 0; `reduce` divides by it as by a flat field.
 
     Raises
     ------
-    DetectorError : a parameter is no number or outside its range.
+    DetectorError : a parameter is no number or outside its range, or a map cannot be read.
     """
-
-    quantum_efficiency: float
-    dark_current: float
-    read_noise: float
-    full_well: float
-    gain: float
-    bias: float
-    bits: int
-    pixel_pitch: float | None = None
-    name: str = "detector"
-    gain_error: float = 0.0
 
     @classmethod
     def typical_ccd(cls) -> Detector:
@@ -122,89 +92,52 @@ class Detector:
             bias=500,
             bits=16,
             pixel_pitch=0.0135,
-            name="typical, not a data sheet",
+            name=NOT_A_SHEET,
         )
 
     @classmethod
-    def from_toml(cls, path: str | os.PathLike[str]) -> Detector:
-        """Detector of a camera's TOML file: its table [detector], whose keys are the parameters of the class.
+    def typical_emccd(cls) -> Detector:
+        """Cooled back-illuminated 1024² EMCCD with 13 µm pixels at a gain of 300; typical values, no data sheet.
 
-        Only `pixel_pitch` and `name` may be left out. A table [lens] in the same file is not read.
-
-            [detector]
-            name = "iKon-M 934, serial 1234"
-            quantum_efficiency = 0.9   # electrons per photon
-            dark_current = 1e-3        # e-/px/s
-            read_noise = 3.5           # e-
-            full_well = 1e5            # e-
-            gain = 1.6                 # e-/DN
-            bias = 500                 # DN
-            bits = 16
-            pixel_pitch = 0.013        # mm, of the pixel of the dark current
-
-        Raises
-        ------
-        DetectorError : the file cannot be read, has no table [detector], a key is unknown or missing, or a value is of
-            the wrong type or outside its range.
+        F² = 2 and the gamma law of the register: Robbins and Hadwen, IEEE Trans. Electron Devices 50, 1227 (2003);
+        Basden et al., Mon. Not. R. Astron. Soc. 345, 985 (2003). Spurious charge: the range of 1e-3 to 1e-2 e-/px/frame
+        in Daigle et al., Publ. Astron. Soc. Pac. 121, 866 (2009). Read noise, of tens of electrons at MHz pixel rates,
+        and a register that holds several times the pixel's well are usual for sensors of this kind.
         """
-        content = read_toml(path, DetectorError)
-        table = content.get("detector")
-        if not isinstance(table, dict):
-            raise DetectorError(f"'{path}': the table [detector] is missing. Give it, with {', '.join(EXAMPLES)}.")
-        if unknown := [key for key in content if key not in TABLES]:
-            raise DetectorError(
-                f"'{path}': '{unknown[0]}' means nothing here. Put it into [detector], or leave it out."
-            )
-        known = {field.name: field.default for field in fields(cls)}
-        table = _own_names(table, path)
-        if unknown := [key for key in table if key not in known]:
-            raise DetectorError(f"'{path}' [detector]: '{unknown[0]}' means nothing here. Give {', '.join(known)}.")
-        if missing := [key for key, default in known.items() if default is MISSING and key not in table]:
-            key = missing[0]
-            raise DetectorError(f"'{path}' [detector]: '{key}' is missing. Give for example {key} = {EXAMPLES[key]}.")
-        if not isinstance(table.get("name", ""), str):
-            raise DetectorError(
-                f"'{path}' [detector]: 'name' must be a text in quotes, got {table['name']}. Give for example \"CCD\"."
-            )
-        try:
-            return cls(**table)
-        except DetectorError as cause:
-            raise DetectorError(f"'{path}' [detector]: {str(cause).removeprefix('detector: ')}") from cause
+        return cls(
+            quantum_efficiency=0.9,
+            dark_current=5e-4,
+            read_noise=60.0,
+            full_well=4e5,
+            gain=8.0,
+            bias=200,
+            bits=16,
+            pixel_pitch=0.013,
+            name=NOT_A_SHEET,
+            em_gain=300,
+            spurious_charge=2e-3,
+        )
 
-    def __post_init__(self) -> None:
-        for name, example in EXAMPLES.items():
-            value = getattr(self, name)
-            if name != "pixel_pitch" or value is not None:
-                object.__setattr__(self, name, number(f"detector: '{name}'", value, DetectorError, example))
-        eta, full_well, bits = self.quantum_efficiency, self.full_well, self.bits
-        _require("quantum_efficiency", eta, 0 < eta <= 1, "in (0, 1], for example 0.85")
-        _require("full_well", full_well, 0 < full_well <= 1e15, "in (0, 1e15] e-, for example 1e5")
-        _require("gain", self.gain, self.gain > 0, "> 0 e-/DN, for example 1.6")
-        _require("dark_current", self.dark_current, self.dark_current >= 0, ">= 0 e-/px/s, for example 1e-3")
-        _require("read_noise", self.read_noise, self.read_noise >= 0, ">= 0 e-, for example 3.5")
-        _require("bias", self.bias, self.bias >= 0, ">= 0 DN, for example 500")
-        _require("bits", bits, bits in range(1, 17), "a whole number in 1 … 16, for example 16")
-        object.__setattr__(self, "bits", int(bits))
-        error = number("detector: 'gain_error'", self.gain_error, DetectorError, "0.05")
-        object.__setattr__(self, "gain_error", error)
-        _require("gain_error", error, 0 <= error < 1, "in [0, 1), for example 0.05")
-        if self.pixel_pitch is not None:
-            _require("pixel_pitch", self.pixel_pitch, self.pixel_pitch > 0, "> 0 mm, for example 0.0135")
+    @classmethod
+    def typical_scmos(cls) -> Detector:
+        """Cooled 2048² sCMOS with 6.5 µm pixels; typical values, no data sheet.
 
-    def to_toml(self, path: str | os.PathLike[str]) -> None:
-        """Write a camera's TOML file with the table [detector], which `from_toml` reads.
-
-        Raises DetectorError if the file cannot be written.
+        Read noise, gain, bias and well are of the size that Huang et al., Nat. Methods 10, 653 (2013), found on such a
+        camera, where the read noise differs from pixel to pixel: give maps for one. A PRNU below 1 % is what EMVA 1288
+        reports of such sensors state.
         """
-        path = Path(path)
-        if path.suffix.lower() != ".toml":
-            raise DetectorError(f"output file '{path}' must end in .toml. Give a name such as camera.toml.")
-        lines = ["[detector]", f"name = {json.dumps(self.name)}"]
-        for name, comment in COMMENTS.items():
-            if (value := getattr(self, name)) is not None:
-                lines.append(f"{name} = {value!r}  # {comment}")
-        with atomic_path(path, DetectorError) as temporary:
-            temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
+        return cls(
+            quantum_efficiency=0.82,
+            dark_current=0.06,
+            read_noise=1.6,
+            full_well=3e4,
+            gain=0.46,
+            bias=100,
+            bits=16,
+            pixel_pitch=0.0065,
+            name=NOT_A_SHEET,
+            prnu=0.005,
+        )
 
     def reduce(
         self,
@@ -245,8 +178,10 @@ class Detector:
         cosmic_rays : also mask pixels that cosmic rays have hit
         metadata : further entries, such as those of the rendered image that was exposed, without how it was computed
 
-        The metadata hold `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (variance of dark current, rounding
-        and subtracted frames [e-²]) and `gain_error`; a pixel where `flat` is f has f times `electrons_per_watt`.
+        The image contains its noise as a function of the light (Eq. M.24). The metadata hold, for electrons before the
+        register, `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (variance of dark current, spurious charge,
+        rounding and subtracted frames [e-²]), `excess_noise`, `prnu` and `gain_error`; a pixel where `flat` is f has
+        f times `electrons_per_watt`. Planes are `flat`, `flat_error` and, with maps, `dark_noise`.
 
         Raises
         ------
@@ -254,18 +189,21 @@ class Detector:
         ImageError : a file cannot be read, or a stack has the shape (h, w, frames).
         SceneError, OpticsError, BackendError : the scene has no usable lens; a package is not installed.
         """
-        from .reduction import Corrections, Exposed, reduce_counts
-
         exposed = Exposed(exposure_time, wavelength_nm, binning, pixel_pitch)
         corrections = Corrections(bias, dark, flat, flat_kind, flat_dark, scene, bad_pixels, cosmic_rays)
         return reduce_counts(self, counts, exposed, corrections, frames=frames, metadata=metadata)
 
     def expected(self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1) -> Expectation:
-        """Mean and variance of the electrons that `expose` draws, before the full well limits them.
+        """Mean and variance of the electrons that `expose` draws, after the register, before the full well limits them.
 
         Parameters and errors as for `expose`.
         """
-        exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
+        charge = self._charge(image, *_time_and_wavelength(exposure_time, wavelength_nm), _whole("binning", binning))
+        noise = np.square(self.on_pixels("read_noise", charge.shape))
+        return Expectation(self.em_gain * charge, self.em_gain**2 * self.excess * charge + noise)
+
+    def _charge(self, image: Image, exposure_time: float, wavelength_nm: float, binning: int) -> Array:
+        """Mean charge of each pixel read out before the register, (h, w) [e-]."""
         if not isinstance(image, Image):
             raise DetectorError(
                 f"detector: must be given an image, got {type(image).__name__}. Give fspt.Image(power)."
@@ -275,11 +213,28 @@ class Detector:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
         energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
         photons = image.power.astype(np.float64) * (exposure_time / energy)
+        light = _binned(self.quantum_efficiency * photons, binning)
         pitch = image.metadata.get("pixel_pitch")
-        area = 1.0 if self.pixel_pitch is None or pitch is None else (float(pitch) / self.pixel_pitch) ** 2
-        charge = self.quantum_efficiency * photons + self.dark_current * exposure_time * area
-        mean = _binned(charge, _whole("binning", binning))
-        return Expectation(mean, mean + self.read_noise**2)
+        area = self.area(None if pitch is None else float(pitch) * binning, binning)
+        dark = self.on_pixels("dark_current", light.shape) * exposure_time
+        return self._drawn_response(light.shape, area) * light + (dark + self.spurious_charge) * area
+
+    def _drawn_response(self, shape: tuple[int, ...], area: float) -> Array | float:
+        """Response of the pixels read out (h, w), each of `area` own ones: the map, or drawn from the number `prnu`."""
+        known = self.response(shape)
+        if known is not None:
+            return known
+        deviation = float(self.prnu) / math.sqrt(max(area, 1.0))
+        if not deviation:
+            return 1.0
+        return 1 + deviation * np.random.default_rng(zlib.crc32(self.name.encode())).standard_normal(shape)
+
+    def _multiplied(self, charge: NDArray[np.int64], rng: np.random.Generator) -> Array:
+        """Electrons after the register of a `charge` before it, (h, w) [e-] (Eq. M.37)."""
+        surplus = self.excess - 1
+        if not surplus:
+            return self.em_gain * charge.astype(np.float64)
+        return rng.gamma(charge / surplus, self.em_gain * surplus)
 
     def expose(
         self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
@@ -292,27 +247,31 @@ class Detector:
         exposure_time : [s], 0 … 1e12 (0 gives a bias frame)
         wavelength_nm : of the light in vacuum [nm], 200 … 2500
         binning : side of the square of pixels whose charge is summed before read-out, a divisor of h and w
-        seed : of the shot and read noise, 0 … 2⁵³
+        seed : of the shot and read noise and of the register, 0 … 2⁵³
 
         Raises
         ------
-        DetectorError : a parameter is outside its range, or the binning does not divide the image.
+        DetectorError : a parameter is outside its range, a map is not of the pixels read out, or the binning does not
+            divide the image.
         ImageError : the image was rendered for another wavelength.
         """
         exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
         seed, binning = _whole("seed", seed), _whole("binning", binning)
-        _require(
-            "seed", seed, 0 <= seed <= 1 << 53, ">= 0 and at most 2^53, for example 1"
-        )  # an EXR stores integers as doubles, which hold no larger one exactly
+        if not 0 <= seed <= 1 << 53:  # an EXR stores integers as doubles, which hold no larger one exactly
+            raise DetectorError(
+                f"detector: 'seed' must be finite and >= 0 and at most 2^53, for example 1, got {seed}."
+            )
         rng = np.random.default_rng(seed)
-        mean = self.expected(image, exposure_time, wavelength_nm, binning=binning).mean
+        mean = self._charge(image, exposure_time, wavelength_nm, binning)
         # A mean this far above the full well saturates with certainty. NumPy cannot draw Poisson numbers above 9e18.
-        charge = rng.poisson(np.minimum(mean, 2 * self.full_well + 1e6))
-        electrons = np.minimum(charge + rng.normal(0.0, self.read_noise, mean.shape), self.full_well)
+        charge = self._multiplied(rng.poisson(np.minimum(mean, 2 * self.full_well + 1e6)), rng)
+        noise = rng.normal(0.0, self.on_pixels("read_noise", mean.shape), mean.shape)
+        electrons = np.minimum(charge + noise, self.full_well)
         full = electrons >= self.full_well
         electrons = electrons.astype(np.float32)  # the counts follow from the values that the EXR holds
         top = 2**self.bits - 1
-        counts = np.clip(np.rint(self.bias + electrons / np.float64(self.gain)), 0, top)
+        levels = self.on_pixels("bias", mean.shape) + electrons / np.float64(self.on_pixels("gain", mean.shape))
+        counts = np.clip(np.rint(levels), 0, top)
         metadata = image.metadata | {
             "quantity": "electrons",
             "unit": "e-",
@@ -323,30 +282,25 @@ class Detector:
             "detector_seed": seed,
             "saturated_pixels": int(np.sum(full | (counts >= top))),
         }
-        metadata |= {key: getattr(self, name) for name, key in RECORDED.items() if getattr(self, name) is not None}
-        if self.gain_error:
-            metadata["gain_error"] = self.gain_error
+        metadata |= self._recorded()
         if "pixel_pitch" in image.metadata:
             metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
         if binning > 1:  # of a crop window, in pixels of the read-out
             metadata |= {key: float(image.metadata[key]) / binning for key in CROP if key in image.metadata}
         return Exposure(electrons, counts.astype(np.uint16), metadata)
 
-
-def _own_names(table: dict[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Table [detector] with EMVA 1288's names replaced by this package's; DetectorError for a number given twice."""
-    found = dict(table)
-    for theirs, ours in EMVA_1288.items():
-        if theirs not in found:
-            continue
-        if ours in found:
-            raise DetectorError(f"'{path}' [detector]: '{theirs}' and '{ours}' are the same. Give one of them.")
-        value = found.pop(theirs)
-        if theirs == "overall_system_gain":
-            value = number(f"'{path}' [detector]: '{theirs}'", value, DetectorError, "0.625")
-            value = 1 / value if value else math.inf
-        found[ours] = value
-    return found
+    def _recorded(self) -> Metadata:
+        """Parameters as entries of an exposure's metadata: numbers, of maps the mean with path and digest."""
+        found: Metadata = {}
+        for name, key in RECORDED.items():
+            if name in self.maps:
+                found |= {key: self.mean(name), **self.maps[name].recorded(key)}
+            elif getattr(self, name) is not None:
+                found[key] = getattr(self, name)
+        register = {} if self.em_gain > 1 else {"em_gain": 1.0, "excess_noise": 1.0}
+        unused = register | {"spurious_charge": 0.0, "prnu": 0.0}
+        found = {key: value for key, value in found.items() if unused.get(key) != value}
+        return found | ({"gain_error": self.gain_error} if self.gain_error else {})
 
 
 def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
@@ -364,15 +318,10 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
 def _time_and_wavelength(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
     """Both as floats, or DetectorError. The bound keeps photons per watt finite: 0 W times infinity would be NaN."""
     time = number("detector: 'exposure_time'", exposure_time, DetectorError, "60")
-    _require("exposure_time", time, 0 <= time <= 1e12, "in 0 … 1e12 s, for example 60")
+    if not 0 <= time <= 1e12:
+        raise DetectorError(f"detector: 'exposure_time' must be finite and in 0 … 1e12 s, for example 60, got {time}.")
     return time, wavelength("detector: 'wavelength_nm'", wavelength_nm, DetectorError)
 
 
 def _whole(name: str, value: int) -> int:
     return whole(f"detector: '{name}'", value, DetectorError, "1")
-
-
-def _require(name: str, value: float, holds: bool, rule: str) -> None:
-    """Raise DetectorError unless `value` is finite and the `rule` holds."""
-    if not (holds and math.isfinite(value)):
-        raise DetectorError(f"detector: '{name}' must be finite and {rule}, got {value}.")

@@ -24,7 +24,7 @@ from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number
 from .counts import Counts, Frame, frame_like, require_same_time
-from .detector import Detector
+from .parameters import DetectorParameters
 from .saturation import full_pixels
 
 if TYPE_CHECKING:
@@ -49,18 +49,25 @@ class FlatField:
 
     response : f, relative to the mean of the pixels that are kept; 1 where masked
     mask : True where the flat gives no response: dark, negative, saturated or hot pixels, and those without light
-    variance : relative variance of f by shot and read noise; 0 for a single frame, whose number of frames is unknown
-    kind : 'lens' or 'sensor'
+    error : relative standard error of f (h, w) by shot and read noise; None for a single frame, whose number of frames
+        is unknown, and for a map
+    kind : 'lens', 'sensor' or, of the detector's own map, 'map'
     """
 
     response: Array
     mask: Mask
-    variance: Array | float
+    error: Array | None
     kind: str
+
+    @classmethod
+    def of_map(cls, detector: DetectorParameters, shape: tuple[int, ...]) -> FlatField | None:
+        """Response by the map `prnu` of a detector; None without one."""
+        response = detector.response(shape)
+        return None if response is None else cls(response, np.zeros(shape, bool), None, "map")
 
 
 def flat_field(
-    detector: Detector,
+    detector: DetectorParameters,
     flat: Frame,
     kind: str | None,
     scene: Scene | None,
@@ -69,12 +76,14 @@ def flat_field(
     flat_dark: Frame | float | None = None,
     bias: Array | None = None,
     pixel_pitch: float | None = None,
+    area: float = 1.0,
     binning: int | None = None,
 ) -> FlatField:
     """Flat field of counts of this `shape` (h, w); parameters as of `Detector.reduce`.
 
     bias : frame [DN] in place of the detector's number, for a flat of raw counts without `flat_dark`
     pixel_pitch, binning : of the pixels read out [mm], and the pixels along their side, or None
+    area : number of the detector's own pixels in one that is read out
 
     Raises
     ------
@@ -84,7 +93,9 @@ def flat_field(
     """
     _require_kind(kind, scene)
     found = frame_like(flat, "flat", shape)
-    background, frames = _background(detector, found, flat_dark, bias, shape)
+    spurious = detector.spurious_charge * area * detector.em_gain / detector.on_pixels("gain", shape)
+    level = detector.on_pixels("bias", shape) + spurious if bias is None else bias  # a frame contains that charge
+    background, frames = _background(detector, found, flat_dark, level, shape)
     light = found.values - background
     full = _full(detector, found, light)
     screen = np.ones(shape) if scene is None else uniform_screen(scene, shape, pixel_pitch, binning)
@@ -95,14 +106,15 @@ def flat_field(
             f"reduce: the flat field has no usable pixel: {int(full.sum())} are saturated, {int((light <= 0).sum())} "
             "not above its bias. Give another one."
         )
-    relative = np.where(usable, light / np.where(lit, screen, 1), 0)
+    electrons = light * detector.on_pixels("gain", shape)  # after the register
+    relative = np.where(usable, electrons / np.where(lit, screen, 1), 0)
     usable &= relative >= LEAST * np.median(relative[usable])
     # A masked neighbour counts as the median pixel, so that it makes no other pixel hot.
     filled = np.where(usable, relative, np.median(relative[usable]))
     usable &= relative <= HOT * median_filter(filled, NEIGHBOURS, mode="nearest")
     response = np.where(usable, relative / relative[usable].mean(), 1.0)
-    variance = _variance(detector, np.where(usable, light, 1.0), found.frames, frames) if _is_in_dn(found) else 0.0
-    return FlatField(response, ~usable, variance, str(kind))
+    error = _error(detector, np.where(usable, electrons, 1.0), found.frames, frames) if _is_in_dn(found) else None
+    return FlatField(response, ~usable, error, str(kind))
 
 
 def uniform_screen(
@@ -152,7 +164,11 @@ def _require_kind(kind: str | None, scene: Scene | None) -> None:
 
 
 def _background(
-    detector: Detector, flat: Counts, flat_dark: Frame | float | None, bias: Array | None, shape: tuple[int, int]
+    detector: DetectorParameters,
+    flat: Counts,
+    flat_dark: Frame | float | None,
+    bias: Array | float,
+    shape: tuple[int, int],
 ) -> tuple[Array | float, float]:
     """Level to subtract from the flat [DN], and the number of frames that it is the mean of (inf for a number).
 
@@ -168,13 +184,13 @@ def _background(
         require_same_time("flat_dark", frame, "flat", flat.exposure_time)
         return frame.values, frame.frames
     if flat.raw:
-        given = f"{detector.bias:g} DN" if bias is None else "frame"
+        given = f"{float(bias):g} DN" if np.ndim(bias) == 0 else "frame"
         LOG.warning(
             "fspt: reduce: the flat field holds raw counts; the bias, %s, is subtracted, no dark current. Give "
             "'flat_dark', a frame of the flat's exposure time that contains the bias, or 0.",
             given,
         )
-        return detector.bias if bias is None else bias, np.inf
+        return bias, np.inf
     if (middle := float(np.median(flat.values))) > NORMALISED:
         LOG.warning(
             "fspt: reduce: the flat field, median %.6g, holds no unsigned integers as raw counts are; it is taken as "
@@ -197,26 +213,28 @@ def _is_in_dn(flat: Counts) -> bool:
     return False
 
 
-def _full(detector: Detector, flat: Counts, light: Array) -> Mask:
+def _full(detector: DetectorParameters, flat: Counts, light: Array) -> Mask:
     """True where the flat is saturated; nowhere for one in other units than DN, such as a sum of frames."""
     if flat.raw:
         return full_pixels(detector, flat, "flat field")
     if float(np.median(flat.values)) <= NORMALISED:
         return np.zeros(flat.values.shape, bool)
     with_bias = bool(np.any(light != flat.values))  # a dark frame has been subtracted
-    more = 0.0 if with_bias else detector.bias
+    more = 0.0 if with_bias else detector.mean("bias")
     highest, first = (None if one is None else one + more for one in (flat.highest, flat.first))
     full = full_pixels(detector, replace(flat, values=flat.values + more, highest=highest, first=first), "flat field")
     return full if full.mean() < 0.5 else np.zeros_like(full)
 
 
-def _variance(detector: Detector, light: Array, frames: int, dark_frames: float) -> Array | float:
-    """Relative variance of the mean of a stack of flats by shot and read noise, and by the read noise of its dark."""
+def _error(detector: DetectorParameters, electrons: Array, frames: int, dark_frames: float) -> Array | None:
+    """Relative standard error of the mean of a stack of flats by shot and read noise, and the read noise of its dark.
+
+    electrons : mean of the flats (h, w) [e-] after the register;  frames, dark_frames : of the flat and of its dark
+    """
     if frames == 1:
-        return 0.0
-    electrons = light * detector.gain
-    read = detector.read_noise**2 * (1 / frames + 1 / dark_frames)
-    return (electrons / frames + read) / electrons**2
+        return None
+    read = np.square(detector.on_pixels("read_noise", electrons.shape)) * (1 / frames + 1 / dark_frames)
+    return np.sqrt(detector.em_gain * detector.excess * electrons / frames + read) / electrons
 
 
 def require_no_flat(**given: Any) -> None:

@@ -1,16 +1,17 @@
 """Counts of a detector to power [W]: bias, dark, flat, cosmic rays, quantum efficiency, and the noise that remains.
 
-    electrons = gain (DN − bias) − dark,   P = electrons / (flat · k),   k = η t λ / (h c) [electrons per watt]
-    error² = (max(electrons, 0) + σ_read² + dark) / (flat · k)² + (P ε)²
+    electrons n = gain (DN − bias)/g − dark,   P = n / (flat · k),   k = η t λ / (h c) [electrons per watt]
+    error² = (F² (max(n, 0) + dark) + (σ_read/g)²) / (flat · k)² + (P ε)²
 
-with the variance of the dark current and of the rounding in `dark_electrons`, and the relative error ε of the flat
-field. Frames are corrected by ccdproc. A pixel of a flat field below 1 collects fewer electrons per watt, flat · k;
-the image stores the flat field.
+with g and F² of a multiplying register, both 1 without one, and the relative error ε of the response. All electrons of
+an image, `dark_electrons` and `read_noise` too, are those before the register. Frames are corrected by ccdproc. A pixel
+of a flat field below 1 collects fewer electrons per watt, flat · k. The image stores the flat field and its noise.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import warnings
 from collections.abc import Mapping
@@ -23,34 +24,37 @@ from numpy.typing import NDArray
 
 from ..images.exposure import Exposure, image_or_exposure
 from ..images.formats import Metadata, read_planes
+from ..images.frame_file import FITS, TIFF
 from ..images.image import Image
+from ..images.noise_model import NoiseModel
+from ..images.pixel_map import DIGEST, MAP, recorded_map
 from ..images.radiometry import PLANCK_TIMES_LIGHT
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from ..runtime.wavelength import wavelength
-from .counts import CLICK, FITS, SAME_TIME, TIFF, Counts, Frame, frame_like, frame_of, require_same_time
-from .detector import RECORDED, Detector
+from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time
 from .flat_field import FlatField, flat_field, require_no_flat
+from .parameters import MAPPED, RECORDED, DetectorParameters, Own
 from .saturation import full_pixels, saturated
 
 if TYPE_CHECKING:
     from .flat_field import Scene
 
-    Array = NDArray[np.float64]
-
+Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
 DARKER = 5.0  # standard deviations of a total below 0: noise makes more once in 3 million images
 REPLACED = (
     *("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"),
-    *("flat_kind", "flat_masked_pixels"),
+    *("flat_kind", "flat_masked_pixels", "em_gain", "excess_noise", "spurious_charge", "prnu"),
+    *(name + end for name in MAPPED for end in (MAP, DIGEST)),
 )
+OPTIONAL = ("pixel_pitch", "em_gain", "excess_noise", "spurious_charge", "prnu")  # entries that an exposure may lack
 # Metadata of a rendered image that say how it was computed. They do not hold for counts of it, whose error is noise.
 COMPUTED = (
     *("method", "rtol", "domain", "pixel", "max_nodes", "max_specular", "shortcuts_off", "nodes", "levels", "left_out"),
     *("light_left_out", "light_left_out_error", "warnings", "wall_time", "variant", "versions"),
     *("sampler", "spp", "passes", "seed", "max_depth", "max_time", "stopped_after"),
 )
-ROUNDING = 1e-6  # relative error of a variance from a file's float32 numbers
 
 
 @dataclass(frozen=True)
@@ -87,13 +91,17 @@ class Exposed:
         """k, electrons per watt on a pixel."""
         return quantum_efficiency * self.exposure_time * self.wavelength_nm * 1e-9 / PLANCK_TIMES_LIGHT
 
-    def dark(self, dark_current: float, own_pitch: float | None) -> float:
-        """Electrons of the dark current in a pixel read out."""
-        if self.pixel_pitch is None or own_pitch is None:
-            area = float((self.binning or 1) ** 2)
-        else:
-            area = (self.pixel_pitch / own_pitch) ** 2
-        return dark_current * self.exposure_time * area
+    def area(self, detector: DetectorParameters) -> float:
+        """Number of the detector's own pixels in one that is read out."""
+        return detector.area(self.pixel_pitch, self.binning)
+
+    def dark(self, detector: DetectorParameters, shape: tuple[int, ...]) -> Array | float:
+        """Electrons of the dark current in a pixel read out, a number or (h, w)."""
+        return detector.on_pixels("dark_current", shape) * self.exposure_time * self.area(detector)
+
+    def spurious(self, detector: DetectorParameters) -> float:
+        """Electrons of the spurious charge in a pixel read out."""
+        return detector.spurious_charge * self.area(detector)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,12 +117,15 @@ class Corrections:
     bad_pixels: Frame | None = None
     cosmic_rays: bool = False
 
-    def flat_field(self, detector: Detector, counts: Counts, exposed: Exposed) -> FlatField | None:
-        """Flat field of the counts, or None; DetectorError for settings of one without it."""
+    def flat_field(self, detector: DetectorParameters, counts: Counts, exposed: Exposed) -> FlatField | None:
+        """Flat field of the counts, that of the detector's map, or None; DetectorError for settings of a missing one.
+
+        A flat field of the counts contains the response that the map has, which is then not used.
+        """
+        shape = counts.values.shape
         if self.flat is None:
             require_no_flat(flat_kind=self.flat_kind, flat_dark=self.flat_dark, scene=self.scene)
-            return None
-        shape = counts.values.shape
+            return FlatField.of_map(detector, shape)
         if isinstance(self.flat, FlatField):
             if self.flat.response.shape != shape:
                 raise DetectorError(
@@ -132,6 +143,7 @@ class Corrections:
             flat_dark=self.flat_dark,
             bias=bias,
             pixel_pitch=exposed.pixel_pitch,
+            area=replace(exposed, binning=exposed.binning or counts.binning or 1).area(detector),
             binning=exposed.binning or counts.binning,
         )
 
@@ -147,7 +159,7 @@ class Corrections:
 
 
 def reduce_counts(
-    detector: Detector,
+    detector: DetectorParameters,
     counts: Frame | Counts,
     exposed: Exposed,
     corrections: Corrections,
@@ -167,8 +179,9 @@ def reduce_counts(
     rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)
     level, charge, added = _background(detector, raw, exposed, corrections.bias, corrections.dark)
     flat = corrections.flat_field(detector, raw, exposed)
-    electrons = _corrected(raw.values, level, flat) * detector.gain
-    independent = charge + detector.gain**2 / 12 + raw.frames * added  # gain²/12: variance of the rounding
+    gain = detector.on_pixels("gain", shape) / detector.em_gain
+    electrons = _corrected(raw.values, level, flat) * gain
+    independent = detector.excess * charge + gain**2 / 12 + raw.frames * added  # gain²/12: variance of the rounding
     mask = full | rays | corrections.bad(shape)
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
     _report_darkness(image)
@@ -200,20 +213,23 @@ def _report_darkness(image: Image) -> None:
 
 
 def reduced(exposure: Exposure) -> Image:
-    """Image in W of an exposure, by the numbers of its detector in its metadata.
+    """Image in W of an exposure, by the parameters of its detector in its metadata.
 
     Raises
     ------
-    DetectorError : the metadata lack a number.
+    DetectorError : the metadata lack a number, or a map is missing or has changed since.
     """
     found = exposure.metadata
-    needed = [key for name, key in RECORDED.items() if name != "pixel_pitch"]
+    needed = [key for name, key in RECORDED.items() if name not in OPTIONAL]
     if missing := [key for key in (*needed, "exposure_time", "wavelength_nm") if key not in found]:
         raise DetectorError(
             f"reduce: the electrons come without '{missing[0]}'. Reduce the counts with the numbers of their detector."
         )
     numbers: dict[str, Any] = {name: found[key] for name, key in RECORDED.items() if key in found}
-    detector = Detector(**numbers, name=str(found.get("detector", "detector")))
+    for name in MAPPED:
+        if (one := recorded_map(found, name)) is not None:
+            numbers[name] = one.path
+    detector = DetectorParameters(**numbers, name=str(found.get("detector", "detector")))
     pitch = found.get("pixel_pitch")
     exposed = Exposed(
         found["exposure_time"],  # type: ignore[arg-type]
@@ -222,48 +238,15 @@ def reduced(exposure: Exposure) -> Image:
         None if pitch is None else float(pitch),
     )
     detector = replace(detector, gain_error=float(found.get("gain_error", 0.0)))
-    dark = exposed.dark(detector.dark_current, detector.pixel_pitch)
+    charge = exposed.dark(detector, exposure.shape) + exposed.spurious(detector)
     electrons = exposure.electrons.astype(np.float64)
     full = (electrons >= detector.full_well) | saturated(detector, exposure.counts.astype(np.float64))
-    return _image(detector, electrons - dark, None, dark, 1, full, exposed, found)
+    flat = FlatField.of_map(detector, exposure.shape)
+    light = (electrons / detector.em_gain - charge) / (1.0 if flat is None else flat.response)
+    return _image(detector, light, flat, detector.excess * charge, 1, full, exposed, found)
 
 
-def responses(image: Image) -> Array:
-    """Flat field f (h, w) of a reduced image: a pixel collects f times `electrons_per_watt`.
-
-    It is the image's `flat`. An image of an earlier version has none; there it follows from the power P, its error s,
-    k = `electrons_per_watt` and the variance R of read-out and dark current by s² = (max(P k f, 0) + R)/(k f)². It is 1
-    where the image has no error. If the noise of a stack of flat fields is part of s, the result is smaller than f,
-    such that k times it still gives the variance s².
-    """
-    if image.flat is not None:
-        return image.flat.astype(np.float64)
-    shape, error = image.shape, image.error
-    k = float(image.metadata["electrons_per_watt"])
-    rest = float(image.metadata.get("read_noise", 0.0)) ** 2 + float(image.metadata.get("dark_electrons", 0.0))
-    if error is None:
-        return np.ones(shape)
-    variance = (error.astype(np.float64) * k) ** 2
-    signal = np.maximum(image.power.astype(np.float64) * k, 0)
-    root = signal + np.sqrt(signal**2 + 4 * variance * rest)
-    return np.where((variance > 0) & (root > 0), root / np.maximum(2 * variance, 1e-300), 1.0)
-
-
-def flat_variance(image: Image) -> Array | float:
-    """Variance [W²] of the power (h, w) by the noise of a stack of flat fields; 0 for an image without a flat field.
-
-    It is the part of the squared error beyond shot noise, read noise and dark current.
-    """
-    if image.flat is None or image.error is None:
-        return 0.0
-    each = float(image.metadata["electrons_per_watt"]) * responses(image)
-    rest = float(image.metadata.get("read_noise", 0.0)) ** 2 + float(image.metadata.get("dark_electrons", 0.0))
-    variance = image.error.astype(np.float64) ** 2
-    others = np.maximum(image.power.astype(np.float64), 0) / each + rest / each**2
-    return np.where(variance > others * (1 + ROUNDING), variance - others, 0.0)
-
-
-def calibrated(detector: Detector, image: Image, power: Array, error: float) -> Detector:
+def calibrated(detector: Own, image: Image, power: Array, error: float) -> Own:
     """Detector with the quantum efficiency that follows from the image of a source of known power.
 
     Parameters
@@ -297,24 +280,28 @@ def calibrated(detector: Detector, image: Image, power: Array, error: float) -> 
 
 
 def _background(
-    detector: Detector, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | None
-) -> tuple[Array | float, float, float]:
-    """Level to subtract [DN], a number or a frame; the dark charge [e-]; the variance that the frame adds [e-²].
+    detector: DetectorParameters, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | None
+) -> tuple[Array | float, Array | float, Array | float]:
+    """Level to subtract [DN], a number or a frame; the dark and spurious charge [e-]; the variance that the frame adds
+    [e-²]. Electrons are those before the register.
 
-    A dark frame has the same exposure time as the counts and contains the bias.
+    A dark frame has the same exposure time as the counts and contains the bias. Both contain the spurious charge.
     """
-    charge = exposed.dark(detector.dark_current, detector.pixel_pitch)
-    rounding = detector.gain**2 / 12
+    shape = raw.values.shape
+    gain = detector.on_pixels("gain", shape) / detector.em_gain  # electrons before the register per DN
+    dark_charge, spurious = exposed.dark(detector, shape), exposed.spurious(detector)
+    charge = dark_charge + spurious
+    reading = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2 + gain**2 / 12
     frame = raw.background if dark is None and raw.background is not None else dark
     if frame is not None:
         found = frame_like(frame, "dark", raw.values.shape)
         require_same_time("dark", found, "counts", exposed.exposure_time)
-        return found.values, charge, (charge + detector.read_noise**2 + rounding) / found.frames
+        return found.values, charge, (detector.excess * charge + reading) / found.frames
     frame = raw.bias if bias is None and raw.bias is not None else bias
     if frame is not None:
         found = frame_like(frame, "bias", raw.values.shape)
-        return found.values + charge / detector.gain, charge, (detector.read_noise**2 + rounding) / found.frames
-    return detector.bias + charge / detector.gain, charge, 0.0
+        return found.values + dark_charge / gain, charge, (detector.excess * spurious + reading) / found.frames
+    return detector.on_pixels("bias", shape) + charge / gain, charge, 0.0
 
 
 def _corrected(values: Array, level: Array | float, flat: FlatField | None) -> Array:
@@ -331,14 +318,23 @@ def _corrected(values: Array, level: Array | float, flat: FlatField | None) -> A
     return np.asarray(frame.data, np.float64)
 
 
-def _cosmic_rays(detector: Detector, values: Array, full: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels that cosmic rays hit, by the Laplacian edge detection of ccdproc."""
+def _cosmic_rays(detector: DetectorParameters, values: Array, full: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels that cosmic rays hit, by the Laplacian edge detection of ccdproc.
+
+    It takes the variance for the signal; that of x electrons after a register is g F² x, so that x/(g F²) is given.
+    """
     ccdproc, data_of = _ccdproc()
-    electrons = data_of((values - detector.bias) * detector.gain, unit="electron", mask=full)
+    unit = detector.em_gain * detector.excess  # electrons after the register
+    light = (values - detector.on_pixels("bias", values.shape)) * detector.on_pixels("gain", values.shape) / unit
+    electrons = data_of(light, unit="electron", mask=full)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = ccdproc.cosmicray_lacosmic(
-            electrons, readnoise=detector.read_noise, gain_apply=False, satlevel=detector.full_well, sigclip=6.0
+            electrons,
+            readnoise=detector.mean("read_noise") / unit,
+            gain_apply=False,
+            satlevel=detector.full_well / unit,
+            sigclip=6.0,
         )
     return np.asarray(found.mask, bool) & ~full
 
@@ -357,28 +353,23 @@ def _ccdproc() -> tuple[Any, Any]:
 
 
 def _image(
-    detector: Detector,
+    detector: DetectorParameters,
     electrons: Array,
     flat: FlatField | None,
-    dark: float,
+    dark: Array | float,
     frames: int,
     mask: NDArray[np.bool_],
     exposed: Exposed,
     metadata: Mapping[str, Any] | None,
 ) -> Image:
-    """Image in W from `electrons` (h, w), the mean over `frames` frames, divided by the flat field.
+    """Image in W from `electrons` (h, w) before the register, the mean over `frames` frames, over the flat field.
 
-    `dark` is the variance [e-²] of one frame in addition to shot and read noise. The numbers in the metadata are those
-    of the sum of the frames, whose shot noise is that of all its electrons.
+    `dark` is the variance [e-²] of one frame in addition to that of light and of reading. The numbers in the metadata
+    are those of the sum of the frames, whose shot noise is that of all its electrons.
     """
     per_watt = exposed.per_watt(detector.quantum_efficiency) * frames
-    read = detector.read_noise * frames**0.5
-    response, flat_noise = (1.0, 0.0) if flat is None else (flat.response, flat.variance)
+    read = detector.on_pixels("read_noise", electrons.shape) / detector.em_gain * frames**0.5
     mask = mask if flat is None else mask | flat.mask
-    total = np.where(mask, 0, electrons) * frames
-    independent = dark * frames
-    variance = np.maximum(total * response, 0) + read**2 + independent + flat_noise * (total * response) ** 2
-    error = np.sqrt(variance) / (per_watt * response)
     kept: Metadata = dict(metadata or {})
     for name in (*REPLACED, *COMPUTED):
         kept.pop(name, None)
@@ -390,18 +381,33 @@ def _image(
         "wavelength_nm": exposed.wavelength_nm,
         "binning": exposed.binning or 1,
         "electrons_per_watt": per_watt,
-        "read_noise": read,
-        "dark_electrons": float(independent),
+        "read_noise": float(np.sqrt(np.mean(np.square(read)))),
+        "dark_electrons": float(np.mean(dark)) * frames,
         "gain_error": detector.gain_error,
         "masked_pixels": int(mask.sum()),
     }
+    if detector.em_gain > 1:
+        kept |= {"em_gain": detector.em_gain, "excess_noise": detector.excess}
     if flat is not None:
         kept |= {"flat_kind": flat.kind, "flat_masked_pixels": int(flat.mask.sum())}
+    elif detector.prnu:  # a number, of which the response of each pixel does not follow
+        kept["prnu"] = float(detector.prnu) / math.sqrt(max(exposed.area(detector), 1.0))
     if exposed.pixel_pitch is not None:
         kept["pixel_pitch"] = exposed.pixel_pitch
     if detector.pixel_pitch is not None:
         kept[RECORDED["pixel_pitch"]] = detector.pixel_pitch
-    return Image(total / per_watt, error, metadata=kept, mask=mask, flat=None if flat is None else flat.response)
+    planes = {} if flat is None else {"flat": flat.response, "flat_error": flat.error}
+    if np.ndim(read) or np.ndim(dark):  # another noise on each pixel
+        planes["dark_noise"] = np.sqrt(np.broadcast_to(np.square(read) + dark * frames, electrons.shape))
+    return _with_error(Image(np.where(mask, 0, electrons) * frames / per_watt, metadata=kept, mask=mask, **planes))
+
+
+def _with_error(image: Image) -> Image:
+    """The image with the standard error that follows from its power by its noise model."""
+    model = NoiseModel.of(image)
+    if model is None:
+        return image
+    return replace(image, error=np.sqrt(model.variance(image.power.astype(np.float64))))
 
 
 def measured(given: Image | Exposure | str | os.PathLike[str]) -> Image:

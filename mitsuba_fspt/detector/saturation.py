@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm, poisson
 
 from .counts import Counts
-from .detector import Detector
+from .parameters import DetectorParameters
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -20,13 +20,19 @@ MANY = 5  # pixels: fewer at the largest count are passed over
 WINDOW = 2.0  # standard deviations to each side of a value, within which other counts of equal light lie
 
 
-def saturated(detector: Detector, counts: Array) -> Mask:
+def saturated(detector: DetectorParameters, counts: Array) -> Mask:
     """True (h, w) where a count has reached the largest value of the converter or the full well."""
     top = 2**detector.bits - 1
-    return (counts >= top) | (counts >= detector.bias + detector.full_well / detector.gain - 0.5)
+    bias, gain = (_level(detector, name, counts) for name in ("bias", "gain"))
+    return (counts >= top) | (counts >= bias + detector.full_well / gain - 0.5)
 
 
-def full_pixels(detector: Detector, counts: Counts, name: str) -> Mask:
+def _level(detector: DetectorParameters, name: str, counts: Array) -> Array | float:
+    """Value of a parameter on the pixels of counts (h, w), its mean for a single count."""
+    return detector.on_pixels(name, counts.shape) if counts.ndim else detector.mean(name)
+
+
+def full_pixels(detector: DetectorParameters, counts: Counts, name: str) -> Mask:
     """True (h, w) where counts are saturated in any frame: by the detector's numbers, or at an `unknown_ceiling`.
 
     The latter is told in one line on stderr, which calls the counts `name`.
@@ -52,7 +58,7 @@ def full_pixels(detector: Detector, counts: Counts, name: str) -> Mask:
     return full | reached
 
 
-def unknown_ceiling(detector: Detector, counts: Array, frames: int = 1) -> float | None:
+def unknown_ceiling(detector: DetectorParameters, counts: Array, frames: int = 1) -> float | None:
     """The largest count [DN], if so many pixels have exactly this one that the camera saturates there; else None.
 
     Of n pixels that reach the largest value M, all have exactly M by chance with the probability hⁿ. h is the share of
@@ -86,7 +92,9 @@ def _step(values: Array, frames: int) -> float:
     return float(np.gcd.reduce(np.diff(whole).astype(np.int64))) / frames
 
 
-def _without_noise(detector: Detector, values: Array, numbers: NDArray[np.int64], step: float, frames: int) -> bool:
+def _without_noise(
+    detector: DetectorParameters, values: Array, numbers: NDArray[np.int64], step: float, frames: int
+) -> bool:
     """True if the most frequent of the `values` [DN] is more frequent than the detector's noise lets it be.
 
     Of normally distributed counts, the share of one value among those within `WINDOW` σ is largest at their mean. The
@@ -99,8 +107,9 @@ def _without_noise(detector: Detector, values: Array, numbers: NDArray[np.int64]
     return bool(numbers[most] > 1 and len(values) * poisson.sf(numbers[most] - 1, inside * share) < CHANCE)
 
 
-def _sigma(detector: Detector, counts: float, frames: int) -> float:
+def _sigma(detector: DetectorParameters, counts: float, frames: int) -> float:
     """Standard deviation [DN] of shot, read and rounding noise of the mean of `frames` frames at these counts [DN]."""
-    electrons = max(detector.gain * (counts - detector.bias), 0.0)
-    variance = (electrons + detector.read_noise**2) / detector.gain**2 + 1 / 12
+    gain, read = detector.mean("gain"), detector.mean("read_noise")
+    electrons = max(gain * (counts - detector.mean("bias")), 0.0)
+    variance = (detector.em_gain * detector.excess * electrons + read**2) / gain**2 + 1 / 12
     return float(np.sqrt(variance / frames))

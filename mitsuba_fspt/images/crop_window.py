@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..runtime.errors import ImageError
+from .formats import BESIDE
 from .image import Image
 
 
@@ -22,7 +23,7 @@ def cropped(image: Image, key: Any) -> Image:
     known.setdefault("film_height", height)
     known["crop_offset_x"] = known.get("crop_offset_x", 0) + left  # type: ignore[operator]  # a number of pixels
     known["crop_offset_y"] = known.get("crop_offset_y", 0) + top  # type: ignore[operator]
-    planes = {name: getattr(image, name) for name in ("power", "error", "coverage", "mask", "flat")}
+    planes = {name: getattr(image, name) for name in ("power", *BESIDE)}
     parts = {name: plane[top:bottom, left:right] for name, plane in planes.items() if plane is not None}
     if "masked_pixels" in known and "mask" in parts:
         known["masked_pixels"] = int(parts["mask"].sum())

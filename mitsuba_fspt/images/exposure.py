@@ -16,6 +16,7 @@ from ..runtime.atomic_files import atomic_path, file_path
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from .formats import Metadata, read_planes, write_planes
 from .image import Image, image_of
+from .pixel_map import recorded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,10 +28,11 @@ class Exposure:
 
     Attributes
     ----------
-    electrons : float32 array, shape (h, w) [e-], before the conversion to counts; at low light, read noise can make
-        them negative
+    electrons : float32 array, shape (h, w) [e-], before the conversion to counts, after the multiplying register of an
+        EMCCD; at low light, read noise can make them negative
     counts : uint16 array, shape (h, w) [DN]
-    metadata : those of the image and the detector's parameters; `quantity` is electrons, `unit` e-
+    metadata : those of the image and the detector's parameters; `quantity` is electrons, `unit` e-. A parameter that
+        a map gives has the mean there, and path and digest of the map in NAME_map and NAME_map_digest
     """
 
     electrons: NDArray[np.float32]
@@ -126,7 +128,7 @@ def image_or_exposure(
     Raises
     ------
     ImageError : neither, or values that are not finite.
-    DetectorError : the metadata of electrons lack a number of the detector.
+    DetectorError : the metadata of electrons lack a number of the detector, or its map has changed.
     """
     if "electrons" not in planes:
         return image_of(path, planes, metadata)
@@ -137,10 +139,10 @@ def image_or_exposure(
         raise DetectorError(
             f"'{path}': the electrons come without '{missing[0]}'. Reduce the counts with 'fspt reduce'."
         )
-    gain = float(metadata["gain"])
-    if not gain > 0:
-        raise DetectorError(f"'{path}': its gain must be > 0 e-/DN, it is {gain:g}. Expose the image again.")
+    gain, bias = (recorded(metadata, name, electrons.shape) for name in ("gain", "bias"))
+    if not np.all(gain > 0):
+        raise DetectorError(f"'{path}': its gain must be > 0 e-/DN, it is {np.min(gain):g}. Expose the image again.")
     with np.errstate(over="ignore"):  # beyond the converter's range
-        counts = np.rint(float(metadata["bias"]) + electrons / gain)
+        counts = np.rint(bias + electrons / np.float64(gain))
     top = 2 ** int(metadata["bits"]) - 1
     return Exposure(electrons, np.clip(counts, 0, top).astype(np.uint16), metadata)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
-from .formats import Metadata, read_planes, write_planes
+from .formats import BESIDE, Metadata, read_planes, write_planes
 from .pixel_axes import PixelAxes
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ class Image:
     mask : bool array, shape (h, w), True for pixels to leave out, such as saturated ones, or None
     flat : array, shape (h, w), > 0: electrons per watt of each pixel relative to `electrons_per_watt`, of an image that
         `Detector.reduce` corrected by a flat field, or None
+    flat_error : array, shape (h, w), >= 0: relative standard error of `flat`, or None
+    dark_noise : array, shape (h, w), >= 0 [e-]: standard deviation of a pixel without light, of an image whose
+        detector has another one on each pixel; None: `read_noise` and `dark_electrons` of the metadata, if it has them
 
     The arrays are stored as read-only views with at least 32-bit floats.
 
@@ -53,12 +56,14 @@ class Image:
     metadata: Metadata = field(default_factory=dict)
     mask: NDArray[np.bool_] | None = None
     flat: NDArray[np.floating] | None = None
+    flat_error: NDArray[np.floating] | None = None
+    dark_noise: NDArray[np.floating] | None = None
 
     def __post_init__(self) -> None:
         shape = np.shape(self.power)
         if self.mask is not None:
             object.__setattr__(self, "mask", _mask_plane(self.mask, shape))
-        for name in ("power", "error", "coverage", "flat"):
+        for name in ("power", *(name for name in BESIDE if name != "mask")):
             values = getattr(self, name)
             if values is None and name != "power":
                 continue
@@ -68,6 +73,9 @@ class Image:
             object.__setattr__(self, name, plane)
         if self.flat is not None and not (self.flat > 0).all():
             raise ImageError(f"image: 'flat' must be > 0, got {self.flat.min():g}. Mask such pixels, with 1 in 'flat'.")
+        for name in ("flat_error", "dark_noise"):
+            if (given := getattr(self, name)) is not None and not (given >= 0).all():
+                raise ImageError(f"image: '{name}' must be >= 0, got {given.min():g}. Give a standard deviation.")
         metadata: Metadata = {"quantity": "power", "unit": "W"}
         metadata |= {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
         if (metadata["quantity"], metadata["unit"]) != ("power", "W"):
@@ -127,12 +135,16 @@ class Image:
 
     @property
     def electrons_per_watt(self) -> float | None:
-        """Electrons per watt on a pixel, of an image that `Detector.reduce` made; None of any other."""
+        """Photoelectrons per watt on a pixel, before an electron-multiplying register, of an image that
+        `Detector.reduce` made; None of any other."""
         return self._recorded("electrons_per_watt")
 
     @property
     def read_noise(self) -> float | None:
-        """Read noise [e-] of the sum of its frames, of an image that `Detector.reduce` made; None of any other."""
+        """Read noise [e-] of the sum of its frames over `em_gain`, of an image that `Detector.reduce` made; else None.
+
+        Of a map, it is the root mean square.
+        """
         return self._recorded("read_noise")
 
     @property
@@ -321,8 +333,8 @@ class Image:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a file of float32 planes and all metadata; its suffix chooses the format, see docs/images.md.
 
-        .exr has the channels `Y`, `error.Y`, `coverage.Y`, `mask.Y` and `flat.Y`, as far as the image has them,
-        and metadata under `fspt:`; .tif, .h5, .npz and .fits hold the same.
+        .exr has the channels `Y`, `error.Y`, `coverage.Y`, `mask.Y`, `flat.Y`, `flat_error.Y` and `dark_noise.Y`, as
+        far as the image has them, and metadata under `fspt:`; .tif, .h5, .npz and .fits hold the same.
         The file is written completely or not at all. Pixels below 1e-38 W, the smallest float32, may become 0; an image
         whose brightest pixel lies below it is refused.
 
@@ -337,7 +349,7 @@ class Image:
                 f"image: the brightest pixel has {peak:g} W, below what the file can hold (1.2e-38 W). "
                 "Scale the exitance up."
             )
-        planes = {"power": self.power, "error": self.error, "coverage": self.coverage, "flat": self.flat}
+        planes = {name: getattr(self, name) for name in ("power", *BESIDE)}
         planes["mask"] = None if self.mask is None else self.mask.astype(np.float32)
         write_planes(path, {name: p for name, p in planes.items() if p is not None}, self.metadata)
 
@@ -345,7 +357,7 @@ class Image:
 def read(path: str | os.PathLike[str]) -> Image:
     """Image from a file that `Image.write` wrote, or from any EXR file with a channel `Y`, which is taken as power [W].
 
-    `error`, `coverage`, `mask` and `flat` are None if the file does not have them.
+    Planes that the file does not have, such as `error`, `coverage` or `mask`, are None.
 
     Raises
     ------
@@ -365,8 +377,10 @@ def image_of(path: str | os.PathLike[str], planes: Mapping[str, NDArray], metada
             "that fspt wrote."
         )
     try:
-        mask = planes["mask"] != 0 if "mask" in planes else None
-        return Image(planes[quantity], planes.get("error"), planes.get("coverage"), metadata, mask, planes.get("flat"))
+        beside = {name: planes[name] for name in BESIDE if name in planes}
+        if "mask" in beside:
+            beside["mask"] = beside["mask"] != 0
+        return Image(planes[quantity], metadata=metadata, **beside)
     except ImageError as cause:
         raise ImageError(f"image file '{path}': {cause}") from cause
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from ..runtime.errors import ImageError
 from .formats import Metadata
 from .image import Image
+from .noise_model import NUMBERS
 from .pixel_axes import PixelAxes
 from .z_test import is_deterministic
 
-NOISE = ("electrons_per_watt", "read_noise", "dark_electrons")  # by which the noise follows from the power
+SQUARES = ("read_noise", "dark_electrons")  # numbers of the noise that add up, the former in squares
 
 
 def combined(one: Image, other: Image, sign: int) -> Image:
@@ -24,20 +25,41 @@ def combined(one: Image, other: Image, sign: int) -> Image:
     power = one.power.astype(np.float64) + sign * other.power.astype(np.float64)
     if mask is not None:
         power[mask] = 0
-    flat = one.flat if _same(one.flat, other.flat) else None
     coverage = one.coverage if _same(one.coverage, other.coverage) else None
-    known = _metadata(one, other)
-    counted = sign == 1 and "electrons_per_watt" in known and _same(one.flat, other.flat)
-    if counted and all(name in image.metadata for name in NOISE for image in (one, other)):
-        read, dark = ([float(image.metadata[name]) for image in (one, other)] for name in NOISE[1:])
+    known, planes = _metadata(one, other), {}
+    if sign == 1 and _of_one_detector(one, other):
+        read, dark = ([float(image.metadata[name]) for image in (one, other)] for name in SQUARES)
         known |= {"read_noise": math.hypot(*read), "dark_electrons": sum(dark)}
+        planes = {"flat": one.flat, "flat_error": one.flat_error, "dark_noise": _dark_noise(one, other)}
     else:  # no shot noise of the sum follows from its power: the error alone states it
-        flat = None
-        for name in NOISE:
+        for name in ("electrons_per_watt", *NUMBERS):
             known.pop(name, None)
     if mask is not None:
         known["masked_pixels"] = int(mask.sum())
-    return Image(power, _error(one, other), coverage, known, mask, flat)
+    return Image(power, _error(one, other), coverage, known, mask, **planes)
+
+
+def _of_one_detector(one: Image, other: Image) -> bool:
+    """True for measured images with the same electrons per watt, excess noise and response of each pixel."""
+    if not all(name in image.metadata for name in ("electrons_per_watt", *SQUARES) for image in (one, other)):
+        return False
+    same = [name for name in ("electrons_per_watt", *NUMBERS) if name not in SQUARES]
+    return (
+        all(one.metadata.get(name) == other.metadata.get(name) for name in same)
+        and _same(one.flat, other.flat)
+        and _same(one.flat_error, other.flat_error)
+    )
+
+
+def _dark_noise(one: Image, other: Image) -> NDArray[np.float64] | None:
+    """Dark noise [e-] of the sum of two measured images, (h, w); None if both have the same on all pixels."""
+    if one.dark_noise is None and other.dark_noise is None:
+        return None
+    planes = []
+    for image in (one, other):
+        read, dark = (float(image.metadata[name]) for name in SQUARES)
+        planes.append(math.hypot(read, math.sqrt(dark)) if image.dark_noise is None else image.dark_noise)
+    return np.hypot(*(np.broadcast_to(plane, one.shape).astype(np.float64) for plane in planes))
 
 
 def _error(one: Image, other: Image) -> NDArray[np.float64] | None:

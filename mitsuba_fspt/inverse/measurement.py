@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
-from ..detector.reduction import flat_variance, measured, responses
+from ..detector.reduction import measured
 from ..images.exposure import Exposure
 from ..images.image import Image
-from ..runtime.errors import InversionError
+from ..images.noise_model import NoiseModel
+from ..runtime.errors import ImageError, InversionError
 from ..runtime.numbers import number
 from .transport_matrix import TransportMatrix
 
@@ -43,21 +44,26 @@ class Chi2:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Variance of the pixels of all views, arrays (views, h, w): shot · signal + other (Eq. M.24, M.27).
+    """Variance of the pixels of all views, (views, h, w): shot · signal + other + (relative · signal)² (M.24, M.27).
 
-    shot : [W], variance of the shot noise over the power: 1/(electrons per watt), 0 where `other` holds all the noise
+    shot : [W], variance of the shot noise over the power: F²/(electrons per watt), 0 where `other` holds all the noise
     other : [W²], variance that does not depend on the signal: read-out, dark current, a given error
     sampled : (views,) True for images of Monte Carlo: their `other` are squares of standard errors that the scatter of
         samples gave, and the variance is a smooth function of the signal instead
+    relative : relative standard error of the pixels' response, (views, h, w) or a number
+    excess : F² of an electron-multiplying register, (views,) or a number
     """
 
     shot: Array
     other: Array
     sampled: NDArray[np.bool_]
+    relative: Array | float = 0.0
+    excess: Array | float = 1.0
 
     def variance(self, signal: Array, used: NDArray[np.bool_]) -> Array:
         """Variance [W²] for a fitted signal [W], NaN where it is not known, of the pixels `used`; (views, h, w)."""
-        variance = self.shot * np.maximum(signal, 0) + self.other
+        light = np.maximum(signal, 0)
+        variance = self.shot * light + self.other + (self.relative * light) ** 2
         if self.sampled.any():
             drawn = used & self.sampled[:, None, None]
             variance[drawn] = sampling_variance(signal, self.other, drawn)[drawn]
@@ -67,8 +73,10 @@ class Noise:
         """Mean and variance of Σ (noise/σ)² over the pixels `used`; `sigma` [W] may contain more than noise (M.24)."""
         variance = self.variance(signal, used)[used]
         shot = np.where(self.sampled[:, None, None], 0, self.shot)[used] * np.maximum(signal[used], 0)
-        # Light in events of power w: the fourth moment of the noise is 3 v² + w² v for a variance v.
-        fourth = self.shot[used] ** 2 * shot
+        # Light in events of power w: the fourth moment of the noise is 3 v² + w² v for a variance v. A register turns
+        # one electron into a gamma distributed number with the moments 1, F² and F² (2 F² − 1) (3 F² − 2) over gⁿ.
+        f2 = np.broadcast_to(np.reshape(self.excess, (-1, 1, 1)), used.shape)[used]
+        fourth = self.shot[used] ** 2 * shot * (2 * f2 - 1) * (3 * f2 - 2) / f2**2
         drawn = np.broadcast_to(self.sampled[:, None, None], used.shape)[used] & (signal[used] > 0)
         fourth[drawn] = variance[drawn] ** 3 / signal[used][drawn] ** 2
         square = sigma[used] ** 2
@@ -259,7 +267,7 @@ def noise_of(
         raise InversionError(
             f"{verb}: 'sampled' must be True or False, got {sampled!r}. Give True for images of a Monte Carlo."
         )
-    shot, other = np.zeros(shape), np.zeros(shape)
+    shot, other, relative, excess = np.zeros(shape), np.zeros(shape), np.zeros(shape), np.ones(shape[0])
     drawn = np.full(shape[0], bool(sampled))
     if error is not None:
         other[...] = _checked_error(error, shape, verb) ** 2
@@ -275,22 +283,16 @@ def noise_of(
                 f"{verb}: image {k} says nothing of its noise. Give images of 'fspt reduce'"
                 f"{', or in Python error= [W]' if verb == 'invert' else ''}."
             )
-        if "electrons_per_watt" in image.metadata:
-            per_watt, read, dark = (
-                number(f"{verb}: image {k}, '{name}'", image.metadata.get(name, 0.0), InversionError, "1e15")
-                for name in ("electrons_per_watt", "read_noise", "dark_electrons")
-            )
-            if not (0 < per_watt < np.inf and 0 <= read < np.inf and 0 <= dark < np.inf):
-                raise InversionError(
-                    f"{verb}: image {k} has {per_watt:g} electrons a watt and {read:g} electrons of read noise. Reduce "
-                    "it again from its counts."
-                )
+        try:
+            model = NoiseModel.of(image, f"{verb}: image {k}")
+        except ImageError as cause:
+            raise InversionError(str(cause)) from cause
+        if model is not None:
             if sampled:
                 raise InversionError(
                     f"{verb}: image {k} has the noise of electrons, not that of a Monte Carlo. Leave out 'sampled'."
                 )
-            each = per_watt * responses(image)
-            shot[k], other[k] = 1 / each, (read**2 + dark) / each**2 + flat_variance(image)
+            shot[k], other[k], relative[k], excess[k] = model.shot, model.dark, model.relative, model.excess
         elif image.error is not None:
             other[k] = image.error.astype(np.float64) ** 2
             drawn[k] |= "passes" in image.metadata
@@ -299,7 +301,7 @@ def noise_of(
                 f"{verb}: image {k} has neither 'electrons_per_watt' nor an error. Reduce it from its counts"
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
-    return Noise(shot, other, drawn)
+    return Noise(shot, other, drawn, relative, excess)
 
 
 def tell_misfit(verb: str, chi2_sum: float, pixels: int, fitted: float, noise: Sequence[Chi2]) -> list[str]:

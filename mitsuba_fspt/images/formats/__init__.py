@@ -1,8 +1,7 @@
 """Formats of image files: float32 planes with metadata. Each Python file here has one format, found by its suffix.
 
 A format is a subclass of `Format` that is named like its Python file: `Exr` in exr.py reads and writes .exr. The first
-plane is `power` or `electrons`, further planes are `error`, `coverage`, `mask` and `flat`. Row 0 is the top in every
-format.
+plane is `power` or `electrons`, further planes are those of `BESIDE`. Row 0 is the top in every format.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from ...runtime.extras import require
 Metadata = dict[str, str | int | float]
 Planes = dict[str, NDArray[np.float32]]
 
-BESIDE = ("error", "coverage", "mask", "flat")  # planes beside that of the values
-PURE = ("coverage", "mask", "flat")  # those without a unit
+BESIDE = ("error", "coverage", "mask", "flat", "flat_error", "dark_noise")  # planes beside that of the values
+OWN_UNIT = {"coverage": "1", "mask": "1", "flat": "1", "flat_error": "1", "dark_noise": "e-"}  # whatever the values' is
 ALIASES = {"tiff": "tif"}
 
 
@@ -129,8 +128,8 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], Metad
 
 
 def units(planes: Mapping[str, object], metadata: Metadata) -> dict[str, str]:
-    """Unit of each plane: that of the metadata, W or e-, and '1' for those without one."""
-    return {name: "1" if name in PURE else str(metadata.get("unit", "W")) for name in planes}
+    """Unit of each plane: that of the metadata, W or e-, but for those that have one of their own, '1' for none."""
+    return {name: OWN_UNIT.get(name, str(metadata.get("unit", "W"))) for name in planes}
 
 
 def _plain(key: str, value: object) -> str | int | float:

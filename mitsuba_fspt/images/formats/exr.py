@@ -1,4 +1,4 @@
-"""OpenEXR: 32-bit float channels `Y`, `error.Y`, `coverage.Y`, `mask.Y`, `flat.Y`; metadata under `fspt:`."""
+"""OpenEXR: 32-bit float channels `Y` and `NAME.Y` of further planes, such as `error.Y`; metadata under `fspt:`."""
 
 from __future__ import annotations
 

@@ -1,0 +1,66 @@
+"""Noise of an image that was reduced from counts, as a function of the light on a pixel (Eq. M.24).
+
+    s²(P) = F² P/(k f) + (σ_d/(k f))² + (ε P)²
+
+with k = `electrons_per_watt` and F² = `excess_noise` of the metadata; the response f, the dark noise σ_d [e⁻] and the
+relative error ε of the response are planes of the image or numbers of its metadata.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.errors import ImageError
+from ..runtime.numbers import number
+from .image import Image
+
+Array = NDArray[np.float64]
+NUMBERS = ("read_noise", "dark_electrons", "excess_noise", "prnu")  # of the metadata, beside `electrons_per_watt`
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Variance of the power P on a pixel: shot P + dark + (relative P)² [W²], arrays (h, w).
+
+    shot : [W], excess noise F² over the electrons per watt of the pixel
+    dark : [W²], variance without light: read-out, dark current, spurious charge, rounding, subtracted frames
+    relative : relative standard error of the pixel's response
+    excess : F²
+    """
+
+    shot: Array
+    dark: Array
+    relative: Array
+    excess: float
+
+    @classmethod
+    def of(cls, image: Image, thing: str = "image") -> NoiseModel | None:
+        """Noise model that a reduced image contains; None for any other image.
+
+        Raises ImageError, which calls the image `thing`, for numbers that no detector has.
+        """
+        if "electrons_per_watt" not in image.metadata:
+            return None
+        per_watt, *others = (
+            number(f"{thing}, '{name}'", image.metadata.get(name, default), ImageError, "1e15")
+            for name, default in (("electrons_per_watt", 0.0), *zip(NUMBERS, (0.0, 0.0, 1.0, 0.0), strict=True))
+        )
+        read, dark, excess, prnu = others
+        if not (0 < per_watt < math.inf and 0 <= read < math.inf and 0 <= dark < math.inf and excess >= 1):
+            raise ImageError(
+                f"{thing} has {per_watt:g} electrons a watt, {read:g} electrons of read noise, {dark:g} e-² of dark "
+                f"current and an excess noise of {excess:g}. Reduce it again from its counts."
+            )
+        each = np.full(image.shape, per_watt) if image.flat is None else per_watt * image.flat.astype(np.float64)
+        noise = math.hypot(read, math.sqrt(dark)) if image.dark_noise is None else image.dark_noise.astype(np.float64)
+        error = 0.0 if image.flat_error is None else image.flat_error.astype(np.float64)
+        return cls(excess / each, (noise / each) ** 2, np.hypot(error, np.full(image.shape, prnu)), excess)
+
+    def variance(self, power: Array) -> Array:
+        """Variance [W²] for the light `power` [W]; that of a negative one is the variance without light."""
+        light = np.maximum(power, 0)
+        return self.shot * light + self.dark + (self.relative * light) ** 2
