@@ -417,7 +417,7 @@ def write_electrons(path: Path) -> None:
 def read_image(path: Path) -> None:
     """As `fspt plot` reads it, with what `fspt roi` and `fspt compare` compute of an image."""
     import mitsuba_fspt as fspt
-    from mitsuba_fspt.images.exposure import read_image_or_exposure
+    from mitsuba_fspt.images.image import read_image_or_exposure
     from mitsuba_fspt.images.regions import measure
 
     image = read_image_or_exposure(path)

@@ -46,7 +46,7 @@ def compare(
     if png:
         from ..images.picture import write_comparison_png
 
-        write_comparison_png(*images, png)
+        write_comparison_png(*images, result, png)
     print_result(result.render_text(), result.to_dict(), as_json=as_json, quiet=quiet)
 
 
@@ -70,7 +70,8 @@ def plot(
 
     The scale is logarithmic where peaks differ a lot.
     """
-    from ..images.exposure import Exposure, read_image_or_exposure
+    from ..images.exposure import Exposure
+    from ..images.image import read_image_or_exposure
     from ..images.picture import draw_panels, save_figure
 
     output = output or Path(f"{images[0].stem}.png" if len(images) == 1 else "plot.png")

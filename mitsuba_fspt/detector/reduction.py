@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.exposure import Exposure, image_or_exposure
+from ..images.exposure import Exposure
 from ..images.formats import Metadata, read_planes
 from ..images.frame_file import FITS, TIFF
-from ..images.image import Image
+from ..images.image import Image, image_or_exposure
 from ..images.noise_model import NoiseModel
 from ..images.pixel_map import DIGEST, MAP, recorded_map
 from ..images.radiometry import PLANCK_TIMES_LIGHT

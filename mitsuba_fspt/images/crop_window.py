@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from ..runtime.errors import ImageError
 from .formats import BESIDE
-from .image import Image
+from .image_data import ImageData
+
+Part = TypeVar("Part", bound=ImageData)
 
 
-def cropped(image: Image, key: Any) -> Image:
+def cropped(image: Part, key: Any) -> Part:
     """Part of an image, as of `Image.__getitem__`."""
     window = key if isinstance(key, tuple) else (key,)
     if not 1 <= len(window) <= 2 or not all(isinstance(one, slice) for one in window):

@@ -6,24 +6,22 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ..runtime.atomic_files import atomic_path, file_path
 from ..runtime.errors import BackendError, DetectorError, ImageError
-from .formats import Metadata, read_planes, write_planes
-from .image import Image, image_of
+from .electrons import Electrons
+from .formats import Metadata, write_planes
 from .pixel_map import recorded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-@dataclass(frozen=True, eq=False)
-class Exposure:
+class Exposure(Electrons):
     """One read-out of a detector.
 
     Attributes
@@ -34,24 +32,6 @@ class Exposure:
     metadata : those of the image and the detector's parameters; `quantity` is electrons, `unit` e-. A parameter that
         a map gives has the mean there, and path and digest of the map in NAME_map and NAME_map_digest
     """
-
-    electrons: NDArray[np.float32]
-    counts: NDArray[np.uint16]
-    metadata: Metadata
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width (h, w) [pixels]."""
-        return self.electrons.shape  # type: ignore[return-value]
-
-    @property
-    def total(self) -> float:
-        """Sum over all pixels [e-]."""
-        return float(self.electrons.sum(dtype=np.float64))
-
-    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
-        """The electrons, shape (h, w) [e-], for `np.asarray(exposure)`."""
-        return np.array(self.electrons, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
 
     def plot(self, axes: Axes | None = None, *, log: bool = False, limits: tuple[float, float] | None = None) -> Axes:
         """Draw the electrons with colour bar and axes in mm; returns matplotlib's axes. See `Image.plot`."""
@@ -105,33 +85,14 @@ class Exposure:
             yield
 
 
-class Exposes(Protocol):
-    """What exposes itself to an image: a `Detector`."""
-
-    def expose(
-        self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
-    ) -> Exposure:
-        """One exposure; see `Detector.expose`."""
-        ...
-
-
-def read_image_or_exposure(path: str | os.PathLike[str]) -> Image | Exposure:
-    """Image [W] or exposure [e-] from a file that fspt wrote. Raises as `image.read` and `image_or_exposure`."""
-    return image_or_exposure(path, *read_planes(path))
-
-
-def image_or_exposure(
-    path: str | os.PathLike[str], planes: Mapping[str, NDArray], metadata: Metadata
-) -> Image | Exposure:
-    """What the planes and metadata of a file are: an image in W, or electrons, whose counts follow from the detector.
+def exposure_of(path: str | os.PathLike[str], planes: Mapping[str, NDArray], metadata: Metadata) -> Exposure:
+    """Exposure of the electrons and metadata in a file, whose counts follow from the detector.
 
     Raises
     ------
-    ImageError : neither, or values that are not finite.
-    DetectorError : the metadata of electrons lack a number of the detector, or its map has changed.
+    ImageError : values that are not finite.
+    DetectorError : the metadata lack a number of the detector, or its map has changed.
     """
-    if "electrons" not in planes:
-        return image_of(path, planes, metadata)
     electrons = planes["electrons"].astype(np.float32)
     if not np.isfinite(electrons).all():
         raise ImageError(f"image file '{path}' has electrons that are NaN or inf. Expose it again.")

@@ -5,27 +5,39 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
+from .crop_window import cropped
 from .formats import BESIDE, Metadata, read_planes, write_planes
+from .image_data import ImageData
+from .image_sum import combined
 from .pixel_axes import PixelAxes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import DataArray, Dataset
 
-    from .exposure import Exposes, Exposure
+    from .exposure import Exposure
     from .regions import Measurement
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Image:
+class Exposes(Protocol):
+    """What exposes itself to an image: a `Detector`."""
+
+    def expose(
+        self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
+    ) -> Exposure:
+        """One exposure; see `Detector.expose`."""
+        ...
+
+
+class Image(ImageData):
     """Power on the pixels of a detector; row 0 is the top of the upright picture.
 
     Parameters
@@ -50,66 +62,11 @@ class Image:
         metadata name another quantity or unit than power in W.
     """
 
-    power: NDArray[np.floating]
-    error: NDArray[np.floating] | None = None
-    coverage: NDArray[np.floating] | None = None
-    metadata: Metadata = field(default_factory=dict)
-    mask: NDArray[np.bool_] | None = None
-    flat: NDArray[np.floating] | None = None
-    flat_error: NDArray[np.floating] | None = None
-    dark_noise: NDArray[np.floating] | None = None
-
-    def __post_init__(self) -> None:
-        shape = np.shape(self.power)
-        if self.mask is not None:
-            object.__setattr__(self, "mask", _mask_plane(self.mask, shape))
-        for name in ("power", *(name for name in BESIDE if name != "mask")):
-            values = getattr(self, name)
-            if values is None and name != "power":
-                continue
-            plane = _plane(name, values)
-            if plane.shape != shape:
-                raise ImageError(f"image: '{name}' must have the shape {shape} of 'power', got {plane.shape}. Crop it.")
-            object.__setattr__(self, name, plane)
-        if self.flat is not None and not (self.flat > 0).all():
-            raise ImageError(f"image: 'flat' must be > 0, got {self.flat.min():g}. Mask such pixels, with 1 in 'flat'.")
-        for name in ("flat_error", "dark_noise"):
-            if (given := getattr(self, name)) is not None and not (given >= 0).all():
-                raise ImageError(f"image: '{name}' must be >= 0, got {given.min():g}. Give a standard deviation.")
-        metadata: Metadata = {"quantity": "power", "unit": "W"}
-        metadata |= {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
-        if (metadata["quantity"], metadata["unit"]) != ("power", "W"):
-            raise ImageError(
-                f"image: the values are {metadata['quantity']} in {metadata['unit']}, not power in W. "
-                "Give an image as the camera renders it."
-            )
-        object.__setattr__(self, "metadata", metadata)
-
     def __repr__(self) -> str:
         height, width = self.shape
         total = self.total_power
         error = "unknown" if self.error is None else f"at most {self.error.max(initial=0.0):.3g} W a pixel"
         return f"Image({width} x {height} pixels, {total:.6g} W in all, error {error})"
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width (h, w) [pixels]."""
-        return self.power.shape
-
-    @property
-    def kept(self) -> NDArray[np.bool_]:
-        """True (h, w) on the pixels that are not masked."""
-        return np.ones(self.shape, bool) if self.mask is None else ~self.mask
-
-    @property
-    def masked(self) -> int:
-        """Number of masked pixels, which totals and comparisons leave out."""
-        return 0 if self.mask is None else int(self.mask.sum())
-
-    @property
-    def total_power(self) -> float:
-        """Sum [W] over the pixels that are not masked."""
-        return float(self.power.sum(dtype=np.float64, where=self.kept))
 
     @property
     def x(self) -> NDArray[np.float64]:
@@ -132,29 +89,6 @@ class Image:
                 "fspt.Image(power, metadata={'pixel_pitch': 0.0135})."
             )
         return axes
-
-    @property
-    def electrons_per_watt(self) -> float | None:
-        """Photoelectrons per watt on a pixel, before an electron-multiplying register, of an image that
-        `Detector.reduce` made; None of any other."""
-        return self._recorded("electrons_per_watt")
-
-    @property
-    def read_noise(self) -> float | None:
-        """Read noise [e-] of the sum of its frames over `em_gain`, of an image that `Detector.reduce` made; else None.
-
-        Of a map, it is the root mean square.
-        """
-        return self._recorded("read_noise")
-
-    @property
-    def gain_error(self) -> float | None:
-        """Relative uncertainty common to all pixels, of an image that `Detector.reduce` made; None of any other."""
-        return self._recorded("gain_error")
-
-    def _recorded(self, name: str) -> float | None:
-        value = self.metadata.get(name)
-        return None if value is None else float(value)
 
     def scaled(self, source_power: float) -> Image:
         """Image of the same scene with a light source of `source_power` [W], if this one is for a source of 1 W.
@@ -188,8 +122,6 @@ class Image:
         The metadata state it as a crop window of the film (`film_width`, `crop_offset_x`, …), so that `x`, `y` and the
         étendue of its pixels stay those of the whole image. Raises ImageError for steps, single pixels and no pixels.
         """
-        from .crop_window import cropped
-
         return cropped(self, window)
 
     def __add__(self, other: object) -> Image:
@@ -210,8 +142,6 @@ class Image:
         return self._combined(other, -1)
 
     def _combined(self, other: object, sign: int) -> Image:
-        from .image_sum import combined
-
         return combined(self, other, sign) if isinstance(other, Image) else NotImplemented
 
     def roi(
@@ -368,6 +298,26 @@ def read(path: str | os.PathLike[str]) -> Image:
     return image_of(path, *read_planes(path))
 
 
+def read_image_or_exposure(path: str | os.PathLike[str]) -> Image | Exposure:
+    """Image [W] or exposure [e-] from a file that fspt wrote. Raises as `read` and `image_or_exposure`."""
+    return image_or_exposure(path, *read_planes(path))
+
+
+def image_or_exposure(
+    path: str | os.PathLike[str], planes: Mapping[str, NDArray], metadata: Metadata
+) -> Image | Exposure:
+    """What the planes and metadata of a file are: an image in W, or electrons, whose counts follow from the detector.
+
+    Raises
+    ------
+    ImageError : neither, or values that are not finite.
+    DetectorError : the metadata of electrons lack a number of the detector.
+    """
+    from .exposure import exposure_of
+
+    return exposure_of(path, planes, metadata) if "electrons" in planes else image_of(path, planes, metadata)
+
+
 def image_of(path: str | os.PathLike[str], planes: Mapping[str, NDArray], metadata: Metadata) -> Image:
     """Image of the planes and metadata in a file; raises ImageError as `read`."""
     quantity = str(metadata.get("quantity", "power"))
@@ -391,36 +341,3 @@ def required_source_power(watt: float) -> float:
     if not 0 < found < math.inf:
         raise ImageError(f"image: 'source_power' must be finite and > 0 W, got {found:g}. Give for example 1e-9.")
     return found
-
-
-def _mask_plane(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """`values` as a read-only array of True and False of this shape; ImageError for anything else."""
-    array = np.asarray(values)
-    if array.dtype != bool or array.shape != shape:
-        raise ImageError(
-            f"image: 'mask' must be True and False of the shape {shape} of 'power', got {array.dtype} of shape "
-            f"{array.shape}. Give True for pixels to leave out."
-        )
-    view = array.view()
-    view.flags.writeable = False
-    return view
-
-
-def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:
-    """`values` as a read-only array (h, w) of at least 32-bit floats; ImageError if shape, type or a value is wrong."""
-    array = np.asarray(values)
-    if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "fiu":
-        raise ImageError(
-            f"image: '{name}' must be numbers of shape (h, w), got {array.dtype} of shape {array.shape}. "
-            "Give one value a pixel."
-        )
-    finite = np.isfinite(array)
-    if not finite.all():
-        row, column = np.argwhere(~finite)[0]
-        raise ImageError(
-            f"image: '{name}' must be finite, got {array[row, column]} at row {row}, column {column} "
-            f"({np.sum(~finite)} such pixels). Check the exitance."
-        )
-    view = array.astype(np.result_type(array.dtype, np.float32), copy=False).view()
-    view.flags.writeable = False
-    return view

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import ImageError
-from .formats import Metadata
-from .image import Image
+from .formats import BESIDE, Metadata
+from .image_data import ImageData
 from .noise_model import NUMBERS
 from .pixel_axes import PixelAxes
 from .z_test import is_deterministic
 
+Sum = TypeVar("Sum", bound=ImageData)
 SQUARES = ("read_noise", "dark_electrons")  # numbers of the noise that add up, the former in squares
 
 
-def combined(one: Image, other: Image, sign: int) -> Image:
+def combined(one: Sum, other: ImageData, sign: int) -> Sum:
     """Sum of two images for `sign` = 1, difference for -1, as of `Image.__add__`."""
     _require_same_film(one, other)
     mask = None if one.mask is None and other.mask is None else ~(one.kept & other.kept)
@@ -26,20 +29,22 @@ def combined(one: Image, other: Image, sign: int) -> Image:
     if mask is not None:
         power[mask] = 0
     coverage = one.coverage if _same(one.coverage, other.coverage) else None
-    known, planes = _metadata(one, other), {}
+    known = _metadata(one, other)
+    planes: dict[str, Any] = dict.fromkeys(BESIDE)
+    planes |= {"error": _error(one, other), "coverage": coverage, "mask": mask}
     if sign == 1 and _of_one_detector(one, other):
         read, dark = ([float(image.metadata[name]) for image in (one, other)] for name in SQUARES)
         known |= {"read_noise": math.hypot(*read), "dark_electrons": sum(dark)}
-        planes = {"flat": one.flat, "flat_error": one.flat_error, "dark_noise": _dark_noise(one, other)}
+        planes |= {"flat": one.flat, "flat_error": one.flat_error, "dark_noise": _dark_noise(one, other)}
     else:  # no shot noise of the sum follows from its power: the error alone states it
         for name in ("electrons_per_watt", *NUMBERS):
             known.pop(name, None)
     if mask is not None:
         known["masked_pixels"] = int(mask.sum())
-    return Image(power, _error(one, other), coverage, known, mask, **planes)
+    return replace(one, power=power, metadata=known, **planes)
 
 
-def _of_one_detector(one: Image, other: Image) -> bool:
+def _of_one_detector(one: ImageData, other: ImageData) -> bool:
     """True for measured images with the same electrons per watt, excess noise and response of each pixel."""
     if not all(name in image.metadata for name in ("electrons_per_watt", *SQUARES) for image in (one, other)):
         return False
@@ -51,7 +56,7 @@ def _of_one_detector(one: Image, other: Image) -> bool:
     )
 
 
-def _dark_noise(one: Image, other: Image) -> NDArray[np.float64] | None:
+def _dark_noise(one: ImageData, other: ImageData) -> NDArray[np.float64] | None:
     """Dark noise [e-] of the sum of two measured images, (h, w); None if both have the same on all pixels."""
     if one.dark_noise is None and other.dark_noise is None:
         return None
@@ -62,7 +67,7 @@ def _dark_noise(one: Image, other: Image) -> NDArray[np.float64] | None:
     return np.hypot(*(np.broadcast_to(plane, one.shape).astype(np.float64) for plane in planes))
 
 
-def _error(one: Image, other: Image) -> NDArray[np.float64] | None:
+def _error(one: ImageData, other: ImageData) -> NDArray[np.float64] | None:
     """Standard errors added in squares; bounds, of which the integral's are, added up. None where one is unknown."""
     if one.error is None or other.error is None:
         return None
@@ -72,7 +77,7 @@ def _error(one: Image, other: Image) -> NDArray[np.float64] | None:
     return np.sqrt(first**2 + second**2)
 
 
-def _metadata(one: Image, other: Image) -> Metadata:
+def _metadata(one: ImageData, other: ImageData) -> Metadata:
     """Entries that both have, and the warnings of either."""
     known = {name: value for name, value in one.metadata.items() if other.metadata.get(name) == value}
     told = dict.fromkeys(str(image.metadata["warnings"]) for image in (one, other) if "warnings" in image.metadata)
@@ -84,7 +89,7 @@ def _same(one: NDArray | None, other: NDArray | None) -> bool:
     return one is other or (one is not None and other is not None and np.array_equal(one, other))
 
 
-def _require_same_film(one: Image, other: Image) -> None:
+def _require_same_film(one: ImageData, other: ImageData) -> None:
     """Raise ImageError unless both images have the same pixels."""
     if one.shape != other.shape:
         raise ImageError(f"image: {one.shape} and {other.shape} pixels cannot be added. Give images of one film.")

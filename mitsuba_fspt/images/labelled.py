@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..runtime.extras import require
 from .formats import units
-from .image import Image
+from .image_data import ImageData
 from .pixel_axes import PixelAxes
 from .radiometry import in_unit
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 DIMENSIONS = ("y", "x")
 
 
-def dataset(image: Image) -> Dataset:
+def dataset(image: ImageData) -> Dataset:
     """As `Image.to_xarray`."""
     require("xarray", "image: to_xarray")
     import xarray as xr
@@ -30,7 +30,7 @@ def dataset(image: Image) -> Dataset:
     return xr.Dataset(arrays, coords=_coordinates(image), attrs=dict(image.metadata))
 
 
-def radiance_array(image: Image, wavelength_nm: float | None) -> DataArray:
+def radiance_array(image: ImageData, wavelength_nm: float | None) -> DataArray:
     """As `Image.to_radiance`."""
     require("xarray", "image: to_radiance")
     import xarray as xr
@@ -47,12 +47,12 @@ def radiance_array(image: Image, wavelength_nm: float | None) -> DataArray:
     return xr.DataArray(values, {**_coordinates(image), **coordinates}, DIMENSIONS, found.quantity, attributes)
 
 
-def _without_masked(image: Image, plane: NDArray) -> NDArray:
+def _without_masked(image: ImageData, plane: NDArray) -> NDArray:
     """`plane` (h, w) with NaN on the pixels that the image masks, which means over arrays leave out."""
     return plane if image.mask is None else np.where(image.mask, np.nan, plane).astype(plane.dtype)
 
 
-def _coordinates(image: Image) -> dict[str, tuple]:
+def _coordinates(image: ImageData) -> dict[str, tuple]:
     """x and y of the pixels' centres, with their unit and plane."""
     axes = PixelAxes.of(image.shape, image.metadata)
     attributes = {"units": axes.unit, "long_name": axes.label}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
-from .image import Image
+from .image_data import ImageData
 
 Array = NDArray[np.float64]
 NUMBERS = ("read_noise", "dark_electrons", "excess_noise", "prnu")  # of the metadata, beside `electrons_per_watt`
@@ -38,7 +38,7 @@ class NoiseModel:
     excess: float
 
     @classmethod
-    def of(cls, image: Image, thing: str = "image") -> NoiseModel | None:
+    def of(cls, image: ImageData, thing: str = "image") -> NoiseModel | None:
         """Noise model that a reduced image contains; None for any other image.
 
         Raises ImageError, which calls the image `thing`, for numbers that no detector has.

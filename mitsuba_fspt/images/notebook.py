@@ -9,8 +9,8 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from ..runtime.errors import BackendError
-from .comparison import Comparison
-from .image import Image
+from .deviations import Deviations
+from .image_data import ImageData
 from .picture import draw_comparison_profiles, draw_panels
 
 if TYPE_CHECKING:
@@ -25,17 +25,17 @@ LENS = (
 )
 
 
-def image_png(image: Image) -> bytes | None:
+def image_png(image: ImageData) -> bytes | None:
     """PNG of the picture that `--png` writes; None without matplotlib."""
     return png_of(lambda: draw_panels([image]))
 
 
-def comparison_png(comparison: Comparison) -> bytes | None:
+def comparison_png(comparison: Deviations) -> bytes | None:
     """PNG of the profiles of both images; None without matplotlib or without profiles."""
     return png_of(lambda: draw_comparison_profiles(comparison)) if comparison.profiles else None
 
 
-def image_html(image: Image) -> str:
+def image_html(image: ImageData) -> str:
     """Table of size, power, error, scene, method and lens, with the picture where matplotlib is installed."""
     known, height, width = image.metadata, *image.shape
     rows = [
@@ -56,7 +56,7 @@ def image_html(image: Image) -> str:
     return html_of("Image", rows, image_png(image))
 
 
-def comparison_html(comparison: Comparison) -> str:
+def comparison_html(comparison: Deviations) -> str:
     """Table of the numbers with their meaning, as `render_text` prints them, and the profiles."""
     rows = []
     for line in comparison.render_text().splitlines():

@@ -19,9 +19,9 @@ from ..runtime.errors import BackendError, ImageError
 from ..runtime.numbers import whole
 from .colour_scale import ColourScale
 from .colour_scale import scale_and_unit as scale_and_unit
-from .comparison import Comparison, Profile, compare
-from .exposure import Exposure
-from .image import Image
+from .deviations import Deviations, Profile
+from .electrons import Electrons
+from .image_data import ImageData
 from .pixel_axes import PixelAxes
 from .radiometry import Converted, in_unit
 from .z_test import differences, error_bound
@@ -36,7 +36,9 @@ OUTLINE = "deepskyblue"  # a colour that the colour map of powers does not conta
 COLUMNS = 4  # panels in a row
 
 
-def write_png(image: Image, path: str | os.PathLike[str], unit: str = "W", wavelength_nm: float | None = None) -> None:
+def write_png(
+    image: ImageData, path: str | os.PathLike[str], unit: str = "W", wavelength_nm: float | None = None
+) -> None:
     """Write a picture of `image` to a PNG file, with view, total power, method and lens as its title.
 
     Axes are in mm from the centre: on the virtual detector plane if the metadata hold `pixel_pitch` and
@@ -53,7 +55,7 @@ def write_png(image: Image, path: str | os.PathLike[str], unit: str = "W", wavel
 
 
 def png_file(
-    image: Image, path: str | os.PathLike[str], unit: str = "W", wavelength_nm: float | None = None
+    image: ImageData, path: str | os.PathLike[str], unit: str = "W", wavelength_nm: float | None = None
 ) -> AbstractContextManager[None]:
     """Context manager that writes the file of `write_png` before its block and renames it to `path` after it.
 
@@ -63,15 +65,16 @@ def png_file(
     return figure_file(draw_panels([image], unit=unit, wavelength_nm=wavelength_nm), path)
 
 
-def write_comparison_png(calculated: Image, standard: Image, path: str | os.PathLike[str]) -> None:
+def write_comparison_png(
+    calculated: ImageData, standard: ImageData, comparison: Deviations, path: str | os.PathLike[str]
+) -> None:
     """Write both images on one scale, their difference and two profiles to a PNG file, with ME and CF as its title.
 
     The difference is drawn in W and in standard errors, beyond the error bound of the integral. The profiles run along
     the row and the column through the standard's brightest pixel; bands show ± `error` where it is given. Raises as
-    `write_png` and `compare`.
+    `write_png`.
     """
     path = require_png(path)
-    comparison = compare(calculated, standard)
     figure = empty_figure(width=15.0, height=1.8 + 7.2 * _aspect(standard))
     (first, second, row), (difference, deviation, column) = figure.subplots(2, 3)
     scale = ColourScale.over([np.maximum(calculated.power, standard.power)])
@@ -90,7 +93,7 @@ def write_comparison_png(calculated: Image, standard: Image, path: str | os.Path
     save_figure(figure, path)
 
 
-def caption(image: Image | Exposure) -> str:
+def caption(image: ImageData | Electrons) -> str:
     """Method and lens of an image in one line, from those keys that its metadata hold; may be empty."""
     forms = (
         ("method", "{}"),
@@ -103,7 +106,7 @@ def caption(image: Image | Exposure) -> str:
     return ",  ".join(form.format(known[key]) for key, form in forms if key in known)
 
 
-def title(image: Image | Exposure, name: str = "") -> str:
+def title(image: ImageData | Electrons, name: str = "") -> str:
     """Name, view and total of an image in one line, in W or e-; the view is that of the scene's parameters, if any.
 
     Masked pixels are not part of the total.
@@ -111,13 +114,13 @@ def title(image: Image | Exposure, name: str = "") -> str:
     view = re.search(r"(?:^|\s)view=(\S+)", str(image.metadata.get("scene", "")))
     parts = [name] if name else []
     parts += [f"view {view[1]}°"] if view else []
-    if isinstance(image, Exposure):
+    if isinstance(image, Electrons):
         return ", ".join([*parts, f"total {image.total:.4g} e-"])
     return ", ".join([*parts, f"total {image.total_power:.4g} W"])
 
 
 def plot_image(
-    image: Image | Exposure,
+    image: ImageData | Electrons,
     axes: Axes | None,
     *,
     log: bool = False,
@@ -135,7 +138,7 @@ def plot_image(
     return axes
 
 
-def plot_profile(image: Image, row: int | None, column: int | None, axes: Axes | None) -> Axes:
+def plot_profile(image: ImageData, row: int | None, column: int | None, axes: Axes | None) -> Axes:
     """As `Image.plot_profile`."""
     if row is not None and column is not None:
         raise ImageError(f"picture: row {row} and column {column} exclude each other. Give one of them.")
@@ -152,7 +155,7 @@ def plot_profile(image: Image, row: int | None, column: int | None, axes: Axes |
     return axes
 
 
-def draw_comparison_profiles(comparison: Comparison) -> Figure:
+def draw_comparison_profiles(comparison: Deviations) -> Figure:
     """Figure of the profiles of both images, power [W/pixel] over the number of the pixel."""
     count = len(comparison.profiles)
     figure = empty_figure(width=5.0 * count, height=3.2)
@@ -176,7 +179,7 @@ def _own_axes(axes: Axes | None) -> Axes:
 
 
 def draw_panels(
-    images: Sequence[Image | Exposure],
+    images: Sequence[ImageData | Electrons],
     names: Sequence[str] = (),
     *,
     log: bool = False,
@@ -237,7 +240,7 @@ def draw_panels(
     return figure
 
 
-def _panel_grid(images: Sequence[Image | Exposure], wide: bool) -> tuple[Figure, NDArray[np.object_]]:
+def _panel_grid(images: Sequence[ImageData | Electrons], wide: bool) -> tuple[Figure, NDArray[np.object_]]:
     """Empty figure and its axes, shape (rows, columns), with room for all images; `wide`: for a colour bar each too."""
     columns = len(images) if len(images) < COLUMNS else min(COLUMNS, math.ceil(len(images) ** 0.5))
     rows = -(-len(images) // columns)
@@ -247,9 +250,9 @@ def _panel_grid(images: Sequence[Image | Exposure], wide: bool) -> tuple[Figure,
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _shown(image: Image | Exposure, unit: str, wavelength_nm: float | None) -> Converted:
+def _shown(image: ImageData | Electrons, unit: str, wavelength_nm: float | None) -> Converted:
     """Values of an image in a unit, see `radiometry.in_unit`; electrons of an exposure, whatever `unit` is "W"."""
-    if not isinstance(image, Exposure):
+    if not isinstance(image, Electrons):
         return in_unit(image, unit, wavelength_nm)
     if unit != "W" or wavelength_nm is not None:
         raise ImageError(
@@ -273,7 +276,7 @@ def _scale(shown: Sequence[Converted], *, log: bool = False, limits: tuple[float
 
 def draw_image(
     axes: Axes,
-    image: Image | Exposure,
+    image: ImageData | Electrons,
     scale: ColourScale,
     values: NDArray | None = None,
     *,
@@ -295,9 +298,9 @@ def draw_image(
         draw_outline(axes, image)
 
 
-def draw_outline(axes: Axes, image: Image | Exposure) -> None:
+def draw_outline(axes: Axes, image: ImageData | Electrons) -> None:
     """Draw the contour where half of a pixel's lines of sight meet the phantom; ImageError without coverage."""
-    if isinstance(image, Exposure) or image.coverage is None:
+    if isinstance(image, Electrons) or image.coverage is None:
         raise ImageError(
             "picture: an image without coverage has no outline. Leave it out, or give one that 'fspt render' wrote."
         )
@@ -322,7 +325,7 @@ def draw_scale_bar(axes: Axes, left: float, bottom: float, width: float, side: f
 def draw_picture(
     axes: Axes,
     values: NDArray,
-    image: Image,
+    image: ImageData,
     label: str,
     limits: tuple[float, float],
     colours: str = COLOURS,
@@ -336,7 +339,7 @@ def draw_picture(
     bar.figure.colorbar(shown, cax=bar, label=label)
 
 
-def _show_difference(axes: Axes, calculated: Image, standard: Image) -> None:
+def _show_difference(axes: Axes, calculated: ImageData, standard: ImageData) -> None:
     """Draw the difference, white where a pixel of either image is masked."""
     both = calculated.kept & standard.kept
     difference = np.where(both, calculated.power.astype(np.float64) - standard.power, 0)
@@ -346,7 +349,7 @@ def _show_difference(axes: Axes, calculated: Image, standard: Image) -> None:
     axes.set_title("calculated − standard", fontsize="medium")
 
 
-def _show_deviation(axes: Axes, calculated: Image, standard: Image, comparison: Comparison) -> None:
+def _show_deviation(axes: Axes, calculated: ImageData, standard: ImageData, comparison: Deviations) -> None:
     """Draw the difference in standard errors, white where it is not tested; a line of text if there are none."""
     test = comparison.z_test
     if test is None:
@@ -361,7 +364,7 @@ def _show_deviation(axes: Axes, calculated: Image, standard: Image, comparison: 
     axes.set_title(f"difference{bound} in standard errors\nchi2 {chi2},  p {test.p_value:.2g}", fontsize="medium")
 
 
-def _show_profile(axes: Axes, profile: Profile, calculated: Image, standard: Image, scale: ColourScale) -> None:
+def _show_profile(axes: Axes, profile: Profile, calculated: ImageData, standard: ImageData, scale: ColourScale) -> None:
     """Draw the power along a row or column of both images, the calculated one as a thin line on a wide one."""
     pairs = [
         (standard, profile.standard, "standard", "0.65", 4.0),
@@ -374,9 +377,9 @@ def _show_profile(axes: Axes, profile: Profile, calculated: Image, standard: Ima
 
 def _draw_profile(
     axes: Axes,
-    frame: Image,
+    frame: ImageData,
     profile: Profile,
-    curves: Sequence[tuple[Image, NDArray, str, str, float]],
+    curves: Sequence[tuple[ImageData, NDArray, str, str, float]],
     scale: ColourScale | None = None,
 ) -> None:
     """Draw curves (image, power along the profile, name, colour, line width) with bands of ± error, in mm of `frame`.
@@ -407,7 +410,7 @@ def _extend(planes: Sequence[NDArray], scale: ColourScale) -> Literal["neither",
     return "both" if below and above else "min" if below else "max" if above else "neither"
 
 
-def _extent(image: Image | Exposure) -> tuple[tuple[float, float, float, float], str]:
+def _extent(image: ImageData | Electrons) -> tuple[tuple[float, float, float, float], str]:
     """(left, right, bottom, top) of the picture [mm or pixels], and the axis label with unit and plane."""
     axes = _axes_of(image)
     across, down = axes.step / 2, axes.down / 2
@@ -415,11 +418,11 @@ def _extent(image: Image | Exposure) -> tuple[tuple[float, float, float, float],
     return tuple(map(float, ends)), axes.label  # type: ignore[return-value]
 
 
-def _axes_of(image: Image | Exposure) -> PixelAxes:
+def _axes_of(image: ImageData | Electrons) -> PixelAxes:
     return PixelAxes.of(image.shape, image.metadata)
 
 
-def _aspect(image: Image | Exposure) -> float:
+def _aspect(image: ImageData | Electrons) -> float:
     """Height over width, limited to [0.5, 2] for the figure."""
     return min(2.0, max(0.5, image.shape[0] / image.shape[1]))
 

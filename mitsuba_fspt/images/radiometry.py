@@ -15,7 +15,7 @@ from ..optics.thin_lens import Lens, number_names
 from ..runtime.errors import ImageError, OpticsError
 from ..runtime.wavelength import wavelength
 from .formats import Metadata, write_planes
-from .image import Image
+from .image_data import ImageData
 from .pixel_axes import PixelAxes
 
 PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
@@ -41,7 +41,7 @@ class Converted:
     unit: str
     wavelength_nm: float | None
 
-    def write(self, path: str | os.PathLike[str], image: Image) -> None:
+    def write(self, path: str | os.PathLike[str], image: ImageData) -> None:
         """Write values, error and the coverage and metadata of `image`, which this is made of, as `Image.write` does.
 
         The metadata state quantity, unit and wavelength. Raises as `Image.write`.
@@ -62,7 +62,7 @@ def require_unit(unit: str, wavelength_nm: float | None) -> None:
         raise ImageError(f"image: 'wavelength_nm' = {wavelength_nm:g} has no meaning for watts. Leave it out.")
 
 
-def in_unit(image: Image, unit: str, wavelength_nm: float | None = None) -> Converted:
+def in_unit(image: ImageData, unit: str, wavelength_nm: float | None = None) -> Converted:
     """Image in a unit of `UNITS`: W, photons/s or p/s/cm2/sr.
 
     The radiance is that of a surface in focus: P/(τ G ⟨cos⁴θ⟩), with the étendue of each pixel (Eq. M.6); 0 on pixels
@@ -87,7 +87,7 @@ def in_unit(image: Image, unit: str, wavelength_nm: float | None = None) -> Conv
     return Converted((image.power * factor).astype(np.float64), error, quantity, unit, nanometres)
 
 
-def wavelength_of(image: Image, wavelength_nm: float | None) -> float:
+def wavelength_of(image: ImageData, wavelength_nm: float | None) -> float:
     """Wavelength [nm], given or that of the image's filter.
 
     Raises
@@ -113,7 +113,7 @@ def wavelength_by(metadata: Mapping[str, object], wavelength_nm: float | None) -
     return found
 
 
-def etendue(image: Image) -> Plane:
+def etendue(image: ImageData) -> Plane:
     """Étendue τ G ⟨cos⁴θ⟩ of every pixel, shape (h, w) [mm² sr]; ImageError if the metadata lack the lens.
 
     Of an image that the integral computed with `pixel` = centre, it is that of the centres, as in the integral.

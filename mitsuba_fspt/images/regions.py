@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import ImageError
-from .image import Image
+from .image_data import ImageData
 from .pixel_axes import PixelAxes
 from .radiometry import SQUARE_MM_PER_CM, in_unit
 from .tiff_pages import read_tiff
@@ -67,7 +67,7 @@ HEADINGS = {
 
 
 def measure(
-    image: Image, region: str | os.PathLike[str] | Mask | None = None, wavelength_nm: float | None = None
+    image: ImageData, region: str | os.PathLike[str] | Mask | None = None, wavelength_nm: float | None = None
 ) -> Measurement:
     """Radiometric quantities of the light from a region of an image, without its masked pixels.
 
@@ -114,7 +114,7 @@ def measure(
     )
 
 
-def region_mask(image: Image, text: str) -> Mask:
+def region_mask(image: ImageData, text: str) -> Mask:
     """Pixels (h, w) of a region described by text; pixels count from the upper left corner.
 
     'x,y,width,height' : a rectangle, with the first pixel x, y
@@ -161,7 +161,7 @@ def _mask_of_file(name: str) -> Mask:
     return np.asarray(read_tiff(Path(name), f"region '{name}'")) != 0
 
 
-def _check_mask(image: Image, mask: Mask, what: str) -> None:
+def _check_mask(image: ImageData, mask: Mask, what: str) -> None:
     """Raise ImageError for a mask of another size, or without a pixel."""
     if mask.shape != image.shape or mask.dtype != bool:
         size = " x ".join(map(str, image.shape[::-1]))

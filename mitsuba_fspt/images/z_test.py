@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .image import Image
+from .image_data import ImageData
 
 LEVEL = 0.01  # probability of a false alarm, to which `ZTest.detectable` refers
 NOISY = 0.5  # largest bound over standard error of a pixel that counts for chi2: a bias of that size adds 0.25 to it
@@ -62,29 +62,29 @@ class ZTest:
         return f"{test}\npower  {power}"
 
 
-def is_deterministic(image: Image) -> bool:
+def is_deterministic(image: ImageData) -> bool:
     """True if `error` is the integral's estimate, not a standard error."""
     return image.metadata.get("method") == "integral"
 
 
-def error_bound(*images: Image) -> Plane:
+def error_bound(*images: ImageData) -> Plane:
     """Sum of the errors [W] of the deterministic images, shape (h, w)."""
     given = [image.error for image in images if image.error is not None and is_deterministic(image)]
     return np.sum([np.zeros(images[0].shape), *given], axis=0, dtype=np.float64)
 
 
-def brightest(image: Image, kept: NDArray[np.bool_]) -> tuple[int, int]:
+def brightest(image: ImageData, kept: NDArray[np.bool_]) -> tuple[int, int]:
     """Row and column of the brightest of the pixels `kept` (h, w)."""
     row, column = np.unravel_index(np.where(kept, image.power, -np.inf).argmax(), image.shape)
     return int(row), int(column)
 
 
-def differences(calculated: Image, standard: Image) -> Plane:
+def differences(calculated: ImageData, standard: ImageData) -> Plane:
     """z of every pixel with the sign of P_cal − P_std, shape (h, w); NaN on pixels that are not tested."""
     return _Differences(calculated, standard).signed_z()
 
 
-def z_test(calculated: Image, standard: Image) -> ZTest | None:
+def z_test(calculated: ImageData, standard: ImageData) -> ZTest | None:
     """Test of the differences against their errors; None if no image has a standard error above 0."""
     found = _Differences(calculated, standard)
     if not found.error.any():
@@ -122,7 +122,7 @@ class _Differences:
         Monte Carlo there is the power of a possible sample
     """
 
-    def __init__(self, calculated: Image, standard: Image) -> None:
+    def __init__(self, calculated: ImageData, standard: ImageData) -> None:
         p_cal, self.power = (image.power.astype(np.float64) for image in (calculated, standard))
         self.kept = calculated.kept & standard.kept
         self.difference = np.where(self.kept, p_cal - self.power, 0)
@@ -145,7 +145,7 @@ class _Differences:
         self.tested = (self.error > 0) & ((p_cal != 0) | (self.power != 0))
         self.missed = self._missed(calculated, standard)
 
-    def _missed(self, calculated: Image, standard: Image) -> Plane:
+    def _missed(self, calculated: ImageData, standard: ImageData) -> Plane:
         """Standard deviation [W] missing in s where Monte Carlo is darker than a deterministic image by d.
 
         If light arrives in events of power w, the variance of the mean is w (P + d). From the passes of a pixel that

@@ -8,8 +8,7 @@ import pytest
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.detector.reduction import read_measured, reduced
-from mitsuba_fspt.images.exposure import read_image_or_exposure
-from mitsuba_fspt.images.image import Image
+from mitsuba_fspt.images.image import Image, read_image_or_exposure
 from mitsuba_fspt.images.noise_model import NoiseModel
 from mitsuba_fspt.inverse.measurement import noise_of
 from mitsuba_fspt.runtime.errors import DetectorError, ImageError

@@ -1,0 +1,127 @@
+"""Data of an image: power [W] on every pixel, its error and coverage, and metadata, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..runtime.errors import ImageError
+from .formats import BESIDE, Metadata
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ImageData:
+    """Planes and metadata of an image, as `Image` describes them; `Image` adds what can be done with them."""
+
+    power: NDArray[np.floating]
+    error: NDArray[np.floating] | None = None
+    coverage: NDArray[np.floating] | None = None
+    metadata: Metadata = field(default_factory=dict)
+    mask: NDArray[np.bool_] | None = None
+    flat: NDArray[np.floating] | None = None
+    flat_error: NDArray[np.floating] | None = None
+    dark_noise: NDArray[np.floating] | None = None
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.power)
+        if self.mask is not None:
+            object.__setattr__(self, "mask", _mask_plane(self.mask, shape))
+        for name in ("power", *(name for name in BESIDE if name != "mask")):
+            values = getattr(self, name)
+            if values is None and name != "power":
+                continue
+            plane = _plane(name, values)
+            if plane.shape != shape:
+                raise ImageError(f"image: '{name}' must have the shape {shape} of 'power', got {plane.shape}. Crop it.")
+            object.__setattr__(self, name, plane)
+        if self.flat is not None and not (self.flat > 0).all():
+            raise ImageError(f"image: 'flat' must be > 0, got {self.flat.min():g}. Mask such pixels, with 1 in 'flat'.")
+        for name in ("flat_error", "dark_noise"):
+            if (given := getattr(self, name)) is not None and not (given >= 0).all():
+                raise ImageError(f"image: '{name}' must be >= 0, got {given.min():g}. Give a standard deviation.")
+        metadata: Metadata = {"quantity": "power", "unit": "W"}
+        metadata |= {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
+        if (metadata["quantity"], metadata["unit"]) != ("power", "W"):
+            raise ImageError(
+                f"image: the values are {metadata['quantity']} in {metadata['unit']}, not power in W. "
+                "Give an image as the camera renders it."
+            )
+        object.__setattr__(self, "metadata", metadata)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width (h, w) [pixels]."""
+        return self.power.shape
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """True (h, w) on the pixels that are not masked."""
+        return np.ones(self.shape, bool) if self.mask is None else ~self.mask
+
+    @property
+    def masked(self) -> int:
+        """Number of masked pixels, which totals and comparisons leave out."""
+        return 0 if self.mask is None else int(self.mask.sum())
+
+    @property
+    def total_power(self) -> float:
+        """Sum [W] over the pixels that are not masked."""
+        return float(self.power.sum(dtype=np.float64, where=self.kept))
+
+    @property
+    def electrons_per_watt(self) -> float | None:
+        """Photoelectrons per watt on a pixel, before an electron-multiplying register, of an image that
+        `Detector.reduce` made; None of any other."""
+        return self._recorded("electrons_per_watt")
+
+    @property
+    def read_noise(self) -> float | None:
+        """Read noise [e-] of the sum of its frames over `em_gain`, of an image that `Detector.reduce` made; else None.
+
+        Of a map, it is the root mean square.
+        """
+        return self._recorded("read_noise")
+
+    @property
+    def gain_error(self) -> float | None:
+        """Relative uncertainty common to all pixels, of an image that `Detector.reduce` made; None of any other."""
+        return self._recorded("gain_error")
+
+    def _recorded(self, name: str) -> float | None:
+        value = self.metadata.get(name)
+        return None if value is None else float(value)
+
+
+def _mask_plane(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """`values` as a read-only array of True and False of this shape; ImageError for anything else."""
+    array = np.asarray(values)
+    if array.dtype != bool or array.shape != shape:
+        raise ImageError(
+            f"image: 'mask' must be True and False of the shape {shape} of 'power', got {array.dtype} of shape "
+            f"{array.shape}. Give True for pixels to leave out."
+        )
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:
+    """`values` as a read-only array (h, w) of at least 32-bit floats; ImageError if shape, type or a value is wrong."""
+    array = np.asarray(values)
+    if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "fiu":
+        raise ImageError(
+            f"image: '{name}' must be numbers of shape (h, w), got {array.dtype} of shape {array.shape}. "
+            "Give one value a pixel."
+        )
+    finite = np.isfinite(array)
+    if not finite.all():
+        row, column = np.argwhere(~finite)[0]
+        raise ImageError(
+            f"image: '{name}' must be finite, got {array[row, column]} at row {row}, column {column} "
+            f"({np.sum(~finite)} such pixels). Check the exitance."
+        )
+    view = array.astype(np.result_type(array.dtype, np.float32), copy=False).view()
+    view.flags.writeable = False
+    return view
