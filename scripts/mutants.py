@@ -125,7 +125,7 @@ MUTANTS = (
     ),
     Mutant(
         "D = F/f_num of Eq. 3",
-        "optics/thin_lens.py",
+        "optics/focused_lens.py",
         "return self.focal_length / self.f_number",
         "return self.focal_length / self.f_number**2",
         ("tests/optics/test_thin_lens.py",),

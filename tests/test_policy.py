@@ -60,7 +60,7 @@ ARROWS = {
 # Only these import `validation`: no result depends on it.
 IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
 # Rooms in which files still import each other.
-TIED = {"detector", "inverse", "optics"}
+TIED = {"detector", "inverse"}
 # Rooms of Dr.Jit code. Others import the renderer inside functions alone, and only these do.
 DRJIT_ROOMS = {"jit", "emission", "integral", "plugins"}
 IMPORTS_MITSUBA = {"runtime", "rendering", "validation", "studies", "inverse"}

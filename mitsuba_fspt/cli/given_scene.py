@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from ..optics.thin_lens import FOCUS
+from ..optics.focused_lens import FOCUS
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import read_text
 from ..runtime.errors import SceneError

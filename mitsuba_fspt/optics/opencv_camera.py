@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from ..runtime.errors import OpticsError
 from ..runtime.numbers import whole
-from .thin_lens import FOCUS, Lens
+from .focused_lens import FOCUS
+from .thin_lens import Lens
 
 Array = NDArray[np.float64]
 TOLERANCE = 0.5  # pixels: largest shift of an image corner by properties of K that a lens with square pixels lacks

@@ -10,22 +10,16 @@ import math
 from dataclasses import dataclass, field
 
 from ..runtime.errors import OpticsError
-from ..runtime.numbers import number
 from .discs import Disc
+from .focused_lens import BORDERS, FOCUS, NUMBERS, FocusedLens, require_positive
 from .models import LensModel, model_named, model_names
 from .models.diaphragm import Diaphragm
 
 MM_PER_NM = 1e-6
-LARGEST = 1e30  # largest number of a lens, and largest inverse of one: squares stay finite
-LEAST_F_NUMBER = 1e-3  # of the model: no lens in air is below 0.5; far below 1e-3, stated errors are too small
-FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
-BORDERS = ("lens_diameter", "diaphragm_distance", "image_stop_diameter")
-NUMBERS = ("focal_length", "f_number", *FOCUS, *BORDERS)  # of `Lens.focused`, whatever the model
-EXAMPLES = dict(zip(NUMBERS, ("55", "8", "165", "0.5", "82.5", "20", "5", "20"), strict=True))
 
 
 @dataclass(frozen=True)
-class Lens:
+class Lens(FocusedLens):
     """Thin lens with a diaphragm, focused on the virtual detector plane z = u (paper, section 2.C).
 
     Parameters
@@ -43,12 +37,6 @@ class Lens:
     OpticsError : the lens cannot exist or forms no real image; the message names the parameter.
     """
 
-    focal_length: float
-    f_number: float
-    focus_distance: float
-    lens_diameter: float | None = None
-    diaphragm_distance: float = 0.0
-    image_stop_diameter: float | None = None
     model: LensModel = field(default_factory=Diaphragm)
 
     @classmethod
@@ -69,7 +57,7 @@ class Lens:
         parameters. Raises OpticsError where none or several set the focus, and for a number that belongs to no lens or
         to another model.
         """
-        focal_length = _require_positive("focal_length", focal_length, "mm, for example 55")
+        focal_length = require_positive("focal_length", focal_length, "mm, for example 55")
         focus = zip(FOCUS, (focus_distance, magnification, image_distance), strict=True)
         given = {name: value for name, value in focus if value is not None}
         if len(given) != 1:
@@ -78,7 +66,7 @@ class Lens:
                 f"{' and '.join(map(repr, given)) or 'none'}. Give one, for example magnification = 0.5."
             )
         ((name, value),) = given.items()
-        value = _require_positive(name, value, "for example magnification = 0.5")
+        value = require_positive(name, value, "for example magnification = 0.5")
         if name == "magnification":
             focus_distance = focal_length * (1 + 1 / value)
         elif name == "image_distance":
@@ -95,51 +83,8 @@ class Lens:
         return cls(focal_length, f_number, focus_distance, **borders, model=_model(model, rest))  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
-        for name in ("focal_length", "f_number", "focus_distance", *BORDERS):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, number(f"'{name}'", value, OpticsError, EXAMPLES[name]))
-        _require_positive("focal_length", self.focal_length, "mm, for example 55")
-        _require_positive("f_number", self.f_number, "f_number = F/D, for example 8")
-        if self.f_number < LEAST_F_NUMBER:
-            raise OpticsError(
-                f"'f_number' must be at least {LEAST_F_NUMBER:g}, got {self.f_number:g}: the diaphragm would be "
-                f"{self.diaphragm_diameter:g} mm wide. f_number = F/D, for example 8."
-            )
-        _require_positive("focus_distance", self.focus_distance, "mm, for example 165")
-        if self.focus_distance <= self.focal_length:
-            raise OpticsError(
-                f"'focus_distance' must be > focal_length = {self.focal_length:g} mm for a real image, "
-                f"got {self.focus_distance:g}. Move the camera back or use a shorter lens."
-            )
-        if not math.isfinite(self.diaphragm_distance):
-            raise OpticsError(
-                f"'diaphragm_distance' must be finite, got {self.diaphragm_distance:g} mm. Give mm, for example 5."
-            )
-        if self.image_stop_diameter is not None:
-            _require_positive("image_stop_diameter", self.image_stop_diameter, "mm on the detector, for example 20")
-        if self.lens_diameter is not None:
-            _require_positive("lens_diameter", self.lens_diameter, "mm, for example 20")
+        super().__post_init__()
         self.model.check(self)
-
-    @property
-    def image_distance(self) -> float:
-        """v [mm] from the lens law 1/F = 1/u + 1/v."""
-        return self.focal_length * self.focus_distance / (self.focus_distance - self.focal_length)
-
-    @property
-    def magnification(self) -> float:
-        """t = v/u."""
-        return self.focal_length / (self.focus_distance - self.focal_length)
-
-    @property
-    def diaphragm_diameter(self) -> float:
-        """D = F/f_num [mm] (Eq. 3)."""
-        return self.focal_length / self.f_number
-
-    @property
-    def seen_field(self) -> float:
-        """Distance from the axis [mm] up to which virtual points lie inside the image-plane stop; inf without one."""
-        return math.inf if self.image_stop_diameter is None else self.image_stop_diameter / 2 / self.magnification
 
     @property
     def pupil_radius(self) -> float:
@@ -196,13 +141,3 @@ def configuration_factor(radius: float, distance: float, offset: float) -> float
     z = distance**2 + radius**2 + offset**2
     s = math.sqrt((z - 2 * radius * offset) * (z + 2 * radius * offset))
     return 2 * radius**2 * distance**2 / (s * (s + z - 2 * radius**2))
-
-
-def _require_positive(name: str, value: float, example: str) -> float:
-    """`value` as a float; OpticsError if it is no number, not positive, or beyond `LARGEST`."""
-    value = number(f"'{name}'", value, OpticsError, EXAMPLES[name])
-    if not (math.isfinite(value) and value > 0):
-        raise OpticsError(f"'{name}' must be > 0 and finite, got {value:g}. Give {example}.")
-    if not 1 / LARGEST <= value <= LARGEST:
-        raise OpticsError(f"'{name}' must be in 1/{LARGEST:g} … {LARGEST:g}, got {value:g}. Give {example}.")
-    return value

@@ -13,7 +13,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optics.thin_lens import FOCUS, Lens, number_names
+from ..optics.focused_lens import FOCUS
+from ..optics.thin_lens import Lens, number_names
 from ..optics.transmittance import NUMBERS as LIGHT
 from ..runtime.errors import OpticsError, SceneError
 from ..runtime.numbers import number, whole

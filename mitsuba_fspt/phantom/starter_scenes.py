@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..optics.thin_lens import FOCUS
+from ..optics.focused_lens import FOCUS
 from ..runtime.errors import SceneError
 from .framed_scene import Outline, framed_text, scene_xml
 

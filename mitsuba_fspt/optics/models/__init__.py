@@ -12,7 +12,7 @@ from ...runtime.numbers import number
 
 if TYPE_CHECKING:
     from ..discs import Disc
-    from ..thin_lens import Lens
+    from ..focused_lens import FocusedLens
 
 
 @dataclass(frozen=True)
@@ -45,17 +45,17 @@ class LensModel:
         """Names of the parameters that this model alone has."""
         return tuple(field.name for field in fields(cls))
 
-    def check(self, lens: Lens) -> None:
+    def check(self, lens: FocusedLens) -> None:
         """Raise OpticsError where the lens and this model's parameters do not fit together."""
 
-    def discs(self, lens: Lens) -> tuple[Disc, ...]:
+    def discs(self, lens: FocusedLens) -> tuple[Disc, ...]:
         """The one or two discs of the lens plane that a line of sight has to pass; their overlap is the open pupil.
 
         They generalise β of Eq. 5. The integral runs over the first disc; a second one clips it.
         """
         raise NotImplementedError
 
-    def pupil_radius(self, lens: Lens) -> float:
+    def pupil_radius(self, lens: FocusedLens) -> float:
         """Radius [mm] of the disc that contains the lens points of all lines of sight: the first disc."""
         return self.discs(lens)[0].radius
 

@@ -10,7 +10,7 @@ from ..discs import Disc
 from . import LensModel
 
 if TYPE_CHECKING:
-    from ..thin_lens import Lens
+    from ..focused_lens import FocusedLens
 
 ROUNDING = 1e-6  # share by which D = F/f_num of float32 numbers may exceed a lens border of the same size
 
@@ -19,7 +19,7 @@ ROUNDING = 1e-6  # share by which D = F/f_num of float32 numbers may exceed a le
 class Diaphragm(LensModel):
     """Lines of sight pass the diaphragm, and also the border of the lens if the diaphragm is apart from it (Fig. 2)."""
 
-    def check(self, lens: Lens) -> None:
+    def check(self, lens: FocusedLens) -> None:
         if lens.diaphragm_distance != 0:
             self._check_distance(lens)
         elif lens.lens_diameter is not None and lens.lens_diameter < lens.diaphragm_diameter * (1 - ROUNDING):
@@ -29,7 +29,7 @@ class Diaphragm(LensModel):
                 f"f_number >= {lens.focal_length / lens.lens_diameter:.4g}."
             )
 
-    def _check_distance(self, lens: Lens) -> None:
+    def _check_distance(self, lens: FocusedLens) -> None:
         distance = lens.diaphragm_distance
         if lens.lens_diameter is None:
             raise OpticsError(
@@ -48,7 +48,7 @@ class Diaphragm(LensModel):
                 "more."
             )
 
-    def discs(self, lens: Lens) -> tuple[Disc, ...]:
+    def discs(self, lens: FocusedLens) -> tuple[Disc, ...]:
         """A diaphragm in the lens itself; otherwise its entrance pupil and the border of the lens."""
         if lens.diaphragm_distance == 0 or lens.lens_diameter is None:
             return (Disc(0.0, lens.diaphragm_diameter / 2),)
@@ -57,7 +57,7 @@ class Diaphragm(LensModel):
         return (border,) if pupil is None else (pupil, border)
 
 
-def _entrance_pupil(lens: Lens) -> Disc | None:
+def _entrance_pupil(lens: FocusedLens) -> Disc | None:
     """Entrance pupil, projected from the virtual point onto the lens plane (Eqs. M.11, M.12); None on the detector.
 
     The image of a diaphragm at the distance s behind the lens, seen from the object side, is at s F/(s - F) and

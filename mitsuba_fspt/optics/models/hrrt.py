@@ -10,17 +10,17 @@ from ..discs import Disc
 from . import LensModel
 
 if TYPE_CHECKING:
-    from ..thin_lens import Lens
+    from ..focused_lens import FocusedLens
 
 
 @dataclass(frozen=True)
 class Hrrt(LensModel):
     """Lines of sight pass the border of the lens, D = `lens_diameter`."""
 
-    def check(self, lens: Lens) -> None:
+    def check(self, lens: FocusedLens) -> None:
         if lens.lens_diameter is None:
             raise OpticsError("model 'hrrt' needs 'lens_diameter', the border that stops its light. Give mm, say 20.")
 
-    def discs(self, lens: Lens) -> tuple[Disc, ...]:
+    def discs(self, lens: FocusedLens) -> tuple[Disc, ...]:
         """The border of the lens, which `check` requires."""
         return (Disc(0.0, (lens.lens_diameter or 0.0) / 2),)

@@ -9,16 +9,16 @@ from ..discs import Disc
 from . import LensModel
 
 if TYPE_CHECKING:
-    from ..thin_lens import Lens
+    from ..focused_lens import FocusedLens
 
 
 @dataclass(frozen=True)
 class Pinhole(LensModel):
     """Every line of sight passes the middle of the lens; the étendue is that of the diaphragm D = F/f_num."""
 
-    def discs(self, lens: Lens) -> tuple[Disc, ...]:
+    def discs(self, lens: FocusedLens) -> tuple[Disc, ...]:
         return (Disc(0.0, lens.diaphragm_diameter / 2),)
 
-    def pupil_radius(self, lens: Lens) -> float:
+    def pupil_radius(self, lens: FocusedLens) -> float:
         """0, since all lines of sight pass the same lens point."""
         return 0.0

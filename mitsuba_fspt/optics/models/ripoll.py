@@ -11,7 +11,7 @@ from ..discs import Disc
 from . import LensModel
 
 if TYPE_CHECKING:
-    from ..thin_lens import Lens
+    from ..focused_lens import FocusedLens
 
 
 @dataclass(frozen=True)
@@ -24,13 +24,13 @@ class Ripoll(LensModel):
     numerical_aperture: float | None = None
     EXAMPLES: ClassVar[dict[str, str]] = {"numerical_aperture": "0.5"}
 
-    def check(self, lens: Lens) -> None:
+    def check(self, lens: FocusedLens) -> None:
         if self.numerical_aperture is None or not 0 < self.numerical_aperture < 1:
             raise OpticsError(
                 f"model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}. "
                 "Give for example 0.5."
             )
 
-    def discs(self, lens: Lens) -> tuple[Disc, ...]:
+    def discs(self, lens: FocusedLens) -> tuple[Disc, ...]:
         """The disc in which the cone meets the lens plane; its centre is opposite the virtual point (κ = 1)."""
         return (Disc(1.0, lens.focus_distance * math.tan(math.asin(self.numerical_aperture or 0.0))),)
