@@ -82,36 +82,36 @@ def glowing() -> object:
 
 def measured(name: str, scene: object, mesh: trimesh.Trimesh) -> list[object]:
     """One row of the file."""
-    lens = scene.sensors()[0]
+    camera = scene.sensors()[0].camera
     mesh.merge_vertices(merge_norm=True)
-    edges = silhouette(mesh, lens)
-    visible = ~hidden(mesh.vertices[edges].mean(axis=1), scene, lens)
-    discs, blur = lens.film_discs(mesh.vertices[edges].reshape(-1, 3))
+    edges = silhouette(mesh, camera)
+    visible = ~hidden(mesh.vertices[edges].mean(axis=1), scene, camera)
+    discs, blur = camera.film_discs(mesh.vertices[edges].reshape(-1, 3))
     ends, width = discs.reshape(-1, 2, 2), blur.reshape(-1, 2).max(axis=1) + HALF_PIXEL
-    shape = tuple(int(n) for n in lens.film().size())[::-1]
+    shape = camera.film.size[::-1]
     count, seen = bands(ends, width, shape), bands(ends[visible], width[visible], shape)
     met = count > 0
     numbers = (f"{np.median(count[met]):.0f}", f"{np.mean(count[met] == 1):.3f}", f"{np.mean(seen[met] == 0):.3f}")
-    return [name, len(mesh.faces), lens.optics.f_number, len(edges), int(met.sum()), *numbers]
+    return [name, len(mesh.faces), camera.lens.f_number, len(edges), int(met.sum()), *numbers]
 
 
-def silhouette(mesh: trimesh.Trimesh, lens: object) -> NDArray[np.int64]:
+def silhouette(mesh: trimesh.Trimesh, camera: object) -> NDArray[np.int64]:
     """Vertices (n, 2) of edges with one face that some point of the pupil sees, and one that some point does not."""
-    matrix = np.array(lens.world_transform().matrix, np.float64).reshape(4, 4)
+    matrix = np.array(camera.placement).reshape(4, 4)
     centre, axis = matrix[:3, 3], matrix[:3, 2]
     normal = mesh.face_normals
     towards = np.einsum("fk,fk->f", normal, centre - mesh.triangles_center)
-    across = np.linalg.norm(normal - np.outer(normal @ axis, axis), axis=1) * lens.optics.pupil_radius
+    across = np.linalg.norm(normal - np.outer(normal @ axis, axis), axis=1) * camera.lens.pupil_radius
     front, back = (towards + across > 0)[mesh.face_adjacency], (towards - across < 0)[mesh.face_adjacency]
     changes = (front[:, 0] & back[:, 1]) | (front[:, 1] & back[:, 0])
     return mesh.face_adjacency_edges[changes & (mesh.face_adjacency_angles > FLAT)]
 
 
-def hidden(points: NDArray[np.float64], scene: object, lens: object) -> NDArray[np.bool_]:
+def hidden(points: NDArray[np.float64], scene: object, camera: object) -> NDArray[np.bool_]:
     """True (n,) where something lies between these points (n, 3) [mm] and the middle of the lens."""
     import mitsuba as mi
 
-    centre = np.array(lens.world_transform().matrix, np.float64).reshape(4, 4)[:3, 3]
+    centre = np.array(camera.centre)
     way = points - centre
     ray = mi.Ray3f(mi.Point3f(*map(float, centre)), mi.Vector3f(*np.asarray(way, np.float32).T))
     ray.maxt = 1 - NEAR

@@ -93,7 +93,7 @@ def draft_of(names: list[str], f_number: float) -> Draft:
     from mitsuba_fspt.integral.eq9 import View
     from mitsuba_fspt.integral.nodes import first_nodes
     from mitsuba_fspt.integral.quadrature import Quadrature
-    from mitsuba_fspt.integral.window import visible_window
+    from mitsuba_fspt.integral.visible_window import visible_window
 
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "pixel_format": "luminance"}
     scene = {"type": "scene", "sensor": {"type": "fspt_lens", "f_number": f_number, **LENS, "film": film}}
@@ -102,9 +102,9 @@ def draft_of(names: list[str], f_number: float) -> Draft:
         glow = {"type": "fspt_surface", "exitance": exitance}
         scene[name] = {"type": "sphere", "center": list(centre), "radius": radius, "emitter": glow}
     scene = mi.load_dict(scene)
-    lens = scene.sensors()[0]
-    window = visible_window(scene, lens)
-    draft = Draft(View.of(scene, lens, window), window, Quadrature(rtol=RTOL), None)
+    camera = scene.sensors()[0].camera
+    window = visible_window(scene, camera)
+    draft = Draft(View.of(scene, camera, window), window, Quadrature(rtol=RTOL), None)
     first_nodes(draft, np.zeros(window.shape))
     return draft
 

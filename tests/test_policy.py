@@ -23,13 +23,14 @@ ARROWS = {
     "phantom": {"runtime", "optics"},
     "tissue": {"runtime", "optics", "phantom"},
     "jit": set(),
+    "camera": {"runtime", "optics", "jit"},
     "emission": {"runtime", "optics", "jit"},
-    "integral": {"runtime", "optics", "phantom", "jit", "emission"},
-    "plugins": {"runtime", "optics", "jit", "emission", "integral"},
-    "rendering": {"runtime", "images", "jit", "emission", "integral"},
+    "integral": {"runtime", "phantom", "jit", "camera", "emission"},
+    "plugins": {"runtime", "optics", "jit", "camera", "emission", "integral"},
+    "rendering": {"runtime", "images", "jit", "camera", "emission", "integral"},
     "detector": {"runtime", "images", "rendering"},
-    "validation": {"runtime", "optics", "jit", "emission", "integral", "rendering"},
-    "studies": {"runtime", "optics", "images", "jit", "emission", "integral", "rendering", "validation"},
+    "validation": {"runtime", "optics", "jit", "camera", "emission", "integral", "rendering"},
+    "studies": {"runtime", "optics", "images", "jit", "camera", "emission", "integral", "rendering", "validation"},
     "inverse": {
         "runtime",
         "optics",
@@ -38,6 +39,8 @@ ARROWS = {
         "phantom",
         "tissue",
         "jit",
+        "camera",
+        "emission",
         "integral",
         "rendering",
         "studies",
@@ -50,6 +53,7 @@ ARROWS = {
         "detector",
         "phantom",
         "tissue",
+        "camera",
         "rendering",
         "studies",
         "inverse",
@@ -62,7 +66,7 @@ IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
 # Rooms in which files still import each other.
 TIED = {"detector", "inverse"}
 # Rooms of Dr.Jit code. Others import the renderer inside functions alone, and only these do.
-DRJIT_ROOMS = {"jit", "emission", "integral", "plugins"}
+DRJIT_ROOMS = {"jit", "camera", "emission", "integral", "plugins"}
 IMPORTS_MITSUBA = {"runtime", "rendering", "validation", "studies", "inverse"}
 PUBLIC = [
     "Calibration",
@@ -196,6 +200,56 @@ def test_every_listed_arrow_exists():
 def test_only_some_import_the_validation():
     wrong = [name for name in NAMES if "validation" in imported_rooms(name)]
     assert not [name for name in wrong if not name.startswith(tuple(IMPORTS_VALIDATION))]
+
+
+# The only files that ask a plugin for its camera or its emitting surface; everybody else takes those.
+ASKS_PLUGINS = {"camera/of_sensor.py": {"camera"}, "emission/of_emitter.py": {"surface"}}
+WITHOUT_PLUGINS = {"camera", "emission", "integral", "inverse"}
+
+
+def members_of_plugins():
+    """Public names of the lens's and the surface's class that are not Mitsuba's: methods and attributes of `self`."""
+    found = set()
+    for name, base in (("plugins/lens.py", "Sensor"), ("plugins/surface.py", "Emitter")):
+        body = next(node for node in TREES[name].body if isinstance(node, ast.ClassDef))
+        found |= {node.name for node in body.body if isinstance(node, ast.FunctionDef)} - MITSUBAS[base]
+        for node in ast.walk(body):
+            if (
+                isinstance(node, ast.Attribute)
+                and ast.unparse(node.value) == "self"
+                and isinstance(node.ctx, ast.Store)
+            ):
+                found.add(node.attr)
+    return {name for name in found if not name.startswith(("_", "m_"))}
+
+
+MITSUBAS = {
+    "Sensor": {
+        "traverse",
+        "parameters_changed",
+        "sample_ray",
+        "sample_direction",
+        "pdf_direction",
+        "bbox",
+        "to_string",
+    },
+    "Emitter": {
+        *("traverse", "parameters_changed", "bbox", "to_string", "eval", "sample_position", "pdf_position"),
+        *("sample_ray", "sample_direction", "pdf_direction", "eval_direction", "sample_wavelengths"),
+    },
+}
+
+
+def test_lens_and_surface_are_shells_whose_members_nobody_uses_below():
+    """What integral, inverse and emission need of a plugin is its `Camera` or `EmittingSurface`, taken in one place."""
+    members = members_of_plugins()
+    assert members == {"camera", "prepare_model", "surface"}
+    for name in (name for name in NAMES if room_of(name) in WITHOUT_PLUGINS):
+        for node in ast.walk(TREES[name]):
+            if isinstance(node, ast.Attribute) and node.attr in members:
+                holder = ast.unparse(node.value).rpartition(".")[2]
+                plugin = holder in ("sensor", "lens", "emitter") or holder.endswith("()")
+                assert not plugin or node.attr in ASKS_PLUGINS.get(name, ()), f"{name}, line {node.lineno}"
 
 
 def test_no_star_imports():

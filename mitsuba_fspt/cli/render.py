@@ -144,6 +144,7 @@ def _rendered(
     images: list[Image] = []
     deadline = Deadline(max_time)
     with _kept(shots, images), progress_bar(quiet) as progress:
+        from ..camera.of_sensor import camera_of
         from ..images.radiometry import wavelength_by
         from ..rendering.render import render, sensor_of
         from ..rendering.scene import load
@@ -154,7 +155,7 @@ def _rendered(
             scene = load(shot.given.scene, **shot.given.parameters)
             lens: Any = sensor_of(scene, settings["sensor"])
             if output.unit != "W" and is_lens(lens):  # before the work
-                wavelength_by(lens.numbers(), output.wavelength_nm)
+                wavelength_by(camera_of(lens).numbers(), output.wavelength_nm)
             if deadline.is_set:
                 settings["max_time"] = max(deadline.left / (len(shots) - number), LEAST_TIME)
             image = render(scene, progress=progress, **settings)

@@ -7,7 +7,6 @@ import mitsuba as mi
 
 from ..jit.mesh_buffers import set_triangles, triangles
 from ..jit.robust_tracing import traced_robustly
-from ..runtime.plugin_types import is_surface
 
 REACH = 1e-4  # of the largest coordinate: the ray runs from this distance before the surface to as much behind it
 APART = (
@@ -25,7 +24,7 @@ class Probe:
     def __init__(self, mesh: mi.Shape, beside: mi.Scene | None = None) -> None:
         if beside is None and mi.variant().startswith("cuda"):
             mi.Log(mi.LogLevel.Warn, APART)
-        # A copy: the emitter of the mesh holds the probe, so that a reference to the mesh itself would be a cycle.
+        # A copy: the surface of the mesh holds the probe, so that a reference to the mesh itself would be a cycle.
         self.scene = traced_robustly([_bare_copy(mesh)], beside)
 
     def at(self, mesh: mi.Shape, ps: mi.PositionSample3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
@@ -39,15 +38,6 @@ class Probe:
         si = mesh.compute_surface_interaction(ray, pi, active=hit)
         si.t = dr.select(hit, si.t, dr.inf)
         return si
-
-
-def probe_beside(scene: mi.Scene) -> None:
-    """Set up the probes of a scene's meshes for kernels that trace rays in the scene; needed on CUDA only."""
-    if not mi.variant().startswith("cuda"):
-        return
-    for emitter in scene.emitters():
-        if is_surface(emitter):
-            emitter.trace_beside(scene)
 
 
 def _bare_copy(mesh: mi.Shape) -> mi.Mesh:

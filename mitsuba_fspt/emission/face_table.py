@@ -15,8 +15,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.mesh_buffers import buffers, face_count
-from ..runtime.plugin_types import is_surface
 from .elements import elements_of
+from .of_emitter import edition_of, surface_of
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class FaceTable:
     first : index in the table of the first face of each shape, by the shape's number
     table : eight numbers per face: the least radiance at its corners, the excess over it at each corner [W/mm²/sr],
         the normal, 0
-    sources : buffers of the meshes. `edition_of` compares their Dr.Jit indices; while they are kept, no other buffer
+    sources : buffers of the meshes. `editions_of` compares their Dr.Jit indices; while they are kept, no other buffer
         can get the same index
     """
 
@@ -65,7 +65,7 @@ class FaceTable:
         return dr.select(met & (towards < 0), radiance, 0)
 
 
-def edition_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
+def editions_of(shapes: Sequence[mi.Shape]) -> list[tuple[Any, ...]] | None:
     """Key of the data that `FaceTable.of` depends on, for a checked scene; None unless every emitter is a mesh."""
     if not all(shape.is_mesh() or shape.emitter() is None for shape in shapes):
         return None
@@ -76,14 +76,7 @@ def _edition(mesh: mi.Shape) -> tuple[Any, ...]:
     """Key of one mesh: shape, indices of its buffers, emitter and edition of J_n. For other shapes: the shape alone."""
     if not mesh.is_mesh():
         return (shape_number(mesh),)
-    emitter = mesh.emitter()
-    indices = (buffer.index for buffer in buffers(mesh))
-    return shape_number(mesh), *indices, mark_of(emitter), getattr(emitter, "edition", 0)
-
-
-def mark_of(emitter: mi.Emitter | None) -> object:
-    """Key that identifies an emitter and is stored in place of it."""
-    return getattr(emitter, "mark", None) or dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]
+    return shape_number(mesh), *(buffer.index for buffer in buffers(mesh)), *edition_of(mesh.emitter())
 
 
 def _number(shape: mi.ShapePtr) -> mi.UInt32:
@@ -101,7 +94,8 @@ def _radiance_at_corners(mesh: mi.Shape) -> tuple[mi.Float, ...] | None:
     emitter = mesh.emitter()
     if emitter is None:
         return (dr.zeros(mi.Float, face_count(mesh)),) * 3
-    return emitter.radiance_at_corners() if is_surface(emitter) else None
+    surface = surface_of(emitter)
+    return surface.radiance_at_corners() if surface else None
 
 
 def _table(mesh: mi.Shape, radiance: tuple[mi.Float, ...]) -> mi.Float:

@@ -15,41 +15,39 @@ import mitsuba as mi
 
 from ..runtime.errors import SceneError
 from ..runtime.plugin_types import is_surface
+from .emitting_surface import EmittingSurface
 from .exitance import attribute_name
+from .of_emitter import surfaces_of
 
 
-def emitters_with_gradients(scene: mi.Scene, sensor: mi.Sensor) -> list[mi.Emitter]:
-    """Emitters of a scene whose J_n depends on numbers with gradients. Must be called while gradients are enabled.
+def surfaces_with_gradients(scene: mi.Scene, sensor: mi.Sensor) -> list[EmittingSurface]:
+    """Emitting surfaces of a scene whose J_n depends on numbers with gradients. To be called while gradients are on.
 
     Raises
     ------
     SceneError : a parameter with gradients is not one of the numbers behind `exitance`.
     """
     found, parameters = [], mi.traverse(scene)
-    for emitter in scene.emitters():
-        if is_surface(emitter) and any(dr.grad_enabled(value) for value in _behind_exitance(emitter)):
-            found.append(emitter)
+    for surface in surfaces_of(scene):
+        if any(dr.grad_enabled(value) for value in _behind_exitance(surface)):
+            found.append(surface)
     _refuse_others(scene, parameters)
     _refuse_others(scene, mi.traverse(sensor))
     return found
 
 
-def _behind_exitance(emitter: mi.Emitter) -> Iterator[Any]:
+def _behind_exitance(surface: EmittingSurface) -> Iterator[Any]:
     """Values of the numbers behind `exitance` that may have gradients."""
-    parameters = mi.traverse(emitter.exitance)
+    parameters = mi.traverse(surface.exitance)
     yield from (parameters[key] for key in parameters.keys() if _differentiable(parameters, key))
-    name, on_shape = attribute_name(emitter.exitance), mi.traverse(emitter.get_shape())
+    name, on_shape = attribute_name(surface.exitance), mi.traverse(surface.shape)
     if name is not None and name in on_shape:
         yield on_shape[name]
 
 
 def _refuse_others(scene: mi.Scene, parameters: mi.SceneParameters) -> None:
     """Raise SceneError for a parameter with gradients that is not behind `exitance`."""
-    attributes = {
-        (emitter.get_shape().id(), attribute_name(emitter.exitance))
-        for emitter in scene.emitters()
-        if is_surface(emitter)
-    }
+    attributes = {(surface.shape.id(), attribute_name(surface.exitance)) for surface in surfaces_of(scene)}
     for key in parameters.keys():
         if not dr.grad_enabled(parameters[key]):
             continue

@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
 from ..emission.elements import of_part
 from ..jit.batches import batch_slices, numbered
 from . import pupil_cells
@@ -75,7 +76,7 @@ def column_windows(faces: FaceLight, count: int, on: str, shape: tuple[int, int]
 
 def columns_of(
     scene: mi.Scene,
-    lens: mi.Sensor,
+    camera: Camera,
     faces: FaceLight,
     windows: Windows,
     on: str,
@@ -83,8 +84,7 @@ def columns_of(
     progress: Callable[[float], None] | None = None,
 ) -> Columns:
     """Columns of one mesh, accumulated on some windows at a time; `progress` is called with the share done."""
-    film = lens.film()
-    shape = (int(film.crop_size()[1]), int(film.crop_size()[0]))
+    shape = camera.film.shape
     plan = faces.plan(rule, on)
     parts = []
     groups = list(_groups(windows))
@@ -94,8 +94,8 @@ def columns_of(
         some = windows.of(group)
         inside = group if on == "face" else group[faces.corners].any(axis=1)
         index = np.flatnonzero(faces.bright & inside)
-        fine, coarse = (_laid(scene, lens, faces, index, p, some, on, shape) for p in (plan, plan.halved()))
-        parts.append(_kept(some, fine, coarse, rule, lens, shape))
+        fine, coarse = (_laid(scene, camera, faces, index, p, some, on, shape) for p in (plan, plan.halved()))
+        parts.append(_kept(some, fine, coarse, rule, camera, shape))
     exact = ~faces.mixed
     if on == "vertex":
         exact = np.ones(len(windows.left), bool)
@@ -120,7 +120,7 @@ def _groups(windows: Windows) -> Iterator[Mask]:
 
 
 def _kept(
-    windows: Windows, fine: Array, coarse: Array, rule: ColumnRule, lens: mi.Sensor, shape: tuple[int, int]
+    windows: Windows, fine: Array, coarse: Array, rule: ColumnRule, camera: Camera, shape: tuple[int, int]
 ) -> tuple[NDArray[Any], ...]:
     """Column, pixel, light and relative change of the entries that count."""
     column = windows.columns()
@@ -133,19 +133,19 @@ def _kept(
     some = some[fine[some] > rule.drop * brightest[column[some]]]
     column, fine, coarse = column[some].astype(np.int32), fine[some], coarse[some]
     y, x = windows.rows_of_film()[some], windows.columns_of_film()[some]
-    offset = lens.film().crop_offset()
+    offset = camera.film.crop_offset
     left, top = mi.Float(x + float(offset[0])), mi.Float(y + float(offset[1]))
     even = np.zeros(len(some))
     for a in GAUSS if some.size else ():
         for b in GAUSS:
-            even += falloff(lens, mi.Point2f(left + a, top + b)).numpy() / len(GAUSS) ** 2
+            even += falloff(camera, mi.Point2f(left + a, top + b)).numpy() / len(GAUSS) ** 2
     change = np.clip(LEFT * (fine - coarse) / fine, -MOST_CHANGE, MOST_CHANGE)
     return column, (y * shape[1] + x).astype(np.int32), (even * fine).astype(np.float32), change.astype(np.float16)
 
 
 def _laid(
     scene: mi.Scene,
-    lens: mi.Sensor,
+    camera: Camera,
     faces: FaceLight,
     index: Index,
     plan: Plan,
@@ -165,7 +165,7 @@ def _laid(
             face, m, cut, at, mask = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in part)
             # Array entries beyond the last line gather 0, and whole numbers divided by 0 end the process.
             lines = _Lines(face, dr.maximum(m, 1), dr.maximum(cut, 1), at > 0, mi.UInt32(number.astype(np.uint32)))
-            planes, ring, count, active = lines.image(scene, lens, faces, on)
+            planes, ring, count, active = lines.image(scene, camera, faces, on)
             columns = [face] if on == "face" else [dr.gather(mi.UInt32, corners, 3 * face + k) for k in range(3)]
             columns = [dr.select(mask & (1 << k) != 0, column, canvas.none) for k, column in enumerate(columns)]
             canvas.lay(columns, planes, ring, count, active)
@@ -184,7 +184,7 @@ class _Lines:
     number: mi.UInt32
 
     def image(
-        self, scene: mi.Scene, lens: mi.Sensor, faces: FaceLight, on: str
+        self, scene: mi.Scene, camera: Camera, faces: FaceLight, on: str
     ) -> tuple[list[Plane], list[mi.Point2d], mi.UInt32, mi.Bool]:
         """Density of the light of each column, the polygon on the crop window that it fills with the number of
         its edges, and where there is any."""
@@ -192,50 +192,50 @@ class _Lines:
         part, i, j = self.number // (m * m), self.number % m, self.number // m % m
         node = pupil_cells.middle(i, j, m)
         middle, area = elements.place(face, mi.Point2f(*elements.middle), self.cut, part)
-        _, lens_point, arrival, _ = lens.arrival(middle.p, node)
+        _, lens_point, arrival, _ = camera.arrival(middle.p, node)
         cos_s = dr.dot(middle.n, dr.normalize(lens_point - middle.p))
         active = (cos_s > 0) & (arrival > 0)
         if faces.shadows:
             within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
             spot, _ = elements.place(face, within, self.cut, part)
-            _, to, _, _ = lens.arrival(spot.p, aim)
+            _, to, _, _ = camera.arrival(spot.p, aim)
             active &= ~hidden(scene, spot.p, to, active)
-        origin = mi.Vector2f(*(dr.opaque(mi.Float, int(n)) for n in lens.film().crop_offset()))
+        origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in camera.film.crop_offset))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)
         for at in CORNERS:
             corner, _ = elements.place(face, mi.Point2f(*at), self.cut, part)
-            position, to, _, cos_theta = lens.arrival(corner.p, node)
-            profile = faces.emitter.law.profile(middle, dr.normalize(to - corner.p), active)
+            position, to, _, cos_theta = camera.arrival(corner.p, node)
+            profile = faces.surface.law.profile(middle, dr.normalize(to - corner.p), active)
             cos4 = mi.Float64(etendue_from_pixel(cos_theta, True))
             images.append(mi.Point2d(position - origin))
             values.append(eq9(mi.Float64(profile), cos4))
             mean += cos4 / 3
             b = of_part(part, self.cut, mi.warp.square_to_uniform_triangle(mi.Point2f(*at)))
             shares.append([mi.Float64(1 - b.x - b.y), mi.Float64(b.x), mi.Float64(b.y)])
-            depths.append(mi.Float64(lens.blur_disc(corner.p)[2]))
+            depths.append(mi.Float64(camera.blur_disc(corner.p)[2]))
             active &= dr.isfinite(position.x) & dr.isfinite(position.y)
-        centre, radius, side = lens.blur_disc(middle.p)
+        centre, radius, side = camera.blur_disc(middle.p)
         active &= side > 0
         cell = [pupil_cells.corner(i + x, j + y, m) for x, y in AROUND]
         tile = [mi.Point2d(centre - origin + radius * c) for c in cell]
         own = dr.select(self.points, pupil_cells.area(cell), dr.pi / mi.Float(m * m))
-        virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
+        virtual_pixel = dr.opaque(mi.Float, camera.virtual_pitch**2)
         etendue = mi.Float64(etendue_from_surface(cos_s, area, arrival, own, virtual_pixel))
         ring, count, light_area, flat = _polygon(images, tile, self.points)
         turn = _cross(images[1] - images[0], images[2] - images[0])
         large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
         # The falloff over the film, which is not linear over a large piece, is put back pixel by pixel.
-        even = [falloff(lens, mi.Point2f(image) + origin) for image in images]
+        even = [falloff(camera, mi.Point2f(image) + origin) for image in images]
         values = [etendue / (light_area * mean * f) * value for f, value in zip(even, values, strict=True)]
         weights = [values] if on == "face" else _weights(values, shares, depths)
         return [_plane(images, w, turn, self.points | flat) for w in weights], ring, count, active
 
 
-def falloff(lens: mi.Sensor, position: mi.Point2f) -> mi.Float64:
+def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:
     """cos⁴θ of the line of sight from the middle of the pupil to a film position [pixels]."""
-    x = mi.Point2d(lens.virtual_point(position)) * (1 - lens.optics.discs[0].shift)
-    squared = dr.square(dr.opaque(mi.Float64, lens.optics.focus_distance))
+    x = mi.Point2d(camera.film_map.to_plane(position)) * (1 - camera.lens.discs[0].shift)
+    squared = dr.square(dr.opaque(mi.Float64, camera.lens.focus_distance))
     return dr.square(squared / (squared + dr.squared_norm(x)))
 
 

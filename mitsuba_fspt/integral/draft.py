@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from ..camera.camera import Camera
+from ..camera.window import Window
 from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
 from ..runtime.plugin_types import is_surface
 from . import node_rules
@@ -15,7 +17,6 @@ from .eq9 import View, most_radiance
 from .progress import SILENT, Progress
 from .quadrature import Quadrature
 from .solution import Solution
-from .window import Window
 
 if TYPE_CHECKING:
     from ..jit.pixel_grid import Mask, PixelArray
@@ -57,7 +58,7 @@ class Draft:
         progress: Progress = SILENT,
         grid: Grid | None = None,
     ) -> None:
-        self.view, self.lens, self.window, self.quadrature = view, view.lens, window, quadrature
+        self.view, self.camera, self.window, self.quadrature = view, view.camera, window, quadrature
         self.estimator = quadrature.estimator
         self.least_peak, self.progress = least_peak, progress
         self.area = quadrature.pixel == "area"
@@ -69,8 +70,8 @@ class Draft:
         self.roughness, self.lost = (grid.full(mi.Float64, 0) for _ in range(2))
         self.shown = grid.flat(window.shown()) if window.count < math.prod(window.shape) else mi.Bool(True)
         self.clipped, self.outside = (grid.full(mi.Bool, False) for _ in range(2))
-        if math.isfinite(view.lens.optics.seen_field):
-            inside, cut = window.field_stop(view.lens)
+        if math.isfinite(view.camera.lens.seen_field):
+            inside, cut = window.field_stop(view.camera)
             self.clipped, self.outside = grid.flat(cut & self.area), grid.flat(~(inside | cut))
         self.outline, self.most_blur = grid.full(mi.Bool, False), 0.0
         self.computed = grid.full(mi.Bool, True)
@@ -78,7 +79,7 @@ class Draft:
         if given is not None:
             self.computed = grid.flat(~window.cut(given.where))
             self.given, self.given_error = (
-                grid.flat(window.cut(image) / view.lens.etendue) for image in (given.power, given.error)
+                grid.flat(window.cut(image) / view.camera.etendue) for image in (given.power, given.error)
             )
         self._peak: tuple[PixelArray, PixelArray] | None = None  # of the value before it
         self.nodes = self.rays = 0
@@ -122,9 +123,9 @@ class Draft:
             most = dr.opaque(mi.Float64, most_radiance(self.view.scene))
             error = dr.minimum(error, dr.maximum(self.value, most - self.value))
         coverage = dr.select(self.coverage > 1 - FULL, 1, dr.maximum(self.coverage, 0))
-        etendue = dr.opaque(mi.Float64, self.lens.etendue)
+        etendue = dr.opaque(mi.Float64, self.camera.etendue)
         power, error = etendue * self.value, etendue * dr.select(self.outside, 0, error)
-        images = (power, error, coverage * open_share(self.lens, self.window, self.grid))
+        images = (power, error, coverage * open_share(self.camera, self.window, self.grid))
         dr.eval(images)
         return images
 
@@ -151,7 +152,7 @@ class Draft:
         detector plane.
         """
         seen = dr.isfinite(self.nearest)
-        front, back = (self.lens.blur_radius(depth) for depth in (front, farthest))
+        front, back = (self.camera.blur_radius(depth) for depth in (front, farthest))
         through = (front > 0) & (back < 0)  # the virtual detector plane lies between
         front, back = dr.abs(front), dr.abs(back)
         self.least_blur = dr.select(seen, dr.select(through, 0, dr.minimum(front, back)), dr.inf)
@@ -219,6 +220,6 @@ class Draft:
         return self.grid.spread_max(whole, reach)
 
 
-def open_share(lens: mi.Sensor, window: Window, grid: Grid) -> PixelArray:
+def open_share(camera: Camera, window: Window, grid: Grid) -> PixelArray:
     """Share of the pupil that a second border of the lens leaves open to the centre of each pixel."""
-    return mi.Float64(lens.open_pupil(window.centres(grid.place(grid.number)), mi.Point2f(0))[1])
+    return mi.Float64(camera.open_pupil(window.centres(grid.place(grid.number)), mi.Point2f(0))[1])

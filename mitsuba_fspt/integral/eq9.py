@@ -20,7 +20,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..camera.camera import Camera
 from ..emission.face_table import FaceTable, shape_number
+from ..emission.of_emitter import surfaces_of
 from ..jit.mesh_buffers import box_of, face_count
 from ..jit.spectra import at_one_wavelength, scalar
 from ..runtime.plugin_types import is_surface
@@ -28,23 +30,15 @@ from .shortcuts import Finding
 from .specular import Specular, follow
 
 if TYPE_CHECKING:
-    from .window import Window
+    from ..camera.window import Window
 
 
 def eq9(radiance: Any, etendue: Any) -> Any:
     """Power [W] that lines of sight with this radiance [W/mm²/sr] and étendue [mm² sr] carry: L · dG (Eq. 9).
 
-    With an étendue relative to the pixel's own, `pixel_etendue`, the mean radiance on film [W/mm²/sr].
+    With an étendue relative to the pixel's own, `Camera.etendue`, the mean radiance on film [W/mm²/sr].
     """
     return etendue * radiance
-
-
-def pixel_etendue(side: float, pupil_radius: float, focus_distance: float) -> float:
-    """Étendue A_vd A_pupil/u² [mm² sr] of a virtual pixel of a `side` and a pupil at `focus_distance` u [mm] (Eq. M.6).
-
-    In double precision: far away and stopped down its factors leave the range of float32.
-    """
-    return side**2 * math.pi * (pupil_radius / focus_distance) ** 2
 
 
 def etendue_from_pixel(cos_theta: mi.Float, passes: mi.Bool, open_share: mi.Float | float = 1.0) -> mi.Float:
@@ -64,7 +58,7 @@ def etendue_from_surface(
 
     cos_s : cosine of the line to the normal of the surface element
     area : of the element, dS [mm²]
-    arrival : solid angle of the pupil over A_pupil/u² (`FsptLens.arrival`)
+    arrival : solid angle of the pupil over A_pupil/u² (`Camera.arrival`)
     cell : area of the part of the unit disc, all of which is the pupil, that the line stands for
     virtual_pixel : area A_vd of a virtual pixel [mm²]
     """
@@ -105,7 +99,7 @@ class View:
     """
 
     scene: mi.Scene
-    lens: mi.Sensor
+    camera: Camera
     start: mi.Float
     faces: FaceTable | None
     detail: float
@@ -116,7 +110,7 @@ class View:
     def of(
         cls,
         scene: mi.Scene,
-        lens: mi.Sensor,
+        camera: Camera,
         window: Window,
         faces: FaceTable | None = None,
         specular: Specular | None = None,
@@ -126,8 +120,8 @@ class View:
         # In packets Embree misses some points of a disk.
         meshes = all(shape.is_mesh() for shape in shapes)
         triangles = sum(map(face_count, shapes)) if meshes else math.inf
-        start = dr.opaque(mi.Float, lens.clear_depth(box_of(shapes)))
-        return cls(scene, lens, start, faces, triangles / math.prod(window.shape), _emitting(shapes), specular)
+        start = dr.opaque(mi.Float, camera.clear_depth(box_of(shapes)))
+        return cls(scene, camera, start, faces, triangles / math.prod(window.shape), _emitting(shapes), specular)
 
     def integrand(self, position: mi.Point2f, pupil: mi.Point2f, together: bool = False) -> Sight:
         """Integrand of Eq. 9 in the pupil form on one line of sight, and what the line met.
@@ -136,8 +130,8 @@ class View:
         pupil : on the unit disc; stands for as large a share of what is open of the pupil
         together : trace the lines of neighbouring array entries as one packet
         """
-        pupil, open_share = self.lens.open_pupil(position, pupil)
-        ray, cos_theta, passes = self.lens.line_of_sight(position, pupil, self.start)
+        pupil, open_share = self.camera.open_pupil(position, pupil)
+        ray, cos_theta, passes = self.camera.line_of_sight(position, pupil, self.start)
         at_one_wavelength(ray)
         etendue = etendue_from_pixel(cos_theta, passes, open_share)
         if self.specular:
@@ -188,8 +182,7 @@ def most_radiance(scene: mi.Scene) -> float:
 
     J_n/π under Lambert's law; no law sends more than J_n per steradian.
     """
-    own = [emitter for emitter in scene.emitters() if is_surface(emitter)]
-    return max((e.brightest / (math.pi if e.is_isotropic() else 1) for e in own), default=0.0)
+    return max((s.brightest / (math.pi if s.is_isotropic() else 1) for s in surfaces_of(scene)), default=0.0)
 
 
 def _emitting(shapes: list[mi.Shape]) -> mi.Float | None:

@@ -22,9 +22,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..emission.exitance import attribute_name, function_on, is_uniform, texels_of, values_on
+from ..camera.camera import Camera
+from ..emission.emitting_surface import EmittingSurface
+from ..emission.exitance import attribute_name, function_on, texels_of, values_on
+from ..emission.of_emitter import surface_of, surfaces_of
 from ..jit.mesh_buffers import triangles
-from ..runtime.plugin_types import is_surface
 from .eq9 import View, eq9, etendue_from_pixel
 from .lattices import VECTOR
 from .quadrature import Quadrature
@@ -74,17 +76,17 @@ class Rows:
 
     @classmethod
     def on_meshes(
-        cls, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, picture: Solution, kinds: Kinds
+        cls, scene: mi.Scene, camera: Camera, quadrature: Quadrature, picture: Solution, kinds: Kinds
     ) -> Rows:
         """Rows of the transport matrix for columns of these `kinds_of`, from the `picture` of J_n = 1, as it must be.
 
         Raises TransportError where the memory does not suffice.
         """
-        emitters = scene.emitters()
-        counts = [columns_on(emitter.get_shape(), kind) for emitter, kind in zip(emitters, kinds, strict=True)]
+        surfaces = surfaces_of(scene)
+        counts = [columns_on(surface.shape, kind) for surface, kind in zip(surfaces, kinds, strict=True)]
         ends = itertools.pairwise(itertools.accumulate(counts, initial=0))
-        columns = {emitter.mark: slice(*pair) for emitter, pair in zip(emitters, ends, strict=True)}
-        found = sparse_rows(scene, lens, lambda: picture, kinds, quadrature, name="fspt_integral")
+        columns = {surface.mark: slice(*pair) for surface, pair in zip(surfaces, ends, strict=True)}
+        found = sparse_rows(scene, camera, lambda: picture, kinds, quadrature, name="fspt_integral")
         return cls(picture.power.shape, matrix=found, columns=columns)
 
     @classmethod
@@ -95,7 +97,7 @@ class Rows:
 
         sizes : number of values behind J_n, see `sizes_of`
         """
-        power, uncertain = (plane.ravel() / view.lens.etendue for plane in (picture.power, picture.error))
+        power, uncertain = (plane.ravel() / view.camera.etendue for plane in (picture.power, picture.error))
         tolerance = quadrature.rtol * power.max(initial=0.0)
         pixels = np.flatnonzero(window.ravel() & ((power > 0) | (uncertain > tolerance)))
         lines, groups = _lines_for(quadrature, sizes, len(pixels)), []
@@ -118,43 +120,45 @@ class Rows:
             pixels, lines = pixels[rough], finer
         return cls(picture.power.shape, tuple(group for group in groups if len(group.pixels)))
 
-    def forward(self, view: View, quadrature: Quadrature, emitters: Sequence[mi.Emitter]) -> Array:
-        """Tangent (h, w) [W] of the picture, of that of the numbers behind J_n of these emitters."""
+    def forward(self, view: View, quadrature: Quadrature, surfaces: Sequence[EmittingSurface]) -> Array:
+        """Tangent (h, w) [W] of the picture, of that of the numbers behind J_n of these surfaces."""
         if self.matrix is not None:
             change = np.zeros(self.matrix.count)
             with dr.resume_grad():
-                for emitter in emitters:
-                    values = values_on(emitter.get_shape(), emitter.exitance)
+                for surface in surfaces:
+                    values = values_on(surface.shape, surface.exitance)
                     dr.forward_to(values, flags=dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
-                    change[self.columns[emitter.mark]] = dr.grad(values).numpy()
+                    change[self.columns[surface.mark]] = dr.grad(values).numpy()
             return (self.matrix.matrix @ change).reshape(self.shape)
         tangent = np.zeros(math.prod(self.shape))
         for part in self._parts(view, quadrature):
             with dr.resume_grad():
-                radiance = part.radiance(emitters)
+                radiance = part.radiance(surfaces)
                 if not dr.grad_enabled(radiance):
                     continue
                 dr.forward_to(radiance, flags=dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges)
                 change = dr.grad(radiance)
             light = eq9(mi.Float64(change), mi.Float64(part.etendue))
             tangent[part.pixels] = (dr.block_sum(light, part.lines)).numpy() * part.factors
-        return tangent.reshape(self.shape) * view.lens.etendue
+        return tangent.reshape(self.shape) * view.camera.etendue
 
-    def backward(self, view: View, quadrature: Quadrature, emitters: Sequence[mi.Emitter], gradient: Array) -> None:
+    def backward(
+        self, view: View, quadrature: Quadrature, surfaces: Sequence[EmittingSurface], gradient: Array
+    ) -> None:
         """Add the transpose of `forward` of a `gradient` (h, w) [1/W] to the gradients of the numbers behind J_n."""
         if self.matrix is not None:
             weights = self.matrix.matrix.T @ gradient.ravel()
             with dr.resume_grad():
-                for emitter in emitters:
-                    values = values_on(emitter.get_shape(), emitter.exitance)
-                    dr.backward_from(values * mi.Float(weights[self.columns[emitter.mark]].astype(np.float32)))
+                for surface in surfaces:
+                    values = values_on(surface.shape, surface.exitance)
+                    dr.backward_from(values * mi.Float(weights[self.columns[surface.mark]].astype(np.float32)))
             dr.eval()
             return
         for part in self._parts(view, quadrature):
-            of_row = mi.Float(gradient.ravel()[part.pixels] * part.factors * view.lens.etendue)
+            of_row = mi.Float(gradient.ravel()[part.pixels] * part.factors * view.camera.etendue)
             weight = eq9(dr.gather(mi.Float, of_row, part.row), part.etendue)
             with dr.resume_grad():
-                radiance = part.radiance(emitters)
+                radiance = part.radiance(surfaces)
                 if dr.grad_enabled(radiance):
                     dr.backward_from(radiance * weight)
             dr.eval()
@@ -164,31 +168,32 @@ class Rows:
             yield from _parts(view, quadrature, group)
 
 
-def kinds_of(scene: mi.Scene, asked: Sequence[mi.Emitter], quadrature: Quadrature) -> Kinds | None:
+def kinds_of(scene: mi.Scene, asked: Sequence[EmittingSurface], quadrature: Quadrature) -> Kinds | None:
     """Of each emitter of a scene 'vertex' or 'face', the columns on which its J_n is linear; None where rows of the
     transport matrix do not give the derivative by the numbers behind J_n of the emitters that are `asked` for."""
-    marks, kinds = {emitter.mark for emitter in asked}, []
+    marks, kinds = {surface.mark for surface in asked}, []
     for emitter in scene.emitters():
-        if not (is_surface(emitter) and emitter.law.linear and emitter.get_shape().is_mesh()):
+        surface = surface_of(emitter)
+        if not (surface and surface.law.linear and surface.shape.is_mesh()):
             return None
-        name = attribute_name(emitter.exitance)
-        if name is None and emitter.mark in marks and not is_uniform(emitter.exitance):
+        name = attribute_name(surface.exitance)
+        if name is None and surface.mark in marks and not surface.is_uniform():
             return None
         kinds.append("face" if (name or "").startswith("face") else "vertex")
     return tuple(kinds) if quadrature.pixel == "area" else None
 
 
-def sizes_of(emitters: Sequence[mi.Emitter]) -> Sizes:
-    """Number of values behind J_n of these emitters, between which J_n is continuous and between which it steps."""
+def sizes_of(surfaces: Sequence[EmittingSurface]) -> Sizes:
+    """Number of values behind J_n of these surfaces, between which J_n is continuous and between which it steps."""
     smooth = stepped = 0
-    for emitter in emitters:
-        name, texture = attribute_name(emitter.exitance), emitter.exitance
+    for surface in surfaces:
+        name, texture = attribute_name(surface.exitance), surface.exitance
         if name is None:
             smooth += texels_of(texture)
         elif name.startswith("face"):
-            stepped += dr.width(triangles(emitter.get_shape())[1]) // 3
+            stepped += dr.width(triangles(surface.shape)[1]) // 3
         else:
-            smooth += dr.width(triangles(emitter.get_shape())[0]) // 3
+            smooth += dr.width(triangles(surface.shape)[0]) // 3
     return smooth, stepped
 
 
@@ -218,16 +223,16 @@ class _Part:
     si: mi.SurfaceInteraction3f
     towards: mi.Vector3f
 
-    def radiance(self, emitters: Sequence[mi.Emitter]) -> mi.Float:
-        """Radiance [W/mm²/sr] of these emitters along each line, attached to the numbers behind their J_n."""
+    def radiance(self, surfaces: Sequence[EmittingSurface]) -> mi.Float:
+        """Radiance [W/mm²/sr] of these surfaces along each line, attached to the numbers behind their J_n."""
         total = mi.Float(0)
-        for emitter in emitters:
-            shape = emitter.get_shape()
-            value = function_on(shape, emitter.exitance)
+        for surface in surfaces:
+            shape = surface.shape
+            value = function_on(shape, surface.exitance)
             with dr.suspend_grad():
                 outward = self.si.is_valid() & (dr.dot(self.si.n, self.towards) > 0)
                 met = outward & (self.si.shape == mi.ShapePtr(shape))
-                profile = emitter.law.profile(self.si, self.towards, met)
+                profile = surface.law.profile(self.si, self.towards, met)
                 # On a sliver, where interpolation in single precision fails, J_n is NaN.
                 met &= dr.isfinite(profile * value(self.si, met))
                 profile = dr.select(met, profile, 0)
@@ -241,8 +246,8 @@ def _parts(view: View, quadrature: Quadrature, group: RowGroup) -> Iterator[_Par
     for first in range(0, len(group.pixels), size):
         chosen = slice(first, first + size)
         position, pupil, row = _places(view, quadrature, group.pixels[chosen], group.lines)
-        pupil, open_share = view.lens.open_pupil(position, pupil)
-        ray, cos_theta, passes = view.lens.line_of_sight(position, pupil, view.start)
+        pupil, open_share = view.camera.open_pupil(position, pupil)
+        ray, cos_theta, passes = view.camera.line_of_sight(position, pupil, view.start)
         etendue = etendue_from_pixel(cos_theta, passes, open_share) * dr.opaque(mi.Float, 1 / group.lines)
         si = view.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=passes)
         yield _Part(group.pixels[chosen], group.factors[chosen], group.lines, row, etendue, si, -ray.d)
@@ -266,9 +271,9 @@ def _places(
 
     A rank-1 lattice, the same in every pixel: on the film it continues from pixel to pixel.
     """
-    film = view.lens.film()
-    width = dr.opaque(mi.UInt32, int(film.crop_size()[0]))
-    left, top = (dr.opaque(mi.Float, float(n)) for n in film.crop_offset())
+    film = view.camera.film
+    width = dr.opaque(mi.UInt32, film.crop_size[0])
+    left, top = (dr.opaque(mi.Float, float(n)) for n in film.crop_offset)
     lane, each = dr.arange(mi.UInt32, len(pixels) * lines), dr.opaque(mi.UInt32, lines)
     row = lane // each
     k = lane - row * each

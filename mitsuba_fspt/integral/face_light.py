@@ -15,7 +15,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
 from ..emission.elements import Elements, elements_of
+from ..emission.emitting_surface import EmittingSurface
 from ..jit.batches import BATCH
 from ..jit.mesh_buffers import triangles
 from . import pupil_cells
@@ -149,7 +151,7 @@ class FaceLight:
     longest edge. distance: in focus [virtual pixels].
     """
 
-    emitter: mi.Emitter
+    surface: EmittingSurface
     elements: Elements
     corners: Index
     low: Array
@@ -167,13 +169,15 @@ class FaceLight:
     shadows: bool
 
     @classmethod
-    def seen(cls, emitter: mi.Emitter, lens: mi.Sensor, origin: tuple[int, int], shape: tuple[int, int]) -> FaceLight:
+    def seen(
+        cls, surface: EmittingSurface, camera: Camera, origin: tuple[int, int], shape: tuple[int, int]
+    ) -> FaceLight:
         """What `lens` sees of an emitting mesh on the crop window of `shape` (h, w) at `origin` (x, y)."""
-        mesh = emitter.get_shape()
+        mesh = surface.shape
         positions, faces = triangles(mesh)
         vertices = positions.numpy().reshape(-1, 3).astype(np.float64)
         corners = faces.numpy().reshape(-1, 3).astype(np.int64)
-        centre, radius = lens.film_discs(vertices)
+        centre, radius = camera.film_discs(vertices)
         centre -= origin
         reach = radius * (1 + RIM) + MARGIN
         low, high = (centre - reach)[corners].min(axis=1), (centre + reach)[corners].max(axis=1)
@@ -184,7 +188,7 @@ class FaceLight:
         turn = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
         heights = np.divide(turn, sides, out=np.zeros(len(sides)), where=(sides > 0) & np.isfinite(turn))
         elements = elements_of(mesh, minimum=1)
-        most, least, rim = _facing(elements, lens)
+        most, least, rim = _facing(elements, camera)
         size = np.array(shape[::-1])
         beside = ((high <= 0) | (low >= size)).any(axis=1)
         area = np.isfinite(most)  # a face without area has no normal
@@ -194,12 +198,12 @@ class FaceLight:
         cut = _border(corners, len(vertices))
         cut[corners[~(least >= 0) | (rim < 1)].ravel()] = True
         none = np.zeros(len(corners), bool)
-        depth = _scales(mesh, lens)[corners]
+        depth = _scales(mesh, camera)[corners]
         slant = np.ptp(depth, axis=1) / np.maximum(np.abs(depth).min(axis=1), 1e-3 * np.abs(depth).max(axis=1))
         bounded = np.isfinite(blur)
         sides, blur = np.where(bounded, sides, np.inf), np.where(bounded, blur, math.hypot(*shape))
         return cls(
-            emitter,
+            surface,
             elements,
             corners,
             low,
@@ -213,7 +217,7 @@ class FaceLight:
             none,
             lengths,
             np.zeros(len(corners)),
-            lens.optics.focus_distance / lens.virtual_pitch,
+            camera.lens.focus_distance / camera.virtual_pitch,
             shadows=False,
         )
 
@@ -222,13 +226,13 @@ class FaceLight:
         """Faces that may send light."""
         return self.low[:, 0] <= self.high[:, 0]
 
-    def behind(self, scene: mi.Scene, lens: mi.Sensor) -> FaceLight:
+    def behind(self, scene: mi.Scene, camera: Camera) -> FaceLight:
         """The same in a scene where one surface may hide another: faces that none of their lines shows are dark."""
         bright = np.flatnonzero(self.bright)
         if not bright.size:
             return self
         share = np.zeros(len(self.corners))
-        share[bright] = _open_share(scene, lens, self.elements, bright)
+        share[bright] = _open_share(scene, camera, self.elements, bright)
         count = int(self.corners.max(initial=-1)) + 1
         least, most = np.ones(count), np.zeros(count)
         for k in range(3):
@@ -243,7 +247,7 @@ class FaceLight:
         cut[self.corners[mixed | hidden_all].ravel()] = True
         crossed = np.zeros(len(self.corners))
         some = np.flatnonzero(mixed & np.isfinite(self.edges).all(axis=1) & (self.sides > 0))
-        shares = _crossed_share(scene, lens, self.elements, some)
+        shares = _crossed_share(scene, camera, self.elements, some)
         crossed[mixed] = 1
         crossed[some] = (shares * self.edges[some]).max(axis=1) / self.sides[some]
         return replace(self, low=low, high=high, cut=cut, mixed=mixed, crossed=crossed, shadows=True)
@@ -309,24 +313,24 @@ def _border(corners: Index, count: int) -> Mask:
     return found
 
 
-def _scales(mesh: mi.Shape, lens: mi.Sensor) -> Array:
+def _scales(mesh: mi.Shape, camera: Camera) -> Array:
     """Of every vertex the side of a virtual pixel at its depth [mm], which is linear in the depth."""
     positions = triangles(mesh)[0]
-    return lens.blur_disc(dr.unravel(mi.Point3f, positions))[2].numpy().astype(np.float64)
+    return camera.blur_disc(dr.unravel(mi.Point3f, positions))[2].numpy().astype(np.float64)
 
 
-def _facing(elements: Elements, lens: mi.Sensor) -> tuple[Array, Array, Array]:
+def _facing(elements: Elements, camera: Camera) -> tuple[Array, Array, Array]:
     """n·(a − r) of faces at the most and at the least [mm], and the share of the pupil's rim that is open to them.
 
     Over the corners r of a face and the points a of the pupil; NaN where a face has no normal.
     """
     index = dr.arange(mi.UInt32, elements.count)
-    axis = dr.normalize(lens.world_transform() @ mi.Vector3f(0, 0, 1))
+    axis = dr.normalize(camera.axis)
     most, least = np.full(elements.count, -np.inf), np.full(elements.count, np.inf)
     for corner in CORNERS:
         si, _ = elements.place(index, mi.Point2f(*corner))
-        _, middle, _, _ = lens.arrival(si.p, mi.Point2f(0))
-        _, rim, _, _ = lens.arrival(si.p, mi.Point2f(1, 0))
+        _, middle, _, _ = camera.arrival(si.p, mi.Point2f(0))
+        _, rim, _, _ = camera.arrival(si.p, mi.Point2f(1, 0))
         towards = dr.dot(si.n, middle - si.p)
         spread = dr.norm(rim - middle) * dr.safe_sqrt(1 - dr.square(dr.dot(si.n, axis)))
         most = np.maximum(most, (towards + spread).numpy())
@@ -335,29 +339,31 @@ def _facing(elements: Elements, lens: mi.Sensor) -> tuple[Array, Array, Array]:
     si, _ = elements.place(index, mi.Point2f(*elements.middle))
     turns = dr.two_pi * np.arange(RIM_POINTS) / RIM_POINTS
     for turn in turns:
-        _, _, weight, _ = lens.arrival(si.p, mi.Point2f(*(dr.opaque(mi.Float, f(turn)) for f in (math.cos, math.sin))))
+        _, _, weight, _ = camera.arrival(
+            si.p, mi.Point2f(*(dr.opaque(mi.Float, f(turn)) for f in (math.cos, math.sin)))
+        )
         open_rim += dr.select(weight > 0, 1 / RIM_POINTS, 0)
-    if len(lens.optics.discs) > 1:  # the middle of the pupil may be open where its rim is not
-        _, _, weight, _ = lens.arrival(si.p, mi.Point2f(0))
+    if len(camera.lens.discs) > 1:  # the middle of the pupil may be open where its rim is not
+        _, _, weight, _ = camera.arrival(si.p, mi.Point2f(0))
         open_rim = dr.select(weight > 0, dr.maximum(open_rim, 0.5 / RIM_POINTS), open_rim)
     return most, least, np.broadcast_to(open_rim.numpy(), elements.count)
 
 
-def _open_share(scene: mi.Scene, lens: mi.Sensor, elements: Elements, faces: Index, cells: int = 4) -> Array:
+def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
     """Share of the lines of sight of each of some faces that nothing blocks, of `cells`² lines."""
     index = mi.UInt32(np.repeat(faces, cells**2).astype(np.uint32))
     number = mi.UInt32(np.tile(np.arange(cells**2), len(faces)).astype(np.uint32))
     m = mi.UInt32(cells)
     within, aim = pupil_cells.strata(number % m, number // m, m, index * pupil_cells.STRIDE)
     spot, _ = elements.place(index, within)
-    _, lens_point, arrival, _ = lens.arrival(spot.p, aim)
+    _, lens_point, arrival, _ = camera.arrival(spot.p, aim)
     reaches = (arrival > 0) & (dr.dot(spot.n, lens_point - spot.p) > 0)
     blocked = reaches & hidden(scene, spot.p, lens_point, reaches)
     counted = [np.asarray(flag.numpy()).reshape(-1, cells**2).sum(axis=1) for flag in (reaches, blocked)]
     return 1 - counted[1] / np.maximum(counted[0], 1)
 
 
-def _crossed_share(scene: mi.Scene, lens: mi.Sensor, elements: Elements, faces: Index, cells: int = 4) -> Array:
+def _crossed_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
     """Share (n, 3) of the lines of sight of some faces, through `cells`² points of the pupil, for which not all of an
     edge is lit: over those for which any of the face is, for the edges from each corner to the next."""
     if not faces.size:
@@ -371,7 +377,7 @@ def _crossed_share(scene: mi.Scene, lens: mi.Sensor, elements: Elements, faces: 
     seen = []
     for k in range(6):
         point = 0.5 * (corners[k // 2] + corners[(k + 1) // 2 % 3])
-        _, lens_point, arrival, _ = lens.arrival(point, node)
+        _, lens_point, arrival, _ = camera.arrival(point, node)
         open_to = (arrival > 0) & (dr.dot(middle.n, lens_point - point) > 0)
         seen.append((open_to & ~hidden(scene, point, lens_point, open_to)).numpy().reshape(-1, cells**2))
     lit = np.stack(seen, axis=-1)

@@ -11,12 +11,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
+from ..camera.window import Window
 from ..emission.elements import Elements, elements_of
 from ..emission.exitance import function_on
+from ..emission.of_emitter import surface_of
 from ..jit.batches import BATCH, batch_slices, numbered
 from ..runtime.errors import SceneError
-from ..runtime.plugin_types import is_surface
-from .window import Window
 
 CELLS = 2.5  # cells along the pupil over ⁴√lines: errors of cells and of pieces are then about equal for any blur
 PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
@@ -105,14 +106,14 @@ class Glow:
         return np.flatnonzero((marked > 0) & (right > left) & (bottom > top))
 
     @classmethod
-    def seen(cls, emitter: mi.Emitter, lens: mi.Sensor, window: Window, rtol: float, skip_dark: bool) -> Glow:
-        """The shape of an emitter, imaged by `lens` in `window`; SceneError where the emitter has no surface."""
+    def seen(cls, emitter: mi.Emitter, camera: Camera, window: Window, rtol: float, skip_dark: bool) -> Glow:
+        """The shape of an emitter, imaged by `camera` in `window`; SceneError where the emitter has no surface."""
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
             raise SceneError(
                 f"fspt_integral: domain 'surface' needs surfaces, but emitter {emitter.class_name()} has none. Set "
                 "domain to 'pupil'."
             )
-        elements = _elements(emitter.get_shape(), lens, rtol)
+        elements = _elements(emitter.get_shape(), camera, rtol)
         count = elements.count
         low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
         least, most = np.full(count, np.inf), np.full(count, -np.inf)
@@ -121,10 +122,10 @@ class Glow:
         exitance = _exitance(emitter)
         for corner in CORNERS:
             si, _ = elements.place(dr.arange(mi.UInt32, count), mi.Point2f(*corner))
-            front = _front(si, lens)
+            front = _front(si, camera)
             level = exitance(si) / dr.pi
             dr.eval(si.p, front, level)
-            centre, radius = lens.film_discs(si.p.numpy().T.astype(np.float64))
+            centre, radius = camera.film_discs(si.p.numpy().T.astype(np.float64))
             low, high = np.minimum(low, centre - radius), np.maximum(high, centre + radius)
             least, most = np.minimum(least, front.numpy()), np.maximum(most, front.numpy())
             axes += (np.array(corner) - 0.5)[:, None, None] * centre
@@ -180,9 +181,9 @@ def cells_of(lines: int) -> int:
     return octave if ideal < 1.5 * octave else 3 * octave // 2
 
 
-def _elements(shape: mi.Shape, lens: mi.Sensor, rtol: float) -> Elements:
+def _elements(shape: mi.Shape, camera: Camera, rtol: float) -> Elements:
     """Elements of a few pixels each, so that the refinement of one pixel affects few others."""
-    pixel = float(lens.blur_disc(mi.Point3f(shape.bbox().center()))[2][0])
+    pixel = float(camera.blur_disc(mi.Point3f(shape.bbox().center()))[2][0])
     ideal = float(shape.surface_area()[0]) / (PIXELS_PER_ELEMENT * pixel**2)
     curved = shape.class_name() in ("Sphere", "Cylinder")
     fewest = FEWEST_ELEMENTS if shape.is_mesh() else max(FEWEST_ELEMENTS, (CURVED if curved else FLAT) / rtol)
@@ -191,19 +192,18 @@ def _elements(shape: mi.Shape, lens: mi.Sensor, rtol: float) -> Elements:
 
 def _dark(emitter: mi.Emitter, brightest: Plane) -> NDArray[np.bool_]:
     """True of elements whose `brightest` corner is dark and J_n, a mesh attribute, linear between the corners."""
-    linear = is_surface(emitter) and emitter.is_linear()
-    return (brightest == 0) & linear
+    surface = surface_of(emitter)
+    return (brightest == 0) & bool(surface and surface.is_linear())
 
 
 def _exitance(emitter: mi.Emitter) -> Callable[[mi.SurfaceInteraction3f], mi.Float]:
     """J_n [W/mm²] at surface points; of other emitters than `fspt_surface` 0."""
-    if not is_surface(emitter):
-        return lambda si: mi.Float(0)
-    return function_on(emitter.get_shape(), emitter.exitance)
+    surface = surface_of(emitter)
+    return function_on(surface.shape, surface.exitance) if surface else lambda si: mi.Float(0)
 
 
-def _front(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Float:
+def _front(si: mi.SurfaceInteraction3f, camera: Camera) -> mi.Float:
     """n·(a − r) at the most for any point a of the pupil [mm]: positive where the pupil can see the surface point."""
-    _, middle, _, _ = lens.arrival(si.p, mi.Point2f(0))
-    _, rim, _, _ = lens.arrival(si.p, mi.Point2f(1, 0))
+    _, middle, _, _ = camera.arrival(si.p, mi.Point2f(0))
+    _, rim, _, _ = camera.arrival(si.p, mi.Point2f(1, 0))
     return dr.dot(si.n, middle - si.p) + dr.norm(rim - middle)

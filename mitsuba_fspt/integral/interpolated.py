@@ -19,6 +19,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
+from ..camera.window import Window
 from ..jit.block_grid import BlockGrid
 from ..jit.mesh_buffers import box_of
 from ..jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
@@ -33,7 +35,6 @@ from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
 from .transects import edges_of, integrate_by_transects
-from .window import Window
 
 # Pixels along the largest blocks; fewest blocks along the shorter side of an image for which blocks save time.
 SIDES, FEWEST = (8, 4), 128
@@ -63,19 +64,19 @@ Marks = NDArray[np.bool_]
 class Blocks:
     """Blocks of `side`² pixels over a window and `MARGIN` of the largest blocks around it.
 
-    lens : the same lens before a film of such blocks
+    camera : the same camera with a film of such blocks
     window : of all blocks on that film, on which it may begin between two of its pixels
     """
 
     side: int
-    lens: mi.Sensor
+    camera: Camera
     window: Window
 
     def __str__(self) -> str:
         return f"blocks of {self.side}² pixels" if self.side > 1 else "pixels"
 
 
-def blocks_of(window: Window, lens: mi.Sensor) -> tuple[Blocks, ...]:
+def blocks_of(window: Window, camera: Camera) -> tuple[Blocks, ...]:
     """The largest blocks of which a window has `FEWEST`, then their halves down to pixels; none for a small window."""
     largest = next((side for side in SIDES if min(window.shape) >= side * FEWEST), 0)
     if not largest:
@@ -84,9 +85,9 @@ def blocks_of(window: Window, lens: mi.Sensor) -> tuple[Blocks, ...]:
     left, top = (n - MARGIN * largest for n in window.corner)
     found, side = [], largest
     while side > 1:
-        coarser, times = lens.coarser(side), largest // side
+        coarser, times = camera.coarser(side), largest // side
         # The optical axis is in the middle of both films.
-        places = zip((left, top), lens.film().size(), coarser.film().size(), strict=True)
+        places = zip((left, top), camera.film.size, coarser.film.size, strict=True)
         offset = tuple((n - own / 2) / side + its / 2 + MARGIN * times for n, own, its in places)
         inner, shape = (tuple(times * (n + more) for n in blocks) for more in (0, 2 * MARGIN))
         whole = Window(-MARGIN * times, -MARGIN * times, shape, inner, offset, window.blur / side)
@@ -94,7 +95,7 @@ def blocks_of(window: Window, lens: mi.Sensor) -> tuple[Blocks, ...]:
         side //= 2
     left, top = (n - its for n, its in zip((left, top), window.crop_offset, strict=True))
     shape = tuple(largest * (n + 2 * MARGIN) for n in blocks)
-    return (*found, Blocks(1, lens, replace(window, top=top, left=left, shape=shape)))
+    return (*found, Blocks(1, camera, replace(window, top=top, left=left, shape=shape)))
 
 
 def solve(
@@ -154,7 +155,7 @@ class _Picture:
         else:
             refine(draft, np.broadcast_to(0.0, grid.shape))
         power, error, coverage = draft.images()
-        images = (power / blocks.lens.etendue, error / blocks.lens.etendue, coverage)
+        images = (power / blocks.camera.etendue, error / blocks.camera.etendue, coverage)
         for plane, image in zip((self.value, self.error, self.coverage), images, strict=True):
             grid.lay(dr.select(draft.computed, image, grid.flat(plane)), plane)
         if self.own.all():
@@ -169,7 +170,7 @@ class _Picture:
 
     def _seen(self) -> View:
         """View of the lens before a film of such blocks."""
-        return replace(self.view, lens=self.blocks.lens, detail=self.view.detail * self.blocks.side**2)
+        return replace(self.view, camera=self.blocks.camera, detail=self.view.detail * self.blocks.side**2)
 
     def _quadrature(self) -> Quadrature:
         """Accuracy of the blocks, or of pixels."""
@@ -263,7 +264,7 @@ class _Picture:
 
     def solution(self) -> Solution:
         """The picture of pixels."""
-        etendue, window = self.view.lens.etendue, self.sizes[-1].window
+        etendue, window = self.view.camera.etendue, self.sizes[-1].window
         why = f"{', '.join(self.shares)} are computed for {self.own.size} pixels"
         findings = (Finding("smooth blocks", True, why), *self.findings)
         power, error = (etendue * window.expand(image) for image in (self.value, self.error))
@@ -297,7 +298,7 @@ def _small_bodies(view: View, window: Window) -> Marks:
     shapes = [box_of([shape]) for shape in view.scene.shapes()]
     ends = np.array([[box.min, box.max] for box in shapes], np.float64).reshape(-1, 2, 3)
     corners = np.stack([ends[:, (k >> np.arange(3)) & 1, np.arange(3)] for k in range(8)], axis=1)
-    centre, blur = view.lens.film_discs(corners)
+    centre, blur = view.camera.film_discs(corners)
     low, high = centre.min(axis=1), centre.max(axis=1)
     small = ((high - low).max(axis=1) < SMALL) | ~np.isfinite(blur).all(axis=(1, 2))
     reach = np.where(np.isfinite(blur), blur, 2.0 * max(window.shape)).max(axis=1)

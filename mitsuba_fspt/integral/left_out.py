@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
 from ..jit.plugin_objects import made
 from ..jit.recording import recording
 from ..jit.spectra import at_one_wavelength, scalar
@@ -21,7 +22,7 @@ from .eq9 import View, etendue_from_pixel
 from .occlusion import hides_nothing
 from .quadrature import Quadrature
 from .specular import Specular
-from .window import visible_window
+from .visible_window import visible_window
 
 PATHS = 1 << 14  # standard error of a share of 5 %: about 0.1 %
 BOUNCES = 2  # scattering reflections that are counted: further ones are weaker by the albedo each
@@ -58,20 +59,18 @@ class LeftOut:
         )
 
 
-def light_left_out(
-    scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature, depth: int | None = None
-) -> LeftOut | None:
+def light_left_out(scene: mi.Scene, camera: Camera, quadrature: Quadrature, depth: int | None = None) -> LeftOut | None:
     """Share of the power on the crop window that a method leaves out; None where nothing can be.
 
     depth : segments of the paths that a Monte Carlo follows; None: the integral
     """
     with recording(), dr.suspend_grad():
-        window = visible_window(scene, lens)
+        window = visible_window(scene, camera)
         if 0 in window.shape:  # no emitter is in the image, but what it shines on may be
-            window = visible_window(scene, lens, everywhere=True)
+            window = visible_window(scene, camera, everywhere=True)
         if 0 in window.shape:
             return None
-        view = View.of(scene, lens, window, None, Specular.of(scene, lens, quadrature))
+        view = View.of(scene, camera, window, None, Specular.of(scene, camera, quadrature))
         return _left_out_of(view, quadrature, depth)
 
 
@@ -105,11 +104,11 @@ def _sampled(view: View, needed: int, depth: int | None) -> tuple[NDArray[np.flo
         path = made("path", max_depth=segments, rr_depth=needed)
         sampler = made("independent")
         sampler.seed(0, PATHS)
-        lens, film = view.lens, view.lens.film()
-        position = sampler.next_2d() * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
+        camera, film = view.camera, view.camera.film
+        position = sampler.next_2d() * mi.Vector2f(film.crop_size) + mi.Vector2f(film.crop_offset)
         pupil = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
-        on_open, open_share = lens.open_pupil(position, pupil)
-        ray, cos_theta, passes = lens.line_of_sight(position, on_open, view.start)
+        on_open, open_share = camera.open_pupil(position, pupil)
+        ray, cos_theta, passes = camera.line_of_sight(position, on_open, view.start)
         at_one_wavelength(ray)
         found = scalar(path.sample(view.scene, sampler, mi.RayDifferential3f(ray), None, passes)[0])
         etendue = etendue_from_pixel(cos_theta, passes, open_share)

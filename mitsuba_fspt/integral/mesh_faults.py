@@ -8,19 +8,21 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from ..camera.camera import Camera
+from ..emission.emitting_surface import EmittingSurface
+from ..emission.of_emitter import surfaces_of
 from ..jit.mesh_buffers import box_of, triangles
 from ..phantom.length_unit import MILLIMETRES, is_usual, likelier_unit
 from ..phantom.surface_mesh import Closure, closure, turned_share
-from ..runtime.plugin_types import is_surface
 
 FROM_FILES = ("PLYMesh", "OBJMesh", "SerializedMesh")  # meshes that may be in another unit than the scene
 
 
-def mesh_faults(scene: mi.Scene, lens: mi.Sensor) -> list[str]:
+def mesh_faults(scene: mi.Scene, camera: Camera) -> list[str]:
     """One line for each glowing mesh whose faces point to the wrong side, and one for the size of all of them."""
-    meshes = [emitter for emitter in scene.emitters() if is_surface(emitter) and emitter.get_shape().is_mesh()]
-    found = [winding_fault(emitter, lens) for emitter in meshes]
-    if read := [emitter.get_shape() for emitter in meshes if emitter.get_shape().class_name() in FROM_FILES]:
+    meshes = [surface for surface in surfaces_of(scene) if surface.shape.is_mesh()]
+    found = [winding_fault(surface, camera) for surface in meshes]
+    if read := [surface.shape for surface in meshes if surface.shape.class_name() in FROM_FILES]:
         found.append(size_fault(float(np.linalg.norm(np.array(box_of(read).extents(), np.float64)))))
     return [text for text in found if text]
 
@@ -37,13 +39,13 @@ def size_fault(diagonal: float) -> str | None:
     return f"{found}. If its mesh is in {unit}, scale it by {factor:g} in 'to_world': {factor * diagonal:.3g} mm"
 
 
-def winding_fault(emitter: mi.Emitter, lens: mi.Sensor) -> str | None:
+def winding_fault(surface: EmittingSurface, camera: Camera) -> str | None:
     """What is wrong with the orientation of a mesh, None if nothing is; found once for each state of the mesh."""
-    mesh = emitter.get_shape()
+    mesh = surface.shape
     buffers = triangles(mesh)
-    if not emitter.winding or [b.index for b in buffers] != [b.index for b in emitter.winding[0]]:
-        emitter.winding = buffers, *_winding(mesh, *(b.numpy().reshape(-1, 3) for b in buffers))
-    _, shape, share = emitter.winding
+    if not surface.winding or [b.index for b in buffers] != [b.index for b in surface.winding[0]]:
+        surface.winding = buffers, *_winding(mesh, *(b.numpy().reshape(-1, 3) for b in buffers))
+    _, shape, share = surface.winding
     name = f"mesh '{mesh.id()}'"
     if shape.twisted:
         return (
@@ -51,7 +53,7 @@ def winding_fault(emitter: mi.Emitter, lens: mi.Sensor) -> str | None:
             "points inward, where it is dark from outside. Repair it, for example by trimesh.repair.fix_winding"
         )
     # A lens within may look at the walls of a cavity.
-    if not shape.inside_out or mesh.bbox().contains(mi.ScalarPoint3f(lens.placement[3:12:4])):
+    if not shape.inside_out or mesh.bbox().contains(mi.ScalarPoint3f(camera.centre)):
         return None
     if shape.inside_out == shape.pieces:
         return (

@@ -15,16 +15,18 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
+from ..camera.window import Window
 from ..emission.elements import Elements, elements_of
+from ..emission.emitting_surface import EmittingSurface
 from ..emission.exitance import texels_of
+from ..emission.of_emitter import surfaces_of
 from ..jit.batches import numbered
 from ..jit.loops import repeat
 from ..jit.pixel_grid import Grid
 from ..jit.spectra import at_one_wavelength, scalar
-from ..runtime.plugin_types import is_surface
 from .node_rules import PLASTIC, twelve
 from .specular import Specular, transmission
-from .window import Window
 
 OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than every square around, in focus
 # The limb of a wide body is not narrow light, as transects integrate it: its cosine to the lens is below `SLANTED`, the
@@ -52,12 +54,12 @@ class NarrowLight:
     in_focus: PixelArray
 
 
-def points_on_surfaces(scene: mi.Scene, lens: mi.Sensor, specular: Specular | None = None) -> Points | None:
-    """Points all over the surfaces, imaged by `lens`; None where no emitter is an `fspt_surface`.
+def points_on_surfaces(scene: mi.Scene, camera: Camera, specular: Specular | None = None) -> Points | None:
+    """Points all over the surfaces, imaged by `camera`; None where no emitter is an `fspt_surface`.
 
     Along straight lines only, also through `specular` shapes.
     """
-    parts = [_seen(scene, emitter, lens, specular) for emitter in scene.emitters() if is_surface(emitter)]
+    parts = [_seen(scene, surface, camera, specular) for surface in surfaces_of(scene)]
     return Points.joined(parts) if parts else None
 
 
@@ -220,25 +222,25 @@ def _spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) -
     return grid.array(grid.box_sum(grid.flat(sums), reach))[reach : reach + height, reach : reach + width]
 
 
-def _seen(scene: mi.Scene, emitter: mi.Emitter, lens: mi.Sensor, specular: Specular | None) -> Points:
+def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: Specular | None) -> Points:
     """Points all over a surface, with their images."""
-    shape = emitter.get_shape()
-    texels = texels_of(emitter.exitance)
+    shape = surface.shape
+    texels = texels_of(surface.exitance)
     if shape.is_mesh():  # whose elements lie across the texels
         elements: Elements = elements_of(shape, 4 * texels if texels > 1 else 1)
     else:
         elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
     counts = np.ones(elements.count, np.int64)
-    middles = _on_elements(emitter, elements, lens, counts)
+    middles = _on_elements(surface, elements, camera, counts)
     area, unit = middles.image.numpy(), np.maximum(middles.blur.numpy(), 1)
-    reach = _reach(elements, lens) / unit
+    reach = _reach(elements, camera) / unit
     # A long and thin element is represented by many points, a quarter of a unit apart, any other by one.
     long = np.isfinite(reach) & (reach > MOST_POINTS)  # `MOST_POINTS` points would be too far apart
     thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
-    at = _on_elements(emitter, elements, lens, counts)
+    at = _on_elements(surface, elements, camera, counts)
     if len(scene.shapes()) > 1:
-        at.radiance = dr.select(_in_sight(scene, lens, at.place, specular), at.radiance, 0)
+        at.radiance = dr.select(_in_sight(scene, camera, at.place, specular), at.radiance, 0)
     columns = (at.radiance, at.image, at.cosine, at.front, at.blur, at.centre.x, at.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
@@ -263,49 +265,48 @@ class _OnElements:
     place: mi.Point3f
 
 
-def _on_elements(emitter: mi.Emitter, elements: Elements, lens: mi.Sensor, counts: Index) -> _OnElements:
+def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, counts: Index) -> _OnElements:
     """Values at `counts` points of each element, the first in its middle."""
     index, number = numbered(counts)
     sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
     si, area = elements.place(mi.UInt32(index), sample)
-    to_lens = dr.normalize(_rim_above(si, lens) - si.p)
-    si.initialize_sh_frame()
-    si.wi = si.to_local(to_lens)
+    to_lens = dr.normalize(_rim_above(si, camera) - si.p)
     at_one_wavelength(si)
-    centre, blur, scale = lens.blur_disc(si.p)
-    axis = lens.world_transform() @ mi.Vector3f(0, 0, 1)
+    centre, blur, scale = camera.blur_disc(si.p)
     cosine = dr.dot(si.n, to_lens)
-    image = area * dr.abs(cosine / (dr.dot(axis, to_lens) * dr.square(scale)))
-    front = dr.dot(si.n, lens.world_transform() @ mi.Point3f(0) - si.p)
-    at = _OnElements(scalar(emitter.eval(si)), image, cosine, front, dr.abs(blur), centre, si.p)
+    image = area * dr.abs(cosine / (dr.dot(camera.axis, to_lens) * dr.square(scale)))
+    front = dr.dot(si.n, camera.to_world @ mi.Point3f(0) - si.p)
+    at = _OnElements(
+        scalar(surface.radiance(si, to_lens, mi.Bool(True))), image, cosine, front, dr.abs(blur), centre, si.p
+    )
     dr.eval(at)
     return at
 
 
-def _in_sight(scene: mi.Scene, lens: mi.Sensor, place: mi.Point3f, specular: Specular | None) -> mi.Bool:
+def _in_sight(scene: mi.Scene, camera: Camera, place: mi.Point3f, specular: Specular | None) -> mi.Bool:
     """True for points that one of twelve points of the pupil is visible from."""
     x, y = (mi.Float(column) for column in twelve(False).pupil.T)
 
     def test(k: mi.UInt32, seen: mi.Bool) -> tuple[mi.Bool]:
         pupil = mi.Point2f(dr.gather(mi.Float, x, k), dr.gather(mi.Float, y, k))
-        return (seen | (transmission(scene, specular, place, lens.arrival(place, pupil)[1], ~seen) > 0),)
+        return (seen | (transmission(scene, specular, place, camera.arrival(place, pupil)[1], ~seen) > 0),)
 
     return repeat(dr.opaque(mi.UInt32, len(twelve(False))), test, mi.Bool(False))[0]
 
 
-def _rim_above(si: mi.SurfaceInteraction3f, lens: mi.Sensor) -> mi.Point3f:
+def _rim_above(si: mi.SurfaceInteraction3f, camera: Camera) -> mi.Point3f:
     """The point of the pupil farthest above the tangent plane, the only side that a grazing surface shines on."""
-    normal = lens.world_transform().inverse() @ mi.Vector3f(si.n)
+    normal = camera.to_world.inverse() @ mi.Vector3f(si.n)
     across = dr.norm(mi.Vector2f(normal.x, normal.y))
-    return lens.arrival(si.p, dr.select(across > 0, mi.Point2f(normal.x, normal.y) / across, 0))[1]
+    return camera.arrival(si.p, dr.select(across > 0, mi.Point2f(normal.x, normal.y) / across, 0))[1]
 
 
-def _reach(elements: Elements, lens: mi.Sensor) -> Column:
+def _reach(elements: Elements, camera: Camera) -> Column:
     """How far the corners of each element lie from its middle on the film [pixels]; inf where one has no image."""
     index = dr.arange(mi.UInt32, elements.count)
-    centre, _, scale = lens.blur_disc(elements.place(index, mi.Point2f(0.5))[0].p)
+    centre, _, scale = camera.blur_disc(elements.place(index, mi.Point2f(0.5))[0].p)
     reach = dr.zeros(mi.Float, elements.count)
     for corner in elements.corners:
-        there, _, side = lens.blur_disc(elements.place(index, mi.Point2f(*corner))[0].p)
+        there, _, side = camera.blur_disc(elements.place(index, mi.Point2f(*corner))[0].p)
         reach = dr.maximum(reach, dr.select(side * scale > 0, dr.norm(there - centre), dr.inf))
     return np.nan_to_num(reach.numpy().astype(np.float64), nan=np.inf, posinf=np.inf)

@@ -14,12 +14,14 @@ import numpy as np
 from numpy.polynomial import Legendre
 from numpy.typing import NDArray
 
+from ..camera.window import SEARCHED_RIM
+
 GOLDEN = 0.6180339887498949
 PLASTIC = (0.7548776662466927, 0.5698402909980532)  # steps of the R₂ sequence, even in the unit square
 
 # Width [blur radii] of the gap between the outermost nodes of a rule, or the first transects, and the rim of the pupil,
 # in which a silhouette changes none of the lines of sight.
-GAP = {1: 1.0, 4: 0.6, 12: 0.25, "transects": 0.1}
+GAP = {1: 1.0, 4: SEARCHED_RIM, 12: 0.25, "transects": 0.1}
 
 PixelArray = Any  # an array of numbers on the pixel grid, NumPy's or Dr.Jit's
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from ..emission.of_emitter import surface_of
 from ..jit.batches import batches
 from ..jit.pixel_grid import COVERAGE_ROUNDING, parted
 from . import node_rules
@@ -113,12 +114,12 @@ def _missed(draft: Draft, light: PixelArray) -> Mask:
 
 def _one_suffices(draft: Draft) -> bool:
     """True if one line of sight a pixel suffices: the radiance varies no more over the pupil than over a pixel."""
-    lens, blur = draft.lens.optics, draft.window.blur
+    lens, blur = draft.camera.lens, draft.window.blur
     curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
     estimator, rtol = draft.estimator, draft.quadrature.rtol
     suffices = curvature <= estimator.falloff * rtol and blur <= estimator.in_pixel and len(lens.discs) == 1
     bends = bool(draft.view.specular and draft.view.specular.bending)
-    lambert = all(getattr(emitter, "is_isotropic", bool)() for emitter in draft.view.scene.emitters())
+    lambert = all((own := surface_of(emitter)) and own.is_isotropic() for emitter in draft.view.scene.emitters())
     taken = suffices and lambert and not bends and draft.quadrature.takes("one line")
     why = f"cos⁴θ differs by {curvature:.1e} over the pupil, blur discs reach {blur:.2g} pixels"
     why += "" if lambert else ", the radiance depends on direction"

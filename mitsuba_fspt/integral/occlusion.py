@@ -1,4 +1,4 @@
-"""Occlusion between surface and lens, and shapes that cannot occlude themselves."""
+"""Occlusion between surface and camera, and shapes that cannot occlude themselves."""
 
 from __future__ import annotations
 

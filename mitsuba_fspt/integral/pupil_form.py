@@ -17,6 +17,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..camera.camera import Camera
+from ..camera.window import Window
 from ..jit.batches import batches
 from ..jit.pixel_grid import Grid
 from . import node_rules
@@ -30,7 +32,7 @@ from .quadrature import Quadrature
 from .solution import Solution
 from .specular import Specular
 from .transects import integrate_by_transects
-from .window import Window, visible_window
+from .visible_window import visible_window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,12 +91,12 @@ def peak_of_few(view: View, window: Window, quadrature: Quadrature) -> float:
     return MARGIN * float(dr.max(seen.value)[0])
 
 
-def coverage(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.float64]:
+def coverage(scene: mi.Scene, camera: Camera) -> NDArray[np.float64]:
     """Share of each pixel's lines of sight that meet a glowing surface, by twelve of them; shape (h, w)."""
-    window = visible_window(scene, lens)
+    window = visible_window(scene, camera)
     if 0 in window.shape:
         return np.zeros(window.full)
-    return coverage_of(View.of(scene, lens, window, specular=Specular.of(scene, lens)), window)
+    return coverage_of(View.of(scene, camera, window, specular=Specular.of(scene, camera)), window)
 
 
 def coverage_of(view: View, window: Window) -> NDArray[np.float64]:
@@ -104,4 +106,4 @@ def coverage_of(view: View, window: Window) -> NDArray[np.float64]:
     for part in batches(grid.number):
         coverage = apply_rule(view, window.centres(part), node_rules.twelve(True), ("coverage",)).coverage
         dr.scatter(image, mi.Float64(coverage), part)
-    return window.expand(grid.array(image * open_share(view.lens, window, grid)))
+    return window.expand(grid.array(image * open_share(view.camera, window, grid)))

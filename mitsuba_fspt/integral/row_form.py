@@ -14,7 +14,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
 from ..emission.elements import Elements, elements_of
+from ..emission.emitting_surface import EmittingSurface
 from ..jit.batches import batches
 from ..jit.mesh_buffers import box_of
 from ..runtime.errors import SceneError
@@ -42,8 +44,8 @@ class Row:
 
 def rows_of(
     scene: mi.Scene,
-    lens: mi.Sensor,
-    emitters: Sequence[mi.Emitter],
+    camera: Camera,
+    surfaces: Sequence[EmittingSurface],
     pixels: Index,
     lines: int,
     specular: Specular | None = None,
@@ -53,22 +55,23 @@ def rows_of(
     The light is that of J_n = 1 W/mm²; its sum over the lines of a pixel, over their number, is the row's sum. Lines go
     on through and off `specular` shapes; those that meet several surfaces have a row for each.
     """
-    elements = [elements_of(emitter.get_shape(), minimum=1) for emitter in emitters]
-    found: list[list[tuple]] = [[] for _ in emitters]
-    width = int(lens.film().crop_size()[0])
-    offset = [int(n) for n in lens.film().crop_offset()]
+    elements = [elements_of(surface.shape, minimum=1) for surface in surfaces]
+    found: list[list[tuple]] = [[] for _ in surfaces]
+    width, offset = camera.film.crop_size[0], camera.film.crop_offset
     numbers = mi.UInt32(pixels.astype(np.uint32))
-    start = dr.opaque(mi.Float, lens.clear_depth(box_of(scene.shapes())))
+    start = dr.opaque(mi.Float, camera.clear_depth(box_of(scene.shapes())))
     for part in batches(dr.arange(mi.UInt32, len(pixels)), lines):
         place, line = dr.repeat(part, lines), dr.tile(dr.arange(mi.UInt32, lines), dr.width(part))
         pixel = dr.gather(mi.UInt32, numbers, place)
         x = [mi.Float((line * step + pixel * STRIDE * (2 * k + 1)) >> 8) * 2.0**-24 for k, step in enumerate(STEPS)]
         position = mi.Point2f(mi.Float(pixel % width) + x[0], mi.Float(pixel // width) + x[1]) + mi.Vector2f(*offset)
-        pupil, open_share = lens.open_pupil(position, mi.warp.square_to_uniform_disk_concentric(mi.Point2f(x[2], x[3])))
-        ray, cos_theta, passes = lens.line_of_sight(position, pupil, start)
+        pupil, open_share = camera.open_pupil(
+            position, mi.warp.square_to_uniform_disk_concentric(mi.Point2f(x[2], x[3]))
+        )
+        ray, cos_theta, passes = camera.line_of_sight(position, pupil, start)
         etendue = etendue_from_pixel(cos_theta, passes, open_share)
         most = MOST_HITS if specular and len(specular.lobes) > 1 else 1
-        hits = _Hits(emitters, elements, dr.width(place), most)
+        hits = _Hits(surfaces, elements, dr.width(place), most)
         if specular:
             follow(scene, specular, ray, cos_theta, start, passes, _nothing, _never, hits.note)
         else:
@@ -90,23 +93,25 @@ def rows_of(
 class _Hits:
     """Where so many `lanes`, lines of sight, meet emitting meshes; one lane may meet several."""
 
-    def __init__(self, emitters: Sequence[mi.Emitter], elements: Sequence[Elements], lanes: int, most: int) -> None:
-        self._meshes = list(zip(emitters, elements, strict=True))
+    def __init__(
+        self, surfaces: Sequence[EmittingSurface], elements: Sequence[Elements], lanes: int, most: int
+    ) -> None:
+        self._meshes = list(zip(surfaces, elements, strict=True))
         self._lane, self._most = dr.arange(mi.UInt32, lanes), most * lanes
-        self._counts = [dr.zeros(mi.UInt32) for _ in emitters]
+        self._counts = [dr.zeros(mi.UInt32) for _ in surfaces]
         self._stored = [
             [dr.zeros(kind, self._most) for kind in (mi.UInt32, mi.UInt32, mi.Float, mi.Float, mi.Float, mi.Float)]
-            for _ in emitters
+            for _ in surfaces
         ]
 
     def note(self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, weight: mi.Float, met: mi.Bool) -> None:
         """Store the intersections that lie on the outward side of an emitting mesh."""
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active=met)
         outward, index = met & (dr.dot(si.n, ray.d) < 0), mi.UInt32(si.prim_index)
-        for (emitter, own), count, stored in zip(self._meshes, self._counts, self._stored, strict=True):
-            mine = outward & (si.shape == mi.ShapePtr(emitter.get_shape()))
+        for (surface, own), count, stored in zip(self._meshes, self._counts, self._stored, strict=True):
+            mine = outward & (si.shape == mi.ShapePtr(surface.shape))
             si.prim_index = dr.select(mine, index, 0)  # another mesh may have more faces than this one
-            radiance = weight * emitter.law.profile(si, -ray.d, mine)
+            radiance = weight * surface.law.profile(si, -ray.d, mine)
             face, weights = own.weigh(si)
             kept = mine & (radiance > 0)
             slot = dr.scatter_inc(count, mi.UInt32(0), kept)

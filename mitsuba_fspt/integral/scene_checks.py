@@ -13,10 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..camera.camera import Camera
 from ..emission.elements import elements_of
+from ..emission.emitting_surface import EmittingSurface
+from ..emission.of_emitter import surfaces_of
 from ..jit.mesh_buffers import box_of, triangles
 from ..runtime.errors import ExitanceError, SceneError
-from ..runtime.plugin_types import is_lens, is_surface
 from .nested_bsdfs import check_textures
 from .specular import specular_bsdf
 
@@ -30,47 +32,39 @@ LIFT = 1e-6  # of the largest coordinate: surfaces closer than this coincide in 
 PARALLEL = 0.999  # cosine of the normals of coincident surfaces; shapes that intersect meet at an angle
 
 
-def check_scene(scene: mi.Scene, sensor: mi.Sensor) -> None:
+def check_scene(scene: mi.Scene, camera: Camera) -> None:
     """Raise SceneError or ExitanceError where the scene cannot give a picture; the message says how to fix it."""
-    check_lens(sensor)
-    check_rounding(sensor)
+    check_film(camera)
+    check_rounding(camera)
     if not scene.emitters():
         raise SceneError("scene: nothing glows. Give a shape an emitter of type 'fspt_surface' with its 'exitance'.")
-    for emitter in scene.emitters():
-        if is_surface(emitter):
-            check_curve(emitter.get_shape())
-            emitter.check()
-            check_range(emitter, sensor)
-            check_placement(emitter.get_shape())
-            with dr.suspend_grad():
-                check_alone(scene, emitter)
+    for surface in surfaces_of(scene):
+        check_curve(surface.shape)
+        surface.check()
+        check_range(surface, camera)
+        check_placement(surface.shape)
+        with dr.suspend_grad():
+            check_alone(scene, surface)
     check_textures(scene)
-    check_outside(scene, sensor)
+    check_outside(scene, camera)
 
 
-def check_lens(sensor: mi.Sensor) -> None:
-    """Raise SceneError unless the sensor is an `fspt_lens` with a film, OpticsError where it cannot exist."""
-    if not is_lens(sensor):
-        raise SceneError(
-            f"scene: the sensor is a {sensor.class_name()}, power on a pixel needs a lens. Use a sensor of type "
-            "'fspt_lens'."
-        )
-    if sensor.fault:  # the last update was refused
-        raise sensor.fault
-    width, height = (int(n) for n in sensor.film().crop_size())
+def check_film(camera: Camera) -> None:
+    """Raise SceneError for a film without pixels."""
+    width, height = camera.film.crop_size
     if not (width and height):
         raise SceneError(f"scene: the film has {width} x {height} pixels. Give it at least one.")
 
 
-def check_rounding(lens: mi.Sensor) -> None:
+def check_rounding(camera: Camera) -> None:
     """Raise SceneError where float32 moves lines of sight by more than a tenth of a pixel."""
-    if lens.rounding <= COARSEST:
+    if camera.rounding <= COARSEST:
         return
-    side = lens.virtual_pitch
+    side = camera.virtual_pitch
     raise SceneError(
-        f"fspt_lens: single precision places lines of sight to {lens.rounding * side:.2g} mm, a pixel is {side:.2g} mm "
-        f"wide on the virtual detector plane and must be at least {1 / COARSEST:g} times that. Give a larger "
-        "'pixel_pitch' or, where the scene lies far from the world's origin, move it there."
+        f"fspt_lens: single precision places lines of sight to {camera.rounding * side:.2g} mm, a pixel is "
+        f"{side:.2g} mm wide on the virtual detector plane and must be at least {1 / COARSEST:g} times that. Give a "
+        "larger 'pixel_pitch' or, where the scene lies far from the world's origin, move it there."
     )
 
 
@@ -84,18 +78,18 @@ def check_surfaces_alone(scene: mi.Scene) -> None:
             )
 
 
-def check_range(emitter: mi.Emitter, lens: mi.Sensor) -> None:
+def check_range(surface: EmittingSurface, camera: Camera) -> None:
     """Raise ExitanceError where J_n, or the power on a pixel that follows from it, leaves the range of float32."""
-    brightest = emitter.brightest
+    brightest = surface.brightest
     if brightest == 0:  # dark, as an optimiser may begin
         return
-    name = f"fspt_surface: 'exitance' of shape '{emitter.get_shape().id()}'"
+    name = f"fspt_surface: 'exitance' of shape '{surface.shape.id()}'"
     if not EXITANCES[0] <= brightest <= EXITANCES[1]:
         raise ExitanceError(
             f"{name} reaches {brightest:.3g} W/mm², single precision needs {EXITANCES[0]:g} … {EXITANCES[1]:g}. Give "
             "J_n on another scale and rescale the picture, which is linear in it."
         )
-    power = brightest / math.pi * lens.etendue
+    power = brightest / math.pi * camera.etendue
     if power < FAINTEST:
         raise ExitanceError(
             f"{name} reaches {brightest:.3g} W/mm², of which a pixel gets {power:.1g} W; single precision needs "
@@ -138,16 +132,16 @@ def check_curve(shape: mi.Shape) -> None:
         )
 
 
-def check_alone(scene: mi.Scene, emitter: mi.Emitter) -> None:
+def check_alone(scene: mi.Scene, surface: EmittingSurface) -> None:
     """Raise SceneError where a second surface coincides with this one: which of them a ray meets is undefined."""
-    shape = emitter.get_shape()
+    shape = surface.shape
     doubled = 0
     if shape.is_mesh():
         buffers = triangles(shape)
         # Counted once for each state of the mesh.
-        if [b.index for b in buffers] != [b.index for b in emitter.single_faces]:
+        if [b.index for b in buffers] != [b.index for b in surface.single_faces]:
             doubled = _doubled_faces(*buffers)
-            emitter.single_faces = () if doubled else buffers
+            surface.single_faces = () if doubled else buffers
     if doubled:
         raise SceneError(
             f"scene: shape '{shape.id()}' has {doubled} faces more than once, its light would count as often. Merge "
@@ -194,13 +188,13 @@ def _doubled_faces(positions: mi.Float, faces: mi.UInt32) -> int:
     return int((np.cross(b - a, c - a) != 0).any(axis=1).sum())
 
 
-def check_outside(scene: mi.Scene, lens: mi.Sensor) -> None:
+def check_outside(scene: mi.Scene, camera: Camera) -> None:
     """Raise SceneError where the lens centre is inside a closed surface: all around it shows its inward side."""
-    if not box_of(scene.shapes()).contains(mi.ScalarPoint3f(lens.placement[3:12:4])):
+    if not box_of(scene.shapes()).contains(mi.ScalarPoint3f(camera.centre)):
         return
     directions = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], np.float32)
     # Turned a little, so that no direction runs along the faces of an axis-aligned box.
-    rays = mi.Ray3f(lens.world_transform() @ mi.Point3f(0, 0, 0), dr.normalize(mi.Vector3f(directions.T + 0.1234)))
+    rays = mi.Ray3f(camera.to_world @ mi.Point3f(0, 0, 0), dr.normalize(mi.Vector3f(directions.T + 0.1234)))
     si = scene.ray_intersect(rays)
     opaque = mi.Bool(True)  # False for directions through panes of a chamber
     for shape in scene.shapes():

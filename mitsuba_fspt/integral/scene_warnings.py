@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from ..camera.camera import Camera
 from .left_out import scatters
 from .mesh_faults import mesh_faults
 from .nested_bsdfs import BENDS, blended_parts
@@ -11,12 +12,12 @@ from .nested_bsdfs import BENDS, blended_parts
 VOLUMETRIC = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator"}
 
 
-def scene_warnings(scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator) -> list[str]:
+def scene_warnings(scene: mi.Scene, camera: Camera, integrator: mi.Integrator) -> list[str]:
     """Warnings about a picture of a scene by this integrator."""
-    found = [None if treats_media(integrator) else _media(scene, sensor), _blends(scene), diffraction(sensor)]
+    found = [None if treats_media(integrator) else _media(scene, camera), _blends(scene), diffraction(camera)]
     if integrator.class_name() == "PathIntegrator":
         found.append(_glowing_windows(scene))
-    return [text for text in found if text] + mesh_faults(scene, sensor)
+    return [text for text in found if text] + mesh_faults(scene, camera)
 
 
 def treats_media(integrator: mi.Integrator) -> bool:
@@ -24,23 +25,23 @@ def treats_media(integrator: mi.Integrator) -> bool:
     return bool({integrator.class_name(), type(integrator).__name__} & VOLUMETRIC)
 
 
-def diffraction(lens: mi.Sensor) -> str | None:
+def diffraction(camera: Camera) -> str | None:
     """Diffraction at the diaphragm, which no method contains, where it spreads a point over a pixel or more."""
-    pixels = lens.airy_radius / lens.pixel_pitch
+    pixels = camera.airy_radius / camera.pixel_pitch
     if pixels < 1:
         return None
     return (
-        f"diffraction is left out: at f/{lens.optics.f_number:g} the Airy disc has a radius of {pixels:.3g} pixels "
-        f"({lens.airy_radius:.3g} mm on the film at {lens.airy_wavelength_nm:g} nm), over which a real camera spreads "
-        "each point"
+        f"diffraction is left out: at f/{camera.lens.f_number:g} the Airy disc has a radius of {pixels:.3g} pixels "
+        f"({camera.airy_radius:.3g} mm on the film at {camera.airy_wavelength_nm:g} nm), over which a real camera "
+        "spreads each point"
     )
 
 
-def _media(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
+def _media(scene: mi.Scene, camera: Camera) -> str | None:
     """Participating media, through which every method but `volpath` leads light as through a vacuum."""
     media = [shape.id() for shape in scene.shapes() if shape.interior_medium() or shape.exterior_medium()]
-    if getattr(sensor, "in_medium", False):
-        media.append(sensor.id())
+    if camera.in_medium:
+        media.append("the lens")
     if not media:
         return None
     return (

@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
+from ..camera.camera import Camera
+from ..emission.of_emitter import surfaces_of
 from ..jit.batches import BATCH
 from ..jit.mesh_buffers import triangles
 from ..runtime.errors import TransportError, named
@@ -32,7 +34,7 @@ from .quadrature import Quadrature
 from .row_form import rows_of
 from .solution import Solution
 from .specular import Specular
-from .window import visible_window
+from .visible_window import visible_window
 
 CERTAIN = 0.35  # of its estimated error: what the picture of J_n = 1 is wrong by at the most, as a rule
 ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further from it are computed by lines of sight
@@ -85,7 +87,7 @@ def columns_on(mesh: mi.Shape, on: str) -> int:
 
 def sparse_rows(
     scene: mi.Scene,
-    lens: mi.Sensor,
+    camera: Camera,
     picture: Callable[[], Solution],
     on: Sequence[str],
     quadrature: Quadrature,
@@ -107,19 +109,19 @@ def sparse_rows(
     ------
     TransportError : the memory does not suffice.
     """
-    specular = Specular.of(scene, lens, quadrature)
+    specular = Specular.of(scene, camera, quadrature)
     if specular:
         solution = picture()
-        entries = _by_lines(scene, lens, solution, on, quadrature.rtol, specular)
+        entries = _by_lines(scene, camera, solution, on, quadrature.rtol, specular)
         sums = np.full(entries.count, np.nan)
     else:
         with named(name):
-            laid = _laid_out(scene, lens, on, most_bytes)
+            laid = _laid_out(scene, camera, on, most_bytes)
         solution = picture()
         with named(name):
-            entries, sums = _by_faces(scene, lens, solution, laid, on, quadrature.rtol, progress)
+            entries, sums = _by_faces(scene, camera, solution, laid, on, quadrature.rtol, progress)
     least = quadrature.least_error * float(solution.power.max(initial=0.0))
-    return _balanced(entries, sums, solution, np.maximum(solution.error, least), lens.etendue)
+    return _balanced(entries, sums, solution, np.maximum(solution.error, least), camera.etendue)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,29 +201,23 @@ class _Entries:
 
 
 def _laid_out(
-    scene: mi.Scene, lens: mi.Sensor, on: Sequence[str], most_bytes: int | None
+    scene: mi.Scene, camera: Camera, on: Sequence[str], most_bytes: int | None
 ) -> list[tuple[FaceLight, Windows]]:
     """Faces of each mesh with the windows of its columns; TransportError where the memory does not hold the entries."""
-    alone, shape = hides_nothing(scene), _shape(lens)
-    offset = (int(lens.film().crop_offset()[0]), int(lens.film().crop_offset()[1]))
+    alone, shape = hides_nothing(scene), camera.film.shape
+    offset = camera.film.crop_offset
     laid = []
-    for emitter, kind in zip(scene.emitters(), on, strict=True):
-        faces = FaceLight.seen(emitter, lens, offset, shape)
-        faces = faces if alone else faces.behind(scene, lens)
-        laid.append((faces, column_windows(faces, columns_on(emitter.get_shape(), kind), kind, shape)))
+    for surface, kind in zip(surfaces_of(scene), on, strict=True):
+        faces = FaceLight.seen(surface, camera, offset, shape)
+        faces = faces if alone else faces.behind(scene, camera)
+        laid.append((faces, column_windows(faces, columns_on(surface.shape, kind), kind, shape)))
     _require_memory(sum(windows.pixels for _, windows in laid), math.prod(shape), most_bytes)
     return laid
 
 
-def _shape(lens: mi.Sensor) -> tuple[int, int]:
-    """Height and width of the crop window [pixels]."""
-    width, height = lens.film().crop_size()
-    return int(height), int(width)
-
-
 def _by_faces(
     scene: mi.Scene,
-    lens: mi.Sensor,
+    camera: Camera,
     picture: Solution,
     laid: list[tuple[FaceLight, Windows]],
     on: Sequence[str],
@@ -237,38 +233,38 @@ def _by_faces(
             def report(share: float, first: float = number / len(on)) -> None:
                 progress(first + share / len(on))
 
-        columns.append(columns_of(scene, lens, faces, windows, kind, ColumnRule.of(rtol), report))
+        columns.append(columns_of(scene, camera, faces, windows, kind, ColumnRule.of(rtol), report))
     exact = np.concatenate([part.exact for part in columns])
-    entries = _Entries.of(columns, math.prod(_shape(lens)))
+    entries = _Entries.of(columns, math.prod(camera.film.shape))
     del columns
     laid.clear()  # the work that follows needs the memory
-    rough, cut, outside = _rough(scene, lens, entries, picture, rtol)
+    rough, cut, outside = _rough(scene, camera, entries, picture, rtol)
     sums = np.where(exact, entries.column_sums(), np.nan)
     if outside.any() or cut.any():
         sizes = np.diff(entries.starts)
         sums[entries.columns[np.repeat(outside | cut, sizes)]] = np.nan  # the stop takes some of their light
         entries = entries.where(~np.repeat(outside, sizes))
     if rough.any():
-        entries = _refined(scene, lens, entries, on, rough, cut, rtol)
+        entries = _refined(scene, camera, entries, on, rough, cut, rtol)
     return entries, sums
 
 
 def _by_lines(
-    scene: mi.Scene, lens: mi.Sensor, picture: Solution, on: Sequence[str], rtol: float, specular: Specular
+    scene: mi.Scene, camera: Camera, picture: Solution, on: Sequence[str], rtol: float, specular: Specular
 ) -> _Entries:
     """Entries of all pixels by lines of sight."""
     pixels = np.flatnonzero(picture.power.ravel() > 0)
-    count = sum(columns_on(emitter.get_shape(), kind) for emitter, kind in zip(scene.emitters(), on, strict=True))
+    count = sum(columns_on(surface.shape, kind) for surface, kind in zip(surfaces_of(scene), on, strict=True))
     lines = int(ALL_LINES * (1e-3 / rtol) ** 0.5) // 2 * 2
     places = np.array_split(pixels, -(-len(pixels) * lines // LINES)) if pixels.size else []
-    rows = [_rows(scene, lens, some, on, lines, specular) for some in places]
+    rows = [_rows(scene, camera, some, on, lines, specular) for some in places]
     none = np.zeros(picture.power.size + 1, np.int64)
     empty = _Entries(count, none, *(np.zeros(0, kind) for kind in (np.int32, np.float32, np.float16)))
     return empty.joined(rows, places)
 
 
 def _refined(
-    scene: mi.Scene, lens: mi.Sensor, entries: _Entries, on: Sequence[str], rough: Mask, cut: Mask, rtol: float
+    scene: mi.Scene, camera: Camera, entries: _Entries, on: Sequence[str], rough: Mask, cut: Mask, rtol: float
 ) -> _Entries:
     """The same with the bright entries of rough pixels as lines of sight find them, and the faint ones as they are.
 
@@ -281,7 +277,7 @@ def _refined(
     places = np.array_split(pixels, max(1, -(-len(pixels) * lines // LINES)))
     kept, found = np.ones(len(entries.light), bool), []
     for some in places:
-        rows = _rows(scene, lens, some, on, lines)
+        rows = _rows(scene, camera, some, on, lines)
         threshold = np.where(cut[some], 0, FEWEST_HITS / (math.pi * lines))
         sizes = np.diff(entries.starts)[some]
         row, met = (np.repeat(np.arange(len(some)), counts) for counts in (sizes, np.diff(rows.starts)))
@@ -295,17 +291,17 @@ def _refined(
 
 
 def _rough(
-    scene: mi.Scene, lens: mi.Sensor, entries: _Entries, solution: Solution, rtol: float
+    scene: mi.Scene, camera: Camera, entries: _Entries, solution: Solution, rtol: float
 ) -> tuple[Mask, Mask, Mask]:
     """Pixels (h · w) whose row the surface form gives wrongly, those that the stop cuts, and those beyond it.
 
     The first include the second, and those whose sum is far from the picture, or off where that is uncertain.
     """
-    window = visible_window(scene, lens, everywhere=True)
-    inside, cut = (window.expand(flags.astype(np.float64)).ravel() > 0 for flags in window.field_stop(lens))
-    inside |= math.isinf(lens.optics.seen_field)
-    picture = solution.power.ravel() / lens.etendue
-    off, uncertain = np.abs(picture - entries.row_sums()), solution.error.ravel() / lens.etendue
+    window = visible_window(scene, camera, everywhere=True)
+    inside, cut = (window.expand(flags.astype(np.float64)).ravel() > 0 for flags in window.field_stop(camera))
+    inside |= math.isinf(camera.lens.seen_field)
+    picture = solution.power.ravel() / camera.etendue
+    off, uncertain = np.abs(picture - entries.row_sums()), solution.error.ravel() / camera.etendue
     unit = rtol * picture.max(initial=0.0)
     far = inside & ((off > ROUGH * unit) | (off > UNREACHED * unit) & (uncertain > unit))
     cut &= ~inside
@@ -314,7 +310,7 @@ def _rough(
 
 def _rows(
     scene: mi.Scene,
-    lens: mi.Sensor,
+    camera: Camera,
     pixels: NDArray[np.int64],
     on: Sequence[str],
     lines: int,
@@ -322,18 +318,18 @@ def _rows(
 ) -> _Entries:
     """Rows of these pixels by lines of sight; their change follows from half of the lines."""
     found: list[tuple[Any, ...]] = []
-    first, emitters = 0, scene.emitters()
-    for emitter, kind, row in zip(emitters, on, rows_of(scene, lens, emitters, pixels, lines, specular), strict=True):
+    first, surfaces = 0, surfaces_of(scene)
+    for surface, kind, row in zip(surfaces, on, rows_of(scene, camera, surfaces, pixels, lines, specular), strict=True):
         light, half = row.light / lines, np.where(row.line < lines // 2, 2 * row.light / lines, 0)
         if kind == "face":
             found.append((row.place, first + row.face, light, half))
         else:
-            corners = triangles(emitter.get_shape())[1].numpy().reshape(-1, 3)[row.face]
+            corners = triangles(surface.shape)[1].numpy().reshape(-1, 3)[row.face]
             found += [
                 (row.place, first + corners[:, k].astype(np.int64), light * row.corners[:, k], half * row.corners[:, k])
                 for k in range(3)
             ]
-        first += columns_on(emitter.get_shape(), kind)
+        first += columns_on(surface.shape, kind)
     place, column, light, half = (np.concatenate(values) for values in zip(*found, strict=True))
     both = csr_array((light + 1j * half, (place, column)), shape=(len(pixels), first))  # sums both at once
     both.eliminate_zeros()

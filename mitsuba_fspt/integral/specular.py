@@ -20,11 +20,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
 from ..emission.face_table import shape_number
+from ..emission.of_emitter import surfaces_of
 from ..jit.mesh_buffers import box_of, triangles
 from ..jit.plugin_objects import made
 from ..jit.spectra import at_one_wavelength, scalar
-from ..runtime.plugin_types import is_surface
 from .nested_bsdfs import blended_parts
 from .occlusion import hidden, ray_to_lens
 from .quadrature import Quadrature
@@ -80,7 +81,7 @@ class Specular:
 
     @classmethod
     def of(
-        cls, scene: mi.Scene, lens: mi.Sensor, quadrature: Quadrature | None = None, even_if_none: bool = False
+        cls, scene: mi.Scene, camera: Camera, quadrature: Quadrature | None = None, even_if_none: bool = False
     ) -> Specular | None:
         """Specular shapes of a scene before a `lens`; None if there is none, unless `even_if_none`."""
         quadrature = quadrature or Quadrature()
@@ -89,10 +90,8 @@ class Specular:
             return None
         lobes = {name for _, bsdf in shapes for name in lobes_of(bsdf)}
         bent = [(shape, bsdf) for shape, bsdf in shapes if set(lobes_of(bsdf)) - {"null"}]
-        glowing = [_box(emitter.get_shape()) for emitter in scene.emitters() if is_surface(emitter)] or [
-            _box(*scene.shapes())
-        ]
-        if len(bent) == 1 and "transmission" not in lobes and _between(bent[0][0], lens, glowing):
+        glowing = [_box(surface.shape) for surface in surfaces_of(scene)] or [_box(*scene.shapes())]
+        if len(bent) == 1 and "transmission" not in lobes and _between(bent[0][0], camera, glowing):
             lobes, bent = lobes - {"reflection"}, []  # what a pane reflects to the lens is dark
         if not (lobes or even_if_none):
             return None
@@ -194,7 +193,7 @@ def _plane(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]] |
     return (middle, axes[2]) if size[2] <= FLAT * size[0] else None
 
 
-def _between(shape: mi.Shape, lens: mi.Sensor, glowing: Sequence[Box]) -> bool:
+def _between(shape: mi.Shape, camera: Camera, glowing: Sequence[Box]) -> bool:
     """True if a shape is flat and its plane lies between the whole pupil and everything that glows."""
     if (plane := _plane(shape)) is None:
         return False
@@ -202,10 +201,9 @@ def _between(shape: mi.Shape, lens: mi.Sensor, glowing: Sequence[Box]) -> bool:
     ends = np.array(glowing, np.float64).reshape(-1, 2, 3)
     corners = ends[:, (np.arange(8)[:, None] >> np.arange(3)) & 1, range(3)].reshape(-1, 3)
     heights = (corners - point) @ normal
-    placement = np.array(lens.placement).reshape(4, 4)
-    own = float((placement[:3, 3] - point) @ normal)
+    own = float((np.array(camera.centre) - point) @ normal)
     side = math.copysign(1.0, own)
-    return abs(own) > lens.optics.pupil_radius and bool((side * heights < 0).all())
+    return abs(own) > camera.lens.pupil_radius and bool((side * heights < 0).all())
 
 
 def transmission(

@@ -17,6 +17,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
+from ..camera.window import Window
 from ..jit.pixel_grid import Grid
 from ..jit.spectra import scalar
 from ..runtime.deadline import Deadline
@@ -30,7 +32,6 @@ from .quadrature import Quadrature
 from .shortcuts import Finding
 from .solution import Solution
 from .specular import Specular, transmission
-from .window import Window
 
 # Lines of sight a pixel of the image at the first level, and factors from level to level: at the second level both
 # pieces and cells are refined, as the change of one alone would not show the error of the other.
@@ -52,7 +53,7 @@ Plane = NDArray[np.float64]
 
 def solve(
     scene: mi.Scene,
-    lens: mi.Sensor,
+    camera: Camera,
     window: Window,
     quadrature: Quadrature,
     where: NDArray[np.bool_] | None = None,
@@ -71,19 +72,19 @@ def solve(
     Light goes on through `specular` shapes where it stays straight. Coverage counts the lines of sight that meet a
     glowing surface, not those that meet a dark one. Raises SceneError where an emitter has no surface.
     """
-    return _Refinement(scene, lens, window, quadrature, specular).run(where, least_peak, progress)
+    return _Refinement(scene, camera, window, quadrature, specular).run(where, least_peak, progress)
 
 
 class _Refinement:
     """Image during refinement: mean radiance on film [W/mm²/sr], its error and coverage, shape (h, w)."""
 
     def __init__(
-        self, scene: mi.Scene, lens: mi.Sensor, window: Window, quadrature: Quadrature, specular: Specular | None
+        self, scene: mi.Scene, camera: Camera, window: Window, quadrature: Quadrature, specular: Specular | None
     ) -> None:
-        self.scene, self.lens, self.window, self.quadrature = scene, lens, window, quadrature
+        self.scene, self.camera, self.window, self.quadrature = scene, camera, window, quadrature
         self.specular = specular
         dark = quadrature.takes("dark")
-        self.glows = [Glow.seen(emitter, lens, window, quadrature.rtol, dark) for emitter in scene.emitters()]
+        self.glows = [Glow.seen(emitter, camera, window, quadrature.rtol, dark) for emitter in scene.emitters()]
         self.value, self.error, self.coverage = (np.zeros(self.window.shape) for _ in range(3))
         self.peak = float(np.finfo(np.float32).tiny)
         self.rays = 0
@@ -119,7 +120,7 @@ class _Refinement:
             self.error = SAFETY * grid.array(grid.spread_max(grid.flat(self.value)))
         error = np.maximum(self.error, self.quadrature.least_error * self.window.brightest(self.value))
         error[self.coverage == 0] = self.error[self.coverage == 0]
-        power, error = (self.window.expand(image) * self.lens.etendue for image in (self.value, error))
+        power, error = (self.window.expand(image) * self.camera.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.coverage, 0, 1))
         complete = self.window.expand(where.astype(np.float64)) > 0
         progress(1.0)
@@ -170,7 +171,7 @@ class _Refinement:
 
     def _lay(self, canvas: Canvas, batch: Batch) -> float:
         """Lay the light of a batch of lines of sight on the canvas; returns the largest radiance met [W/mm²/sr]."""
-        elements, lens = batch.glow.elements, self.lens
+        elements, camera = batch.glow.elements, self.camera
         (index, cut, number), m = batch.lanes(), dr.opaque(mi.UInt32, batch.cells)
         part, i, j = number // (m * m), number % m, number // m % m
         within, aim = pupil_cells.strata(i, j, m, index * pupil_cells.STRIDE + part)
@@ -179,7 +180,7 @@ class _Refinement:
         # a round shape noisy. J_n and occlusion, which may jump within a piece, are sampled all over it.
         middle, area = elements.place(index, mi.Point2f(*elements.middle), cut, part)
         spot, _ = elements.place(index, within, cut, part)
-        _, lens_point, arrival, cos_theta = lens.arrival(middle.p, aim)
+        _, lens_point, arrival, cos_theta = camera.arrival(middle.p, aim)
         to_lens = dr.normalize(lens_point - middle.p)
         cos_s = dr.dot(middle.n, to_lens)
         active = (cos_s > 0) & (arrival > 0)
@@ -191,13 +192,13 @@ class _Refinement:
         spot.initialize_sh_frame()
         spot.wi = spot.to_local(_turned_along(to_lens, middle.n, spot.n))
         radiance = dr.select(active, through * scalar(batch.glow.emitter.eval(spot, active)), 0)
-        virtual_pixel = dr.opaque(mi.Float, lens.virtual_pitch**2)
+        virtual_pixel = dr.opaque(mi.Float, camera.virtual_pitch**2)
         cell = [pupil_cells.corner(i + x, j + y, m) for x, y in CORNERS]
         etendue = dr.select(
             active, etendue_from_surface(cos_s, area, arrival, pupil_cells.area(cell), virtual_pixel), 0
         )
 
-        discs = {at: lens.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
+        discs = {at: camera.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.window.corner))
         middle = pupil_cells.middle(i, j, m)
         images = [centre - origin + radius * middle for centre, radius, _ in discs.values()]

@@ -14,12 +14,12 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.window import Window
 from ..jit.pixel_grid import Grid
 from ..runtime.errors import SceneError
 from ..runtime.memory import available_memory
 from .shortcuts import Finding
 from .solution import Solution
-from .window import Window
 
 SIDE = 2048  # pixels along a tile with its rim; Dr.Jit allocates powers of two
 LARGE = 1 << 26  # pixels: the planes of a larger picture are of float32, as they are in its file

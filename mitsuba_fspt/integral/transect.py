@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..camera.pupil import turned
 from ..jit.disc_segments import segment, segment_double_integral, segment_height, segment_integral
-from .pupil import turned
 
 # Blur radii [pixels] at which smaller and larger ones are clipped; the position of the edge then depends on `place`.
 LEAST_BLUR, MOST_BLUR = 0.01, 32.0

@@ -236,7 +236,7 @@ def edges_of(draft: Draft) -> Edges:
     # On a pixel without a silhouette there may be a part of a blurred one that its nodes missed.
     farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
     nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
-    blur = dr.select(draft.clipped, 0, draft.lens.blur_radius(nearest))
+    blur = dr.select(draft.clipped, 0, draft.camera.blur_radius(nearest))
     return Edges(angle, blur, dr.abs(blur) < draft.estimator.sharp)
 
 
@@ -329,7 +329,7 @@ def _along_transects(
     value, coverage, jumps, depth, traced = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
     # The edge of a weak reflection beside nothing has no depth.
     has_depth = (jumps > 0) & dr.isfinite(depth)
-    blur = mi.Float(dr.select(has_depth, draft.lens.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
+    blur = mi.Float(dr.select(has_depth, draft.camera.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
     found = value, coverage, jumps, blur, traced
     dr.eval(found)  # together, as a later reduction of one of them would trace every ray again
     return found

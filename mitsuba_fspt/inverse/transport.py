@@ -307,14 +307,14 @@ def _scene_of(task: ViewTask) -> tuple[mi.Scene, mi.Sensor]:
 
 
 def _described(scene: mi.Scene, lens: mi.Sensor, task: ViewTask) -> ViewResult:
-    from ..integral.scene_checks import check_lens
+    from ..camera.of_sensor import camera_of
+    from ..integral.scene_checks import check_film
 
     glowing_meshes(scene)
-    check_lens(lens)
-    film = lens.film()
-    numbers = lens.numbers()
-    numbers["film"] = [int(n) for n in (*film.crop_size(), *film.crop_offset(), *film.size())]
-    numbers["to_world"] = [float(n) for n in lens.placement]
+    check_film(camera := camera_of(lens))
+    film, numbers = camera.film, camera.numbers()
+    numbers["film"] = [*film.crop_size, *film.crop_offset, *film.size]
+    numbers["to_world"] = list(camera.placement)
     warnings = tuple(warnings_of(scene, task.sensor))
     left_out = light_left_out_of(scene, lens, task.rtol)
     return ViewResult(None, parts_of(scene, task.on), numbers, defaults_of(lens), warnings, left_out)

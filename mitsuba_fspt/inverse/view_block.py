@@ -15,10 +15,11 @@ from scipy.sparse import csr_array
 
 from ..integral.quadrature import Quadrature
 from ..runtime.errors import SceneError, TransportError, named
-from ..runtime.plugin_types import is_surface
 
 if TYPE_CHECKING:
     import mitsuba as mi
+
+    from ..emission.emitting_surface import EmittingSurface
 
 
 ON = ("vertex", "face")
@@ -97,8 +98,8 @@ class Block:
         return sum(value.nbytes for field in fields(self) if isinstance(value := getattr(self, field.name), np.ndarray))
 
 
-def glowing_meshes(scene: mi.Scene) -> list[mi.Emitter]:
-    """The emitters of a scene, all of them meshes whose radiance is linear in J_n.
+def glowing_meshes(scene: mi.Scene) -> list[EmittingSurface]:
+    """The emitting surfaces of a scene, all of them meshes whose radiance is linear in J_n.
 
     Raises
     ------
@@ -107,29 +108,34 @@ def glowing_meshes(scene: mi.Scene) -> list[mi.Emitter]:
     """
     if not scene.emitters():
         raise TransportError("transport: nothing glows. Give a mesh an emitter of type 'fspt_surface'.")
+    from ..emission.of_emitter import surface_of
+
+    found = []
     for emitter in scene.emitters():
-        if not is_surface(emitter):
+        surface = surface_of(emitter)
+        if surface is None:
             raise TransportError(
                 f"transport: emitter {emitter.class_name()} is no fspt_surface, whose J_n the matrix takes. Leave it "
                 "out."
             )
-        shape = emitter.get_shape()
+        shape = surface.shape
         if not shape.is_mesh():
             raise TransportError(
                 f"transport: shape '{shape.id()}' is a {shape.class_name().lower()}, J_n needs the vertices or faces "
                 "of a mesh. Give a PLY, for example of trimesh.creation."
             )
-        if emitter.exitance.class_name().startswith("Bitmap"):
+        if surface.exitance.class_name().startswith("Bitmap"):
             raise TransportError(
                 f"transport: 'exitance' of shape '{shape.id()}' is a bitmap, the columns are vertices or faces. Give "
                 "J_n as a mesh attribute or a number."
             )
-        if not emitter.law.linear:
+        if not surface.law.linear:
             raise TransportError(
-                f"transport: emission '{emitter.law.name}' of shape '{shape.id()}' depends on the fluence, not on J_n "
+                f"transport: emission '{surface.law.name}' of shape '{shape.id()}' depends on the fluence, not on J_n "
                 "alone. Give 'lambert' or 'fresnel'."
             )
-    return scene.emitters()
+        found.append(surface)
+    return found
 
 
 def parts_of(scene: mi.Scene, on: str) -> list[Part]:
@@ -138,15 +144,15 @@ def parts_of(scene: mi.Scene, on: str) -> list[Part]:
     from ..rendering.provenance import digest_of
 
     found = []
-    for emitter in glowing_meshes(scene):
-        mesh = emitter.get_shape()
+    for surface in glowing_meshes(scene):
+        mesh = surface.shape
         positions, faces = (buffer.numpy() for buffer in triangles(mesh))
         vertices, corners = positions.reshape(-1, 3).astype(np.float64), faces.reshape(-1, 3)
         a, b, c = (vertices[corners[:, k]] for k in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         if on == "vertex":
             area = np.bincount(corners.ravel(), np.repeat(area / 3, 3), minlength=len(vertices))
-        found.append(Part(mesh.id(), len(area), digest_of(emitter, mesh), str(emitter.law), area))
+        found.append(Part(mesh.id(), len(area), digest_of(mesh.emitter(), mesh), str(surface.law), area))
     return found
 
 
@@ -168,25 +174,26 @@ def block_of(
     """
     import drjit as dr
 
+    from ..camera.of_sensor import camera_of
     from ..integral.scene_checks import check_rounding
     from ..integral.sparse_rows import sparse_rows
     from ..jit.recording import recording
     from ..rendering.render import integrator_of
 
-    emitters = glowing_meshes(scene)
+    surfaces, camera = glowing_meshes(scene), camera_of(lens)
     with ExitStack() as stack:
-        for emitter in emitters:
-            stack.enter_context(emitter.shining(1.0))
+        for surface in surfaces:
+            stack.enter_context(surface.shining(1.0))
         with named("fspt_integral"):
             quadrature = Quadrature(rtol=rtol)
         integrator = integrator_of(scene, "integral")
-        check_rounding(lens)
+        check_rounding(camera)
         with recording(), dr.suspend_grad():
             rows = sparse_rows(
                 scene,
-                lens,
+                camera,
                 lambda: integrator.solve(scene, lens, quadrature),
-                [on] * len(emitters),
+                [on] * len(surfaces),
                 quadrature,
                 progress,
                 most_bytes,
@@ -199,8 +206,8 @@ def light_left_out_of(scene: mi.Scene, lens: mi.Sensor, rtol: float) -> tuple[fl
     from ..rendering.render import integrator_of
 
     with ExitStack() as stack:
-        for emitter in glowing_meshes(scene):
-            stack.enter_context(emitter.shining(1.0))
+        for surface in glowing_meshes(scene):
+            stack.enter_context(surface.shining(1.0))
         found = integrator_of(scene, "integral").light_left_out(scene, lens, Quadrature(rtol=rtol))
     warning = found.warning(rtol) if found else None
     return (found.share, warning) if warning else None

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
 from typing import Any
 
 import drjit as dr
@@ -54,22 +53,6 @@ def evaluated_outside(build: Callable[[mi.Shape], Any], shape: mi.Shape) -> Any:
     # follow that evaluation.
     dr.detail.new_scope(dr.backend_v(mi.Float))
     return built
-
-
-def zero_if_invalid(*kinds: str) -> Callable[[Callable], Callable]:
-    """Decorator of an emitter's method: for an invalid surface of another scene it returns zeros of types `kinds`."""
-
-    def decorate(method: Callable) -> Callable:
-        @wraps(method)
-        def guarded(emitter: Any, *arguments: Any, **named: Any) -> Any:
-            if emitter.sound():
-                return method(emitter, *arguments, **named)
-            zeros = tuple(dr.zeros(getattr(mi, kind)) for kind in kinds)
-            return zeros if len(zeros) > 1 else zeros[0]
-
-        return guarded
-
-    return decorate
 
 
 def scene_is_checked() -> bool:

@@ -18,15 +18,15 @@ STEP = 1e-4  # distance between a tested point and its four neighbours, over the
 STEPS = (3242174889, 2447445414)  # of the R₂ sequence, in units of 2⁻³²: uniform over edges and positions on them
 
 
-def robust_scene(scene: mi.Scene, lens: mi.Sensor, warn: bool = True) -> mi.Scene:
+def robust_scene(scene: mi.Scene, centre: mi.Point3f, warn: bool = True) -> mi.Scene:
     """`scene` itself, or, if it loses rays, a scene of the same shapes in Embree's robust mode, by default with a
     warning.
     """
-    lost = lost_rays(scene, lens)
+    lost = lost_rays(scene, centre)
     if not lost:
         return scene
     robust = traced_robustly(scene.shapes())
-    if lost_rays(robust, lens) >= lost:  # `scene` was robust: a few rays are lost in any case
+    if lost_rays(robust, centre) >= lost:  # `scene` was robust: a few rays are lost in any case
         return scene
     if warn:
         mi.Log(
@@ -51,16 +51,16 @@ def traced_robustly(shapes: Sequence[mi.Shape], beside: mi.Scene | None = None) 
     return mi.Scene(props)
 
 
-def lost_rays(scene: mi.Scene, lens: mi.Sensor) -> int:
-    """Number of rays from the lens to points on edges that meet no shape although four rays around each meet one."""
+def lost_rays(scene: mi.Scene, centre: mi.Point3f) -> int:
+    """Number of rays from the lens's `centre` to points on edges that meet no shape while four rays around each do."""
     if not mi.variant().startswith("llvm"):
         return 0
-    return sum(_lost_rays(scene, lens, shape) for shape in scene.shapes() if shape.is_mesh())
+    return sum(_lost_rays(scene, centre, shape) for shape in scene.shapes() if shape.is_mesh())
 
 
-def _lost_rays(scene: mi.Scene, lens: mi.Sensor, mesh: mi.Shape) -> int:
+def _lost_rays(scene: mi.Scene, centre: mi.Point3f, mesh: mi.Shape) -> int:
     """Number of rays lost at the edges of one mesh."""
-    target, origin = _points_on_edges(mesh), lens.world_transform() @ mi.Point3f(0, 0, 0)
+    target, origin = _points_on_edges(mesh), centre
     d = mi.Vector3f(target - origin)
     frame = mi.Frame3f(dr.normalize(d))
 

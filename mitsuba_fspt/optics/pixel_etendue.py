@@ -19,6 +19,14 @@ CHORDS, ALONG = 16, 6  # Gauss nodes across each part of the open pupil and alon
 Plane = NDArray[np.float64]
 
 
+def full_etendue(side: float, pupil_radius: float, focus_distance: float) -> float:
+    """Étendue A_vd A_pupil/u² [mm² sr] of a virtual pixel of a `side` and a pupil at `focus_distance` u [mm] (Eq. M.6).
+
+    In double precision: far away and stopped down its factors leave the range of float32.
+    """
+    return side**2 * math.pi * (pupil_radius / focus_distance) ** 2
+
+
 def pixel_etendues(
     lens: Lens, side: float, x: Plane, y: Plane, transmittance: float = 1.0, pixel: str = "area"
 ) -> Plane:
@@ -49,8 +57,7 @@ def pixel_etendues(
         columns, rows = (np.broadcast_to(place, steep.shape)[steep] for place in (x[None, :], y[:, None]))
         mean[steep] = _mean_over_pixels(table, values, half, columns, rows, MORE_NODES)
         mean *= _inside_stop(lens.seen_field, side, x, y)
-    bare = transmittance * side**2 * math.pi * (lens.discs[0].radius / lens.focus_distance) ** 2
-    return bare * mean
+    return transmittance * full_etendue(side, lens.discs[0].radius, lens.focus_distance) * mean
 
 
 def _towards_axis(place: Plane, reach: float) -> Plane:

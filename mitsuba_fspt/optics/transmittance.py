@@ -108,6 +108,36 @@ def _check(path: Path, wavelengths: NDArray[np.float64], values: NDArray[np.floa
         )
 
 
+@dataclass(frozen=True)
+class Filters:
+    """What lens and filters let through.
+
+    transmittance : share τ of the power, in (0, 1]
+    curve : name of the file of the transmittance over the wavelength; None where τ is given as a number
+    wavelength_nm : of the light [nm], for which τ holds; None without a curve
+    """
+
+    transmittance: float = 1.0
+    curve: str | None = None
+    wavelength_nm: float | None = None
+
+    @classmethod
+    def of(cls, numbers: Mapping[str, float], curve: Curve | None) -> Filters:
+        """Filters from the numbers of an `fspt_lens` and its curve, checked as in `transmittance_of`."""
+        passed = transmittance_of(numbers, curve)
+        return cls(passed, curve.file if curve else None, numbers.get("wavelength_nm"))
+
+    def numbers(self, f_number: float) -> dict[str, float | str]:
+        """Transmittance, T-stop of a lens with this f-number, and the curve with its wavelength, by name."""
+        found: dict[str, float | str] = {
+            "transmittance": self.transmittance,
+            "t_stop": t_stop(f_number, self.transmittance),
+        }
+        if self.curve is not None and self.wavelength_nm is not None:
+            found |= {"transmittance_curve": self.curve, "wavelength_nm": self.wavelength_nm}
+        return found
+
+
 def transmittance_of(numbers: Mapping[str, float], curve: Curve | None) -> float:
     """τ, in (0, 1], from `transmittance`, or from a curve at `wavelength_nm`; 1 if none of them is given.
 

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import weakref
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..emission import exitance
-from ..emission.elements import ElementDistribution, elements_of
-from ..emission.face_probe import Probe
+from ..emission.emitting_surface import EmittingSurface
+from ..emission.exitance import texture_of
 from ..emission.laws import law_of
-from ..jit.recording import evaluated_outside, scene_is_checked, zero_if_invalid
 from ..jit.spectra import sample_wavelengths
 from ..runtime.errors import ExitanceError
+
+
+def _zero_if_invalid(*kinds: str) -> Callable[[Callable], Callable]:
+    """Decorator of an emitter's method: for an invalid `surface` of another scene it returns zeros of types `kinds`."""
+
+    def decorate(method: Callable) -> Callable:
+        @wraps(method)
+        def guarded(emitter: Any, *arguments: Any, **named: Any) -> Any:
+            if emitter.surface.sound():
+                return method(emitter, *arguments, **named)
+            zeros = tuple(dr.zeros(getattr(mi, kind)) for kind in kinds)
+            return zeros if len(zeros) > 1 else zeros[0]
+
+        return guarded
+
+    return decorate
 
 
 class FsptSurface(mi.Emitter):
@@ -65,82 +80,45 @@ class FsptSurface(mi.Emitter):
             raise ExitanceError("fspt_surface: 'exitance' is missing. Give J_n in W/mm² as a float or a texture.")
         if "to_world" in props:
             raise ExitanceError("fspt_surface: 'to_world' has no meaning, light comes from the shape. Give it to that.")
-        self.exitance = exitance.texture_of(props)
-        self.law = law_of(props)
+        own = weakref.ref(self)  # a reference would be a cycle
+        self.surface = EmittingSurface(texture_of(props), law_of(props), lambda: own().get_shape())
         self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
-        self._positions: ElementDistribution | None = None
-        self._probe: Probe | None = None
-        self._source: exitance.ExitanceState | None = None  # data of J_n at the last `check`
-        self.single_faces: tuple[mi.Float, ...] = ()  # buffers of the mesh for which no face was found twice
-        self.winding: tuple[Any, ...] = ()  # what `integral.mesh_faults` found, with the buffers of that mesh
-        self.brightest = 0.0  # largest J_n [W/mm²], set by `check`
-        # For caches: `mark` identifies this emitter, `edition` counts the changes of J_n. A cache must not hold the
-        # emitter itself: Dr.Jit would record it even after its shape has been deleted.
-        self.mark, self.edition = object(), 0
-        self._shape: mi.ShapePtr | None = None
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
-        cb.put("exitance", self.exitance, mi.ParamFlags.Differentiable)
-        self.law.traverse(cb)
+        cb.put("exitance", self.surface.exitance, mi.ParamFlags.Differentiable)
+        self.surface.law.traverse(cb)
 
     def parameters_changed(self, keys: list[str]) -> None:
         super().parameters_changed(keys)
         if not keys or "parent" in keys:  # the shape itself changed
-            self._probe = None
-        self._forget_exitance()
-
-    def _forget_exitance(self) -> None:
-        """Discard all results that depend on J_n."""
-        self._positions = self._source = None
-        self.edition += 1
-
-    @contextmanager
-    def shining(self, value: float) -> Iterator[None]:
-        """Context manager: within the block J_n is `value` [W/mm²] everywhere."""
-        own, self.exitance = self.exitance, exitance.uniform(value)
-        self._forget_exitance()
-        try:
-            yield
-        finally:
-            self.exitance = own
-            self._forget_exitance()
-
-    # ------------------------------------------------------------------ radiance
+            self.surface.forget_shape()
+        else:
+            self.surface.forget_exitance()
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         """Radiance [W/mm²/sr] towards `si.wi`, 0 on the inward side."""
-        return mi.depolarizer(self._radiance(si, si.to_world(si.wi), active))
-
-    def _radiance(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Radiance [W/mm²/sr] towards a unit vector in world coordinates, 0 on the inward side."""
-        if not self.sound():
-            return mi.UnpolarizedSpectrum(0)
-        outward = active & (dr.dot(si.n, direction) > 0)
-        radiance = self.exitance.eval(si, outward) * self.law.profile(si, direction, outward)
-        # On a sliver, where interpolation in single precision fails, J_n is NaN.
-        # `select` returns a plain array, of which Mitsuba's depolarizer would take the first wavelength only.
-        return mi.UnpolarizedSpectrum(dr.select(outward & dr.isfinite(radiance), radiance, 0))
+        return mi.depolarizer(self.surface.radiance(si, si.to_world(si.wi), active))
 
     # ------------------------------------------------------------------ sampling
 
-    @zero_if_invalid("PositionSample3f", "Float")
+    @_zero_if_invalid("PositionSample3f", "Float")
     def sample_position(
         self, time: mi.Float, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.PositionSample3f, mi.Float]:
         """Surface point with density ∝ J_n [1/mm²]; the weight is 1/density."""
-        si, pdf = self._distribution().sample(sample, active)
+        si, pdf = self.surface.distribution().sample(sample, active)
         ps = mi.PositionSample3f(si)
         ps.n, ps.time, ps.pdf, ps.delta = si.n, time, pdf, False
         return ps, _rcp(pdf)
 
-    @zero_if_invalid("Float")
+    @_zero_if_invalid("Float")
     def pdf_position(self, ps: mi.PositionSample3f, active: mi.Bool = True) -> mi.Float:
         """Density of `sample_position` [1/mm²]."""
-        return self._distribution().pdf(self._surface_at(ps, active), active)
+        return self.surface.distribution().pdf(self.surface.interaction_at(ps, active), active)
 
-    @zero_if_invalid("Ray3f", "Spectrum")
+    @_zero_if_invalid("Ray3f", "Spectrum")
     def sample_ray(
         self,
         time: mi.Float,
@@ -150,20 +128,20 @@ class FsptSurface(mi.Emitter):
         active: mi.Bool = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Ray from a point with density ∝ J_n in a direction with density ∝ cosθ; the weight is its power [W]."""
-        si, pdf = self._distribution().sample(sample2, active)
+        si, pdf = self.surface.distribution().sample(sample2, active)
         si.wavelengths, weight = sample_wavelengths(sample1)
         direction = mi.Frame3f(si.n).to_world(mi.warp.square_to_cosine_hemisphere(sample3))
         si.time = time
         ray = si.spawn_ray(direction)
-        power = self._radiance(si, direction, active) * (dr.pi * _rcp(pdf))
+        power = self.surface.radiance(si, direction, active) * (dr.pi * _rcp(pdf))
         return ray, mi.depolarizer(power * weight)
 
-    @zero_if_invalid("DirectionSample3f", "Spectrum")
+    @_zero_if_invalid("DirectionSample3f", "Spectrum")
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """Direction from `it` to a surface point with density ∝ J_n; the weight is radiance over density [1/sr]."""
-        si, pdf = self._distribution().sample(sample, active)
+        si, pdf = self.surface.distribution().sample(sample, active)
         ds = mi.DirectionSample3f(mi.PositionSample3f(si))
         ds.n, ds.time, ds.emitter, ds.delta = si.n, it.time, mi.EmitterPtr(self), False
         ds.d = si.p - it.p
@@ -172,22 +150,22 @@ class FsptSurface(mi.Emitter):
         ds.pdf = _solid_angle(pdf, ds)
         active &= ds.pdf > 0
         si.wavelengths = it.wavelengths
-        return ds, mi.depolarizer(self._radiance(si, -ds.d, active) * _rcp(ds.pdf))
+        return ds, mi.depolarizer(self.surface.radiance(si, -ds.d, active) * _rcp(ds.pdf))
 
-    @zero_if_invalid("Float")
+    @_zero_if_invalid("Float")
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         """Density of `sample_direction` [1/sr]."""
-        pdf = self._distribution().pdf(self._surface_at(ds, active), active)
+        pdf = self.surface.distribution().pdf(self.surface.interaction_at(ds, active), active)
         return dr.select(active, _solid_angle(pdf, ds), 0)
 
-    @zero_if_invalid("Spectrum")
+    @_zero_if_invalid("Spectrum")
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Spectrum:
         """Radiance [W/mm²/sr] that arrives at `it` from the surface point of `ds`."""
-        si = self._surface_at(ds, active)
+        si = self.surface.interaction_at(ds, active)
         si.wavelengths = it.wavelengths
-        return mi.depolarizer(self._radiance(si, -ds.d, active))
+        return mi.depolarizer(self.surface.radiance(si, -ds.d, active))
 
-    @zero_if_invalid("Wavelength", "Spectrum")
+    @_zero_if_invalid("Wavelength", "Spectrum")
     def sample_wavelengths(
         self, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool = True
     ) -> tuple[mi.Wavelength, mi.Spectrum]:
@@ -198,104 +176,15 @@ class FsptSurface(mi.Emitter):
         ps = mi.PositionSample3f(si)
         ps.n = si.n
         wavelengths, weight = sample_wavelengths(sample)
-        here = self._surface_at(ps, active)
+        here = self.surface.interaction_at(ps, active)
         here.wavelengths = wavelengths
-        return wavelengths, mi.depolarizer(self._radiance(here, si.wi, active) * weight)
-
-    # ------------------------------------------------------------------ the surface itself
-
-    def _own_shape(self) -> mi.Shape:
-        """Shape of the emitter; ExitanceError if it was deleted with its scene, while the emitter still exists."""
-        if self._shape is None:
-            self._shape = mi.ShapePtr(self.get_shape())
-        if self._shape[0] is None:
-            raise ExitanceError("fspt_surface: its scene was deleted. Keep the scene as well as its emitter.")
-        return self._shape[0]
-
-    def check(self) -> None:
-        """Raise ExitanceError if J_n or the exit law does not fit the shape; repeated only after a change."""
-        source = exitance.ExitanceState.of(self._own_shape(), self.exitance)
-        # Mitsuba does not inform an emitter of new values on its mesh, or of objects that are updated separately.
-        if self._source and (self._source.state() != source.state() or self.law.renewed()):
-            self._forget_exitance()
-        if self._source:
-            return
-
-        def checked(shape: mi.Shape) -> float:
-            brightest = exitance.check_values(shape, self.exitance)
-            self.law.prepare(shape)
-            return brightest
-
-        self.brightest = evaluated_outside(checked, self._own_shape())
-        self._source = source
-
-    def sound(self) -> bool:
-        """True if `check` succeeds. During a recording for another scene, which must not raise: False if it fails."""
-        if scene_is_checked() and (self._source or self._shape is None):
-            # A surface that was never checked belongs to another scene. If the loading of that scene failed, the shape
-            # is deleted and must not be accessed.
-            return self._source is not None
-        try:
-            self.check()
-        except ExitanceError:
-            if scene_is_checked():
-                return False
-            raise
-        return True
-
-    def is_isotropic(self) -> bool:
-        """True if the radiance is equal in all outward directions."""
-        return self.law.isotropic
-
-    def is_uniform(self) -> bool:
-        """True if J_n is one number."""
-        return exitance.is_uniform(self.exitance)
-
-    def is_linear(self) -> bool:
-        """True if J_n is a mesh attribute, and so linear on every face."""
-        return bool(self._source) and self._source.attribute is not None and self._own_shape().is_mesh()
-
-    def radiance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
-        """Radiance [W/mm²/sr] at the corners of every face of a mesh; None if it is not linear or not Lambert's."""
-        corners = exitance.at_corners(self._own_shape(), self.exitance) if self.is_isotropic() else None
-        if corners is None:
-            return None
-        profile = self.law.profile(dr.zeros(mi.SurfaceInteraction3f), mi.Vector3f(0, 0, 1), mi.Bool(True))
-        return tuple(profile * value for value in corners)
-
-    def _distribution(self) -> ElementDistribution:
-        """Distribution of positions ∝ J_n, built on first use."""
-        self.check()
-        if self._positions is None:
-            self._positions = evaluated_outside(
-                lambda shape: ElementDistribution(elements_of(shape), exitance.function_on(shape, self.exitance)),
-                self._own_shape(),
-            )
-        return self._positions
-
-    def _surface_at(self, ps: mi.PositionSample3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        """Surface interaction at a position sample, which does not contain its face."""
-        shape = self._own_shape()
-        if not shape.is_mesh():
-            return self._distribution().elements.at(ps.uv)
-        if self._probe is None:
-            self._probe = evaluated_outside(Probe, shape)
-        return self._probe.at(shape, ps, active)
-
-    def trace_beside(self, scene: mi.Scene) -> None:
-        """Set up the search for faces for kernels that trace rays in `scene`, see `Probe`.
-
-        Repeated on every call, since the probe may have been built beside another scene in between.
-        """
-        if self._own_shape().is_mesh():
-            with dr.suspend_grad():
-                self._probe = Probe(self._own_shape(), scene)
+        return wavelengths, mi.depolarizer(self.surface.radiance(here, si.wi, active) * weight)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
-        return self._own_shape().bbox()
+        return self.surface.shape.bbox()
 
     def to_string(self) -> str:
-        return f"FsptSurface[\n  exitance = {self.exitance},\n  emission = {self.law}\n]"
+        return f"FsptSurface[\n  exitance = {self.surface.exitance},\n  emission = {self.surface.law}\n]"
 
 
 def _solid_angle(pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:

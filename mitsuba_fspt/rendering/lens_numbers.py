@@ -27,10 +27,12 @@ def lens_numbers(
     OpticsError : the lens cannot exist.
     """
     found = []
-    for sensor in loaded(scene).sensors():
-        if is_lens(sensor):
-            width, height = (int(n) for n in sensor.film().crop_size())
-            found.append((sensor.numbers(), (height, width)))
+    sensors = loaded(scene).sensors()
+    from ..camera.of_sensor import camera_of
+
+    for sensor in filter(is_lens, sensors):
+        camera = camera_of(sensor)
+        found.append((camera.numbers(), camera.film.shape))
     if not found:
         raise SceneError("scene: it has no 'fspt_lens'. Give a scene with the lens of the camera.")
     if any(other != found[0] for other in found[1:]):

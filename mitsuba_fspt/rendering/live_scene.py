@@ -23,6 +23,8 @@ from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from ..camera.camera import Camera
+
 DRAFT = 0.03  # rtol of a draft, the quick image while a parameter moves
 DRAFT_NODES = 16  # lines of sight of a pixel in a draft; silhouettes that need more are left to the full image
 DRAFT_SAMPLES = 8  # samples of a pixel in a draft by Monte Carlo
@@ -175,6 +177,8 @@ class LiveScene:
         Spots that lines of sight may miss are not searched for. If the scene has another integrator, it is used with
         few samples, because the integral may leave out light of that scene. Parameters and errors as of `image`.
         """
+        from ..camera.of_sensor import camera_of
+
         scene = self.scene(values, model, exact=False)
         lens, integrator = sensor_of(scene, self.sensor), integrator_of(scene, None)
         if not is_integral(integrator):
@@ -183,7 +187,7 @@ class LiveScene:
         quadrature = replace(own, rtol=max(own.rtol, rtol), max_nodes=min(own.max_nodes, max_nodes))
         solution = integrator.solve(scene, lens, quadrature, narrow=False)
         how = {"method": "integral", "rtol": quadrature.rtol}
-        return Image(solution.power, solution.error, solution.coverage, how | lens.numbers())
+        return Image(solution.power, solution.error, solution.coverage, how | camera_of(lens).numbers())
 
     def surface_point(
         self, values: Mapping[str, object], model: str | None, column: int, row: int
@@ -192,20 +196,23 @@ class LiveScene:
         import drjit as dr
         import mitsuba as mi
 
+        from ..camera.of_sensor import camera_of
+        from ..emission.of_emitter import surface_of
+
         scene = self.scene(values, model)
-        lens = sensor_of(scene, self.sensor)
-        offset = mi.Vector2f(lens.film().crop_offset())
+        camera = camera_of(sensor_of(scene, self.sensor))
+        offset = mi.Vector2f(camera.film.crop_offset)
         pixel = mi.Point2f(column + 0.5, row + 0.5) + offset
         dr.make_opaque(pixel)  # no new kernel for every pixel
-        ray, cosine, _ = lens.line_of_sight(pixel, mi.Point2f(0, 0))
-        met = _surfaces(scene, lens, ray, cosine)
+        ray, cosine, _ = camera.line_of_sight(pixel, mi.Point2f(0, 0))
+        met = _surfaces(scene, camera, ray, cosine)
         if not met:
             return None
         shapes = [shape for shape, _, _ in met]
         shape, si, depth = met[-1]
-        emitter = shape.emitter()
-        exitance = float(emitter.exitance.eval(si)[0][0]) if is_surface(emitter) else None
-        centre, radius, _ = lens.blur_disc(ray(depth / cosine))
+        surface = surface_of(shape.emitter())
+        exitance = float(surface.exitance.eval(si)[0][0]) if surface else None
+        centre, radius, _ = camera.blur_disc(ray(depth / cosine))
         centre -= offset
         return SurfacePoint(
             tuple(float(c[0]) for c in si.p),  # type: ignore[arg-type]
@@ -254,7 +261,7 @@ def _stamp(file: Path) -> Stamp:
 
 
 def _surfaces(
-    scene: mi.Scene, lens: mi.Sensor, ray: mi.Ray3f, cosine: mi.Float
+    scene: mi.Scene, camera: Camera, ray: mi.Ray3f, cosine: mi.Float
 ) -> list[tuple[mi.Shape, mi.SurfaceInteraction3f, mi.Float]]:
     """Shapes on a line of sight up to the first that glows, their points and the depths [mm] at which they are seen."""
     import drjit as dr
@@ -262,7 +269,7 @@ def _surfaces(
 
     from ..integral.specular import Specular, strongest_course
 
-    specular = Specular.of(scene, lens, even_if_none=True)
+    specular = Specular.of(scene, camera, even_if_none=True)
     found = []
     for si, depth in strongest_course(scene, specular, ray, cosine, mi.Float(0)):  # type: ignore[arg-type]
         shape = next(s for s in scene.shapes() if dr.all(si.shape == mi.ShapePtr(s)))
@@ -349,14 +356,15 @@ def _apply(change: Change, lens: mi.Sensor, model: str | None) -> None:
     """Give the lens its new numbers, placement and model; OpticsError for a lens that cannot exist."""
     import mitsuba as mi
 
+    from ..camera.of_sensor import camera_of
+
     lens.prepare_model(model or change.model)
     parameters = mi.traverse(lens)
     for name, number in change.lens.items():
         parameters[name] = number
     parameters["to_world"] = mi.Transform4f(change.placement)
     parameters.update()
-    if lens.fault:
-        raise lens.fault
+    camera_of(lens)  # raises what the update refused
 
 
 def _unchanged_source(scene: mi.Scene) -> tuple[Any, dict[str, object]]:

@@ -34,10 +34,11 @@ def tracer(method: str, scene: mi.Scene, lens: mi.Sensor, max_depth: int | None 
     """
     import mitsuba as mi
 
+    from ..camera.of_sensor import camera_of
     from ..integral.quadrature import Quadrature
     from ..integral.specular import Specular
 
-    specular = Specular.of(scene, lens)
+    specular = Specular.of(scene, camera_of(lens))
     if specular and method == "ptracer":
         raise SceneError(
             f"render: method ptracer cannot connect light to the lens through or off the specular shapes "

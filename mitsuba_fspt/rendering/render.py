@@ -30,6 +30,8 @@ from .scene import loaded
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from ..camera.camera import Camera
+
 METHODS = ("integral", *monte_carlo.METHODS)
 PASSES = 32  # independent Monte Carlo passes whose scatter gives the standard error
 SAMPLES_IN_FLIGHT = 1 << 23  # Monte Carlo samples of one pass, which bounds its memory
@@ -97,8 +99,15 @@ def render(
         *planes, how = _timed(scene, lens, integrator, accuracy, (spp, seed), report, deadline)
     how |= {} if max_time is None else {"max_time": max_time}
     how |= _warned(how, planes[0], scene, lens, integrator)
-    origin, numbers = origin_of(scene, lens), {**lens.numbers(), "airy_radius": lens.airy_radius}
-    return Image(*planes, {**origin, "sensor": sensor, **how, **numbers, **_versions()})
+    return Image(*planes, {**origin_of(scene, lens), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
+
+
+def _lens_numbers(lens: mi.Sensor) -> dict[str, float | int | str]:
+    """Numbers of the lens and its film for the metadata, with the radius of the Airy disc."""
+    from ..camera.of_sensor import camera_of
+
+    camera = camera_of(lens)
+    return {**camera.numbers(), "airy_radius": camera.airy_radius}
 
 
 def _timed(
@@ -125,18 +134,22 @@ def _warned(
     how: dict, power: NDArray[np.float64], scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator
 ) -> dict[str, str]:
     """The warnings of metadata `how`, that the picture is dark, and those about the scene."""
+    from ..camera.of_sensor import camera_of
     from ..integral.scene_warnings import scene_warnings
 
     dark = None if power.any() else DARK
-    warnings = [text for text in (how.get("warnings"), dark, *scene_warnings(scene, lens, integrator)) if text]
+    warnings = [
+        text for text in (how.get("warnings"), dark, *scene_warnings(scene, camera_of(lens), integrator)) if text
+    ]
     return {"warnings": "; ".join(warnings)} if warnings else {}
 
 
 def warnings_of(scene: mi.Scene, sensor: int = 0) -> list[str]:
     """What is odd about a scene, or not treated by the integral: one line each, as in the metadata of its image."""
+    from ..camera.of_sensor import camera_of
     from ..integral.scene_warnings import scene_warnings
 
-    return scene_warnings(scene, sensor_of(scene, sensor), integrator_of(scene, "integral"))
+    return scene_warnings(scene, camera_of(sensor_of(scene, sensor)), integrator_of(scene, "integral"))
 
 
 def _integrator(
@@ -165,11 +178,12 @@ def _integrate(
     deadline: Deadline,
 ) -> tuple:
     """Power, error [W] and coverage, shape (h, w), by the deterministic integral, and metadata."""
+    from ..camera.of_sensor import camera_of
     from ..integral.scene_checks import check_scene, check_surfaces_alone
 
     with named("fspt_integral"):
         quadrature = replace(integrator.quadrature, **{k: value for k, value in accuracy.items() if value is not None})
-    check_scene(scene, lens)
+    check_scene(scene, camera_of(lens))
     check_surfaces_alone(scene)
     left_out = integrator.light_left_out(scene, lens, quadrature)  # first, as it takes its time in any case
     solution = integrator.solve(scene, lens, quadrature, partial(progress, "integrating"), deadline=deadline)
@@ -201,12 +215,14 @@ def _sample(
     deadline: Deadline,
 ) -> tuple:
     """Mean and standard error [W] of Monte Carlo passes and coverage, shape (h, w), in double precision; metadata."""
-    from ..emission.face_probe import probe_beside
+    from ..camera.of_sensor import camera_of
+    from ..emission.of_emitter import probe_beside
     from ..integral.pupil_form import coverage
     from ..integral.scene_checks import check_scene
     from ..jit.recording import recording
 
-    check_scene(scene, lens)
+    camera = camera_of(lens)
+    check_scene(scene, camera)
     spp = whole("render: 'spp'", spp, SceneError, "256")
     seed = whole("render: 'seed'", seed, SceneError, "1")
     if spp < 2:
@@ -215,7 +231,7 @@ def _sample(
         raise SceneError(f"render: 'seed' must be in 0 … 2^32 - 1, got {seed}. Give for example 1.")
     probe_beside(scene)
     followed = _followed(scene, lens, integrator)  # first, as it takes its time in any case
-    pixels = math.prod(int(n) for n in lens.film().crop_size())
+    pixels = math.prod(camera.film.shape)
     count = max(min(PASSES, spp), math.ceil(spp * pixels / SAMPLES_IN_FLIGHT))
     lens.sampler().set_sample_count(math.ceil(spp / count))
     each = lens.sampler().sample_count()  # some samplers round up, with a warning: here once, not in every pass
@@ -244,12 +260,13 @@ def _sample(
         how["warnings"] = "; ".join([stopped, *([how["warnings"]] if "warnings" in how else [])])
     error = monte_carlo.standard_error(mean, squares / count, count, samples)
     with recording():
-        met = coverage(scene, lens)
-    return mean, np.where((mean > 0) | _can_see(scene, lens), error, 0), met, how
+        met = coverage(scene, camera)
+    return mean, np.where((mean > 0) | _can_see(scene, camera), error, 0), met, how
 
 
 def _followed(scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator) -> dict[str, object]:
     """Metadata of the paths that a Monte Carlo follows: `max_depth`, and the share of the light that it leaves out."""
+    from ..camera.of_sensor import camera_of
     from ..integral.left_out import light_left_out
     from ..integral.quadrature import Quadrature
     from ..integral.scene_warnings import treats_media
@@ -261,19 +278,19 @@ def _followed(scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator) -> di
     if depth < 0 or treats_media(integrator):  # whose light takes other paths
         return how
     own = getattr(scene.integrator(), "quadrature", Quadrature())
-    if (left_out := light_left_out(scene, lens, own, depth)) is not None:
+    if (left_out := light_left_out(scene, camera_of(lens), own, depth)) is not None:
         how |= {"light_left_out": left_out.share, "light_left_out_error": left_out.error}
         if warning := left_out.warning(own.rtol):
             how["warnings"] = warning
     return how
 
 
-def _can_see(scene: mi.Scene, lens: mi.Sensor) -> NDArray[np.bool_]:
+def _can_see(scene: mi.Scene, camera: Camera) -> NDArray[np.bool_]:
     """True, shape (h, w), on pixels with lines of sight to an emitter (Eq. 4) that no image-plane stop blocks."""
-    from ..integral.window import visible_window
+    from ..integral.visible_window import visible_window
 
-    window = visible_window(scene, lens)
-    inside, cut = window.field_stop(lens)
+    window = visible_window(scene, camera)
+    inside, cut = window.field_stop(camera)
     return window.expand((inside | cut).astype(np.float64)) > 0
 
 

@@ -54,7 +54,7 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
     backend.ensure_variant()
     import mitsuba as mi
 
-    from ..emission.face_probe import probe_beside
+    from ..emission.of_emitter import probe_beside
 
     path, folder, parse = _source_of(scene, parameters)
     with _files_of(folder):

@@ -204,18 +204,19 @@ def _reference(
     scene: mi.Scene, lens: mi.Sensor, path: str | os.PathLike[str] | None, budget: float, report: Progress
 ) -> Reference:
     """The reference: that of the file, or the integral at a fine rtol if no file is given."""
-    width, height = (int(n) for n in _film(scene, lens).crop_size())
-    from_file = read_reference(path, (height, width)) if path is not None else None
+    shape = _shape(scene, lens)
+    from_file = read_reference(path, shape) if path is not None else None
     report("reference", 0.0)
     return from_file or own_reference(scene, lens, REFERENCE_TIME * budget)
 
 
-def _film(scene: mi.Scene, lens: mi.Sensor) -> mi.Film:
-    """The film of the lens; raises as `check_scene` does."""
+def _shape(scene: mi.Scene, lens: mi.Sensor) -> tuple[int, int]:
+    """Shape (h, w) of the image; raises as `check_scene` does."""
+    from ..camera.of_sensor import camera_of
     from ..integral.scene_checks import check_scene
 
-    check_scene(scene, lens)
-    return lens.film()
+    check_scene(scene, camera := camera_of(lens))
+    return camera.film.shape
 
 
 def read_reference(path: str | os.PathLike[str], shape: tuple[int, int]) -> Reference:

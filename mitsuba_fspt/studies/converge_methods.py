@@ -96,29 +96,33 @@ def _surfaces_and_pupil(scene: mi.Scene, lens: mi.Sensor) -> tuple[bool, str]:
     """Whether light can be traced from the surfaces to the pupil, and if not, why."""
     import mitsuba as mi
 
+    from ..camera.of_sensor import camera_of
     from ..integral.specular import Specular
 
-    if lens.optics.model.name == "pinhole":
+    camera = camera_of(lens)
+    if camera.lens.model.name == "pinhole":
         return False, "a pinhole is no disc that light from the surface could meet"
     for emitter in scene.emitters():
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
             return False, f"the emitter {emitter.class_name()} has no surface"
-    if specular := Specular.of(scene, lens):
+    if specular := Specular.of(scene, camera):
         return False, f"light reaches the lens through or off specular shapes: {', '.join(specular.names)}"
     return True, ""
 
 
 def _point_sum(scene: mi.Scene, lens: mi.Sensor) -> Method:
     """The paper's sum over surface points."""
+    from ..camera.of_sensor import camera_of
     from ..validation import direct_summation
 
+    camera = camera_of(lens)
     # At a minimum of 1 the faces of a mesh are not divided. Minima that give the same number of points are one setting.
     minima = (1, *itertools.takewhile(lambda n: n <= MOST_POINTS, (POINTS * 4**k for k in itertools.count())))
     counts = {direct_summation.points_of(scene, minimum): minimum for minimum in reversed(minima)}
 
     def prepare(points: float) -> Callable[[], RunResult]:
         def run() -> RunResult:
-            power, pairs = direct_summation.solve(scene, lens, counts[int(points)])
+            power, pairs = direct_summation.solve(scene, camera, counts[int(points)])
             return RunResult(power, pairs, points)
 
         return run
@@ -147,19 +151,21 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
     """A copy of an `fspt_lens` and its film with another sampler."""
     import mitsuba as mi
 
-    own = dict(mi.traverse(lens))
+    from ..camera.of_sensor import camera_of
+
+    own, camera = dict(mi.traverse(lens)), camera_of(lens)
     numbers = {name: float(value[0]) for name, value in own.items() if isinstance(value, mi.Float64)}
     numbers.pop("wavelength_nm", None)  # belongs to a curve; `numbers` has the curve's transmittance there
-    numbers["transmittance"] = lens.transmittance
-    film = lens.film()
+    numbers["transmittance"] = camera.filters.transmittance
+    film = camera.film
     names = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
-    sizes = (int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
+    sizes = (*film.size, *film.crop_size, *film.crop_offset)
     return mi.load_dict(
         {
             "type": "fspt_lens",
             **numbers,
-            "model": lens.optics.model.name,
-            "to_world": mi.ScalarTransform4f(np.array(lens.world_transform().matrix, np.float64).reshape(4, 4)),
+            "model": camera.lens.model.name,
+            "to_world": mi.ScalarTransform4f(np.array(camera.placement).reshape(4, 4)),
             "film": {"type": "hdrfilm", "pixel_format": "luminance", **dict(zip(names, sizes, strict=True))},
             "sampler": {"type": sampler},
         }
@@ -168,7 +174,7 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
 
 def _monte_carlo(kind: str, scene: mi.Scene, lens: mi.Sensor) -> Callable[[float], Callable[[], RunResult]]:
     """`prepare` for a number of samples per pixel, in as few passes as memory permits; every run has another seed."""
-    from ..emission.face_probe import probe_beside
+    from ..emission.of_emitter import probe_beside
 
     probe_beside(scene)
     integrator, seed = tracer(kind, scene, lens), itertools.count(1)
@@ -199,11 +205,13 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 <<
     import drjit as dr
     import mitsuba as mi
 
+    from ..camera.of_sensor import camera_of
     from ..integral import node_rules
-    from ..integral.window import visible_window
+    from ..integral.visible_window import visible_window
     from ..jit.pixel_grid import Grid
 
-    window = visible_window(scene, lens)
+    camera = camera_of(lens)
+    window = visible_window(scene, camera)
     pixels = math.prod(window.shape)
     rule = node_rules.four(True)
     turns = max(1, math.ceil(least / (len(rule) * pixels)))
@@ -214,7 +222,7 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 <<
     node = dr.arange(mi.UInt32, pixels * columns.shape[1])
     pixel, node = dr.gather(mi.UInt32, Grid(window.shape).pixels(), node % pixels), node // pixels
     ax, ay, dx, dy = (dr.gather(mi.Float, mi.Float(column), node) for column in columns)
-    ray, _, _ = lens.line_of_sight(window.centres(pixel) + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
+    ray, _, _ = camera.line_of_sight(window.centres(pixel) + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
     dr.eval(ray)
 
     def run() -> int:

@@ -16,7 +16,6 @@ from ..rendering.scene import loaded
 from ..runtime import backend
 from ..runtime.errors import named
 from ..runtime.extras import EXTRAS
-from ..runtime.plugin_types import is_surface
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -138,15 +137,21 @@ def _scattered(left_out: LeftOut) -> Explanation:
 
 def _diffraction(lens: mi.Sensor) -> Explanation:
     """Row for the diffraction at the diaphragm."""
-    radius, nm = lens.airy_radius, lens.airy_wavelength_nm
-    why = f"Airy radius {radius:.2g} mm on the film, {radius / lens.pixel_pitch:.2g} pixels, at {nm:g} nm"
+    from ..camera.of_sensor import camera_of
+
+    camera = camera_of(lens)
+    radius, nm = camera.airy_radius, camera.airy_wavelength_nm
+    why = f"Airy radius {radius:.2g} mm on the film, {radius / camera.pixel_pitch:.2g} pixels, at {nm:g} nm"
     return Explanation("diffraction", True, why)
 
 
 def _never_done(scene: mi.Scene, variant: str) -> list[Explanation]:
     """Rows for work that is not started unless it is needed, so that there is no cost to measure."""
+    from ..emission.of_emitter import surface_of
+
     loaded = [one.module for one in EXTRAS if one.module in sys.modules]
-    uniform = [is_surface(emitter) and emitter.is_uniform() for emitter in scene.emitters()]
+    surfaces = map(surface_of, scene.emitters())
+    uniform = [surface is not None and surface.is_uniform() for surface in surfaces]
     return [
         Explanation("J_n look-ups", all(uniform), f"{sum(uniform)} of {len(uniform)} surfaces glow alike everywhere"),
         Explanation("gradients", True, "an image needs none"),

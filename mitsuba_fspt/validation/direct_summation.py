@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.camera import Camera
 from ..emission.elements import Elements, elements_of
 from ..integral.eq9 import eq9
 from ..integral.occlusion import hidden
@@ -32,32 +33,30 @@ def points_of(scene: mi.Scene, minimum: int) -> int:
     return sum(elements_of(emitter.get_shape(), minimum).count for emitter in scene.emitters())
 
 
-def solve(scene: mi.Scene, lens: mi.Sensor, minimum: int = 1) -> tuple[Plane, int]:
+def solve(scene: mi.Scene, camera: Camera, minimum: int = 1) -> tuple[Plane, int]:
     """Power on the pixels of the crop window, shape (h, w) [W], and the number of pairs of a point and a pixel.
 
     Every glowing shape has at least `minimum` points; with 1 those of a mesh are the centres of its faces. Raises
     SceneError or ExitanceError as in `check_scene`.
     """
-    check_scene(scene, lens)
-    width, height = (int(n) for n in lens.film().crop_size())
+    check_scene(scene, camera)
+    width, height = camera.film.crop_size
     power, pairs = dr.zeros(mi.Float64, width * height), 0
     with recording(), dr.suspend_grad():
         for emitter in scene.emitters():
             elements = elements_of(emitter.get_shape(), minimum)
-            for index, pixel in _pairs(elements, lens):
+            for index, pixel in _pairs(elements, camera):
                 pairs += len(index)
-                _add(power, scene, lens, emitter, elements, index, pixel)
+                _add(power, scene, camera, emitter, elements, index, pixel)
                 dr.eval(power)
-    return lens.transmittance * power.numpy().reshape(height, width), pairs
+    return camera.filters.transmittance * power.numpy().reshape(height, width), pairs
 
 
-def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]:
+def _pairs(elements: Elements, camera: Camera) -> Iterator[tuple[Index, Index]]:
     """Pairs of an element and the number of a pixel near its blur disc, about `BATCH` pairs at a time."""
     si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(*elements.middle))
-    centre, radius = lens.film_discs(si.p.numpy().T.astype(np.float64))
-    size, offset = (
-        np.array([int(n) for n in corner]) for corner in (lens.film().crop_size(), lens.film().crop_offset())
-    )
+    centre, radius = camera.film_discs(si.p.numpy().T.astype(np.float64))
+    size, offset = np.array(camera.film.crop_size), np.array(camera.film.crop_offset)
     # Integers k with |k + ½ - centre| <= radius, plus the rounding error of float32.
     reach = np.where(np.isfinite(radius), radius * (1 + 1e-4) + 1e-3, np.inf)
     first = np.clip(np.ceil(centre - reach - 0.5 - offset), 0, size).astype(np.int64)
@@ -75,7 +74,7 @@ def _pairs(elements: Elements, lens: mi.Sensor) -> Iterator[tuple[Index, Index]]
 def _add(
     power: mi.Float64,
     scene: mi.Scene,
-    lens: mi.Sensor,
+    camera: Camera,
     emitter: mi.Emitter,
     elements: Elements,
     index: Index,
@@ -83,14 +82,14 @@ def _add(
 ) -> None:
     """Add the contributions of the pairs to their pixels, one array entry per pair, in one kernel."""
     number = mi.UInt32(pixel.astype(np.uint32))
-    width = dr.opaque(mi.UInt32, int(lens.film().crop_size()[0]))
-    corner = mi.Point2f(*(dr.opaque(mi.Float, int(n) + 0.5) for n in lens.film().crop_offset()))
+    width = dr.opaque(mi.UInt32, camera.film.crop_size[0])
+    corner = mi.Point2f(*(dr.opaque(mi.Float, n + 0.5) for n in camera.film.crop_offset))
     position = corner + mi.Vector2f(mi.Float(number % width), mi.Float(number // width))
 
     si, area = elements.place(mi.UInt32(index.astype(np.uint32)), mi.Point2f(*elements.middle))
-    centre, radius, _ = lens.blur_disc(si.p)
+    centre, radius, _ = camera.blur_disc(si.p)
     pupil = mi.Point2f((position - centre) / radius)
-    _, lens_point, passes, cos_d = lens.arrival(si.p, pupil)
+    _, lens_point, passes, cos_d = camera.arrival(si.p, pupil)
     to_lens = lens_point - si.p
     distance = dr.norm(to_lens)
     to_lens /= distance
@@ -101,7 +100,7 @@ def _add(
     si.wi = si.to_local(to_lens)
     radiance = dr.select(lit, scalar(emitter.eval(si, lit)), 0)
     # |r_vd - r| = |u - z|/cosθ_d. A_vd is multiplied last, so that no intermediate value exceeds float32.
-    defocus = dr.opaque(mi.Float, lens.optics.focus_distance) - distance * cos_d
-    solid_angle = cos_d * dr.square(cos_d * dr.opaque(mi.Float, lens.virtual_pitch) / defocus)
+    defocus = dr.opaque(mi.Float, camera.lens.focus_distance) - distance * cos_d
+    solid_angle = cos_d * dr.square(cos_d * dr.opaque(mi.Float, camera.virtual_pitch) / defocus)
     added = eq9(mi.Float64(radiance), mi.Float64(cos_s) * mi.Float64(area) * mi.Float64(solid_angle))
     dr.scatter_add(power, dr.select(lit, added, 0), number, lit)

@@ -54,9 +54,9 @@ def test_who_sees_the_tip_of_a_small_checkerboard_gets_its_light():
     rectangle = {"type": "rectangle", "to_world": place, "emitter": {"type": "fspt_surface", "exitance": bitmap}}
     optics = {"f_number": 2.75, "magnification": None, "focus_distance": 180.0, "to_world": None}
     scene = world_scene(rectangle, sensor=lens(size=(12, 10), pitch=0.572, **optics))
-    camera = scene.sensors()[0]
+    camera = scene.sensors()[0].camera
     ax, ay = np.meshgrid(*2 * [(np.arange(500) + 0.5) / 250 - 1])
-    ax, ay = (camera.optics.pupil_radius * a[ax**2 + ay**2 <= 1] for a in (ax, ay))
+    ax, ay = (camera.lens.pupil_radius * a[ax**2 + ay**2 <= 1] for a in (ax, ay))
     light = np.zeros((10, 12))
     for i, j in np.ndindex(light.shape):
         x, y = camera.virtual_pitch * (5.5 - j), camera.virtual_pitch * (4.5 - i)
@@ -84,7 +84,7 @@ def test_texels_of_half_a_pixel_reach_rtol():
     rectangle = {"type": "rectangle", "to_world": place.scale([half, half, 1]), "emitter": emitter}
     optics = {"f_number": 64.0, "magnification": None, "focus_distance": 180.0, "to_world": None}
     scene = world_scene(rectangle, sensor=lens(size=(width, height), pitch=0.572, **optics))
-    image, camera = fspt.render(scene), scene.sensors()[0]
+    image, camera = fspt.render(scene), scene.sensors()[0].camera
 
     within = (np.arange(400) + 0.5) / 400 - 0.5
     y, x = (camera.virtual_pitch * ((n - 1) / 2 - np.arange(n)[:, None] - within).ravel() for n in (height, width))

@@ -281,7 +281,7 @@ def test_fluence_updated_by_itself_is_followed():
     scene, emitter = glowing_sphere(last_flight(*STEEP))
     fspt.render(scene, method="integral")
     turned = sloping(1.0, (-0.1, 0.05, 0.1))
-    values = mi.traverse(emitter.law.fluence)
+    values = mi.traverse(emitter.surface.law.fluence)
     values["data"] = mi.traverse(mi.load_dict(turned))["data"]
     values.update()
     anew = glowing_sphere(last_flight(1.0, (0, 0, 0), fluence=turned))[0]

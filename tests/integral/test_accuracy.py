@@ -359,7 +359,7 @@ def test_a_disk_between_single_lines_is_seen_beside_a_crop_window_too():
     wide = disk(depth, 5 * side, -8 * side, -5 * side)
     of = camera_scene(small, wide, bright, magnification=0.1, f_number=22, crop=crop)
     image = fspt.render(of, rtol=1e-2)
-    four = image.power[row - 1 : row + 1, 5:7] / of.sensors()[0].etendue * np.pi
+    four = image.power[row - 1 : row + 1, 5:7] / of.sensors()[0].camera.etendue * np.pi
     share = np.pi / 16 * (1 + side**2 * 52 / depth**2) ** -2
     np.testing.assert_allclose(four, share, atol=1e-2 * share)
 
@@ -376,10 +376,10 @@ def test_a_disk_between_single_lines_of_sight_is_seen(width, tilt):
     small = disk(depth, width * side / 2, x=6 * side, y=4 * side, tilt=tilt)
     of = camera_scene(small, disk(depth, 5 * side, x=-8 * side, y=-5 * side), magnification=magnification, f_number=22)
     image = fspt.render(of, rtol=1e-2)
-    lens = of.sensors()[0]
+    camera = of.sensors()[0].camera
     x, y = 6 * side, 4 * side
     towards = (np.cos(np.radians(tilt)) * depth + np.sin(np.radians(tilt)) * x) / depth
     share = np.pi / 16 * width**2 * towards * (1 + (x**2 + y**2) / depth**2) ** -2
     row, column = HEIGHT // 2 - 4, WIDTH // 2 - 6
-    four = image.power[row - 1 : row + 1, column - 1 : column + 1] / lens.etendue * np.pi
+    four = image.power[row - 1 : row + 1, column - 1 : column + 1] / camera.etendue * np.pi
     np.testing.assert_allclose(four, share, atol=1e-2)

@@ -58,7 +58,7 @@ def test_errors_hold_wherever_it_stops(name, batch, monkeypatch):
         off = np.abs(found.power - truth.power) > found.error + truth.error
         assert off.sum() <= 0.01 * off.size
         sums.append(found.error.sum())
-        assert found.error.max() <= 1.001 * sensor.etendue * 3e-3 / np.pi  # no pixel is brighter than a surface
+        assert found.error.max() <= 1.001 * sensor.camera.etendue * 3e-3 / np.pi  # no pixel is brighter than a surface
         assert deadline.cut or found.error.max() <= 1e-3 * found.power.max()
     assert sums[0] > 0
     assert sums[-1] < 0.5 * sums[0]

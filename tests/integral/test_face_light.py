@@ -30,8 +30,8 @@ def shaded_sheet(folder, **optics):
     place = mi.ScalarTransform4f().translate([0.01, SHADE + 20, 0]).rotate([0, 1, 0], 90).scale(20)
     mesh = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute())}
     scene = world_scene(mesh, {"type": "rectangle", "to_world": place}, sensor=lens(24, **optics))
-    camera = scene.sensors()[0]
-    light = FaceLight.seen(scene.emitters()[0], camera, (0, 0), (24, 24)).behind(scene, camera)
+    camera = scene.sensors()[0].camera
+    light = FaceLight.seen(scene.emitters()[0].surface, camera, (0, 0), (24, 24)).behind(scene, camera)
     return vertices[faces][..., 1], light
 
 

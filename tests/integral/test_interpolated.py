@@ -9,7 +9,7 @@ from small_scenes import camera_scene, disk, filled, load_scene, sphere
 from mitsuba_fspt.integral import interpolated
 from mitsuba_fspt.integral.interpolated import blocks_of, means_of_parts, part_weights
 from mitsuba_fspt.integral.quadrature import Quadrature
-from mitsuba_fspt.integral.window import visible_window
+from mitsuba_fspt.integral.visible_window import visible_window
 
 FINER = 16  # times as many pixels along each side as the films of `small_scenes`
 
@@ -56,18 +56,18 @@ def test_polynomials_keep_the_power_of_blocks_and_are_exact_to_degree_four(side)
 def test_blocks_of_all_sizes_cover_the_same_pixels_around_the_optical_axis(size):
     """On films whose sides are no whole number of blocks, too."""
     scene = finer_scene(disk(165.0, 60.0), size=size)
-    lens = scene.sensors()[0]
-    window = visible_window(scene, lens)
-    blocks = blocks_of(window, lens)
+    camera = scene.sensors()[0].camera
+    window = visible_window(scene, camera)
+    blocks = blocks_of(window, camera)
     assert [of.side for of in blocks] == [4, 2, 1]
     fine = blocks[-1].window
     assert all(fine.corner[k] <= window.corner[k] - 12 for k in (0, 1))
     assert all(fine.shape[k] >= window.shape[k] + 24 for k in (0, 1))
     for of in blocks:
-        first = np.array(of.window.corner) - np.array(of.lens.film().size()) / 2
+        first = np.array(of.window.corner) - np.array(of.camera.film.size) / 2
         assert of.side * first == pytest.approx(np.array(fine.corner) - np.array(size) / 2, abs=1e-9)
         assert tuple(of.side * n for n in of.window.shape) == fine.shape
-        assert of.side * of.lens.pixel_pitch == pytest.approx(of.side**2 * lens.pixel_pitch, rel=1e-6)
+        assert of.side * of.camera.pixel_pitch == pytest.approx(of.side**2 * camera.pixel_pitch, rel=1e-6)
 
 
 def test_a_uniform_field_is_the_closed_form():

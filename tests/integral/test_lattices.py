@@ -14,7 +14,7 @@ from mitsuba_fspt.integral.draft import Draft
 from mitsuba_fspt.integral.eq9 import View
 from mitsuba_fspt.integral.lattices import FIRST, GROWTH, MOST, VECTOR, Means
 from mitsuba_fspt.integral.quadrature import Quadrature
-from mitsuba_fspt.integral.window import visible_window
+from mitsuba_fspt.integral.visible_window import visible_window
 
 RADIUS = 4.3  # mm, of the disk
 
@@ -37,9 +37,9 @@ def covered_shares():
 def looked_at():
     """Draft of a disk in focus through a small stop, and the pixels that its outline cuts."""
     scene = camera_scene(disk(FOCUS, RADIUS), f_number=2000)
-    lens = scene.sensors()[0]
-    window = visible_window(scene, lens)
-    draft = Draft(View.of(scene, lens, window), window, Quadrature(), None)
+    camera = scene.sensors()[0].camera
+    window = visible_window(scene, camera)
+    draft = Draft(View.of(scene, camera, window), window, Quadrature(), None)
     cut = window.cut((covered_shares() > 1e-3) & (covered_shares() < 1 - 1e-3))
     return draft, cut
 

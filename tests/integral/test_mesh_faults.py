@@ -62,14 +62,14 @@ def test_faces_that_turn_both_ways_are_told(tmp_path, settings):
 def test_a_closed_surface_inside_out_is_said_to_be(tmp_path, shape, inside_out):
     ball = sphere(tmp_path / "ball.ply", inverted=shape.pop("inverted", False))
     scene = world_scene(ball | shape, sensor=lens(**FILM))
-    found = mesh_faults.mesh_faults(scene, scene.sensors()[0])
+    found = mesh_faults.mesh_faults(scene, scene.sensors()[0].camera)
     assert [INSIDE_OUT in text for text in found] == [True] * inside_out
 
 
 def test_the_walls_of_a_cavity_around_the_lens_are_right(tmp_path):
     """An integrating sphere glows inward, to the lens within."""
     scene = world_scene(sphere(tmp_path / "wall.ply", inverted=True, radius=280.0), sensor=lens(**FILM))
-    assert mesh_faults.mesh_faults(scene, scene.sensors()[0]) == []
+    assert mesh_faults.mesh_faults(scene, scene.sensors()[0].camera) == []
 
 
 def test_a_mesh_in_metres_is_told(tmp_path):
@@ -126,4 +126,4 @@ def test_plain_mitsuba_logs_it_once(mixed_xml, capfd):
 def test_the_scenes_of_the_package_have_no_fault():
     for name in ("nylon_cylinder", "l_shape"):
         scene = fspt.load(SCENES / f"{name}.xml")
-        assert mesh_faults.mesh_faults(scene, scene.sensors()[0]) == []
+        assert mesh_faults.mesh_faults(scene, scene.sensors()[0].camera) == []

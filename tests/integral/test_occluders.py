@@ -99,7 +99,7 @@ def test_narrow_light_before_a_dark_plate_that_hides_a_wide_body():
     wide = {"type": "disk", "to_world": at([0, 0, 200]) @ turned.scale(6), "emitter": glow(1.0)}
     shapes = [plate, wide, *(disk | {"emitter": glow(1.0)} for disk in disks)]
     scene = world_scene(*shapes, sensor=lens(size=(16, 12), pitch=0.22, **optics))
-    camera = scene.sensors()[0]
+    camera = scene.sensors()[0].camera
     light = 3 * camera.etendue * 0.08**2 / camera.virtual_pitch**2
     assert fspt.render(scene, rtol=1e-2).power.sum() > 10 * light
     parameters = mi.traverse(scene)

@@ -406,7 +406,7 @@ def test_a_bright_vertex_of_small_faces_lies_where_it_is(tmp_path, domain):
     column, row = (size / 2 - (n * steps + o) / side for n, o, size in ((u, off[0], 12), (v, off[1], 10)))
     expected = np.full((10, 12), 1e-3)
     np.add.at(expected, (row.astype(int), column.astype(int)), 0.999 * cone)
-    found = image.power / of.sensors()[0].etendue * np.pi
+    found = image.power / of.sensors()[0].camera.etendue * np.pi
     here = slice(4, 6), slice(5, 7)
     assert np.abs(found - expected)[here].max() < 1e-2 * expected.max()
 

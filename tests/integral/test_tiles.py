@@ -9,9 +9,10 @@ import pytest
 from small_scenes import ball, glow, lens, load_scene, mi, world_scene
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.camera.window import Window
 from mitsuba_fspt.integral import tiles
 from mitsuba_fspt.integral.tiles import Mosaic, tiles_of
-from mitsuba_fspt.integral.window import Window, visible_window
+from mitsuba_fspt.integral.visible_window import visible_window
 from mitsuba_fspt.runtime import memory
 from mitsuba_fspt.runtime.errors import SceneError
 
@@ -44,7 +45,7 @@ def test_tiles_and_one_piece_agree_within_the_errors_of_both(name, accuracy, mon
     side = 384 if "domain" in accuracy else 512
     scene = scene_of(name, side)
     whole, tiled = both(scene, monkeypatch, **accuracy)
-    assert len(tiles_of(visible_window(scene, scene.sensors()[0]))) > 3
+    assert len(tiles_of(visible_window(scene, scene.sensors()[0].camera))) > 3
     apart, errors = np.abs(tiled.power - whole.power), tiled.error + whole.error
     assert (apart <= errors).all()
     assert apart.max() > 0  # that they are tiles at all
@@ -62,7 +63,7 @@ def test_there_are_no_seams(monkeypatch):
     whole, tiled = both(scene, monkeypatch, rtol=1e-3)
     apart = np.abs(tiled.power - whole.power) / whole.power.max()
     seam = np.zeros(apart.shape, bool)
-    for tile in tiles_of(visible_window(scene, scene.sensors()[0])):
+    for tile in tiles_of(visible_window(scene, scene.sensors()[0].camera)):
         left, top = tile.crop_offset
         for row, column in ((top, left), (top + tile.full[0] - 1, left + tile.full[1] - 1)):
             seam[row, left : left + tile.full[1]] = True
@@ -168,7 +169,7 @@ def test_progress_is_told_tile_by_tile(monkeypatch):
     scene = world_scene(ball(radius=12.0), sensor=lens(64, pitch=0.4))
     fspt.render(scene, rtol=1e-2, progress=lambda stage, share: told.append((stage, share)))
     shares = [share for _, share in told]
-    count = len(tiles_of(visible_window(scene, scene.sensors()[0])))
+    count = len(tiles_of(visible_window(scene, scene.sensors()[0].camera)))
     assert {stage for stage, _ in told} == {"integrating"}
     assert set(np.arange(count + 1) / count) <= {round(share, 9) for share in shares}
     assert len(shares) > 2 * count

@@ -14,7 +14,7 @@ from mitsuba_fspt.integral.nodes import first_nodes
 from mitsuba_fspt.integral.quadrature import Quadrature
 from mitsuba_fspt.integral.transect import transect
 from mitsuba_fspt.integral.transects import apply_transects, edges_of
-from mitsuba_fspt.integral.window import visible_window
+from mitsuba_fspt.integral.visible_window import visible_window
 from mitsuba_fspt.jit.pixel_grid import parted
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -128,8 +128,8 @@ def test_scatter_says_where_transects_kink_and_where_they_only_lean():
     balls = [{"type": "sphere", "center": [x, y, 0], "radius": 4.0, "emitter": glow()} for x, y in ((12, -2), (-15, 2))]
     scene = world_scene(*balls, sensor=lens(48, pitch=0.2, f_number=2.8))
     sensor = scene.sensors()[0]
-    window = visible_window(scene, sensor)
-    draft = Draft(View.of(scene, sensor, window), window, Quadrature(rtol=1e-4), None)
+    window = visible_window(scene, sensor.camera)
+    draft = Draft(View.of(scene, sensor.camera, window), window, Quadrature(rtol=1e-4), None)
     first_nodes(draft, np.zeros(draft.grid.shape))
     cut = parted(draft.coverage)
     edges = edges_of(draft)
@@ -175,7 +175,7 @@ def test_eight_transects_know_the_share_of_a_straight_edge(shift, turn):
     solution = scene.integrator().solve(scene, sensor, few)
     assert any("8 transects" in level for level in solution.levels)
     assert not any("24 transects" in level for level in solution.levels)
-    blur = abs(float(sensor.blur_radius(mi.Float64(165.0 - shift))[0]))
+    blur = abs(float(sensor.camera.blur_radius(mi.Float64(165.0 - shift))[0]))
     assert 2 < blur < 12
     # The plane's border runs through the middle of the film; depth stretches the pixels, and no more than that.
     rows, columns = np.mgrid[:24, :24] + 0.5 - 12
@@ -200,7 +200,7 @@ def test_a_transect_is_split_where_it_enters_one_body_leaves_it_for_another_and_
     ]
     scene = world_scene(*balls, sensor=lens(8, pitch=4.0, f_number=2.8))
     sensor, points, number = scene.sensors()[0], 4000, 16
-    view = View.of(scene, sensor, visible_window(scene, sensor))
+    view = View.of(scene, sensor.camera, visible_window(scene, sensor.camera))
     place = np.stack([np.linspace(0.3, 0.7, number), np.full(number, 0.5), np.linspace(0.4, 0.6, number)])
 
     def curves(copies):

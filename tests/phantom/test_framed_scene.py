@@ -103,7 +103,7 @@ def test_a_magnification_or_a_distance_alone_keeps_the_front_in_focus(tmp_path):
 
 def test_further_numbers_of_the_lens_reach_it():
     text = fspt.scene_xml(CYLINDER, model="hrrt", lens_diameter=22.0)
-    optics = fspt.load(text).sensors()[0].optics
+    optics = fspt.load(text).sensors()[0].camera.lens
     assert (optics.model.name, optics.lens_diameter) == ("hrrt", 22)
 
 
@@ -190,7 +190,7 @@ def test_a_front_out_of_focus_is_said(tmp_path, run):
     assert distance == pytest.approx(defaults(text)["distance"])
     sharp = fspt.scene_xml(path, **film, magnification=magnification, distance=distance)
     assert "In view" not in sharp
-    lens = fspt.load(sharp).sensors()[0].optics
+    lens = fspt.load(sharp).sensors()[0].camera.lens
     assert lens.focus_distance == pytest.approx(distance - 4, rel=1e-3)
     assert "In view" not in fspt.scene_xml(path, **film, view=90)
     options = [text for name, value in film.items() for text in ("-D", f"{name}={value}")]

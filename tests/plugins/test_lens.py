@@ -299,11 +299,11 @@ def test_an_updated_parameter_changes_the_picture_as_in_a_fresh_scene(name):
 def test_the_focus_may_be_given_in_three_ways(focus):
     (name, value), *_ = focus.items()
     camera = mi.load_dict(lens(**{"magnification": None, **focus}))
-    assert camera.optics.focus_distance == pytest.approx(U)
+    assert camera.camera.lens.focus_distance == pytest.approx(U)
     parameters = mi.traverse(camera)
     parameters[name] = value * 1.1
     parameters.update()
-    assert camera.optics.focus_distance != pytest.approx(U)
+    assert camera.camera.lens.focus_distance != pytest.approx(U)
 
 
 def test_an_impossible_update_is_refused():

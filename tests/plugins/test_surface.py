@@ -312,19 +312,19 @@ def test_new_exitance_leaves_the_probe_in_its_place_and_a_new_shape_does_not(tmp
     """On CUDA one that was set up beside the scene would be lost, and light with it."""
     path = write_ply(tmp_path / "one.ply", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     scene = plastic("ply", 1e-3, filename=str(path))
-    emitter = scene.emitters()[0]
-    emitter.trace_beside(scene)
-    probe = emitter._probe
+    surface = scene.emitters()[0].surface
+    surface.trace_beside(scene)
+    probe = surface._probe
     parameters = mi.traverse(scene)
     exitance = next(name for name in parameters.keys() if "exitance" in name)
     positions = next(name for name in parameters.keys() if name.endswith("vertex_positions"))
     parameters[exitance] = 2 * parameters[exitance]
     parameters.update()
     assert probe is not None
-    assert emitter._probe is probe
+    assert surface._probe is probe
     parameters[positions] = 2 * parameters[positions]
     parameters.update()
-    assert emitter._probe is None
+    assert surface._probe is None
 
 
 def test_position_density_and_weight(case):
@@ -334,7 +334,7 @@ def test_position_density_and_weight(case):
     assert pdf.min() > 0
     np.testing.assert_allclose(weight.numpy() * pdf, 1, rtol=1e-5)
     assert_mostly_close(case.emitter.pdf_position(ps).numpy(), pdf, 1e-3)
-    case.emitter.trace_beside(case.scene)
+    case.emitter.surface.trace_beside(case.scene)
     assert_mostly_close(case.emitter.pdf_position(ps).numpy(), pdf, 1e-3)
     assert np.all(ps.time.numpy() == 0.25)
     share = case.exitance(local(ps.p)) / case.power.sum() + UNIFORM_SHARE / case.area.sum()

@@ -209,18 +209,18 @@ def test_lens_with_another_sampler_is_the_same_lens():
     assert copy.sampler().class_name() == "StratifiedSampler"
     assert [int(n) for n in (*copy.film().crop_size(), *copy.film().crop_offset())] == [20, 10, 3, 5]
     place, pupil = mi.Point2f([4.0, 12.5], [6.0, 14.0]), mi.Point2f([0.1, -0.9], [0.2, 0.1])
-    for one, other in zip(lens.line_of_sight(place, pupil), copy.line_of_sight(place, pupil), strict=True):
+    for one, other in zip(*(each.camera.line_of_sight(place, pupil) for each in (lens, copy)), strict=True):
         np.testing.assert_array_equal(np.array(getattr(one, "d", one)), np.array(getattr(other, "d", other)))
 
 
 @pytest.mark.usefixtures("mono")
 def test_raw_rays_are_as_many_as_asked_for():
     """On the pixels that can see what glows alone: rays beside it cost next to nothing."""
-    from mitsuba_fspt.integral.window import visible_window
+    from mitsuba_fspt.integral.visible_window import visible_window
 
     scene = small_scenes.camera_scene(small_scenes.sphere(200.0, 4.0))
     lens = scene.sensors()[0]
-    once = 4 * math.prod(visible_window(scene, lens).shape)
+    once = 4 * math.prod(visible_window(scene, lens.camera).shape)
     assert 0 < once < 2 * WIDTH * HEIGHT
     for together in (False, True):
         lines = [converge_methods.raw_rate(scene, lens, together, least)() for least in (1, 30000)]

@@ -12,14 +12,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..jit.mesh_buffers import box_of
-from ..runtime.plugin_types import is_surface
-from .node_rules import GAP
-from .specular import Specular
+from .camera import Camera
 
 Boxes = tuple[tuple[float, ...], ...]
 
-MOST_RIM = 16  # pixels: widest rim around the crop window that is searched for silhouettes
+# Rim around the crop window that is searched for silhouettes: its width in blur radii, and the largest one in pixels.
+SEARCHED_RIM, MOST_RIM = 0.6, 16
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Window:
     @property
     def rim(self) -> int:
         """Pixels around the crop window, or around a tile of it, that are searched for silhouettes."""
-        return 1 + math.ceil(min(GAP[4] * self.blur, MOST_RIM - 1))
+        return 1 + math.ceil(min(SEARCHED_RIM * self.blur, MOST_RIM - 1))
 
     @property
     def count(self) -> int:
@@ -76,21 +74,21 @@ class Window:
         left, top = (dr.opaque(mi.Float, n + 0.5) for n in self.corner)
         return mi.Point2f(left + mi.Float(number % width), top + mi.Float(number // width))
 
-    def field_stop(self, lens: mi.Sensor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def field_stop(self, camera: Camera) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Pixels (h, w) that lie inside the image-plane stop, and those that its border cuts."""
-        if math.isinf(lens.optics.seen_field):
+        if math.isinf(camera.lens.seen_field):
             return np.ones(self.shape, bool), np.zeros(self.shape, bool)
-        width, height = (int(n) for n in lens.film().size())
+        width, height = camera.film.size
         left, top = self.corner
         x = np.abs(left + np.arange(self.shape[1]) + 0.5 - width / 2)
         y = np.abs(top + np.arange(self.shape[0]) + 0.5 - height / 2)[:, None]
-        radius = lens.optics.seen_field / lens.virtual_pitch
+        radius = camera.lens.seen_field / camera.virtual_pitch
         inside = np.hypot(x + 0.5, y + 0.5) <= radius
         return inside, ~inside & (np.hypot(np.maximum(x - 0.5, 0), np.maximum(y - 0.5, 0)) < radius)
 
-    def seen_in(self, boxes: Boxes, lens: mi.Sensor) -> NDArray[np.bool_]:
+    def seen_in(self, boxes: Boxes, camera: Camera) -> NDArray[np.bool_]:
         """Pixels (h, w) of this window with a line of sight into one of these boxes, and some around."""
-        other = window_of(boxes, lens)
+        other = window_of(boxes, camera)
         left, top = (own - its for own, its in zip(self.corner, other.corner, strict=True))
         rows, columns = top + np.arange(self.shape[0]), left + np.arange(self.shape[1])
         inside = (rows >= 0) & (rows < other.shape[0])
@@ -131,45 +129,25 @@ class Window:
         return here, tuple(slice(a, b) for a, b in ends)
 
 
-def visible_window(scene: mi.Scene, lens: mi.Sensor, everywhere: bool = False) -> Window:
-    """Window of the pixels with a line of sight into the bounding box of emitting surfaces; all if it holds the lens.
-
-    `everywhere`: all pixels. Emitters other than `fspt_surface` count with the bounding box of the scene; mirrors and
-    glass, in which light is seen, count, too.
-    """
-    specular = Specular.of(scene, lens)
-    return window_of(glowing_boxes(scene), lens, everywhere, specular.bending if specular else ())
-
-
-def glowing_boxes(scene: mi.Scene) -> Boxes:
-    """Bounding boxes of emitting surfaces, each as (x, y, z) of its lowest and of its highest corner [mm]."""
-    emitters = scene.emitters()
-    direct = all(is_surface(emitter) for emitter in emitters)
-    boxes = [emitter.bbox() for emitter in emitters] if direct else [box_of(scene.shapes())]
-    return tuple((*map(float, box.min), *map(float, box.max)) for box in boxes)
-
-
-def window_of(boxes: Boxes, lens: mi.Sensor, everywhere: bool = False, bending: Boxes = ()) -> Window:
+def window_of(boxes: Boxes, camera: Camera, everywhere: bool = False, bending: Boxes = ()) -> Window:
     """Window of the pixels with a line of sight into these boxes, or into those of `bending` shapes; or `everywhere`.
 
     Perspective keeps straight lines straight, so that corners bound a box's blurred image.
     """
     boxes = (*boxes, *bending)
-    film = lens.film()
-    width, height = (int(n) for n in film.crop_size())
-    offset = (int(film.crop_offset()[0]), int(film.crop_offset()[1]))
+    (height, width), offset = camera.film.shape, camera.film.crop_offset
     ends = np.array(boxes, np.float64).reshape(-1, 2, 3)
     points = np.array([ends[:, list(pick), range(3)] for pick in itertools.product((0, 1), repeat=3)]).reshape(-1, 3)
-    discs, radii = lens.film_discs(points)
+    discs, radii = camera.film_discs(points)
     blur = radii.max(initial=0.0)
     if bending:  # an image behind a mirror is as far as its light travels in front of it
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
-        far = lens.blur_radius(mi.Float64(lens.farthest_depth(points) + size))
+        far = camera.blur_radius(mi.Float64(camera.farthest_depth(points) + size))
         blur = max(blur, abs(float(far[0])))
     low, high = (discs - radii).min(axis=0, initial=np.inf), (discs + radii).max(axis=0, initial=-np.inf)
     if everywhere or not len(points):
         low, high = np.full(2, -np.inf), np.full(2, np.inf)
-    middle, radius = 0.5 * np.array(film.size(), np.float64), lens.optics.seen_field / lens.virtual_pitch
+    middle, radius = np.array(camera.film_map.middle), camera.lens.seen_field / camera.virtual_pitch
     low, high = np.maximum(low, middle - radius), np.minimum(high, middle + radius)
     crop = Window(0, 0, (height, width), (height, width), offset, float(blur))
     # One pixel more than needed on each side keeps second differences and rounding inside.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_scenes import even_disc, mi
 
-from mitsuba_fspt.integral.pupil import onto_overlap
+from mitsuba_fspt.camera.pupil import onto_overlap
 
 pytestmark = pytest.mark.usefixtures("mono")
 

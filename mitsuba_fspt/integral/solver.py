@@ -1,0 +1,246 @@
+"""Solution of Eq. 9 for a scene and a camera, by the forms that are right and quickest on each pixel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera.camera import Camera
+from ..camera.window import Boxes, Window, window_of
+from ..emission.face_table import FaceTable, editions_of
+from ..emission.of_emitter import edition_of
+from ..jit.recording import recording
+from ..runtime.cached_value import CachedValue
+from ..runtime.deadline import Deadline
+from ..runtime.errors import SceneError
+from . import interpolated, pupil_form, surface_form
+from .eq9 import View
+from .interpolated import Blocks, blocks_of
+from .narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
+from .nested_bsdfs import check_followed
+from .progress import Progress
+from .quadrature import Quadrature
+from .scene_checks import check_scene, check_surfaces_alone
+from .shortcuts import Finding
+from .solution import Solution
+from .specular import Specular
+from .tiles import Mosaic
+from .traced_scene import TracedScene, poses_of
+from .visible_window import glowing_boxes
+
+LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
+NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
+UNCERTAINTY = 2.0  # largest ratio of that light and its estimate
+
+
+class Solver:
+    """Power on the pixels of a camera; it keeps what does not change from one solution of a scene to the next."""
+
+    def __init__(self) -> None:
+        # A reference to the scene itself would be a cycle: the integrator that holds this solver is its child.
+        self._traced = TracedScene()
+        self._window, self._narrow, self._faces, self._grid_of_blocks = (CachedValue() for _ in range(4))
+
+    def solve(
+        self,
+        scene: mi.Scene,
+        camera: Camera,
+        quadrature: Quadrature,
+        progress: Callable[[float], None] | None = None,
+        *,
+        narrow: bool = True,
+        deadline: Deadline | None = None,
+    ) -> Solution:
+        """Power, error and coverage of the camera's crop window.
+
+        A large film is solved in tiles; `progress` is called with the share done, 0 … 1, after every level of each
+        tile. With `narrow` = False, objects and spots that lines of sight may miss are neither searched for nor
+        contained in the error; that is meant for drafts of an image that is computed in full afterwards. After the
+        `deadline` no pixel is refined further: its error is that of the level it has reached. Every pixel takes four
+        lines of sight in any case.
+
+        Raises
+        ------
+        SceneError, ExitanceError : as in `check_scene`, or the scene has an environment emitter, or the memory does not
+            suffice for the film.
+        """
+        check_scene(scene, camera)
+        check_surfaces_alone(scene)
+        check_followed(scene)
+        with recording(), dr.suspend_grad():
+            specular = Specular.of(scene, camera, quadrature, even_if_none=not quadrature.takes("specular"))
+            bending = specular.bending if specular else ()
+            _refuse_bending(specular, quadrature)
+            window = self.visible_window(scene, camera, not quadrature.takes("outside"), bending)
+            mosaic = Mosaic(window)
+            if mosaic.tiles:
+                traced = self.traced(scene, camera)
+                faces = self._faces_of(traced) if quadrature.takes("record") else None
+                view = View.of(traced, camera, window, faces, specular)
+                self._fill(mosaic, view, quadrature, Progress(progress, deadline=deadline or Deadline()), narrow)
+            # Smaller displacements are random.
+            rounding = camera.rounding if camera.rounding >= LEAST_DISPLACEMENT else 0.0
+            solution = mosaic.solution(quadrature.least_error, rounding)
+        return replace(solution, findings=(_outside(window), *solution.findings))
+
+    def traced(self, scene: mi.Scene, camera: Camera) -> mi.Scene:
+        """`scene`, or a robust copy if it loses rays."""
+        return self._traced.of(scene, camera)
+
+    def visible_window(self, scene: mi.Scene, camera: Camera, everywhere: bool, bending: Boxes) -> Window:
+        """Window of the pixels that can see an emitter or a `bending` shape, or of all `everywhere`; cached."""
+        boxes = glowing_boxes(scene)
+        state = (boxes, bending, camera.state, everywhere)
+        return self._window.recall(state, lambda: window_of(boxes, camera, everywhere, bending))
+
+    def _faces_of(self, scene: mi.Scene) -> FaceTable | None:
+        """Table of the scene's faces, None if `FaceTable.of` gives none; cached."""
+        shapes = scene.shapes()
+        edition = editions_of(shapes)
+        return None if edition is None else self._faces.recall(edition, lambda: FaceTable.of(shapes))
+
+    def _narrow_light(self, view: View, window: Window) -> NarrowLight:
+        """Light of objects and spots that lines of sight may miss; cached."""
+        scene, camera, specular = view.scene, view.camera, view.specular
+        editions = [edition_of(emitter) for emitter in scene.emitters()]
+        through = specular.state() if specular else ()
+        state = (editions, glowing_boxes(scene), poses_of(scene.shapes()), through, camera.state, window)
+        return self._narrow.recall(state, lambda: narrow_light(points_on_surfaces(scene, camera, specular), window))
+
+    def _fill(
+        self,
+        mosaic: Mosaic,
+        view: View,
+        quadrature: Quadrature,
+        progress: Progress,
+        narrow: bool,
+    ) -> None:
+        """Solve all tiles. With several, their tolerance follows from a lower bound of the brightest pixel."""
+        tiles, window = mosaic.tiles, mosaic.window
+        least_peak, points = 0.0, None
+        progress(0.0)
+        if len(tiles) > 1 and narrow:
+            points = points_on_surfaces(view.scene, view.camera, view.specular)
+            least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points, window))
+        for k, tile in enumerate(tiles):
+            light = partial(self._narrow_light, view, tile)
+            if points or not narrow:
+                light = partial(narrow_light, points, tile)
+            mosaic.put(tile, self._solve_tile(tile, view, quadrature, light, least_peak, progress.part(k, len(tiles))))
+
+    def _solve_tile(
+        self,
+        window: Window,
+        view: View,
+        quadrature: Quadrature,
+        narrow_light: Callable[[], NarrowLight],
+        least_peak: float,
+        progress: Progress,
+    ) -> Solution:
+        """Solution by the requested form of Eq. 9; pixels with light of narrow spots always take the surface form.
+
+        least_peak : lower bound of the brightest pixel of all tiles [W/mm²/sr]
+        """
+        scene, camera, specular = view.scene, view.camera, view.specular
+        # The surface form ignores the border of the image-plane stop: pixels that the border crosses take lines of
+        # sight.
+        inside, cut = window.field_stop(camera)
+        everywhere = quadrature.domain == "surface"
+        if everywhere and not cut.any():
+            known = surface_form.solve(scene, camera, window, quadrature, None, least_peak, progress, specular)
+            return _with_dark_coverage(known, view, window)
+        blocks, why = self._blocks(view, window, quadrature)
+        if blocks:
+            if solution := self._by_blocks(view, blocks, quadrature, least_peak, progress):
+                return solution
+            why = "most blocks of pixels have an edge, or light too narrow for them"
+        narrow = narrow_light()
+        where, peak = inside, least_peak
+        if not everywhere:
+            where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
+            peak = max(narrow.brightest / 2, least_peak)
+        if specular and specular.bending:  # the surface form contains only light that goes straight to the lens
+            where = np.zeros(window.shape, bool)
+        if where.any() and not progress.deadline.passed():
+            known = surface_form.solve(scene, camera, window, quadrature, where, peak, progress.part(0, 2), specular)
+            known = _with_dark_coverage(known, view, window)
+            rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak, progress.part(1, 2))
+            solution = known.completed_by(rest)
+        else:
+            where = np.zeros(window.shape, bool)
+            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, None, least_peak, progress)
+        findings = (Finding("smooth blocks", False, why), *solution.findings)
+        if not narrow.on_pixels.any():
+            return replace(solution, findings=findings)
+        missed = _missed(narrow, where, cut, window, camera, solution)
+        if specular and specular.bending:
+            # The positions at which a mirror or glass shows a narrow spot are not known.
+            there = window.seen_in(specular.bending, camera)
+            missed = np.maximum(missed, window.expand(there * UNCERTAINTY * narrow.on_pixels.max() * camera.etendue))
+        return replace(solution, error=np.maximum(solution.error, missed), findings=findings)
+
+    def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[tuple[Blocks, ...], str]:
+        """Blocks of pixels between which the image may be interpolated; the reason if there are none."""
+        if not quadrature.takes("smooth blocks"):
+            return (), "as requested"
+        if quadrature.domain != "pupil" or view.specular:
+            return (), "only lines of sight from the pixel straight to the first surface are interpolated"
+        if math.isfinite(view.camera.lens.seen_field):
+            return (), "an image-plane stop cuts blocks"
+        state = (window, view.camera.state)
+        blocks = self._grid_of_blocks.recall(state, lambda: blocks_of(window, view.camera))
+        return blocks, f"{' x '.join(map(str, window.shape[::-1]))} pixels are too few"
+
+    def _by_blocks(
+        self, view: View, blocks: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float, progress: Progress
+    ) -> Solution | None:
+        """Solution with values interpolated between blocks; None if that saves no lines of sight."""
+        # Light that is narrow for a pixel is narrow for a block, too.
+        largest = blocks[0]
+        narrow = self._narrow_light(replace(view, camera=largest.camera), largest.window)
+        if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
+            return None
+        return interpolated.solve(view, blocks, quadrature, least_peak, progress)
+
+
+def _refuse_bending(specular: Specular | None, quadrature: Quadrature) -> None:
+    """Raise SceneError for the surface form where light reaches the lens by reflection or refraction."""
+    if quadrature.domain == "surface" and specular and specular.bending:
+        raise SceneError(
+            f"fspt_integral: 'domain' = surface follows light straight to the camera, but {', '.join(specular.names)} "
+            "reflects or refracts it. Set it to pupil."
+        )
+
+
+def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solution:
+    """The surface form's `solution`, with the coverage of elements with J_n = 0 added, which that form leaves out."""
+    if not any(finding.name == "dark" and finding.taken for finding in solution.findings):
+        return solution
+    met = np.where(solution.where, pupil_form.coverage_of(view, window), 0)
+    return replace(solution, coverage=np.maximum(solution.coverage, met))
+
+
+def _missed(
+    narrow: NarrowLight, where: NDArray[np.bool_], cut: NDArray[np.bool_], window: Window, camera: Camera, of: Solution
+) -> NDArray[np.float64]:
+    """Light of narrow spots that lines of sight may miss [W], shape (h, w), on pixels without the surface form.
+
+    where : pixels of the window that took the surface form
+    cut : pixels that the border of the image-plane stop crosses, which always take lines of sight
+    """
+    light = np.where(where, 0, UNCERTAINTY * narrow.on_pixels)
+    bright = window.expand(np.where(cut, light, 0)) * camera.etendue - of.power
+    return np.maximum(bright, window.expand(np.where(cut, 0, light)) * camera.etendue)
+
+
+def _outside(window: Window) -> Finding:
+    """Finding about the pixels outside the visible window."""
+    inside, pixels = window.count, math.prod(window.full)
+    return Finding("outside", inside < pixels, f"{inside} of {pixels} pixels can see what glows")
