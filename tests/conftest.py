@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import gc
 import signal
+import sys
 
 import pytest
+
+pytest_plugins = ["cpu_seconds"]
 
 # A shell's background jobs inherit that Ctrl-C is ignored, and so would all that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -45,7 +48,22 @@ def no_lines_of_progress(monkeypatch):
     monkeypatch.setattr("mitsuba_fspt.runtime.progress_bar.LINE_EVERY", 1e6)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def no_scene_of_another_file():
-    """Kernels record every living emitter, and one of a scene that was meant to be bad refuses."""
+@pytest.fixture(autouse=True)
+def no_scene_of_another_test():
+    """Delete the scenes of earlier tests, which reference cycles keep alive.
+
+    Kernels record the class of every living emitter and shape: one of a scene that was meant to be bad refuses, and
+    with others alive a kernel is compiled anew that the cache would have. What is alive before the first test, such as
+    the modules, is not searched, which makes the search a matter of milliseconds.
+    """
+    if not gc.get_freeze_count():
+        gc.collect()
+        gc.freeze()
     gc.collect()
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Dr.Jit's threads wait for work by spinning, and a worker of pytest has one core."""
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].set_thread_count(1)

@@ -167,11 +167,15 @@ def test_error_knows_what_float32_makes_of_far_places():
 
 
 def test_same_bits_in_every_run():
-    """Expected: power, error and coverage, of the same scene and of one loaded anew."""
+    """Expected: power, error and coverage, of the same scene and of one loaded anew, on one thread and on two."""
+    import drjit as dr
+
     image, *_ = pictures(*CASES[0])
     name, view, f_number, part = CASES[0]
     phantom = load_scene(name, view=view, f_number=f_number, crop=part)
-    for again in (fspt.render(phantom, rtol=RTOL), fspt.render(phantom, rtol=RTOL)):
+    for threads in (1, 2):
+        dr.set_thread_count(threads)
+        again = fspt.render(phantom, rtol=RTOL)
         for plane in ("power", "error", "coverage"):
             np.testing.assert_array_equal(getattr(image, plane), getattr(again, plane))
 

@@ -44,3 +44,20 @@ def test_tests_that_do_not_run_catch_nothing(tmp_path):
     (tmp_path / "mitsuba_fspt/code.py").write_text("area = 1\n")
     mutant = mutants.Mutant("one", "code.py", "1", "2", ("no_such_test.py",))
     assert mutants.tried(mutant, tmp_path)[0] == "not run"
+
+
+def test_the_test_that_caught_it_before_runs_first(tmp_path):
+    """Where it is gone, the others decide."""
+    (tmp_path / "mitsuba_fspt").mkdir()
+    (tmp_path / "mitsuba_fspt/code.py").write_text("area = 1\n")
+    text = "from mitsuba_fspt import code\n\ndef test_one():\n    assert code.area == 1\n"
+    (tmp_path / "test_first.py").write_text(text)
+    (tmp_path / "test_second.py").write_text(text)
+    table = tmp_path / "mutants.csv"
+    table.write_text('law,result,test\none,caught,"test_second.py::test_one[1, 2]"\ntwo,survived,\n')
+    assert mutants.caught_by(table) == {"one": "test_second.py::test_one"}
+    assert mutants.caught_by(tmp_path / "none.csv") == {}
+    mutant = mutants.Mutant("one", "code.py", "1", "2", ("test_first.py",))
+    for before in ("test_second.py::test_one", "gone.py::test_one"):
+        by = before if before.startswith("test_second") else "test_first.py::test_one"
+        assert mutants.tried(mutant, tmp_path, before) == ("caught", by)

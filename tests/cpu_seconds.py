@@ -1,0 +1,70 @@
+"""Plugin of pytest: CPU seconds of the tests, the dearest ten of them and the total of all processes, at the end.
+
+Wall times on a busy machine say little, so that the budget of the suite is one of CPU time. The time of a test is that
+of this process with all its threads and of the child processes that have ended meanwhile.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+
+import pytest
+
+BUDGET = 600.0  # seconds of CPU of the whole suite with an empty kernel cache: five minutes of two cores
+DEAREST = 10
+
+
+def cpu() -> float:
+    """CPU seconds of this process and of its children that have ended."""
+    return sum(os.times()[:4])
+
+
+class Spent:
+    """CPU seconds of each test, and of the workers of pytest-xdist."""
+
+    def __init__(self) -> None:
+        self.last, self.tests, self.workers = cpu(), Counter(), 0.0
+        self.total = 0.0
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_makereport(self):
+        """Set `cpu` of the report of set-up, test or tear-down to the seconds since the report before it."""
+        outcome = yield
+        self.last, before = cpu(), self.last
+        outcome.get_result().cpu = self.last - before
+
+    def pytest_runtest_logreport(self, report) -> None:
+        self.tests[report.nodeid] += getattr(report, "cpu", 0.0)
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node) -> None:
+        self.workers += getattr(node, "workeroutput", {}).get("cpu", 0.0)
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session) -> None:
+        if hasattr(session.config, "workeroutput"):
+            session.config.workeroutput["cpu"] = cpu()
+            return
+        self.total = sum(os.times()[:2]) + (self.workers or sum(os.times()[2:4]))
+        limit = session.config.getoption("cpu_limit")
+        if limit is not None and self.total > limit and not session.exitstatus:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter, config) -> None:
+        terminalreporter.section(f"dearest {DEAREST} tests, CPU seconds")
+        for name, seconds in self.tests.most_common(DEAREST):
+            terminalreporter.write_line(f"{seconds:7.1f}  {name}")
+        limit = config.getoption("cpu_limit")
+        verdict = "over" if self.total > (BUDGET if limit is None else limit) else "within"
+        text = f"{self.total:7.1f}  in all, {verdict} the budget of {BUDGET if limit is None else limit:.0f}"
+        terminalreporter.write_line(text, yellow=verdict == "over")
+
+
+def pytest_addoption(parser) -> None:
+    text = "fail if the tests take more CPU seconds than this; without it, the summary tells it"
+    parser.addoption("--cpu-limit", type=float, default=None, metavar="SECONDS", help=text)
+
+
+def pytest_configure(config) -> None:
+    config.pluginmanager.register(Spent(), "cpu_seconds_spent")

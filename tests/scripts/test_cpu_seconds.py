@@ -1,0 +1,49 @@
+"""The summary of CPU seconds at the end of a run of the tests, and its limit."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+TESTS = Path(__file__).resolve().parents[1]
+BUSY = """
+import subprocess, sys, time
+
+def spend(seconds):
+    start = time.process_time()
+    while time.process_time() < start + seconds:
+        pass
+
+def test_here():
+    spend(0.6)
+
+def test_in_a_child():
+    code = "import time\\nwhile time.process_time() < 0.6: pass"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+def test_asleep():
+    time.sleep(0.6)
+"""
+
+
+def test_dearest_tests_and_the_limit(tmp_path):
+    """0.6 s of a worker and of its child count, sleep does not; the total has all, and a limit below it fails.
+
+    Seen to fail with wall times, without the children, and without the workers' totals.
+    """
+    (tmp_path / "test_busy.py").write_text(BUSY)
+    plugins = ("-p", "no:cacheprovider", "-p", "xdist", "-p", "cpu_seconds")
+    command = [sys.executable, "-m", "pytest", "-q", *plugins, "-n", "2", "--cpu-limit", "1", "test_busy.py"]
+    paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": paths, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    found = {name: float(s) for s, name in re.findall(r"^ +([\d.]+)  (\S+)", done.stdout, re.MULTILINE)}
+    here, child, asleep = (found[f"test_busy.py::test_{name}"] for name in ("here", "in_a_child", "asleep"))
+    assert min(here, child) > 0.55
+    assert asleep < 0.3
+    assert found["in"] > here + child
+    assert "in all, over the budget of 1" in done.stdout
+    assert done.returncode == 1
