@@ -33,6 +33,7 @@ PHYSICS, FORMS = "tests/integral/test_physics.py", "tests/integral/test_surface_
 LAWS, DETECTOR = "tests/emission/test_laws.py", "tests/detector/test_detector.py"
 REDUCTION, RADIOMETRY = "tests/detector/test_reduction.py", "tests/images/test_radiometry.py"
 CAMERAS = "tests/detector/test_cameras.py"
+STRAY = "tests/detector/test_stray_light.py"
 TISSUE, INVERT = "tests/tissue/test_diffusion.py", "tests/inverse/test_invert.py"
 
 
@@ -325,6 +326,55 @@ MUTANTS = (
         "electrons / np.where(lit, screen, 1)",
         "electrons",
         ("tests/detector/test_flat_field.py",),
+    ),
+    Mutant(
+        "share of the glare",
+        "detector/stray_light.py",
+        "(1 - self.glare) * spread + self.glare * images.mean(",
+        "spread + self.glare * images.mean(",
+        (STRAY,),
+    ),
+    Mutant(
+        "mean of the glare",
+        "detector/stray_light.py",
+        "images.mean(axis=(-2, -1)",
+        "images.sum(axis=(-2, -1)",
+        (STRAY,),
+    ),
+    Mutant(
+        "kernel of the transpose",
+        "detector/stray_light.py",
+        "self.kernel[::-1, ::-1]",
+        "self.kernel",
+        (STRAY, "tests/inverse/test_stray_matrix.py"),
+    ),
+    Mutant(
+        "glare in invert",
+        "inverse/measurement.py",
+        "return (power - level) / share",
+        "return power / share",
+        ("tests/inverse/test_stray_matrix.py",),
+    ),
+    Mutant(
+        "noise of the glare's light",
+        "inverse/measurement.py",
+        "noise.other + noise.shot * light",
+        "noise.other + 0 * light",
+        ("tests/inverse/test_stray_matrix.py",),
+    ),
+    Mutant(
+        "kernel in invert",
+        "inverse/stray_matrix.py",
+        "return base if stray.kernel is None else",
+        "return base if stray else",
+        ("tests/inverse/test_stray_matrix.py",),
+    ),
+    Mutant(
+        "stray light in calibrate",
+        "inverse/calibrate.py",
+        "s.forward(np.asarray(getattr(i, n), np.float64))",
+        "np.asarray(getattr(i, n), np.float64)",
+        ("tests/inverse/test_calibrate.py",),
     ),
     # Tissue
     Mutant(

@@ -11,6 +11,7 @@ x = n. σ_read, full well and gain are those of the electrons after the register
 
 from __future__ import annotations
 
+import logging
 import math
 import zlib
 from dataclasses import dataclass
@@ -29,12 +30,14 @@ from ..runtime.numbers import number, whole
 from ..runtime.wavelength import wavelength
 from .parameters import RECORDED, DetectorParameters
 from .reduction import Corrections, Exposed, reduce_counts
+from .stray_light import StrayLight
 
 if TYPE_CHECKING:
     from .counts import Frame
     from .flat_field import Scene
 
 Array = NDArray[np.float64]
+LOG = logging.getLogger("mitsuba_fspt")
 NOT_A_SHEET = "typical, not a data sheet"
 
 
@@ -70,6 +73,9 @@ class Detector(DetectorParameters):
     prnu : relative standard deviation of the response of the detector's own pixels, 0 … 0.1. `expose` draws the
         response from it, the same for all exposures of a `name` and size; reduced images without a flat field have it
         in their errors
+    psf : image file of a point's light on the film, with its `pixel_pitch`, >= 0; `expose` spreads the light so, with
+        the sum of the kernel as 1, and `invert` and `locate` compare with images that are spread so (Eq. M.38)
+    veiling_glare : share of the film's light that is spread evenly over the film, in [0, 1); used as `psf` is
 
     `read_noise`, `gain`, `bias`, `dark_current` and `prnu` may each be the name of a map in place of a number: a FITS,
     TIFF or NPY file with the values on the pixels read out, row 0 at the top. A map for `prnu` is the response of each
@@ -77,7 +83,7 @@ class Detector(DetectorParameters):
 
     Raises
     ------
-    DetectorError : a parameter is no number or outside its range, or a map cannot be read.
+    DetectorError : a parameter is no number or outside its range, or a map or the kernel cannot be read.
     """
 
     @classmethod
@@ -212,12 +218,29 @@ class Detector(DetectorParameters):
         if (darkest := image.power.min()) < 0:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
         energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
-        photons = image.power.astype(np.float64) * (exposure_time / energy)
+        photons = self._with_stray_light(image) * (exposure_time / energy)
         light = _binned(self.quantum_efficiency * photons, binning)
         pitch = image.metadata.get("pixel_pitch")
         area = self.area(None if pitch is None else float(pitch) * binning, binning)
         dark = self.on_pixels("dark_current", light.shape) * exposure_time
         return self._drawn_response(light.shape, area) * light + (dark + self.spurious_charge) * area
+
+    def _with_stray_light(self, image: Image) -> Array:
+        """Power on the film (h, w) [W] with the detector's stray light, unless the image has it already (Eq. M.38)."""
+        power = image.power.astype(np.float64)
+        if not self.stray_light:
+            return power
+        own = StrayLight.of(image.metadata, image.shape)
+        if not own:
+            pitch = image.metadata.get("pixel_pitch")
+            return np.maximum(self.stray_light.on(None if pitch is None else float(pitch)).forward(power), 0)
+        if not own.same(self.stray_light):
+            raise DetectorError(
+                "detector: the image has the stray light of another detector already, 'psf' or 'veiling_glare' of its "
+                "metadata. Give the image as it was rendered."
+            )
+        LOG.warning("fspt: expose: the image has the detector's stray light already; it is not applied again.")
+        return power
 
     def _drawn_response(self, shape: tuple[int, ...], area: float) -> Array | float:
         """Response of the pixels read out (h, w), each of `area` own ones: the map, or drawn from the number `prnu`."""
@@ -282,7 +305,7 @@ class Detector(DetectorParameters):
             "detector_seed": seed,
             "saturated_pixels": int(np.sum(full | (counts >= top))),
         }
-        metadata |= self._recorded()
+        metadata |= self._recorded() | self.stray_light.recorded(counts.shape)
         if "pixel_pitch" in image.metadata:
             metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
         if binning > 1:  # of a crop window, in pixels of the read-out

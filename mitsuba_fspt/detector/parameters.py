@@ -19,6 +19,7 @@ from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number
 from ..runtime.toml_file import read_toml
+from .stray_light import Kernel, StrayLight
 
 Array = NDArray[np.float64]
 Own = TypeVar("Own", bound="DetectorParameters")
@@ -38,6 +39,7 @@ EXAMPLES = {
     "excess_noise": "2",
     "spurious_charge": "2e-3",
     "prnu": "0.005",
+    "veiling_glare": "0.01",
 }
 TABLES = ("detector", "lens")  # of a camera's TOML file; this file reads the first one only
 COMMENTS = {
@@ -54,6 +56,8 @@ COMMENTS = {
     "excess_noise": "F² of the register",
     "spurious_charge": "e-/px/frame, before the register",
     "prnu": "relative standard deviation of the pixels' response",
+    "psf": "kernel of the stray light, an image file",
+    "veiling_glare": "share of the film's light that is spread evenly over it",
 }
 MAPPED = ("read_noise", "gain", "bias", "dark_current", "prnu")  # a number, or the name of a map
 # Names of EMVA 1288 that a TOML may use instead; the overall system gain K is in DN/e-.
@@ -63,7 +67,8 @@ EMVA_1288 = {
     "overall_system_gain": "gain",
 }
 # Keys of an exposure's metadata, where `pixel_pitch` is that of the pixels read out.
-RECORDED = {name: name for name in EXAMPLES if name != "gain_error"} | {"pixel_pitch": "detector_pixel_pitch"}
+RECORDED = {name: name for name in EXAMPLES if name not in ("gain_error", "veiling_glare")}
+RECORDED["pixel_pitch"] = "detector_pixel_pitch"
 MOST_EXCESS = 2.5  # F² of an avalanche of many stages is 2, that of an intensifier up to about 2.5
 MOST_PRNU = 0.1  # of a number: far below 1, so that no pixel drawn has a negative response
 SUFFIX = re.compile(r"\.[A-Za-z]\w*$")
@@ -86,6 +91,7 @@ RULES: dict[str, tuple[str, Callable[[Any], Any]]] = {
     ),
     "spurious_charge": (">= 0 e-/px/frame", lambda v: v >= 0),
     "prnu": (f"in [0, {MOST_PRNU:g}]; above that give a map", lambda v: (v >= 0) & (v <= MOST_PRNU)),
+    "veiling_glare": ("in [0, 1)", lambda v: (v >= 0) & (v < 1)),
 }
 
 
@@ -111,6 +117,8 @@ class DetectorParameters:
     excess_noise: float | None = None
     spurious_charge: float = 0.0
     prnu: float | str = 0.0
+    psf: str | None = None
+    veiling_glare: float = 0.0
 
     @classmethod
     def from_toml(cls: type[Own], path: str | os.PathLike[str]) -> Own:
@@ -154,7 +162,7 @@ class DetectorParameters:
             raise DetectorError(
                 f"'{path}' [detector]: 'name' must be a text in quotes, got {table['name']}. Give for example \"CCD\"."
             )
-        table |= {key: str(_beside(path, table[key])) for key in MAPPED if _is_name(table.get(key))}
+        table |= {key: str(Path(path).parent / table[key]) for key in (*MAPPED, "psf") if _is_name(table.get(key))}
         try:
             return cls(**table)
         except DetectorError as cause:
@@ -179,6 +187,13 @@ class DetectorParameters:
             object.__setattr__(self, name, value if isinstance(value, Derived) else checked)
         object.__setattr__(self, "bits", int(self.bits))
         object.__setattr__(self, "_maps", maps)
+        kernel = None
+        if self.psf is not None:
+            if not isinstance(self.psf, (str, os.PathLike)):
+                raise DetectorError(f"detector: 'psf' must be the name of an image file, got {self.psf!r}.")
+            object.__setattr__(self, "psf", os.fspath(self.psf))
+            kernel = Kernel.read(self.psf)
+        object.__setattr__(self, "_stray_light", StrayLight(kernel, self.veiling_glare))
         self._derive_excess_noise()
 
     def _derive_excess_noise(self) -> None:
@@ -201,6 +216,11 @@ class DetectorParameters:
     def maps(self) -> dict[str, PixelMap]:
         """Maps by the names of their parameters."""
         return self._maps  # type: ignore[attr-defined]  # set when the numbers are checked
+
+    @property
+    def stray_light(self) -> StrayLight:
+        """Point-spread function and veiling glare."""
+        return self._stray_light  # type: ignore[attr-defined]  # likewise
 
     def on_pixels(self, name: str, shape: tuple[int, ...]) -> Array | float:
         """Value of a parameter of `MAPPED`: its number, or its map (h, w), which must be of this shape."""
@@ -243,8 +263,8 @@ class DetectorParameters:
         lines = ["[detector]", f"name = {json.dumps(self.name)}"]
         for name, comment in COMMENTS.items():
             value = getattr(self, name)
-            if name in self.maps:
-                lines.append(f"{name} = {json.dumps(self.maps[name].path)}  # {comment}")
+            if isinstance(value, str):  # a map or a kernel, relative to another folder as it may be
+                lines.append(f"{name} = {json.dumps(str(Path(value).absolute()))}  # {comment}")
             elif value is not None and not isinstance(value, Derived):
                 lines.append(f"{name} = {value!r}  # {comment}")
         with atomic_path(path, DetectorError) as temporary:
@@ -266,11 +286,6 @@ def _map(name: str, path: str | os.PathLike[str]) -> PixelMap:
 def _is_name(value: object) -> bool:
     """True for the name of a file, which has a suffix."""
     return isinstance(value, os.PathLike) or (isinstance(value, str) and SUFFIX.search(value) is not None)
-
-
-def _beside(toml: str | os.PathLike[str], name: str) -> Path:
-    """Path of a file that a TOML names, relative to its folder."""
-    return Path(toml).parent / name
 
 
 def _own_names(table: dict[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -386,6 +386,7 @@ def _image(
         "gain_error": detector.gain_error,
         "masked_pixels": int(mask.sum()),
     }
+    kept |= detector.stray_light.recorded(electrons.shape)  # which the image has
     if detector.em_gain > 1:
         kept |= {"em_gain": detector.em_gain, "excess_noise": detector.excess}
     if flat is not None:

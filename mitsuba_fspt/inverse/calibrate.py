@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..detector.reduction import measured
+from ..detector.stray_light import StrayLight
 from ..images.exposure import Exposure
 from ..images.image import Image
 from ..rendering.render import render
@@ -127,7 +128,8 @@ def calibrate(
     settings = settings.for_noise(_noise(found))
     with reported(progress) as report:
         powers = [image.metadata.get("source_power") for image in found]
-        pictures = _Pictures(scene, names, views, powers, sensor, settings.rtol or 1e-4, report)
+        strays = [StrayLight.of(image.metadata, image.shape) for image in found]
+        pictures = _Pictures(scene, names, views, powers, strays, sensor, settings.rtol or 1e-4, report)
         pictures(start)
         data = measured_of(found, views, pictures.first, len(names), sampled)
         fitted = CalibrationFit(names, start, data, pictures, settings).solved()
@@ -197,6 +199,7 @@ class _Pictures:
     """Power and numerical error [W] of all views, (views, h, w), as a function of the values of the free parameters.
 
     powers : of the light source [W] by which the image of each view was scaled, and its picture is, or None
+    strays : stray light that the image of each view has, and its picture gets (Eq. M.38)
     first : the pictures of the first call
     """
 
@@ -206,12 +209,13 @@ class _Pictures:
         names: tuple[str, ...],
         views: Sequence[Mapping[str, str]],
         powers: Sequence[Any],
+        strays: Sequence[StrayLight],
         sensor: int,
         rtol: float,
         report: Progress,
     ) -> None:
         self.scene, self.names, self.views, self.powers, self.sensor = scene, names, views, powers, sensor
-        self.rtol, self.report = rtol, report
+        self.strays, self.rtol, self.report = strays, rtol, report
         self.first: list[Image] = []
         self._known: dict[tuple[float, ...], tuple[Array, Array]] = {}
         self._count = 0
@@ -238,7 +242,11 @@ class _Pictures:
             ]
             images = [i if watt is None else i.scaled(watt) for i, watt in zip(images, self.powers, strict=True)]
         self.first = self.first or images
-        power, error = (np.stack([np.asarray(getattr(i, n), np.float64) for i in images]) for n in ("power", "error"))
+        spreads = [s.on(float(i.metadata["pixel_pitch"])) for s, i in zip(self.strays, images, strict=True)]
+        power, error = (
+            np.stack([s.forward(np.asarray(getattr(i, n), np.float64)) for s, i in zip(spreads, images, strict=True)])
+            for n in ("power", "error")
+        )
         return power, error
 
 

@@ -98,7 +98,7 @@ def invert(
     measurement = Measurement.of(matrix, images, error, mask, gain_error, sampled)
     surface = replace(Surface.of(matrix, scene), crease_angle=options.crease_angle)
     settings, prior = settings or Settings(), prior or Prior()
-    problem = Problem.of(matrix, measurement, surface, prior, settings, options.gain_per_view)
+    problem = Problem.of(measurement.matrix, measurement, surface, prior, settings, options.gain_per_view)
     with reported(progress) as report:
         found = problem.solved(options, report)
     return found

@@ -248,5 +248,5 @@ def _band_images(
     for one, (surface, measurement, optics) in zip(given, read, strict=True):
         tissue = Tissue(mesh, optics.media, a=described.a, order=described.order, repeated=True)
         with renamed("locate", one.label):
-            bands.append(BandImages.of(one.name, one.matrix, surface, measurement, tissue, optics.share))
+            bands.append(BandImages.of(one.name, measurement.matrix, surface, measurement, tissue, optics.share))
     return bands

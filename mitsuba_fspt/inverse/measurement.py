@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from ..images.image import Image
 from ..images.noise_model import NoiseModel
 from ..runtime.errors import ImageError, InversionError
 from ..runtime.numbers import number
+from .stray_matrix import stray_light_of, without_glare_of
 from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
@@ -124,12 +126,16 @@ class Measurement:
     noise : variance of the pixels, (views, height, width)
     mask : True where a pixel is left out
     gain_error : relative standard deviation of a factor common to all pixels
+    matrix : T for these images, behind the point-spread function of their detector, if they name one
+
+    The veiling glare g of a detector is taken out of the images: power and noise are those of (P − g ⟨P⟩)/(1 − g).
     """
 
     power: Array
     noise: Noise
     mask: NDArray[np.bool_]
     gain_error: float
+    matrix: TransportMatrix
 
     @property
     def shot(self) -> Array:
@@ -184,7 +190,9 @@ class Measurement:
             raise InversionError(f"invert: 'gain_error' must be in [0, 1), got {found:g}. Give for example 0.05.")
         if masks.all():
             raise InversionError("invert: every pixel is masked or saturated. Expose for a shorter time.")
-        return cls(np.where(masks, 0, power).ravel(), noise, masks.ravel(), found)
+        stray = stray_light_of(matrix, planes if listed else [], "invert")
+        power, noise = without_glare(power, noise, masks, stray.glare)
+        return cls(np.where(masks, 0, power).ravel(), noise, masks.ravel(), found, without_glare_of(matrix, stray))
 
     def sigma(self, rows: NDArray[np.int64], signal: Array, numerical: Array, verb: str) -> Array:
         """Standard deviation [W] of the pixels `rows` for a fitted signal and its numerical error [W] (Eq. M.24).
@@ -302,6 +310,42 @@ def noise_of(
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
     return Noise(shot, other, drawn, relative, excess)
+
+
+def without_glare(power: Array, noise: Noise, masks: NDArray[np.bool_], glare: float) -> tuple[Array, Noise]:
+    """Power (views, h, w) [W] without a veiling glare, the share `glare` of its mean, and its noise (Eq. M.38).
+
+    The mean has far less noise than a pixel. Masked pixels count in it with the median of their neighbours, which is
+    told in one line.
+    """
+    if not glare:
+        return power, noise
+    filled = power
+    if masks.any():
+        filled = np.where(masks, np.nan, power)
+        for _ in range(max(power.shape)):  # from the rim of a masked part inwards
+            if not (left := np.isnan(filled)).any():
+                break
+            filled = np.where(left, _median_around(filled), filled)
+        LOG.warning(
+            "fspt: invert: %d masked pixels count in the veiling glare with the median of their neighbours. Expose so "
+            "that no pixel saturates.",
+            int(masks.sum()),
+        )
+    level = glare * np.nan_to_num(filled).mean(axis=(1, 2), keepdims=True)
+    share, light = 1 - glare, np.maximum(level, 0)
+    other = (noise.other + noise.shot * light + (noise.relative * light) ** 2) / share**2
+    return (power - level) / share, replace(noise, shot=noise.shot / share, other=other)
+
+
+def _median_around(images: Array) -> Array:
+    """Median of the pixels that are not NaN among each pixel and its 8 neighbours, (views, h, w)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of pixels without any
+        padded = np.pad(images, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
+        height, width = images.shape[1:]
+        around = [padded[:, i : i + height, j : j + width] for i in range(3) for j in range(3)]
+        return np.asarray(np.nanmedian(around, axis=0))
 
 
 def tell_misfit(verb: str, chi2_sum: float, pixels: int, fitted: float, noise: Sequence[Chi2]) -> list[str]:

@@ -7,7 +7,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,8 +17,11 @@ from scipy.sparse.linalg import LinearOperator
 from ..images.image import Image
 from ..images.pixel_axes import CROP
 from ..rendering.provenance import same_mesh
-from ..runtime.errors import TransportError
+from ..runtime.errors import DetectorError, TransportError
 from .view_block import Block
+
+if TYPE_CHECKING:
+    from ..detector.parameters import DetectorParameters
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
@@ -165,6 +168,19 @@ class TransportMatrix(LinearOperator):
         for block, part in zip(self.blocks, parts, strict=True):
             total += block.matrix.T @ part
         return total
+
+    def through(self, detector: DetectorParameters) -> TransportMatrix:
+        """T behind the point-spread function and the veiling glare of a `Detector`, of the same interface (Eq. M.38).
+
+        `invert` and `locate` do so by themselves for images whose metadata name them. Returns T where the detector has
+        neither. Raises TransportError for a matrix that is behind a detector already, DetectorError for anything else.
+        """
+        from .stray_matrix import StrayMatrix
+
+        stray = getattr(detector, "stray_light", None)
+        if stray is None:
+            raise DetectorError(f"transport: 'through' takes a Detector, got {type(detector).__name__}. Give one.")
+        return StrayMatrix(self, stray) if stray else self
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an npz file, blocks a view, which `read_transport` reads; TransportError where it cannot be written."""

@@ -63,6 +63,17 @@ def test_electrons_of_another_source_give_the_parameters(scene, tmp_path):
     assert found.sd["distance"] < 2
 
 
+def test_a_gain_of_images_with_stray_light(scene):
+    """5 % of glare over the film is in the pictures, too: the gain is 1. Seen to fail (0.95, 30 sd) without it."""
+    image = noisy(scene, 3, share=0.002)
+    power = image.power.astype(float)
+    power = 0.95 * power + 0.05 * power.mean()
+    known = {"veiling_glare": 0.05, "veiling_glare_film": f"{image.shape[1]} x {image.shape[0]}"}
+    found = fspt.calibrate(scene, fspt.Image(power, image.error, metadata=known), free=["gain"])
+    assert found.values["gain"] == pytest.approx(1, abs=4 * found.sd["gain"])
+    assert found.chi2 == pytest.approx(0.95**2, abs=0.4)
+
+
 def test_degenerate_sets_are_told(scene):
     """Gain and f-number both scale the picture: the message names both, and no small sd is returned."""
     with pytest.raises(InversionError, match="do not determine f_number, gain separately"):
