@@ -30,7 +30,7 @@ from interval_calibration import READ_NOISE, SCENE, case, fixed
 from numpy.typing import NDArray
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.inverse import invert, source_fit
+from mitsuba_fspt.inverse import fit_warnings, source_fit
 from mitsuba_fspt.inverse.structure import Structure
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.optics.media import Source
@@ -161,7 +161,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "residual_structure.csv")
     arguments = parser.parse_args()
     logging.getLogger("mitsuba_fspt").setLevel(logging.ERROR)
-    invert.structure = kept(invert.structure)  # type: ignore[attr-defined]
+    fit_warnings.structure = kept(fit_warnings.structure)  # type: ignore[attr-defined]
     source_fit.structure = kept(source_fit.structure)  # type: ignore[attr-defined]
     verbs = arguments.only.split(",")
     rows: list[Row] = []

@@ -35,6 +35,8 @@ class Settings:
         begins anew with two to four times as many. What is finer than these unknowns makes up (2/π)/`resolved` of the
         variance of a vertex, which intervals then lack: 8 %, or 4 % of their width.
     hopeless : when the images count as not those of the surface, after a first fit on few unknowns
+    fine : standard deviations of a sum of J_n by which a linear J_n on faces may change it, on the edges that a
+        warning of a coarse mesh names
     rough : times the bounds of variances and weight, the bounds of the first fit, whose J_n only scales the penalty
     """
 
@@ -55,4 +57,5 @@ class Settings:
     unknowns: int = 6000
     resolved: float = 8.0
     hopeless: Hopeless = field(default_factory=Hopeless)
+    fine: float = 0.5
     rough: float = 10.0

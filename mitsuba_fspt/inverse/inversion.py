@@ -30,9 +30,9 @@ LOG = logging.getLogger("mitsuba_fspt")
 class Inversion:
     """Surface flux density J_n from pictures, on the columns of a transport matrix.
 
-    The intervals contain the noise, the numerical error of the matrix and a common factor. They leave out errors of the
-    model: pose, lens, mesh, exit law, flat field, factors of single views. `warnings` say what the residuals show of
-    these, by χ² and by structure over the views (Eq. M.34).
+    The intervals contain the noise, the numerical error of the matrix, a common factor, and what J_n leaves out that is
+    linear on faces (Eq. M.38). They leave out errors of the model: pose, lens, shape, exit law, flat field, factors of
+    single views. `warnings` say what the residuals show of these, by χ² and by structure over the views (Eq. M.34).
 
     Attributes
     ----------
@@ -52,7 +52,9 @@ class Inversion:
     gain_per_view : relative standard deviation of a factor of each view, fitted as well and contained in the intervals
     view_factors : (views,) these factors, which `fitted` contains;  view_factor_draws : (views, samples) draws of them
     measured, fitted, sigma : (views, height, width) [W]; NaN where masked, or outside the surface
-    warnings : lines of stderr on what the residuals say of the model and of the stated errors
+    mesh_error : largest change of a weighted sum of J_n by J_n that is curved on faces, over the sum's standard
+        deviation without it; contained in the intervals (Eq. M.38)
+    warnings : lines of stderr on what the residuals say of the model and of the stated errors, and on a coarse mesh
     """
 
     matrix: TransportMatrix
@@ -76,6 +78,7 @@ class Inversion:
     measured: Array
     fitted: Array
     sigma: Array
+    mesh_error: float = 0.0
     warnings: tuple[str, ...] = ()
 
     @cached_property
@@ -179,6 +182,7 @@ class Inversion:
             "decrement": self.decrement,
             "converged": self.converged,
             "unknowns": self.surface.unknowns,
+            "mesh_error": self.mesh_error,
             "samples": self.draws.shape[1],
             "warnings": list(self.warnings),
         }

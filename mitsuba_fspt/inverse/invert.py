@@ -21,18 +21,17 @@ from ..images.image import Image
 from ..runtime.errors import InversionError
 from ..runtime.progress_bar import Progress, reported
 from .fit_settings import Settings
+from .fit_warnings import fit_warnings, tell_unconverged
 from .inversion import Inversion
 from .invert_options import Options, require_matrix
-from .measurement import LOG, Measurement, tell_misfit, told
+from .measurement import Measurement
+from .mesh_error import MeshError
 from .mlem import mlem
 from .multipliers import Minima
 from .nonnegative import Accuracy, Solve, factor, minimise
 from .outlook import is_hopeless
-from .patterns import Patterns, views_of
 from .seen_area import seen_share
-from .sensitivity_picture import view_labels
 from .smoothness import Prior, Smoothness
-from .structure import common_errors, structure
 from .surface import CREASE_ANGLE, Surface
 from .transport_matrix import TransportMatrix
 from .view_factors import ViewFactors
@@ -216,7 +215,7 @@ class Problem:
             coarse = problem.surface, first, fit
             problem = whole._with(levels[-1])
         draws = problem.draws(fit, options.samples, options.seed, report)
-        _report_unconverged(fit, problem.settings.rounds)
+        tell_unconverged(fit, problem.settings.rounds)
         return problem.result(fit, draws, options)
 
     def _carried(self, x: Array, coarse: Surface) -> Array:
@@ -370,10 +369,10 @@ class Problem:
 
     def _normal(self, design: csr_array, sigma: Array, weight: float) -> tuple[csr_array, Solve]:
         """H + w Q with H = TᵀT/σ², and what solves it."""
-        normal = self._hessian(design, sigma, weight)
+        normal = self.hessian(design, sigma, weight)
         return normal, factor(normal)
 
-    def _hessian(self, design: csr_array, sigma: Array, weight: float) -> csr_array:
+    def hessian(self, design: csr_array, sigma: Array, weight: float) -> csr_array:
         """H + w Q with H = TᵀT/σ², T the design, and the unit variance of the factors of views."""
         scaled = csr_array(diags_array(1 / sigma) @ design)
         prior = block_diag([weight * self.smoothness.matrix, diags_array(np.ones(self.factors.count))], format="csr")
@@ -399,25 +398,12 @@ class Problem:
         exitance = self.surface.spread @ (x[: self.surface.unknowns] * self.reference)
         return self.matrix.error(exitance).ravel()[self.rows]
 
-    def _told(self, fit: Fit, signal: Array, chi2_sum: float) -> list[str]:
-        """Warnings about the residuals, each told on stderr: their χ², and their structure, but for `mlem`."""
-        noise = self.measurement.chi2(self.rows, signal, fit.sigma)
-        if not fit.determined > 0:  # mlem follows the noise: its χ² may be small
-            noise = replace(noise, mean=0.0)
-        lines = tell_misfit("invert", chi2_sum, len(self.rows), fit.determined, [noise])
-        if not fit.determined > 0:
-            return lines
-        fitted = self.measurement.as_images(self.rows, signal)[0]
-        views = views_of(view_labels(self.matrix), fitted, self.rows, fit.sigma)
-        free, design = ~self.bounds | (fit.x > 0), self.design(fit.x)
-        found = structure(
-            (self.measurement.power[self.rows] - signal) / fit.sigma,
-            csr_array((diags_array(1 / fit.sigma) @ design)[:, free]),
-            factor(csr_array(self._hessian(design, fit.sigma, fit.weight)[free][:, free])),
-            Patterns.of(views),
-            common_errors(fit.numerical / fit.sigma, views),
-        )
-        return [*lines, *told("invert", found.lines())]
+    def between(self, x: Array) -> tuple[Array, float]:
+        """Power on the pixels (N,) [W] of what J_n linear on faces leaves out, and length of the edges (Eq. M.38)."""
+        count = self.surface.unknowns
+        error = MeshError.of(self.surface, self.surface.spread @ (x[:count] * self.reference))
+        factors = self.factors.of(x[count:])[self.factors.view]
+        return np.asarray((self.matrix @ error.columns)[self.rows] * factors), error.edge
 
     def draws(self, fit: Fit, count: int, seed: int, report: Progress) -> Array:
         """x of `count` random draws, (m, count), followed by the factors of the views, (views, count)."""
@@ -426,12 +412,13 @@ class Problem:
         design = self.design(fit.x)
         normal, solve = self._normal(design, fit.sigma, fit.weight)
         minima = Minima(normal, solve, self.bounds, self.settings.columns * count)
+        between = self.between(fit.x)[0]
         sizes = [min(self.settings.block, count - k) for k in range(0, count, self.settings.block)]
         seeds = np.random.SeedSequence(seed).spawn(len(sizes))
 
         def block(size: int, sequence: np.random.SeedSequence) -> Array:
             rng = np.random.default_rng(sequence)
-            right, gain = self._drawn(design, fit, size, rng)
+            right, gain = self._drawn(design, fit, between, size, rng)
             found = minimise(normal, right, minima.near(right, fit.x), self.bounds, solve, self.settings.drawn).x
             common = 1 + self.factors.common * rng.standard_normal(size)
             own = slice(self.surface.unknowns, None)
@@ -449,15 +436,19 @@ class Problem:
                 raise
         return np.concatenate(found, axis=1)
 
-    def _drawn(self, design: csr_array, fit: Fit, size: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    def _drawn(
+        self, design: csr_array, fit: Fit, between: Array, size: int, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
         """Right-hand sides (m + factors, size) with noise on data and priors, and factors of gain (size,).
 
-        The numerical error of a view has one sign: it does not average out over pixels.
+        The numerical error of a view has one sign: it does not average out over pixels. What J_n linear on faces
+        leaves out has one size on the whole surface.
         """
         power = self.measurement.power[self.rows] + fit.correction
         noise = np.sqrt(np.maximum(fit.sigma**2 - fit.numerical**2, 0))[:, None]
         common = rng.standard_normal((self.factors.views, size))[self.factors.view]
         data = power[:, None] + noise * rng.standard_normal((len(power), size)) + fit.numerical[:, None] * common
+        data += between[:, None] * rng.standard_normal(size)
         right = self._right(design, data, fit.sigma, fit.weight)
         rough = self.smoothness.root.T @ rng.standard_normal((self.surface.unknowns, size))
         gain = 1 + self.measurement.gain_error * rng.standard_normal(size)
@@ -478,6 +469,7 @@ class Problem:
         chi2_sum = float(np.sum(((self.measurement.power[self.rows] - signal) / fit.sigma) ** 2))
         sigma = np.full(self.matrix.shape[0], np.nan)
         sigma[self.rows] = fit.sigma
+        warnings, mesh_error = fit_warnings(self, fit, signal, chi2_sum, options.confidence)
         return Inversion(
             matrix=self.matrix,
             surface=self.surface,
@@ -497,19 +489,9 @@ class Problem:
             gain_error=self.measurement.gain_error,
             gain_per_view=self.factors.sd,
             chi2_sum=chi2_sum,
-            warnings=tuple(self._told(fit, signal, chi2_sum)),
+            mesh_error=mesh_error,
+            warnings=tuple(warnings),
             measured=np.where(self.measurement.mask, np.nan, self.measurement.power).reshape(views),
             fitted=fitted,
             sigma=sigma.reshape(views),
-        )
-
-
-def _report_unconverged(found: Fit, rounds: int) -> None:
-    """Say in one line on stderr that the rounds were too few for variances and weight."""
-    if not found.converged:
-        LOG.warning(
-            "fspt: invert: variances and weight still change after %d rounds; the last ones are kept. Give a weight, "
-            "for example %.3g.",
-            rounds,
-            found.weight,
         )
