@@ -9,7 +9,7 @@ sphere above each vertex, so that only J_n between the vertices differs; or of t
 Regions are the vertices within 10, 15 and 30 degrees of the spot; their true sum is Σ areas · J_n at the vertices.
 Columns: `mesh_error` of the result, share of warnings of a coarse mesh; mean difference of the sums from the true ones
 and its standard error [%], half-width of their 90 % intervals [%] and share that contains the true sum; both again
-without the error of the mesh (Eq. M.38).
+without the error of the mesh (Eq. M.42).
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ def fit_warnings(
     signal : (N,) fitted power [W];  chi2_sum : Σ (residual/σ)²
 
     With them the largest change of a weighted sum of J_n by a J_n that is curved on faces, over the sum's standard
-    deviation (Eq. M.38); 0 for `mlem`.
+    deviation (Eq. M.42); 0 for `mlem`.
     """
     measurement, rows = problem.measurement, problem.rows
     noise = measurement.chi2(rows, signal, fit.sigma)

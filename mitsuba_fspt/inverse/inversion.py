@@ -31,7 +31,7 @@ class Inversion:
     """Surface flux density J_n from pictures, on the columns of a transport matrix.
 
     The intervals contain the noise, the numerical error of the matrix, a common factor, and what J_n leaves out that is
-    linear on faces (Eq. M.38). They leave out errors of the model: pose, lens, shape, exit law, flat field, factors of
+    linear on faces (Eq. M.42). They leave out errors of the model: pose, lens, shape, exit law, flat field, factors of
     single views. `warnings` say what the residuals show of these, by χ² and by structure over the views (Eq. M.34).
 
     Attributes
@@ -53,7 +53,7 @@ class Inversion:
     view_factors : (views,) these factors, which `fitted` contains;  view_factor_draws : (views, samples) draws of them
     measured, fitted, sigma : (views, height, width) [W]; NaN where masked, or outside the surface
     mesh_error : largest change of a weighted sum of J_n by J_n that is curved on faces, over the sum's standard
-        deviation without it; contained in the intervals (Eq. M.38)
+        deviation without it; contained in the intervals (Eq. M.42)
     warnings : lines of stderr on what the residuals say of the model and of the stated errors, and on a coarse mesh
     """
 

@@ -399,7 +399,7 @@ class Problem:
         return self.matrix.error(exitance).ravel()[self.rows]
 
     def between(self, x: Array) -> tuple[Array, float]:
-        """Power on the pixels (N,) [W] of what J_n linear on faces leaves out, and length of the edges (Eq. M.38)."""
+        """Power on the pixels (N,) [W] of what J_n linear on faces leaves out, and length of the edges (Eq. M.42)."""
         count = self.surface.unknowns
         error = MeshError.of(self.surface, self.surface.spread @ (x[:count] * self.reference))
         factors = self.factors.of(x[count:])[self.factors.view]

@@ -1,4 +1,4 @@
-"""What J_n between the vertices adds to the images: the mean error of the linear interpolation on faces (Eq. M.38).
+"""What J_n between the vertices adds to the images: the mean error of the linear interpolation on faces (Eq. M.42).
 
 J_n is linear on faces, that of a body is curved. Where second derivatives do not change over a triangle, J_n exceeds
 the linear function of its values at the corners by −(1/24) Σ eᵀ∇∇J e on average, over the three edges e. Pixels see

@@ -16,8 +16,9 @@ LARGEST = 1e30  # largest number of a lens, and largest inverse of one: squares 
 LEAST_F_NUMBER = 1e-3  # of the model: no lens in air is below 0.5; far below 1e-3, stated errors are too small
 FOCUS = ("focus_distance", "magnification", "image_distance")  # exactly one of them is given
 BORDERS = ("lens_diameter", "diaphragm_distance", "image_stop_diameter")
-NUMBERS = ("focal_length", "f_number", *FOCUS, *BORDERS)  # of `Lens.focused`, whatever the model
-EXAMPLES = dict(zip(NUMBERS, ("55", "8", "165", "0.5", "82.5", "20", "5", "20"), strict=True))
+OPTIONAL = (*BORDERS, "pupil_magnification")
+NUMBERS = ("focal_length", "f_number", *FOCUS, *OPTIONAL)  # of `Lens.focused`, whatever the model
+EXAMPLES = dict(zip(NUMBERS, ("55", "8", "165", "0.5", "82.5", "20", "5", "20", "0.9"), strict=True))
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,10 @@ class FocusedLens:
     lens_diameter: float | None = None
     diaphragm_distance: float = 0.0
     image_stop_diameter: float | None = None
+    pupil_magnification: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("focal_length", "f_number", "focus_distance", *BORDERS):
+        for name in ("focal_length", "f_number", "focus_distance", *OPTIONAL):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, number(f"'{name}'", value, OpticsError, EXAMPLES[name]))
         require_positive("focal_length", self.focal_length, "mm, for example 55")
@@ -61,6 +63,7 @@ class FocusedLens:
             require_positive("image_stop_diameter", self.image_stop_diameter, "mm on the detector, for example 20")
         if self.lens_diameter is not None:
             require_positive("lens_diameter", self.lens_diameter, "mm, for example 20")
+        require_positive("pupil_magnification", self.pupil_magnification, "exit over entrance pupil, for example 0.9")
 
     @property
     def image_distance(self) -> float:
@@ -76,6 +79,16 @@ class FocusedLens:
     def diaphragm_diameter(self) -> float:
         """D = F/f_num [mm] (Eq. 3)."""
         return self.focal_length / self.f_number
+
+    @property
+    def pupil_depth(self) -> float:
+        """z_p = F (1 − 1/P) [mm], depth of the entrance pupil before the lens plane; < 0 behind it (Eq. M.39)."""
+        return self.focal_length * (1 - 1 / self.pupil_magnification)
+
+    @property
+    def working_f_number(self) -> float:
+        """f_num (1 + t/P): half the image distance from the exit pupil over that pupil's radius (Eq. M.40)."""
+        return self.f_number * (1 + self.magnification / self.pupil_magnification)
 
     @property
     def seen_field(self) -> float:

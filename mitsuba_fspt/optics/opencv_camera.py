@@ -2,8 +2,8 @@
 
 OpenCV: X_c = R X + t with x to the right, y down and z forward, and the pixel (f_x x/z + s y/z + c_x, f_y y/z + c_y),
 whose integer values are centres of pixels. The lens looks along its +z with x to the left and y up, so that
-to_world = [Rᵀ diag(−1, −1, 1) | −Rᵀ t]. A pinhole has f_x = v/p: the pixel pitch is p = v/f_x for a lens focused at the
-image distance v.
+to_world = [Rᵀ diag(−1, −1, 1) | −Rᵀ t]. OpenCV's centre of projection is that of the entrance pupil. A lens with the
+pupil magnification P has f_x = F (1 + t/P)/p (Eq. M.41): the pixel pitch is p = F (1 + t/P)/f_x, v/f_x for P = 1.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..runtime.errors import OpticsError
-from ..runtime.numbers import whole
+from ..runtime.numbers import number, whole
 from .focused_lens import FOCUS
 from .thin_lens import Lens
 
@@ -28,11 +28,12 @@ WIDEST = 3.0  # largest size, over that of the image, of a film with the princip
 class OpenCVCamera:
     """Pose and film of a camera. Aperture and focus are missing, since OpenCV's numbers do not contain them.
 
-    to_world : (4, 4), from the lens at the origin to the world [mm]
-    focal_pixels : image distance over pixel pitch, (f_x + f_y)/2
+    to_world : (4, 4), from the centre of the entrance pupil at the origin to the world [mm]
+    focal_pixels : F (1 + t/P) over the pixel pitch, (f_x + f_y)/2
     width, height : of the film whose middle is the principal point;  crop : (x, y, width, height) of the image in it
     deviation : shift of an image corner [pixels] by all that is neglected: skew, f_x ≠ f_y, and the part of the
         principal point that is smaller than half a pixel
+    pupil_magnification : P of the lens, 1 where its pupils lie in its principal planes
     """
 
     to_world: Array
@@ -41,10 +42,48 @@ class OpenCVCamera:
     height: int
     crop: tuple[int, int, int, int]
     deviation: float
+    pupil_magnification: float = 1.0
 
-    def pixel_pitch(self, image_distance: float) -> float:
-        """Pixel pitch p = v/f [mm] of a lens at the `image_distance` v [mm] from the detector."""
-        return image_distance / self.focal_pixels
+    def pixel_pitch(self, image_distance: float, focal_length: float | None = None) -> float:
+        """Pixel pitch p = (F + (v − F)/P)/f [mm] (Eq. M.41) of a lens at the `image_distance` v [mm] from the detector.
+
+        `focal_length` F [mm] is needed unless P = 1. Raises OpticsError where it is missing or not in 0 … v.
+        """
+        if focal_length is None:
+            if self.pupil_magnification != 1:
+                raise OpticsError(
+                    f"pixel_pitch: 'pupil_magnification' = {self.pupil_magnification:g} needs 'focal_length'. Give mm, "
+                    "for example pixel_pitch(82.5, focal_length=55)."
+                )
+            return image_distance / self.focal_pixels
+        if not 0 < focal_length < image_distance:
+            raise OpticsError(
+                f"pixel_pitch: 'focal_length' must be > 0 and below image_distance = {image_distance:g} mm, got "
+                f"{focal_length:g}. Give mm."
+            )
+        return (focal_length + (image_distance - focal_length) / self.pupil_magnification) / self.focal_pixels
+
+    def pupil_magnification_of(
+        self, pixel_pitch: float, *, focal_length: float, magnification: float, focal_length_sd: float = 0.0
+    ) -> tuple[float, float]:
+        """P of a lens on a detector of known pitch, and its standard deviation: f p = F (1 + t/P) solved for P.
+
+        pixel_pitch : of the detector [mm];  focal_length : F [mm];  magnification : t
+        focal_length_sd : relative standard deviation of F. That of P is (1 + P/t) times as large: at t = 0.1 an F that
+            is known to 1 % gives P to 11 %.
+
+        Raises
+        ------
+        OpticsError : the numbers leave no P > 0.
+        """
+        ratio = self.focal_pixels * pixel_pitch / focal_length - 1
+        if not ratio > 0:
+            raise OpticsError(
+                f"pupil_magnification_of: f · pixel_pitch = {self.focal_pixels * pixel_pitch:.6g} mm must exceed "
+                f"focal_length = {focal_length:g} mm. Check the pitch, the focal length and the units of K."
+            )
+        found = magnification / ratio
+        return found, found * (1 + found / magnification) * focal_length_sd
 
     def sensor_xml(self, *, focal_length: float, f_number: float, **focus: float) -> str:
         """XML text of the `<sensor>` for a scene file.
@@ -60,14 +99,17 @@ class OpenCVCamera:
         """
         if unknown := set(focus) - set(FOCUS):
             raise OpticsError(f"camera_from_opencv: '{unknown.pop()}' sets no focus. Give one of {', '.join(FOCUS)}.")
-        lens = Lens.focused(focal_length, f_number, **focus)  # type: ignore[arg-type]
-        numbers = {"focal_length": lens.focal_length, "f_number": lens.f_number, **focus}
-        numbers["pixel_pitch"] = self.pixel_pitch(lens.image_distance)
+        magnified = {} if self.pupil_magnification == 1 else {"pupil_magnification": self.pupil_magnification}
+        lens = Lens.focused(focal_length, f_number, **focus, **magnified)  # type: ignore[arg-type]
+        numbers = {"focal_length": lens.focal_length, "f_number": lens.f_number, **focus, **magnified}
+        numbers["pixel_pitch"] = self.pixel_pitch(lens.image_distance, lens.focal_length)
+        place = self.to_world.copy()
+        place[:3, 3] -= lens.pupil_depth * place[:3, 2]  # the lens plane lies behind the entrance pupil by its depth
         floats = "".join(f'    <float name="{name}" value="{float(value)!r}"/>\n' for name, value in numbers.items())
         crop = dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), self.crop, strict=True))
         sides = {"width": self.width, "height": self.height} | crop
         film = "".join(f'        <integer name="{name}" value="{value}"/>\n' for name, value in sides.items())
-        matrix = " ".join(f"{value!r}" for value in self.to_world.ravel().tolist())
+        matrix = " ".join(f"{value!r}" for value in place.ravel().tolist())
         return (
             f'<sensor type="fspt_lens">\n{floats}'
             f'    <transform name="to_world"><matrix value="{matrix}"/></transform>\n'
@@ -78,7 +120,9 @@ class OpenCVCamera:
         )
 
 
-def camera_from_opencv(K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, width: int, height: int) -> OpenCVCamera:
+def camera_from_opencv(
+    K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, width: int, height: int, pupil_magnification: float = 1.0
+) -> OpenCVCamera:
     """Camera of `cv2.calibrateCamera` or `cv2.solvePnP`, for images whose distortion has been removed.
 
         camera = fspt.camera_from_opencv(K, rvec, tvec, width=512, height=512)
@@ -94,6 +138,8 @@ def camera_from_opencv(K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, wid
     rvec : 3 numbers, the rotation from the world to the camera as axis times angle [rad]
     tvec : 3 numbers, its translation [mm]: the calibration target's squares must have been given in mm
     width, height : of the image [pixels]
+    pupil_magnification : P of the lens. OpenCV's centre is that of the entrance pupil: `to_world` stays there, and
+        `sensor_xml` moves the lens plane back along the axis by F (1 − 1/P)
 
     Raises
     ------
@@ -114,6 +160,12 @@ def camera_from_opencv(K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, wid
         raise OpticsError(
             f"camera_from_opencv: f_x = {matrix[0, 0]:g} and f_y = {matrix[1, 1]:g} must be > 0. Give OpenCV's K."
         )
+    magnified = number("camera_from_opencv: 'pupil_magnification'", pupil_magnification, OpticsError, "0.9")
+    if not 0 < magnified < float("inf"):
+        raise OpticsError(
+            f"camera_from_opencv: 'pupil_magnification' must be > 0 and finite, got {magnified:g}. Give the diameter "
+            "of the exit pupil over that of the entrance pupil, for example 0.9."
+        )
     focal = float(matrix[0, 0] + matrix[1, 1]) / 2
     first, wide, rest_x = _film(float(matrix[0, 2]), width)
     upper, high, rest_y = _film(float(matrix[1, 2]), height)
@@ -131,7 +183,7 @@ def camera_from_opencv(K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, wid
     to_world = np.eye(4)
     to_world[:3, :3] = rotation.T @ np.diag([-1.0, -1.0, 1.0])
     to_world[:3, 3] = -rotation.T @ shift
-    return OpenCVCamera(to_world, focal, wide, high, (first, upper, width, height), deviation)
+    return OpenCVCamera(to_world, focal, wide, high, (first, upper, width, height), deviation, magnified)
 
 
 def _film(centre: float, size: int) -> tuple[int, int, float]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from ..runtime.errors import OpticsError
 from .discs import Disc
-from .focused_lens import BORDERS, FOCUS, NUMBERS, FocusedLens, require_positive
+from .focused_lens import FOCUS, NUMBERS, OPTIONAL, FocusedLens, require_positive
 from .models import LensModel, model_named, model_names
 from .models.diaphragm import Diaphragm
 
@@ -30,6 +30,8 @@ class Lens(FocusedLens):
     lens_diameter : the lens border [mm]; None leaves the diaphragm as the only border
     diaphragm_distance : from the lens plane to the diaphragm [mm]; > 0 behind the lens (detector side), < 0 in front
     image_stop_diameter : circular stop on the detector, centred on the optical axis [mm]; None leaves the film's border
+    pupil_magnification : P, diameter of the exit pupil over that of the entrance pupil, > 0; unless it is 1, the lens
+        plane is the front principal plane of a compound lens with the entrance pupil F/f_num at F (1 − 1/P) (Eq. M.39)
     model : which lines of sight pass, see `mitsuba_fspt.optics.models`
 
     Raises
@@ -78,9 +80,9 @@ class Lens(FocusedLens):
             focus_distance = focal_length * value / (value - focal_length)
         else:
             focus_distance = value
-        borders = {name: value for name, value in numbers.items() if name in BORDERS}
-        rest = {name: value for name, value in numbers.items() if name not in BORDERS and value is not None}
-        return cls(focal_length, f_number, focus_distance, **borders, model=_model(model, rest))  # type: ignore[arg-type]
+        optional = {name: value for name, value in numbers.items() if name in OPTIONAL}
+        rest = {name: value for name, value in numbers.items() if name not in OPTIONAL and value is not None}
+        return cls(focal_length, f_number, focus_distance, **optional, model=_model(model, rest))  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,8 +101,8 @@ class Lens(FocusedLens):
     def airy_radius(self, wavelength_nm: float) -> float:
         """Radius [mm] of the Airy disc on the detector, of light of this wavelength from a point in focus (Eq. M.32).
 
-        1.22 λ N (1 + t) where the diaphragm is in the lens: the first dark ring of the diffraction at the pupil, which
-        lines of sight leave out. It is that on the axis, of the narrower one of two borders.
+        1.22 λ N (1 + t/P), with P = 1 where the diaphragm is in the lens: the first dark ring of the diffraction at the
+        pupil, which lines of sight leave out. It is that on the axis, of the narrower one of two borders.
         """
         radius = min(disc.radius for disc in self.discs)
         return 0.61 * wavelength_nm * MM_PER_NM * self.image_distance / radius

@@ -45,6 +45,12 @@ class FsptLens(mi.Sensor):
      * - diaphragm_distance
        - |float| [mm]
        - From the lens to the diaphragm, > 0 behind the lens, < 0 in front, 0 in it (Default: 0). Needs lens_diameter.
+     * - pupil_magnification
+       - |float|
+       - P > 0 of a compound lens, diameter of the exit pupil over that of the entrance pupil (Default: 1). The entrance
+         pupil, F/f_num wide, then lies F (1 − 1/P) before the lens plane, which is the front principal plane, and the
+         working f-number is f_num (1 + t/P). Not with lens_diameter or diaphragm_distance; only with the models
+         diaphragm and pinhole. Updatable.
      * - model
        - |string|
        - diaphragm (default) | hrrt (no diaphragm, D = lens_diameter) | pinhole (one line of sight a point) |
@@ -66,7 +72,8 @@ class FsptLens(mi.Sensor):
          must not lie outside. The wavelength is updatable.
      * - to_world
        - |transform|
-       - Rotation and translation. Puts the lens centre at the origin looking along +z. Updatable.
+       - Rotation and translation. Puts the lens centre, for a compound lens that of the front principal plane, at the
+         origin looking along +z. Updatable.
 
     The sensor weights a line of sight from lens point a to virtual point r_vd by τ A_vd A_pupil cos⁴θ/u², so that
     the mean of weight × radiance over a pixel is the power on it [W] (pupil form of Eq. 9). A pixel stores its power as

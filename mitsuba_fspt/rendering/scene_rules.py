@@ -16,7 +16,10 @@ LISTS = {  # attributes that hold one or several numbers, by element
     **dict.fromkeys(("point", "vector", "translate", "scale", "rotate", "matrix"), ("value",)),
     "lookat": ("origin", "target", "up"),
 }
-OF_THE_LENS = ("f_number", "magnification", "image_distance", "pixel_pitch", "lens_diameter", "diaphragm_distance")
+OF_THE_LENS = (
+    *("f_number", "magnification", "image_distance", "pixel_pitch", "lens_diameter", "diaphragm_distance"),
+    "pupil_magnification",
+)
 CAMERAS = ("perspective", "thinlens", "orthographic")  # of Mitsuba
 NEEDED = {"bitmap": ("filename", "data", "bitmap"), "volume": ("volume",)}  # without one, the texture crashes Mitsuba
 

@@ -26,6 +26,7 @@ LENSES = {
     "pinhole": {"model": "pinhole", "f_number": 8.0},
     "cone": {"model": "ripoll", "numerical_aperture": 0.03},
     "crop": {"crop": (1, 3, 20, 12)},
+    "compound": {"pupil_magnification": 0.8},
     "wide field": {"pixel_pitch": 2.0},
 }
 

@@ -40,7 +40,7 @@ def views(tmp_path_factory, mono):
 def test_images_of_a_finer_mesh(views, depth):
     """What 16 triangles in place of one add to the images, 1 to 2 % of the peak, is T times the mean error, to 25 %.
 
-    In the sum over pixels to 20 %: third derivatives, which M.38 leaves out, are that large. Seen to fail with 1/12 in
+    In the sum over pixels to 20 %: third derivatives, which M.42 leaves out, are that large. Seen to fail with 1/12 in
     place of 1/24.
     """
     (coarse, surface), (fine, whole) = views
@@ -110,7 +110,7 @@ def test_a_crease_adds_nothing():
 def test_intervals_contain_the_mesh(views, monkeypatch):
     """Images of the divided triangles at 30,000 electrons, 642 vertices: the interval of the sum near the spot.
 
-    Its shift is some 3 standard deviations of the noise. The interval contains the sum, and misses it without M.38. The
+    Its shift is some 3 standard deviations of the noise. The interval contains the sum, and misses it without M.42. The
     warning names an edge at which the shift is small. scripts/mesh_error.py has many seeds.
     """
     (coarse, surface), (fine, whole) = views

@@ -48,6 +48,14 @@ class LensModel:
     def check(self, lens: FocusedLens) -> None:
         """Raise OpticsError where the lens and this model's parameters do not fit together."""
 
+    def refuse_pupil_magnification(self, lens: FocusedLens, why: str) -> None:
+        """Raise OpticsError for `pupil_magnification` ≠ 1, which this model does not define, and say `why`."""
+        if lens.pupil_magnification != 1:
+            raise OpticsError(
+                f"'pupil_magnification' = {lens.pupil_magnification:g} has no meaning with model '{self.name}', which "
+                f"{why}. Leave it out, or set model to 'diaphragm'."
+            )
+
     def discs(self, lens: FocusedLens) -> tuple[Disc, ...]:
         """The one or two discs of the lens plane that a line of sight has to pass; their overlap is the open pupil.
 

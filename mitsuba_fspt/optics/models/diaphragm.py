@@ -20,7 +20,9 @@ class Diaphragm(LensModel):
     """Lines of sight pass the diaphragm, and also the border of the lens if the diaphragm is apart from it (Fig. 2)."""
 
     def check(self, lens: FocusedLens) -> None:
-        if lens.diaphragm_distance != 0:
+        if lens.pupil_magnification != 1:
+            check_pupil_alone(lens)
+        elif lens.diaphragm_distance != 0:
             self._check_distance(lens)
         elif lens.lens_diameter is not None and lens.lens_diameter < lens.diaphragm_diameter * (1 - ROUNDING):
             raise OpticsError(
@@ -49,20 +51,46 @@ class Diaphragm(LensModel):
             )
 
     def discs(self, lens: FocusedLens) -> tuple[Disc, ...]:
-        """A diaphragm in the lens itself; otherwise its entrance pupil and the border of the lens."""
+        """A diaphragm in the lens itself; otherwise its entrance pupil and the border of the lens, if it is given."""
+        if lens.pupil_magnification != 1:
+            return (entrance_pupil(lens),)
         if lens.diaphragm_distance == 0 or lens.lens_diameter is None:
             return (Disc(0.0, lens.diaphragm_diameter / 2),)
-        pupil = _entrance_pupil(lens)
+        pupil = _image_of_diaphragm(lens)
         border = Disc(0.0, lens.lens_diameter / 2)
         return (border,) if pupil is None else (pupil, border)
 
 
-def _entrance_pupil(lens: FocusedLens) -> Disc | None:
+def entrance_pupil(lens: FocusedLens) -> Disc:
+    """Entrance pupil of a compound lens, D = F/f_num at the `pupil_depth`, on the lens plane (Eqs. M.39, M.12)."""
+    if lens.pupil_depth == 0:
+        return Disc(0.0, lens.diaphragm_diameter / 2)
+    return _on_lens_plane(lens.pupil_depth, lens.diaphragm_diameter / 2, lens.focus_distance)
+
+
+def check_pupil_alone(lens: FocusedLens) -> None:
+    """Raise OpticsError for a number that contradicts `pupil_magnification` ≠ 1, which alone places the pupil."""
+    for name, absent in (("diaphragm_distance", 0.0), ("lens_diameter", None)):
+        if (value := getattr(lens, name)) != absent:
+            raise OpticsError(
+                f"'pupil_magnification' = {lens.pupil_magnification:g} and '{name}' = {value:g} mm exclude each other: "
+                "the first places the entrance pupil, the only border of such a lens. Give one."
+            )
+
+
+def _on_lens_plane(depth: float, radius: float, focus_distance: float) -> Disc:
+    """Disc of the lens plane through which virtual points see a circle of this radius [mm] at `depth` (Eq. M.12).
+
+    From the virtual point (x, u) it projects onto the disc of radius R_p u/|u - z_p| about -x z_p/(u - z_p).
+    """
+    return Disc(-depth / (focus_distance - depth), abs(radius * focus_distance / (focus_distance - depth)))
+
+
+def _image_of_diaphragm(lens: FocusedLens) -> Disc | None:
     """Entrance pupil, projected from the virtual point onto the lens plane (Eqs. M.11, M.12); None on the detector.
 
     The image of a diaphragm at the distance s behind the lens, seen from the object side, is at s F/(s - F) and
-    magnified by F/(F - s); a diaphragm in front of the lens is its own image. From the virtual point (x, u) a circle of
-    radius R_p at depth z_p projects onto the disc of the lens plane with radius R_p u/(u - z_p) about -x z_p/(u - z_p).
+    magnified by F/(F - s); a diaphragm in front of the lens is its own image.
     """
     s, focal, u, radius = lens.diaphragm_distance, lens.focal_length, lens.focus_distance, lens.diaphragm_diameter / 2
     if s < 0:
@@ -74,4 +102,4 @@ def _entrance_pupil(lens: FocusedLens) -> Disc | None:
         depth, pupil_radius = s * focal / (s - focal), abs(radius * focal / (focal - s))
     if depth == u:
         return None  # the diaphragm lies on the detector: a field stop, not a pupil
-    return Disc(-depth / (u - depth), abs(pupil_radius * u / (u - depth)))
+    return _on_lens_plane(depth, pupil_radius, u)

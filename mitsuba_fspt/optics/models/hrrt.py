@@ -18,6 +18,7 @@ class Hrrt(LensModel):
     """Lines of sight pass the border of the lens, D = `lens_diameter`."""
 
     def check(self, lens: FocusedLens) -> None:
+        self.refuse_pupil_magnification(lens, "has no diaphragm, so no pupil to magnify")
         if lens.lens_diameter is None:
             raise OpticsError("model 'hrrt' needs 'lens_diameter', the border that stops its light. Give mm, say 20.")
 

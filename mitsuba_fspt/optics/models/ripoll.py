@@ -25,6 +25,7 @@ class Ripoll(LensModel):
     EXAMPLES: ClassVar[dict[str, str]] = {"numerical_aperture": "0.5"}
 
     def check(self, lens: FocusedLens) -> None:
+        self.refuse_pupil_magnification(lens, "accepts directions, not a pupil")
         if self.numerical_aperture is None or not 0 < self.numerical_aperture < 1:
             raise OpticsError(
                 f"model 'ripoll' needs 'numerical_aperture' in (0, 1), got {self.numerical_aperture}. "
