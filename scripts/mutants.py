@@ -29,7 +29,7 @@ FAILED = 1  # exit code of pytest for tests that fail; others mean that they did
 TIMEOUT = 1200  # seconds for the tests of one mutant: one that never ends counts as caught
 
 LENS, SURFACE = "tests/plugins/test_lens.py", "tests/plugins/test_surface.py"
-PHYSICS, FORMS = "tests/integral/test_physics.py", "tests/integral/test_surface_form.py"
+PHYSICS, FORMS = "tests/integral/test_physics.py", "tests/integral/surface/test_surface_form.py"
 LAWS, DETECTOR = "tests/emission/test_laws.py", "tests/detector/test_detector.py"
 REDUCTION, RADIOMETRY = "tests/detector/test_reduction.py", "tests/images/test_radiometry.py"
 CAMERAS = "tests/detector/test_cameras.py"
@@ -61,7 +61,13 @@ class Mutant:
 
 MUTANTS = (
     # Optics and Eq. 9
-    Mutant("cos4 of Eq. M.5", "integral/eq9.py", "dr.square(dr.square(cos_theta))", "dr.square(cos_theta)", (PHYSICS,)),
+    Mutant(
+        "cos4 of Eq. M.5",
+        "integral/lines/eq9.py",
+        "dr.square(dr.square(cos_theta))",
+        "dr.square(cos_theta)",
+        (PHYSICS,),
+    ),
     Mutant(
         "1/u2 of the etendue",
         "optics/pixel_etendue.py",
@@ -70,9 +76,13 @@ MUTANTS = (
         (PHYSICS,),
     ),
     Mutant("square of the virtual pixel", "optics/pixel_etendue.py", "side**2 * math.pi", "side * math.pi", (PHYSICS,)),
-    Mutant("cos of the surface form", "integral/eq9.py", "return cos_s * arrival", "return arrival", (FORMS,)),
+    Mutant("cos of the surface form", "integral/lines/eq9.py", "return cos_s * arrival", "return arrival", (FORMS,)),
     Mutant(
-        "1/pi of a pupil cell", "integral/eq9.py", "cell / (dr.pi * virtual_pixel)", "cell / virtual_pixel", (FORMS,)
+        "1/pi of a pupil cell",
+        "integral/lines/eq9.py",
+        "cell / (dr.pi * virtual_pixel)",
+        "cell / virtual_pixel",
+        (FORMS,),
     ),
     Mutant(
         "cos of the arrival",
@@ -211,17 +221,17 @@ MUTANTS = (
     # Windows and mirrors
     Mutant(
         "weight of a specular course",
-        "integral/specular.py",
+        "integral/lines/specular.py",
         "found.radiance + course.weight * radiance",
         "found.radiance + radiance",
-        ("tests/integral/test_specular.py",),
+        ("tests/integral/lines/test_specular.py",),
     ),
     Mutant(
         "apparent depth behind glass",
-        "integral/specular.py",
+        "integral/lines/specular.py",
         "dr.select(met, pi.t, 0) * cosine / course.index",
         "dr.select(met, pi.t, 0) * cosine",
-        ("tests/integral/test_specular.py",),
+        ("tests/integral/lines/test_specular.py",),
     ),
     # Detector and counts
     Mutant(

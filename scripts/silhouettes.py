@@ -27,13 +27,13 @@ from references.camera import ReferenceCamera, Stops
 from references.fans import CERTAIN, FanReference
 from references.shapes import Sphere
 
-from mitsuba_fspt.integral import node_rules
+from mitsuba_fspt.integral.pupil import node_rules
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.runtime.atomic_files import atomic_path
 from mitsuba_fspt.studies.convergence import fitted_order
 
 if TYPE_CHECKING:
-    from mitsuba_fspt.integral.draft import Draft
+    from mitsuba_fspt.integral.pupil.draft import Draft
 
 RTOL = 1e-5
 GOAL, FANS = 3e-7, 8192  # of the reference: error over the brightest pixel at which it ends, fans at most
@@ -89,11 +89,11 @@ def draft_of(names: list[str], f_number: float) -> Draft:
     """Draft of the picture of these spheres, with its first four nodes."""
     import mitsuba as mi
 
-    from mitsuba_fspt.integral.draft import Draft
-    from mitsuba_fspt.integral.eq9 import View
-    from mitsuba_fspt.integral.nodes import first_nodes
+    from mitsuba_fspt.integral.lines.eq9 import View
+    from mitsuba_fspt.integral.lines.visible_window import visible_window
+    from mitsuba_fspt.integral.pupil.draft import Draft
+    from mitsuba_fspt.integral.pupil.nodes import first_nodes
     from mitsuba_fspt.integral.quadrature import Quadrature
-    from mitsuba_fspt.integral.visible_window import visible_window
 
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "pixel_format": "luminance"}
     scene = {"type": "scene", "sensor": {"type": "fspt_lens", "f_number": f_number, **LENS, "film": film}}
@@ -140,9 +140,9 @@ def rules(draft: Draft, chosen: np.ndarray) -> list[Rule]:
     import drjit as dr
     import mitsuba as mi
 
-    from mitsuba_fspt.integral.lattices import SHIFTS, Means
-    from mitsuba_fspt.integral.nodes import apply_nodes
-    from mitsuba_fspt.integral.transects import apply_transects, edges_of
+    from mitsuba_fspt.integral.pupil.lattices import SHIFTS, Means
+    from mitsuba_fspt.integral.pupil.nodes import apply_nodes
+    from mitsuba_fspt.integral.pupil.transects import apply_transects, edges_of
 
     marked = np.zeros(SIZE * SIZE, bool)
     marked[chosen] = True

@@ -61,6 +61,10 @@ ARROWS = {
         "viewer",
     },
 }
+# The rooms inside `integral` and which others of them each may import. All may import the files beside them that are
+# listed; no room imports the other files there, which join the rooms.
+ARROWS_OF_INTEGRAL = {"lines": set(), "pupil": {"lines"}, "surface": {"lines"}, "rows": {"lines", "pupil", "surface"}}
+FOR_ALL_OF_INTEGRAL = {"estimator", "progress", "quadrature", "shortcuts", "solution"}
 # Only these import `validation`: no result depends on it.
 IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
 # Rooms in which files still import each other.
@@ -195,6 +199,42 @@ def test_no_files_import_each_other():
 def test_every_listed_arrow_exists():
     found = {(room_of(name), other) for name in NAMES for other in imported_rooms(name)}
     assert {(room, other) for room, others in ARROWS.items() for other in others} <= found
+
+
+def files_imported(name):
+    """Files of the package that a file imports from, as paths without suffix, those for types alone included."""
+    folder = name.split("/")[:-1]
+    for node in ast.walk(TREES[name]):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            home = [*folder[: len(folder) - node.level + 1], *(node.module.split(".") if node.module else [])]
+            found = ["/".join(home), *("/".join([*home, alias.name]) for alias in node.names)]
+            yield from (file for file in found if f"{file}.py" in TREES)
+
+
+def test_arrows_between_the_rooms_of_the_integral_run_one_way():
+    """And no files of it import each other in a circle."""
+    files = [name for name in NAMES if room_of(name) == "integral" and not name.endswith("__init__.py")]
+    above = {name[:-3]: {file for file in files_imported(name) if room_of(file) == "integral"} for name in files}
+    found = set()
+    for file, others in above.items():
+        _, *room, _ = file.split("/")
+        for other in others if room else ():
+            _, *below, stem = other.split("/")
+            assert below or stem in FOR_ALL_OF_INTEGRAL, f"{file} imports {other}"
+            found |= {(*room, *below)} if below not in ([], room) else set()
+    listed = {(room, other) for room, others in ARROWS_OF_INTEGRAL.items() for other in others}
+    assert found == listed
+    assert {name.split("/")[1] for name in files if name.count("/") > 1} == set(ARROWS_OF_INTEGRAL)
+    assert not circles(above)
+
+
+def circles(above):
+    """Files that import each other in a circle, and files that import those."""
+    left = dict(above)
+    while leaves := [file for file, others in left.items() if not others & set(left)]:
+        for file in leaves:
+            del left[file]
+    return sorted(left)
 
 
 def test_only_some_import_the_validation():

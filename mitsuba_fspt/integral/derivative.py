@@ -17,13 +17,13 @@ from ..jit.mesh_buffers import buffers
 from ..jit.recording import recording
 from ..runtime.cached_value import CachedValue
 from ..runtime.errors import SceneError
-from .eq9 import View
-from .exitance_rows import Rows, kinds_of, sizes_of
+from .lines.eq9 import View
+from .lines.scene_checks import check_scene
+from .lines.specular import Specular
+from .lines.traced_scene import pose_of
 from .quadrature import Quadrature
-from .scene_checks import check_scene
+from .rows.exitance_rows import Rows, kinds_of, sizes_of
 from .solver import Solver
-from .specular import Specular
-from .traced_scene import pose_of
 
 
 class Derivative:

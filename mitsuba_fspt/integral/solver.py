@@ -20,20 +20,21 @@ from ..jit.recording import recording
 from ..runtime.cached_value import CachedValue
 from ..runtime.deadline import Deadline
 from ..runtime.errors import SceneError
-from . import interpolated, pupil_form, surface_form
-from .eq9 import View
-from .interpolated import Blocks, blocks_of
-from .narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
-from .nested_bsdfs import check_followed
+from .lines.eq9 import View
+from .lines.nested_bsdfs import check_followed
+from .lines.scene_checks import check_scene, check_surfaces_alone
+from .lines.specular import Specular
+from .lines.traced_scene import TracedScene, poses_of
+from .lines.visible_window import glowing_boxes
 from .progress import Progress
+from .pupil import interpolated, pupil_form
+from .pupil.interpolated import Blocks, blocks_of
+from .pupil.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
 from .quadrature import Quadrature
-from .scene_checks import check_scene, check_surfaces_alone
 from .shortcuts import Finding
 from .solution import Solution
-from .specular import Specular
+from .surface import surface_form
 from .tiles import Mosaic
-from .traced_scene import TracedScene, poses_of
-from .visible_window import glowing_boxes
 
 LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
 NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form

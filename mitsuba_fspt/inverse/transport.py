@@ -308,7 +308,7 @@ def _scene_of(task: ViewTask) -> tuple[mi.Scene, mi.Sensor]:
 
 def _described(scene: mi.Scene, lens: mi.Sensor, task: ViewTask) -> ViewResult:
     from ..camera.of_sensor import camera_of
-    from ..integral.scene_checks import check_film
+    from ..integral.lines.scene_checks import check_film
 
     glowing_meshes(scene)
     check_film(camera := camera_of(lens))

@@ -175,8 +175,8 @@ def block_of(
     import drjit as dr
 
     from ..camera.of_sensor import camera_of
-    from ..integral.scene_checks import check_rounding
-    from ..integral.sparse_rows import sparse_rows
+    from ..integral.lines.scene_checks import check_rounding
+    from ..integral.rows.sparse_rows import sparse_rows
     from ..jit.recording import recording
     from ..rendering.render import integrator_of
 

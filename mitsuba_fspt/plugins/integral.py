@@ -15,15 +15,15 @@ from ..emission.emitting_surface import EmittingSurface
 from ..emission.face_table import shape_number
 from ..emission.gradients import surfaces_with_gradients
 from ..integral.derivative import Derivative
-from ..integral.eq9 import View
-from ..integral.exitance_rows import Rows
-from ..integral.left_out import LeftOut, light_left_out
+from ..integral.lines.eq9 import View
+from ..integral.lines.left_out import LeftOut, light_left_out
+from ..integral.lines.scene_warnings import scene_warnings
+from ..integral.lines.traced_scene import pose_of
 from ..integral.quadrature import Quadrature
-from ..integral.scene_warnings import scene_warnings
+from ..integral.rows.exitance_rows import Rows
 from ..integral.shortcuts import SHORTCUTS
 from ..integral.solution import Solution
 from ..integral.solver import Solver
-from ..integral.traced_scene import pose_of
 from ..runtime.cached_value import CachedValue
 from ..runtime.deadline import Deadline
 from ..runtime.errors import SceneError, named

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..camera.camera import Camera
 from ..camera.film import Film
-from ..integral.eq9 import etendue_from_pixel
+from ..integral.lines.eq9 import etendue_from_pixel
 from ..jit.spectra import flat_share
 from ..optics.thin_lens import Lens, number_names
 from ..optics.transmittance import NUMBERS as FILTER_NUMBERS

@@ -267,7 +267,7 @@ def _surfaces(
     import drjit as dr
     import mitsuba as mi
 
-    from ..integral.specular import Specular, strongest_course
+    from ..integral.lines.specular import Specular, strongest_course
 
     specular = Specular.of(scene, camera, even_if_none=True)
     found = []

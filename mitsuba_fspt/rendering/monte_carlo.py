@@ -35,8 +35,8 @@ def tracer(method: str, scene: mi.Scene, lens: mi.Sensor, max_depth: int | None 
     import mitsuba as mi
 
     from ..camera.of_sensor import camera_of
+    from ..integral.lines.specular import Specular
     from ..integral.quadrature import Quadrature
-    from ..integral.specular import Specular
 
     specular = Specular.of(scene, camera_of(lens))
     if specular and method == "ptracer":

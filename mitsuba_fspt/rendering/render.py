@@ -135,7 +135,7 @@ def _warned(
 ) -> dict[str, str]:
     """The warnings of metadata `how`, that the picture is dark, and those about the scene."""
     from ..camera.of_sensor import camera_of
-    from ..integral.scene_warnings import scene_warnings
+    from ..integral.lines.scene_warnings import scene_warnings
 
     dark = None if power.any() else DARK
     warnings = [
@@ -147,7 +147,7 @@ def _warned(
 def warnings_of(scene: mi.Scene, sensor: int = 0) -> list[str]:
     """What is odd about a scene, or not treated by the integral: one line each, as in the metadata of its image."""
     from ..camera.of_sensor import camera_of
-    from ..integral.scene_warnings import scene_warnings
+    from ..integral.lines.scene_warnings import scene_warnings
 
     return scene_warnings(scene, camera_of(sensor_of(scene, sensor)), integrator_of(scene, "integral"))
 
@@ -179,7 +179,7 @@ def _integrate(
 ) -> tuple:
     """Power, error [W] and coverage, shape (h, w), by the deterministic integral, and metadata."""
     from ..camera.of_sensor import camera_of
-    from ..integral.scene_checks import check_scene, check_surfaces_alone
+    from ..integral.lines.scene_checks import check_scene, check_surfaces_alone
 
     with named("fspt_integral"):
         quadrature = replace(integrator.quadrature, **{k: value for k, value in accuracy.items() if value is not None})
@@ -217,8 +217,8 @@ def _sample(
     """Mean and standard error [W] of Monte Carlo passes and coverage, shape (h, w), in double precision; metadata."""
     from ..camera.of_sensor import camera_of
     from ..emission.of_emitter import probe_beside
-    from ..integral.pupil_form import coverage
-    from ..integral.scene_checks import check_scene
+    from ..integral.lines.scene_checks import check_scene
+    from ..integral.pupil.pupil_form import coverage
     from ..jit.recording import recording
 
     camera = camera_of(lens)
@@ -267,9 +267,9 @@ def _sample(
 def _followed(scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator) -> dict[str, object]:
     """Metadata of the paths that a Monte Carlo follows: `max_depth`, and the share of the light that it leaves out."""
     from ..camera.of_sensor import camera_of
-    from ..integral.left_out import light_left_out
+    from ..integral.lines.left_out import light_left_out
+    from ..integral.lines.scene_warnings import treats_media
     from ..integral.quadrature import Quadrature
-    from ..integral.scene_warnings import treats_media
 
     depth = monte_carlo.depth_of(integrator)
     if depth is None:
@@ -287,7 +287,7 @@ def _followed(scene: mi.Scene, lens: mi.Sensor, integrator: mi.Integrator) -> di
 
 def _can_see(scene: mi.Scene, camera: Camera) -> NDArray[np.bool_]:
     """True, shape (h, w), on pixels with lines of sight to an emitter (Eq. 4) that no image-plane stop blocks."""
-    from ..integral.visible_window import visible_window
+    from ..integral.lines.visible_window import visible_window
 
     window = visible_window(scene, camera)
     inside, cut = window.field_stop(camera)

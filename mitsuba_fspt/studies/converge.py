@@ -213,7 +213,7 @@ def _reference(
 def _shape(scene: mi.Scene, lens: mi.Sensor) -> tuple[int, int]:
     """Shape (h, w) of the image; raises as `check_scene` does."""
     from ..camera.of_sensor import camera_of
-    from ..integral.scene_checks import check_scene
+    from ..integral.lines.scene_checks import check_scene
 
     check_scene(scene, camera := camera_of(lens))
     return camera.film.shape

@@ -97,7 +97,7 @@ def _surfaces_and_pupil(scene: mi.Scene, lens: mi.Sensor) -> tuple[bool, str]:
     import mitsuba as mi
 
     from ..camera.of_sensor import camera_of
-    from ..integral.specular import Specular
+    from ..integral.lines.specular import Specular
 
     camera = camera_of(lens)
     if camera.lens.model.name == "pinhole":
@@ -206,8 +206,8 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 <<
     import mitsuba as mi
 
     from ..camera.of_sensor import camera_of
-    from ..integral import node_rules
-    from ..integral.visible_window import visible_window
+    from ..integral.lines.visible_window import visible_window
+    from ..integral.pupil import node_rules
     from ..jit.pixel_grid import Grid
 
     camera = camera_of(lens)

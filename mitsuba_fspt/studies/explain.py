@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import mitsuba as mi
 
-    from ..integral.left_out import LeftOut
+    from ..integral.lines.left_out import LeftOut
     from ..integral.quadrature import Quadrature
     from ..integral.solution import Solution
 

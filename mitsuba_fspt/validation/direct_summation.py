@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ..camera.camera import Camera
 from ..emission.elements import Elements, elements_of
-from ..integral.eq9 import eq9
-from ..integral.occlusion import hidden
-from ..integral.scene_checks import check_scene
+from ..integral.lines.eq9 import eq9
+from ..integral.lines.occlusion import hidden
+from ..integral.lines.scene_checks import check_scene
 from ..jit.batches import batch_slices, numbered
 from ..jit.recording import recording
 from ..jit.spectra import scalar

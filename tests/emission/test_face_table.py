@@ -64,8 +64,8 @@ def test_packets_of_lines_of_sight_meet_what_single_ones_meet(build, tmp_path, m
     """Seen to fail with packets of which one line of sight in sixteen is lost."""
     scene, found = build(tmp_path / "body.ply"), []
     for most in (-1.0, np.inf):
-        monkeypatch.setattr("mitsuba_fspt.integral.node_sums.NODES_TOGETHER", most)
-        monkeypatch.setattr("mitsuba_fspt.integral.jumps.TRANSECTS_TOGETHER", most)
+        monkeypatch.setattr("mitsuba_fspt.integral.pupil.node_sums.NODES_TOGETHER", most)
+        monkeypatch.setattr("mitsuba_fspt.integral.pupil.jumps.TRANSECTS_TOGETHER", most)
         found.append(solved(scene))
     singly, together = found
     np.testing.assert_allclose(together.power, singly.power, rtol=0, atol=10 * FLOAT32 * singly.power.max())

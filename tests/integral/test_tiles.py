@@ -11,8 +11,8 @@ from small_scenes import ball, glow, lens, load_scene, mi, world_scene
 import mitsuba_fspt as fspt
 from mitsuba_fspt.camera.window import Window
 from mitsuba_fspt.integral import tiles
+from mitsuba_fspt.integral.lines.visible_window import visible_window
 from mitsuba_fspt.integral.tiles import Mosaic, tiles_of
-from mitsuba_fspt.integral.visible_window import visible_window
 from mitsuba_fspt.runtime import memory
 from mitsuba_fspt.runtime.errors import SceneError
 
@@ -87,7 +87,7 @@ def test_one_bright_point_between_the_first_pixels_that_are_looked_at_counts(mon
     """Seen to fail with the brightest pixel sought by lines of sight alone: a sphere of 0.02 mm is on none."""
     shapes = ball(1e-3, 8.0, (0, -10, 0)), ball(100.0, 0.02, (0, 10.013, 3.017))
     scene = world_scene(*shapes, sensor=lens(512, pitch=FIELD / 512))
-    monkeypatch.setattr("mitsuba_fspt.integral.pupil_form.FEW", 64)
+    monkeypatch.setattr("mitsuba_fspt.integral.pupil.pupil_form.FEW", 64)
     whole, tiled = both(scene, monkeypatch, rtol=1e-2)
     assert (np.abs(tiled.power - whole.power) <= tiled.error + whole.error).all()
     assert tiled.metadata["nodes"] < 1.3 * whole.metadata["nodes"]

@@ -344,7 +344,7 @@ def test_scenes_without_columns_are_refused(tmp_path):
 
 def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
     """Seen to fail where nothing compares the bytes."""
-    from mitsuba_fspt.integral import sparse_rows
+    from mitsuba_fspt.integral.rows import sparse_rows
 
     monkeypatch.setattr(sparse_rows, "available_memory", lambda: 1 << 20)
     scene = load_scene("nylon_cylinder")

@@ -12,7 +12,7 @@ import trimesh
 from small_scenes import attribute, ball, glow, lens, mi, world_scene, write_ply
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.integral import exitance_rows
+from mitsuba_fspt.integral.rows import exitance_rows
 from mitsuba_fspt.runtime.errors import SceneError
 
 import drjit as dr  # isort: skip  # after the package, which chooses its LLVM

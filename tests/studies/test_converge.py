@@ -216,7 +216,7 @@ def test_lens_with_another_sampler_is_the_same_lens():
 @pytest.mark.usefixtures("mono")
 def test_raw_rays_are_as_many_as_asked_for():
     """On the pixels that can see what glows alone: rays beside it cost next to nothing."""
-    from mitsuba_fspt.integral.visible_window import visible_window
+    from mitsuba_fspt.integral.lines.visible_window import visible_window
 
     scene = small_scenes.camera_scene(small_scenes.sphere(200.0, 4.0))
     lens = scene.sensors()[0]

@@ -1,0 +1,80 @@
+"""Occlusion between surface and camera, and shapes that cannot occlude themselves."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from ...emission.elements import Elements, elements_of
+
+GRAZING = 0.01  # rad above the surface; less light than this leaves it at flatter angles
+LIFT = 1e-6  # of the shape's size: distance from the surface that float32 resolves
+DIRECTIONS = 4  # rays from each element
+ELEMENTS = 1 << 14  # rays leave so many elements at least
+SLIVERS = 1e-6  # of the shape's area: elements that float32 gives no direction, whose rays may meet anything
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+# Start of a ray that leaves the surface: these shares of the largest coordinate and of the distance [mm/mm], some
+# hundred times the rounding of float32.
+CLEAR, CLEAR_OF_DISTANCE = 2.0**-16, 2.0**-20
+
+
+def hidden(scene: mi.Scene, point: mi.Point3f, lens_point: mi.Point3f, active: mi.Bool) -> mi.Bool:
+    """True where a surface lies between a surface point and a point of the lens."""
+    return scene.ray_test(ray_to_lens(point, lens_point), active=active)
+
+
+def ray_to_lens(point: mi.Point3f, lens_point: mi.Point3f) -> mi.Ray3f:
+    """Ray from a surface point that ends at a point of the lens.
+
+    It starts a little further along its own direction. Mitsuba's `spawn_ray` would move the start along the normal by
+    9e-5 of the point's distance from the origin, and with it the borders of shadows by a hundredth of a pixel.
+    """
+    way = mi.Vector3f(lens_point - point)
+    distance = dr.norm(way)
+    direction = way / distance
+    clear = clear_of(point) + CLEAR_OF_DISTANCE * distance
+    ray = mi.Ray3f(point + clear * direction, direction)
+    ray.maxt = distance - clear
+    return ray
+
+
+def clear_of(point: mi.Point3f) -> mi.Float:
+    """How far [mm] from a surface point a ray starts that leaves it, beyond the rounding of its coordinates."""
+    return CLEAR * dr.max(dr.abs(point), axis=0)
+
+
+def hides_nothing(scene: mi.Scene) -> bool:
+    """True for a scene of one shape that no grazing ray from any of its elements meets again.
+
+    A test of the mesh edge by edge would miss a shallow dent in a fine mesh, where each edge bends by less than
+    rounding. Elements too narrow for float32 to give them a normal, such as those at the poles of a sphere, have no
+    say as long as they are next to none of the surface.
+    """
+    shapes = scene.shapes()
+    if len(shapes) != 1:
+        return False
+    elements, box = elements_of(shapes[0], ELEMENTS), shapes[0].bbox()
+    index = dr.arange(mi.UInt32, elements.count)
+    si, area = elements.place(index, mi.Point2f(0.5))
+    frame = mi.Frame3f(si.n)
+    origin = si.p + LIFT * float(dr.norm(box.extents())) * si.n
+    directed = area > clear_of(si.p) * _longest_side(elements, index)
+    met = dr.zeros(mi.Bool, elements.count)
+    for k in range(DIRECTIONS):
+        sine, cosine = dr.sincos(GOLDEN_ANGLE * mi.Float(index) + dr.opaque(mi.Float, 2 * math.pi * k / DIRECTIONS))
+        direction = dr.normalize(frame.to_world(mi.Vector3f(cosine, sine, GRAZING)))
+        met |= scene.ray_test(mi.Ray3f(origin, direction), active=area > 0)
+        if dr.any(met & directed):
+            return False
+    return float(dr.sum(dr.select(met, area, 0))[0]) <= SLIVERS * float(dr.sum(area)[0])
+
+
+def _longest_side(elements: Elements, index: mi.UInt32) -> mi.Float:
+    """Largest distance between neighbouring corners of each element [mm]."""
+    corners = [elements.place(index, mi.Point2f(*at))[0].p for at in elements.corners]
+    longest = mi.Float(0)
+    for k, corner in enumerate(corners):
+        longest = dr.maximum(longest, dr.norm(corner - corners[k - 1]))
+    return longest

@@ -1,0 +1,68 @@
+"""The scene that lines of sight are traced in: the scene itself, or a robust copy if its ray tracing loses rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from ...camera.camera import Camera
+from ...emission.face_table import shape_number
+from ...emission.of_emitter import mark_of
+from ...jit.mesh_buffers import box_of, buffers
+from ...jit.robust_tracing import robust_scene
+
+
+@dataclass(frozen=True)
+class RobustCopy:
+    """Robust copy of a scene that loses rays: of its shapes alone, so that nothing in it refers to the integrator.
+
+    state : marks of the emitters, and numbers and poses of the shapes that it was built from
+    positions : vertex buffers of the shapes. Poses are compared by the indices of these buffers; while the buffers are
+        kept, no other one can get the same index
+    """
+
+    scene: mi.Scene
+    state: tuple[list[object], list[tuple[int, tuple[float, ...]]]]
+    positions: tuple[mi.Float, ...]
+
+
+class TracedScene:
+    """Cache of the decision; tested once, and again if the geometry of a copy changes."""
+
+    def __init__(self) -> None:
+        self._lossless: list[object] = []  # marks of the emitters of a scene that loses no rays
+        self._robust: RobustCopy | None = None
+
+    def of(self, scene: mi.Scene, camera: Camera) -> mi.Scene:
+        """`scene`, or a robust copy if it loses rays."""
+        marks = [mark_of(emitter) for emitter in scene.emitters()]
+        if marks == self._lossless:
+            return scene
+        shapes, old = scene.shapes(), self._robust
+        state = (marks, [(shape_number(shape), pose_of(shape)) for shape in shapes])
+        if old is None or old.state != state:
+            known = old is not None and old.state[0] == marks
+            robust = robust_scene(scene, camera.to_world @ mi.Point3f(0, 0, 0), warn=not known)
+            if robust is scene:
+                self._lossless, self._robust = marks, None
+                return scene
+            positions = tuple(buffers(shape)[0] for shape in shapes if shape.is_mesh())
+            self._robust = old = RobustCopy(robust, state, positions)
+        return old.scene
+
+
+def poses_of(shapes: list[mi.Shape]) -> list[tuple[float, ...]]:
+    """Poses of shapes, which may hide one another; empty for a single shape."""
+    return [pose_of(shape) for shape in shapes] if len(shapes) > 1 else []
+
+
+def pose_of(shape: mi.Shape) -> tuple[float, ...]:
+    """Bounding box of a shape, with the index of its vertex buffer or the matrix of its `to_world`."""
+    own = box_of([shape])
+    box = (*own.min, *own.max)
+    if shape.is_mesh():
+        return (buffers(shape)[0].index, *box)
+    parameters = mi.traverse(shape)
+    return (*box, *np.ravel(parameters["to_world"].matrix).tolist()) if "to_world" in parameters else box

@@ -1,0 +1,157 @@
+"""Lattices over pixel × pupil, for pixels on which transects do not converge: corners, many edges, rough textures.
+
+A rank-1 lattice in four dimensions is moved by random shifts. The means of the shifts are independent unbiased
+estimates, and their scatter gives the error for any integrand. The points are in such an order that the first 2^m of
+them form a lattice for every m, so that each step adds points to those of the last one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from ...jit.batches import batches
+from ...jit.loops import repeat
+from ..lines.eq9 import most_radiance
+from .draft import Draft
+
+if TYPE_CHECKING:
+    from ...jit.pixel_grid import PixelArray
+
+# x and y of pixel and pupil. Of a million random vectors, among those none of whose two-dimensional projections has a
+# dual vector below 0.45 of the longest one possible, the one with the least error P₂ (Sloan and Joe 1994) over all
+# of 2¹⁰ … 2¹⁸ points.
+VECTOR = (1, 949661, 683229, 634757)
+FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
+SHIFTS = 16
+
+
+def refine_by_lattices(draft: Draft) -> None:
+    """Value and error of the pixels above the tolerance by lattices of more and more points, until they are below it.
+
+    The error of a pixel is at least `missed_share` over the number of points times the brightest value around; on
+    pixels that another solution gives, times the brightest surface.
+    """
+    most = min(1 << (draft.quadrature.max_nodes // SHIFTS).bit_length() >> 1, MOST)  # a power of two
+    above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
+    if most < FIRST or not dr.any(above):
+        return
+    deadline, tolerance = draft.progress.deadline, draft.tolerance
+    brightest = dr.select(
+        draft.computed, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
+    )
+    means, points = Means.none(draft.grid.pixels(above)), 0
+    while points < most and not deadline.passed():
+        more = min(GROWTH * points or FIRST, most)
+        means, points = means.refined(draft, points, more), more
+        if not dr.width(means.pixels):  # the deadline left no time for the first of them
+            break
+        unmet = dr.opaque(mi.Float64, draft.estimator.missed_share / (points * SHIFTS)) * dr.gather(
+            mi.Float64, brightest, means.pixels
+        )
+        scatter = draft.estimator.student_t * means.standard_error
+        error = dr.maximum(scatter, unmet)
+        better = error < dr.gather(mi.Float64, draft.error, means.pixels)
+        images = mi.Float64(draft.value), mi.Float64(draft.coverage), mi.Float64(draft.error)
+        for image, column in zip(images, (means.value, means.share, error), strict=True):
+            dr.scatter(image, column, means.pixels, better)
+        dr.eval(images)
+        draft.value, draft.coverage, draft.error = images
+        left = error > tolerance
+        if not dr.any(left):
+            break
+        means = means.of(left)
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means of each shift on each of the `pixels` (n,): `radiance` on film [W/mm²/sr] and `coverage`, (16 n,)."""
+
+    pixels: mi.UInt32
+    radiance: PixelArray
+    coverage: PixelArray
+
+    @classmethod
+    def none(cls, pixels: mi.UInt32) -> Means:
+        """Means before the first point."""
+        zero = dr.zeros(mi.Float64, dr.width(pixels) * SHIFTS)
+        return cls(pixels, zero, zero)
+
+    @property
+    def value(self) -> PixelArray:
+        """Mean radiance on film of each pixel [W/mm²/sr]."""
+        return dr.block_sum(self.radiance, SHIFTS) / SHIFTS
+
+    @property
+    def share(self) -> PixelArray:
+        """Coverage of each pixel."""
+        return dr.block_sum(self.coverage, SHIFTS) / SHIFTS
+
+    @property
+    def standard_error(self) -> PixelArray:
+        """Standard error of `value` [W/mm²/sr], from the scatter of the shifts."""
+        deviation = self.radiance - dr.repeat(self.value, SHIFTS)
+        return dr.sqrt(dr.block_sum(dr.square(deviation), SHIFTS) / (SHIFTS * (SHIFTS - 1)))
+
+    def of(self, which: mi.Bool) -> Means:
+        """Means of the pixels marked in `which`."""
+        number = dr.compress(which)
+        shifts = dr.repeat(number * SHIFTS, SHIFTS) + dr.tile(dr.arange(mi.UInt32, SHIFTS), dr.width(number))
+        columns = (dr.gather(mi.Float64, column, shifts) for column in (self.radiance, self.coverage))
+        return Means(dr.gather(mi.UInt32, self.pixels, number), *columns)
+
+    def refined(self, draft: Draft, points: int, more: int) -> Means:
+        """Means over `more` points, given these over the first `points`; both are powers of two.
+
+        After the deadline only those of the pixels for which there was time.
+        """
+        sums = [dr.zeros(mi.Float64, dr.width(self.pixels) * SHIFTS) for _ in range(2)]
+        runs, done = (more - points) // FIRST, 0
+        lanes = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS * runs)
+        for part in batches(lanes, FIRST, draft.progress.batch):
+            if done and draft.progress.deadline.passed():
+                break
+            done += dr.width(part)
+            shift, run = part // runs, part % runs
+            for total, column in zip(sums, _run(draft, self.pixels, shift, points + run * FIRST), strict=True):
+                dr.scatter_add(total, column, shift)
+            dr.eval(sums)
+        whole = done // (SHIFTS * runs)  # lanes of one pixel follow one another
+        draft.count(f"{SHIFTS} lattices of {more}", whole, done * FIRST)
+        old, new = (dr.opaque(mi.Float64, share) for share in (points / more, 1 / more))
+        radiance, coverage = (
+            old * before + new * total for before, total in zip((self.radiance, self.coverage), sums, strict=True)
+        )
+        dr.eval(radiance, coverage)
+        found = replace(self, radiance=radiance, coverage=coverage)
+        if whole == dr.width(self.pixels):
+            return found
+        return found.of(dr.arange(mi.UInt32, dr.width(self.pixels)) < whole)
+
+
+def _run(draft: Draft, pixels: mi.UInt32, shift: mi.UInt32, first: mi.UInt32) -> tuple[PixelArray, PixelArray]:
+    """Sums of integrand and coverage over `FIRST` points from number `first` on, for each `shift` of `pixels`."""
+    pixel = dr.gather(mi.UInt32, pixels, shift // SHIFTS)
+    centre, area = draft.centres(pixel), dr.opaque(mi.Float, float(draft.area))
+    shifts = [mi.sample_tea_32(pixel, SHIFTS * k + shift % SHIFTS)[0] for k in range(len(VECTOR))]
+
+    def add(k: mi.UInt32, value: mi.Float64, coverage: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
+        # In units of 2⁻³²: whole numbers wrap around as the lattice does.
+        point = dr.brev(first + k)
+        x, y, u, v = (
+            _folded(start + point * dr.opaque(mi.UInt32, step)) for start, step in zip(shifts, VECTOR, strict=True)
+        )
+        pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
+        sight = draft.view.integrand(centre + area * mi.Point2f(x - 0.5, y - 0.5), pupil)
+        return value + mi.Float64(sight.integrand), coverage + dr.select(sight.covered, mi.Float64(1), 0)
+
+    return repeat(dr.opaque(mi.UInt32, FIRST), add, mi.Float64(0), mi.Float64(0))
+
+
+def _folded(place: mi.UInt32) -> mi.Float:
+    """Tent transform to [0, 1], by which any integrand becomes periodic."""
+    x = mi.Float(place) * 2.0**-31
+    return dr.minimum(dr.abs(1 - dr.abs(1 - x)), 1)

@@ -1,0 +1,312 @@
+"""Narrow light: bodies and spots much smaller than a pixel and brighter than everything around them.
+
+Four nodes a pixel detect light from a region as large as a pixel at the phantom, or as its blur disc where that is
+larger. Smaller bodies and spots they may miss, and error estimates from the nodes do not show that. Such light is
+detected from points all over the surfaces; the pixels that it reaches take the surface form.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ...camera.camera import Camera
+from ...camera.window import Window
+from ...emission.elements import Elements, elements_of
+from ...emission.emitting_surface import EmittingSurface
+from ...emission.exitance import texels_of
+from ...emission.of_emitter import surfaces_of
+from ...jit.batches import numbered
+from ...jit.loops import repeat
+from ...jit.pixel_grid import Grid
+from ...jit.spectra import at_one_wavelength, scalar
+from ..lines.specular import Specular, transmission
+from .node_rules import PLASTIC, twelve
+
+OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than every square around, in focus
+# The limb of a wide body is not narrow light, as transects integrate it: its cosine to the lens is below `SLANTED`, the
+# body covers at least the share `COVERED` of a square around, the point is at most `GLARES` times as bright as that.
+SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
+FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
+WIDE, MOST_POINTS = 2.0, 1 << 12  # least width of a wide element [pixels, blur radii]; most points of a thin one
+LARGEST_GRID = 1 << 12  # cells along each side of the grid
+
+Column = NDArray[np.float64]
+Index = NDArray[np.int64]
+PixelArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NarrowLight:
+    """Light of narrow spots on each pixel of the window (h, w), of all surfaces on the brightest pixel that is shown,
+    and of these on each pixel as if they were in focus.
+
+    Mean radiance on film [W/mm²/sr], to a factor of two.
+    """
+
+    on_pixels: PixelArray
+    brightest: float
+    in_focus: PixelArray
+
+
+def points_on_surfaces(scene: mi.Scene, camera: Camera, specular: Specular | None = None) -> Points | None:
+    """Points all over the surfaces, imaged by `camera`; None where no emitter is an `fspt_surface`.
+
+    Along straight lines only, also through `specular` shapes.
+    """
+    parts = [_seen(scene, surface, camera, specular) for surface in surfaces_of(scene)]
+    return Points.joined(parts) if parts else None
+
+
+def narrow_light(points: Points | None, window: Window) -> NarrowLight:
+    """Of the light of points all over the surfaces, that of narrow spots; nothing without points."""
+    on_pixels = np.zeros(window.shape)
+    if points is None or not on_pixels.size:
+        return NarrowLight(on_pixels, 0.0, on_pixels)
+    points = points.seen_in(window)
+    if not (points.radiance > 0).any():
+        return NarrowLight(on_pixels, 0.0, on_pixels)
+    light, level = points.light(), points.level()
+    shown = points.shown_in(window)
+    if not (light[shown] > 0).any():
+        shown[:] = True
+    brightest = 0.0
+    for k in np.unique(level):
+        here, reach = level == k, math.ceil(2 ** (k + 0.5))
+        if (counts := here & shown).any():
+            brightest = max(brightest, points[counts].cells(2**k).sums(light[counts]).max())
+        there = points.near(reach + 2 * 2**k, window.shape)  # beyond, those of this level have no neighbours
+        here[there] &= _hidden(points[there], 2**k)
+        here &= there & (points.apart < 1)
+        if here.any():
+            on_pixels += _spread(light[here], points[here], reach, window.shape)
+    return NarrowLight(on_pixels, float(brightest), points.on_pixels(light, window.shape))
+
+
+def peak_of_points(points: Points | None, window: Window) -> float:
+    """Lower bound of the brightest pixel that is shown [W/mm²/sr], from points on surfaces; 0 without points.
+
+    As `NarrowLight.brightest`, less the factor of two, for windows of any size.
+    """
+    if points is None:
+        return 0.0
+    points = points.seen_in(window)
+    points = points[points.shown_in(window)]
+    light, level, brightest = points.light(), points.level(), 0.0
+    for k in np.unique(level):
+        here = level == k
+        column, row = (np.floor(c[here] / 2**k).astype(np.int64) for c in (points.x, points.y))
+        cell = np.unique(row * (1 << 32) + column, return_inverse=True)[1]
+        brightest = max(brightest, np.bincount(cell, light[here]).max())
+    return float(brightest) / 2
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points all over surfaces, columns (n,).
+
+    radiance : to the lens; 0 where a point has no image, or another body hides it
+    area : of the sharp image that it stands for [pixels²]
+    cosine, front : the largest cosine of the normal to a point of the pupil; > 0 if the pupil's middle sees the point
+    apart : how far it is from the next; in pixels, or in blur radii where they are larger
+    blur, x, y : on film [pixels]
+    """
+
+    radiance: Column
+    area: Column
+    cosine: Column
+    front: Column
+    apart: Column
+    blur: Column
+    x: Column
+    y: Column
+
+    @classmethod
+    def joined(cls, parts: list[Points]) -> Points:
+        """All of them."""
+        return cls(*(np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)))
+
+    def __getitem__(self, which: NDArray[np.bool_]) -> Points:
+        return Points(*(column[which] for column in vars(self).values()))
+
+    def seen_in(self, window: Window) -> Points:
+        """Those that shine into a window, with places counted from its corner."""
+        left, top = window.corner
+        points = replace(self, x=self.x - left, y=self.y - top)
+        return points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
+
+    def light(self) -> Column:
+        """Radiance on film [W/mm²/sr] that each gives to a pixel, by itself.
+
+        A blur disc spreads a point's light over so many pixels; discs that overlap add up. More than all of a disc does
+        not come from an element, however wide.
+        """
+        return self.radiance * np.minimum(self.area / (math.pi * self.blur**2 + 1), 1)
+
+    def level(self) -> Column:
+        """Of each blur disc larger than a pixel the logarithm of its radius, rounded."""
+        return np.round(np.log2(np.maximum(self.blur, 1)))
+
+    def near(self, far: float | Column, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """True less than `far` from a picture of this shape."""
+        (height, width), (x, y) = shape, (self.x, self.y)
+        return (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
+
+    def shown_in(self, window: Window) -> NDArray[np.bool_]:
+        """True where a blur disc reaches what is shown of a window."""
+        rows, columns = window.inner
+        moved = replace(self, x=self.x - columns.start, y=self.y - rows.start)
+        return moved.near(self.blur, (rows.stop - rows.start, columns.stop - columns.start))
+
+    def on_pixels(self, light: Column, shape: tuple[int, int]) -> PixelArray:
+        """Sum of the points' `light` on each pixel of a picture of this shape, where they are seen sharp."""
+        here = self.near(0, shape)
+        column, row = (np.floor(c[here]).astype(np.int64) for c in (self.x, self.y))
+        return _Cells(shape, row * shape[1] + column).sums(light[here])
+
+    def cells(self, side: float) -> _Cells:
+        """Square cells of a `side` [pixels]; what is too far off falls into the last."""
+        column, row = (
+            np.clip(np.floor((c - c.min()) / side), 0, LARGEST_GRID - 1).astype(np.int64) for c in (self.x, self.y)
+        )
+        width = int(column.max()) + 1
+        return _Cells((int(row.max()) + 1, width), row * width + column)
+
+
+def _hidden(points: Points, side: float) -> NDArray[np.bool_]:
+    """True for points that are narrow light among squares of a `side` [pixels], and not the limb of a wide body.
+
+    Points beyond the limb, visible from a part of the pupil only, lie beside points visible from the pupil's middle.
+    """
+    cells = points.cells(side)
+    grid = Grid(cells.shape)
+    share = np.minimum(points.area / side**2, 1)
+    light, covered, front = (
+        cells.sums(weight) for weight in (points.radiance * share, share, (points.front > 0).astype(np.float64))
+    )
+    mean = np.divide(light, covered, out=np.zeros_like(light), where=covered > 0)
+    around, mean_around, most, facing = (
+        grid.array(grid.spread_max(grid.flat(image))).ravel()[cells.number] for image in (light, mean, covered, front)
+    )
+    limb = (points.cosine < SLANTED) & (most > COVERED) & (points.radiance <= GLARES * mean_around)
+    limb |= (points.front <= 0) & (facing > 0)
+    return (points.radiance > OUTSHINES * around) & ~limb
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Cells with points in them: `shape` (h, w) of their grid and, row by row, the `number` of each point's."""
+
+    shape: tuple[int, int]
+    number: Index
+
+    def sums(self, weight: Column) -> PixelArray:
+        """Sum of the points' weights on each cell."""
+        return np.bincount(self.number, weight, minlength=math.prod(self.shape)).reshape(self.shape)
+
+
+def _spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) -> PixelArray:
+    """Sums of `light` within `reach` pixels of each pixel of the window, (h, w)."""
+    height, width = shape
+    reach = min(reach, height + width)
+    row, column = (np.floor(c).astype(np.int64) + reach for c in (points.y, points.x))
+    on = (row >= 0) & (row < height + 2 * reach) & (column >= 0) & (column < width + 2 * reach)
+    sums = np.zeros((height + 2 * reach, width + 2 * reach))
+    np.add.at(sums, (row[on], column[on]), light[on])
+    grid = Grid(sums.shape)
+    return grid.array(grid.box_sum(grid.flat(sums), reach))[reach : reach + height, reach : reach + width]
+
+
+def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: Specular | None) -> Points:
+    """Points all over a surface, with their images."""
+    shape = surface.shape
+    texels = texels_of(surface.exitance)
+    if shape.is_mesh():  # whose elements lie across the texels
+        elements: Elements = elements_of(shape, 4 * texels if texels > 1 else 1)
+    else:
+        elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
+    counts = np.ones(elements.count, np.int64)
+    middles = _on_elements(surface, elements, camera, counts)
+    area, unit = middles.image.numpy(), np.maximum(middles.blur.numpy(), 1)
+    reach = _reach(elements, camera) / unit
+    # A long and thin element is represented by many points, a quarter of a unit apart, any other by one.
+    long = np.isfinite(reach) & (reach > MOST_POINTS)  # `MOST_POINTS` points would be too far apart
+    thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
+    counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
+    at = _on_elements(surface, elements, camera, counts)
+    if len(scene.shapes()) > 1:
+        at.radiance = dr.select(_in_sight(scene, camera, at.place, specular), at.radiance, 0)
+    columns = (at.radiance, at.image, at.cosine, at.front, at.blur, at.centre.x, at.centre.y)
+    seen = np.array([column.numpy() for column in columns], np.float64)
+    unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
+    radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    # An element half as thick as a unit covers half of some square by itself: its points are not narrow.
+    apart = np.repeat(np.where(area < unit**2 * reach, reach / counts, np.inf), counts)
+    return Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
+
+
+@dataclass
+class _OnElements:
+    """Values at points of elements: `radiance` towards the point of the pupil highest above them, area of the element's
+    `image` from there [pixels²]; cosine, front, blur, `centre` on film as in `Points`; `place` in the world.
+    """
+
+    radiance: mi.Float
+    image: mi.Float
+    cosine: mi.Float
+    front: mi.Float
+    blur: mi.Float
+    centre: mi.Point2f
+    place: mi.Point3f
+
+
+def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, counts: Index) -> _OnElements:
+    """Values at `counts` points of each element, the first in its middle."""
+    index, number = numbered(counts)
+    sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
+    si, area = elements.place(mi.UInt32(index), sample)
+    to_lens = dr.normalize(_rim_above(si, camera) - si.p)
+    at_one_wavelength(si)
+    centre, blur, scale = camera.blur_disc(si.p)
+    cosine = dr.dot(si.n, to_lens)
+    image = area * dr.abs(cosine / (dr.dot(camera.axis, to_lens) * dr.square(scale)))
+    front = dr.dot(si.n, camera.to_world @ mi.Point3f(0) - si.p)
+    at = _OnElements(
+        scalar(surface.radiance(si, to_lens, mi.Bool(True))), image, cosine, front, dr.abs(blur), centre, si.p
+    )
+    dr.eval(at)
+    return at
+
+
+def _in_sight(scene: mi.Scene, camera: Camera, place: mi.Point3f, specular: Specular | None) -> mi.Bool:
+    """True for points that one of twelve points of the pupil is visible from."""
+    x, y = (mi.Float(column) for column in twelve(False).pupil.T)
+
+    def test(k: mi.UInt32, seen: mi.Bool) -> tuple[mi.Bool]:
+        pupil = mi.Point2f(dr.gather(mi.Float, x, k), dr.gather(mi.Float, y, k))
+        return (seen | (transmission(scene, specular, place, camera.arrival(place, pupil)[1], ~seen) > 0),)
+
+    return repeat(dr.opaque(mi.UInt32, len(twelve(False))), test, mi.Bool(False))[0]
+
+
+def _rim_above(si: mi.SurfaceInteraction3f, camera: Camera) -> mi.Point3f:
+    """The point of the pupil farthest above the tangent plane, the only side that a grazing surface shines on."""
+    normal = camera.to_world.inverse() @ mi.Vector3f(si.n)
+    across = dr.norm(mi.Vector2f(normal.x, normal.y))
+    return camera.arrival(si.p, dr.select(across > 0, mi.Point2f(normal.x, normal.y) / across, 0))[1]
+
+
+def _reach(elements: Elements, camera: Camera) -> Column:
+    """How far the corners of each element lie from its middle on the film [pixels]; inf where one has no image."""
+    index = dr.arange(mi.UInt32, elements.count)
+    centre, _, scale = camera.blur_disc(elements.place(index, mi.Point2f(0.5))[0].p)
+    reach = dr.zeros(mi.Float, elements.count)
+    for corner in elements.corners:
+        there, _, side = camera.blur_disc(elements.place(index, mi.Point2f(*corner))[0].p)
+        reach = dr.maximum(reach, dr.select(side * scale > 0, dr.norm(there - centre), dr.inf))
+    return np.nan_to_num(reach.numpy().astype(np.float64), nan=np.inf, posinf=np.inf)

@@ -1,0 +1,387 @@
+"""Refinement by transects where the integrand jumps: more of them at each level, until the estimated error is small."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from ...jit.batches import batches
+from ...jit.loops import repeat
+from ...jit.pixel_grid import COVERAGE_ROUNDING, parted
+from ..estimator import Estimator
+from . import node_rules
+from .draft import Draft
+from .jumps import integrate_transect
+from .nodes import apply_nodes
+from .transect import transect
+
+if TYPE_CHECKING:
+    from ...jit.pixel_grid import Mask, PixelArray
+
+DARK_LEVELS = 3  # levels of transects that are taken while no line of sight of the image has met light
+FAR = 1e30  # depth [mm] at which larger ones are clipped; the blur of an edge is finite there
+
+
+def integrate_by_transects(
+    draft: Draft, rough: Mask, levels: list[tuple[int, node_rules.AlongTransect]], among: Mask | None = None
+) -> None:
+    """Refine the `rough` pixels, and those around on which the same edge may lie, by transects.
+
+    levels : number of transects of each level, and the accuracy along each
+    among : pixels that may be refined; None: all that influence a pixel of the crop window
+    """
+    refinement = _Refinement(draft, rough, draft.wanted() if among is None else draft.wanted() & among)
+    for level, (count, along) in enumerate(levels):
+        if not dr.any(refinement.where):
+            break
+        if draft.progress.deadline.passed():
+            if level == 0:
+                draft.spread_error(rough)
+            break
+        refinement.refine(level, node_rules.transects(count), along)
+        draft.progress((3 + level) / (2 + len(levels)))  # after two steps of nodes
+
+
+class _Refinement:
+    """State of the refinement by transects.
+
+    where : pixels that take the next level
+    wanted : pixels that may take transects
+    edges : direction and blur of the edge on each pixel
+    has_jump : True where a transect has crossed a jump
+    smooth : True where no transect has crossed one, so that node rules may converge
+    value, remaining : of the last level of each pixel, and the error that follows from its own transects [W/mm²/sr]
+    own : the same error of the value in `draft`, that of an earlier level if it is smaller there [W/mm²/sr]
+    count, means : number of transects of the last level, and their means
+    """
+
+    def __init__(self, draft: Draft, rough: Mask, wanted: Mask) -> None:
+        self.draft, self.edges, self.wanted = draft, edges_of(draft), wanted
+        self.estimator = draft.estimator
+        self.where = rough & self.wanted
+        self.has_jump, self.smooth = (draft.grid.full(mi.Bool, known) for known in (False, True))
+        self.value = draft.value
+        self.remaining, self.own = (draft.grid.full(mi.Float64, 0) for _ in range(2))
+        self.count = 0
+        self.means: Means | None = None
+
+    def refine(self, level: int, rule: node_rules.Transects, along: node_rules.AlongTransect) -> None:
+        """One level: new values and errors, and the pixels that take the next level."""
+        draft, where = self.draft, self.where
+        if self.means:
+            self.edges.update(draft, self.means, self.has_jump, across=level % 2 == 0)
+        self.means = means = apply_transects(draft, where, self.edges, rule, along)
+        if means.done is not None:  # the other pixels keep the value and the error of the level before
+            if level == 0:
+                draft.spread_error(where & ~means.done)
+            self.where = where = where & means.done
+        # The outline of a dark body counts only where some lines of sight meet light.
+        lit = means.value > dr.opaque(mi.Float64, self.estimator.faint) * draft.peak
+        first_met = where & means.jumps & lit & ~self.has_jump
+        self.has_jump |= first_met
+        self.smooth = self.smooth & where & ~self.has_jump
+        value, coverage = self._smooth_by_nodes(level)
+        change = dr.abs(value - self.value)
+        if level == 0:
+            remaining, around = self._after_first(first_met, change, parted(coverage))
+        else:
+            remaining, around = self._after_later(level, first_met, change, len(rule))
+            self.smooth = self.smooth & (value > 0)  # where all is dark, only transects detect a small body
+        # An edge may reach into pixels around whose transects have crossed no jump.
+        around = dr.select((self.has_jump & where) | ~draft.computed, 0, around)
+        replaced = where if level else first_met  # without a jump, nodes are more accurate than two transects
+        self.value = dr.select(replaced, value, self.value)
+        self.remaining = dr.select(where, remaining, self.remaining)
+        kept = self._earlier_is_better(remaining, first_met) if level > 1 else mi.Bool(False)
+        self.own = dr.select(where & ~kept, remaining, self.own)
+        draft.value = dr.select(replaced & ~kept, value, draft.value)
+        draft.set_coverage(dr.select(replaced & ~kept, coverage, draft.coverage))
+        error = dr.maximum(self.own, self._by_neighbours(self.has_jump & ~first_met))
+        draft.error = dr.maximum(dr.select(where, error, draft.error), around)
+        tolerance = draft.tolerance
+        dark = (tolerance <= 0) & dr.opaque(mi.Bool, level + 1 < DARK_LEVELS)
+        self.where = (where | (around > 0)) & ((draft.error > tolerance) | dark) & self.wanted
+        self.count = len(rule)
+        dr.eval(draft.value, draft.error, self.has_jump, self.smooth, self.where)
+        dr.eval(self.value, self.remaining, self.own)
+
+    def _earlier_is_better(self, remaining: PixelArray, first_met: Mask) -> Mask:
+        """Pixels whose value in the draft has a smaller error than that of this level, which lies within that error.
+
+        A value beyond it contradicts the earlier error, which was too small, and so does a jump that is new. Without an
+        earlier level the error is 0. The error of the first level, which nothing but its own few transects and a node
+        rule tell, keeps no value.
+        """
+        agrees = dr.abs(self.value - self.draft.value) <= self.own
+        return agrees & (self.own > 0) & (self.own < remaining) & ~first_met
+
+    def _smooth_by_nodes(self, level: int) -> tuple[PixelArray, PixelArray]:
+        """Value and coverage of the level: by a node rule on smooth pixels, by transects on the others."""
+        value, coverage = self.means.value, self.means.coverage
+        if not 0 < level <= node_rules.SMOOTH_LEVELS or not dr.any(self.smooth):
+            return value, coverage
+        rule = node_rules.product(level, self.draft.area)
+        seen = apply_nodes(self.draft, rule, self.smooth, ("value", "coverage"))
+        return dr.select(self.smooth, seen.value, value), dr.select(self.smooth, seen.coverage, coverage)
+
+    def _above_tolerance(self, remaining: PixelArray) -> PixelArray:
+        """The error that remains, or one above the tolerance, so that another level follows."""
+        return dr.maximum(remaining, self.estimator.new_jump * self.draft.tolerance)
+
+    def _by_neighbours(self, met_before: Mask) -> PixelArray:
+        """Error of each pixel that follows from the errors of its neighbours, as their edges may reach into it.
+
+        `neighbour_share` of a neighbour's error; all of it where the edge is sharp, or where the neighbour's transects
+        have crossed a jump and those of the pixel had not (`met_before`).
+        """
+        near, with_jump = self.draft.grid.spread_all((self.own, dr.select(self.has_jump, self.own, 0)))
+        share = dr.opaque(mi.Float64, self.estimator.neighbour_share)
+        blurred = dr.maximum(share * near, dr.select(met_before, 0, with_jump))
+        return dr.select(self.edges.sharp, near, blurred)
+
+    def _after_first(self, first_met: Mask, change: PixelArray, silhouette: Mask) -> tuple[PixelArray, PixelArray]:
+        """Error that remains after the first transects, and error of pixels around a jump, which may have missed it.
+
+        Two transects that agree with the nodes suffice on a silhouette, which coverage shows too, but not on a step of
+        J_n.
+        """
+        draft, estimator = self.draft, self.estimator
+        at_jump = dr.maximum(estimator.first_ratio * change, self.means.scatter)
+        at_jump = dr.select(silhouette, at_jump, self._above_tolerance(at_jump))
+        elsewhere = dr.select(parted(draft.coverage), draft.error, draft.roughness)
+        elsewhere = dr.maximum(estimator.nodes_ratio * change, elsewhere)
+        # Pixels that another solution gives take no transects; their outlines count as jumps here.
+        jumps = first_met | (draft.outline & ~draft.computed)
+        return dr.select(first_met, at_jump, elsewhere), draft.missed_edge_error(jumps)
+
+    def _after_later(
+        self, level: int, first_met: Mask, change: PixelArray, count: int
+    ) -> tuple[PixelArray, PixelArray]:
+        """Error that remains after a later level, and error around pixels that this level changed beyond their error.
+
+        The smaller the change of the value relative to the error before, the smaller the error that remains; but the
+        change counts as no smaller than the order of convergence predicts, as two wrong values may agree by chance.
+        Where a jump is crossed for the first time another level follows, as earlier changes do not bound its error.
+        """
+        before, estimator = self.remaining, self.estimator
+        least, most = estimator.least_ratio, estimator.most_ratio
+        fewer = self.count / count
+        one, several = (dr.opaque(mi.Float64, fewer**order) for order in (estimator.order, estimator.several_order))
+        least_change = before * dr.select(self.edges.sharp & self.means.several, several, one)
+        assumed = dr.maximum(change, least_change)
+        ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), least, most)
+        remaining = dr.maximum(assumed * ratio, self.means.scatter)
+        if level <= node_rules.SMOOTH_LEVELS:
+            # On smooth pixels the next node rule changes the value by less than this one did.
+            remaining = dr.select(self.smooth, estimator.step_ratio * change, remaining)
+        remaining = dr.select(first_met, self._above_tolerance(remaining), remaining)
+        expected = dr.maximum(dr.opaque(mi.Float64, estimator.unexpected) * before, self.draft.tolerance)
+        unexpected = self.where & (change > expected)
+        return remaining, self.draft.near_edge(dr.select(first_met | unexpected, change, 0))
+
+
+# ---------------------------------------------------------------------- direction and blur of edges
+
+
+@dataclass
+class Edges:
+    """Edge on each pixel: `angle` of its normal [rad], signed `blur` radius [pixels], whether it counts as `sharp`."""
+
+    angle: PixelArray
+    blur: PixelArray
+    sharp: Mask
+
+    def update(self, draft: Draft, means: Means, has_jump: Mask, across: bool = False) -> None:
+        """Set the blur to that of the edges which the last transects crossed, on pixels around as well.
+
+        Where no transect has crossed a jump, the end of a neighbour's edge may lie on the pixel: the next transects go
+        along the gradient of the coverage, at every other level `across` it, as light beside a dark body may lie
+        between all those along it.
+        """
+        grid, jumps = draft.grid, means.jumps
+        around = (means.blur, -means.blur, jumps, has_jump | draft.outline)
+        ahead, behind, known, near = grid.spread_all(around)
+        blur = dr.select(jumps, means.blur, _most_blurred(ahead, -behind))
+        self.blur = dr.select(known & ~draft.clipped, blur, self.blur)
+        self.sharp = (dr.abs(self.blur) < draft.estimator.sharp) & near
+        x, y = grid.gradient(grid.box_sum(draft.coverage, _around(draft)))
+        alike = dr.abs(x) + dr.abs(y) < COVERAGE_ROUNDING
+        turn = dr.opaque(mi.Float64, math.pi / 2 if across else 0)
+        self.angle = dr.select(has_jump | alike, self.angle, dr.atan2(y, x) + turn)
+        dr.eval(self.angle, self.blur, self.sharp)
+
+
+def _around(draft: Draft) -> int:
+    """Radius [pixels] of the square over which the gradient is averaged for the direction of an edge."""
+    return 1 + math.ceil(draft.most_blur / 2)
+
+
+def _most_blurred(ahead: PixelArray, behind: PixelArray) -> PixelArray:
+    """The one of two signed blur radii with the larger magnitude; their mean could be 0, that of a sharp edge."""
+    return dr.select(ahead > -behind, ahead, behind)
+
+
+def edges_of(draft: Draft) -> Edges:
+    """Edges before the first transect: normal along the gradient of the image, blur of the nearest surface.
+
+    The image-plane stop is sharp.
+    """
+    grid = draft.grid
+    angle = grid.principal_angle(*grid.gradient(draft.value), _around(draft))
+    nearest = grid.spread_max(-draft.nearest)
+    # On a pixel without a silhouette there may be a part of a blurred one that its nodes missed.
+    farther = grid.spread_max(nearest, draft.reach(12)[1] - 1)
+    nearest = -dr.select(draft.outline & dr.isfinite(nearest), nearest, farther)
+    blur = dr.select(draft.clipped, 0, draft.camera.blur_radius(nearest))
+    return Edges(angle, blur, dr.abs(blur) < draft.estimator.sharp)
+
+
+# ---------------------------------------------------------------------- evaluation of transects
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means over the transects of each marked pixel.
+
+    value, coverage : mean radiance on film [W/mm²/sr], share of lines of sight that meet a glowing surface
+    jumps : True where a transect crosses a jump
+    several : True where a share of the transects, `several_share`, crosses more than one
+    scatter : error of the value that follows from the differences between transects [W/mm²/sr]
+    blur : signed radius of the most blurred edge that a transect crosses, 0 without one [pixels]
+    done : False on pixels that the deadline left out; None if there are none
+    """
+
+    value: PixelArray
+    coverage: PixelArray
+    jumps: Mask
+    several: Mask
+    scatter: PixelArray
+    blur: PixelArray
+    done: Mask | None = None
+
+
+def apply_transects(
+    draft: Draft, where: Mask, edges: Edges, rule: node_rules.Transects, along: node_rules.AlongTransect
+) -> Means:
+    """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
+    index, table = draft.grid.pixels(where), mi.Float(rule.table)
+    images = [draft.grid.full(mi.Float64, 0) for _ in range(8)]
+    rays = count = 0
+    for part in batches(index, len(rule), draft.progress.batch):
+        if count and draft.progress.deadline.passed():
+            break
+        *found, traced = _along_transects(draft, part, edges, rule, table, along)
+        columns = *_sums(part, edges, rule, table, found), _second_edge(dr.width(part), rule, found[0], draft.estimator)
+        for image, column in zip(images, columns, strict=True):
+            dr.scatter(image, column, part)
+        dr.eval(images)
+        rays += int(dr.sum(traced)[0])
+        count += dr.width(part)
+    draft.count(f"{len(rule)} transects", count, rays)
+    done = None
+    if count < dr.width(index):
+        done = draft.grid.full(mi.Bool, False)
+        dr.scatter(done, mi.Bool(True), dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, count)))
+    value, coverage, squares, trend, split, several, blur, between = images
+    number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
+    variance = squares - value * value
+    spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
+    blurred = spread * dr.safe_sqrt(variance - trend) / number
+    # A sharp edge slants: each transect crosses a part of its own. A second edge may lie between two of them.
+    slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
+    sharp = dr.maximum(slant, between)
+    return Means(
+        value,
+        coverage,
+        split > 0,
+        several >= estimator.several_share * number,
+        dr.select(edges.sharp, sharp, blurred),
+        blur,
+        done,
+    )
+
+
+def _along_transects(
+    draft: Draft,
+    part: mi.UInt32,
+    edges: Edges,
+    rule: node_rules.Transects,
+    table: mi.Float,
+    along: node_rules.AlongTransect,
+) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
+    """Value, coverage, number of jumps, signed blur radius of the edge at the largest jump (0 without one) [pixels] and
+    number of lines of sight of each transect of the pixels `part`, those of a pixel one after the other.
+    """
+    count = dr.opaque(mi.UInt32, len(rule))
+    lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
+    pixel, number = dr.gather(mi.UInt32, part, lane // count), lane % count
+    angle, blur = (mi.Float(dr.gather(mi.Float64, image, pixel)) for image in (edges.angle, edges.blur))
+    first = dr.select(dr.gather(mi.Bool, edges.sharp, pixel), mi.UInt32(0), 3)
+    place = mi.Point3f(*(dr.gather(mi.Float, table, (first + k) * count + number) for k in range(3)))
+    phase = dr.gather(mi.Float, table, 7 * count + number)
+    curve = transect(draft.centres(pixel), angle, blur, place, dr.opaque(mi.Float, float(draft.area)))
+    outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
+    least, steep = mi.Float(draft.estimator.least_jump * draft.tolerance), draft.estimator.steep
+    value, coverage, jumps, depth, traced = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
+    # The edge of a weak reflection beside nothing has no depth.
+    has_depth = (jumps > 0) & dr.isfinite(depth)
+    blur = mi.Float(dr.select(has_depth, draft.camera.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
+    found = value, coverage, jumps, blur, traced
+    dr.eval(found)  # together, as a later reduction of one of them would trace every ray again
+    return found
+
+
+def _sums(
+    part: mi.UInt32, edges: Edges, rule: node_rules.Transects, table: mi.Float, found: list[mi.Float]
+) -> list[PixelArray]:
+    """Means over the transects of each pixel of `part`: value, coverage, value squared, sum of the squared trends,
+    number of transects with a jump and with several, blur of the most blurred edge [pixels].
+
+    `found`: value, coverage, jumps, blur as of `_along_transects`.
+    """
+    count = dr.opaque(mi.UInt32, len(rule))
+    first = dr.arange(mi.UInt32, dr.width(part)) * count
+    sharp, even = dr.gather(mi.Bool, edges.sharp, part), dr.opaque(mi.Float, 1 / len(rule))
+
+    def add(k: mi.UInt32, sums: list[PixelArray], trends: list[PixelArray], ends: list[mi.Float]) -> tuple:
+        value, coverage, blur = (dr.gather(mi.Float, found[n], first + k) for n in (0, 1, 3))
+        weight = mi.Float64(dr.select(sharp, even, dr.gather(mi.Float, table, 6 * count + k)))
+        share, jumps = weight * mi.Float64(value), dr.gather(mi.UInt32, found[2], first + k)
+        counts = (dr.select(counted, mi.Float64(1), 0) for counted in (jumps > 0, jumps > 1))
+        terms = share, weight * mi.Float64(coverage), share * mi.Float64(value), *counts
+        sums = [total + term for total, term in zip(sums, terms, strict=True)]
+        polynomials = [dr.gather(mi.Float, table, (8 + n) * count + k) for n in range(len(trends))]
+        trends = [total + share * mi.Float64(p) for total, p in zip(trends, polynomials, strict=True)]
+        return sums, trends, [dr.maximum(ends[0], blur), dr.minimum(ends[1], blur)]
+
+    nothing = [mi.Float64(0) for _ in range(5)], [mi.Float64(0) for _ in range(node_rules.TRENDS)]
+    sums, trends, (ahead, behind) = repeat(count, add, *nothing, [mi.Float(-dr.inf), mi.Float(dr.inf)])
+    value, coverage, squares, split, several = sums
+    trend = sum(map(dr.square, trends))
+    return [value, coverage, squares, trend, split, several, mi.Float64(_most_blurred(ahead, behind))]
+
+
+def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float, estimator: Estimator) -> PixelArray:
+    """Error of a second edge between two transects of each pixel, from the `value` of all transects, pixel by pixel.
+
+    In the order of transects across a sharp edge, their place along it increases, so that a second edge gives two
+    second differences d that are much larger than the others. √(Σd² − 2 (Σ|d|)²/n) is then √2 times the jump; it is 0
+    where all differences vary alike. On a net, where the edge is nearly along many transects, it cuts all but one of
+    them evenly: the error is at most the largest |d| over n.
+    """
+    count = len(rule)
+    first = dr.arange(mi.UInt32, pixels) * dr.opaque(mi.UInt32, count)
+
+    def add(k: mi.UInt32, squares: PixelArray, sizes: PixelArray, most: PixelArray) -> tuple[PixelArray, ...]:
+        before, here, after = (dr.gather(mi.Float, value, first + k + n) for n in range(3))
+        size = mi.Float64(dr.abs(before - 2 * here + after))
+        return squares + size * size, sizes + size, dr.maximum(most, size)
+
+    zero = mi.Float64(0)
+    squares, sizes, most = repeat(dr.opaque(mi.UInt32, count - 2), add, zero, zero, zero)
+    jumps = estimator.second_edge * dr.safe_sqrt(squares - dr.opaque(mi.Float64, 2 / count) * sizes * sizes)
+    return (dr.minimum(jumps, most) if rule.is_net else jumps) / dr.opaque(mi.Float64, count)

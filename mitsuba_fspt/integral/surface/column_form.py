@@ -1,0 +1,294 @@
+"""Columns of the transport matrix: Eq. 9 in its surface form (M.9) for unit J_n of one vertex or face at a time.
+
+Every face sends its light through M × M nodes of the pupil. Through one node the image of a flat triangle is a
+triangle, and the étendue that a pixel takes of it is cos⁴θ (Eq. M.5) times the part of the pixel inside: the light of
+each of its columns, linear over the triangle, is distributed exactly over the pixels (`ColumnCanvas`), whatever the
+sizes of face and pixel. Only the pupil is sampled. Of a face much smaller than its blur disc not the face but the pupil
+is laid: the images of the pupil's cells through the middle of a piece, which tile the blur disc.
+
+All columns are computed twice, with the cells and pieces of `ColumnRule` and with half of them. The error is of second
+order in both, so that a third of the difference is left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ...camera.camera import Camera
+from ...emission.elements import of_part
+from ...jit.batches import batch_slices, numbered
+from ..lines.eq9 import eq9, etendue_from_pixel, etendue_from_surface
+from ..lines.occlusion import hidden
+from . import pupil_cells
+from .column_canvas import ColumnCanvas, Plane, Windows
+from .face_light import CORNERS, ColumnRule, FaceLight, Plan
+
+AROUND = ((0, 0), (1, 0), (1, 1), (0, 1))  # of a cell of the pupil
+SPECK, LEAST_AREA = 2.0**-4, 2.0**-20  # half a side of the square [pixels] that stands for a smaller image [pixels²]
+LEAST_HEIGHT = 2.0**-5  # pixels: over a flatter image the density is taken as constant
+FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
+GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
+MOST_WORK = 1 << 23  # entries of windows that are accumulated at a time
+LEFT = 1 / 3  # error over the change by twice the cells and pieces, of second order
+MOST_CHANGE = 6e4  # relative, that float16 holds
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Light of the columns of one mesh on the film: of every entry the column, the pixel, row by row from the first of
+    the crop window, the light, and by how much many more cells and pieces would change it, over it; in any order.
+
+    Light is over that of a pixel whose pupil is filled by 1 W/mm²/sr, for J_n = 1 W/mm²: 1/π at the most for Lambert's
+    law; times the pixel's étendue it is an entry of T [mm²]. `exact` (n,): columns of which no face is hidden in part,
+    whose sums are those of form factors.
+    """
+
+    columns: NDArray[np.int32]
+    pixels: NDArray[np.int32]
+    light: NDArray[np.float32]
+    change: NDArray[np.float16]
+    exact: Mask
+
+
+def column_windows(faces: FaceLight, count: int, on: str, shape: tuple[int, int]) -> Windows:
+    """Windows of the `count` columns of a mesh: of its faces, or of its vertices with all faces around each."""
+    if on == "face":
+        return Windows.around(faces.low, faces.high, shape)
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    bright = faces.bright
+    for k in range(3):
+        np.minimum.at(low, faces.corners[bright, k], faces.low[bright])
+        np.maximum.at(high, faces.corners[bright, k], faces.high[bright])
+    return Windows.around(low, high, shape)
+
+
+def columns_of(
+    scene: mi.Scene,
+    camera: Camera,
+    faces: FaceLight,
+    windows: Windows,
+    on: str,
+    rule: ColumnRule,
+    progress: Callable[[float], None] | None = None,
+) -> Columns:
+    """Columns of one mesh, accumulated on some windows at a time; `progress` is called with the share done."""
+    shape = camera.film.shape
+    plan = faces.plan(rule, on)
+    parts = []
+    groups = list(_groups(windows))
+    for number, group in enumerate(groups):
+        if progress:
+            progress(number / len(groups))
+        some = windows.of(group)
+        inside = group if on == "face" else group[faces.corners].any(axis=1)
+        index = np.flatnonzero(faces.bright & inside)
+        fine, coarse = (_laid(scene, camera, faces, index, p, some, on, shape) for p in (plan, plan.halved()))
+        parts.append(_kept(some, fine, coarse, rule, camera, shape))
+    exact = ~faces.mixed
+    if on == "vertex":
+        exact = np.ones(len(windows.left), bool)
+        exact[faces.corners[faces.mixed].ravel()] = False
+    return Columns(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))), exact)
+
+
+def _groups(windows: Windows) -> Iterator[Mask]:
+    """Columns in groups of at most `MOST_WORK` entries, neighbours on the film together; at least one group."""
+    areas = windows.areas
+    if areas.sum() <= MOST_WORK:
+        yield np.ones(len(areas), bool)
+        return
+    middle = np.stack([windows.top + windows.height // 2, windows.left + windows.width // 2])
+    band = max(int(np.median(windows.height[windows.height > 0])) * 4, 1)
+    order = np.lexsort((middle[1], middle[0] // band))
+    number = np.cumsum(areas[order]) // MOST_WORK
+    for k in np.unique(number):
+        group = np.zeros(len(areas), bool)
+        group[order[number == k]] = True
+        yield group
+
+
+def _kept(
+    windows: Windows, fine: Array, coarse: Array, rule: ColumnRule, camera: Camera, shape: tuple[int, int]
+) -> tuple[NDArray[Any], ...]:
+    """Column, pixel, light and relative change of the entries that count."""
+    column = windows.columns()
+    some = np.flatnonzero((fine > 0) & windows.inside())
+    starts = np.cumsum(windows.areas) - windows.areas
+    brightest = np.zeros(len(windows.left))
+    filled = windows.areas > 0
+    if filled.any():
+        brightest[filled] = np.maximum.reduceat(fine, starts[filled])
+    some = some[fine[some] > rule.drop * brightest[column[some]]]
+    column, fine, coarse = column[some].astype(np.int32), fine[some], coarse[some]
+    y, x = windows.rows_of_film()[some], windows.columns_of_film()[some]
+    offset = camera.film.crop_offset
+    left, top = mi.Float(x + float(offset[0])), mi.Float(y + float(offset[1]))
+    even = np.zeros(len(some))
+    for a in GAUSS if some.size else ():
+        for b in GAUSS:
+            even += falloff(camera, mi.Point2f(left + a, top + b)).numpy() / len(GAUSS) ** 2
+    change = np.clip(LEFT * (fine - coarse) / fine, -MOST_CHANGE, MOST_CHANGE)
+    return column, (y * shape[1] + x).astype(np.int32), (even * fine).astype(np.float32), change.astype(np.float16)
+
+
+def _laid(
+    scene: mi.Scene,
+    camera: Camera,
+    faces: FaceLight,
+    index: Index,
+    plan: Plan,
+    windows: Windows,
+    on: str,
+    shape: tuple[int, int],
+) -> Array:
+    """Light of some faces on the windows, see `ColumnCanvas.light`."""
+    canvas = ColumnCanvas(shape, windows)
+    corners = mi.UInt32(faces.corners.ravel().astype(np.uint32))
+    for some, cells, cuts, points, taken in plan.of(index).passes():
+        items = np.stack([index[some], cells, cuts, points, taken @ (1 << np.arange(taken.shape[1]))])
+        for run in batch_slices((items[1] * items[2]) ** 2):
+            part = items[:, run]
+            row, number = numbered((part[1] * part[2]) ** 2)
+            row = mi.UInt32(row.astype(np.uint32))
+            face, m, cut, at, mask = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in part)
+            # Array entries beyond the last line gather 0, and whole numbers divided by 0 end the process.
+            lines = _Lines(face, dr.maximum(m, 1), dr.maximum(cut, 1), at > 0, mi.UInt32(number.astype(np.uint32)))
+            planes, ring, count, active = lines.image(scene, camera, faces, on)
+            columns = [face] if on == "face" else [dr.gather(mi.UInt32, corners, 3 * face + k) for k in range(3)]
+            columns = [dr.select(mask & (1 << k) != 0, column, canvas.none) for k, column in enumerate(columns)]
+            canvas.lay(columns, planes, ring, count, active)
+            canvas.evaluate()
+    return canvas.light()
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Lines of sight of one launch: face, M, pieces along a side, whether cells are laid, number within the face."""
+
+    face: mi.UInt32
+    m: mi.UInt32
+    cut: mi.UInt32
+    points: mi.Bool
+    number: mi.UInt32
+
+    def image(
+        self, scene: mi.Scene, camera: Camera, faces: FaceLight, on: str
+    ) -> tuple[list[Plane], list[mi.Point2d], mi.UInt32, mi.Bool]:
+        """Density of the light of each column, the polygon on the crop window that it fills with the number of
+        its edges, and where there is any."""
+        m, elements, face = self.m, faces.elements, self.face
+        part, i, j = self.number // (m * m), self.number % m, self.number // m % m
+        node = pupil_cells.middle(i, j, m)
+        middle, area = elements.place(face, mi.Point2f(*elements.middle), self.cut, part)
+        _, lens_point, arrival, _ = camera.arrival(middle.p, node)
+        cos_s = dr.dot(middle.n, dr.normalize(lens_point - middle.p))
+        active = (cos_s > 0) & (arrival > 0)
+        if faces.shadows:
+            within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
+            spot, _ = elements.place(face, within, self.cut, part)
+            _, to, _, _ = camera.arrival(spot.p, aim)
+            active &= ~hidden(scene, spot.p, to, active)
+        origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in camera.film.crop_offset))
+        images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)
+        for at in CORNERS:
+            corner, _ = elements.place(face, mi.Point2f(*at), self.cut, part)
+            position, to, _, cos_theta = camera.arrival(corner.p, node)
+            profile = faces.surface.law.profile(middle, dr.normalize(to - corner.p), active)
+            cos4 = mi.Float64(etendue_from_pixel(cos_theta, True))
+            images.append(mi.Point2d(position - origin))
+            values.append(eq9(mi.Float64(profile), cos4))
+            mean += cos4 / 3
+            b = of_part(part, self.cut, mi.warp.square_to_uniform_triangle(mi.Point2f(*at)))
+            shares.append([mi.Float64(1 - b.x - b.y), mi.Float64(b.x), mi.Float64(b.y)])
+            depths.append(mi.Float64(camera.blur_disc(corner.p)[2]))
+            active &= dr.isfinite(position.x) & dr.isfinite(position.y)
+        centre, radius, side = camera.blur_disc(middle.p)
+        active &= side > 0
+        cell = [pupil_cells.corner(i + x, j + y, m) for x, y in AROUND]
+        tile = [mi.Point2d(centre - origin + radius * c) for c in cell]
+        own = dr.select(self.points, pupil_cells.area(cell), dr.pi / mi.Float(m * m))
+        virtual_pixel = dr.opaque(mi.Float, camera.virtual_pitch**2)
+        etendue = mi.Float64(etendue_from_surface(cos_s, area, arrival, own, virtual_pixel))
+        ring, count, light_area, flat = _polygon(images, tile, self.points)
+        turn = _cross(images[1] - images[0], images[2] - images[0])
+        large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
+        etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
+        # The falloff over the film, which is not linear over a large piece, is put back pixel by pixel.
+        even = [falloff(camera, mi.Point2f(image) + origin) for image in images]
+        values = [etendue / (light_area * mean * f) * value for f, value in zip(even, values, strict=True)]
+        weights = [values] if on == "face" else _weights(values, shares, depths)
+        return [_plane(images, w, turn, self.points | flat) for w in weights], ring, count, active
+
+
+def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:
+    """cos⁴θ of the line of sight from the middle of the pupil to a film position [pixels]."""
+    x = mi.Point2d(camera.film_map.to_plane(position)) * (1 - camera.lens.discs[0].shift)
+    squared = dr.square(dr.opaque(mi.Float64, camera.lens.focus_distance))
+    return dr.square(squared / (squared + dr.squared_norm(x)))
+
+
+def _weights(
+    values: list[mi.Float64], shares: list[list[mi.Float64]], depths: list[mi.Float64]
+) -> list[list[mi.Float64]]:
+    """Density of the light of each of three columns at the corners of an image.
+
+    values : density of all light at the corners; shares : φ of each column there; depths : up to a factor
+
+    On the film φ is not linear but, with λ the barycentric coordinates of the image and δ the relative depth,
+    λ_k (1 - δ_k + Σ λ_m δ_m) to first order: on average over the image (Σ δ - 3 δ_k)/12 more than λ_k.
+    """
+    mean_depth = (depths[0] + depths[1] + depths[2]) / 3
+    more = [(1 - depth / mean_depth) / 4 for depth in depths]  # where Σ δ = 0
+    mean = (values[0] + values[1] + values[2]) / 3
+    weights = []
+    for k in range(3):
+        shift = sum((more[c] * shares[c][k] for c in range(3)), mi.Float64(0)) * mean
+        weights.append([values[c] * shares[c][k] + shift for c in range(3)])
+    return weights
+
+
+def _polygon(
+    images: list[mi.Point2d], tile: list[mi.Point2d], points: mi.Bool
+) -> tuple[list[mi.Point2d], mi.UInt32, mi.Float64, mi.Bool]:
+    """Polygon that the light fills: the image of a piece or of a cell, or a small square where that has no size.
+
+    Beside it the number of its edges, its area [pixels²], and True where the density over it is taken as constant.
+    """
+    ring = [dr.select(points, t, c) for t, c in zip(tile, (*images, images[0]), strict=True)]
+    area = 0.5 * dr.abs(_cross(ring[2] - ring[0], ring[3] - ring[1]))
+    longest = mi.Float64(0)
+    for k in range(4):
+        longest = dr.maximum(longest, dr.squared_norm(ring[k] - ring[k - 1]))
+    flat = 2 * area < LEAST_HEIGHT * dr.sqrt(longest)
+    none = ~(area > LEAST_AREA)
+    count = dr.select(points | none, mi.UInt32(4), 3)
+    middle = 0.25 * (ring[0] + ring[1] + ring[2] + ring[3])
+    speck = [middle + SPECK * mi.Vector2d(x, y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    ring = [dr.select(none, s, own) for s, own in zip(speck, ring, strict=True)]
+    return ring, count, dr.select(none, 4 * SPECK**2, area), flat | none
+
+
+def _plane(images: list[mi.Point2d], values: list[mi.Float64], turn: mi.Float64, constant: mi.Bool) -> Plane:
+    """The linear density with these values at three corners, `turn` twice their signed area; or their mean."""
+    a, b = images[1] - images[0], images[2] - images[0]
+    u, v = values[1] - values[0], values[2] - values[0]
+    x, y = (u * b.y - v * a.y) / turn, (v * a.x - u * b.x) / turn
+    at = values[0] - x * images[0].x - y * images[0].y
+    mean = (values[0] + values[1] + values[2]) / 3
+    return Plane(dr.select(constant, mean, at), dr.select(constant, 0, x), dr.select(constant, 0, y))
+
+
+def _cross(a: mi.Vector2d, b: mi.Vector2d) -> mi.Float64:
+    return a.x * b.y - a.y * b.x

@@ -1,0 +1,386 @@
+"""How the faces of a mesh are divided for the columns of the transport matrix: cells of the pupil, pieces of a face.
+
+A column (the hat function of a vertex, or a face) takes the same cells of the pupil on all of its faces: through each
+of them its light is continuous, and what is sampled is as smooth as the column, whatever its neighbours take.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ...camera.camera import Camera
+from ...emission.elements import Elements, elements_of
+from ...emission.emitting_surface import EmittingSurface
+from ...jit.batches import BATCH
+from ...jit.mesh_buffers import triangles
+from ..lines.occlusion import hidden
+from . import pupil_cells
+
+CORNERS = ((0, 0), (1, 0), (0, 1))  # of a face, in the square that `Elements.place` maps to it
+MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for float32, and of the blur radius, for cells
+RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
+INWARD = 0.05  # of a face: how far from its sides rays start that look for the edge of a shadow
+LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
+# M of columns of several faces: neighbours mostly take the same.
+LEVELS = (4, 6, 8, 10, 12, 16, 20, 24, 28, 32, 36, 40, 44, 50, 56, 64)
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ColumnRule:
+    """Numbers of cells and pieces, each with the error it bounds.
+
+    edge : error at an edge of J_n, over its step: cells M along the pupil are √(edge_factor · r/edge) for a blur
+        radius r [pixels], or √(coarse_factor · r/edge) where that is below `coarse` · r
+    step : likewise at the sides of faces, at which J_n on faces steps
+    kink : error at a face's side where J_n is continuous, over its change along the face: of columns that are
+        continuous and nowhere cut off M is √(kink_factor · r/(h · kink)), with h [pixels] the height of a face's image
+    edge_factor, coarse_factor : by what middles of cells leave of a half plane averaged over pixels, the most of all
+        directions and offsets for r = 0.5 … 32, M = 4 … 32, with more and with less than `coarse` · r cells
+    kink_factor : likewise for a slope that begins at a straight line; fitted for r = 1 … 64, M = 4 … 32
+    fewest, most : least and largest M
+    partial : least M where a face turns away from part of the pupil, or a second border cuts the pupil
+    mixed : least M where one surface may hide another
+    cells : M where the cells are laid; their étendue is constant in each
+    point : largest piece [pixels] that may be taken as a point then
+    speckle : error where J_n varies at random from face to face, over its standard deviation, and pieces are points:
+        for pieces of s pixels speckle_factor · s³/r^1.5, root mean square over the pixels
+    speckle_factor : the most of random J_n on equilateral triangles, r = 0.1 … 3, s = 0.05 … 0.4
+    piece : largest piece over the distance in focus, over which étendue and exit law are linear but for some of its
+        square
+    perspective : J_n that perspective, corrected on average, misplaces within a piece, over its change along the face:
+        pieces along a side of a face of relative depth δ are √(δ/(8 · perspective))
+    shadow : largest piece [pixels] where one surface may hide another: each piece is lit or not on a line of sight
+    displaced : light of a column that is displaced so, over all of it, times the distance [pixels], on faces smaller
+        than their blur disc: w · s²/a for pieces of s on a face of a pixels, with w the share of the lines of sight of
+        which the edge of a shadow crosses it
+    drop : entries below this share of a column's brightest are left out
+    """
+
+    edge: float
+    step: float
+    kink: float
+    speckle: float
+    edge_factor: float = 0.12
+    coarse_factor: float = 0.18
+    coarse: float = 1.25
+    kink_factor: float = 0.13
+    speckle_factor: float = 0.04
+    fewest: int = 4
+    most: int = 64
+    partial: int = 12
+    mixed: int = 16
+    cells: int = 6
+    point: float = 0.5
+    piece: float = 0.03
+    perspective: float = 2e-3
+    shadow: float = 0.7
+    displaced: float = 0.16
+    drop: float = 1e-5
+
+    @classmethod
+    def of(cls, rtol: float) -> ColumnRule:
+        """The rule for a tolerance relative to the brightest pixel: columns are right to some ten times that."""
+        finer = math.sqrt(min(rtol / 1e-3, 1))
+        cells = 2 * math.ceil(3 / math.sqrt(finer))
+        partial = 2 * math.ceil(6 / math.sqrt(finer))
+        return cls(
+            edge=2 * rtol,
+            step=rtol,
+            kink=3 * rtol,
+            speckle=0.25 * rtol,
+            cells=cells,
+            partial=partial,
+            mixed=2 * math.ceil(8 / math.sqrt(finer)),
+            point=0.5 * finer,
+            shadow=0.7 * finer,
+            displaced=0.16 * finer**2,
+            perspective=2 * rtol,
+            drop=1e-2 * rtol,
+        )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How each of some faces is divided for each of its columns, (F, 1) on faces, (F, 3) on vertices: M of the pupil,
+    pieces along a side, and whether the pupil's cells are laid."""
+
+    cells: Index
+    cuts: Index
+    points: Mask
+
+    def halved(self) -> Plan:
+        """Half as many cells and pieces, where there are enough."""
+        return Plan(np.maximum(2 * (self.cells // 4), 2), np.maximum((self.cuts + 1) // 2, 1), self.points)
+
+    def of(self, faces: Index) -> Plan:
+        """The same of some of the faces."""
+        return Plan(self.cells[faces], self.cuts[faces], self.points[faces])
+
+    def passes(self) -> Iterator[tuple[Index, Index, Index, Mask, Mask]]:
+        """Faces, their M and pieces, whether cells are laid, and the columns (n, 1 or 3) that take light so: by turns
+        those like the first column of a face, like the second if that takes others, and like the third."""
+        kind = 2 * self.cells + self.points
+        for k in range(kind.shape[1]):
+            alike = kind == kind[:, k : k + 1]
+            faces = np.flatnonzero(~alike[:, :k].any(axis=1))
+            if faces.size:
+                yield faces, self.cells[faces, k], self.cuts[faces, k], self.points[faces, k], alike[faces]
+
+
+@dataclass(frozen=True)
+class FaceLight:
+    """The faces of one mesh as a lens sees them.
+
+    corners (F, 3): numbers of their vertices. low, high (F, 2): bounds of their light [pixels of the crop window],
+    empty for a face that sends none. sides, heights, blur (F,): longest edge, height over it and blur radius of the
+    image [pixels]. slant (F,): depth of the face over its distance. partial (F,): only part of the pupil takes light of
+    the face. cut (V,): vertices at which the light of the surface ends for part of the pupil, at silhouettes and
+    borders. mixed (F,): one surface hides part of another here. edges (F, 3): of the image, from each corner to the
+    next [pixels]. crossed (F,): share of the lines of sight of which the edge of a shadow lies on the face, along its
+    longest edge. distance: in focus [virtual pixels].
+    """
+
+    surface: EmittingSurface
+    elements: Elements
+    corners: Index
+    low: Array
+    high: Array
+    sides: Array
+    heights: Array
+    blur: Array
+    slant: Array
+    partial: Mask
+    cut: Mask
+    mixed: Mask
+    edges: Array
+    crossed: Array
+    distance: float
+    shadows: bool
+
+    @classmethod
+    def seen(
+        cls, surface: EmittingSurface, camera: Camera, origin: tuple[int, int], shape: tuple[int, int]
+    ) -> FaceLight:
+        """What `lens` sees of an emitting mesh on the crop window of `shape` (h, w) at `origin` (x, y)."""
+        mesh = surface.shape
+        positions, faces = triangles(mesh)
+        vertices = positions.numpy().reshape(-1, 3).astype(np.float64)
+        corners = faces.numpy().reshape(-1, 3).astype(np.int64)
+        centre, radius = camera.film_discs(vertices)
+        centre -= origin
+        reach = radius * (1 + RIM) + MARGIN
+        low, high = (centre - reach)[corners].min(axis=1), (centre + reach)[corners].max(axis=1)
+        blur = radius[:, 0][corners].max(axis=1)
+        edges = centre[np.roll(corners, -1, axis=1)] - centre[corners]
+        lengths = np.hypot(edges[..., 0], edges[..., 1])
+        sides = lengths.max(axis=1)
+        turn = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+        heights = np.divide(turn, sides, out=np.zeros(len(sides)), where=(sides > 0) & np.isfinite(turn))
+        elements = elements_of(mesh, minimum=1)
+        most, least, rim = _facing(elements, camera)
+        size = np.array(shape[::-1])
+        beside = ((high <= 0) | (low >= size)).any(axis=1)
+        area = np.isfinite(most)  # a face without area has no normal
+        dark = beside | (most <= 0) | (rim == 0) | ~area
+        low[dark], high[dark] = np.inf, -np.inf
+        partial = ~dark & ((least < 0) | (rim < 1))
+        cut = _border(corners, len(vertices))
+        cut[corners[~(least >= 0) | (rim < 1)].ravel()] = True
+        none = np.zeros(len(corners), bool)
+        depth = _scales(mesh, camera)[corners]
+        slant = np.ptp(depth, axis=1) / np.maximum(np.abs(depth).min(axis=1), 1e-3 * np.abs(depth).max(axis=1))
+        bounded = np.isfinite(blur)
+        sides, blur = np.where(bounded, sides, np.inf), np.where(bounded, blur, math.hypot(*shape))
+        return cls(
+            surface,
+            elements,
+            corners,
+            low,
+            high,
+            sides,
+            heights,
+            blur,
+            slant,
+            partial,
+            cut,
+            none,
+            lengths,
+            np.zeros(len(corners)),
+            camera.lens.focus_distance / camera.virtual_pitch,
+            shadows=False,
+        )
+
+    @property
+    def bright(self) -> Mask:
+        """Faces that may send light."""
+        return self.low[:, 0] <= self.high[:, 0]
+
+    def behind(self, scene: mi.Scene, camera: Camera) -> FaceLight:
+        """The same in a scene where one surface may hide another: faces that none of their lines shows are dark."""
+        bright = np.flatnonzero(self.bright)
+        if not bright.size:
+            return self
+        share = np.zeros(len(self.corners))
+        share[bright] = _open_share(scene, camera, self.elements, bright)
+        count = int(self.corners.max(initial=-1)) + 1
+        least, most = np.ones(count), np.zeros(count)
+        for k in range(3):
+            np.minimum.at(least, self.corners[bright, k], share[bright])
+            np.maximum.at(most, self.corners[bright, k], share[bright])
+        around = least[self.corners].min(axis=1), most[self.corners].max(axis=1)
+        mixed = self.bright & (around[0] < 1) & (around[1] > 0)
+        hidden_all = self.bright & (around[1] == 0)
+        low, high = self.low.copy(), self.high.copy()
+        low[hidden_all], high[hidden_all] = np.inf, -np.inf
+        cut = self.cut.copy()
+        cut[self.corners[mixed | hidden_all].ravel()] = True
+        crossed = np.zeros(len(self.corners))
+        some = np.flatnonzero(mixed & np.isfinite(self.edges).all(axis=1) & (self.sides > 0))
+        shares = _crossed_share(scene, camera, self.elements, some)
+        crossed[mixed] = 1
+        crossed[some] = (shares * self.edges[some]).max(axis=1) / self.sides[some]
+        return replace(self, low=low, high=high, cut=cut, mixed=mixed, crossed=crossed, shadows=True)
+
+    def plan(self, rule: ColumnRule, on: str) -> Plan:
+        """How the faces are divided: the cheaper of nodes with images of pieces and pieces with images of cells."""
+        sides = np.minimum(self.sides, LONGEST)
+        nodes = self._nodes(rule, sides, on)
+        shaded = np.where(self.mixed, sides / rule.shadow, 0)
+        small = sides < 2 * self.blur + 1
+        shaded = np.where(small, np.minimum(shaded, np.sqrt(self.crossed * sides / rule.displaced)), shaded)
+        pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
+        # Within a pixel perspective misplaces nothing.
+        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant / (8 * rule.perspective)), sides))
+        pieces = np.maximum(np.ceil(pieces), 1)
+        cells = np.where(self.partial, rule.partial, rule.cells)
+        largest = np.minimum(rule.point, np.cbrt(rule.speckle / rule.speckle_factor) * np.sqrt(self.blur))
+        smaller = np.maximum(np.ceil(sides / np.maximum(largest, 1 / LONGEST)), pieces)
+        by_nodes = (nodes * pieces) ** 2 * (1 + sides / pieces)
+        by_cells = (cells * smaller) ** 2 * (1 + 2 * self.blur / cells)
+        points = by_cells < by_nodes
+        nodes = np.minimum(nodes, rule.most)
+        if on == "face":
+            of_columns = np.where(points, cells, nodes)[:, None]
+            points = points[:, None]
+        else:
+            points = ~self._most(~points & self.bright)[self.corners]
+            of_columns = np.where(points, self._most(cells)[self.corners], self._most(nodes)[self.corners])
+        of_columns = np.maximum(of_columns, 2).astype(np.int64)
+        cuts = np.where(points, smaller[:, None], pieces[:, None]).astype(np.int64)
+        return Plan(of_columns, np.minimum(cuts, math.isqrt(BATCH) // of_columns), points)
+
+    def _nodes(self, rule: ColumnRule, sides: Array, on: str) -> Array:
+        """M of nodes that each face asks for."""
+        fewest = np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
+        error = self.blur / (rule.step if on == "face" else rule.edge)
+        many = np.minimum(np.sqrt(rule.coarse_factor * error), rule.coarse * self.blur)
+        nodes = np.maximum(np.sqrt(rule.edge_factor * error), many)
+        if on == "vertex":
+            kinks = np.sqrt(rule.kink_factor * self.blur / (rule.kink * np.maximum(self.heights, 1e-3)))
+            nodes = np.where(self.cut[self.corners].any(axis=1), nodes, np.minimum(nodes, kinks))
+        nodes = np.maximum(nodes, 2 * self.blur / np.maximum(sides, 1e-3))  # their images overlap
+        if on == "face":
+            return (2 * np.ceil(nodes / 2)).clip(fewest, None)
+        level = np.searchsorted(LEVELS, nodes.clip(fewest, LEVELS[-1]))
+        return np.where(nodes > LEVELS[-1], nodes, np.array(LEVELS)[level])
+
+    def _most(self, values: Array | Index | Mask) -> Array | Index | Mask:
+        """The most (V,) of what the bright faces around each vertex have."""
+        found = np.zeros(len(self.cut), values.dtype)
+        for k in range(3):
+            np.maximum.at(found, self.corners[self.bright, k], values[self.bright])
+        return found
+
+
+def _border(corners: Index, count: int) -> Mask:
+    """True (V,) for vertices of edges that belong to one face alone."""
+    edges = np.sort(np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    keys, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
+    found = np.zeros(count, bool)
+    for ends in np.divmod(keys[uses == 1], count):
+        found[ends] = True
+    return found
+
+
+def _scales(mesh: mi.Shape, camera: Camera) -> Array:
+    """Of every vertex the side of a virtual pixel at its depth [mm], which is linear in the depth."""
+    positions = triangles(mesh)[0]
+    return camera.blur_disc(dr.unravel(mi.Point3f, positions))[2].numpy().astype(np.float64)
+
+
+def _facing(elements: Elements, camera: Camera) -> tuple[Array, Array, Array]:
+    """n·(a − r) of faces at the most and at the least [mm], and the share of the pupil's rim that is open to them.
+
+    Over the corners r of a face and the points a of the pupil; NaN where a face has no normal.
+    """
+    index = dr.arange(mi.UInt32, elements.count)
+    axis = dr.normalize(camera.axis)
+    most, least = np.full(elements.count, -np.inf), np.full(elements.count, np.inf)
+    for corner in CORNERS:
+        si, _ = elements.place(index, mi.Point2f(*corner))
+        _, middle, _, _ = camera.arrival(si.p, mi.Point2f(0))
+        _, rim, _, _ = camera.arrival(si.p, mi.Point2f(1, 0))
+        towards = dr.dot(si.n, middle - si.p)
+        spread = dr.norm(rim - middle) * dr.safe_sqrt(1 - dr.square(dr.dot(si.n, axis)))
+        most = np.maximum(most, (towards + spread).numpy())
+        least = np.minimum(least, (towards - spread).numpy())
+    open_rim = mi.Float(0)
+    si, _ = elements.place(index, mi.Point2f(*elements.middle))
+    turns = dr.two_pi * np.arange(RIM_POINTS) / RIM_POINTS
+    for turn in turns:
+        _, _, weight, _ = camera.arrival(
+            si.p, mi.Point2f(*(dr.opaque(mi.Float, f(turn)) for f in (math.cos, math.sin)))
+        )
+        open_rim += dr.select(weight > 0, 1 / RIM_POINTS, 0)
+    if len(camera.lens.discs) > 1:  # the middle of the pupil may be open where its rim is not
+        _, _, weight, _ = camera.arrival(si.p, mi.Point2f(0))
+        open_rim = dr.select(weight > 0, dr.maximum(open_rim, 0.5 / RIM_POINTS), open_rim)
+    return most, least, np.broadcast_to(open_rim.numpy(), elements.count)
+
+
+def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
+    """Share of the lines of sight of each of some faces that nothing blocks, of `cells`² lines."""
+    index = mi.UInt32(np.repeat(faces, cells**2).astype(np.uint32))
+    number = mi.UInt32(np.tile(np.arange(cells**2), len(faces)).astype(np.uint32))
+    m = mi.UInt32(cells)
+    within, aim = pupil_cells.strata(number % m, number // m, m, index * pupil_cells.STRIDE)
+    spot, _ = elements.place(index, within)
+    _, lens_point, arrival, _ = camera.arrival(spot.p, aim)
+    reaches = (arrival > 0) & (dr.dot(spot.n, lens_point - spot.p) > 0)
+    blocked = reaches & hidden(scene, spot.p, lens_point, reaches)
+    counted = [np.asarray(flag.numpy()).reshape(-1, cells**2).sum(axis=1) for flag in (reaches, blocked)]
+    return 1 - counted[1] / np.maximum(counted[0], 1)
+
+
+def _crossed_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
+    """Share (n, 3) of the lines of sight of some faces, through `cells`² points of the pupil, for which not all of an
+    edge is lit: over those for which any of the face is, for the edges from each corner to the next."""
+    if not faces.size:
+        return np.zeros((0, 3))
+    index = mi.UInt32(np.repeat(faces, cells**2).astype(np.uint32))
+    number = mi.UInt32(np.tile(np.arange(cells**2), len(faces)).astype(np.uint32))
+    node = pupil_cells.middle(number % cells, number // cells, dr.opaque(mi.UInt32, cells))
+    middle, _ = elements.place(index, mi.Point2f(*elements.middle))
+    corners = [elements.place(index, mi.Point2f(*at))[0].p for at in CORNERS]
+    corners = [corner + INWARD * (middle.p - corner) for corner in corners]
+    seen = []
+    for k in range(6):
+        point = 0.5 * (corners[k // 2] + corners[(k + 1) // 2 % 3])
+        _, lens_point, arrival, _ = camera.arrival(point, node)
+        open_to = (arrival > 0) & (dr.dot(middle.n, lens_point - point) > 0)
+        seen.append((open_to & ~hidden(scene, point, lens_point, open_to)).numpy().reshape(-1, cells**2))
+    lit = np.stack(seen, axis=-1)
+    some = np.maximum(lit.any(axis=-1).sum(axis=1), 1)
+    edges = [lit[..., [2 * k, 2 * k + 1, (2 * k + 2) % 6]] for k in range(3)]
+    return np.stack([(edge.any(axis=-1) & ~edge.all(axis=-1)).sum(axis=1) / some for edge in edges], axis=-1)

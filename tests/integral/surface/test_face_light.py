@@ -1,0 +1,58 @@
+"""How faces are divided for columns of the transport matrix: which of them the edge of a shadow crosses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_scenes import attribute, glow, lens, world_scene, write_ply
+
+from mitsuba_fspt.integral.surface.face_light import ColumnRule, FaceLight
+
+pytestmark = pytest.mark.usefixtures("mono")
+
+COUNT, SHADE = 13, 0.3  # vertices a side of a sheet with a spacing of 1 mm; an occluder hides what lies beyond y [mm]
+
+
+def sheet():
+    """Vertices and faces of a sheet in the plane x = 0, its normal along +x."""
+    y, z = (grid.ravel() for grid in np.meshgrid(np.arange(COUNT) - 6.0, np.arange(COUNT) - 6.0, indexing="ij"))
+    first = np.add.outer(np.arange(COUNT - 1) * COUNT, np.arange(COUNT - 1)).ravel()[:, None]
+    faces = np.concatenate([first + np.array(other) for other in ((0, COUNT, COUNT + 1), (0, COUNT + 1, 1))])
+    return np.stack([0 * y, y, z], -1), faces
+
+
+def shaded_sheet(folder, **optics):
+    """The sheet's light behind an occluder that all but touches it."""
+    import mitsuba as mi
+
+    vertices, faces = sheet()
+    path = write_ply(folder / "sheet.ply", vertices, faces, vertex=np.ones(len(vertices)))
+    place = mi.ScalarTransform4f().translate([0.01, SHADE + 20, 0]).rotate([0, 1, 0], 90).scale(20)
+    mesh = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute())}
+    scene = world_scene(mesh, {"type": "rectangle", "to_world": place}, sensor=lens(24, **optics))
+    camera = scene.sensors()[0].camera
+    light = FaceLight.seen(scene.emitters()[0].surface, camera, (0, 0), (24, 24)).behind(scene, camera)
+    return vertices[faces][..., 1], light
+
+
+def test_the_edge_of_a_shadow_is_found_on_the_faces_that_it_crosses(tmp_path):
+    """Expected: all lines of sight of these faces, none of others. Seen to fail without differences."""
+    y, light = shaded_sheet(tmp_path)
+    crossed = (y.min(axis=1) < SHADE) & (y.max(axis=1) > SHADE)
+    assert crossed.sum() == 2 * (COUNT - 1)
+    np.testing.assert_allclose(light.crossed[crossed], 1, atol=0.02)
+    assert not light.crossed[~crossed & light.bright].any()
+
+
+def test_faces_larger_than_their_blur_are_cut_wherever_a_shadow_may_be(tmp_path):
+    """Pieces of at most `shadow` pixels in focus, for a shadow may be smaller than what is probed; far out of focus, on
+    faces that no edge of a shadow crosses, one. Seen to fail with the latter everywhere."""
+    rule = ColumnRule.of(1e-3)
+    _, light = shaded_sheet(tmp_path, pitch=0.1)
+    assert (light.sides[light.mixed] > 2 * light.blur[light.mixed] + 1).all()
+    cuts = light.plan(rule, "vertex").cuts[light.mixed]
+    assert (cuts >= np.ceil(light.sides[light.mixed] / rule.shadow)[:, None]).all()
+    _, light = shaded_sheet(tmp_path, pitch=0.1, distance=400.0, f_number=1.4)
+    free = light.mixed & (light.crossed == 0)
+    assert free.any()
+    assert (light.plan(rule, "vertex").cuts[free].min(axis=1) < light.sides[free] / rule.shadow).all()
