@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import signal
-import sys
 
 import pytest
 
@@ -60,10 +59,3 @@ def no_scene_of_another_test():
         gc.collect()
         gc.freeze()
     gc.collect()
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Dr.Jit's threads wait for work by spinning, and a worker of pytest has one core."""
-    if "drjit" in sys.modules:
-        sys.modules["drjit"].set_thread_count(1)
