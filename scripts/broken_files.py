@@ -32,6 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsuba_fspt.optics.light import Light
 from mitsuba_fspt.runtime.backend import quiet_mitsuba
 
 TIME_LIMIT = 90.0  # s for one file: most take 0.01 s, a scene with a vertex far away 4 s, ten times that under load
@@ -422,7 +423,7 @@ def read_image(path: Path) -> None:
 
     image = read_image_or_exposure(path)
     if isinstance(image, fspt.Image):
-        measure(image, "50%", 660.0)
+        measure(image, "50%", Light.given(660))
         fspt.compare(image, image)
 
 
@@ -613,7 +614,7 @@ def write_mask(path: Path) -> None:
 def read_mask(path: Path) -> None:
     from mitsuba_fspt.images.regions import measure
 
-    measure(an_image(), str(path), 660.0)
+    measure(an_image(), str(path), Light.given(660))
 
 
 def write_curve(path: Path) -> None:

@@ -33,6 +33,7 @@ PHYSICS, FORMS = "tests/integral/test_physics.py", "tests/integral/surface/test_
 LAWS, DETECTOR = "tests/emission/test_laws.py", "tests/detector/test_detector.py"
 REDUCTION, RADIOMETRY = "tests/detector/test_reduction.py", "tests/images/test_radiometry.py"
 CAMERAS = "tests/detector/test_cameras.py"
+LIGHT = "tests/optics/test_light.py"
 STRAY = "tests/detector/test_stray_light.py"
 TISSUE, INVERT = "tests/tissue/test_diffusion.py", "tests/inverse/test_invert.py"
 
@@ -237,16 +238,33 @@ MUTANTS = (
     Mutant(
         "quantum efficiency",
         "detector/detector.py",
-        "_binned(self.quantum_efficiency * photons, binning)",
-        "_binned(photons, binning)",
+        "self.electrons_per_joule(light)), binning)",
+        "light.photons_per_joule), binning)",
         (DETECTOR,),
     ),
     Mutant(
         "energy of a photon",
-        "detector/detector.py",
-        "PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)",
-        "PLANCK_TIMES_LIGHT / 650e-9",
+        "optics/light.py",
+        "self.mean_wavelength_nm * METRE / PLANCK_TIMES_LIGHT",
+        "650 * METRE / PLANCK_TIMES_LIGHT",
         (DETECTOR,),
+    ),
+    Mutant(
+        "mean of efficiency times wavelength",
+        "optics/light.py",
+        "nm * efficiency.on(nm)",
+        "self.mean_wavelength_nm * efficiency.on(nm)",
+        (LIGHT,),
+    ),
+    Mutant(
+        "weights of the spectrum", "optics/light.py", "WEIGHTS * spectrum.on(points)", "WEIGHTS + 0 * points", (LIGHT,)
+    ),
+    Mutant(
+        "rows of a product of curves",
+        "optics/light.py",
+        ".clip(1, 1000)",
+        ".clip(1, 1)",
+        (LIGHT,),
     ),
     Mutant(
         "area of the dark current",
@@ -309,8 +327,8 @@ MUTANTS = (
     Mutant(
         "frames of a stack",
         "detector/reduction.py",
-        "detector.quantum_efficiency) * frames",
-        "detector.quantum_efficiency)",
+        "exposed.per_watt(detector) * frames",
+        "exposed.per_watt(detector)",
         (REDUCTION,),
     ),
     Mutant(

@@ -10,7 +10,7 @@ import numpy as np
 from paper_common import DISTANCE, FOCAL, FOCUS, Table, Value, figure, panel, photograph, places, save, solve
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.images.radiometry import PLANCK_TIMES_LIGHT
+from mitsuba_fspt.optics.light import PLANCK_TIMES_LIGHT
 
 LENSES = (FOCAL / 2.8, FOCAL / 2)  # mm: the least border that a 55 mm f/2.8 lens can have, and a larger one
 PRINTED = ("printed (Table 2), not stated", None, None, 0.0421, 0.8685, 0.0110, 0.9153)

@@ -28,7 +28,7 @@ ARROWS = {
     "integral": {"runtime", "phantom", "jit", "camera", "emission"},
     "plugins": {"runtime", "optics", "jit", "camera", "emission", "integral"},
     "rendering": {"runtime", "images", "jit", "camera", "emission", "integral"},
-    "detector": {"runtime", "images", "rendering"},
+    "detector": {"runtime", "optics", "images", "rendering"},
     "validation": {"runtime", "optics", "jit", "camera", "emission", "integral", "rendering"},
     "studies": {"runtime", "optics", "images", "jit", "camera", "emission", "integral", "rendering", "validation"},
     "inverse": {

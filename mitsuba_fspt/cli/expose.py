@@ -12,7 +12,7 @@ import typer
 from ..rendering.scene_rules import is_number
 from ..runtime.atomic_files import require_apart
 from ..runtime.errors import ImageError
-from .options import AsJson, Quiet, SourcePower, require_image
+from .options import AsJson, Quiet, SourcePower, SpectrumFile, WavelengthNm, require_image
 from .terminal import print_result
 
 MAP = "or a map, .fits, .tif, .npy"
@@ -21,7 +21,9 @@ Camera = Annotated[
     typer.Option(metavar="CAMERA.toml", help="Camera with a table [detector]; a typical cooled CCD if left out."),
 ]
 Counts = Annotated[Path | None, typer.Option(help="Also write the counts [DN], 16-bit .png or .tif.")]
-Efficiency = Annotated[float | None, typer.Option(help="Electrons per photon, in (0, 1].")]
+Efficiency = Annotated[
+    str | None, typer.Option(metavar="X|CSV", help="Electrons per photon, in (0, 1], or a CSV of nm, efficiency.")
+]
 DarkCurrent = Annotated[str | None, typer.Option(metavar="X|MAP", help=f"[e-/px/s], of a --pixel-pitch, {MAP}.")]
 ReadNoise = Annotated[str | None, typer.Option(metavar="X|MAP", help=f"Of one read-out [e-], {MAP}.")]
 FullWell = Annotated[float | None, typer.Option(help="Of a read-out pixel, binned or not [e-].")]
@@ -39,7 +41,8 @@ def expose(
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Power image, as 'fspt render' writes it.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Electrons to write: .exr, .tif, .h5, .npz or .fits.")],
     exposure_time: Annotated[float, typer.Option(help="Exposure time [s].")],
-    wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
+    wavelength_nm: WavelengthNm = None,
+    spectrum: SpectrumFile = None,
     source_power: SourcePower = None,
     binning: Annotated[int, typer.Option(help="Pixels per side binned before read-out.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
@@ -78,7 +81,7 @@ def expose(
     camera = replace(camera, **_numbers(given))
     power = read(image)
     power = power if source_power is None else power.scaled(source_power)
-    exposure = camera.expose(power, exposure_time, wavelength_nm, binning=binning, seed=seed)
+    exposure = camera.expose(power, exposure_time, wavelength_nm, spectrum=spectrum, binning=binning, seed=seed)
     with exposure.counts_file(counts) if counts else nullcontext():  # both files or none
         exposure.write(output)
     peak, saturated = float(exposure.electrons.max()), exposure.metadata["saturated_pixels"]

@@ -14,6 +14,7 @@ from .options import (
     AsJson,
     Quiet,
     Rows,
+    SpectrumFile,
     Unit,
     WavelengthNm,
     require_picture,
@@ -63,6 +64,7 @@ def plot(
     outline: Annotated[bool, typer.Option("--outline", help="Draw the outline of the phantom.")] = False,
     unit: Unit = "W",
     wavelength_nm: WavelengthNm = None,
+    spectrum: SpectrumFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -73,6 +75,7 @@ def plot(
     from ..images.exposure import Exposure
     from ..images.image import read_image_or_exposure
     from ..images.picture import draw_panels, save_figure
+    from ..optics.light import Light
 
     output = output or Path(f"{images[0].stem}.png" if len(images) == 1 else "plot.png")
     require_picture(output)
@@ -88,7 +91,7 @@ def plot(
         per_panel=per_panel,
         outline=outline,
         unit=unit,
-        wavelength_nm=wavelength_nm,
+        light=Light.given(wavelength_nm, spectrum),
     )
     save_figure(figure, output)
     masked = [0 if isinstance(image, Exposure) else image.masked for image in pictures]
@@ -117,6 +120,7 @@ def roi(
         ),
     ] = None,
     wavelength_nm: WavelengthNm = None,
+    spectrum: SpectrumFile = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Table to write, .csv.")] = None,
     as_json: Rows = False,
     quiet: Quiet = False,
@@ -128,15 +132,17 @@ def roi(
     """
     from ..images.image import read
     from ..images.regions import csv_table, measure
+    from ..optics.light import Light
 
     if output:
         require_writable(output, ".csv")
         require_apart(output, images, error=ImageError)
+    light = Light.given(wavelength_nm, spectrum)
     regions: list[str | None] = [*region] if region else [None]
     rows = []
     for path in images:
         image = read(path)
-        rows += [(str(path), name or "all", measure(image, name, wavelength_nm)) for name in regions]
+        rows += [(str(path), name or "all", measure(image, name, light)) for name in regions]
     for name, one, found in rows:
         if found.masked:
             typer.echo(

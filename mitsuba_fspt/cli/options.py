@@ -73,7 +73,13 @@ Unit = Annotated[
         autocompletion=lambda: ["W", "photons/s", "p/s/cm2/sr"],
     ),
 ]
-WavelengthNm = Annotated[float | None, typer.Option(help="Of the light [nm], for units of photons.")]
+WavelengthNm = Annotated[float | None, typer.Option(help="Of the light [nm], for photons and electrons.")]
+SpectrumFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--spectrum", metavar="CSV", help="Of the light at the detector: nm, power per nm; for --wavelength-nm."
+    ),
+]
 MOST = 100_000  # values of a range
 NAMES = {
     ".xml": "scene",

@@ -14,7 +14,16 @@ from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import DetectorError, ImageError, SceneError
 from ..runtime.progress_bar import progress_bar
-from .options import AsJson, Parameters, Quiet, definitions, require_image, require_writable
+from .options import (
+    AsJson,
+    Parameters,
+    Quiet,
+    SpectrumFile,
+    WavelengthNm,
+    definitions,
+    require_image,
+    require_writable,
+)
 from .terminal import print_result
 
 if TYPE_CHECKING:
@@ -24,6 +33,7 @@ if TYPE_CHECKING:
     from ..detector.detector import Detector
     from ..detector.reduction import Corrections, Exposed
     from ..images.image import Image
+    from ..optics.light import Light
     from ..optics.thin_lens import Lens
 
 FILES = ".tif, .fits, .npy"
@@ -73,7 +83,8 @@ def reduce(
     counts: Annotated[list[Path], typer.Argument(metavar="COUNTS...", help=".tif, .fits, .npy, or a click folder.")],
     detector: Annotated[Path, typer.Option(metavar="CAMERA.toml", help="Camera with a table [detector].")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Image to write, .exr; of several OUT_0.exr, …")],
-    wavelength_nm: Annotated[float, typer.Option(help="Wavelength [nm].")],
+    wavelength_nm: WavelengthNm = None,
+    spectrum: SpectrumFile = None,
     exposure_time: Time = None,
     binning: Binning = None,
     pixel_pitch: Pitch = None,
@@ -105,13 +116,15 @@ def reduce(
     """
     from ..detector.detector import Detector
     from ..detector.reduction import Corrections
+    from ..optics.light import Light
 
     camera = Detector.from_toml(detector)
-    given = dict(exposure_time=exposure_time, wavelength_nm=wavelength_nm, binning=binning, pixel_pitch=pixel_pitch)
+    light = Light.of_image({}, Light.given(wavelength_nm, spectrum, DetectorError, "reduce"), DetectorError, "reduce")
+    given = dict(exposure_time=exposure_time, light=light, binning=binning, pixel_pitch=pixel_pitch)
     level = float(flat_dark) if flat_dark is not None and is_number(flat_dark) else flat_dark
     _require_output(output, calibrate, radiance is not None or radiance_error != 0)
     names = _outputs(output, len(counts))
-    inputs = [*counts, detector, *(Path(p) for p in (bias, dark, flat, flat_dark, bad_pixels, scene) if p)]
+    inputs = [*counts, detector, *(Path(p) for p in (bias, dark, flat, flat_dark, bad_pixels, scene, spectrum) if p)]
     for name in names:
         require_apart(name, inputs, error=ImageError)
     corrections = Corrections(bias, dark, flat, flat_kind, level, _loaded(scene, define), bad_pixels, cosmic_rays)
@@ -209,6 +222,7 @@ def _calibrated(
 ) -> dict[str, Any]:
     """Write the calibrated camera, and say what changed."""
     from ..detector.reduction import Exposed, calibrated
+    from ..optics.light import Light
     from ..optics.uniform_source import uniform_power
 
     if radiance is None or not 0 < radiance < np.inf:
@@ -220,16 +234,17 @@ def _calibrated(
             f"--calibrate takes one file of counts and needs 'pixel_pitch', got {len(images)}. Give a stack of frames."
         )
     image = images[0]
-    lens, transmittance = _lens(toml, float(image.metadata["wavelength_nm"]))
+    light = Light.of_image(image.metadata, None, DetectorError, "calibrate")
+    lens, transmittance = _lens(toml, light)
     power = uniform_power(lens, radiance, float(image.metadata["pixel_pitch"]), image.shape, transmittance)
     found = calibrated(camera, image, power, error)
     found.to_toml(output)
-    frame = Exposed(float(image.metadata["exposure_time"]), float(image.metadata["wavelength_nm"]))
+    frame = Exposed(float(image.metadata["exposure_time"]), light)
     return {
         "output": str(output),
         "quantum_efficiency": found.quantum_efficiency,
         "gain_error": found.gain_error,
-        "watts_per_dn": found.mean("gain") / found.em_gain / frame.per_watt(found.quantum_efficiency),
+        "watts_per_dn": found.mean("gain") / found.em_gain / frame.per_watt(found),
         "masked_pixels": image.metadata["masked_pixels"],
     }
 
@@ -241,8 +256,8 @@ def _calibrated_text(record: dict[str, Any]) -> str:
     )
 
 
-def _lens(toml: Path, wavelength_nm: float) -> tuple[Lens, float]:
-    """Lens of the table [lens] with its borders, and its transmittance at a wavelength."""
+def _lens(toml: Path, light: Light) -> tuple[Lens, float]:
+    """Lens of the table [lens] with its borders, and its transmittance for a light at the detector."""
     from ..optics.thin_lens import Lens, number_names
     from ..optics.transmittance import Curve, transmittance_of
     from ..phantom.framed_scene import CURVE, camera_lens
@@ -254,4 +269,9 @@ def _lens(toml: Path, wavelength_nm: float) -> tuple[Lens, float]:
     given = {name: table[name] for name in ("transmittance",) if name in table}
     if CURVE not in table:
         return lens, transmittance_of(given, None)
-    return lens, transmittance_of(given | {"wavelength_nm": wavelength_nm}, Curve.read(table[CURVE]))
+    if light.wavelength_nm is None:
+        raise DetectorError(
+            f"--calibrate: the mean of 'transmittance_curve' in '{toml}' does not follow from a spectrum at the "
+            "detector. Give 'transmittance' there, a number, or --wavelength-nm."
+        )
+    return lens, transmittance_of(given | {"wavelength_nm": light.wavelength_nm}, Curve.read(table[CURVE]))

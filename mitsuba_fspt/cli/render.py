@@ -29,6 +29,7 @@ from .options import (
     Seed,
     Sensor,
     SourcePower,
+    SpectrumFile,
     Spp,
     Unit,
     WavelengthNm,
@@ -40,6 +41,7 @@ from .terminal import Interrupted, print_result, print_warnings
 
 if TYPE_CHECKING:
     from ..images.image import Image
+    from ..optics.light import Light
 
 
 class Shot(NamedTuple):
@@ -57,13 +59,13 @@ class Output(NamedTuple):
     """How images are written.
 
     source_power : of the light source [W], None for images as they are
-    unit, wavelength_nm : of the values, see `images.radiometry`
+    unit, light : of the values, see `images.radiometry`
     png : a picture beside each image
     """
 
     source_power: float | None
     unit: str
-    wavelength_nm: float | None
+    light: Light | None
     png: bool
 
     def write(self, image: Image, output: Path, picture: Path | None) -> None:
@@ -71,11 +73,11 @@ class Output(NamedTuple):
         from ..images.picture import png_file
         from ..images.radiometry import in_unit
 
-        with png_file(image, picture, self.unit, self.wavelength_nm) if picture else nullcontext():
+        with png_file(image, picture, self.unit, self.light) if picture else nullcontext():
             if self.unit == "W":
                 image.write(output)
             else:
-                in_unit(image, self.unit, self.wavelength_nm).write(output, image)
+                in_unit(image, self.unit, self.light).write(output, image)
 
 
 def render(
@@ -97,6 +99,7 @@ def render(
     source_power: SourcePower = None,
     unit: Unit = "W",
     wavelength_nm: WavelengthNm = None,
+    spectrum: SpectrumFile = None,
     define: Parameters = None,
     png: Annotated[bool, typer.Option("--png", help="Also write the image as a PNG picture.")] = False,
     shortcuts: Annotated[bool, typer.Option(help="Leave out what the scene does not need, see 'fspt explain'.")] = True,
@@ -114,17 +117,17 @@ def render(
     framing = framing_of(view, focal_length, f_number, camera)
     shots = _shots(scene, output, scenes_of(scene, definitions(define), framing))
     _check_outputs(shots, [scene, camera] if camera else [scene], png)
-    require_scaling(source_power, unit, wavelength_nm)
+    light = required_scaling(source_power, unit, wavelength_nm, spectrum)
     settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
     images = _rendered(
         shots,
         settings | {"max_depth": max_depth, "sensor": sensor},
-        Output(source_power, unit, wavelength_nm, png),
+        Output(source_power, unit, light, png),
         required_time("render", max_time, SceneError),
         quiet,
     )
     summaries = [
-        _summary(image, shot.output, _picture(shot, png), unit, wavelength_nm)
+        _summary(image, shot.output, _picture(shot, png), unit, light)
         for shot, image in zip(shots, images, strict=True)
     ]
     text = "\n".join(map(_summary_text, summaries))
@@ -145,7 +148,7 @@ def _rendered(
     deadline = Deadline(max_time)
     with _kept(shots, images), progress_bar(quiet) as progress:
         from ..camera.of_sensor import camera_of
-        from ..images.radiometry import wavelength_by
+        from ..optics.light import Light
         from ..rendering.render import render, sensor_of
         from ..rendering.scene import load
         from ..runtime.plugin_types import is_lens
@@ -155,7 +158,7 @@ def _rendered(
             scene = load(shot.given.scene, **shot.given.parameters)
             lens: Any = sensor_of(scene, settings["sensor"])
             if output.unit != "W" and is_lens(lens):  # before the work
-                wavelength_by(camera_of(lens).numbers(), output.wavelength_nm)
+                Light.of_image(camera_of(lens).numbers(), output.light)
             if deadline.is_set:
                 settings["max_time"] = max(deadline.left / (len(shots) - number), LEAST_TIME)
             image = render(scene, progress=progress, **settings)
@@ -170,14 +173,19 @@ def _rendered(
     return images
 
 
-def require_scaling(source_power: float | None, unit: str, wavelength_nm: float | None) -> None:
-    """Raise ImageError, before the work, for a source power or a unit that no image can have."""
+def required_scaling(
+    source_power: float | None, unit: str, wavelength_nm: float | None, spectrum: Path | None
+) -> Light | None:
+    """The light that is given; ImageError, before the work, for a source power or a unit that no image can have."""
     from ..images.image import required_source_power
     from ..images.radiometry import require_unit
+    from ..optics.light import Light
 
     if source_power is not None:
         required_source_power(source_power)
-    require_unit(unit, wavelength_nm)
+    light = Light.given(wavelength_nm, spectrum)
+    require_unit(unit, light)
+    return light
 
 
 def _shots(scene: Path, output: Path | None, scenes: list[GivenScene]) -> list[Shot]:
@@ -219,13 +227,11 @@ def _kept(shots: list[Shot], images: list[Image]) -> Iterator[None]:
         raise Interrupted(f"interrupted; {len(images)} of {len(shots)} images are written: {names}.") from cause
 
 
-def _summary(
-    image: Image, output: Path, picture: Path | None, unit: str, wavelength_nm: float | None
-) -> dict[str, Any]:
+def _summary(image: Image, output: Path, picture: Path | None, unit: str, light: Light | None) -> dict[str, Any]:
     """The files, the total power [W], the brightest pixel [unit], the time [s], and what the metadata warn of."""
     from ..images.radiometry import in_unit
 
-    shown = in_unit(image, unit, wavelength_nm)
+    shown = in_unit(image, unit, light)
     summary: dict[str, Any] = {"output": str(output), "total_power": image.total_power, "power_unit": "W"}
     summary |= {"peak": float(shown.values.max()), "unit": shown.unit, "wall_time": image.metadata["wall_time"]}
     if picture:

@@ -1,6 +1,6 @@
 """Detector behind the lens, in the terms of EMVA 1288: from power on a pixel to electrons and counts.
 
-    photons    μ_p = P t λ / (h c)
+    photons    μ_p = P t ⟨λ⟩/(h c),  electrons per photon η = ⟨η λ⟩/⟨λ⟩ over the spectrum (Eq. M.43)
     charge     n   = Poisson(Σ (f η μ_p + I_dark t + c)),  over the pixels of a bin
     electrons  x   = G n,  by a multiplying register;  ⟨x⟩ = g n,  σ_x² = g² (F² − 1) n for a charge n
     counts     y   = bias + round((x + normal(σ_read)) / gain)
@@ -24,10 +24,9 @@ from ..images.exposure import Exposure
 from ..images.formats import Metadata
 from ..images.image import Image
 from ..images.pixel_axes import CROP
-from ..images.radiometry import PLANCK_TIMES_LIGHT, wavelength_of
+from ..optics.light import Light, Spectrum
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
-from ..runtime.wavelength import wavelength
 from .parameters import RECORDED, DetectorParameters
 from .reduction import Corrections, Exposed, reduce_counts
 from .stray_light import StrayLight
@@ -54,7 +53,7 @@ class Detector(DetectorParameters):
 
     Parameters
     ----------
-    quantum_efficiency : η, electrons per photon, in (0, 1]
+    quantum_efficiency : η, electrons per photon, in (0, 1]; or a CSV file of nm, η, ascending
     dark_current : [e-/px/s], >= 0
     read_noise : σ_read [e-] of one read-out, >= 0, after the multiplying register if there is one
     full_well : [e-], in (0, 1e15]; the most electrons that a read-out pixel, binned or not, delivers, after a register
@@ -150,7 +149,8 @@ class Detector(DetectorParameters):
         counts: Frame,
         *,
         exposure_time: float,
-        wavelength_nm: float,
+        wavelength_nm: float | None = None,
+        spectrum: Spectrum | None = None,
         binning: int | None = None,
         pixel_pitch: float | None = None,
         frames: int | None = None,
@@ -170,7 +170,7 @@ class Detector(DetectorParameters):
         ----------
         counts : (h, w) or (frames, h, w) [DN], or the name of a .tif, .fits, .npy file or of a click folder
         exposure_time : [s] of one frame, > 0
-        wavelength_nm : of the light in vacuum [nm], 200 … 2500
+        wavelength_nm, spectrum : of the light at the detector, see `expose`; neither: that in `metadata`
         binning : side of the square of pixels that was read out as one; None: that of the file, else 1
         pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene;
             None: that of the file, if the detector has none of its own
@@ -195,35 +195,49 @@ class Detector(DetectorParameters):
         ImageError : a file cannot be read, or a stack has the shape (h, w, frames).
         SceneError, OpticsError, BackendError : the scene has no usable lens; a package is not installed.
         """
-        exposed = Exposed(exposure_time, wavelength_nm, binning, pixel_pitch)
+        given = Light.given(wavelength_nm, spectrum, DetectorError, "reduce")
+        light = Light.of_image(metadata or {}, given, DetectorError, "reduce")
+        exposed = Exposed(exposure_time, light, binning, pixel_pitch)
         corrections = Corrections(bias, dark, flat, flat_kind, flat_dark, scene, bad_pixels, cosmic_rays)
         return reduce_counts(self, counts, exposed, corrections, frames=frames, metadata=metadata)
 
-    def expected(self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1) -> Expectation:
+    def expected(
+        self,
+        image: Image,
+        exposure_time: float,
+        wavelength_nm: float | None = None,
+        *,
+        spectrum: Spectrum | None = None,
+        binning: int = 1,
+    ) -> Expectation:
         """Mean and variance of the electrons that `expose` draws, after the register, before the full well limits them.
 
         Parameters and errors as for `expose`.
         """
-        charge = self._charge(image, *_time_and_wavelength(exposure_time, wavelength_nm), _whole("binning", binning))
+        light = self._light(image, wavelength_nm, spectrum)
+        charge = self._charge(image, _time(exposure_time), light, _whole("binning", binning))
         noise = np.square(self.on_pixels("read_noise", charge.shape))
         return Expectation(self.em_gain * charge, self.em_gain**2 * self.excess * charge + noise)
 
-    def _charge(self, image: Image, exposure_time: float, wavelength_nm: float, binning: int) -> Array:
-        """Mean charge of each pixel read out before the register, (h, w) [e-]."""
+    def _light(self, image: Image, wavelength_nm: object, spectrum: Spectrum | None) -> Light:
+        """The light of an image, given or its own; raises as `expose`."""
+        given = Light.given(wavelength_nm, spectrum, DetectorError, "detector")
         if not isinstance(image, Image):
             raise DetectorError(
                 f"detector: must be given an image, got {type(image).__name__}. Give fspt.Image(power)."
             )
-        wavelength_of(image, wavelength_nm)
+        return Light.of_image(image.metadata, given)
+
+    def _charge(self, image: Image, exposure_time: float, light: Light, binning: int) -> Array:
+        """Mean charge of each pixel read out before the register, (h, w) [e-]."""
         if (darkest := image.power.min()) < 0:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
-        energy = PLANCK_TIMES_LIGHT / (wavelength_nm * 1e-9)  # of one photon [J]
-        photons = self._with_stray_light(image) * (exposure_time / energy)
-        light = _binned(self.quantum_efficiency * photons, binning)
+        power = self._with_stray_light(image)
+        electrons = _binned(power * (exposure_time * self.electrons_per_joule(light)), binning)
         pitch = image.metadata.get("pixel_pitch")
         area = self.area(None if pitch is None else float(pitch) * binning, binning)
-        dark = self.on_pixels("dark_current", light.shape) * exposure_time
-        return self._drawn_response(light.shape, area) * light + (dark + self.spurious_charge) * area
+        dark = self.on_pixels("dark_current", electrons.shape) * exposure_time
+        return self._drawn_response(electrons.shape, area) * electrons + (dark + self.spurious_charge) * area
 
     def _with_stray_light(self, image: Image) -> Array:
         """Power on the film (h, w) [W] with the detector's stray light, unless the image has it already (Eq. M.38)."""
@@ -260,32 +274,42 @@ class Detector(DetectorParameters):
         return rng.gamma(charge / surplus, self.em_gain * surplus)
 
     def expose(
-        self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
+        self,
+        image: Image,
+        exposure_time: float,
+        wavelength_nm: float | None = None,
+        *,
+        spectrum: Spectrum | None = None,
+        binning: int = 1,
+        seed: int = 0,
     ) -> Exposure:
         """One exposure of the detector to an image; the same seed gives bit-identical results.
 
         Parameters
         ----------
-        image : power [W], shape (h, w), monochromatic
+        image : power [W], shape (h, w)
         exposure_time : [s], 0 … 1e12 (0 gives a bias frame)
         wavelength_nm : of the light in vacuum [nm], 200 … 2500
+        spectrum : of the light at the detector in its place, a CSV file of nm, relative power per nm, ascending. None
+            of both: the light of the image, whose lens has a filter
         binning : side of the square of pixels whose charge is summed before read-out, a divisor of h and w
         seed : of the shot and read noise and of the register, 0 … 2⁵³
 
         Raises
         ------
-        DetectorError : a parameter is outside its range, a map is not of the pixels read out, or the binning does not
+        DetectorError : a parameter is outside its range, `wavelength_nm` and `spectrum` are both given, a map is not of
+            the pixels read out, the curve of the quantum efficiency does not cover the light, or the binning does not
             divide the image.
-        ImageError : the image was rendered for another wavelength.
+        ImageError : the image was rendered for another light, or has none and none is given.
         """
-        exposure_time, wavelength_nm = _time_and_wavelength(exposure_time, wavelength_nm)
+        exposure_time, light = _time(exposure_time), self._light(image, wavelength_nm, spectrum)
         seed, binning = _whole("seed", seed), _whole("binning", binning)
         if not 0 <= seed <= 1 << 53:  # an EXR stores integers as doubles, which hold no larger one exactly
             raise DetectorError(
                 f"detector: 'seed' must be finite and >= 0 and at most 2^53, for example 1, got {seed}."
             )
         rng = np.random.default_rng(seed)
-        mean = self._charge(image, exposure_time, wavelength_nm, binning)
+        mean = self._charge(image, exposure_time, light, binning)
         # A mean this far above the full well saturates with certainty. NumPy cannot draw Poisson numbers above 9e18.
         charge = self._multiplied(rng.poisson(np.minimum(mean, 2 * self.full_well + 1e6)), rng)
         noise = rng.normal(0.0, self.on_pixels("read_noise", mean.shape), mean.shape)
@@ -300,23 +324,23 @@ class Detector(DetectorParameters):
             "unit": "e-",
             "detector": self.name,
             "exposure_time": exposure_time,
-            "wavelength_nm": wavelength_nm,
             "binning": binning,
             "detector_seed": seed,
             "saturated_pixels": int(np.sum(full | (counts >= top))),
         }
-        metadata |= self._recorded() | self.stray_light.recorded(counts.shape)
-        if "pixel_pitch" in image.metadata:
-            metadata["pixel_pitch"] = image.metadata["pixel_pitch"] * binning
-        if binning > 1:  # of a crop window, in pixels of the read-out
-            metadata |= {key: float(image.metadata[key]) / binning for key in CROP if key in image.metadata}
-        return Exposure(electrons, counts.astype(np.uint16), metadata)
+        metadata |= light.metadata() | self._recorded(light) | self.stray_light.recorded(counts.shape)
+        return Exposure(electrons, counts.astype(np.uint16), metadata | _pixels_read_out(image, binning))
 
-    def _recorded(self) -> Metadata:
-        """Parameters as entries of an exposure's metadata: numbers, of maps the mean with path and digest."""
+    def _recorded(self, light: Light) -> Metadata:
+        """Parameters as entries of an exposure's metadata: numbers, of maps the mean with path and digest.
+
+        The quantum efficiency is that for this light: electrons over photons.
+        """
         found: Metadata = {}
         for name, key in RECORDED.items():
-            if name in self.maps:
+            if name == "quantum_efficiency":
+                found[key] = self.electrons_per_joule(light) / light.photons_per_joule
+            elif name in self.maps:
                 found |= {key: self.mean(name), **self.maps[name].recorded(key)}
             elif getattr(self, name) is not None:
                 found[key] = getattr(self, name)
@@ -338,12 +362,22 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
     return blocks.sum(axis=(1, 3))
 
 
-def _time_and_wavelength(exposure_time: float, wavelength_nm: float) -> tuple[float, float]:
-    """Both as floats, or DetectorError. The bound keeps photons per watt finite: 0 W times infinity would be NaN."""
+def _pixels_read_out(image: Image, binning: int) -> Metadata:
+    """Entries of the metadata about the pixels that are read out: their pitch and crop window."""
+    found: Metadata = {}
+    if "pixel_pitch" in image.metadata:
+        found["pixel_pitch"] = float(image.metadata["pixel_pitch"]) * binning
+    if binning > 1:  # of a crop window, in pixels of the read-out
+        found |= {key: float(image.metadata[key]) / binning for key in CROP if key in image.metadata}
+    return found
+
+
+def _time(exposure_time: float) -> float:
+    """As a float, or DetectorError. The bound keeps photons per watt finite: 0 W times infinity would be NaN."""
     time = number("detector: 'exposure_time'", exposure_time, DetectorError, "60")
     if not 0 <= time <= 1e12:
         raise DetectorError(f"detector: 'exposure_time' must be finite and in 0 … 1e12 s, for example 60, got {time}.")
-    return time, wavelength("detector: 'wavelength_nm'", wavelength_nm, DetectorError)
+    return time
 
 
 def _whole(name: str, value: int) -> int:

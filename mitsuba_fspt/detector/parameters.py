@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.pixel_map import PixelMap
+from ..optics.curve_file import Curve
+from ..optics.light import Light, read_efficiency
 from ..runtime.atomic_files import atomic_path
-from ..runtime.errors import DetectorError
+from ..runtime.errors import DetectorError, named
 from ..runtime.numbers import number
 from ..runtime.toml_file import read_toml
 from .stray_light import Kernel, StrayLight
@@ -59,6 +61,7 @@ COMMENTS = {
     "psf": "kernel of the stray light, an image file",
     "veiling_glare": "share of the film's light that is spread evenly over it",
 }
+FILES = ("quantum_efficiency", "psf")  # that may be names of other files
 MAPPED = ("read_noise", "gain", "bias", "dark_current", "prnu")  # a number, or the name of a map
 # Names of EMVA 1288 that a TOML may use instead; the overall system gain K is in DN/e-.
 EMVA_1288 = {
@@ -103,7 +106,7 @@ class Derived(float):
 class DetectorParameters:
     """Parameters of a detector; see `Detector`, which exposes and reduces with them."""
 
-    quantum_efficiency: float
+    quantum_efficiency: float | str
     dark_current: float | str
     read_noise: float | str
     full_well: float
@@ -129,7 +132,7 @@ class DetectorParameters:
 
             [detector]
             name = "iKon-M 934, serial 1234"
-            quantum_efficiency = 0.9   # electrons per photon
+            quantum_efficiency = 0.9   # electrons per photon, or a CSV of nm, η
             dark_current = 1e-3        # e-/px/s
             read_noise = 3.5           # e-, or a map such as "read_noise.fits"
             full_well = 1e5            # e-
@@ -162,20 +165,25 @@ class DetectorParameters:
             raise DetectorError(
                 f"'{path}' [detector]: 'name' must be a text in quotes, got {table['name']}. Give for example \"CCD\"."
             )
-        table |= {key: str(Path(path).parent / table[key]) for key in (*MAPPED, "psf") if _is_name(table.get(key))}
+        table |= {key: str(Path(path).parent / table[key]) for key in (*MAPPED, *FILES) if _is_name(table.get(key))}
         try:
             return cls(**table)
         except DetectorError as cause:
             raise DetectorError(f"'{path}' [detector]: {str(cause).removeprefix('detector: ')}") from cause
 
     def __post_init__(self) -> None:
-        maps: dict[str, PixelMap] = {}
+        maps, curve = dict[str, PixelMap](), None
         for name, example in EXAMPLES.items():
             value = getattr(self, name)
             if value is None and name in ("pixel_pitch", "excess_noise"):
                 continue
             if name in MAPPED and _is_name(value):
                 maps[name] = _map(name, value)
+                object.__setattr__(self, name, os.fspath(value))
+                continue
+            if name == "quantum_efficiency" and _is_name(value):
+                with named("detector"):
+                    curve = read_efficiency(value, DetectorError)
                 object.__setattr__(self, name, os.fspath(value))
                 continue
             rule, holds = RULES[name]
@@ -187,6 +195,7 @@ class DetectorParameters:
             object.__setattr__(self, name, value if isinstance(value, Derived) else checked)
         object.__setattr__(self, "bits", int(self.bits))
         object.__setattr__(self, "_maps", maps)
+        object.__setattr__(self, "_efficiency", self.quantum_efficiency if curve is None else curve)
         kernel = None
         if self.psf is not None:
             if not isinstance(self.psf, (str, os.PathLike)):
@@ -206,6 +215,13 @@ class DetectorParameters:
                 f"detector: 'excess_noise' = {given:g} goes with 'em_gain' > 1, which is 1: without multiplication it "
                 "is 1. Give 'em_gain', for example 300, or leave 'excess_noise' out."
             )
+
+    def electrons_per_joule(self, light: Light) -> float:
+        """Electrons before the register per joule of light; DetectorError where the curve of η does not cover it."""
+        efficiency: float | Curve = self._efficiency  # type: ignore[attr-defined]  # set when the numbers are checked
+        if isinstance(efficiency, Curve):
+            light.require_cover(efficiency, "quantum_efficiency", DetectorError)
+        return light.electrons_per_joule(efficiency)
 
     @property
     def excess(self) -> float:

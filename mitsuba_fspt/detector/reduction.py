@@ -1,6 +1,6 @@
 """Counts of a detector to power [W]: bias, dark, flat, cosmic rays, quantum efficiency, and the noise that remains.
 
-    electrons n = gain (DN − bias)/g − dark,   P = n / (flat · k),   k = η t λ / (h c) [electrons per watt]
+    electrons n = gain (DN − bias)/g − dark,   P = n / (flat · k),   k = t ⟨η λ⟩/(h c) [electrons per watt]
     error² = (F² (max(n, 0) + dark) + (σ_read/g)²) / (flat · k)² + (P ε)²
 
 with g and F² of a multiplying register, both 1 without one, and the relative error ε of the response. All electrons of
@@ -28,10 +28,9 @@ from ..images.frame_file import FITS, TIFF
 from ..images.image import Image, image_or_exposure
 from ..images.noise_model import NoiseModel
 from ..images.pixel_map import DIGEST, MAP, recorded_map
-from ..images.radiometry import PLANCK_TIMES_LIGHT
+from ..optics.light import Light
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
-from ..runtime.wavelength import wavelength
 from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time
 from .flat_field import FlatField, flat_field, require_no_flat
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
@@ -59,13 +58,13 @@ COMPUTED = (
 
 @dataclass(frozen=True)
 class Exposed:
-    """Conditions of an exposure: time [s], wavelength [nm], binning, pitch of the pixels read out [mm] or None.
+    """Conditions of an exposure: time [s], light, binning, pitch of the pixels read out [mm] or None.
 
     A `binning` of None stands for that of the file of counts, or for 1 if the file does not state it.
     """
 
     exposure_time: float
-    wavelength_nm: float
+    light: Light
     binning: int | None = 1
     pixel_pitch: float | None = None
 
@@ -74,8 +73,6 @@ class Exposed:
         if not 0 < time <= 1e12:
             raise DetectorError(f"reduce: 'exposure_time' must be > 0 and at most 1e12 s, got {time:g}. Give 60.")
         object.__setattr__(self, "exposure_time", time)
-        nanometres = wavelength("reduce: 'wavelength_nm'", self.wavelength_nm, DetectorError)
-        object.__setattr__(self, "wavelength_nm", nanometres)
         if self.binning is not None:
             sides = whole("reduce: 'binning'", self.binning, DetectorError, "1")
             object.__setattr__(self, "binning", sides)
@@ -87,9 +84,9 @@ class Exposed:
             if not 0 < pitch < np.inf:
                 raise DetectorError(f"reduce: 'pixel_pitch' must be > 0 mm, got {pitch:g}. Give for example 0.108.")
 
-    def per_watt(self, quantum_efficiency: float) -> float:
-        """k, electrons per watt on a pixel."""
-        return quantum_efficiency * self.exposure_time * self.wavelength_nm * 1e-9 / PLANCK_TIMES_LIGHT
+    def per_watt(self, detector: DetectorParameters) -> float:
+        """k, electrons per watt on a pixel (Eq. M.43)."""
+        return detector.electrons_per_joule(self.light) * self.exposure_time
 
     def area(self, detector: DetectorParameters) -> float:
         """Number of the detector's own pixels in one that is read out."""
@@ -221,7 +218,9 @@ def reduced(exposure: Exposure) -> Image:
     """
     found = exposure.metadata
     needed = [key for name, key in RECORDED.items() if name not in OPTIONAL]
-    if missing := [key for key in (*needed, "exposure_time", "wavelength_nm") if key not in found]:
+    light = Light.recorded(found, DetectorError, "reduce")
+    missing = [key for key in (*needed, "exposure_time") if key not in found]
+    if missing := [*missing, *([] if light else ["wavelength_nm"])]:
         raise DetectorError(
             f"reduce: the electrons come without '{missing[0]}'. Reduce the counts with the numbers of their detector."
         )
@@ -233,7 +232,7 @@ def reduced(exposure: Exposure) -> Image:
     pitch = found.get("pixel_pitch")
     exposed = Exposed(
         found["exposure_time"],  # type: ignore[arg-type]
-        found["wavelength_nm"],  # type: ignore[arg-type]
+        light,  # type: ignore[arg-type]  # there is one
         int(found.get("binning", 1)),
         None if pitch is None else float(pitch),
     )
@@ -242,12 +241,12 @@ def reduced(exposure: Exposure) -> Image:
     electrons = exposure.electrons.astype(np.float64)
     full = (electrons >= detector.full_well) | saturated(detector, exposure.counts.astype(np.float64))
     flat = FlatField.of_map(detector, exposure.shape)
-    light = (electrons / detector.em_gain - charge) / (1.0 if flat is None else flat.response)
-    return _image(detector, light, flat, detector.excess * charge, 1, full, exposed, found)
+    charge_of_light = (electrons / detector.em_gain - charge) / (1.0 if flat is None else flat.response)
+    return _image(detector, charge_of_light, flat, detector.excess * charge, 1, full, exposed, found)
 
 
 def calibrated(detector: Own, image: Image, power: Array, error: float) -> Own:
-    """Detector with the quantum efficiency that follows from the image of a source of known power.
+    """Detector with the quantum efficiency, a number, that follows from the image of a source of known power.
 
     Parameters
     ----------
@@ -267,7 +266,8 @@ def calibrated(detector: Own, image: Image, power: Array, error: float) -> Own:
             f"{int(good.sum())} pixels are not saturated. Give an unsaturated frame of the same film."
         )
     share = float(image.power[good].sum() / power[good].sum())
-    efficiency = detector.quantum_efficiency * share
+    light = Light.of_image(image.metadata, None, DetectorError, "calibrate")
+    efficiency = detector.electrons_per_joule(light) / light.photons_per_joule * share
     if not 0 < efficiency <= 1:
         raise DetectorError(
             f"calibrate: the source shows a quantum efficiency of {efficiency:.4g}, which must be in (0, 1]. Check the "
@@ -367,7 +367,7 @@ def _image(
     `dark` is the variance [e-²] of one frame in addition to that of light and of reading. The numbers in the metadata
     are those of the sum of the frames, whose shot noise is that of all its electrons.
     """
-    per_watt = exposed.per_watt(detector.quantum_efficiency) * frames
+    per_watt = exposed.per_watt(detector) * frames
     read = detector.on_pixels("read_noise", electrons.shape) / detector.em_gain * frames**0.5
     mask = mask if flat is None else mask | flat.mask
     kept: Metadata = dict(metadata or {})
@@ -378,7 +378,7 @@ def _image(
         "unit": "W",
         "detector": detector.name,
         "exposure_time": exposed.exposure_time,
-        "wavelength_nm": exposed.wavelength_nm,
+        **exposed.light.metadata(),
         "binning": exposed.binning or 1,
         "electrons_per_watt": per_watt,
         "read_noise": float(np.sqrt(np.mean(np.square(read)))),

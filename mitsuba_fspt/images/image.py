@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ..optics.light import Light, Spectrum
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
 from .crop_window import cropped
@@ -31,7 +32,14 @@ class Exposes(Protocol):
     """What exposes itself to an image: a `Detector`."""
 
     def expose(
-        self, image: Image, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
+        self,
+        image: Image,
+        exposure_time: float,
+        wavelength_nm: float | None = None,
+        *,
+        spectrum: Spectrum | None = None,
+        binning: int = 1,
+        seed: int = 0,
     ) -> Exposure:
         """One exposure; see `Detector.expose`."""
         ...
@@ -145,30 +153,41 @@ class Image(ImageData):
         return combined(self, other, sign) if isinstance(other, Image) else NotImplemented
 
     def roi(
-        self, region: str | os.PathLike[str] | NDArray[np.bool_] | None = None, wavelength_nm: float | None = None
+        self,
+        region: str | os.PathLike[str] | NDArray[np.bool_] | None = None,
+        wavelength_nm: float | None = None,
+        *,
+        spectrum: Spectrum | None = None,
     ) -> Measurement:
         """Radiometric quantities of the light from a region, as `fspt roi` prints them.
 
         Parameters
         ----------
         region : mask (h, w), or text 'x,y,width,height', 'circle:x,y,radius', '25%' or the name of a TIFF; None: all
-        wavelength_nm : of the light [nm]; None: that of the image's filter
+        wavelength_nm, spectrum : of the light, see `to_radiance`
 
         Raises
         ------
-        ImageError : there is no such region, all its pixels are masked, or lens or wavelength are unknown.
+        ImageError : there is no such region, all its pixels are masked, or lens or light are unknown.
         """
         from .regions import measure
 
-        return measure(self, region, wavelength_nm)
+        return measure(self, region, Light.given(wavelength_nm, spectrum))
 
     def expose(
-        self, detector: Exposes, exposure_time: float, wavelength_nm: float, *, binning: int = 1, seed: int = 0
+        self,
+        detector: Exposes,
+        exposure_time: float,
+        wavelength_nm: float | None = None,
+        *,
+        spectrum: Spectrum | None = None,
+        binning: int = 1,
+        seed: int = 0,
     ) -> Exposure:
         """Electrons and counts of one exposure of `detector`, a `Detector`, to this image; see `Detector.expose`."""
-        return detector.expose(self, exposure_time, wavelength_nm, binning=binning, seed=seed)
+        return detector.expose(self, exposure_time, wavelength_nm, spectrum=spectrum, binning=binning, seed=seed)
 
-    def to_radiance(self, wavelength_nm: float | None = None) -> DataArray:
+    def to_radiance(self, wavelength_nm: float | None = None, *, spectrum: Spectrum | None = None) -> DataArray:
         """Apparent radiance [photons/s/cm²/sr] of a surface in focus, a DataArray with dimensions (y, x).
 
         P/(τ G ⟨cos⁴θ⟩) of every pixel, with its étendue and the transmittance τ of the lens (Eq. M.6); 0 where no light
@@ -176,30 +195,34 @@ class Image(ImageData):
 
         Parameters
         ----------
-        wavelength_nm : of the light [nm]; None: that of the lens's filter, if the image has one
+        wavelength_nm : of the light [nm]
+        spectrum : of the light at the detector in its place, a CSV file of nm, relative power per nm. None of both:
+            those of the image, if its lens has a filter
 
         Raises
         ------
-        ImageError : the metadata lack the lens or the wavelength.
+        ImageError : the metadata lack the lens or the light, or both are given.
         BackendError : xarray is not installed.
         """
         from .labelled import radiance_array
 
-        return radiance_array(self, wavelength_nm)
+        return radiance_array(self, Light.given(wavelength_nm, spectrum))
 
-    def to_xarray(self) -> Dataset:
+    def to_xarray(self, wavelength_nm: float | None = None, *, spectrum: Spectrum | None = None) -> Dataset:
         """Dataset of `power`, `error` and `coverage`, dimensions (y, x), with `units` and the metadata as attributes.
 
         Coordinates are the pixels' centres [mm] on the virtual detector plane, x to the right and y up: the first row
-        has the largest y. Masked pixels are NaN.
+        has the largest y. Masked pixels are NaN. With a wavelength [nm] or a spectrum of the light, see `to_radiance`,
+        there is also `photon_rate` [photons/s].
 
         Raises
         ------
+        ImageError : another light than that of the image.
         BackendError : xarray is not installed.
         """
         from .labelled import dataset
 
-        return dataset(self)
+        return dataset(self, Light.given(wavelength_nm, spectrum))
 
     def plot(
         self,
@@ -210,6 +233,7 @@ class Image(ImageData):
         outline: bool = False,
         unit: str = "W",
         wavelength_nm: float | None = None,
+        spectrum: Spectrum | None = None,
     ) -> Axes:
         """Draw the picture that `--png` writes, with colour bar and axes in mm; returns matplotlib's axes.
 
@@ -219,7 +243,7 @@ class Image(ImageData):
         log, limits : of the colour scale, limits in the unit that is shown; see `ColourScale.over`
         outline : draw the silhouette of the phantom, where the coverage is 1/2
         unit : 'W', 'photons/s' or 'p/s/cm2/sr'
-        wavelength_nm : of the light [nm], for the units with photons; None: that of the image's filter
+        wavelength_nm, spectrum : of the light, for the units with photons, see `to_radiance`
 
         Raises
         ------
@@ -229,7 +253,8 @@ class Image(ImageData):
         """
         from .picture import plot_image
 
-        return plot_image(self, axes, log=log, limits=limits, outline=outline, unit=unit, wavelength_nm=wavelength_nm)
+        light = Light.given(wavelength_nm, spectrum)
+        return plot_image(self, axes, log=log, limits=limits, outline=outline, unit=unit, light=light)
 
     def plot_profile(self, row: int | None = None, column: int | None = None, axes: Axes | None = None) -> Axes:
         """Draw the power along a row or a column, with a band of ± error; returns matplotlib's axes.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..optics.light import Light
 from ..runtime.extras import require
 from .formats import units
 from .image_data import ImageData
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 DIMENSIONS = ("y", "x")
 
 
-def dataset(image: ImageData) -> Dataset:
+def dataset(image: ImageData, light: Light | None = None) -> Dataset:
     """As `Image.to_xarray`."""
     require("xarray", "image: to_xarray")
     import xarray as xr
@@ -27,22 +28,27 @@ def dataset(image: ImageData) -> Dataset:
     given = {name: getattr(image, name) for name in ("power", "error", "coverage")}
     planes = {name: _without_masked(image, plane) for name, plane in given.items() if plane is not None}
     arrays = {name: (DIMENSIONS, planes[name], {"units": unit}) for name, unit in units(planes, image.metadata).items()}
-    return xr.Dataset(arrays, coords=_coordinates(image), attrs=dict(image.metadata))
+    known = dict(image.metadata)
+    if light is not None:
+        found = in_unit(image, "photons/s", light)
+        arrays[found.quantity] = DIMENSIONS, _without_masked(image, found.values), {"units": found.unit}
+        known |= light.metadata()
+    return xr.Dataset(arrays, coords=_coordinates(image), attrs=known)
 
 
-def radiance_array(image: ImageData, wavelength_nm: float | None) -> DataArray:
+def radiance_array(image: ImageData, light: Light | None) -> DataArray:
     """As `Image.to_radiance`."""
     require("xarray", "image: to_radiance")
     import xarray as xr
 
-    found = in_unit(image, "p/s/cm2/sr", wavelength_nm)
+    found = in_unit(image, "p/s/cm2/sr", light)
     beside = {"error": (found.error, found.unit), "coverage": (image.coverage, "1")}
     coordinates = {
         name: (DIMENSIONS, _without_masked(image, plane), {"units": unit})
         for name, (plane, unit) in beside.items()
         if plane is not None
     }
-    attributes = {"units": found.unit, "wavelength_nm": found.wavelength_nm}
+    attributes = {"units": found.unit} | (found.light.metadata() if found.light else {})
     values = _without_masked(image, found.values)
     return xr.DataArray(values, {**_coordinates(image), **coordinates}, DIMENSIONS, found.quantity, attributes)
 

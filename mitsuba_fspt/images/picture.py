@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..optics.light import Light
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, ImageError
 from ..runtime.numbers import whole
@@ -36,9 +37,7 @@ OUTLINE = "deepskyblue"  # a colour that the colour map of powers does not conta
 COLUMNS = 4  # panels in a row
 
 
-def write_png(
-    image: ImageData, path: str | os.PathLike[str], unit: str = "W", wavelength_nm: float | None = None
-) -> None:
+def write_png(image: ImageData, path: str | os.PathLike[str], unit: str = "W", light: Light | None = None) -> None:
     """Write a picture of `image` to a PNG file, with view, total power, method and lens as its title.
 
     Axes are in mm from the centre: on the virtual detector plane if the metadata hold `pixel_pitch` and
@@ -50,19 +49,19 @@ def write_png(
         `radiometry.in_unit`.
     BackendError : matplotlib is not installed.
     """
-    with png_file(image, path, unit, wavelength_nm):
+    with png_file(image, path, unit, light):
         pass
 
 
 def png_file(
-    image: ImageData, path: str | os.PathLike[str], unit: str = "W", wavelength_nm: float | None = None
+    image: ImageData, path: str | os.PathLike[str], unit: str = "W", light: Light | None = None
 ) -> AbstractContextManager[None]:
     """Context manager that writes the file of `write_png` before its block and renames it to `path` after it.
 
     An exception in the block leaves `path` unchanged. Raises as `write_png`.
     """
     path = require_png(path)
-    return figure_file(draw_panels([image], unit=unit, wavelength_nm=wavelength_nm), path)
+    return figure_file(draw_panels([image], unit=unit, light=light), path)
 
 
 def write_comparison_png(
@@ -127,10 +126,10 @@ def plot_image(
     limits: tuple[float, float] | None = None,
     outline: bool = False,
     unit: str = "W",
-    wavelength_nm: float | None = None,
+    light: Light | None = None,
 ) -> Axes:
     """As `Image.plot`, and of an exposure."""
-    shown = _shown(image, unit, wavelength_nm)
+    shown = _shown(image, unit, light)
     scale = _scale([shown], log=log, limits=limits)
     axes = _own_axes(axes)
     draw_image(axes, image, scale, shown.values, outline=outline)
@@ -187,7 +186,7 @@ def draw_panels(
     per_panel: bool = False,
     outline: bool = False,
     unit: str = "W",
-    wavelength_nm: float | None = None,
+    light: Light | None = None,
 ) -> Figure:
     """Figure with a panel for each image, up to `COLUMNS` in a row.
 
@@ -198,7 +197,7 @@ def draw_panels(
     log, limits : of the colour scale, limits in the unit that is shown; see `ColourScale.over`
     per_panel : a colour scale for each image; False: one for all
     outline : draw the outline of the phantom, where the coverage is 1/2
-    unit, wavelength_nm : what is shown, see `radiometry.in_unit`; totals in titles are in W
+    unit, light : what is shown, see `radiometry.in_unit`; totals in titles are in W
 
     Raises
     ------
@@ -210,7 +209,7 @@ def draw_panels(
         raise ImageError("picture: no images to draw. Give one or more.")
     if per_panel and limits is not None:
         raise ImageError("picture: one range for all panels and a scale for each exclude each other. Leave one out.")
-    shown = [_shown(image, unit, wavelength_nm) for image in images]
+    shown = [_shown(image, unit, light) for image in images]
     scales = [_scale([one], log=log) for one in shown]
     if not per_panel:
         scales = [_scale(shown, log=log, limits=limits)] * len(images)
@@ -250,14 +249,14 @@ def _panel_grid(images: Sequence[ImageData | Electrons], wide: bool) -> tuple[Fi
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _shown(image: ImageData | Electrons, unit: str, wavelength_nm: float | None) -> Converted:
+def _shown(image: ImageData | Electrons, unit: str, light: Light | None) -> Converted:
     """Values of an image in a unit, see `radiometry.in_unit`; electrons of an exposure, whatever `unit` is "W"."""
     if not isinstance(image, Electrons):
-        return in_unit(image, unit, wavelength_nm)
-    if unit != "W" or wavelength_nm is not None:
+        return in_unit(image, unit, light)
+    if unit != "W" or light is not None:
         raise ImageError(
-            f"picture: electrons have no unit '{unit}' and no wavelength to choose. Leave both out, or draw the image "
-            "that was exposed."
+            f"picture: electrons have no unit '{unit}' and no light to choose. Leave both out, or draw the image that "
+            "was exposed."
         )
     return Converted(image.electrons.astype(np.float64), None, "electrons", "e-", None)
 

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..optics.light import Light
 from ..optics.pixel_etendue import pixel_etendues
 from ..optics.thin_lens import Lens, number_names
 from ..runtime.errors import ImageError, OpticsError
-from ..runtime.wavelength import wavelength
 from .formats import Metadata, write_planes
 from .image_data import ImageData
 from .pixel_axes import PixelAxes
 
-PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c [J m], both exact in the SI
 UNITS = {"W": "power", "photons/s": "photon_rate", "p/s/cm2/sr": "radiance"}  # with the quantity of each
 RADIANCE = "photons/s/cm²/sr"
 SQUARE_MM_PER_CM = 100.0
@@ -32,37 +29,35 @@ class Converted:
 
     values, error : shape (h, w) [unit]; error None if the image has none
     quantity, unit : 'power' in 'W', 'photon_rate' in 'photons/s' or 'radiance' in 'photons/s/cm²/sr'
-    wavelength_nm : None for watts
+    light : None for watts
     """
 
     values: NDArray[np.floating]
     error: NDArray[np.floating] | None
     quantity: str
     unit: str
-    wavelength_nm: float | None
+    light: Light | None
 
     def write(self, path: str | os.PathLike[str], image: ImageData) -> None:
         """Write values, error and the coverage and metadata of `image`, which this is made of, as `Image.write` does.
 
-        The metadata state quantity, unit and wavelength. Raises as `Image.write`.
+        The metadata state quantity, unit and light. Raises as `Image.write`.
         """
         planes = {self.quantity: self.values, "error": self.error, "coverage": image.coverage}
         entries: Metadata = {"quantity": self.quantity, "unit": self.unit}
-        entries |= {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
+        entries |= {} if self.light is None else self.light.metadata()
         write_planes(path, {name: p for name, p in planes.items() if p is not None}, image.metadata | entries)
 
 
-def require_unit(unit: str, wavelength_nm: float | None) -> None:
-    """Raise ImageError for a unit that does not exist, a wavelength outside 200 … 2500 nm, or one with watts."""
+def require_unit(unit: str, light: Light | None) -> None:
+    """Raise ImageError for a unit that does not exist, or a light given with watts."""
     if unit not in UNITS:
         raise ImageError(f"image: 'unit' must be one of {', '.join(UNITS)}, got '{unit}'. Give one of these.")
-    if wavelength_nm is not None:
-        wavelength("image: 'wavelength_nm'", wavelength_nm, ImageError)
-    if unit == "W" and wavelength_nm is not None:
-        raise ImageError(f"image: 'wavelength_nm' = {wavelength_nm:g} has no meaning for watts. Leave it out.")
+    if unit == "W" and light is not None:
+        raise ImageError(f"image: {light.argument} has no meaning for watts. Leave it out.")
 
 
-def in_unit(image: ImageData, unit: str, wavelength_nm: float | None = None) -> Converted:
+def in_unit(image: ImageData, unit: str, light: Light | None = None) -> Converted:
     """Image in a unit of `UNITS`: W, photons/s or p/s/cm2/sr.
 
     The radiance is that of a surface in focus: P/(τ G ⟨cos⁴θ⟩), with the étendue of each pixel (Eq. M.6); 0 on pixels
@@ -70,47 +65,21 @@ def in_unit(image: ImageData, unit: str, wavelength_nm: float | None = None) -> 
 
     Raises
     ------
-    ImageError : there is no such unit; the wavelength is missing, not in 200 … 2500 nm, not the one that the image was
-        rendered for, or given for watts; the metadata do not describe the lens.
+    ImageError : there is no such unit; the light is missing, not the one that the image was rendered for, or given for
+        watts; the metadata do not describe the lens.
     """
-    require_unit(unit, wavelength_nm)
+    require_unit(unit, light)
     if unit == "W":  # without copies, to save memory
         return Converted(image.power, image.error, UNITS[unit], unit, None)
-    nanometres = wavelength_of(image, wavelength_nm)
-    factor: Plane | float = nanometres * 1e-9 / PLANCK_TIMES_LIGHT  # photons per joule
+    light = Light.of_image(image.metadata, light)
+    factor: Plane | float = light.photons_per_joule
     if unit != "photons/s":
         etendues = etendue(image)
         inverse = np.divide(SQUARE_MM_PER_CM, etendues, out=np.zeros_like(etendues), where=etendues > 0)
         factor, unit = factor * inverse, RADIANCE
     quantity = "radiance" if unit == RADIANCE else UNITS[unit]
     error = None if image.error is None else (image.error * factor).astype(np.float64)
-    return Converted((image.power * factor).astype(np.float64), error, quantity, unit, nanometres)
-
-
-def wavelength_of(image: ImageData, wavelength_nm: float | None) -> float:
-    """Wavelength [nm], given or that of the image's filter.
-
-    Raises
-    ------
-    ImageError : there is none, it is not in 200 … 2500 nm, or the given one is not that of the filter.
-    """
-    return wavelength_by(image.metadata, wavelength_nm)
-
-
-def wavelength_by(metadata: Mapping[str, object], wavelength_nm: float | None) -> float:
-    """Wavelength [nm] of an image with these metadata, or of a lens with these numbers; raises as `wavelength_of`."""
-    own: Any = metadata.get("wavelength_nm")
-    if wavelength_nm is None:
-        if own is None:
-            raise ImageError("image: photons need a wavelength, the image has none. Give wavelength_nm, say 660.")
-        return wavelength("image: 'wavelength_nm' of its metadata", own, ImageError)
-    found = wavelength("image: 'wavelength_nm'", wavelength_nm, ImageError)
-    if own is not None and found != float(own):
-        raise ImageError(
-            f"image: 'wavelength_nm' = {found:g}, but the image was rendered for {float(own):g} nm, by its filter's "
-            "curve. Leave it out, or render at that wavelength."
-        )
-    return found
+    return Converted((image.power * factor).astype(np.float64), error, quantity, unit, light)
 
 
 def etendue(image: ImageData) -> Plane:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..optics.light import Light
 from ..runtime.errors import ImageError
 from .image_data import ImageData
 from .pixel_axes import PixelAxes
@@ -67,7 +68,7 @@ HEADINGS = {
 
 
 def measure(
-    image: ImageData, region: str | os.PathLike[str] | Mask | None = None, wavelength_nm: float | None = None
+    image: ImageData, region: str | os.PathLike[str] | Mask | None = None, light: Light | None = None
 ) -> Measurement:
     """Radiometric quantities of the light from a region of an image, without its masked pixels.
 
@@ -75,7 +76,7 @@ def measure(
     ----------
     image : power [W]
     region : mask (h, w) of True and False, or text or a file's name as of `region_mask`; None: all pixels
-    wavelength_nm : of the light [nm]; None: that of the image's filter
+    light : None: that of the image, by its lens and filter
 
     Raises
     ------
@@ -91,7 +92,7 @@ def measure(
     if not mask.any():
         name = f"region '{region}'" if isinstance(region, str) else "region"
         raise ImageError(f"{name}: all its {masked} pixels are masked. Give another one, or expose for a shorter time.")
-    converted = in_unit(image, "p/s/cm2/sr", wavelength_nm)
+    converted = in_unit(image, "p/s/cm2/sr", light)
     side = PixelAxes.of(image.shape, image.metadata).step
     area = side**2 / SQUARE_MM_PER_CM  # of a pixel
     values, count = converted.values[mask], int(mask.sum())

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from ..images.image import Image
 from ..images.pixel_axes import virtual_pitch
-from ..images.radiometry import PLANCK_TIMES_LIGHT, etendue
+from ..images.radiometry import etendue
+from ..optics.light import PLANCK_TIMES_LIGHT
 from ..optics.models import model_names
 from ..rendering.live_scene import LiveScene
 from ..rendering.scene_rules import is_number

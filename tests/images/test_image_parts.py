@@ -9,6 +9,7 @@ from small_scenes import camera_scene, disk
 import mitsuba_fspt as fspt
 from mitsuba_fspt.images.radiometry import etendue
 from mitsuba_fspt.inverse.measurement import noise_of
+from mitsuba_fspt.optics.light import Light
 from mitsuba_fspt.runtime.errors import ImageError
 
 CCD = fspt.Detector.typical_ccd()
@@ -119,7 +120,7 @@ def test_masks_unite_and_other_pixels_are_refused(image):
 def test_a_region_and_an_exposure_are_those_of_the_verbs(image):
     from mitsuba_fspt.images.regions import measure
 
-    assert image.roi("25%", 660) == measure(image, "25%", 660)
+    assert image.roi("25%", 660) == measure(image, "25%", Light.given(660))
     assert image.roi(wavelength_nm=660).pixels == 40 * 32
     assert image.roi(image.power > 0, 660).pixels == np.count_nonzero(image.power)
     with pytest.raises(ImageError, match=r"a mask of shape \(4,\) does not fit"):

@@ -13,6 +13,7 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.images.formats import read_planes
 from mitsuba_fspt.images.picture import draw_panels
 from mitsuba_fspt.images.radiometry import RADIANCE, etendue, in_unit
+from mitsuba_fspt.optics.light import Light
 from mitsuba_fspt.runtime.errors import BackendError, DetectorError, ImageError
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -46,7 +47,7 @@ def test_a_focused_lambert_disk_has_the_radiance_of_its_exitance(settings):
 
 def test_a_stop_leaves_no_light_and_no_radiance_outside():
     image = fspt.render(camera_scene(disk(165), exitance=2.0, image_stop_diameter=8.0), method="integral", rtol=1e-4)
-    radiance = in_unit(image, "p/s/cm2/sr", 660).values
+    radiance = in_unit(image, "p/s/cm2/sr", Light.given(660)).values
     assert radiance[0, 0] == 0
     assert radiance[HEIGHT // 2, WIDTH // 2] == pytest.approx(200 / math.pi * PER_JOULE, rel=1e-4)
 
@@ -75,7 +76,7 @@ def test_pixels_cut_by_a_border_have_the_radiance_of_the_others_at_their_centres
 
 def test_photons_and_watts():
     image = fspt.Image([[1e-9, 0.0]], [[1e-12, 0.0]], metadata={"f_number": 8.0})
-    photons = in_unit(image, "photons/s", 660)
+    photons = in_unit(image, "photons/s", Light.given(660))
     assert photons.values[0, 0] == pytest.approx(1e-9 * PER_JOULE, rel=1e-12)
     assert photons.error[0, 0] == pytest.approx(1e-12 * PER_JOULE, rel=1e-12)
     assert (photons.quantity, photons.unit) == ("photon_rate", "photons/s")
@@ -88,10 +89,10 @@ def test_photons_and_watts():
 )
 def test_a_picture_in_photons_shows_their_numbers_beside_its_colours(unit, label):
     image = fspt.render(camera_scene(disk(165, 400.0), exitance=2.0), method="integral")
-    figure = draw_panels([image], unit=unit, wavelength_nm=660)
+    figure = draw_panels([image], unit=unit, light=Light.given(660))
     (axes,) = figure.axes
     (bar,) = axes.child_axes
-    values = in_unit(image, unit, 660).values
+    values = in_unit(image, unit, Light.given(660)).values
     factor = 10.0 ** int(re.search(r"\{(\d+)\}", label)[1])
     np.testing.assert_allclose(axes.get_images()[0].get_array(), values / factor)
     assert bar.get_ylabel() == label
@@ -102,7 +103,7 @@ def test_a_picture_in_photons_shows_their_numbers_beside_its_colours(unit, label
 def test_files_in_another_unit(tmp_path, suffix):
     """They state it, and `read` does not take them for watts."""
     image = fspt.render(camera_scene(disk(165)), method="integral", rtol=1e-2)
-    in_unit(image, "p/s/cm2/sr", 660).write(tmp_path / f"a{suffix}", image)
+    in_unit(image, "p/s/cm2/sr", Light.given(660)).write(tmp_path / f"a{suffix}", image)
     planes, metadata = read_planes(tmp_path / f"a{suffix}")
     assert (metadata["quantity"], metadata["unit"], metadata["wavelength_nm"]) == ("radiance", RADIANCE, 660)
     assert set(planes) == {"radiance", "error", "coverage"}
@@ -124,7 +125,7 @@ def test_files_in_another_unit(tmp_path, suffix):
 )
 def test_units_that_cannot_be(unit, wavelength, message):
     with pytest.raises(ImageError, match=message):
-        in_unit(fspt.Image([[1.0]]), unit, wavelength)
+        in_unit(fspt.Image([[1.0]]), unit, Light.given(wavelength))
 
 
 def test_metadata_of_no_lens():
@@ -136,10 +137,10 @@ def test_metadata_of_no_lens():
 def test_the_wavelength_of_a_filter_is_that_of_the_image():
     """Another one would use the transmittance of the first: a wrong number without a word."""
     image = fspt.Image([[1e-12]], metadata={"wavelength_nm": 600.0, "pixel_pitch": 0.0135})
-    assert in_unit(image, "photons/s").wavelength_nm == 600
-    assert in_unit(image, "photons/s", 600).wavelength_nm == 600
+    assert in_unit(image, "photons/s").light.wavelength_nm == 600
+    assert in_unit(image, "photons/s", Light.given(600)).light.wavelength_nm == 600
     with pytest.raises(ImageError, match="'wavelength_nm' = 660, but the image was rendered for 600 nm"):
-        in_unit(image, "photons/s", 660)
+        in_unit(image, "photons/s", Light.given(660))
     camera = fspt.Detector.typical_ccd()
     camera.expose(image, 1.0, 600)
     with pytest.raises((ImageError, DetectorError), match="rendered for 600 nm"):

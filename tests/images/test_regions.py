@@ -13,6 +13,7 @@ from small_scenes import SIDE, camera_scene, disk
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.images.regions import Measurement, measure, region_mask
+from mitsuba_fspt.optics.light import Light
 from mitsuba_fspt.runtime.errors import ImageError
 
 PER_JOULE = 660e-9 / (6.62607015e-34 * 299792458.0)
@@ -26,7 +27,7 @@ def image(mono):
 
 def test_the_flux_of_a_disk_is_its_power(image):
     """All its pixels: π L A = J_n π r² in photons. Seen to fail with 4π for π."""
-    found = measure(image, wavelength_nm=660)
+    found = measure(image, light=Light.given(660))
     assert found.total_flux == pytest.approx(2.0 * math.pi * 81 * PER_JOULE, rel=1e-4)
     assert found.power == pytest.approx(image.power.sum())
     assert found.pixels == image.power.size
@@ -34,7 +35,7 @@ def test_the_flux_of_a_disk_is_its_power(image):
 
 
 def test_radiance_within_the_disk(image):
-    found = measure(image, "circle:20,16,8", 660)
+    found = measure(image, "circle:20,16,8", Light.given(660))
     expected = 200 / math.pi * PER_JOULE
     assert (found.mean_radiance, found.max_radiance) == pytest.approx((expected, expected), rel=1e-4)
     assert found.min_radiance <= found.mean_radiance <= found.max_radiance
@@ -42,7 +43,7 @@ def test_radiance_within_the_disk(image):
     assert found.area == pytest.approx(math.pi * (8 * SIDE) ** 2 / 100, rel=0.04)
     assert 0 < found.mean_radiance_error < 1e-3 * expected
     assert found.total_flux_error == pytest.approx(math.pi * found.area * found.mean_radiance_error)
-    by_mask = measure(image, region_mask(image, "circle:20,16,8"), 660)
+    by_mask = measure(image, region_mask(image, "circle:20,16,8"), Light.given(660))
     assert by_mask == found
 
 
@@ -51,10 +52,10 @@ def test_errors_of_monte_carlo_add_up_in_squares_and_bounds_add_up(image):
     flat = {}
     for method in ("integral", "path"):
         plain = fspt.Image(np.full((5, 5), 1e-9), np.full((5, 5), 1e-11), metadata=lens | {"method": method})
-        flat[method] = measure(plain, wavelength_nm=660)
+        flat[method] = measure(plain, light=Light.given(660))
     assert flat["integral"].mean_radiance_error == pytest.approx(0.01 * flat["integral"].mean_radiance, rel=1e-3)
     assert flat["path"].mean_radiance_error == pytest.approx(0.01 / 5 * flat["path"].mean_radiance, rel=1e-3)
-    assert measure(fspt.Image(np.ones((2, 2)), metadata=lens), wavelength_nm=660).total_flux_error is None
+    assert measure(fspt.Image(np.ones((2, 2)), metadata=lens), light=Light.given(660)).total_flux_error is None
 
 
 def test_pixels_of_regions():
@@ -118,7 +119,7 @@ def test_the_verb(image, run, tmp_path, monkeypatch):
     assert [(row["image"], row["region"]) for row in rows] == [
         (name, region) for name in ("a.h5", "b.exr") for region in ("circle:20,16,8", "50%")
     ]
-    expected = measure(fspt.read("a.h5"), "circle:20,16,8", 660)
+    expected = measure(fspt.read("a.h5"), "circle:20,16,8", Light.given(660))
     assert Measurement(**{key: value for key, value in rows[0].items() if key not in ("image", "region")}) == expected
     code, out, err = run(*words)
     assert (code, err) == (0, "")
