@@ -271,9 +271,7 @@ def computed_on_worker(task: ViewTask, threads: int | None) -> ViewResult | Fspt
 
     backend.ensure_variant()
     backend.quiet_mitsuba()
-    import drjit as dr
-
-    dr.set_thread_count(get_worker().state.nthreads if threads is None else threads)
+    backend.set_threads(get_worker().state.nthreads if threads is None else threads)
     try:
         return computed(task)
     except FsptError as error:

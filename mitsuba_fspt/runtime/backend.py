@@ -149,7 +149,22 @@ def ensure_variant() -> str:
             " Call mi.set_variant('llvm_ad_mono') or 'cuda_ad_mono' first, or set none."
         )
     require_working_llvm(active)
+    import drjit
+
+    if drjit.thread_count() < 2:  # on one core
+        set_threads(2)
     return active
+
+
+def set_threads(count: int) -> None:
+    """Set the number of Dr.Jit's threads, at least two.
+
+    With one there is no worker thread, and Mitsuba's reader of EXR bitmaps, which gives its lines to worker threads,
+    never returns.
+    """
+    import drjit
+
+    drjit.set_thread_count(max(count, 2))
 
 
 def quiet_mitsuba() -> None:

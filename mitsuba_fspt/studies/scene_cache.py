@@ -11,7 +11,7 @@ from ..images.image import Image
 from ..rendering.provenance import remember_defaults
 from ..rendering.render import render
 from ..rendering.scene import load
-from ..runtime.backend import ensure_variant
+from ..runtime.backend import ensure_variant, set_threads
 from ..runtime.deadline import LEAST_TIME
 from ..runtime.errors import FsptError
 from .sweep_point import SweepPoint
@@ -80,13 +80,12 @@ class SceneCache:
     def _set_up_mitsuba(self) -> None:
         """Set a variant, the log level and the number of threads; once, before the first scene."""
         ensure_variant()
-        import drjit as dr
         import mitsuba as mi
 
         if self._quiet:
             mi.set_log_level(mi.LogLevel.Error)
         if self._threads is not None:
-            dr.set_thread_count(self._threads)
+            set_threads(self._threads)
 
 
 def _set_lens(scene: mi.Scene, point: SweepPoint) -> None:

@@ -267,3 +267,21 @@ def test_a_missing_libatomic_is_named_when_drjit_is_asked_for(monkeypatch: pytes
     assert watch.find_spec("numpy") is None
     with pytest.raises(BackendError, match=r"libatomic\.so\.1.*sudo apt install libatomic1"):
         watch.find_spec("drjit")
+
+
+@pytest.mark.parametrize("cores", ["one", "all"])
+def test_an_exr_is_read_with_one_core_or_thread(cores: str) -> None:
+    """Seen to hang, in Mitsuba's reader, where Dr.Jit has no worker thread beside the main one."""
+    if cores == "one" and not hasattr(os, "sched_setaffinity"):
+        pytest.skip("this system binds no process to a core")
+    script = f"""
+if {cores == "one"}:
+    os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])
+from mitsuba_fspt.runtime import backend
+backend.ensure_variant()
+if {cores == "all"}:
+    backend.set_threads(1)
+import mitsuba
+print(json.dumps(list(mitsuba.Bitmap({str(REPOSITORY / "scenes/textured_sphere.exr")!r}).size())))
+"""
+    assert run_script(script) == [512, 256]
