@@ -27,10 +27,10 @@ ARROWS = {
     "emission": {"runtime", "optics", "jit"},
     "integral": {"runtime", "phantom", "jit", "camera", "emission"},
     "plugins": {"runtime", "optics", "jit", "camera", "emission", "integral"},
-    "rendering": {"runtime", "images", "jit", "camera", "emission", "integral"},
+    "rendering": {"runtime", "optics", "images", "jit", "camera", "emission", "integral"},
     "detector": {"runtime", "optics", "images", "rendering"},
     "validation": {"runtime", "optics", "jit", "camera", "emission", "integral", "rendering"},
-    "studies": {"runtime", "optics", "images", "jit", "camera", "emission", "integral", "rendering", "validation"},
+    "studies": {"runtime", "images", "jit", "camera", "emission", "integral", "rendering", "validation"},
     "inverse": {
         "runtime",
         "optics",
@@ -43,7 +43,6 @@ ARROWS = {
         "emission",
         "integral",
         "rendering",
-        "studies",
     },
     "viewer": {"runtime", "optics", "images", "rendering"},
     "cli": {

@@ -93,9 +93,9 @@ def _views(phantom: Path, parameters: dict[str, str], framing: dict[str, Any]) -
     if wrong := [view for view in views if not is_number(view) or views.count(view) > 1]:
         raise SceneError(f"--view: must be different numbers of degrees, got '{wrong[0]}'. Give for example 0,90,180.")
     text, outline = text_and_outline(phantom, **lens | numbers | framing)
-    scenes = []
+    scenes, defaults = [], read_text(text, {}).defaults
     for view in views:
-        values = read_text(text, {}).defaults | {"view": view}
+        values = defaults | {"view": view}
         origin = " ".join([str(phantom), *(f"{name}={value}" for name, value in values.items())])
         placed = {name: float(number) for name, number in values.items()}
         warning = front_behind_focus(outline, placed, float(view))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from ..rendering.scene_xml import read_xml
+from ..rendering.scene_source import SceneSource
 from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.deadline import LEAST_TIME, Deadline, required_time
@@ -48,10 +48,12 @@ class Shot(NamedTuple):
     """One image to render.
 
     given : the scene
+    source : what is read of it
     output : the image to write
     """
 
     given: GivenScene
+    source: SceneSource
     output: Path
 
 
@@ -150,12 +152,12 @@ def _rendered(
         from ..camera.of_sensor import camera_of
         from ..optics.light import Light
         from ..rendering.render import render, sensor_of
-        from ..rendering.scene import load
+        from ..rendering.scene import load_source
         from ..runtime.plugin_types import is_lens
 
         quiet_mitsuba()
         for number, shot in enumerate(shots):
-            scene = load(shot.given.scene, **shot.given.parameters)
+            scene = load_source(shot.source)
             lens: Any = sensor_of(scene, settings["sensor"])
             if output.unit != "W" and is_lens(lens):  # before the work
                 Light.of_image(camera_of(lens).numbers(), output.light)
@@ -191,10 +193,11 @@ def required_scaling(
 def _shots(scene: Path, output: Path | None, scenes: list[GivenScene]) -> list[Shot]:
     """The scenes with the images to write: the name that was given, of several views with the view in the name."""
     output = output or Path((scene.stem or "image") + ".exr")
-    if len(scenes) == 1:
-        return [Shot(scenes[0], output)]
     suffix = output.suffix or ".exr"
-    return [Shot(one, output.with_name(f"{output.stem}_view{one.view}{suffix}")) for one in scenes]
+    several = [output.with_name(f"{output.stem}_view{one.view}{suffix}") for one in scenes]
+    outputs = [output] if len(scenes) == 1 else several
+    sources = [SceneSource.of(one.scene, one.parameters) for one in scenes]
+    return [Shot(*shot) for shot in zip(scenes, sources, outputs, strict=True)]
 
 
 def _picture(shot: Shot, png: bool) -> Path | None:
@@ -209,8 +212,7 @@ def _check_outputs(shots: list[Shot], inputs: list[Path], png: bool) -> None:
         picture = _picture(shot, png)
         if picture:
             require_picture(picture)
-        scene, parameters = shot.given.scene, shot.given.parameters
-        read = read_xml(scene, parameters).sources() if isinstance(scene, Path) else inputs
+        read = shot.source.files() if isinstance(shot.given.scene, Path) else inputs
         for written in (shot.output, picture) if picture else (shot.output,):
             require_apart(written, read, error=ImageError)
 

@@ -16,13 +16,13 @@ from ..detector.reduction import measured
 from ..detector.stray_light import StrayLight
 from ..images.exposure import Exposure
 from ..images.image import Image
+from ..rendering.parameters import texts_of
 from ..rendering.render import render
 from ..rendering.scene import load
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, named, renamed
 from ..runtime.progress_bar import Progress, reported
-from ..studies.sweep_point import texts_of
 from .calibrated_scene import write_calibrated
 from .calibration_fit import CalibrationFit, CalibrationSettings, Fitted, Measured
 from .derivatives import scene_text, varied_value

@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..rendering.parameters import texts_of
 from ..rendering.provenance import defaults_of, same_mesh, value_of
 from ..rendering.render import sensor_of, warnings_of
 from ..rendering.scene import load
+from ..rendering.scene_source import SceneSource
 from ..rendering.scene_xml import is_text
 from ..runtime import backend
 from ..runtime.deadline import Deadline, required_time
@@ -25,7 +27,6 @@ from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import whole
 from ..runtime.progress_bar import Progress, reported
 from ..runtime.versions import version, versions
-from ..studies.sweep_point import SceneSource, point_of, texts_of
 from .transport_file import FORMAT, PartialFile, read_transport
 from .transport_matrix import TransportMatrix
 from .view_block import (
@@ -191,9 +192,9 @@ def _origin(scene: Any, given: dict[str, str], digests: dict[Path, str]) -> str:
     """Text that changes with all that a view's scene depends on; the parameters of a file are checked."""
     versions = f"{version('mitsuba-fspt')} {version('mitsuba')}"
     if isinstance(scene, (str, os.PathLike)) and not is_text(scene):
-        if given:
-            return point_of(Path(scene), given, digests, {}).fingerprint
-        return f"{versions} {SceneSource(Path(scene), {}, digests).digests()}"
+        source = SceneSource.of(Path(scene), given, digests)
+        source.check_numbers()
+        return source.fingerprint({}) if given else f"{versions} {source.digests()}"
     if isinstance(scene, (str, Mapping)):
         return f"{versions} {scene}"
     return f"{versions} {scene}"
@@ -245,7 +246,7 @@ def _computed(
             within(0.0)
             yield k, computed(tasks[k], within)
         return
-    from ..studies.sweep_workers import results_of_cluster
+    from ..runtime.workers import results_of_cluster
 
     if missing and (not isinstance(tasks[0].scene, (str, os.PathLike)) or is_text(tasks[0].scene)):
         raise TransportError("transport: 'scheduler' needs a scene file, which its workers load. Give its name.")

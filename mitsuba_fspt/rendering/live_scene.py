@@ -15,10 +15,12 @@ from ..runtime.errors import SceneError
 from ..runtime.plugin_types import is_integral, is_lens, is_surface
 from ..runtime.progress_bar import Progress
 from .moved_shapes import Matrix, MovedShapes
+from .parameters import parameter_texts
 from .provenance import remember_defaults, source_of
 from .render import integrator_of, render, sensor_of
-from .scene import load, parameter_text, parsed, values_of
-from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
+from .scene import load, load_source, parsed
+from .scene_source import SceneSource
+from .scene_xml import TEXT, SceneXml, is_text
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -117,11 +119,12 @@ class LiveScene:
 
     A scene from `load` is replaced by the file or text that it was loaded from, with the values given then.
 
-    Images are those of the sensor number `sensor`. Numbers and pose of that lens are changed in place, without
-    compilation. In drafts, shapes that make a rigid motion are moved in place, too, and a motion common to all shapes
-    is replaced by the inverse motion of the lens; both give the same image but for rounding. Where the image must not
-    differ, and for all other changes, those of referenced files included, the scene is loaded again. `loads` counts how
-    often it was loaded.
+    Images are those of the sensor number `sensor`; with `any_sensor` it may be another one than an `fspt_lens`, and the
+    scene is then loaded for every image. Numbers and pose of the lens are changed in place, without compilation. In
+    drafts, shapes that make a rigid motion are moved in place, too, and a motion common to all shapes is replaced by
+    the inverse motion of the lens; both give the same image but for rounding. Where the image must not differ, and for
+    all other changes, those of referenced files included, the scene is loaded again. `loads` counts how often it was
+    loaded.
 
     Raises
     ------
@@ -134,25 +137,23 @@ class LiveScene:
         scene: mi.Scene | str | os.PathLike[str],
         parameters: Mapping[str, object] | None = None,
         sensor: int = 0,
+        *,
+        any_sensor: bool = False,
     ) -> None:
         parameters = parameters or {}
         if not isinstance(scene, (str, os.PathLike)):
             scene, before = _unchanged_source(scene)
             parameters = before | dict(parameters)
         self.source: str | os.PathLike[str] = scene
-        self.given = {name: parameter_text(value) for name, value in parameters.items()}
-        self.sensor = sensor
+        self.given = parameter_texts(parameters)
+        self.sensor, self._any_sensor = sensor, any_sensor
         self.loads = 0
         self._loaded: Loaded | None = None
 
     @property
     def xml(self) -> SceneXml:
         """The XML with the given values, read again."""
-        return self._read(self.given)
-
-    def _read(self, values: Mapping[str, str]) -> SceneXml:
-        """The XML with these values, read again."""
-        return read_text(str(self.source), values) if is_text(self.source) else read_xml(Path(self.source), values)
+        return SceneSource.of(self.source, self.given).xml
 
     def image(self, values: Mapping[str, object], model: str | None = None, progress: Progress | None = None) -> Image:
         """Image with these values of parameters and this lens `model`; None: the scene's own model.
@@ -161,7 +162,7 @@ class LiveScene:
         Raises what `load` and `render` raise; afterwards the object can still be used.
         """
         image = render(self.scene(values, model), sensor=self.sensor, progress=progress)
-        taken = self.given | _texts(values)
+        taken = self.given | parameter_texts(values)
         scene_id = " ".join([_name(self.source), *(f"{key}={text}" for key, text in taken.items())])
         return replace(image, metadata=image.metadata | {"scene": scene_id})
 
@@ -227,26 +228,27 @@ class LiveScene:
 
     def scene(self, values: Mapping[str, object], model: str | None = None, *, exact: bool = True) -> mi.Scene:
         """The Mitsuba scene with these values of its parameters and this `model` of its lens (None: its own)."""
-        wanted = self.given | _texts(values)
-        nodes = parsed(self.source, **wanted)
+        wanted = self.given | parameter_texts(values)
+        source = SceneSource.of(self.source, wanted)
+        nodes = parsed(source)
         now = self._loaded if self._loaded and self._loaded.is_current() else None
-        change = _change(now.nodes, nodes, self.sensor) if now else None
+        change = _change(now.nodes, nodes, self.sensor) if now and is_lens(sensor_of(now.scene, self.sensor)) else None
         change = now.with_shapes_moved(change, exact) if now and change else None
         if now is None or change is None:
             self._loaded = now = None  # memory for one scene, not two
-            self._loaded = now = self._load(wanted, nodes)
+            self._loaded = now = self._load(source, nodes)
             change = Change.of(nodes, self.sensor)
-        _apply(change, sensor_of(now.scene, self.sensor), model)
-        remember_defaults(now.scene, values_of(self.source, wanted))
+        if is_lens(lens := sensor_of(now.scene, self.sensor)):
+            _apply(change, lens, model)
+        remember_defaults(now.scene, source.values)
         return now.scene
 
-    def _load(self, wanted: Mapping[str, str], nodes: list[mi.parser.SceneNode]) -> Loaded:
-        """The scene with these values of its parameters, of which it has these elements."""
-        xml = self._read(wanted)
-        files = {file: _stamp(file) for file in xml.sources().difference(xml.files)}
-        scene = load(self.source, **wanted)
+    def _load(self, source: SceneSource, nodes: list[mi.parser.SceneNode]) -> Loaded:
+        """The scene of this source, of which it has these elements."""
+        files = {file: _stamp(file) for file in source.files().difference(source.xml.files)}
+        scene = load_source(source)
         self.loads += 1
-        if not is_lens(sensor_of(scene, self.sensor)):
+        if not self._any_sensor and not is_lens(sensor_of(scene, self.sensor)):
             raise SceneError(f"{_name(self.source)}: sensor {self.sensor} is no fspt_lens. Give one that is.")
         return Loaded(scene, nodes, MovedShapes(scene), files)
 
@@ -391,10 +393,6 @@ def _plain(value: object) -> object:
     """Value of a parameter of Mitsuba as NumPy compares it."""
     value = getattr(value, "matrix", value)
     return np.array(value) if hasattr(value, "shape") else value
-
-
-def _texts(values: Mapping[str, object]) -> dict[str, str]:
-    return {name: parameter_text(value) for name, value in values.items()}
 
 
 def _name(source: str | os.PathLike[str]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,8 +18,8 @@ from ..runtime.errors import SceneError
 from ..runtime.interrupt import ctrl_c_noted
 from ..runtime.ply_file import require_whole
 from .provenance import remember_defaults, remember_placements, remember_source
-from .scene_rules import check_text
-from .scene_xml import TEXT, SceneXml, is_text, read_text, read_xml
+from .scene_source import SceneSource
+from .scene_xml import TEXT
 
 COLOUR_FORMATS = ("rgb", "rgba", "xyz", "xyza")
 COLOURS = {  # plugins of colours and of spectra
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     Array = NDArray[np.float64]
-    Parser = Callable[[mi.parser.ParserConfig], mi.parser.ParserState]
 
 
 def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: object) -> mi.Scene:
@@ -52,43 +51,49 @@ def load(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: 
         parameter; one line with the cause.
     """
     backend.ensure_variant()
+    return load_source(SceneSource.of(scene, parameters))
+
+
+def load_source(source: SceneSource) -> mi.Scene:
+    """Mitsuba scene of a source, as of `load`."""
+    backend.ensure_variant()
     import mitsuba as mi
 
     from ..emission.of_emitter import probe_beside
 
-    path, folder, parse = _source_of(scene, parameters)
-    with _files_of(folder):
+    with _files_of(source.folder):
         config = _config()
-        state = parse(config)
-        _set_up(state, path, parameters)
+        state = _parsed(source, config)
+        _set_up(state, source)
         placements = _placements(state)
         mi.parser.transform_all(config, state)
         loaded = mi.parser.instantiate(config, state)
     loaded = loaded[0] if isinstance(loaded, list) else loaded
     probe_beside(loaded)
-    remember_defaults(loaded, values_of(scene, parameters))
+    remember_defaults(loaded, source.values)
     remember_placements(loaded, placements)
-    if not isinstance(scene, Mapping):
-        remember_source(loaded, scene, parameters)
+    if not isinstance(source.scene, Mapping):
+        remember_source(loaded, source.scene, source.parameters)
     return loaded
 
 
-def parsed(scene: str | os.PathLike[str] | Mapping[str, object], /, **parameters: object) -> list[mi.parser.SceneNode]:
+def parsed(source: SceneSource) -> list[mi.parser.SceneNode]:
     """Elements of a scene as `load` parses and checks them, before Mitsuba's objects are made; raises as `load`."""
     backend.ensure_variant()
-    _, folder, parse = _source_of(scene, parameters)
-    with _files_of(folder):
-        return list(parse(_config()).nodes)
+    with _files_of(source.folder):
+        return list(_parsed(source, _config()).nodes)
 
 
-def _source_of(scene: object, parameters: Mapping[str, object]) -> tuple[Path, Path, Parser]:
-    """Name of a scene for messages, folder in which its files are searched for, and the function that parses it."""
-    if isinstance(scene, Mapping):
-        return Path("dictionary"), Path(), _parser_of_dictionary(scene, parameters)
-    if is_text(scene):
-        return TEXT, Path(), _parser_of_text(str(scene), parameters)
-    path = _path_of(scene)
-    return path, path.resolve().parent, _parser_of_file(path, parameters)
+def _parsed(source: SceneSource, config: mi.parser.ParserConfig) -> mi.parser.ParserState:
+    """Mitsuba's elements of a source, after its check."""
+    import mitsuba as mi
+
+    source.check()
+    if isinstance(source.scene, Mapping):
+        return mi.parser.parse_dict(config, dict(source.scene))
+    if source.path is TEXT:
+        return mi.parser.parse_string(config, source.scene, **source.given)
+    return mi.parser.parse_file(config, str(source.path), **source.given)
 
 
 def _config() -> mi.parser.ParserConfig:
@@ -116,63 +121,14 @@ def _files_of(folder: Path) -> Iterator[None]:
         mi.set_file_resolver(resolver)
 
 
-def values_of(scene: object, parameters: Mapping[str, object]) -> dict[str, str]:
-    """Values of all `<default>` parameters of a scene as texts, with the given `parameters`; `scene` as of `load`."""
-    if isinstance(scene, Mapping):
-        return {}
-    given = _texts(parameters)
-    xml = read_text(str(scene), given) if is_text(scene) else read_xml(_path_of(scene), given)
-    return xml.defaults | given
-
-
-def _path_of(scene: object) -> Path:
-    """Name of a scene file as a path; SceneError if `scene` is no name of a file."""
-    if not isinstance(scene, (str, os.PathLike)):
-        raise SceneError(
-            f"scene: must be the name of a file, XML text or a dictionary, got {type(scene).__name__}. Give one."
-        )
-    return Path(scene)
-
-
-def _parser_of_file(path: Path, parameters: Mapping[str, object]) -> Parser:
-    """Function that parses a scene file with these values of its parameters, after their check."""
-    import mitsuba as mi
-
-    check_parameters(path, parameters)
-    check_text(path, _xml_of(path, parameters))
-    return lambda config: mi.parser.parse_file(config, str(path), **_texts(parameters))
-
-
-def _parser_of_text(text: str, parameters: Mapping[str, object]) -> Parser:
-    """Function that parses the XML text of a scene with these values of its parameters, after their check."""
-    import mitsuba as mi
-
-    xml = read_text(text, _texts(parameters))
-    _require_known(TEXT, xml, parameters)
-    check_text(TEXT, xml)
-    return lambda config: mi.parser.parse_string(config, text, **_texts(parameters))
-
-
-def _parser_of_dictionary(scene: Mapping[str, object], parameters: Mapping[str, object]) -> Parser:
-    """Function that parses a scene's dictionary, which has no parameters."""
-    import mitsuba as mi
-
-    if parameters:
-        names = ", ".join(f"'{name}'" for name in parameters)
-        raise SceneError(f"dictionary: a scene given so has no parameter {names}. Put the values into it.")
-    if scene.get("type") != "scene":
-        raise SceneError(f"dictionary: its 'type' is {scene.get('type')!r}, a scene has 'scene'. Give one.")
-    return lambda config: mi.parser.parse_dict(config, dict(scene))
-
-
-def _set_up(state: mi.parser.ParserState, path: Path, parameters: Mapping[str, object]) -> None:
+def _set_up(state: mi.parser.ParserState, source: SceneSource) -> None:
     """Set robust mode, ids and film formats of a parsed scene; SceneError if its root element is no scene."""
     root = state.root.props
     if root.plugin_name() != "scene":
-        raise SceneError(f"{path}: the root is <{root.plugin_name()}>, a scene file has <scene>. Give one.")
+        raise SceneError(f"{source.path}: the root is <{root.plugin_name()}>, a scene file has <scene>. Give one.")
     root["embree_use_robust_intersections"] = True
-    root.set_id(" ".join([str(path), *(f"{name}={text}" for name, text in _texts(parameters).items())]))
-    _refuse_colours(path, state)
+    root.set_id(" ".join([str(source.path), *(f"{name}={text}" for name, text in source.given.items())]))
+    _refuse_colours(source.path, state)
     _require_whole_meshes(state)
     _name_children(state)
     _set_film_formats(state)
@@ -204,37 +160,6 @@ def _placements(state: mi.parser.ParserState) -> dict[str, Array]:
 def loaded(scene: mi.Scene | str | os.PathLike[str] | Mapping[str, object]) -> mi.Scene:
     """`scene` itself, or the scene loaded from the file of that name, from XML text or from a dictionary."""
     return load(scene) if isinstance(scene, (str, os.PathLike, Mapping)) else scene
-
-
-def _texts(parameters: Mapping[str, object]) -> dict[str, str]:
-    """Texts of the parameters' values."""
-    return {name: parameter_text(value) for name, value in parameters.items()}
-
-
-def _xml_of(path: Path, parameters: Mapping[str, object]) -> SceneXml:
-    """XML of the scene file with these values of its parameters."""
-    return read_xml(path, _texts(parameters))
-
-
-def check_parameters(path: Path, parameters: Mapping[str, object]) -> None:
-    """Raise SceneError for a name that is no `<default>` of the file or of the files it includes with these values."""
-    _require_known(path, _xml_of(path, parameters), parameters)
-
-
-def _require_known(path: Path, xml: SceneXml, parameters: Mapping[str, object]) -> None:
-    """Raise SceneError for a name that is no `<default>` of this XML, or that the parser cannot set."""
-    known = xml.defaults
-    for name in parameters:
-        if name not in known:
-            names = ", ".join(known) or "none"
-            raise SceneError(f"{path}: the scene has no parameter '{name}'. Its <default> parameters: {names}.")
-        if name in ("config", "filename", "string"):  # names of arguments of Mitsuba's parser
-            raise SceneError(f"{path}: Mitsuba cannot set a parameter '{name}'. Give the <default> another name.")
-
-
-def parameter_text(value: object) -> str:
-    """Text of a parameter's value for Mitsuba's parser."""
-    return str(value).lower() if isinstance(value, (bool, np.bool_)) else str(value)
 
 
 def _refuse_colours(path: Path, state: mi.parser.ParserState) -> None:

@@ -220,12 +220,12 @@ def _images(missing: list[SweepPoint], jobs: int | None, scheduler: str | None, 
 
         yield from images_of_processes(missing, jobs)
     else:
-        from .scene_cache import SceneCache
+        from .point_renderer import PointRenderer
 
-        cache = SceneCache()
+        renderer = PointRenderer()
         for k, point in enumerate(missing):
             timed = point.within(deadline.left / (len(missing) - k)) if deadline.is_set else point
-            yield point, cache.image_or_error(timed)
+            yield point, renderer.image_or_error(timed)
 
 
 def _by_geometry(missing: Iterable[SweepPoint]) -> list[SweepPoint]:

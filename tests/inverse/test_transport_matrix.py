@@ -21,9 +21,9 @@ from mitsuba_fspt.inverse import transport as module
 from mitsuba_fspt.inverse.transport_file import PartialFile
 from mitsuba_fspt.inverse.view_block import Block
 from mitsuba_fspt.rendering.provenance import mesh_digest, same_mesh
+from mitsuba_fspt.runtime import workers
 from mitsuba_fspt.runtime.errors import SceneError, TransportError
-from mitsuba_fspt.studies import sweep_workers
-from mitsuba_fspt.studies.sweep_workers import LOCAL_CLUSTER
+from mitsuba_fspt.runtime.workers import LOCAL_CLUSTER
 
 pytestmark = pytest.mark.usefixtures("mono")
 
@@ -229,7 +229,7 @@ def test_a_cluster_loses_a_worker(scene_file, tmp_path, monkeypatch):
 def test_a_scheduler_that_does_not_answer_is_named_by_the_matrix(scene_file, run, tmp_path, monkeypatch):
     """One line; views that are finished stay."""
     pytest.importorskip("distributed")
-    monkeypatch.setattr(sweep_workers, "SCHEDULER_TIMEOUT", 0.5)
+    monkeypatch.setattr(workers, "SCHEDULER_TIMEOUT", 0.5)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "T.npz.views").mkdir()
     code, out, err = run("matrix", scene_file, "-o", "T.npz", "--scheduler", "tcp://127.0.0.1:9")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import multiprocessing
-import operator
 import os
 import re
 import signal
@@ -12,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
@@ -23,10 +23,13 @@ from small_scenes import BALL_XML, LENS_XML, write_ply, write_scene
 import mitsuba_fspt as fspt
 from mitsuba_fspt.cli.options import several
 from mitsuba_fspt.images import picture
+from mitsuba_fspt.rendering import live_scene
+from mitsuba_fspt.rendering.scene_source import SceneSource
+from mitsuba_fspt.runtime import workers
 from mitsuba_fspt.runtime.errors import BackendError, ImageError, SceneError
-from mitsuba_fspt.studies import scene_cache, sweep, sweep_workers
+from mitsuba_fspt.studies import sweep, sweep_workers
+from mitsuba_fspt.studies.point_renderer import PointRenderer
 from mitsuba_fspt.studies.sweep import write_contact_sheet
-from mitsuba_fspt.studies.sweep_point import SceneSource
 
 F_NUMBERS, DISTANCES = ("2.8", "8"), ("165", "175")
 VALUES = {"f_number": F_NUMBERS, "distance": DISTANCES}
@@ -52,18 +55,18 @@ def scene(tmp_path, monkeypatch):
 def calls(monkeypatch):
     """Points rendered and scenes loaded in this process, by label and parameters."""
     rendered, loaded = [], []
-    image, load = scene_cache.SceneCache.image, scene_cache.load
+    image, load = PointRenderer.image, live_scene.load_source
 
     def counting_image(self, point):
         rendered.append(point.label)
         return image(self, point)
 
-    def counting_load(path, **parameters):
-        loaded.append(parameters)
-        return load(path, **parameters)
+    def counting_load(source):
+        loaded.append(source.given)
+        return load(source)
 
-    monkeypatch.setattr(scene_cache.SceneCache, "image", counting_image)
-    monkeypatch.setattr(scene_cache, "load", counting_load)
+    monkeypatch.setattr(PointRenderer, "image", counting_image)
+    monkeypatch.setattr(live_scene, "load_source", counting_load)
     return rendered, loaded
 
 
@@ -245,7 +248,7 @@ def test_a_sweep_needs_the_file(scene, kind):
     ],
 )
 def test_a_lens_parameter_sets_numbers_of_the_only_lens_and_nothing_else(tmp_path, more, sensor, expected):
-    assert SceneSource(write_scene(tmp_path / "x.xml", more=more, sensor=sensor)).lens_parameters() == expected
+    assert SceneSource.of(write_scene(tmp_path / "x.xml", more=more, sensor=sensor)).lens_parameters() == expected
 
 
 # --- what is there is not rendered again ---
@@ -357,41 +360,44 @@ def test_a_parameter_of_a_file_that_another_parameter_names(tmp_path):
 
 def hold_all_but_the_first_point():
     """From here on this process renders other points only once there is a file 'go' in the current folder."""
-    image = scene_cache.SceneCache.image
+    image = PointRenderer.image
 
     def held(self, point):
         while point.label != "f_number=2.8 distance=165" and not os.path.exists("go"):
             time.sleep(0.01)
         return image(self, point)
 
-    scene_cache.SceneCache.image = held
+    PointRenderer.image = held
 
 
-def work_held(connection, threads):
-    """What a process of the test below runs."""
+def begin_held(threads, main):
+    """How a process of the test below begins."""
     hold_all_but_the_first_point()
-    sweep_workers._work(connection, threads)
+    sweep_workers._begin(threads, main)
+
+
+def end_at_once(threads, main):
+    """How a process begins that ends before it renders a point."""
+    os._exit(1)
 
 
 def test_two_processes_one_of_them_killed(scene, tmp_path, monkeypatch, serial):
     """Both are at a point when the first is done, however slowly this process handles it."""
     started, killed = [], []
-    start = sweep_workers._Worker.__init__
 
-    def counting(self, threads):
-        start(self, threads)
-        started.append(self)
+    def counting(count, context, _, arguments):
+        started.append(ProcessPoolExecutor(count, context, begin_held, arguments))
+        return started[-1]
 
     def kill_one(what, share):
         if share == 0.25:
-            child = next(child for child in multiprocessing.active_children() if child.pid == started[0]._process.pid)
+            (child,) = started[0]._processes.values()
             os.kill(child.pid, signal.SIGKILL)
             killed.append(child.pid)
             child.join()
             Path("go").touch()
 
-    monkeypatch.setattr(sweep_workers, "_work", work_held)
-    monkeypatch.setattr(sweep_workers._Worker, "__init__", counting)
+    monkeypatch.setattr(sweep_workers, "ProcessPoolExecutor", counting)
     rows = fspt.sweep(scene, VALUES, "o", jobs=2, progress=kill_one)
     assert len(killed) == 1
     assert len(started) == 3  # one in place of the dead, none more
@@ -401,7 +407,7 @@ def test_two_processes_one_of_them_killed(scene, tmp_path, monkeypatch, serial):
 
 
 def test_a_point_that_kills_every_process_is_named(scene, monkeypatch):
-    monkeypatch.setattr(sweep_workers, "_work", operator.is_)  # ends at once
+    monkeypatch.setattr(sweep_workers, "_begin", end_at_once)
     with pytest.raises(BackendError, match=r"3 worker processes died at f_number=8\. Give it more memory"):
         fspt.sweep(scene, {"f_number": [8]}, "o", jobs=2)
 
@@ -425,7 +431,7 @@ def test_a_cluster_of_two_workers_one_of_them_killed(scene, tmp_path, serial):
                 killed.append(busy)
             Path("go").touch()
 
-    with distributed.LocalCluster(n_workers=2, **sweep_workers.LOCAL_CLUSTER, silence_logs=50) as cluster:
+    with distributed.LocalCluster(n_workers=2, **workers.LOCAL_CLUSTER, silence_logs=50) as cluster:
         with distributed.Client(cluster) as client:
             client.run(hold_all_but_the_first_point)
         rows = fspt.sweep(scene, VALUES, "o", scheduler=cluster.scheduler_address, progress=kill_one)
@@ -483,7 +489,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, arguments, mess
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
 def test_a_scheduler_that_does_not_answer(run, tmp_path, monkeypatch, address):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(sweep_workers, "SCHEDULER_TIMEOUT", 0.5)
+    monkeypatch.setattr(workers, "SCHEDULER_TIMEOUT", 0.5)
     code, out, err = run("sweep", "s.xml", *DEFINE, "--scheduler", address)
     assert (code, out) == (2, "")
     assert err == (
@@ -666,7 +672,7 @@ def test_each_point_gets_its_part_of_the_time(scene, monkeypatch):
         given.append(point.max_time)
         raise SceneError("not rendered")
 
-    monkeypatch.setattr(scene_cache.SceneCache, "image", instant)
+    monkeypatch.setattr(PointRenderer, "image", instant)
     with pytest.raises(SceneError):
         sweep.sweep(scene, VALUES, "o", max_time=80)
     assert given == pytest.approx([20, 80 / 3, 40, 80], abs=2)

@@ -1,39 +1,32 @@
-"""The scene cache of a sweep: the last loaded scene is used again where only numbers of its lens differ."""
+"""Renders the points of a sweep; the last loaded scene is used again where only its lens differs."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import replace
 from threading import Lock
-from typing import TYPE_CHECKING
 
+from ..images.formats import Metadata
 from ..images.image import Image
-from ..rendering.provenance import remember_defaults
+from ..rendering.live_scene import LiveScene
 from ..rendering.render import render
-from ..rendering.scene import load
 from ..runtime.backend import ensure_variant, set_threads
 from ..runtime.deadline import LEAST_TIME
 from ..runtime.errors import FsptError
 from .sweep_point import SweepPoint
 
-if TYPE_CHECKING:
-    import mitsuba as mi
 
-
-class SceneCache:
+class PointRenderer:
     """Renders the points of a sweep one at a time and keeps the last scene.
 
-    The images are equal to the bit to those of a scene that is loaded for each point. `loads` counts the scenes that
-    were loaded.
+    The images are equal to the bit to those of a scene that is loaded for each point.
     """
 
     def __init__(self, *, threads: int | None = None, quiet: bool = False) -> None:
         """`threads`: number of Dr.Jit's threads (None leaves it unchanged); `quiet`: no warnings of Mitsuba."""
         self._threads, self._quiet = threads, quiet
-        self._scene: mi.Scene | None = None
-        self._geometry = ""
+        self._live: LiveScene | None = None
         self._one_at_a_time = Lock()
-        self.loads = 0
 
     def image(self, point: SweepPoint) -> Image:
         """Image of a point, with `fingerprint` in its metadata.
@@ -45,7 +38,7 @@ class SceneCache:
                 settings = dict(point.settings)
                 watt = settings.pop("source_power")
                 start = time.monotonic()
-                scene = self._set_up(point)
+                scene = self._live_scene(point).scene(point.parameters)
                 taken = time.monotonic() - start
                 left = None if point.max_time is None else max(point.max_time - taken, LEAST_TIME)
                 image = render(scene, max_time=left, **settings)  # type: ignore[arg-type]
@@ -53,7 +46,7 @@ class SceneCache:
         except FsptError as error:
             raise type(error)(f"{point.label}: {error}") from error
         stopped = " stopped" if "stopped_after" in image.metadata else ""  # a later sweep renders it anew
-        origin = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint + stopped}
+        origin: Metadata = {"scene": f"{point.scene} {point.label}", "fingerprint": point.fingerprint + stopped}
         return replace(image, metadata=image.metadata | origin)
 
     def image_or_error(self, point: SweepPoint) -> Image | FsptError:
@@ -63,19 +56,15 @@ class SceneCache:
         except FsptError as error:
             return error
 
-    def _set_up(self, point: SweepPoint) -> mi.Scene:
-        """The scene of a point, loaded or with its lens changed."""
-        scene = self._scene if self._geometry == point.geometry else None
-        self._scene = None  # if the set-up fails, no partly changed scene is kept
-        if scene is not None:
-            _set_lens(scene, point)
-        else:
-            if self.loads == 0:
-                self._set_up_mitsuba()
-            scene = load(point.path, **point.parameters)
-            self.loads += 1
-        self._scene, self._geometry = scene, point.geometry
-        return scene
+    def _live_scene(self, point: SweepPoint) -> LiveScene:
+        """The scene of the point's file and sensor, the last one if it fits."""
+        sensor = int(point.settings["sensor"] or 0)
+        if self._live is None:
+            self._set_up_mitsuba()
+        if self._live is None or (self._live.source, self._live.sensor) != (point.path, sensor):
+            self._live = None  # memory for one scene, not two
+            self._live = LiveScene(point.path, sensor=sensor, any_sensor=True)
+        return self._live
 
     def _set_up_mitsuba(self) -> None:
         """Set a variant, the log level and the number of threads; once, before the first scene."""
@@ -86,15 +75,3 @@ class SceneCache:
             mi.set_log_level(mi.LogLevel.Error)
         if self._threads is not None:
             set_threads(self._threads)
-
-
-def _set_lens(scene: mi.Scene, point: SweepPoint) -> None:
-    """Set the numbers of the scene's lens to those of the point."""
-    import mitsuba as mi
-
-    numbers = mi.traverse(scene.sensors()[0])
-    for parameter, names in point.lens.items():
-        for name in names:
-            numbers[name] = float(point.parameters[parameter])
-    numbers.update()
-    remember_defaults(scene, point.parameters)
