@@ -248,7 +248,7 @@ class LiveScene:
         files = {file: _stamp(file) for file in source.files().difference(source.xml.files)}
         scene = load_source(source)
         self.loads += 1
-        if not self._any_sensor and not is_lens(sensor_of(scene, self.sensor)):
+        if not is_lens(sensor_of(scene, self.sensor)) and not self._any_sensor:
             raise SceneError(f"{_name(self.source)}: sensor {self.sensor} is no fspt_lens. Give one that is.")
         return Loaded(scene, nodes, MovedShapes(scene), files)
 

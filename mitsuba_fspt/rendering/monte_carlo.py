@@ -73,7 +73,7 @@ def passes(
 
     for seed in seeds:
         with dr.suspend_grad(), recording():
-            image = integrator.render(scene, lens, seed=seed, spp=spp)
+            image = integrator.render(scene, lens, seed=seed, spp=spp)  # type: ignore[call-overload]  # seed: int
         yield np.array(image, np.float64)[..., 0], lens.sampler().sample_count()
 
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,15 +91,15 @@ def render(
     backend.ensure_variant()
     sensor = whole("render: 'sensor'", sensor, SceneError, "0")
     deadline = Deadline(max_time := required_time("render", max_time, SceneError))
-    lens = sensor_of(scene, sensor)
-    accuracy = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes, "max_specular": max_specular}
-    accuracy["shortcuts_off"] = None if shortcuts else frozenset(SHORTCUTS)
+    lens: Any = sensor_of(scene, sensor)
+    accuracy: dict[str, Any] = {"rtol": rtol, "domain": domain, "pixel": pixel, "max_nodes": max_nodes}
+    accuracy |= {"max_specular": max_specular, "shortcuts_off": None if shortcuts else frozenset(SHORTCUTS)}
     integrator = _integrator(scene, lens, method, accuracy, {"spp": spp, "seed": seed}, max_depth)
     with reported(progress) as report:
-        *planes, how = _timed(scene, lens, integrator, accuracy, (spp, seed), report, deadline)
-    how |= {} if max_time is None else {"max_time": max_time}
-    how |= _warned(how, planes[0], scene, lens, integrator)
-    return Image(*planes, {**origin_of(scene, lens), "sensor": sensor, **how, **_lens_numbers(lens), **_versions()})
+        power, error, coverage, how = _timed(scene, lens, integrator, accuracy, (spp, seed), report, deadline)
+    how |= ({} if max_time is None else {"max_time": max_time}) | _warned(how, power, scene, lens, integrator)
+    origin, numbers = origin_of(scene, lens), _lens_numbers(lens)
+    return Image(power, error, coverage, {**origin, "sensor": sensor, **how, **numbers, **_versions()})
 
 
 def _lens_numbers(lens: mi.Sensor) -> dict[str, float | int | str]:
@@ -172,7 +172,7 @@ def _integrator(
 def _integrate(
     scene: mi.Scene,
     lens: mi.Sensor,
-    integrator: mi.Integrator,
+    integrator: Any,  # an fspt_integral
     accuracy: dict,
     progress: Progress,
     deadline: Deadline,
@@ -236,7 +236,7 @@ def _sample(
     lens.sampler().set_sample_count(math.ceil(spp / count))
     each = lens.sampler().sample_count()  # some samplers round up, with a warning: here once, not in every pass
     seeds = (int(np.random.SeedSequence((seed, k)).generate_state(1)[0]) for k in range(count))
-    total = squares = 0.0
+    total = squares = np.zeros(())
     samples = 0
     progress("sampling", 0.0)
     for k, (power, taken) in enumerate(monte_carlo.passes(scene, lens, integrator, seeds, each), 1):
@@ -247,7 +247,7 @@ def _sample(
     wanted, count = count, k
     mean = total / count
     name = {"PathIntegrator": "path", "ParticleTracerIntegrator": "ptracer", "VolumetricPathIntegrator": "volpath"}
-    how = {
+    how: dict[str, Any] = {
         "method": name.get(integrator.class_name(), integrator.class_name()),
         "sampler": lens.sampler().class_name(),
         "spp": samples,
@@ -369,4 +369,7 @@ def _refuse(settings: dict[str, object], method: str) -> None:
 def _versions() -> dict[str, str]:
     import mitsuba as mi
 
-    return {"variant": mi.variant(), "versions": ", ".join(f"{name} {number}" for name, number in versions().items())}
+    return {
+        "variant": str(mi.variant()),
+        "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
+    }

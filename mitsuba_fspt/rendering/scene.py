@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +67,7 @@ def load_source(source: SceneSource) -> mi.Scene:
         _set_up(state, source)
         placements = _placements(state)
         mi.parser.transform_all(config, state)
-        loaded = mi.parser.instantiate(config, state)
+        loaded: Any = mi.parser.instantiate(config, state)
     loaded = loaded[0] if isinstance(loaded, list) else loaded
     probe_beside(loaded)
     remember_defaults(loaded, source.values)
@@ -92,14 +92,14 @@ def _parsed(source: SceneSource, config: mi.parser.ParserConfig) -> mi.parser.Pa
     if isinstance(source.scene, Mapping):
         return mi.parser.parse_dict(config, dict(source.scene))
     if source.path is TEXT:
-        return mi.parser.parse_string(config, source.scene, **source.given)
+        return mi.parser.parse_string(config, str(source.scene), **source.given)
     return mi.parser.parse_file(config, str(source.path), **source.given)
 
 
 def _config() -> mi.parser.ParserConfig:
     import mitsuba as mi
 
-    config = mi.parser.ParserConfig(mi.variant())
+    config = mi.parser.ParserConfig(str(mi.variant()))
     config.merge_meshes = False  # shapes keep their ids, and rectangles their bounding boxes
     return config
 
@@ -109,16 +109,17 @@ def _files_of(folder: Path) -> Iterator[None]:
     """Context manager in which Mitsuba finds files of `folder`, and its errors become SceneErrors of one line."""
     import mitsuba as mi
 
-    resolver = mi.file_resolver()
-    mi.set_file_resolver(mi.FileResolver(resolver))
-    mi.file_resolver().prepend(str(folder))
+    files: Any = mi  # whose stubs do not type the functions of its file resolver
+    resolver = files.file_resolver()
+    files.set_file_resolver(mi.FileResolver(resolver))
+    files.file_resolver().prepend(str(folder))
     try:
         with ctrl_c_noted():
             yield
     except (RuntimeError, ValueError) as error:
         raise error if isinstance(error, SceneError) else SceneError(_one_line(str(error))) from error
     finally:
-        mi.set_file_resolver(resolver)
+        files.set_file_resolver(resolver)
 
 
 def _set_up(state: mi.parser.ParserState, source: SceneSource) -> None:
@@ -138,12 +139,13 @@ def _require_whole_meshes(state: mi.parser.ParserState) -> None:
     """Raise SceneError for a PLY that ends early, or is damaged such that Mitsuba would read beyond its vertices."""
     import mitsuba as mi
 
+    files: Any = mi
     for node in state.nodes:
         props = node.props
         if props.plugin_name() == "ply" and "filename" in props:
             used, name = props.was_queried("filename"), str(props["filename"])
             props.mark_queried("filename", used)  # as before this look-up
-            require_whole(Path(str(mi.file_resolver().resolve(name))), SceneError)
+            require_whole(Path(str(files.file_resolver().resolve(name))), SceneError)
 
 
 def _placements(state: mi.parser.ParserState) -> dict[str, Array]:
@@ -169,16 +171,17 @@ def _refuse_colours(path: Path, state: mi.parser.ParserState) -> None:
     """
     import mitsuba as mi
 
+    kinds: Any = mi.Properties.Type
     todo = [node.props for node in state.nodes if node.props.plugin_name() == "fspt_surface"]
     while todo:
         props = todo.pop()
         for name in props.keys():  # Properties have no iterator
             kind, used, value = props.type(name), props.was_queried(name), props[name]
             props.mark_queried(name, used)  # as before this look-up: Mitsuba reports names that no plugin has queried
-            what = "colour" if kind == mi.Properties.Type.Color else ""
-            if kind == mi.Properties.Type.Spectrum and not value.is_uniform():
+            what = "colour" if kind == kinds.Color else ""
+            if kind == kinds.Spectrum and not value.is_uniform():
                 what = "spectrum"
-            if kind == mi.Properties.Type.ResolvedReference:
+            if kind == kinds.ResolvedReference:
                 inner = state.nodes[value.index()].props
                 todo.append(inner)
                 what = COLOURS.get(inner.plugin_name(), "")

@@ -104,7 +104,7 @@ def converge(
     lens = render.sensor_of(scene, sensor)
     report = progress or (lambda what, share: None)
     measured_from = _reference(scene, lens, reference, budget, report)
-    full = render.render(scene, method="integral", sensor=sensor, rtol=1e-3).coverage > WHOLE_CONE
+    full = np.asarray(render.render(scene, method="integral", sensor=sensor, rtol=1e-3).coverage) > WHOLE_CONE
     benchmark = Benchmark(measured_from, full, Path(kernels) if kernels is not None else None, budget)
     skipped = benchmark.try_all(*methods(scene, lens, measured_from.least_rtol), report)
     rate = benchmark.run_rounds(rounds, [raw_rate(scene, lens, together) for together in (False, True)], report)
@@ -227,6 +227,8 @@ def read_reference(path: str | os.PathLike[str], shape: tuple[int, int]) -> Refe
     ImageError : no such file, not such a file, no error in it, another size than `shape` (h, w), or a dark image.
     """
     path = Path(path)
+    power: NDArray[np.floating]
+    error: NDArray[np.floating] | None
     if path.suffix == ".npz":
         power, error = _arrays(path)
     else:
@@ -436,7 +438,7 @@ def _with_memory(run: Callable[[], RunResult]) -> tuple[float, float, RunResult]
     import drjit as dr
     import mitsuba as mi
 
-    device = dr.JitBackend.CUDA if mi.variant().startswith("cuda") else dr.JitBackend.LLVM
+    device = dr.JitBackend.CUDA if str(mi.variant()).startswith("cuda") else dr.JitBackend.LLVM
     dr.sync_thread()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -87,7 +87,8 @@ def explain(
     """
     scene = loaded(scene)
     variant = backend.ensure_variant()
-    lens, integrator = sensor_of(scene, sensor), integrator_of(scene, "integral")
+    lens: Any = sensor_of(scene, sensor)
+    integrator: Any = integrator_of(scene, "integral")
     wanted = {name: value for name, value in (("rtol", rtol), ("domain", domain)) if value is not None}
     with named("fspt_integral"):
         quadrature = replace(integrator.quadrature, **wanted)

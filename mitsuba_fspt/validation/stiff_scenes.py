@@ -145,7 +145,7 @@ def mesh(
         props["glow"] = mi.load_dict({"type": "fspt_surface", "exitance": texture, **(law or {})})
         built = mi.Mesh("mesh", len(vertices), len(faces), props=props)
         if np.ndim(exitance):
-            built.add_attribute(f"{kind}_exitance", 1, np.asarray(exitance, np.float32))
+            built.add_attribute(f"{kind}_exitance", 1, np.asarray(exitance, np.float32))  # type: ignore[arg-type]
         positions = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
         return set_triangles(built, positions.ravel(), faces.ravel())
 
@@ -211,7 +211,9 @@ def moved(distance: float = 0.0, angle: float = 0.0, axis: str = "1, 2, 3") -> C
 def power(of: mi.Scene, **accuracy: Any) -> Plane:
     """Power on every pixel by the integral, shape (h, w) [W]; all NaN where its error estimate is not finite."""
     image = render(of, method="integral", **accuracy)
-    return np.asarray(image.power if np.isfinite(image.error).all() else np.full(image.shape, np.nan), np.float64)
+    return np.asarray(
+        image.power if np.isfinite(np.asarray(image.error)).all() else np.full(image.shape, np.nan), np.float64
+    )
 
 
 @cache
@@ -273,7 +275,7 @@ def pixel_error(picture: Plane, truth: Plane) -> float:
 
 
 def cone_error(
-    *objects: SceneObject, nodes: int = 4, film: tuple[int, int] | None = None, share: float = 1.0, **lens: float
+    *objects: SceneObject, nodes: int = 4, film: tuple[int, int] | None = None, share: float = 1.0, **lens: Any
 ) -> float:
     """Pixel error of an image in which 1 W/mm² fills every cone, against `share` times the closed form."""
     focal, stop = lens.get("focal_length", FOCAL), lens.get("f_number", F_NUMBER)
@@ -283,7 +285,7 @@ def cone_error(
     return pixel_error(picture, share * filled_cones(focus, side, focal / stop / 2, nodes, film))
 
 
-def balance_error(z: float, radius: float, domain: str = "pupil", rtol: float = 10 * EXACT, **lens: float) -> float:
+def balance_error(z: float, radius: float, domain: str = "pupil", rtol: float = 10 * EXACT, **lens: Any) -> float:
     """Relative error of the total power on all pixels, for a disk whose whole image is on the film."""
     expected = power_through_pupil(radius, z, FOCAL / lens.get("f_number", F_NUMBER) / 2)
     return abs(float(power(scene(disk(z, radius), **lens), domain=domain, rtol=rtol).sum()) / expected - 1)
@@ -297,7 +299,7 @@ def invariance_error(
     return peak_error(power(of) / factor, standard_picture(*objects))
 
 
-def domain_error(*objects: SceneObject, **lens: float) -> float:
+def domain_error(*objects: SceneObject, **lens: Any) -> float:
     """Peak error between the pupil form and the surface form of the integral."""
     of = scene(*objects, **lens)
     return peak_error(power(of, domain="pupil"), power(of, domain="surface"))
