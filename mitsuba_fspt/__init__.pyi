@@ -12,8 +12,8 @@ from .inverse.invert import invert as invert
 from .inverse.locate import locate as locate
 from .inverse.location import Location as Location
 from .inverse.transport import transport as transport
-from .inverse.transport_file import read_transport as read_transport
 from .inverse.transport_matrix import TransportMatrix as TransportMatrix
+from .inverse.transport_matrix import read_transport as read_transport
 from .optics.opencv_camera import camera_from_opencv as camera_from_opencv
 from .phantom.flux_import import import_flux as import_flux
 from .phantom.framed_scene import scene_xml as scene_xml

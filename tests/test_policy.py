@@ -67,7 +67,7 @@ FOR_ALL_OF_INTEGRAL = {"estimator", "progress", "quadrature", "shortcuts", "solu
 # Only these import `validation`: no result depends on it.
 IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
 # Rooms in which files still import each other.
-TIED = {"detector", "inverse"}
+TIED = {"detector"}
 # Rooms of Dr.Jit code. Others import the renderer inside functions alone, and only these do.
 DRJIT_ROOMS = {"jit", "camera", "emission", "integral", "plugins"}
 IMPORTS_MITSUBA = {"runtime", "rendering", "validation", "studies", "inverse"}

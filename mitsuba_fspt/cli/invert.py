@@ -48,7 +48,7 @@ def invert(
     from ..detector.reduction import read_measured
     from ..inverse.inversion import FORMATS
     from ..inverse.invert import invert
-    from ..inverse.transport_file import read_transport
+    from ..inverse.transport_matrix import read_transport
 
     require_writable(output, error=InversionError)
     if output.suffix.lower() not in FORMATS:

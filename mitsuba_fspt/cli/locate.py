@@ -47,7 +47,7 @@ def locate(
     """
     from ..detector.reduction import read_measured
     from ..inverse.locate import locate
-    from ..inverse.transport_file import read_transport
+    from ..inverse.transport_matrix import read_transport
     from ..tissue.phantom_file import PhantomFile
 
     described = PhantomFile.read(phantom)

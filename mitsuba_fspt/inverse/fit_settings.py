@@ -6,7 +6,30 @@ from dataclasses import dataclass, field
 
 from .mlem import MlemAccuracy
 from .nonnegative import Accuracy
-from .outlook import Hopeless
+
+
+@dataclass(frozen=True)
+class Hopeless:
+    """When a first fit counts as hopeless: all of the first three hold, or the first and the three from `alone` on.
+
+    chi2 : least Σ (residual/σ)² over free pixels
+    share : least residual, root of the sum of squares, over that of the image: pose and order of views leave tenths of
+        it, errors of the model with many electrons a few hundredths
+    gain : least χ² with some times as many unknowns, over that with few: where the unknowns are too coarse for J_n, χ²
+        falls by the fourth power of their distance, to a fourth or less
+    alone : largest residual of the four neighbours, on average, over that of a pixel by itself: cosmic rays and hot
+        pixels, where light is spread over neighbours by the lens and by the size of the unknowns
+    rest, few : most of χ² that is left without those pixels, and the largest share of them among all
+    rounds : most rounds of variances and weight of the fit that follows, which no accuracy would help
+    """
+
+    chi2: float = 5.0
+    share: float = 0.1
+    gain: float = 0.5
+    alone: float = 0.25
+    rest: float = 0.5
+    few: float = 0.01
+    rounds: int = 10
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +13,41 @@ from numpy.typing import NDArray
 from ..images.picture import empty_figure, require_png
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import ImageError
-from .sensitivity_picture import view_labels
+from .sensitivity_picture import Rows, view_labels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from .inversion import Inversion
 
 RESIDUAL = 4.0  # standard deviations at the ends of the colour scale
 LINE = 150  # characters of a line of warnings
 
 
-def exitance_images(inversion: Inversion) -> NDArray[np.float64]:
+class Fitted(Protocol):
+    """What the picture needs of an `Inversion`, whose members these are."""
+
+    @property
+    def matrix(self) -> Rows: ...
+
+    @property
+    def solution(self) -> NDArray[np.float64]: ...
+
+    @property
+    def seen(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def measured(self) -> NDArray[np.float64]: ...
+
+    @property
+    def fitted(self) -> NDArray[np.float64]: ...
+
+    @property
+    def residual(self) -> NDArray[np.float64]: ...
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
+
+
+def exitance_images(inversion: Fitted) -> NDArray[np.float64]:
     """J_n as the pixels see it [W/mm²], (views, height, width); NaN where they see nothing of it."""
     matrix = inversion.matrix
     seen = inversion.seen.astype(np.float64)
@@ -31,7 +55,7 @@ def exitance_images(inversion: Inversion) -> NDArray[np.float64]:
     return np.divide(light, weight, out=np.full_like(light, np.nan), where=weight > 0)
 
 
-def draw(inversion: Inversion) -> Figure:
+def draw(inversion: Fitted) -> Figure:
     """Figure with a row a view."""
     views = len(inversion.measured)
     figure = empty_figure(width=12.5, height=0.8 + 2.9 * views)
@@ -65,7 +89,7 @@ def draw(inversion: Inversion) -> Figure:
     return figure
 
 
-def write(inversion: Inversion, path: str | os.PathLike[str]) -> Figure:
+def write(inversion: Fitted, path: str | os.PathLike[str]) -> Figure:
     """Write the figure to a PNG file; ImageError or BackendError where that is not possible."""
     file = require_png(path)
     figure = draw(inversion)

@@ -2,28 +2,46 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 from ..images.notebook import html_of, png_of
 from . import inversion_picture
-from .sensitivity_picture import draw_sensitivity
-
-if TYPE_CHECKING:
-    from .inversion import Inversion
-    from .transport_matrix import TransportMatrix
+from .inversion_picture import Fitted
+from .sensitivity_picture import Rows, draw_sensitivity
 
 
-def matrix_png(matrix: TransportMatrix) -> bytes | None:
+class ShownMatrix(Rows, Protocol):
+    """What the table needs of a `TransportMatrix` beside its picture."""
+
+    metadata: Mapping[str, Any]
+
+    @property
+    def on(self) -> str: ...
+
+    @property
+    def parts(self) -> Mapping[str, slice]: ...
+
+    def summary(self) -> dict[str, Any]: ...
+
+
+class ShownInversion(Fitted, Protocol):
+    """What the table needs of an `Inversion` beside its picture."""
+
+    def summary(self) -> dict[str, Any]: ...
+
+
+def matrix_png(matrix: Rows) -> bytes | None:
     """PNG of the sensitivity to the surface in each view; None without matplotlib."""
     return png_of(lambda: draw_sensitivity(matrix))
 
 
-def inversion_png(inversion: Inversion) -> bytes | None:
+def inversion_png(inversion: Fitted) -> bytes | None:
     """PNG of `Inversion.report`; None without matplotlib."""
     return png_of(lambda: inversion_picture.draw(inversion))
 
 
-def matrix_html(matrix: TransportMatrix) -> str:
+def matrix_html(matrix: ShownMatrix) -> str:
     """Table of views, size, entries, sensitivity and seen share, with the picture."""
     found = matrix.summary()
     views, height, width = found["image_shape"]
@@ -41,7 +59,7 @@ def matrix_html(matrix: TransportMatrix) -> str:
     return html_of("TransportMatrix", rows, matrix_png(matrix))
 
 
-def inversion_html(inversion: Inversion) -> str:
+def inversion_html(inversion: ShownInversion) -> str:
     """Table of the total with its interval, fit and regularisation, with the picture."""
     found = inversion.summary()
     total = f"{found['total']:.6g} W"

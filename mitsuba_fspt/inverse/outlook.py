@@ -2,44 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .measurement import LOG
+from ..runtime.progress_bar import Progress
+from .fit_settings import Hopeless
+from .measurement import LOG, Measurement
 from .surface import Surface
-
-if TYPE_CHECKING:
-    from ..runtime.progress_bar import Progress
-    from .invert import Fit, Problem
+from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Hopeless:
-    """When a first fit counts as hopeless: all of the first three hold, or the first and the three from `alone` on.
+class Fit(Protocol):
+    """Members of a fit of `invert` that the outlook needs: unknowns, their number, standard deviations of pixels."""
 
-    chi2 : least Σ (residual/σ)² over free pixels
-    share : least residual, root of the sum of squares, over that of the image: pose and order of views leave tenths of
-        it, errors of the model with many electrons a few hundredths
-    gain : least χ² with some times as many unknowns, over that with few: where the unknowns are too coarse for J_n, χ²
-        falls by the fourth power of their distance, to a fourth or less
-    alone : largest residual of the four neighbours, on average, over that of a pixel by itself: cosmic rays and hot
-        pixels, where light is spread over neighbours by the lens and by the size of the unknowns
-    rest, few : most of χ² that is left without those pixels, and the largest share of them among all
-    rounds : most rounds of variances and weight of the fit that follows, which no accuracy would help
-    """
+    @property
+    def x(self) -> Array: ...
 
-    chi2: float = 5.0
-    share: float = 0.1
-    gain: float = 0.5
-    alone: float = 0.25
-    rest: float = 0.5
-    few: float = 0.01
-    rounds: int = 10
+    @property
+    def sigma(self) -> Array: ...
+
+    @property
+    def determined(self) -> float: ...
+
+
+class Problem(Protocol):
+    """Members of a problem of `invert` that the outlook needs."""
+
+    @property
+    def matrix(self) -> TransportMatrix: ...
+
+    @property
+    def measurement(self) -> Measurement: ...
+
+    @property
+    def rows(self) -> NDArray[np.int64]: ...
+
+    def free_on(self, surface: Surface, /) -> Problem: ...
+
+    def fit(self, weight: float | None, report: Progress, /, *, rough: bool) -> Fit: ...
+
+    def signal(self, x: Array, /) -> Array: ...
 
 
 def is_hopeless(problem: Problem, levels: list[Surface], bounds: Hopeless, report: Progress) -> bool:

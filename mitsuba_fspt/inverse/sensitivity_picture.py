@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,22 @@ from ..runtime.errors import ImageError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from .transport_matrix import TransportMatrix
-
 MOST_COLUMNS = 4
 
 
-def sensitivity_images(matrix: TransportMatrix) -> NDArray[np.float64]:
+class Rows(Protocol):
+    """What pictures need of a `TransportMatrix`, whose members these are."""
+
+    areas: NDArray[np.float64]
+    sensitivity: NDArray[np.float64]
+
+    @property
+    def views(self) -> list[dict[str, Any]]: ...
+
+    def forward(self, exitance: NDArray[np.float64], /) -> NDArray[np.float64]: ...
+
+
+def sensitivity_images(matrix: Rows) -> NDArray[np.float64]:
     """Share of the light of the surface that arrives on the pixels of all views, as each pixel sees it.
 
     (views, height, width); the mean over the pixel's lines of sight, NaN where it sees nothing.
@@ -30,14 +40,14 @@ def sensitivity_images(matrix: TransportMatrix) -> NDArray[np.float64]:
     return np.divide(light, weight, out=np.full_like(light, np.nan), where=weight > 0)
 
 
-def view_labels(matrix: TransportMatrix) -> list[str]:
+def view_labels(matrix: Rows) -> list[str]:
     """Parameter values of each view, without those that all of several views share."""
     first, *others = matrix.views
     shared = {name for name, value in first.items() if others and all(view.get(name) == value for view in others)}
     return ["  ".join(f"{name}={value}" for name, value in view.items() if name not in shared) for view in matrix.views]
 
 
-def draw_sensitivity(matrix: TransportMatrix) -> Figure:
+def draw_sensitivity(matrix: Rows) -> Figure:
     """Figure of `sensitivity_images`, side by side; BackendError without matplotlib."""
     images = sensitivity_images(matrix)
     columns = min(len(images), MOST_COLUMNS)
@@ -55,7 +65,7 @@ def draw_sensitivity(matrix: TransportMatrix) -> Figure:
     return figure
 
 
-def write_sensitivity(matrix: TransportMatrix, path: str | os.PathLike[str]) -> None:
+def write_sensitivity(matrix: Rows, path: str | os.PathLike[str]) -> None:
     """Write the figure to a PNG file; ImageError or BackendError where that is not possible."""
     file = require_png(path)
     figure = draw_sensitivity(matrix)

@@ -27,8 +27,8 @@ from ..runtime.interrupt import ctrl_c_held
 from ..runtime.numbers import whole
 from ..runtime.progress_bar import Progress, reported
 from ..runtime.versions import version, versions
-from .transport_file import FORMAT, PartialFile, read_transport
-from .transport_matrix import TransportMatrix
+from .transport_file import FORMAT, PartialFile
+from .transport_matrix import TransportMatrix, read_transport
 from .view_block import (
     Block,
     Part,

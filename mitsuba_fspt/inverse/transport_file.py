@@ -16,7 +16,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,6 @@ from ..runtime.errors import TransportError
 from ..runtime.memory import available_memory
 from .view_block import Block
 
-if TYPE_CHECKING:
-    from .transport_matrix import TransportMatrix
-
 FORMAT = "fspt transport matrix 1"
 ARRAYS = ("values", "columns", "starts", "change", "row_error")
 IN_MEMORY = 2.25  # bytes of a matrix that is read, over those of its file, at the most
@@ -36,19 +33,8 @@ KEPT_SHARE = 0.25  # of the free memory: a matrix up to that size stays in memor
 KINDS = {"columns": "iu", "starts": "iu"}  # of the numbers in the arrays, all others are floats
 
 
-def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
-    """The matrix of a file of `TransportMatrix.save`, `transport(file=…)` or `fspt matrix`.
-
-    Views are read when they are needed; those of a matrix larger than a quarter of the free memory are read again each
-    time, one at a time.
-
-    Raises
-    ------
-    TransportError : the file does not exist, is truncated or of another format.
-    """
-    from .transport_matrix import TransportMatrix
-
-    path = Path(path)
+def contents(path: Path) -> tuple[FileBlocks, dict[str, Any], NDArray[Any], NDArray[Any]]:
+    """Blocks, metadata, areas and sensitivity in a file; raises as `read_transport`."""
     if not path.is_file():
         raise TransportError(f"transport matrix '{path}' does not exist. Check the name.")
     try:
@@ -65,7 +51,7 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
             raise KeyError(missing[0])
         if (areas[sensitivity > 0] <= 0).any():
             raise ValueError("light from vertices or faces without area")
-        return TransportMatrix(FileBlocks(path, meta), meta, areas, sensitivity)
+        return FileBlocks(path, meta), meta, areas, sensitivity
     except (TransportError, MemoryError):
         raise
     except Exception as cause:  # whatever a damaged file makes the libraries raise
@@ -132,15 +118,15 @@ class FileBlocks(Sequence[Block]):
         return block
 
 
-def write(matrix: TransportMatrix, path: str | os.PathLike[str]) -> None:
-    """Write a matrix to an npz file, a view at a time; TransportError where it cannot be written."""
-    _write(_npz(path), matrix.blocks, matrix.metadata, matrix.areas, matrix.sensitivity)
-
-
-def _write(
-    path: Path, blocks: Sequence[Block], meta: Mapping[str, Any], areas: NDArray[Any], sensitivity: NDArray[Any]
+def write(
+    path: str | os.PathLike[str],
+    blocks: Sequence[Block],
+    meta: Mapping[str, Any],
+    areas: NDArray[Any],
+    sensitivity: NDArray[Any],
 ) -> None:
-    with atomic_path(path, TransportError) as temporary, zipfile.ZipFile(temporary, "w", allowZip64=True) as file:
+    """Write a matrix to an npz file, a view at a time; TransportError where it cannot be written."""
+    with atomic_path(_npz(path), TransportError) as temporary, zipfile.ZipFile(temporary, "w", allowZip64=True) as file:
         _add(file, "meta", np.array(json.dumps(dict(meta))))
         _add(file, "areas", areas)
         _add(file, "sensitivity", sensitivity)
@@ -247,7 +233,7 @@ class PartialFile(Sequence[Block]):
 
     def finish(self, meta: Mapping[str, Any], areas: NDArray[Any], sensitivity: NDArray[Any]) -> None:
         """Join the views into the file and remove their folder."""
-        _write(self.path, self, meta, areas, sensitivity)
+        write(self.path, self, meta, areas, sensitivity)
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def discard(self) -> None:

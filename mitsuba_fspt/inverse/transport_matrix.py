@@ -7,6 +7,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..images.image import Image
 from ..images.pixel_axes import CROP
 from ..rendering.provenance import same_mesh
 from ..runtime.errors import DetectorError, TransportError
+from .transport_file import contents, write
 from .view_block import Block
 
 if TYPE_CHECKING:
@@ -184,9 +186,7 @@ class TransportMatrix(LinearOperator):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an npz file, blocks a view, which `read_transport` reads; TransportError where it cannot be written."""
-        from .transport_file import write
-
-        write(self, path)
+        write(path, self.blocks, self.metadata, self.areas, self.sensitivity)
 
     def summary(self) -> dict[str, Any]:
         """Numbers about the matrix by name, ready for JSON.
@@ -220,6 +220,19 @@ class TransportMatrix(LinearOperator):
     def __repr__(self) -> str:
         views, height, width = self.image_shape
         return f"TransportMatrix({views} views of {width} x {height} pixels, {self.shape[1]} columns on {self.on})"
+
+
+def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
+    """The matrix of a file of `TransportMatrix.save`, `transport(file=…)` or `fspt matrix`.
+
+    Views are read when they are needed; those of a matrix larger than a quarter of the free memory are read again each
+    time, one at a time.
+
+    Raises
+    ------
+    TransportError : the file does not exist, is truncated or of another format.
+    """
+    return TransportMatrix(*contents(Path(path)))
 
 
 def _finite(name: str, values: Array) -> Array:
