@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +12,9 @@ from scipy.stats import norm
 from .measurement import LOG, tell_misfit, told
 from .nonnegative import factor
 from .patterns import Patterns, views_of
+from .problem import Fit, Problem
 from .sensitivity_picture import view_labels
 from .structure import common_errors, structure
-
-if TYPE_CHECKING:
-    from .invert import Fit, Problem
 
 Array = NDArray[np.float64]
 

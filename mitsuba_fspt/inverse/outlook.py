@@ -2,50 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.progress_bar import Progress
 from .fit_settings import Hopeless
-from .measurement import LOG, Measurement
+from .measurement import LOG
+from .problem import Fit, Problem
 from .surface import Surface
-from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
-
-
-class Fit(Protocol):
-    """Members of a fit of `invert` that the outlook needs: unknowns, their number, standard deviations of pixels."""
-
-    @property
-    def x(self) -> Array: ...
-
-    @property
-    def sigma(self) -> Array: ...
-
-    @property
-    def determined(self) -> float: ...
-
-
-class Problem(Protocol):
-    """Members of a problem of `invert` that the outlook needs."""
-
-    @property
-    def matrix(self) -> TransportMatrix: ...
-
-    @property
-    def measurement(self) -> Measurement: ...
-
-    @property
-    def rows(self) -> NDArray[np.int64]: ...
-
-    def free_on(self, surface: Surface, /) -> Problem: ...
-
-    def fit(self, weight: float | None, report: Progress, /, *, rough: bool) -> Fit: ...
-
-    def signal(self, x: Array, /) -> Array: ...
 
 
 def is_hopeless(problem: Problem, levels: list[Surface], bounds: Hopeless, report: Progress) -> bool:

@@ -15,10 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, vstack
 from scipy.sparse.linalg import LinearOperator
 
+from ..detector.stray_light import StrayLight
 from ..images.image import Image
 from ..images.pixel_axes import CROP
 from ..rendering.provenance import same_mesh
 from ..runtime.errors import DetectorError, TransportError
+from .stray_rows import spread_rows
 from .transport_file import contents, write
 from .view_block import Block
 
@@ -177,8 +179,6 @@ class TransportMatrix(LinearOperator):
         `invert` and `locate` do so by themselves for images whose metadata name them. Returns T where the detector has
         neither. Raises TransportError for a matrix that is behind a detector already, DetectorError for anything else.
         """
-        from .stray_matrix import StrayMatrix
-
         stray = getattr(detector, "stray_light", None)
         if stray is None:
             raise DetectorError(f"transport: 'through' takes a Detector, got {type(detector).__name__}. Give one.")
@@ -220,6 +220,80 @@ class TransportMatrix(LinearOperator):
     def __repr__(self) -> str:
         views, height, width = self.image_shape
         return f"TransportMatrix({views} views of {width} x {height} pixels, {self.shape[1]} columns on {self.on})"
+
+
+class StrayMatrix(TransportMatrix):
+    """T behind the point-spread function and the veiling glare of a detector, as `TransportMatrix.through` makes it.
+
+    Its interface is that of T. The products spread images and their transpose; `matrix` has all entries, of which a
+    glare fills every row. `base` is T, `stray` the stray light; the metadata record it.
+    """
+
+    def __init__(self, base: TransportMatrix, stray: StrayLight) -> None:
+        self.base, self.stray = base, stray
+        self.spreads = [stray.on(float(lens["pixel_pitch"])) for lens in base.metadata["lenses"]]
+        metadata = base.metadata | stray.recorded(base.image_shape[1:])
+        lit = np.stack([spread.backward(np.ones(base.image_shape[1:])) for spread in self.spreads])
+        super().__init__(base.blocks, metadata, base.areas, base.rmatvec(lit.ravel()))
+
+    @cached_property
+    def matrix(self) -> csr_array:
+        """All views as one sparse matrix, (views · height · width, n).
+
+        Raises TransportError if the memory does not suffice.
+        """
+        shape = self.image_shape[1:]
+        views = zip(self.spreads, self.blocks, strict=True)
+        return csr_array(vstack([spread_rows(spread, block.matrix, shape) for spread, block in views], format="csr"))
+
+    @property
+    def entries(self) -> int:
+        """Number of entries that are not 0."""
+        return int(self.matrix.nnz)
+
+    def error(self, exitance: ArrayLike) -> Array:
+        """Estimated absolute error of `forward(exitance)`, (views, height, width) [W]: that of T, spread likewise."""
+        return self._spread(self.base.error(exitance))
+
+    def through(self, detector: object) -> TransportMatrix:
+        """TransportError: the stray light of a detector is applied once."""
+        raise TransportError(
+            "transport: the matrix has the stray light of a detector already. Apply 'through' to the matrix without it."
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """TransportError: the file is that of T."""
+        raise TransportError(
+            f"transport: '{Path(path)}' is not written: a matrix behind a detector is not stored. Save the matrix "
+            "itself, and apply 'through' to what 'read_transport' returns."
+        )
+
+    # ------------------------------------------------------------------ SciPy's interface
+
+    def _matvec(self, x: Array) -> Array:
+        return self._spread(self.base.forward(np.ravel(x))).ravel()
+
+    def _rmatvec(self, x: Array) -> Array:
+        return self.base.rmatvec(self._gathered(self._finite_images(x)).ravel())
+
+    def _matmat(self, x: Array) -> Array:
+        return np.stack([self._matvec(column) for column in np.asarray(x, np.float64).T], axis=1)
+
+    def _rmatmat(self, x: Array) -> Array:
+        return np.stack([self._rmatvec(column) for column in np.asarray(x, np.float64).T], axis=1)
+
+    def _finite_images(self, x: Array) -> Array:
+        """A vector of all pixels as images (views, height, width); TransportError for values that are not finite."""
+        return self.images(np.asarray(x, np.float64).reshape(self.image_shape))
+
+    def _spread(self, images: Array) -> Array:
+        return np.stack([spread.forward(image) for spread, image in zip(self.spreads, images, strict=True)])
+
+    def _gathered(self, images: Array) -> Array:
+        return np.stack([spread.backward(image) for spread, image in zip(self.spreads, images, strict=True)])
+
+    def __repr__(self) -> str:
+        return f"{super().__repr__()[:-1]}, behind stray light)"
 
 
 def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
