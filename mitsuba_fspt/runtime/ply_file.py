@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import mmap
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,8 +60,9 @@ def require_whole(path: Path, error: type[FsptError]) -> None:
     cannot be opened, or with elements other than vertices and triangles, is left to its reader.
     """
     try:
-        content = path.read_bytes()
-    except OSError:
+        with path.open("rb") as file:  # mapped: of a binary file, the vertices are left to the reader
+            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError):  # ValueError: an empty file
         return
     header = _header(content)
     if header is None:
@@ -79,10 +81,10 @@ def require_whole(path: Path, error: type[FsptError]) -> None:
         )
 
 
-def _header(content: bytes) -> Header | None:
+def _header(content: mmap.mmap) -> Header | None:
     """Header of a PLY; None if it is none, or has other elements, for which the readers have their own messages."""
     end = END.search(content, 0, LONGEST_HEADER)
-    if end is None or not content.startswith(b"ply"):
+    if end is None or content[:3] != b"ply":
         return None
     order = ""
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
@@ -107,7 +109,7 @@ def _header(content: bytes) -> Header | None:
     return Header(order, (vertices, faces), vertex, face, end.end())
 
 
-def _binary_corners(path: Path, content: bytes, header: Header, error: type[FsptError]) -> NDArray[Any] | None:
+def _binary_corners(path: Path, content: mmap.mmap, header: Header, error: type[FsptError]) -> NDArray[Any] | None:
     """Corners (F, 3) of a binary file of triangles, None if it has other faces; raises `error` if it ends early."""
     vertex = np.dtype([(f"p{k}", header.order + kind) for k, (_, kind) in enumerate(header.vertex)])
     fields: list[tuple] = []
@@ -127,7 +129,7 @@ def _binary_corners(path: Path, content: bytes, header: Header, error: type[Fspt
     return faces["corners"] if (faces["count"] == 3).all() else None
 
 
-def _text_corners(path: Path, content: bytes, header: Header, error: type[FsptError]) -> NDArray[Any] | None:
+def _text_corners(path: Path, content: mmap.mmap, header: Header, error: type[FsptError]) -> NDArray[Any] | None:
     """Corners (F, 3) of a text of triangles, None if it has other faces; raises `error` if it ends early."""
     body = content[header.size :]
     lines = [line for line in body.splitlines() if line.strip()]
