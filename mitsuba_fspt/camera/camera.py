@@ -15,7 +15,7 @@ from ..optics.discs import defocus
 from ..optics.pixel_etendue import full_etendue
 from ..optics.thin_lens import Lens
 from ..optics.transmittance import Filters
-from ..runtime.errors import OpticsError
+from ..runtime.errors import OpticsError, named
 from .film import Film
 from .film_map import FilmMap
 from .pupil import Pupil
@@ -84,7 +84,9 @@ class Camera:
         farthest = np.abs(matrix[:3, 3]).max()
         self.rounding = EPSILON * (farthest + lens.focus_distance) / self.virtual_pitch
         width, height = film.size
-        self.film_map, self.pupil = FilmMap((0.5 * width, 0.5 * height), self.virtual_pitch), Pupil(lens)
+        with named("fspt_lens"):
+            self.film_map = FilmMap(lens, (0.5 * width, 0.5 * height), self.virtual_pitch)
+        self.pupil = Pupil(lens)
         # Opaque, so that a new value needs no compilation.
         dr.make_opaque(self.to_world)
         self._u = dr.opaque(mi.Float, lens.focus_distance)
@@ -149,7 +151,7 @@ class Camera:
         return (
             mi.Ray3f(origin, dr.normalize(self.to_world @ towards * (1 - share) + lost)),
             cos_theta,
-            self.through_stop(x),
+            self.through_stop(position),
         )
 
     def open_pupil(self, position: mi.Point2f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
@@ -168,22 +170,23 @@ class Camera:
         x = self.film_map.to_plane(position)
         return self.pupil.passes(x, self.pupil.on_lens(x, pupil))
 
-    def through_stop(self, x: mi.Point2f) -> mi.Bool:
-        """True if the image of the virtual point x [mm] lies inside the image-plane stop."""
-        return dr.squared_norm(x) <= dr.square(self._stop_radius)
+    def through_stop(self, position: mi.Point2f) -> mi.Bool:
+        """True if a film position [pixels] lies inside the image-plane stop."""
+        return dr.squared_norm(self.film_map.ideal_to_plane(position)) <= dr.square(self._stop_radius)
 
     # ------------------------------------------------------------------ light of a point
 
     def blur_disc(self, point: mi.Point3f) -> tuple[mi.Point2f, mi.Float, mi.Float]:
         """Blur disc of a world point: centre and signed radius [film pixels]; side of a pixel at its depth [mm].
 
-        Light of the point towards `pupil` [unit disc] arrives at centre + radius · pupil (Eq. M.8). This is the
-        solution of r = x + (a − x)(u − z)/u, a = κx + ρ, for the virtual point x on the line through r and ρ.
+        Light of the point towards `pupil` [unit disc] arrives at centre + radius · pupil (Eq. M.8), an ideal position:
+        `FilmMap.from_ideal` distorts it. This is the solution of r = x + (a − x)(u − z)/u, a = κx + ρ, for the virtual
+        point x on the line through r and ρ.
         """
         p = self._in_camera(point)
         back, scale = defocus(p.z, self._u, self.pupil.shift)
         side = scale * self.film_map.opaque_side
-        return self.film_map.to_film(mi.Point2f(p.x, p.y), scale), self.pupil.radius * back / side, side
+        return self.film_map.ideal_to_film(mi.Point2f(p.x, p.y), scale), self.pupil.radius * back / side, side
 
     def arrival(self, point: mi.Point3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
         """Arrival of the light of a world point towards `pupil` [unit disc], four values.
@@ -196,8 +199,8 @@ class Camera:
         4. cosθ of the line of sight to the optical axis.
         """
         centre, radius, _ = self.blur_disc(point)
-        position, shift = centre + radius * pupil, self.pupil.shift
-        x = self.film_map.to_plane(position)
+        ideal, shift = mi.Point2f(centre + radius * pupil), self.pupil.shift
+        x = self.film_map.ideal_to_plane(ideal)
         a = self.pupil.on_lens(x, pupil)
         lens_point = self.to_world @ mi.Point3f(a.x, a.y, 0)
         depth = self._in_camera(point).z
@@ -208,7 +211,7 @@ class Camera:
         growth = 1 - shift * back / scale
         weight = dr.square(growth * self._u / distance) * cos_theta
         passes = (depth > 0) & dr.isfinite(weight) & self.pupil.passes(x, a)
-        return position, lens_point, dr.select(passes, weight, 0), cos_theta
+        return self.film_map.from_ideal(ideal), lens_point, dr.select(passes, weight, 0), cos_theta
 
     def _in_camera(self, point: mi.Point3f) -> mi.Vector3f:
         """World point in the camera frame [mm]; subtracted before it is rotated, which is exact far from the origin."""
@@ -238,7 +241,15 @@ class Camera:
         return float((points @ axis).max() + offset)
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [film pixels]; radius inf: unbounded."""
+        """Discs on the film that contain the blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [pixels].
+
+        Without distortion they are the blur discs. Radius inf: unbounded.
+        """
+        centre, radius = self.ideal_discs(points)
+        return self.film_map.from_ideal_in_double(centre), self.film_map.stretch * radius
+
+    def ideal_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Blur discs of world points as `film_discs`, in ideal positions."""
         # A few points of a rotated sphere are not finite; with z = -inf their discs are unbounded.
         lost = ~np.isfinite(points).all(axis=-1, keepdims=True)
         p = np.where(lost, 0, points) @ self._to_camera[:3, :3].T + self._to_camera[:3, 3]
@@ -246,6 +257,6 @@ class Camera:
         disc, u = self.lens.discs[0], self.lens.focus_distance
         _, scale = defocus(p[..., 2:], u, disc.shift)
         scale = np.where(scale > 0, scale, 1)  # elsewhere the radius is infinite
-        centre = self.film_map.to_film_in_double(p[..., :2], scale)
+        centre = self.film_map.ideal_in_double(p[..., :2], scale)
         blur = self.blur_radius(mi.Float64(p[..., 2].ravel())).numpy()
         return centre, np.abs(blur).reshape(p[..., 2:].shape)

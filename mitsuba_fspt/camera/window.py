@@ -15,9 +15,13 @@ from numpy.typing import NDArray
 from .camera import Camera
 
 Boxes = tuple[tuple[float, ...], ...]
+Ends = NDArray[np.float64]
 
 # Rim around the crop window that is searched for silhouettes: its width in blur radii, and the largest one in pixels.
 SEARCHED_RIM, MOST_RIM = 0.6, 16
+# Of a rectangle whose distorted image is bounded: points along each side, share of its size that is added, and the
+# largest rectangle, in sizes of the film beyond it.
+SIDE_POINTS, DISTORTED_MARGIN, FAR = 65, 1e-3, 1.0
 
 
 @dataclass(frozen=True)
@@ -132,13 +136,13 @@ class Window:
 def window_of(boxes: Boxes, camera: Camera, everywhere: bool = False, bending: Boxes = ()) -> Window:
     """Window of the pixels with a line of sight into these boxes, or into those of `bending` shapes; or `everywhere`.
 
-    Perspective keeps straight lines straight, so that corners bound a box's blurred image.
+    Perspective keeps straight lines straight, so that corners bound a box's blurred image, before its distortion.
     """
     boxes = (*boxes, *bending)
     (height, width), offset = camera.film.shape, camera.film.crop_offset
     ends = np.array(boxes, np.float64).reshape(-1, 2, 3)
     points = np.array([ends[:, list(pick), range(3)] for pick in itertools.product((0, 1), repeat=3)]).reshape(-1, 3)
-    discs, radii = camera.film_discs(points)
+    discs, radii = camera.ideal_discs(points)
     blur = radii.max(initial=0.0)
     if bending:  # an image behind a mirror is as far as its light travels in front of it
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -147,6 +151,7 @@ def window_of(boxes: Boxes, camera: Camera, everywhere: bool = False, bending: B
     low, high = (discs - radii).min(axis=0, initial=np.inf), (discs + radii).max(axis=0, initial=-np.inf)
     if everywhere or not len(points):
         low, high = np.full(2, -np.inf), np.full(2, np.inf)
+    low, high = _distorted_bounds(camera, low, high)
     middle, radius = np.array(camera.film_map.middle), camera.lens.seen_field / camera.virtual_pitch
     low, high = np.maximum(low, middle - radius), np.minimum(high, middle + radius)
     crop = Window(0, 0, (height, width), (height, width), offset, float(blur))
@@ -161,3 +166,17 @@ def window_of(boxes: Boxes, camera: Camera, everywhere: bool = False, bending: B
     if left >= width or top >= height or right <= 0 or bottom <= 0:  # visible on the rim alone
         right, bottom = left, top
     return replace(crop, top=top, left=left, shape=(max(0, bottom - top), max(0, right - left)))
+
+
+def _distorted_bounds(camera: Camera, low: Ends, high: Ends) -> tuple[Ends, Ends]:
+    """Bounds (2,) on the film [pixels] of a rectangle of ideal positions: of points along its sides, and a margin."""
+    if not camera.film_map.distorted or not (low < high).all():
+        return low, high
+    size = np.array(camera.film.size, np.float64)
+    low, high = np.maximum(low, -FAR * size), np.minimum(high, (1 + FAR) * size)
+    along = np.linspace(0, 1, SIDE_POINTS)[:, None]
+    corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    sides = np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+    found = camera.film_map.from_ideal_in_double(sides)
+    margin = DISTORTED_MARGIN * (high - low).max()
+    return found.min(axis=0) - margin, found.max(axis=0) + margin

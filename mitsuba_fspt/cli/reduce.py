@@ -265,7 +265,7 @@ def _lens(toml: Path, light: Light) -> tuple[Lens, float]:
     table = camera_lens(toml)
     if missing := [name for name in ("focal_length", "f_number") if name not in table]:
         raise DetectorError(f"'{toml}' [lens]: '{missing[0]}' is missing, which --calibrate needs. Give it.")
-    lens = Lens.focused(**{name: table[name] for name in (*number_names(), "model") if name in table})
+    lens = Lens.focused(**{name: table[name] for name in (*number_names(), "model", "distortion") if name in table})
     given = {name: table[name] for name in ("transmittance",) if name in table}
     if CURVE not in table:
         return lens, transmittance_of(given, None)

@@ -102,10 +102,11 @@ def etendue_of(shape: tuple[int, int], known: Metadata) -> Plane:
         lens = Lens.focused(
             float(known["focal_length"]),
             model=str(known.get("model", "diaphragm")),
+            distortion=known.get("distortion"),
             **{name: float(known[name]) for name in names},  # type: ignore[arg-type]
         )
     except (OpticsError, ValueError) as cause:
         raise ImageError(f"image: its metadata describe no lens: {cause}") from cause
     axes = PixelAxes.of(shape, known | {"magnification": lens.magnification})
     passed, pixel = float(known.get("transmittance", 1.0)), str(known.get("pixel", "area"))
-    return pixel_etendues(lens, axes.step, axes.x, axes.y, passed, pixel)
+    return pixel_etendues(lens, axes.step, axes.x, -axes.y, passed, pixel)

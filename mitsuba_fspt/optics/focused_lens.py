@@ -86,6 +86,11 @@ class FocusedLens:
         return self.focal_length * (1 - 1 / self.pupil_magnification)
 
     @property
+    def pupil_distance(self) -> float:
+        """ℓ = u − z_p [mm], from the entrance pupil to the virtual detector plane."""
+        return self.focus_distance - self.pupil_depth
+
+    @property
     def working_f_number(self) -> float:
         """f_num (1 + t/P): half the image distance from the exit pupil over that pupil's radius (Eq. M.40)."""
         return self.f_number * (1 + self.magnification / self.pupil_magnification)

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ..runtime.errors import OpticsError
+from ..runtime.errors import OpticsError, named
 from ..runtime.numbers import number, whole
+from .distortion import Distortion
 from .focused_lens import FOCUS
 from .thin_lens import Lens
 
@@ -34,6 +35,7 @@ class OpenCVCamera:
     deviation : shift of an image corner [pixels] by all that is neglected: skew, f_x ≠ f_y, and the part of the
         principal point that is smaller than half a pixel
     pupil_magnification : P of the lens, 1 where its pupils lie in its principal planes
+    distortion : OpenCV's; None where the distortion of the images has been removed
     """
 
     to_world: Array
@@ -43,6 +45,7 @@ class OpenCVCamera:
     crop: tuple[int, int, int, int]
     deviation: float
     pupil_magnification: float = 1.0
+    distortion: Distortion | None = None
 
     def pixel_pitch(self, image_distance: float, focal_length: float | None = None) -> float:
         """Pixel pitch p = (F + (v − F)/P)/f [mm] (Eq. M.41) of a lens at the `image_distance` v [mm] from the detector.
@@ -109,9 +112,10 @@ class OpenCVCamera:
         crop = dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), self.crop, strict=True))
         sides = {"width": self.width, "height": self.height} | crop
         film = "".join(f'        <integer name="{name}" value="{value}"/>\n' for name, value in sides.items())
+        bent = "" if self.distortion is None else f'    <string name="distortion" value="{self.distortion}"/>\n'
         matrix = " ".join(f"{value!r}" for value in place.ravel().tolist())
         return (
-            f'<sensor type="fspt_lens">\n{floats}'
+            f'<sensor type="fspt_lens">\n{floats}{bent}'
             f'    <transform name="to_world"><matrix value="{matrix}"/></transform>\n'
             f'    <film type="hdrfilm">\n{film}'
             '        <string name="component_format" value="float32"/>\n'
@@ -121,9 +125,17 @@ class OpenCVCamera:
 
 
 def camera_from_opencv(
-    K: ArrayLike, rvec: ArrayLike, tvec: ArrayLike, /, *, width: int, height: int, pupil_magnification: float = 1.0
+    K: ArrayLike,
+    rvec: ArrayLike,
+    tvec: ArrayLike,
+    /,
+    *,
+    width: int,
+    height: int,
+    distortion: ArrayLike | str | None = None,
+    pupil_magnification: float = 1.0,
 ) -> OpenCVCamera:
-    """Camera of `cv2.calibrateCamera` or `cv2.solvePnP`, for images whose distortion has been removed.
+    """Camera of `cv2.calibrateCamera` or `cv2.solvePnP`.
 
         camera = fspt.camera_from_opencv(K, rvec, tvec, width=512, height=512)
         camera.to_world, camera.pixel_pitch(image_distance=82.5)
@@ -138,6 +150,8 @@ def camera_from_opencv(
     rvec : 3 numbers, the rotation from the world to the camera as axis times angle [rad]
     tvec : 3 numbers, its translation [mm]: the calibration target's squares must have been given in mm
     width, height : of the image [pixels]
+    distortion : (k1, k2[, p1, p2[, k3]]) as OpenCV gives it, for images as the camera takes them. Images that OpenCV
+        has undistorted need none, but do not conserve the power on their pixels
     pupil_magnification : P of the lens. OpenCV's centre is that of the entrance pupil: `to_world` stays there, and
         `sensor_xml` moves the lens plane back along the axis by F (1 − 1/P)
 
@@ -152,20 +166,10 @@ def camera_from_opencv(
     )
     if min(width, height) < 1:
         raise OpticsError(f"camera_from_opencv: width x height = {width} x {height} must be >= 1. Give the image's.")
-    matrix = _numbers("K", K, (3, 3))
+    matrix, magnified = _matrix(K), _pupil_magnification(pupil_magnification)
     turn, shift = _numbers("rvec", rvec, (3,)), _numbers("tvec", tvec, (3,))
-    if not np.array_equal(matrix[[1, 2, 2], [0, 0, 1]], [0, 0, 0]) or matrix[2, 2] != 1:
-        raise OpticsError("camera_from_opencv: 'K' must be ((f_x, s, c_x), (0, f_y, c_y), (0, 0, 1)). Give OpenCV's.")
-    if not min(matrix[0, 0], matrix[1, 1]) > 0:
-        raise OpticsError(
-            f"camera_from_opencv: f_x = {matrix[0, 0]:g} and f_y = {matrix[1, 1]:g} must be > 0. Give OpenCV's K."
-        )
-    magnified = number("camera_from_opencv: 'pupil_magnification'", pupil_magnification, OpticsError, "0.9")
-    if not 0 < magnified < float("inf"):
-        raise OpticsError(
-            f"camera_from_opencv: 'pupil_magnification' must be > 0 and finite, got {magnified:g}. Give the diameter "
-            "of the exit pupil over that of the entrance pupil, for example 0.9."
-        )
+    with named("camera_from_opencv"):
+        bent = None if distortion is None else Distortion.of(distortion)
     focal = float(matrix[0, 0] + matrix[1, 1]) / 2
     first, wide, rest_x = _film(float(matrix[0, 2]), width)
     upper, high, rest_y = _film(float(matrix[1, 2]), height)
@@ -183,7 +187,30 @@ def camera_from_opencv(
     to_world = np.eye(4)
     to_world[:3, :3] = rotation.T @ np.diag([-1.0, -1.0, 1.0])
     to_world[:3, 3] = -rotation.T @ shift
-    return OpenCVCamera(to_world, focal, wide, high, (first, upper, width, height), deviation, magnified)
+    return OpenCVCamera(to_world, focal, wide, high, (first, upper, width, height), deviation, magnified, bent)
+
+
+def _matrix(K: ArrayLike) -> Array:
+    """K as numbers; OpticsError where it has another form or f <= 0."""
+    matrix = _numbers("K", K, (3, 3))
+    if not np.array_equal(matrix[[1, 2, 2], [0, 0, 1]], [0, 0, 0]) or matrix[2, 2] != 1:
+        raise OpticsError("camera_from_opencv: 'K' must be ((f_x, s, c_x), (0, f_y, c_y), (0, 0, 1)). Give OpenCV's.")
+    if not min(matrix[0, 0], matrix[1, 1]) > 0:
+        raise OpticsError(
+            f"camera_from_opencv: f_x = {matrix[0, 0]:g} and f_y = {matrix[1, 1]:g} must be > 0. Give OpenCV's K."
+        )
+    return matrix
+
+
+def _pupil_magnification(value: float) -> float:
+    """P as a float; OpticsError unless it is > 0 and finite."""
+    magnified = number("camera_from_opencv: 'pupil_magnification'", value, OpticsError, "0.9")
+    if not 0 < magnified < float("inf"):
+        raise OpticsError(
+            f"camera_from_opencv: 'pupil_magnification' must be > 0 and finite, got {magnified:g}. Give the diameter "
+            "of the exit pupil over that of the entrance pupil, for example 0.9."
+        )
+    return magnified
 
 
 def _film(centre: float, size: int) -> tuple[int, int, float]:

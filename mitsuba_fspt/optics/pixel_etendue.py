@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from .distortion import preimage, shrink_in_double
 from .thin_lens import Lens
 
 # Distances from the axis between which the étendue is interpolated: at least so many, and so many per pixel. The error
@@ -15,6 +16,7 @@ from .thin_lens import Lens
 RADII, RADII_PER_PIXEL = 4097, 16
 # Gauss nodes along each side of a pixel; more where the étendue changes by more than `STEEP` of itself over the pixel.
 NODES, MORE_NODES, STEEP = 2, 16, 0.02
+MORE_DISTORTED = 3  # Gauss nodes along each side of a pixel whose preimage is curved
 CHORDS, ALONG = 16, 6  # Gauss nodes across each part of the open pupil and along its chords
 Plane = NDArray[np.float64]
 
@@ -37,11 +39,17 @@ def pixel_etendues(
 
     lens : focused on the virtual detector plane
     side : of a virtual pixel [mm]
-    x, y : centres of the columns (w,) and rows (h,) on the virtual detector plane, from the optical axis [mm]
+    x, y : centres of the columns (w,), to the right, and of the rows (h,), downwards, on the virtual detector plane,
+        from the optical axis [mm]; with a distortion, of their undistorted images
     transmittance : τ of lens and filters
     pixel : 'area': the mean over the pixel; 'centre': its centre times its area, as the integral's parameter `pixel`
     """
     half = side / 2 if pixel == "area" else 0.0
+    if lens.distortion:
+        mean = _distorted_mean(lens, side, x, y, half) * (
+            1.0 if half == 0 else _inside_stop(lens.seen_field, side, x, y)
+        )
+        return transmittance * full_etendue(side, lens.discs[0].radius, lens.focus_distance) * mean
     nearest, middle, farthest = (
         np.hypot(_towards_axis(x, reach)[None, :], _towards_axis(y, reach)[:, None]) for reach in (half, 0.0, -half)
     )
@@ -58,6 +66,34 @@ def pixel_etendues(
         mean[steep] = _mean_over_pixels(table, values, half, columns, rows, MORE_NODES)
         mean *= _inside_stop(lens.seen_field, side, x, y)
     return transmittance * full_etendue(side, lens.discs[0].radius, lens.focus_distance) * mean
+
+
+def _distorted_mean(lens: Lens, side: float, x: Plane, y: Plane, half: float) -> Plane:
+    """Means over pixels (h, w) of cos⁴θ times the share of area that the distortion leaves them (Eq. M.44)."""
+    distortion, length = lens.distortion, lens.pupil_distance
+    if distortion is None:
+        raise ValueError("the lens has no distortion")
+    nodes, weights = np.polynomial.legendre.leggauss(MORE_DISTORTED if half else 1)
+    corner = float(np.hypot(np.abs(x).max() + side / 2, np.abs(y).max() + side / 2)) / length
+    limit = distortion.limit(corner, lens.magnification * length)
+    found = [
+        preimage(
+            (x[None, :] + step) / length + np.zeros((len(y), 1)),
+            (y[:, None] + other) / length + np.zeros((1, len(x))),
+            distortion.coefficients,
+            lambda u, v: shrink_in_double(u, v, limit),
+        )
+        for step in half * nodes
+        for other in half * nodes
+    ]
+    radii = [length * np.hypot(u, v) for u, v, _ in found]
+    table = np.linspace(0, max(float(r.max()) for r in radii), RADII)
+    values = mean_cos4(lens, table)
+    shares = [a * b / 4 for a in weights for b in weights]
+    return sum(
+        (w * share * np.interp(r, table, values) for w, r, (_, _, share) in zip(shares, radii, found, strict=True)),
+        np.zeros((len(y), len(x))),
+    )
 
 
 def _towards_axis(place: Plane, reach: float) -> Plane:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from ..runtime.errors import OpticsError
 from .discs import Disc
+from .distortion import Distortion
 from .focused_lens import FOCUS, NUMBERS, OPTIONAL, FocusedLens, require_positive
 from .models import LensModel, model_named, model_names
 from .models.diaphragm import Diaphragm
@@ -33,6 +34,7 @@ class Lens(FocusedLens):
     pupil_magnification : P, diameter of the exit pupil over that of the entrance pupil, > 0; unless it is 1, the lens
         plane is the front principal plane of a compound lens with the entrance pupil F/f_num at F (1 − 1/P) (Eq. M.39)
     model : which lines of sight pass, see `mitsuba_fspt.optics.models`
+    distortion : of the image by OpenCV's model, without a diaphragm apart from the lens; None for an undistorted one
 
     Raises
     ------
@@ -40,6 +42,7 @@ class Lens(FocusedLens):
     """
 
     model: LensModel = field(default_factory=Diaphragm)
+    distortion: Distortion | None = None
 
     @classmethod
     def focused(
@@ -51,11 +54,13 @@ class Lens(FocusedLens):
         magnification: float | None = None,
         image_distance: float | None = None,
         model: str = "diaphragm",
+        distortion: object = None,
         **numbers: object,
     ) -> Lens:
         """Lens focused by exactly one of u (`focus_distance`), t (`magnification`) or v (`image_distance`).
 
-        Lens law: 1/F = 1/u + 1/v, t = v/u. `model`: its name; `numbers`: borders of the lens and the model's own
+        Lens law: 1/F = 1/u + 1/v, t = v/u. `model`: its name; `distortion`: as
+        `Distortion.of` takes it; `numbers`: borders of the lens and the model's own
         parameters. Raises OpticsError where none or several set the focus, and for a number that belongs to no lens or
         to another model.
         """
@@ -80,13 +85,19 @@ class Lens(FocusedLens):
             focus_distance = focal_length * value / (value - focal_length)
         else:
             focus_distance = value
+        bent = distortion if distortion is None or isinstance(distortion, Distortion) else Distortion.of(distortion)
         optional = {name: value for name, value in numbers.items() if name in OPTIONAL}
         rest = {name: value for name, value in numbers.items() if name not in OPTIONAL and value is not None}
-        return cls(focal_length, f_number, focus_distance, **optional, model=_model(model, rest))  # type: ignore[arg-type]
+        return cls(focal_length, f_number, focus_distance, **optional, model=_model(model, rest), distortion=bent)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.model.check(self)
+        if self.distortion and self.diaphragm_distance != 0:
+            raise OpticsError(
+                f"'distortion' and 'diaphragm_distance' = {self.diaphragm_distance:g} mm exclude each other: slopes "
+                "count from the entrance pupil. Place that with 'pupil_magnification'."
+            )
 
     @property
     def pupil_radius(self) -> float:
@@ -111,7 +122,8 @@ class Lens(FocusedLens):
         """By name: the model, all numbers that are given or follow from the lens law, and D; lengths in mm."""
         own = {name: getattr(self.model, name) for name in self.model.parameters()}
         common = {name: getattr(self, name) for name in (*NUMBERS, "diaphragm_diameter")}
-        found = {"model": self.model.name} | common | own
+        bent = {} if self.distortion is None else {"distortion": str(self.distortion)}
+        found = {"model": self.model.name} | common | own | bent
         return {name: value for name, value in found.items() if value is not None}
 
 

@@ -51,6 +51,11 @@ class FsptLens(mi.Sensor):
          pupil, F/f_num wide, then lies F (1 − 1/P) before the lens plane, which is the front principal plane, and the
          working f-number is f_num (1 + t/P). Not with lens_diameter or diaphragm_distance; only with the models
          diaphragm and pinhole. Updatable.
+     * - distortion
+       - |string|
+       - "k1, k2[, p1, p2[, k3]]", OpenCV's model and order, on slopes from the centre of the entrance pupil, x to the
+         right and y downwards in the upright image. Power is conserved: a film pixel sees its preimage. Not with
+         diaphragm_distance.
      * - model
        - |string|
        - diaphragm (default) | hrrt (no diaphragm, D = lens_diameter) | pinhole (one line of sight a point) |
@@ -92,6 +97,7 @@ class FsptLens(mi.Sensor):
         if missing:
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
         self._model = str(props.get("model", "diaphragm"))
+        self._distortion = props.get("distortion")
         self._curve = _curve_of(props)
         if self._curve is None:
             self._numbers.setdefault("transmittance", mi.Float64(1.0))
@@ -129,7 +135,8 @@ class FsptLens(mi.Sensor):
         pitch = numbers.pop("pixel_pitch")
         light = {name: numbers.pop(name) for name in FILTER_NUMBERS if name in numbers}
         with named("fspt_lens"):
-            lens, filters = Lens.focused(model=self._model, **numbers), Filters.of(light, self._curve)
+            lens = Lens.focused(model=self._model, distortion=self._distortion, **numbers)
+            filters = Filters.of(light, self._curve)
         dr.make_opaque(self.m_to_world)
         to_world = mi.Transform4f(self.m_to_world)  # a copy: a reference to this object's member would be a cycle
         camera = self._camera = Camera(lens, pitch, Film.of(self.film()), to_world, filters, self._in_medium)
@@ -158,9 +165,10 @@ class FsptLens(mi.Sensor):
         pupil = mi.warp.square_to_uniform_disk_concentric(sample3)
         ray, cos_theta, passes = self._camera.line_of_sight(position, pupil)
         passes &= self._camera.passes_borders(position, pupil)
+        share = self._camera.film_map.area_share(position)
         wavelengths, spectrum = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         ray.time, ray.wavelengths = time, wavelengths
-        return ray, spectrum * (etendue_from_pixel(cos_theta, passes) * self._etendue)
+        return ray, spectrum * (etendue_from_pixel(cos_theta, passes, share) * self._etendue)
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
@@ -173,7 +181,7 @@ class FsptLens(mi.Sensor):
         pupil = mi.warp.square_to_uniform_disk_concentric(sample)
         camera = self._camera
         position, lens_point, weight, _ = camera.arrival(it.p, pupil)
-        active = active & camera.through_stop(camera.film_map.to_plane(position))
+        active = active & camera.through_stop(position)
         position -= mi.Vector2f(film.crop_offset())
         size = mi.Vector2f(film.crop_size())
         inside = active & (weight > 0) & dr.all((position >= 0) & (position < size))
@@ -196,6 +204,7 @@ class FsptLens(mi.Sensor):
 
     def to_string(self) -> str:
         rows = [f"  {name} = {float(value[0]):g}," for name, value in self._numbers.items()]
+        rows += [f"  distortion = {self._distortion},"] if self._distortion else []
         rows += [f"  transmittance_curve = {self._curve.file},"] if self._curve else []
         return "\n".join(["FsptLens[", f"  model = {self._model},", *rows, f"  film = {self.film()}", "]"])
 

@@ -214,7 +214,7 @@ class LiveScene:
         surface = surface_of(shape.emitter())
         exitance = float(surface.exitance.eval(si)[0][0]) if surface else None
         centre, radius, _ = camera.blur_disc(ray(depth / cosine))
-        centre -= offset
+        centre = camera.film_map.from_ideal(centre) - offset
         return SurfacePoint(
             tuple(float(c[0]) for c in si.p),  # type: ignore[arg-type]
             shape.id(),

@@ -88,7 +88,7 @@ def _add(
 
     si, area = elements.place(mi.UInt32(index.astype(np.uint32)), mi.Point2f(*elements.middle))
     centre, radius, _ = camera.blur_disc(si.p)
-    pupil = mi.Point2f((position - centre) / radius)
+    pupil = mi.Point2f((camera.film_map.to_ideal(position) - centre) / radius)
     _, lens_point, passes, cos_d = camera.arrival(si.p, pupil)
     to_lens = lens_point - si.p
     distance = dr.norm(to_lens)
@@ -101,6 +101,7 @@ def _add(
     radiance = dr.select(lit, scalar(emitter.eval(si, lit)), 0)
     # |r_vd - r| = |u - z|/cosθ_d. A_vd is multiplied last, so that no intermediate value exceeds float32.
     defocus = dr.opaque(mi.Float, camera.lens.focus_distance) - distance * cos_d
-    solid_angle = cos_d * dr.square(cos_d * dr.opaque(mi.Float, camera.virtual_pitch) / defocus)
+    area_share = camera.film_map.area_share(position)
+    solid_angle = area_share * cos_d * dr.square(cos_d * dr.opaque(mi.Float, camera.virtual_pitch) / defocus)
     added = eq9(mi.Float64(radiance), mi.Float64(cos_s) * mi.Float64(area) * mi.Float64(solid_angle))
     dr.scatter_add(power, dr.select(lit, added, 0), number, lit)

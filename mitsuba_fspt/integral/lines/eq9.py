@@ -46,7 +46,8 @@ def etendue_from_pixel(cos_theta: mi.Float, passes: mi.Bool, open_share: mi.Floa
 
     cos_theta : cosine of the line to the optical axis
     passes : False where a stop holds the line back
-    open_share : share of the pupil that a second border leaves open to the virtual point
+    open_share : share of the pupil that a second border leaves open to the virtual point, times the share of a virtual
+        pixel's area that the film's distortion leaves a pixel (`FilmMap.area_share`)
     """
     return open_share * dr.select(passes, dr.square(dr.square(cos_theta)), 0)
 
@@ -133,7 +134,7 @@ class View:
         pupil, open_share = self.camera.open_pupil(position, pupil)
         ray, cos_theta, passes = self.camera.line_of_sight(position, pupil, self.start)
         at_one_wavelength(ray)
-        etendue = etendue_from_pixel(cos_theta, passes, open_share)
+        etendue = etendue_from_pixel(cos_theta, passes, open_share * self.camera.film_map.area_share(position))
         if self.specular:
             found = follow(self.scene, self.specular, ray, cos_theta, self.start, passes, self._radiance, self._covers)
             return Sight(

@@ -111,7 +111,7 @@ def _sampled(view: View, needed: int, depth: int | None) -> tuple[NDArray[np.flo
         ray, cos_theta, passes = camera.line_of_sight(position, on_open, view.start)
         at_one_wavelength(ray)
         found = scalar(path.sample(view.scene, sampler, mi.RayDifferential3f(ray), None, passes)[0])
-        etendue = etendue_from_pixel(cos_theta, passes, open_share)
+        etendue = etendue_from_pixel(cos_theta, passes, open_share * camera.film_map.area_share(position))
         dr.eval(found, etendue)
         return found, etendue, position, pupil
 

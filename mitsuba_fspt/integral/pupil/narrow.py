@@ -276,9 +276,8 @@ def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, c
     cosine = dr.dot(si.n, to_lens)
     image = area * dr.abs(cosine / (dr.dot(camera.axis, to_lens) * dr.square(scale)))
     front = dr.dot(si.n, camera.to_world @ mi.Point3f(0) - si.p)
-    at = _OnElements(
-        scalar(surface.radiance(si, to_lens, mi.Bool(True))), image, cosine, front, dr.abs(blur), centre, si.p
-    )
+    radiance, place = scalar(surface.radiance(si, to_lens, mi.Bool(True))), camera.film_map.from_ideal(centre)
+    at = _OnElements(radiance, image, cosine, front, dr.abs(blur), place, si.p)
     dr.eval(at)
     return at
 

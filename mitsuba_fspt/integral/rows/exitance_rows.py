@@ -248,7 +248,8 @@ def _parts(view: View, quadrature: Quadrature, group: RowGroup) -> Iterator[_Par
         position, pupil, row = _places(view, quadrature, group.pixels[chosen], group.lines)
         pupil, open_share = view.camera.open_pupil(position, pupil)
         ray, cos_theta, passes = view.camera.line_of_sight(position, pupil, view.start)
-        etendue = etendue_from_pixel(cos_theta, passes, open_share) * dr.opaque(mi.Float, 1 / group.lines)
+        share = open_share * view.camera.film_map.area_share(position)
+        etendue = etendue_from_pixel(cos_theta, passes, share) * dr.opaque(mi.Float, 1 / group.lines)
         si = view.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=passes)
         yield _Part(group.pixels[chosen], group.factors[chosen], group.lines, row, etendue, si, -ray.d)
 

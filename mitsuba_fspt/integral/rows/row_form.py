@@ -69,7 +69,7 @@ def rows_of(
             position, mi.warp.square_to_uniform_disk_concentric(mi.Point2f(x[2], x[3]))
         )
         ray, cos_theta, passes = camera.line_of_sight(position, pupil, start)
-        etendue = etendue_from_pixel(cos_theta, passes, open_share)
+        etendue = etendue_from_pixel(cos_theta, passes, open_share * camera.film_map.area_share(position))
         most = MOST_HITS if specular and len(specular.lobes) > 1 else 1
         hits = _Hits(surfaces, elements, dr.width(place), most)
         if specular:

@@ -206,7 +206,7 @@ class _Lines:
             corner, _ = elements.place(face, mi.Point2f(*at), self.cut, part)
             position, to, _, cos_theta = camera.arrival(corner.p, node)
             profile = faces.surface.law.profile(middle, dr.normalize(to - corner.p), active)
-            cos4 = mi.Float64(etendue_from_pixel(cos_theta, True))
+            cos4 = mi.Float64(etendue_from_pixel(cos_theta, True, camera.film_map.area_share(position)))
             images.append(mi.Point2d(position - origin))
             values.append(eq9(mi.Float64(profile), cos4))
             mean += cos4 / 3
@@ -217,7 +217,8 @@ class _Lines:
         centre, radius, side = camera.blur_disc(middle.p)
         active &= side > 0
         cell = [pupil_cells.corner(i + x, j + y, m) for x, y in AROUND]
-        tile = [mi.Point2d(centre - origin + radius * c) for c in cell]
+        film = camera.film_map.from_ideal
+        tile = [mi.Point2d(film(mi.Point2f(centre + radius * c)) - origin) for c in cell]
         own = dr.select(self.points, pupil_cells.area(cell), dr.pi / mi.Float(m * m))
         virtual_pixel = dr.opaque(mi.Float, camera.virtual_pitch**2)
         etendue = mi.Float64(etendue_from_surface(cos_s, area, arrival, own, virtual_pixel))
@@ -233,10 +234,10 @@ class _Lines:
 
 
 def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:
-    """cos⁴θ of the line of sight from the middle of the pupil to a film position [pixels]."""
+    """cos⁴θ of the line of sight from the middle of the pupil to a film position [pixels], times its share of area."""
     x = mi.Point2d(camera.film_map.to_plane(position)) * (1 - camera.lens.discs[0].shift)
     squared = dr.square(dr.opaque(mi.Float64, camera.lens.focus_distance))
-    return dr.square(squared / (squared + dr.squared_norm(x)))
+    return dr.square(squared / (squared + dr.squared_norm(x))) * mi.Float64(camera.film_map.area_share(position))
 
 
 def _weights(

@@ -201,16 +201,18 @@ class _Refinement:
         discs = {at: camera.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.window.corner))
         middle = pupil_cells.middle(i, j, m)
-        images = [centre - origin + radius * middle for centre, radius, _ in discs.values()]
+        film = camera.film_map.from_ideal
+        images = [film(mi.Point2f(centre + radius * middle)) - origin for centre, radius, _ in discs.values()]
         # The image of a piece through the cell's middle; or, where that is smaller than a cell's image or the blur disc
         # covers the whole shape, of the cell through the piece's middle. Either way neighbours on the surface or on the
         # pupil are neighbours on the film.
         share = 1 / len(elements.corners)
-        centre = sum((discs[at][0] for at in elements.corners), mi.Point2f(0)) * share - origin
+        centre = sum((discs[at][0] for at in elements.corners), mi.Point2f(0)) * share
         radius = sum((discs[at][1] for at in elements.corners), mi.Float(0)) * share
         least = dr.opaque(mi.Float, BLURRED**2 if batch.glow.small else 0)
         blurred = _size(images) < dr.square(radius) * dr.maximum(dr.two_pi / dr.square(mi.Float(m)), least)
-        polygon = [dr.select(blurred, centre + radius * own, other) for own, other in zip(cell, images, strict=True)]
+        tiles = [film(mi.Point2f(centre + radius * own)) - origin for own in cell]
+        polygon = [dr.select(blurred, own, other) for own, other in zip(tiles, images, strict=True)]
         for _, _, scale in discs.values():  # no image where a piece reaches through the lens plane
             active &= scale * discs[CORNERS[0]][2] > 0
         lights = (eq9(mi.Float64(radiance), mi.Float64(etendue)), mi.Float64(etendue / dr.square(dr.square(cos_theta))))
