@@ -38,12 +38,12 @@ def wall():
 
 
 MESHES = {
-    "vertex": lambda path: world_scene(ply(path, per="vertex"), sensor=lens()),
-    "face": lambda path: world_scene(ply(path, per="face"), sensor=lens()),
-    "number": lambda path: world_scene(ply(path, exitance=2e-3), sensor=lens()),
-    "inside out": lambda path: world_scene(wall(), ply(path, per="vertex", flip_normals=True), sensor=lens()),
-    "rectangle": lambda path: world_scene(rectangle(), sensor=lens()),
-    "several": lambda path: world_scene(wall(), ply(path, per="face"), rectangle(), sensor=lens()),
+    "vertex": lambda path: world_scene(ply(path, per="vertex"), sensor=lens(8, 1.6)),
+    "face": lambda path: world_scene(ply(path, per="face"), sensor=lens(8, 1.6)),
+    "number": lambda path: world_scene(ply(path, exitance=2e-3), sensor=lens(8, 1.6)),
+    "inside out": lambda path: world_scene(wall(), ply(path, per="vertex", flip_normals=True), sensor=lens(8, 1.6)),
+    "rectangle": lambda path: world_scene(rectangle(), sensor=lens(8, 1.6)),
+    "several": lambda path: world_scene(wall(), ply(path, per="face"), rectangle(), sensor=lens(8, 1.6)),
 }
 
 
@@ -54,8 +54,8 @@ def solved(scene, *without, rtol=1e-3):
 
 TUBE = {"type": "cylinder", "p0": [0, -6, -5], "p1": [0, 6, 5], "radius": 0.2, "emitter": glow()}
 OBJECTS = MESHES | {
-    "ball": lambda _: world_scene(ball(), sensor=lens()),
-    "tube": lambda _: world_scene(TUBE, sensor=lens()),
+    "ball": lambda _: world_scene(ball(), sensor=lens(8, 1.6)),
+    "tube": lambda _: world_scene(TUBE, sensor=lens(8, 1.6)),
 }
 
 
@@ -94,26 +94,29 @@ def bitmap():
     return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}
 
 
+SMALL = lens(4, 3.2)
+FRESNEL = {"emission": "fresnel", "int_ior": 1.37}
 OTHERS = {
-    "ball": lambda path: world_scene(ball()),
-    "bitmap": lambda path: world_scene({"type": "rectangle", "emitter": glow(bitmap())}),
-    "fresnel": lambda path: world_scene(rectangle() | {"emitter": glow() | {"emission": "fresnel", "int_ior": 1.37}}),
-    "area light": lambda path: world_scene(rectangle() | {"emitter": {"type": "area"}}),
-    "ball beside": lambda path: world_scene(rectangle(), ball()),
+    "ball": lambda path: world_scene(ball(), sensor=SMALL),
+    "bitmap": lambda path: world_scene({"type": "rectangle", "emitter": glow(bitmap())}, sensor=SMALL),
+    "fresnel": lambda path: world_scene(rectangle() | {"emitter": glow() | FRESNEL}, sensor=SMALL),
+    "area light": lambda path: world_scene(rectangle() | {"emitter": {"type": "area"}}, sensor=SMALL),
+    "ball beside": lambda path: world_scene(rectangle(), ball(), sensor=SMALL),
 }
 
 
 @pytest.mark.parametrize("build", OTHERS.values(), ids=OTHERS)
 def test_what_is_not_linear_on_faces_has_no_table(build, tmp_path):
-    assert not by_table(solved(build(tmp_path / "body.ply")))
+    assert not by_table(solved(build(tmp_path / "body.ply"), rtol=0.1))
 
 
 def test_the_table_follows_every_change(tmp_path):
     """Seen to fail with a table made once."""
     import mitsuba as mi
 
-    scene = world_scene(wall(), ply(tmp_path / "body.ply", per="vertex"), sensor=lens())
+    scene = world_scene(wall(), ply(tmp_path / "body.ply", per="vertex"), sensor=lens(8, 1.6))
     parameters = mi.traverse(scene)
+    before = solved(scene).power
     for name, change in {
         "vertex_exitance": lambda values: values[::-1].copy(),
         "emitter.exitance.scale": lambda value: 3 * value,
@@ -121,13 +124,13 @@ def test_the_table_follows_every_change(tmp_path):
     }.items():
         key = f"shape_1.{name}"
         old = parameters[key]
-        before = solved(scene).power
         parameters[key] = change(np.array(old)) if not isinstance(old, float) else change(old)
         parameters.update()
         after = solved(scene)
         assert by_table(after)
         assert np.abs(after.power - before).max() > 0.1 * before.max()
         np.testing.assert_allclose(after.power, solved(scene, "record").power, atol=1e-3 * after.power.max())
+        before = after.power
 
 
 def test_a_corner_nine_decades_dimmer_than_its_neighbour_keeps_its_light(tmp_path):
@@ -154,7 +157,7 @@ def test_the_table_follows_what_nobody_tells_of(tmp_path):
     body = trimesh.creation.icosphere(2, radius=5)
     write_ply(tmp_path / "body.ply", body.vertices, body.faces, vertex=np.full(len(body.vertices), 1e-3))
     shape = {"type": "ply", "filename": str(tmp_path / "body.ply"), "emitter": glow(texture)}
-    scene = world_scene(shape, sensor=lens())
+    scene = world_scene(shape, sensor=lens(8, 1.6))
     before = solved(scene).power
     alone = mi.traverse(texture)
     alone["scale"] = 4.0
@@ -169,7 +172,7 @@ def test_the_table_follows_what_nobody_tells_of(tmp_path):
 @pytest.mark.parametrize("kind", ["vertex", "face"])
 def test_an_attribute_of_several_channels_is_refused(tmp_path, kind):
     """Fails where the first of its numbers are taken for one each."""
-    scene = world_scene(ply(tmp_path / "body.ply", per=kind), sensor=lens())
+    scene = world_scene(ply(tmp_path / "body.ply", per=kind), sensor=lens(8, 1.6))
     (mesh,) = scene.shapes()
     count = mesh.vertex_count() if kind == "vertex" else mesh.face_count()
     mesh.remove_attribute(f"{kind}_exitance")
@@ -195,7 +198,7 @@ def test_one_integrator_for_many_scenes(tmp_path):
     integrator = mi.load_dict({"type": "fspt_integral"})
 
     def sum_of(exitance):
-        scene = world_scene(ply(tmp_path / "body.ply", exitance=exitance), sensor=lens())
+        scene = world_scene(ply(tmp_path / "body.ply", exitance=exitance), sensor=lens(8, 1.6))
         return integrator.solve(scene, scene.sensors()[0]).power.sum()
 
     sums = [sum_of(exitance) for exitance in (1e-3, 2e-3, 5e-3)]
