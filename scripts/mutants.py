@@ -260,6 +260,13 @@ MUTANTS = (
         "weights of the spectrum", "optics/light.py", "WEIGHTS * spectrum.on(points)", "WEIGHTS + 0 * points", (LIGHT,)
     ),
     Mutant(
+        "light behind the filters",
+        "optics/transmittance.py",
+        "light.through(curve) if curve else light",
+        "light",
+        ("tests/plugins/test_lens_transmittance.py::test_a_spectrum_has_the_mean_of_the_curve",),
+    ),
+    Mutant(
         "rows of a product of curves",
         "optics/light.py",
         ".clip(1, 1000)",

@@ -12,7 +12,7 @@ import typer
 from ..rendering.scene_rules import is_number
 from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
-from ..runtime.errors import DetectorError, ImageError, SceneError
+from ..runtime.errors import DetectorError, ImageError, OpticsError, SceneError
 from ..runtime.progress_bar import progress_bar
 from .options import (
     AsJson,
@@ -258,20 +258,24 @@ def _calibrated_text(record: dict[str, Any]) -> str:
 
 def _lens(toml: Path, light: Light) -> tuple[Lens, float]:
     """Lens of the table [lens] with its borders, and its transmittance for a light at the detector."""
+    from ..optics.light import read_spectrum
     from ..optics.thin_lens import Lens, number_names
-    from ..optics.transmittance import Curve, transmittance_of
-    from ..phantom.framed_scene import CURVE, camera_lens
+    from ..optics.transmittance import CURVE, SPECTRUM, Curve, transmittance_of
+    from ..phantom.framed_scene import camera_lens
 
     table = camera_lens(toml)
     if missing := [name for name in ("focal_length", "f_number") if name not in table]:
         raise DetectorError(f"'{toml}' [lens]: '{missing[0]}' is missing, which --calibrate needs. Give it.")
     lens = Lens.focused(**{name: table[name] for name in (*number_names(), "model", "distortion") if name in table})
     given = {name: table[name] for name in ("transmittance",) if name in table}
-    if CURVE not in table:
+    curve = Curve.read(table[CURVE]) if CURVE in table else None
+    if SPECTRUM in table:
+        return lens, transmittance_of(given, curve, read_spectrum(table[SPECTRUM], OpticsError))
+    if curve is None:
         return lens, transmittance_of(given, None)
     if light.wavelength_nm is None:
         raise DetectorError(
             f"--calibrate: the mean of 'transmittance_curve' in '{toml}' does not follow from a spectrum at the "
-            "detector. Give 'transmittance' there, a number, or --wavelength-nm."
+            "detector. Give 'spectrum' there, that before the filters, or 'transmittance', a number."
         )
-    return lens, transmittance_of(given | {"wavelength_nm": light.wavelength_nm}, Curve.read(table[CURVE]))
+    return lens, transmittance_of(given | {"wavelength_nm": light.wavelength_nm}, curve)

@@ -224,8 +224,8 @@ def _merged(spectrum: Curve, nodes: Array) -> Array:
     return np.union1d(spectrum.wavelengths, inside)
 
 
-def read_spectrum(path: object, error: type[FsptError], thing: str) -> Curve:
-    """Spectrum of a CSV file of nm, relative power per nm, all of it in 200 … 2500 nm."""
+def read_spectrum(path: object, error: type[FsptError], thing: str = "") -> Curve:
+    """Spectrum of a CSV file of nm, relative power per nm, all of it in 200 … 2500 nm; raises `error`."""
     if not isinstance(path, (str, os.PathLike)):
         raise error(f"{thing}: 'spectrum' must be the name of a CSV file, got {type(path).__name__}. Give nm, power.")
     found = ascending_curve(Path(path), "spectrum", error, "power per nm", "660,0.8", math.inf)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,24 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import OpticsError
-from ..runtime.wavelength import LONGEST, SHORTEST, meant
 from ..runtime.wavelength import wavelength as checked
+from . import curve_file
+from .light import Light
 
 NUMBERS = ("transmittance", "wavelength_nm")  # of `fspt_lens`
+CURVE, SPECTRUM = "transmittance_curve", "spectrum"  # names of its files
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """Transmittance over the wavelength, linear between the rows of a table.
-
-    file : its name, for messages
-    wavelengths : of the rows, ascending (n,) [nm]
-    values : τ there (n,), in [0, 1]
-    """
-
-    file: str
-    wavelengths: NDArray[np.float64]
-    values: NDArray[np.float64]
+class Curve(curve_file.Curve):
+    """Transmittance τ over the wavelength, in [0, 1], linear between the rows of a table."""
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Curve:
@@ -42,41 +33,11 @@ class Curve:
         OpticsError : the file cannot be read, or a row is no pair of numbers, is given twice or lies outside the range.
         """
         path = Path(path)
-        try:
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
-        except OSError as cause:
-            raise OpticsError(
-                f"'transmittance_curve' = '{path}' cannot be read: {cause.strerror}. Check it."
-            ) from cause
-        except UnicodeDecodeError as cause:
-            raise OpticsError(
-                f"'transmittance_curve' = '{path}' is no text. Give a CSV of nm, transmittance."
-            ) from cause
-        rows = [line.partition("#")[0].strip() for line in lines]
-        rows = [row for row in rows if row]
-        if rows and not rows[0][0].isdigit():
-            rows = rows[1:]
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of a file without rows, which is refused here
-                table = np.loadtxt(rows, delimiter=",", ndmin=2, dtype=np.float64)
-        except ValueError as cause:
-            reason = " ".join(str(cause).split()).partition(" at row")[0]
-            raise OpticsError(
-                f"'transmittance_curve' = '{path}': {reason}. Give rows of nm,transmittance such as 600,0.92."
-            ) from cause
-        if table.size == 0 or table.shape[1] != 2:
-            raise OpticsError(
-                f"'transmittance_curve' = '{path}' has {table.shape[1] if table.size else 'no'} columns, must have 2. "
-                "Give rows of nm,transmittance such as 600,0.92."
-            )
-        wavelengths, values = table[np.argsort(table[:, 0])].T
+        wavelengths, values = curve_file.read_rows(path, CURVE, OpticsError, "nm, transmittance", "600,0.92")
+        order = np.argsort(wavelengths)
+        wavelengths, values = wavelengths[order], values[order]
         _check(path, wavelengths, values)
-        if wavelengths[0] > LONGEST or wavelengths[-1] < SHORTEST:
-            raise OpticsError(
-                f"'transmittance_curve' = '{path}': wavelengths must be nm, of which {SHORTEST:g} … {LONGEST:g} are "
-                f"used, got {wavelengths[0]:g} … {wavelengths[-1]:g}. {meant(wavelengths[0])}"
-            )
+        curve_file.require_range(path, CURVE, wavelengths, OpticsError)
         return cls(str(path), wavelengths, values)
 
     def at(self, wavelength_nm: float) -> float:
@@ -114,39 +75,53 @@ class Filters:
 
     transmittance : share τ of the power, in (0, 1]
     curve : name of the file of the transmittance over the wavelength; None where τ is given as a number
-    wavelength_nm : of the light [nm], for which τ holds; None without a curve
+    light : behind the filters, for which τ holds; None without a curve or a spectrum
     """
 
     transmittance: float = 1.0
     curve: str | None = None
-    wavelength_nm: float | None = None
+    light: Light | None = None
 
     @classmethod
-    def of(cls, numbers: Mapping[str, float], curve: Curve | None) -> Filters:
-        """Filters from the numbers of an `fspt_lens` and its curve, checked as in `transmittance_of`."""
-        passed = transmittance_of(numbers, curve)
-        return cls(passed, curve.file if curve else None, numbers.get("wavelength_nm"))
+    def of(cls, numbers: Mapping[str, float], curve: Curve | None, spectrum: curve_file.Curve | None = None) -> Filters:
+        """Filters from the numbers of an `fspt_lens`, its curve and its spectrum, checked as in `transmittance_of`."""
+        passed = transmittance_of(numbers, curve, spectrum)
+        file = curve.file if curve else None
+        if spectrum is not None:
+            light = Light(None, spectrum)
+            return cls(passed, file, light.through(curve) if curve else light)
+        return cls(passed, file, Light(numbers["wavelength_nm"], None) if curve else None)
 
-    def numbers(self, f_number: float) -> dict[str, float | str]:
-        """Transmittance, T-stop of a lens with this f-number, and the curve with its wavelength, by name."""
-        found: dict[str, float | str] = {
+    @property
+    def wavelength_nm(self) -> float | None:
+        """Wavelength [nm] of the light, of a spectrum its mean; None where it is not known."""
+        return self.light.mean_wavelength_nm if self.light else None
+
+    def numbers(self, f_number: float) -> dict[str, float | int | str]:
+        """Transmittance, T-stop of a lens with this f-number, and the curve with its light, by name."""
+        found: dict[str, float | int | str] = {
             "transmittance": self.transmittance,
             "t_stop": t_stop(f_number, self.transmittance),
         }
-        if self.curve is not None and self.wavelength_nm is not None:
-            found |= {"transmittance_curve": self.curve, "wavelength_nm": self.wavelength_nm}
-        return found
+        found |= {} if self.curve is None else {CURVE: self.curve}
+        return found | (self.light.metadata() if self.light else {})
 
 
-def transmittance_of(numbers: Mapping[str, float], curve: Curve | None) -> float:
-    """τ, in (0, 1], from `transmittance`, or from a curve at `wavelength_nm`; 1 if none of them is given.
+def transmittance_of(
+    numbers: Mapping[str, float], curve: Curve | None, spectrum: curve_file.Curve | None = None
+) -> float:
+    """τ, in (0, 1]: `transmittance`, or that of a curve at `wavelength_nm` or over a `spectrum`; 1 without any.
+
+    The mean over the spectrum, which is that before the filters, is weighted by power (Eq. M.43).
 
     Raises
     ------
-    OpticsError : a curve and a number, a curve without a wavelength or a wavelength without a curve, or a τ that is not
-        in (0, 1].
+    OpticsError : a curve and a number, a curve without its light, a wavelength without a curve, a wavelength and a
+        spectrum, a curve that does not cover the spectrum, or a τ that is not in (0, 1].
     """
     given, wavelength = numbers.get("transmittance"), numbers.get("wavelength_nm")
+    if wavelength is not None and spectrum is not None:
+        raise OpticsError(f"'wavelength_nm' = {wavelength:g} and 'spectrum' exclude each other. Give one of them.")
     if curve is None:
         if wavelength is not None:
             raise OpticsError(
@@ -157,13 +132,22 @@ def transmittance_of(numbers: Mapping[str, float], curve: Curve | None) -> float
     else:
         if given is not None:
             raise OpticsError(f"'transmittance' = {given:g} and 'transmittance_curve' exclude each other. Give one.")
-        if wavelength is None:
-            raise OpticsError("'transmittance_curve' needs 'wavelength_nm'. Give it in nm, for example 660.")
-        wavelength = checked("'wavelength_nm'", wavelength, OpticsError)
-        found, where = curve.at(wavelength), f" at {wavelength:g} nm in '{curve.file}'"
+        found, where = _mean(curve, wavelength, spectrum)
     if not 0 < found <= 1:
         raise OpticsError(f"'transmittance' must be > 0 and at most 1, got {found:g}{where}. Give for example 0.9.")
     return found
+
+
+def _mean(curve: Curve, wavelength: float | None, spectrum: curve_file.Curve | None) -> tuple[float, str]:
+    """τ of a curve for its light, and the light for messages."""
+    if spectrum is not None:
+        light = Light(None, spectrum)
+        light.require_cover(curve, CURVE, OpticsError)
+        return light.mean(curve), f" over '{spectrum.file}' in '{curve.file}'"
+    if wavelength is None:
+        raise OpticsError("'transmittance_curve' needs 'wavelength_nm'. Give it in nm, for example 660, or 'spectrum'.")
+    wavelength = checked("'wavelength_nm'", wavelength, OpticsError)
+    return curve.at(wavelength), f" at {wavelength:g} nm in '{curve.file}'"
 
 
 def t_stop(f_number: float, transmittance: float) -> float:

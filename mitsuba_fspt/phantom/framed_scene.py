@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..optics.focused_lens import FOCUS
 from ..optics.thin_lens import Lens, number_names
+from ..optics.transmittance import CURVE, SPECTRUM
 from ..optics.transmittance import NUMBERS as LIGHT
 from ..runtime.errors import OpticsError, SceneError
 from ..runtime.numbers import number, whole
@@ -23,7 +24,6 @@ from .phantom import Phantom
 
 FILLED = 0.9  # share of the film's side that the phantom covers in its widest view, blur included
 LEAST, MOST = 1e-6, 1e6  # limits of the search for the magnification that fills the film
-CURVE = "transmittance_curve"
 DIGITS = 3  # of the resulting magnification
 
 SCENE = """<?xml version="1.0" encoding="utf-8"?>
@@ -183,11 +183,10 @@ def framed_text(
     """
     numbers = _numbers(focal_length=focal_length, f_number=f_number, pixel_pitch=pixel_pitch, rtol=rtol, view=view)
     film = {"width": _pixels("width", width), "height": _pixels("height", height)}
-    known = ("model", *number_names(), *LIGHT, CURVE)
+    known = ("model", *number_names(), *LIGHT, CURVE, SPECTRUM)
     if unknown := [name for name in lens if name not in known]:
         raise SceneError(f"scene: 'fspt_lens' has no parameter {unknown[0]}. Leave it out, or give {', '.join(known)}.")
-    if isinstance(curve := lens.get(CURVE), str):  # the text may be saved anywhere
-        lens[CURVE] = str(Path(curve).absolute())
+    lens |= _files(lens, Path.cwd())  # the text may be saved anywhere
     frame = Frame(outline, focal_length, f_number, numbers["pixel_pitch"], film, lens)
     found = dict(zip(("magnification", "distance"), frame.placed(magnification, distance), strict=True))
     values = numbers | found | film | dict(parameters or {})
@@ -227,7 +226,7 @@ def front_behind_focus(outline: Outline, values: Mapping[str, float], view: floa
 def camera_lens(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Keywords of `scene_xml` from the table [lens] of a camera's TOML file; other tables are not read.
 
-    A key `name` is for people and left out; a file that `transmittance_curve` names is searched for beside the TOML.
+    A key `name` is for people and left out; files of `transmittance_curve` and `spectrum` are beside the TOML.
 
     Raises
     ------
@@ -240,9 +239,12 @@ def camera_lens(path: str | os.PathLike[str]) -> dict[str, Any]:
     for name, value in lens.items():
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise SceneError(f"'{path}' [lens]: '{name}' must be a number or a text, got {value!r}. Correct it.")
-    if isinstance(curve := lens.get(CURVE), str):
-        lens[CURVE] = str(Path(path).parent / curve)
-    return lens
+    return lens | _files(lens, Path(path).parent)
+
+
+def _files(lens: Mapping[str, Any], folder: Path) -> dict[str, str]:
+    """Paths of the files that the numbers of a lens name, relative to a folder."""
+    return {name: str(folder / lens[name]) for name in (CURVE, SPECTRUM) if isinstance(lens.get(name), str)}
 
 
 @dataclass(frozen=True, eq=False)

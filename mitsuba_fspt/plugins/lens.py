@@ -9,9 +9,11 @@ from ..camera.camera import Camera
 from ..camera.film import Film
 from ..integral.lines.eq9 import etendue_from_pixel
 from ..jit.spectra import flat_share
+from ..optics import curve_file
+from ..optics.light import read_spectrum
 from ..optics.thin_lens import Lens, number_names
+from ..optics.transmittance import CURVE, SPECTRUM, Curve, Filters
 from ..optics.transmittance import NUMBERS as FILTER_NUMBERS
-from ..optics.transmittance import Curve, Filters
 from ..runtime.errors import OpticsError, named
 from .film import default_sampler, number, own_film
 
@@ -75,6 +77,10 @@ class FsptLens(mi.Sensor):
        - |string|, |float| [nm]
        - In place of a number: CSV file with rows of nm,τ, linear between them, and the wavelength of the light, which
          must not lie outside. The wavelength is updatable.
+     * - spectrum
+       - |string|
+       - In place of the wavelength: CSV file with ascending rows of nm and relative power per nm of the light before
+         the filters. τ is then the mean over it; images state the light behind the filters.
      * - to_world
        - |transform|
        - Rotation and translation. Puts the lens centre, for a compound lens that of the front principal plane, at the
@@ -98,7 +104,7 @@ class FsptLens(mi.Sensor):
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
         self._model = str(props.get("model", "diaphragm"))
         self._distortion = props.get("distortion")
-        self._curve = _curve_of(props)
+        self._curve, self._spectrum = _curve_of(props), _spectrum_of(props)
         if self._curve is None:
             self._numbers.setdefault("transmittance", mi.Float64(1.0))
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
@@ -136,7 +142,7 @@ class FsptLens(mi.Sensor):
         light = {name: numbers.pop(name) for name in FILTER_NUMBERS if name in numbers}
         with named("fspt_lens"):
             lens = Lens.focused(model=self._model, distortion=self._distortion, **numbers)
-            filters = Filters.of(light, self._curve)
+            filters = Filters.of(light, self._curve, self._spectrum)
         dr.make_opaque(self.m_to_world)
         to_world = mi.Transform4f(self.m_to_world)  # a copy: a reference to this object's member would be a cycle
         camera = self._camera = Camera(lens, pitch, Film.of(self.film()), to_world, filters, self._in_medium)
@@ -205,19 +211,35 @@ class FsptLens(mi.Sensor):
     def to_string(self) -> str:
         rows = [f"  {name} = {float(value[0]):g}," for name, value in self._numbers.items()]
         rows += [f"  distortion = {self._distortion},"] if self._distortion else []
-        rows += [f"  transmittance_curve = {self._curve.file},"] if self._curve else []
+        files = {CURVE: self._curve, SPECTRUM: self._spectrum}
+        rows += [f"  {name} = {curve.file}," for name, curve in files.items() if curve]
         return "\n".join(["FsptLens[", f"  model = {self._model},", *rows, f"  film = {self.film()}", "]"])
 
 
 def _curve_of(props: mi.Properties) -> Curve | None:
-    """Curve of the file that the scene names, searched for as Mitsuba searches for bitmaps; None if it names none."""
-    if "transmittance_curve" not in props:
+    """Transmittance of the file that the scene names; None if it names none."""
+    if (path := _file_of(props, CURVE)) is None:
         return None
-    name = props["transmittance_curve"]
     with named("fspt_lens"):
-        if not isinstance(name, str) or not name:
-            raise OpticsError(f"'transmittance_curve' must be the name of a CSV file, got {name!r}. Give a text.")
-        return Curve.read(str(mi.file_resolver().resolve(name)))
+        return Curve.read(path)
+
+
+def _spectrum_of(props: mi.Properties) -> curve_file.Curve | None:
+    """Spectrum of the file that the scene names; None if it names none."""
+    if (path := _file_of(props, SPECTRUM)) is None:
+        return None
+    with named("fspt_lens"):
+        return read_spectrum(path, OpticsError)
+
+
+def _file_of(props: mi.Properties, key: str) -> str | None:
+    """Path of the file that a property names, searched for as Mitsuba searches for bitmaps; None without it."""
+    if key not in props:
+        return None
+    name = props[key]
+    if not isinstance(name, str) or not name:
+        raise OpticsError(f"fspt_lens: '{key}' must be the name of a CSV file, got {name!r}. Give a text.")
+    return str(mi.file_resolver().resolve(name))
 
 
 mi.register_sensor("fspt_lens", FsptLens)

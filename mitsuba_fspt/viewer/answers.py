@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from ..images.image import Image
 from ..images.pixel_axes import virtual_pitch
 from ..images.radiometry import etendue
-from ..optics.light import PLANCK_TIMES_LIGHT
+from ..optics.light import PLANCK_TIMES_LIGHT, Light
 from ..optics.models import model_names
 from ..rendering.live_scene import LiveScene
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
-from ..runtime.errors import FsptError, ViewerError
+from ..runtime.errors import FsptError, ImageError, ViewerError
 from .faults import in_parameters
 from .origin import Origin
 from .sliders import sliders_of
@@ -157,6 +157,7 @@ class Answers:
             except FsptError as error:
                 lacks = _one_line(error)
         height, width = image.shape
+        light = Light.recorded(known, ImageError, "view")
         record = given | {
             "kind": "picture",
             "height": height,
@@ -166,7 +167,7 @@ class Answers:
             "rtol": known.get("rtol"),
             "method": known.get("method"),
             "side": virtual_pitch(known),
-            "wavelength_nm": known.get("wavelength_nm"),
+            "wavelength_nm": light.mean_wavelength_nm if light else None,
             "photons_per_joule_nm": 1e-9 / PLANCK_TIMES_LIGHT,
             "warnings": known.get("warnings", ""),
             "model": request.model or "",

@@ -105,6 +105,52 @@ def test_the_image_states_it(curve):
     assert "transmittance = 0.25" in str(camera_scene(disk(165), transmittance=0.25).sensors()[0])
 
 
+@pytest.fixture
+def spectrum(tmp_path):
+    (tmp_path / "band.csv").write_text("nm,power\n520,0\n580,2\n680,1\n690,0\n")
+    return str(tmp_path / "band.csv")
+
+
+def test_a_spectrum_has_the_mean_of_the_curve(curve, spectrum):
+    """τ is weighted by the power before the filters, and the image has the light behind them: photons without a word.
+
+    Seen to fail with the mean over the nm (0.65 for 0.70), and with the light before the filters in the image.
+    """
+    nm = np.linspace(520, 690, 170001)
+    nm = (nm[1:] + nm[:-1]) / 2
+    before = np.interp(nm, [520, 580, 680, 690], [0, 2, 1, 0])
+    behind = before * np.interp(nm, [500, 600, 700], [0.2, 0.8, 0.5])
+    tau, mean = behind.sum() / before.sum(), (behind * nm).sum() / behind.sum()
+    clear = fspt.render(camera_scene(disk(165)), method="integral", rtol=1e-3)
+    scene = camera_scene(disk(165), transmittance_curve=curve, spectrum=spectrum)
+    image = fspt.render(scene, method="integral", rtol=1e-3)
+    assert image.metadata["transmittance"] == pytest.approx(tau, rel=1e-7)
+    np.testing.assert_allclose(image.power, tau * clear.power, rtol=1e-6)
+    assert "wavelength_nm" not in image.metadata
+    own, given = image.roi(), clear.roi(None, mean)
+    assert own.mean_radiance == pytest.approx(given.mean_radiance, rel=1e-5)
+    ccd = fspt.Detector.typical_ccd()
+    electrons = ccd.expected(image, 1.0).mean - 1e-3 * (0.4 / 0.0135) ** 2
+    expected = ccd.expected(clear, 1.0, mean).mean - 1e-3 * (0.4 / 0.0135) ** 2
+    np.testing.assert_allclose(electrons, tau * expected, rtol=1e-5)
+    alone = fspt.render(camera_scene(disk(165), spectrum=spectrum, transmittance=0.5), method="integral", rtol=1e-2)
+    assert alone.metadata["transmittance"] == 0.5
+    assert alone.metadata["spectrum"] == "[[520.0, 0.0], [580.0, 2.0], [680.0, 1.0], [690.0, 0.0]]"
+    assert f"spectrum = {spectrum}" in str(scene.sensors()[0])
+
+
+def test_spectra_that_the_lens_refuses(curve, spectrum, tmp_path):
+    (tmp_path / "wide.csv").write_text("400,1\n600,1\n")
+    (tmp_path / "down.csv").write_text("600,1\n500,1\n")
+    for settings, message in (
+        ({"transmittance_curve": curve, "spectrum": spectrum, "wavelength_nm": 600.0}, "exclude each other"),
+        ({"transmittance_curve": curve, "spectrum": str(tmp_path / "wide.csv")}, "the light 400 … 600 nm"),
+        ({"spectrum": str(tmp_path / "down.csv")}, "the wavelengths must ascend, got 500 nm in row 2"),
+        ({"spectrum": 3.0}, "'spectrum' must be the name of a CSV file, got 3.0"),
+    ):
+        test_what_the_lens_refuses(settings, message)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -150,7 +196,8 @@ def test_a_camera_file_names_a_curve_beside_itself(tmp_path, run, monkeypatch):
     camera.mkdir()
     (camera / "filter.csv").write_text("500,0.2\n600,0.8\n")
     film = "width = 8\nheight = 8\npixel_pitch = 3.456\n"
-    (camera / "c.toml").write_text(f'[lens]\n{film}transmittance_curve = "filter.csv"\nwavelength_nm = 500\n')
+    curve = 'transmittance_curve = "filter.csv"\n'
+    (camera / "c.toml").write_text(f"[lens]\n{film}{curve}wavelength_nm = 500\n")
     corners = [(0, -9, -9), (0, 9, -9), (0, 9, 9), (0, -9, 9)]
     write_ply(tmp_path / "p.ply", corners, [(0, 1, 2), (0, 2, 3)], vertex=[1.0] * 4)
     monkeypatch.chdir(tmp_path)
@@ -162,6 +209,10 @@ def test_a_camera_file_names_a_curve_beside_itself(tmp_path, run, monkeypatch):
     assert with_filter.power.sum() == pytest.approx(0.2 * clear.power.sum(), rel=1e-5)
     dim = fspt.render(fspt.scene_xml("p.ply", transmittance=0.5, **size), rtol=0.1)
     assert dim.power.sum() == pytest.approx(0.5 * clear.power.sum(), rel=1e-5)
+    (camera / "band.csv").write_text("500,1\n600,1\n")
+    (camera / "c.toml").write_text(f'[lens]\n{film}{curve}spectrum = "band.csv"\n')
+    assert run("render", "p.ply", "--camera", "camera/c.toml", "--rtol", "0.1", "--quiet") == (0, "", "")
+    assert fspt.read("p.exr").metadata["transmittance"] == pytest.approx(0.5)
     code, out, err = run("render", "p.ply", "-D", "transmittance=2")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "'transmittance' must be > 0 and at most 1, got 2" in err
