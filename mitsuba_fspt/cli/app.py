@@ -14,6 +14,7 @@ from typer.exceptions import TyperException
 from ..runtime.errors import FsptError
 from ..runtime.interrupt import ctrl_c_noted, terminated_as_by_ctrl_c
 from .calibrate import calibrate
+from .camera import app as camera
 from .checks import doctor, explain, stability
 from .converge import converge
 from .expose import expose
@@ -44,6 +45,7 @@ for verb in VERBS:
     app.command()(verb)
 app.add_typer(flux, name="flux")
 app.add_typer(scene, name="scene")
+app.add_typer(camera, name="camera")
 
 INTERRUPTED = 130  # exit code after Ctrl-C or SIGTERM
 

@@ -160,12 +160,7 @@ def camera_from_opencv(
     OpticsError : numbers of another form, f <= 0, or a skew, f_x ≠ f_y or principal point that move a corner of the
         image by more than half a pixel from where a thin lens with square pixels puts it.
     """
-    width, height = (
-        whole(f"camera_from_opencv: '{name}'", value, OpticsError, "512")
-        for name, value in (("width", width), ("height", height))
-    )
-    if min(width, height) < 1:
-        raise OpticsError(f"camera_from_opencv: width x height = {width} x {height} must be >= 1. Give the image's.")
+    width, height = _size(width, height)
     matrix, magnified = _matrix(K), _pupil_magnification(pupil_magnification)
     turn, shift = _numbers("rvec", rvec, (3,)), _numbers("tvec", tvec, (3,))
     with named("camera_from_opencv"):
@@ -188,6 +183,17 @@ def camera_from_opencv(
     to_world[:3, :3] = rotation.T @ np.diag([-1.0, -1.0, 1.0])
     to_world[:3, 3] = -rotation.T @ shift
     return OpenCVCamera(to_world, focal, wide, high, (first, upper, width, height), deviation, magnified, bent)
+
+
+def _size(width: int, height: int) -> tuple[int, int]:
+    """Width and height as whole numbers >= 1, else OpticsError."""
+    width, height = (
+        whole(f"camera_from_opencv: '{name}'", value, OpticsError, "512")
+        for name, value in (("width", width), ("height", height))
+    )
+    if min(width, height) < 1:
+        raise OpticsError(f"camera_from_opencv: width x height = {width} x {height} must be >= 1. Give the image's.")
+    return width, height
 
 
 def _matrix(K: ArrayLike) -> Array:
