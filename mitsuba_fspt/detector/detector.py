@@ -155,7 +155,7 @@ class Detector(DetectorParameters):
         pixel_pitch: float | None = None,
         frames: int | None = None,
         bias: Frame | None = None,
-        dark: Frame | None = None,
+        dark: Frame | float | None = None,
         flat: Frame | None = None,
         flat_kind: str | None = None,
         flat_dark: Frame | float | None = None,
@@ -175,7 +175,8 @@ class Detector(DetectorParameters):
         pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene;
             None: that of the file, if the detector has none of its own
         frames : number of frames that counts (h, w) are the mean of; None: 1; of a stack, its length
-        bias, dark : frames or stacks [DN] in place of `bias` and `dark_current`; `dark` contains the bias
+        bias, dark : frames or stacks [DN] in place of `bias` and `dark_current`; `dark` contains the bias, and may be a
+            number
         flat, flat_kind : frame or stack [DN] of a uniform light, 'lens' through the lens of `scene`, or 'sensor'
             without a lens (Eq. M.36); the noise of a stack, not that of a single frame, enters the errors
         flat_dark : number, frame or stack [DN] to subtract from the flat; None: the bias, from unsigned integers alone

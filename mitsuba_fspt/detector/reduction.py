@@ -106,7 +106,7 @@ class Corrections:
     """What corrects counts, see `Detector.reduce`: frames, the flat field with its kind, and pixels to leave out."""
 
     bias: Frame | None = None
-    dark: Frame | None = None
+    dark: Frame | float | None = None
     flat: Frame | FlatField | None = None
     flat_kind: str | None = None
     flat_dark: Frame | float | None = None
@@ -280,18 +280,24 @@ def calibrated(detector: Own, image: Image, power: Array, error: float) -> Own:
 
 
 def _background(
-    detector: DetectorParameters, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | None
+    detector: DetectorParameters, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | float | None
 ) -> tuple[Array | float, Array | float, Array | float]:
     """Level to subtract [DN], a number or a frame; the dark and spurious charge [e-]; the variance that the frame adds
     [e-²]. Electrons are those before the register.
 
-    A dark frame has the same exposure time as the counts and contains the bias. Both contain the spurious charge.
+    A dark frame, or a number in its place, has the same exposure time as the counts and contains the bias. Both frames
+    contain the spurious charge.
     """
     shape = raw.values.shape
     gain = detector.on_pixels("gain", shape) / detector.em_gain  # electrons before the register per DN
     dark_charge, spurious = exposed.dark(detector, shape), exposed.spurious(detector)
     charge = dark_charge + spurious
     reading = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2 + gain**2 / 12
+    if dark is not None and not isinstance(dark, (str, os.PathLike)) and np.ndim(dark) == 0:
+        level = number("reduce: 'dark'", dark, DetectorError, "500")
+        if not 0 <= level < np.inf:
+            raise DetectorError(f"reduce: 'dark' must be >= 0 DN, got {level:g}. Give the bias and the dark current.")
+        return level, charge, 0.0
     frame = raw.background if dark is None and raw.background is not None else dark
     if frame is not None:
         found = frame_like(frame, "dark", raw.values.shape)

@@ -29,7 +29,7 @@ def combined(one: Sum, other: ImageData, sign: int) -> Sum:
     if mask is not None:
         power[mask] = 0
     coverage = one.coverage if _same(one.coverage, other.coverage) else None
-    known = _metadata(one, other)
+    known = _metadata(one, other) | _source_power(one, other, sign)
     planes: dict[str, Any] = dict.fromkeys(BESIDE)
     planes |= {"error": _error(one, other), "coverage": coverage, "mask": mask}
     if sign == 1 and _of_one_detector(one, other):
@@ -68,11 +68,15 @@ def _dark_noise(one: ImageData, other: ImageData) -> NDArray[np.float64] | None:
 
 
 def _error(one: ImageData, other: ImageData) -> NDArray[np.float64] | None:
-    """Standard errors added in squares; bounds, of which the integral's are, added up. None where one is unknown."""
+    """Standard errors added in squares; bounds, of which the integral's are, added up. None where one is unknown.
+
+    Monte Carlo images of one seed have noise in common: their errors add up, too, the bound of any correlation.
+    """
     if one.error is None or other.error is None:
         return None
     first, second = one.error.astype(np.float64), other.error.astype(np.float64)
-    if is_deterministic(one) or is_deterministic(other):
+    seeds = [image.metadata.get("seed") for image in (one, other)]
+    if is_deterministic(one) or is_deterministic(other) or (seeds[0] is not None and seeds[0] == seeds[1]):
         return first + second
     return np.sqrt(first**2 + second**2)
 
@@ -82,6 +86,17 @@ def _metadata(one: ImageData, other: ImageData) -> Metadata:
     known = {name: value for name, value in one.metadata.items() if other.metadata.get(name) == value}
     told = dict.fromkeys(str(image.metadata["warnings"]) for image in (one, other) if "warnings" in image.metadata)
     return known | ({"warnings": "; ".join(told)} if told else {})
+
+
+def _source_power(one: ImageData, other: ImageData, sign: int) -> Metadata:
+    """`source_power` of the sum, that of both sources; of a difference, or where one has none, that of the image.
+
+    A sum without it could be scaled again.
+    """
+    watts = [float(image.metadata["source_power"]) for image in (one, other) if "source_power" in image.metadata]
+    if not watts:
+        return {}
+    return {"source_power": sum(watts) if sign == 1 else watts[0]}
 
 
 def _same(one: NDArray | None, other: NDArray | None) -> bool:

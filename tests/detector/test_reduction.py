@@ -101,6 +101,18 @@ def test_errors_follow_the_flat_field():
     np.testing.assert_allclose(found.flat, flat, rtol=1e-5)
 
 
+def test_a_number_in_place_of_a_dark_frame():
+    """It is subtracted in place of bias and dark current, without noise of its own."""
+    pytest.importorskip("ccdproc")
+    counts = CCD.expose(Image(np.full((16, 16), 1e-12)), 60, 650, seed=1).counts
+    found = CCD.reduce(counts, **SETTINGS, dark=510)
+    frame = CCD.reduce(counts, **SETTINGS, dark=np.full((16, 16), 510.0))
+    np.testing.assert_allclose(found.power, frame.power)
+    assert found.metadata["dark_electrons"] < frame.metadata["dark_electrons"]
+    with pytest.raises(DetectorError, match="'dark' must be >= 0 DN"):
+        CCD.reduce(counts, **SETTINGS, dark=-1)
+
+
 def test_dark_charge_and_frames_add_their_noise():
     """No light: 30 electrons of dark charge, its mean subtracted or a dark frame, stacks, rounding: χ² of pixels is 1.
 
