@@ -43,6 +43,7 @@ class Settings:
     reweighted : relative change of the standard deviations, root mean square, at which they count as converged; it
         changes χ² by as much
     rounds, roughly : most rounds of variances and weight, and of those of a first fit
+    averaged : rounds after which variances of Monte Carlo images are means over the rounds since
     weight : change of log(weight) at which it counts as converged: 1/10 of its own uncertainty for 200 determined
         unknowns
     probes : random vectors for the number of determined unknowns, whose relative error is about (2/(probes γ))^½
@@ -69,6 +70,7 @@ class Settings:
     reweighted: float = 1e-3
     rounds: int = 20
     roughly: int = 8
+    averaged: int = 4
     weight: float = 0.01
     probes: int = 8
     first: float = 100.0

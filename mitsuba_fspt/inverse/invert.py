@@ -300,6 +300,7 @@ class Problem:
         for turn in range(rounds):
             report("fit", turn / rounds)
             before, state = state, self._improved(state, probes, weight, self.settings.drawn)
+            state = replace(state, sigma=self._averaged(before.sigma, state.sigma, turn))
             drift = float(np.sqrt(np.mean((state.sigma / before.sigma - 1) ** 2)))
             changed = abs(np.log(state.weight / before.weight)) if weight is None else 0.0
             converged = bool(drift < looser * self.settings.reweighted and changed < looser * self.settings.weight)
@@ -311,6 +312,18 @@ class Problem:
         if not rough and state.decrement > self.settings.accuracy.decrement:
             state = self._improved(state, probes, weight, self.settings.accuracy)
         return replace(state, converged=converged)
+
+    def _averaged(self, before: Array, sigma: Array, turn: int) -> Array:
+        """σ (N,) for the next round: of images of a Monte Carlo, after some rounds, the mean variance of the rounds.
+
+        Their variance changes by steps where a pixel changes its group (Eq. M.27): without the mean it may never end.
+        """
+        sampled = self.measurement.noise.sampled[self.factors.view]
+        count = turn - self.settings.averaged
+        if count < 1 or not sampled.any():
+            return sigma
+        mean = np.sqrt((count * before**2 + sigma**2) / (count + 1))
+        return np.where(sampled, mean, sigma)
 
     def most_likely(self, report: Progress) -> Fit:
         """Maximum of the likelihood without a penalty."""
@@ -420,7 +433,7 @@ class Problem:
             rng = np.random.default_rng(sequence)
             right, gain = self._drawn(design, fit, between, size, rng)
             found = minimise(normal, right, minima.near(right, fit.x), self.bounds, solve, self.settings.drawn).x
-            common = 1 + self.factors.common * rng.standard_normal(size)
+            common = np.exp(self.factors.common * rng.standard_normal(size))
             own = slice(self.surface.unknowns, None)
             return np.concatenate([found[: own.start] * gain * common, self.factors.of(found[own]) / common])
 

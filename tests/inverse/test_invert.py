@@ -10,10 +10,11 @@ import pytest
 import trimesh
 from scipy.optimize import lsq_linear, minimize, nnls
 from scipy.sparse import csr_array
-from sphere_views import RADIUS, noisy, sphere_views
+from sphere_views import RADIUS, noisy, passes_of, sphere_views
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse import multipliers
+from mitsuba_fspt.inverse.fit_settings import Settings
 from mitsuba_fspt.inverse.nonnegative import Accuracy, factor, minimise, pivoted
 from mitsuba_fspt.inverse.smoothness import Prior, Smoothness
 from mitsuba_fspt.inverse.surface import Surface
@@ -191,6 +192,18 @@ def test_masked_pixels_do_not_count(case):
     assert not front.seen[x < -1].any()
     assert np.isnan(front.exitance[~front.seen]).all()
     assert front.total == pytest.approx((matrix.areas * front.solution)[front.seen].sum())
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_variances_of_a_monte_carlo_converge(case, seed):
+    """Seen to fail: where pixels change their group of Eq. M.27, variances changed for all 20 rounds."""
+    matrix, exitance = case
+    power, error = passes_of(matrix.forward(exitance), 60, np.random.default_rng(seed))
+    found = fspt.invert(matrix, power, error=error, sampled=True)
+    assert found.converged
+    assert 0.9 < found.chi2 < 1.1
+    averaged = fspt.invert(matrix, power, error=error, sampled=True, settings=Settings(averaged=8))
+    assert found.total == pytest.approx(averaged.total, rel=1e-3)
 
 
 @pytest.mark.parametrize("electrons", [10, 100])
