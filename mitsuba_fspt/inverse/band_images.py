@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +27,7 @@ LOG = logging.getLogger("mitsuba_fspt")
 # from which on it is told. The sources are wrong by about that distance, which the intervals do not contain.
 OFF_BORDER = 0.25
 TOLD = 0.02
+STEP = 0.05  # relative change of optical coefficients, for slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +111,26 @@ class BandImages:
         x, y, z = (float(value) for value in position)
         solution = self.tissue.solve([Source(Sphere((x, y, z)))])
         return self.share * solution.exitance_at(self.surface.vertices, self._places)
+
+    def slopes(self, positions: Array, powers: Array) -> dict[str, Array]:
+        """(N,) change of the power on the pixels [W] by relative changes of the tissue's coefficients.
+
+        'absorption': of all µa, 'scattering': of all µs', for point sources at `positions` (K, 3) [mm] with `powers`
+        (K,) [W]. By differences of solutions with linear elements, whose own error cancels but for some percent.
+        """
+        sources = [
+            Source(Sphere((float(x), float(y), float(z))), float(power))
+            for (x, y, z), power in zip(positions, powers, strict=True)
+        ]
+        media = self.tissue.media
+        changes = {
+            "absorption": [replace(medium, mua=(1 + STEP) * medium.mua) for medium in media],
+            "scattering": [replace(medium, musp=(1 + STEP) * medium.musp) for medium in media],
+        }
+        tissues = [self.tissue.linear(), *map(self.tissue.linear, changes.values())]
+        fields = [one.solve(sources).exitance_at(self.surface.vertices, self._places) for one in tissues]
+        change = self.share / STEP * (np.column_stack(fields[1:]) - fields[0][:, None])
+        return dict(zip(changes, (self.transport @ change).T, strict=True))
 
     @cached_property
     def _places(self) -> tuple[Index, Array]:

@@ -1,8 +1,9 @@
 """Patterns in the residuals of images that a cause outside the model makes, of unit length in units of the noise.
 
 Of each view: a factor, an additive background, a gradient, a shift, a scale of the image about its centre, and low
-cosines over the film times the signal; a shift and a scale that all views have in common; of each source inside: powers
-of the distance from it times its light.
+cosines over the film times the signal; a shift and a scale that all views have in common; of each source inside:
+cosines of the distance from it times its light; of the tissue in each band: relative changes of absorption and
+scattering.
 """
 
 from __future__ import annotations
@@ -53,8 +54,8 @@ def views_of(names: Sequence[str], signal: Array, rows: NDArray[np.int64], sigma
 class Pattern:
     """A cause: its kind, where it is, and the columns that it moves.
 
-    kind : 'factor', 'background', 'gradient', 'shift', 'scale', 'smooth' or 'ring'
-    where : name of the view, 'all views', or 'source 1'
+    kind : 'factor', 'background', 'gradient', 'shift', 'scale', 'smooth', 'ring', 'absorption' or 'scattering'
+    where : name of the view, 'all views', 'source 1', 'the tissue' or 'band red'
     columns : (d,) or (d, k) numbers of columns; each of the d unknowns moves its k columns by the unit of the kind
     """
 
@@ -68,7 +69,7 @@ class Patterns:
     """Columns (N, p) of unit length over all pixels that are fitted, one view after the other.
 
     lengths : (p,) of the columns in units of the kind: factor 1, background W, gradient 1 from the centre to the edge
-        of the film, shift pixels, scale 1
+        of the film, shift pixels, scale 1, absorption and scattering 1
     """
 
     columns: csr_array
@@ -76,8 +77,17 @@ class Patterns:
     causes: tuple[Pattern, ...]
 
     @classmethod
-    def of(cls, views: Sequence[Seen], rings: Sequence[tuple[Array, Array]] = ()) -> Patterns:
-        """Patterns of views, and of sources: their light over σ and the distance [mm] from them, (N,) each."""
+    def of(
+        cls,
+        views: Sequence[Seen],
+        rings: Sequence[tuple[Array, Array]] = (),
+        slopes: Sequence[tuple[str, str, Array]] = (),
+    ) -> Patterns:
+        """Patterns of views, of sources and of the tissue.
+
+        rings : of each source its light over σ and the distance [mm] from it, (N,) each
+        slopes : kind, where and (N,) change of the fitted signal over σ by a cause with one size
+        """
         blocks, causes, first, ends = [], list[Pattern](), 0, np.cumsum([0, *(len(one.rows) for one in views)])
         total = int(ends[-1])
         for view, start in zip(views, ends, strict=False):
@@ -99,6 +109,10 @@ class Patterns:
             blocks.append(csr_array(ring))
             causes.append(Pattern("ring", f"source {number}", np.arange(POWERS) + first))
             first += POWERS
+        for kind, where, slope in slopes:
+            blocks.append(csr_array(slope[:, None]))
+            causes.append(Pattern(kind, where, np.array([first])))
+            first += 1
         columns = csr_array(hstack(blocks, format="csr"))
         lengths = np.sqrt(np.asarray(columns.multiply(columns).sum(axis=0)).ravel())
         scaled = columns.multiply(1 / np.where(lengths > 0, lengths, 1.0)[None])

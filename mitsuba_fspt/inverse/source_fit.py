@@ -154,8 +154,9 @@ class SourceFit:
         return [b.measurement.chi2(b.rows, found.signal[own], found.sigma[own]) for b, own in each]
 
     def structure(self, found: PointSources) -> Structure:
-        """Test of the residuals for structure: over each view of each band, and around each source."""
-        views, known, light = list[Seen](), [], found.columns * found.powers / found.sigma[:, None]
+        """Test of the residuals for structure: over views, around sources, by coefficients of the tissue."""
+        views, known, tissue = list[Seen](), [], list[tuple[str, str, Array]]()
+        light = found.columns * found.powers / found.sigma[:, None]
         for band, own, exitance in zip(self.bands, self._parts, found.exitance, strict=True):
             fitted = band.measurement.as_images(band.rows, found.signal[own])[0]
             names = [label if band.name is None else f"{band.name}: {label}" for label in view_labels(band.matrix)]
@@ -164,6 +165,11 @@ class SourceFit:
             factor = band.measurement.gain_error * csr_array((found.signal[own] / found.sigma[own])[:, None])
             known.append(hstack([common_errors(numerical, seen), factor]))
             views += seen
+            where = "the tissue" if band.name is None else f"band {band.name}"
+            for kind, change in band.slopes(found.positions, found.powers).items():
+                slope = np.zeros_like(found.signal)
+                slope[own] = change / found.sigma[own]
+                tissue.append((kind, where, slope))
         places = np.concatenate([band.places() for band in self.bands])
         rings = [(light[:, k], np.linalg.norm(places - at, axis=1)) for k, at in enumerate(found.positions)]
         slopes = found.changes / found.sigma[:, None]
@@ -174,7 +180,7 @@ class SourceFit:
         inverse = np.linalg.inv(slopes.T @ slopes + np.diag(prior))
         errors = csr_array(block_diag(known, format="csr"))
         residual = (self.power - self.fitted(found)) / found.sigma
-        return structure(residual, slopes, lambda x: inverse @ x, Patterns.of(views, rings), errors)
+        return structure(residual, slopes, lambda x: inverse @ x, Patterns.of(views, rings, tissue), errors)
 
     def images(self, values: Array) -> Array | dict[str, Array]:
         """Values (N,) of the pixels as images, (views, height, width); by the names of the bands where they have names.

@@ -26,6 +26,7 @@ from .patterns import Pattern, Patterns, Seen
 Array = NDArray[np.float64]
 Columns: TypeAlias = csr_array | Array
 CHUNK = 1 << 16  # pixels at a time
+TISSUE = "optical coefficients, or a depth at which the diffusion equation does not hold"
 HINTS = {
     "factor": "exposure and filter of the view, or give gain_per_view",
     "background": "background and read-out offset",
@@ -33,7 +34,9 @@ HINTS = {
     "shift": "pose",
     "scale": "distance, magnification and focus",
     "smooth": "shape, absorbers and light that the model leaves out",
-    "ring": "optical coefficients, or a depth at which the diffusion equation does not hold",
+    "ring": TISSUE,
+    "absorption": TISSUE,
+    "scattering": TISSUE,
 }
 
 
@@ -46,12 +49,15 @@ class StructureSettings:
         that the penalty smooths away; in directions with more of it, the test would be one of the prior
     absorbed : least share of a direction that the fit leaves in the residuals; below it rounding counts
     named : most causes that are named
+    shown : least share of the squared length of a cause that the residuals show. What the fit absorbs but for less, as
+        factors of views with `gain_per_view`, would get any size, and is no cause
     """
 
     chance: float = 1e-4
     noise: float = 0.5
     absorbed: float = 1e-3
     named: int = 3
+    shown: float = 1e-2
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,8 @@ class Cause:
                 return f"a shift of {self.where}, {-one:+.2g} pixels to the right and {-self.size[1]:+.2g} down"
             case "scale":
                 return f"a scale of {self.where}, {1 - one:.5g} ± {sd:.1g}"
+            case "absorption" | "scattering":
+                return f"{self.kind} of {self.where} {1 + one:.3g} ± {sd:.1g} times as large as given"
             case "ring":
                 return f"a ring around {self.where}"
         return f"a smooth pattern over {self.where}"
@@ -143,9 +151,17 @@ def structure(
     white = kept @ np.linalg.inv(np.linalg.cholesky(covariance)).T if kept.size else kept
     score = white.T @ (z.T @ residual)
     effect = white.T @ mean * patterns.lengths
+    causes = [one for one in patterns.causes if _share(effect, patterns.lengths, one) > settings.shown]
     total, count = float(score @ score), len(score)
     log_p = _ln_tail(total, count) if count else 0.0
-    return Structure(total, count, log_p, tuple(_causes(score, effect, patterns.causes, log_p, settings)))
+    return Structure(total, count, log_p, tuple(_causes(score, effect, causes, log_p, settings)))
+
+
+def _share(effect: Array, lengths: Array, cause: Pattern) -> float:
+    """Largest share of a cause's squared length, over its unknowns, that the scores show."""
+    columns = cause.columns.reshape(len(cause.columns), -1)
+    shown = np.linalg.norm(effect[:, columns].sum(axis=2), axis=0) ** 2
+    return float(np.max(shown / np.maximum((lengths[columns] ** 2).sum(axis=1), 1e-300), initial=0.0))
 
 
 def _dense(matrix: Columns) -> Array:
@@ -173,7 +189,7 @@ def _causes(
     ]
     found, taken, level = list[int](), np.empty((len(score), 0)), np.log(settings.chance)
     best_log = list[float]()
-    while len(found) < settings.named:
+    while patterns and len(found) < settings.named:
         left = score - taken @ (taken.T @ score)
         chances = [_chance(left, own - taken @ (taken.T @ own), own) for own in effects]
         best = int(np.argmin(chances))

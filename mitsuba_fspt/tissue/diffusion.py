@@ -100,9 +100,9 @@ class Tissue:
         self.factors = tuple(boundary_a(a, medium.n) for medium in media)
         self.system = System(mesh, order, [m.diffusion for m in media], [m.mua for m in media], self.factors, repeated)
 
-    def linear(self) -> Tissue:
-        """The same tissue with finite elements of order 1."""
-        return Tissue(self.mesh, self.media, a=self._a, order=1)
+    def linear(self, media: Sequence[Medium] | None = None) -> Tissue:
+        """The same tissue with finite elements of order 1, or with other media."""
+        return Tissue(self.mesh, media or self.media, a=self._a, order=1)
 
     def places(self, points: Array) -> tuple[Index, Array]:
         """Cells (N,) and local coordinates (N, 3) of `points` (N, 3) [mm], for `exitance_at` of any solution."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from contextlib import suppress
 from dataclasses import replace
 
@@ -300,6 +301,22 @@ def test_structure_of_the_residuals_is_told(case, caplog):
     line = next(one for one in found.warnings if "structure" in one)
     assert "a factor in view=270, 1." in line
     assert found.summary()["warnings"] == list(found.warnings)
+
+
+@pytest.mark.parametrize("coefficient", ["absorption", "scattering"])
+def test_a_wrong_coefficient_is_named(case, coefficient):
+    """The images have 10 % more absorption or scattering than the phantom file says: named with its size.
+
+    Seen to fail ("a ring", or nothing at all) without the patterns of the coefficients.
+    """
+    images, medium = case.images(SOURCE, electrons=30_000), case.described.medium
+    name = {"absorption": "mua", "scattering": "musp"}[coefficient]
+    wrong = replace(case.described, medium=replace(medium, **{name: getattr(medium, name) / 1.1}))
+    found = fspt.locate(wrong, case.matrix, images, scene=case.surface)
+    line = next(one for one in found.warnings if "structure" in one)
+    size = re.search(rf"{coefficient} of the tissue ([\d.]+) ± ([\d.]+) times as large as given", line)
+    assert float(size[1]) == pytest.approx(1.1, abs=4 * float(size[2]))
+    assert "optical coefficients" in line
 
 
 def test_factors_of_views_are_fitted(case):
