@@ -26,7 +26,7 @@ from ..runtime.progress_bar import Progress, reported
 from .calibrated_scene import write_calibrated
 from .calibration_fit import CalibrationFit, CalibrationSettings, Fitted, Measured
 from .derivatives import scene_text, varied_value
-from .measurement import noise_of, tell_misfit
+from .measurement import noise_of, tell_misfit, told
 
 Array = NDArray[np.float64]
 Picture = Image | Exposure | str | os.PathLike[str]
@@ -241,7 +241,12 @@ class _Pictures:
                 for view in self.views
             ]
             images = [i if watt is None else i.scaled(watt) for i, watt in zip(images, self.powers, strict=True)]
-        self.first = self.first or images
+        if not self.first:
+            self.first = images
+            told(
+                "calibrate",
+                list(dict.fromkeys(str(i.metadata["warnings"]) for i in images if "warnings" in i.metadata)),
+            )
         spreads = [s.on(float(i.metadata["pixel_pitch"])) for s, i in zip(self.strays, images, strict=True)]
         power, error = (
             np.stack([s.forward(np.asarray(getattr(i, n), np.float64)) for s, i in zip(spreads, images, strict=True)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.ndimage import binary_erosion
 from small_scenes import LENS_XML, SCENES, write_scene
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.inverse import calibrate
 from mitsuba_fspt.inverse.calibration_fit import CalibrationFit, CalibrationSettings, Measured, UndeterminedError
 from mitsuba_fspt.inverse.measurement import Noise, sampling_variance
 from mitsuba_fspt.runtime.errors import InversionError
@@ -38,6 +40,19 @@ def test_parameters_come_back_within_their_sd(scene):
     assert np.abs(scores).max() < 4
     assert np.mean(chi2) == pytest.approx(1, abs=0.6)
     assert 0 < found.sd["f_number"] < 0.1
+
+
+def test_warnings_about_the_scene_are_told_once(scene, monkeypatch, caplog):
+    """What `render` says of the scene, such as a mesh with faces turned both ways. Seen to fail: nothing was told."""
+    own = calibrate.render
+
+    def warned(*arguments, **options):
+        image = own(*arguments, **options)
+        return replace(image, metadata=image.metadata | {"warnings": "a third of the area points inward"})
+
+    monkeypatch.setattr(calibrate, "render", warned)
+    fspt.calibrate(scene, noisy(scene, 1, distance=163.5), free=["distance"])
+    assert caplog.text.count("fspt: calibrate: a third of the area points inward") == 1
 
 
 def test_monte_carlo_gives_the_parameters_of_its_scene(scene):
