@@ -116,7 +116,7 @@ class BandImages:
         """(N,) change of the power on the pixels [W] by relative changes of the tissue's coefficients.
 
         'absorption': of all µa, 'scattering': of all µs', for point sources at `positions` (K, 3) [mm] with `powers`
-        (K,) [W]. By differences of solutions with linear elements, whose own error cancels but for some percent.
+        (K,) [W]. By differences of solutions.
         """
         sources = [
             Source(Sphere((float(x), float(y), float(z))), float(power))
@@ -127,7 +127,7 @@ class BandImages:
             "absorption": [replace(medium, mua=(1 + STEP) * medium.mua) for medium in media],
             "scattering": [replace(medium, musp=(1 + STEP) * medium.musp) for medium in media],
         }
-        tissues = [self.tissue.linear(), *map(self.tissue.linear, changes.values())]
+        tissues = [self.tissue, *map(self.tissue.of_media, changes.values())]
         fields = [one.solve(sources).exitance_at(self.surface.vertices, self._places) for one in tissues]
         change = self.share / STEP * (np.column_stack(fields[1:]) - fields[0][:, None])
         return dict(zip(changes, (self.transport @ change).T, strict=True))

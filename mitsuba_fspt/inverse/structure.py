@@ -87,7 +87,7 @@ class Cause:
             case "scale":
                 return f"a scale of {self.where}, {1 - one:.5g} ± {sd:.1g}"
             case "absorption" | "scattering":
-                return f"{self.kind} of {self.where} {1 + one:.3g} ± {sd:.1g} times as large as given"
+                return f"other coefficients of {self.where}, as {self.kind} {1 + one:.3g} ± {sd:.1g} times as large"
             case "ring":
                 return f"a ring around {self.where}"
         return f"a smooth pattern over {self.where}"

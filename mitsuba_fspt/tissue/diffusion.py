@@ -96,13 +96,17 @@ class Tissue:
                 f"solve: the mesh has regions {mesh.region.min()} to {mesh.region.max()}, media are given for 0 "
                 f"to {len(media) - 1}. Give one a region."
             )
-        self.mesh, self.media, self._a = mesh, tuple(media), a
+        self.mesh, self.media, self._a, self._order = mesh, tuple(media), a, order
         self.factors = tuple(boundary_a(a, medium.n) for medium in media)
         self.system = System(mesh, order, [m.diffusion for m in media], [m.mua for m in media], self.factors, repeated)
 
-    def linear(self, media: Sequence[Medium] | None = None) -> Tissue:
-        """The same tissue with finite elements of order 1, or with other media."""
-        return Tissue(self.mesh, media or self.media, a=self._a, order=1)
+    def linear(self) -> Tissue:
+        """The same tissue with finite elements of order 1."""
+        return Tissue(self.mesh, self.media, a=self._a, order=1)
+
+    def of_media(self, media: Sequence[Medium]) -> Tissue:
+        """The same tissue and elements with other media."""
+        return Tissue(self.mesh, media, a=self._a, order=self._order)
 
     def places(self, points: Array) -> tuple[Index, Array]:
         """Cells (N,) and local coordinates (N, 3) of `points` (N, 3) [mm], for `exitance_at` of any solution."""
