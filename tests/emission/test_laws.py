@@ -271,7 +271,8 @@ def test_last_flight_is_the_same_in_both_domains():
     with directions told in the frame of another point than they are looked up in.
     """
     scene, _emitter = glowing_sphere(last_flight(*STEEP))
-    pupil, surface = (fspt.render(scene, method="integral", domain=domain) for domain in ("pupil", "surface"))
+    accuracy = {"method": "integral", "rtol": 1e-2}
+    pupil, surface = (fspt.render(scene, domain=domain, **accuracy) for domain in ("pupil", "surface"))
     assert (np.abs(pupil.power - surface.power) <= 3 * (pupil.error + surface.error)).all()
     assert surface.power.sum() == pytest.approx(pupil.power.sum(), rel=1e-3)
 
@@ -279,13 +280,13 @@ def test_last_flight_is_the_same_in_both_domains():
 def test_fluence_updated_by_itself_is_followed():
     """Expected: the picture of a scene that had it from the start. Seen to fail where J_n alone is looked at anew."""
     scene, emitter = glowing_sphere(last_flight(*STEEP))
-    fspt.render(scene, method="integral")
+    fspt.render(scene, method="integral", rtol=1e-2)
     turned = sloping(1.0, (-0.1, 0.05, 0.1))
     values = mi.traverse(emitter.surface.law.fluence)
     values["data"] = mi.traverse(mi.load_dict(turned))["data"]
     values.update()
     anew = glowing_sphere(last_flight(1.0, (0, 0, 0), fluence=turned))[0]
-    pictures = [fspt.render(each, method="integral").power for each in (scene, anew)]
+    pictures = [fspt.render(each, method="integral", rtol=1e-2).power for each in (scene, anew)]
     np.testing.assert_array_equal(*pictures)
 
 

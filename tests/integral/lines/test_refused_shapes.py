@@ -46,7 +46,10 @@ def test_a_glowing_linear_curve_is_refused_on_the_command_line(run, tmp_path):
 @pytest.mark.parametrize("settings", METHODS)
 @pytest.mark.parametrize("coat", [None, {"type": "mask", "opacity": 0.5}])
 def test_a_bump_map_without_a_gradient_is_refused(coat, settings):
-    """Seen to fail: 'dr.while_loop(): encountered an exception'; a bitmap has a gradient."""
+    """Seen to fail: 'dr.while_loop(): encountered an exception'; a bitmap has a gradient.
+
+    Of the bitmap two pairs are rendered: by the integral without a coat, by `path` with one.
+    """
     heights = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((4, 4, 1), 0.5, np.float32))}
 
     def scene(texture):
@@ -56,6 +59,7 @@ def test_a_bump_map_without_a_gradient_is_refused(coat, settings):
         return world_scene(ball(), mirror | {"bsdf": bsdf}, sensor=lens(size=8))
 
     gc.collect()  # Dr.Jit also traces the BSDFs of scenes that wait to be deleted
-    assert fspt.render(scene(heights), **settings).power.max() > 0
+    if bool(coat) == bool(settings):
+        assert fspt.render(scene(heights), **settings).power.max() > 0
     with pytest.raises(SceneError, match=r"bumpmap of shape 'shape_1' has a Checkerboard, .* Give it a bitmap"):
         fspt.render(scene({"type": "checkerboard"}), **settings)

@@ -5,11 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from small_scenes import FOCUS, HEIGHT, SCENES, SIDE, WIDTH, camera_scene, disk, glow, mi, power, sphere, write_ply
+from small_scenes import (
+    FOCUS,
+    HEIGHT,
+    SCENES,
+    SIDE,
+    WIDTH,
+    camera_scene,
+    disk,
+    glow,
+    mi,
+    power,
+    sphere,
+    write_ply,
+)
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.runtime.errors import SceneError
 
+QUARTER = (12, 9, 8, 7)  # crop window: of a sphere on the axis the upper left quarter, limb and middle
 N, THICK = 1.5, 10.0  # refractive index and thickness [mm] of a window
 THROUGH = 2 * N / (N * N + 1)  # of a pane, all internal reflections counted, at normal incidence
 PERFECT = {"type": "conductor", "material": "none"}
@@ -57,7 +71,7 @@ def test_a_window_lets_through_what_fresnel_says(window):
 def test_a_plate_of_glass_moves_the_focus():
     """What lies z behind a plate is seen at z - d (1 - 1/n); without the shift the blurred edge is off by 3 %."""
     depth, nearer = 190.0, THICK * (1 - 1 / N)
-    rim = {"f_number": 4, "crop": (12, 8, 8, 8)}
+    rim = {"f_number": 4, "crop": (12, 12, 4, 4)}
     behind = power(camera_scene(disk(depth, radius=6.0), bodies=(slab(80),), **rim), rtol=3e-4)
     in_air = power(camera_scene(disk(depth - nearer, radius=6.0), **rim), rtol=3e-4)
     unmoved = power(camera_scene(disk(depth, radius=6.0), **rim), rtol=3e-4)
@@ -67,7 +81,7 @@ def test_a_plate_of_glass_moves_the_focus():
 
 @pytest.mark.parametrize("window", [pane(80, PANE, tilt=20), slab(80)], ids=["thin", "solid"])
 def test_a_window_agrees_with_the_path_tracer(window):
-    assert agrees_with_path(camera_scene(sphere(150, 9, x=3), bodies=(window,))) > 1e-3
+    assert agrees_with_path(camera_scene(sphere(150, 9, x=3), bodies=(window,), crop=(2, 10, 9, 6))) > 1e-3
 
 
 @pytest.mark.parametrize("bsdf", [PERFECT, {"type": "roughconductor", "alpha": 0.0, "material": "none"}])
@@ -88,7 +102,7 @@ def test_a_mirror_shows_the_mirrored_phantom(bsdf, depth):
 def test_a_mirror_whose_edge_cuts_the_field(z):
     """A small mirror at 45° hides half of a sphere and shows another one beside it."""
     mirror = pane(z, PERFECT, size=4.0, x=-3.0, tilt=45)
-    scene = camera_scene(sphere(170, 8), sphere(z, 6, x=30), bodies=(mirror,), crop=(8, 8, 24, 8))
+    scene = camera_scene(sphere(170, 8), sphere(z, 6, x=30), bodies=(mirror,), crop=(16, 12, 12, 4))
     assert agrees_with_path(scene, spp=4096) > 1e-3
 
 
@@ -102,8 +116,9 @@ def test_three_views_on_one_detector():
 def test_two_mirrors_in_turn():
     """A periscope: two parallel mirrors at 45° shift the line of sight sideways by 40 mm."""
     mirrors = (pane(70, PERFECT, size=[18, 18, 1], tilt=45), pane(70, PERFECT, size=[25, 25, 1], x=40, tilt=225))
-    shifted = fspt.render(camera_scene(sphere(125, 6, x=40), bodies=mirrors), rtol=1e-3)
-    direct = fspt.render(camera_scene(sphere(FOCUS, 6)), rtol=1e-3)
+    half = (10, 7, 20, 9)
+    shifted = fspt.render(camera_scene(sphere(125, 6, x=40), bodies=mirrors, crop=half), rtol=1e-3)
+    direct = fspt.render(camera_scene(sphere(FOCUS, 6), crop=half), rtol=1e-3)
     assert abs(shifted.power - direct.power).max() < 2e-3 * direct.power.max()
 
 
@@ -128,22 +143,33 @@ def test_a_mask_as_a_graded_filter():
     assert seen[HEIGHT // 2] / bare[HEIGHT // 2] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("share", [1.0, 0.5])
-@pytest.mark.parametrize("kind", ["mask", "blend", "twosided"])
-def test_a_mirror_in_another_bsdf_reflects_its_share(kind, share):
-    """What a mask or a blend leaves of a mirror shows the mirrored phantom as a mirror of that reflectance does."""
-    half = {"type": "blendbsdf", "weight": 1 - share, "a": PERFECT, "b": PERFECT | {"specular_reflectance": 0.2}}
-    inside = {
-        "mask": {"type": "mask", "opacity": share, "nested": PERFECT},
-        "blend": {"type": "blendbsdf", "weight": 1 - share, "a": PERFECT, "b": {"type": "null"}},
-        "twosided": {"type": "twosided", "nested": half},
-    }
-    reflectance = share + 0.2 * (1 - share) if kind == "twosided" else share
-    phantom = sphere(80, 5, x=70)
-    bare = PERFECT | {"specular_reflectance": reflectance}
-    seen, due = (power(camera_scene(phantom, bodies=(pane(80, b, tilt=45),)), rtol=1e-3) for b in (inside[kind], bare))
+def strips(bsdfs):
+    """Upright mirrors of 3 mm, one above the other, that together turn the whole field by 90°."""
+    turn = mi.ScalarTransform4f().rotate([0, 1, 0], 180 - 45).scale([40, 1.5, 1])
+    at = (mi.ScalarTransform4f().translate([0, 3 * k - 1.5 * (len(bsdfs) - 1), 80]) for k in range(len(bsdfs)))
+    return tuple({"type": "rectangle", "to_world": t @ turn, "bsdf": b} for t, b in zip(at, bsdfs, strict=True))
+
+
+def test_a_mirror_in_another_bsdf_reflects_its_share():
+    """What a mask or a blend leaves of a mirror shows the mirrored phantom as a mirror of that reflectance does.
+
+    Six strips in one scene, out of focus, so that most pixels see them all: a share that is off by 5 % on one strip
+    is 8e-3 of the pixel's power.
+    """
+    inside, bare = [], []
+    for share in (1.0, 0.5):
+        dim = PERFECT | {"specular_reflectance": 0.2}
+        half = {"type": "blendbsdf", "weight": 1 - share, "a": PERFECT, "b": dim}
+        inside += [
+            {"type": "mask", "opacity": share, "nested": PERFECT},
+            {"type": "blendbsdf", "weight": 1 - share, "a": PERFECT, "b": {"type": "null"}},
+            {"type": "twosided", "nested": half},
+        ]
+        bare += [PERFECT | {"specular_reflectance": r} for r in (share, share, share + 0.2 * (1 - share))]
+    scenes = (camera_scene(sphere(80, 5, x=70), bodies=strips(bsdfs), crop=QUARTER) for bsdfs in (inside, bare))
+    seen, due = (power(scene, rtol=4e-3) for scene in scenes)
     assert due.max() > 0
-    assert abs(seen - due).max() < 2e-3 * due.max()
+    assert abs(seen - due).max() < 4e-3 * due.max()
 
 
 @pytest.mark.parametrize(
@@ -157,7 +183,8 @@ def test_a_mirror_in_another_bsdf_reflects_its_share(kind, share):
 )
 def test_masks_and_blends_agree_with_the_path_tracer(bsdf):
     splitter = pane(80, bsdf, size=40, tilt=45)
-    assert agrees_with_path(camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,))) > 1e-3
+    both = camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,), crop=QUARTER)
+    assert agrees_with_path(both) > 1e-3
 
 
 GLASSES = {"a": {"type": "dielectric", "int_ior": 1.3}, "b": {"type": "dielectric"}}
@@ -187,7 +214,7 @@ def test_total_reflection_in_a_prism(tmp_path):
         "face_normals": True,
         "bsdf": {"type": "dielectric", "int_ior": n, "ext_ior": 1.0},
     }
-    scene = camera_scene(sphere(90, 5, x=80), bodies=(prism,), f_number=8)
+    scene = camera_scene(sphere(90, 5, x=80), bodies=(prism,), f_number=8, crop=QUARTER)
     assert agrees_with_path(scene) > 1e-3
     assert power(scene, rtol=1e-3).max() > 0
 
@@ -195,14 +222,15 @@ def test_total_reflection_in_a_prism(tmp_path):
 def test_a_beam_splitter_shows_both_phantoms():
     """Its reflection is no ghost that may be left out."""
     splitter = pane(80, PANE, size=40, tilt=45)
-    assert agrees_with_path(camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,))) > 1e-3
+    both = camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,), crop=QUARTER)
+    assert agrees_with_path(both) > 1e-3
 
 
 def test_what_is_cut_off_is_in_the_error():
     """Between two facing mirrors the light goes to and fro; one reflection misses the images of two."""
     mirrors = tuple(pane(200, PERFECT, size=95, x=x, tilt=tilt) for x, tilt in ((8, -90), (-8, 90)))
-    scene = camera_scene(sphere(300, 3, x=2), bodies=mirrors, magnification=0.2)
-    few, many = (fspt.render(scene, rtol=1e-3, max_specular=most) for most in (1, 12))
+    scene = camera_scene(sphere(300, 3, x=2), bodies=mirrors, magnification=0.2, crop=(0, 13, WIDTH, 6))
+    few, many = (fspt.render(scene, rtol=1e-2, max_specular=most) for most in (1, 12))
     missing = abs(many.power - few.power)
     assert missing.max() > 0.1 * many.power.max()
     assert (missing <= few.error + many.error).all()
@@ -211,7 +239,7 @@ def test_what_is_cut_off_is_in_the_error():
 def test_coverage_counts_what_glows_through_what_lets_light_pass():
     plate = {"type": "rectangle", "to_world": place(100, size=2.0), "bsdf": {"type": "diffuse"}}
     cases = {"bare": (), "pane": (pane(80, PANE),), "plate": (plate,), "both": (plate, pane(80, PANE))}
-    scenes = {k: camera_scene(disk(FOCUS, 6), bodies=b, crop=(16, 12, 14, 12)) for k, b in cases.items()}
+    scenes = {k: camera_scene(disk(FOCUS, 6), bodies=b, crop=(20, 14, 10, 4)) for k, b in cases.items()}
     total = {k: fspt.render(scene, rtol=1e-2).coverage.sum() for k, scene in scenes.items()}
     assert total["pane"] == pytest.approx(total["bare"], rel=1e-3)
     assert total["both"] == pytest.approx(total["plate"], rel=1e-3)
@@ -221,15 +249,19 @@ def test_coverage_counts_what_glows_through_what_lets_light_pass():
 def test_narrow_light_behind_a_window():
     """A sphere of 0.06 pixels takes the surface form, through a window, too."""
     tiny = sphere(150, 0.05, x=3.1, y=1.3)
-    bare, seen = (fspt.render(camera_scene(tiny, bodies=b), rtol=1e-3) for b in ((), (pane(80, PANE),)))
+    around = (11, 10, 10, 9)
+    scenes = (camera_scene(tiny, bodies=bodies, crop=around) for bodies in ((), (pane(80, PANE),)))
+    bare, seen = (fspt.render(scene, rtol=1e-3) for scene in scenes)
     assert seen.power.sum() / bare.power.sum() == pytest.approx(THROUGH, rel=2e-3)
 
 
 def test_narrow_light_in_a_mirror_is_in_the_error():
     where = mirrored(np.array([0.0, 1.0, 160.0]), 80, 45)
     tiny = {"type": "sphere", "center": where.tolist(), "radius": 0.05}
-    scene = camera_scene(tiny, disk(300, 3.0, x=60), bodies=(pane(80, PERFECT, tilt=45),))
-    direct = fspt.render(camera_scene(sphere(160, 0.05, y=1.0)), rtol=1e-3)
+    around = (14, 9, 12, 12)
+    scene = camera_scene(tiny, disk(300, 3.0, x=60), bodies=(pane(80, PERFECT, tilt=45),), crop=around)
+    direct = fspt.render(camera_scene(sphere(160, 0.05, y=1.0), crop=around), rtol=1e-3)
+    assert direct.power.max() > 0
     image = fspt.render(scene, rtol=1e-3)
     assert (abs(image.power - direct.power) <= image.error + direct.error).all()
 
@@ -244,7 +276,7 @@ def test_the_surface_form_goes_through_panes_alone():
 
 
 def test_a_scene_without_specular_shapes_ends_lines_of_sight_at_the_first_surface():
-    scene = camera_scene(sphere(150, 9), bodies=(pane(80, {"type": "diffuse"}, size=3.0),), crop=(12, 10, 10, 8))
+    scene = camera_scene(sphere(150, 9), bodies=(pane(80, {"type": "diffuse"}, size=3.0),), crop=(8, 14, 6, 3))
     image, other = (fspt.render(scene, shortcuts=shortcuts) for shortcuts in (True, False))
     assert "lines of sight beyond the first surface: left out" in image.metadata["left_out"]
     assert abs(image.power - other.power).max() <= 2e-3 * image.power.max()
@@ -259,12 +291,13 @@ def test_panes_merged_by_mitsuba_are_not_passed_by():
     lens = {"type": "fspt_lens", "focal_length": 55.0, "f_number": 2.8, "pixel_pitch": 0.4, "magnification": 0.5}
     merged = mi.load_dict(parts | {"sensor": lens | {"film": film}})
     assert len(merged.shapes()) < len(scene.shapes())
-    assert abs(power(merged) - power(scene)).max() < 2e-3 * power(scene).max()
+    seen, due = power(merged), power(scene)
+    assert abs(seen - due).max() < 2e-3 * due.max()
 
 
 def test_a_lens_in_a_glass_chamber_is_not_inside_the_phantom():
     chamber = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(60), "bsdf": {"type": "thindielectric"}}
-    assert power(camera_scene(sphere(150, 9), bodies=(chamber,))).max() > 0
+    assert power(camera_scene(sphere(150, 9), bodies=(chamber,), crop=(18, 14, 4, 4)), rtol=1e-2).max() > 0
 
 
 def test_monte_carlo_gets_the_depth_that_it_needs():
