@@ -66,8 +66,6 @@ ARROWS_OF_INTEGRAL = {"lines": set(), "pupil": {"lines"}, "surface": {"lines"}, 
 FOR_ALL_OF_INTEGRAL = {"estimator", "progress", "quadrature", "shortcuts", "solution"}
 # Only these import `validation`: no result depends on it.
 IMPORTS_VALIDATION = {"cli", "studies/converge", "validation"}
-# Rooms in which files still import each other.
-TIED = {"detector"}
 # Rooms of Dr.Jit code. Others import the renderer inside functions alone, and only these do.
 DRJIT_ROOMS = {"jit", "camera", "emission", "integral", "plugins"}
 IMPORTS_MITSUBA = {"runtime", "rendering", "validation", "studies", "inverse"}
@@ -185,7 +183,7 @@ def test_no_files_import_each_other():
     Files are left out as long as there are some whose imports all lead to files left out before, or that only such
     files import: what remains are circles and what lies between two of them.
     """
-    below = {name: set(imported_files(name)) - {name} for name in NAMES if room_of(name) not in TIED}
+    below = {name: set(imported_files(name)) - {name} for name in NAMES}
     while True:
         above = {other for others in below.values() for other in others}
         left = {name: below[name] & below.keys() for name in below if name in above and below[name] & below.keys()}

@@ -311,7 +311,8 @@ def _described(scene: mi.Scene, lens: mi.Sensor, task: ViewTask) -> ViewResult:
 
     glowing_meshes(scene)
     check_film(camera := camera_of(lens))
-    film, numbers = camera.film, camera.numbers()
+    film = camera.film
+    numbers: dict[str, Any] = {**camera.numbers()}
     numbers["film"] = [*film.crop_size, *film.crop_offset, *film.size]
     numbers["to_world"] = list(camera.placement)
     warnings = tuple(warnings_of(scene, task.sensor))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +89,7 @@ class Block:
         """The largest value of each pixel and its neighbours, (h · w)."""
         return maximum_filter(values.reshape(self.shape), NEIGHBOURS).ravel()
 
-    def _csr(self, values: Array) -> csr_array:
+    def _csr(self, values: NDArray[np.floating]) -> csr_array:
         return csr_array((values, self.columns, self.starts), shape=(len(self.starts) - 1, self.count))
 
     @property
@@ -186,7 +186,7 @@ def block_of(
             stack.enter_context(surface.shining(1.0))
         with named("fspt_integral"):
             quadrature = Quadrature(rtol=rtol)
-        integrator = integrator_of(scene, "integral")
+        integrator: Any = integrator_of(scene, "integral")
         check_rounding(camera)
         with recording(), dr.suspend_grad():
             rows = sparse_rows(
@@ -208,7 +208,8 @@ def light_left_out_of(scene: mi.Scene, lens: mi.Sensor, rtol: float) -> tuple[fl
     with ExitStack() as stack:
         for surface in glowing_meshes(scene):
             stack.enter_context(surface.shining(1.0))
-        found = integrator_of(scene, "integral").light_left_out(scene, lens, Quadrature(rtol=rtol))
+        integrator: Any = integrator_of(scene, "integral")
+        found = integrator.light_left_out(scene, lens, Quadrature(rtol=rtol))
     warning = found.warning(rtol) if found else None
     return (found.share, warning) if warning else None
 

@@ -141,10 +141,11 @@ class LiveScene:
         any_sensor: bool = False,
     ) -> None:
         parameters = parameters or {}
+        source: Any = scene
         if not isinstance(scene, (str, os.PathLike)):
-            scene, before = _unchanged_source(scene)
+            source, before = _unchanged_source(scene)
             parameters = before | dict(parameters)
-        self.source: str | os.PathLike[str] = scene
+        self.source: str | os.PathLike[str] = source
         self.given = parameter_texts(parameters)
         self.sensor, self._any_sensor = sensor, any_sensor
         self.loads = 0
@@ -181,7 +182,8 @@ class LiveScene:
         from ..camera.of_sensor import camera_of
 
         scene = self.scene(values, model, exact=False)
-        lens, integrator = sensor_of(scene, self.sensor), integrator_of(scene, None)
+        lens = sensor_of(scene, self.sensor)
+        integrator: Any = integrator_of(scene, None)
         if not is_integral(integrator):
             return render(scene, sensor=self.sensor, spp=DRAFT_SAMPLES)
         own = integrator.quadrature
@@ -202,7 +204,7 @@ class LiveScene:
 
         scene = self.scene(values, model)
         camera = camera_of(sensor_of(scene, self.sensor))
-        offset = mi.Vector2f(camera.film.crop_offset)
+        offset: Any = mi.Vector2f(camera.film.crop_offset)  # the stubs add no vector to a point
         pixel = mi.Point2f(column + 0.5, row + 0.5) + offset
         dr.make_opaque(pixel)  # no new kernel for every pixel
         ray, cosine, _ = camera.line_of_sight(pixel, mi.Point2f(0, 0))
@@ -213,7 +215,7 @@ class LiveScene:
         shape, si, depth = met[-1]
         surface = surface_of(shape.emitter())
         exitance = float(surface.exitance.eval(si)[0][0]) if surface else None
-        centre, radius, _ = camera.blur_disc(ray(depth / cosine))
+        centre, radius, _ = camera.blur_disc(ray(depth / cosine))  # type: ignore[arg-type]  # Float of the variant
         centre = camera.film_map.from_ideal(centre) - offset
         return SurfacePoint(
             tuple(float(c[0]) for c in si.p),  # type: ignore[arg-type]
@@ -316,7 +318,7 @@ def _differ_in(before: mi.Properties, after: mi.Properties, *kinds: object) -> b
     return True
 
 
-def _equal(one: object, other: object) -> bool:
+def _equal(one: Any, other: Any) -> bool:
     """True if two values of properties are equal; references are equal if they refer to the same element."""
     import mitsuba as mi
 
@@ -351,11 +353,12 @@ def _others_are_placed(nodes: list[mi.parser.SceneNode]) -> bool:
 
 def _matrix(props: mi.Properties) -> Matrix:
     """`to_world` of an element."""
-    return np.array(props["to_world"].matrix, np.float64).reshape(4, 4) if "to_world" in props else np.eye(4)
+    placed: Any = props["to_world"] if "to_world" in props else None
+    return np.eye(4) if placed is None else np.array(placed.matrix, np.float64).reshape(4, 4)
 
 
-def _apply(change: Change, lens: mi.Sensor, model: str | None) -> None:
-    """Give the lens its new numbers, placement and model; OpticsError for a lens that cannot exist."""
+def _apply(change: Change, lens: Any, model: str | None) -> None:
+    """Give the fspt_lens its new numbers, placement and model; OpticsError for a lens that cannot exist."""
     import mitsuba as mi
 
     from ..camera.of_sensor import camera_of
@@ -364,7 +367,7 @@ def _apply(change: Change, lens: mi.Sensor, model: str | None) -> None:
     parameters = mi.traverse(lens)
     for name, number in change.lens.items():
         parameters[name] = number
-    parameters["to_world"] = mi.Transform4f(change.placement)
+    parameters["to_world"] = mi.Transform4f(change.placement)  # type: ignore[arg-type]  # an array
     parameters.update()
     camera_of(lens)  # raises what the update refused
 
@@ -389,7 +392,7 @@ def _unchanged_source(scene: mi.Scene) -> tuple[Any, dict[str, object]]:
     return kept
 
 
-def _plain(value: object) -> object:
+def _plain(value: Any) -> Any:
     """Value of a parameter of Mitsuba as NumPy compares it."""
     value = getattr(value, "matrix", value)
     return np.array(value) if hasattr(value, "shape") else value

@@ -226,7 +226,7 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 <<
     dr.eval(ray)
 
     def run() -> int:
-        hits = scene.ray_intersect_preliminary(ray, coherent=together)
+        hits = scene.ray_intersect_preliminary(ray, coherent=together)  # type: ignore[call-overload]  # a bool
         dr.eval(hits)
         dr.sync_thread()
         return len(node)
