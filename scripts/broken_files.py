@@ -429,13 +429,13 @@ def read_image(path: Path) -> None:
 
 def write_matrix(path: Path) -> None:
     """A matrix of one view of 3 × 2 pixels and the octahedron, by hand."""
+    from mitsuba_fspt.integral.rows.sparse_rows import SparseRows
     from mitsuba_fspt.inverse.transport_file import FORMAT
     from mitsuba_fspt.inverse.transport_matrix import TransportMatrix
-    from mitsuba_fspt.inverse.view_block import Block
 
     rows, columns = 6, len(CORNERS)
     values = np.linspace(0.1, 1.0, rows * columns, dtype=np.float32)
-    block = Block(
+    block = SparseRows(
         (2, 3),
         columns,
         values,

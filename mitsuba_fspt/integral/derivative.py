@@ -72,14 +72,14 @@ class Derivative:
             with ExitStack() as stack:
                 for surface in surfaces:
                     stack.enter_context(surface.shining(1.0))
-                picture = self._solver.solve(scene, camera, self._quadrature)
+                image = self._solver.solve(scene, camera, self._quadrature)
                 window = self._solver.visible_window(scene, camera, False, ())
                 seen = window.expand(np.ones(window.shape)) > 0
                 with recording(), dr.suspend_grad():
                     if kinds is None:
-                        found = Rows.by_lines(self._view(scene, camera), self._quadrature, picture, seen, sizes)
+                        found = Rows.by_lines(self._view(scene, camera), self._quadrature, image, seen, sizes)
                     else:
-                        found = Rows.on_meshes(scene, camera, self._quadrature, picture, kinds)
+                        found = Rows.on_meshes(scene, camera, self._quadrature, image, kinds)
                 return replace(found, kept=positions)
 
         return self._rows.recall(state, find)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..integral.rows.sparse_rows import SparseRows
 from ..rendering.parameters import texts_of
 from ..rendering.provenance import defaults_of, same_mesh, value_of
 from ..rendering.render import sensor_of, warnings_of
@@ -30,7 +31,6 @@ from ..runtime.versions import version, versions
 from .transport_file import FORMAT, PartialFile
 from .transport_matrix import TransportMatrix, read_transport
 from .view_block import (
-    Block,
     Part,
     block_of,
     glowing_meshes,
@@ -75,7 +75,7 @@ class ViewResult:
     left_out : share of the power that T leaves out, for J = 1, and the line about it; None where that is too little
     """
 
-    block: Block | None
+    block: SparseRows | None
     parts: list[Part]
     lens: dict[str, Any]
     defaults: dict[str, Any]

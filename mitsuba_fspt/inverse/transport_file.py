@@ -1,9 +1,9 @@
 """Files of transport matrices: npz, not compressed, with the arrays of each view apart, so that one can be read alone.
 
 Members: `meta` (JSON: format, views, lenses, parts, …), `areas` and `sensitivity` (n,), and for view k
-`view_k/values`, `columns`, `starts`, `change`, `row_error` as in `Block`, the columns as 16-bit numbers where these
-suffice. While a matrix is made, finished views stand
-in a folder beside the file, so that an interrupted run goes on with the next one.
+`view_k/values`, `columns`, `starts`, `change`, `row_error` as in `SparseRows`, the columns as 16-bit numbers where
+these suffice. While a matrix is computed, finished views lie in a folder beside the file, so that an interrupted run
+goes on with the next one.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..integral.rows.sparse_rows import SparseRows
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import TransportError
 from ..runtime.memory import available_memory
-from .view_block import Block
 
 FORMAT = "fspt transport matrix 1"
 ARRAYS = ("values", "columns", "starts", "change", "row_error")
@@ -86,21 +86,21 @@ def _damaged(path: Path, cause: Exception) -> TransportError:
     )
 
 
-class FileBlocks(Sequence[Block]):
+class FileBlocks(Sequence[SparseRows]):
     """The views of a file, each read when it is needed and, if all fit well into memory, kept."""
 
     def __init__(self, path: Path, meta: Mapping[str, Any]) -> None:
         self._path, self._meta = path, meta
         free = available_memory()
         # With its values in double precision, too.
-        self._kept: dict[int, Block] | None = (
+        self._kept: dict[int, SparseRows] | None = (
             {} if free is None or IN_MEMORY * path.stat().st_size < KEPT_SHARE * free else None
         )
 
     def __len__(self) -> int:
         return len(self._meta["views"])
 
-    def __getitem__(self, number: int) -> Block:  # type: ignore[override]  # no slices
+    def __getitem__(self, number: int) -> SparseRows:  # type: ignore[override]  # no slices
         number = range(len(self))[number]
         if self._kept is not None and number in self._kept:
             return self._kept[number]
@@ -120,7 +120,7 @@ class FileBlocks(Sequence[Block]):
 
 def write(
     path: str | os.PathLike[str],
-    blocks: Sequence[Block],
+    blocks: Sequence[SparseRows],
     meta: Mapping[str, Any],
     areas: NDArray[Any],
     sensitivity: NDArray[Any],
@@ -140,7 +140,7 @@ def _add(file: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
         np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
 
 
-def _stored(block: Block) -> dict[str, Any]:
+def _stored(block: SparseRows) -> dict[str, Any]:
     """The arrays of a view by name, as they stand in files."""
     arrays: dict[str, Any] = {name: getattr(block, name) for name in ARRAYS}
     if block.count <= 1 << 16:
@@ -148,7 +148,7 @@ def _stored(block: Block) -> dict[str, Any]:
     return arrays
 
 
-def _block(shape: tuple[int, int], count: int, arrays: Mapping[str, NDArray[Any]]) -> Block:
+def _block(shape: tuple[int, int], count: int, arrays: Mapping[str, NDArray[Any]]) -> SparseRows:
     """The view of these stored arrays; ValueError where they do not fit each other."""
     entries, rows = len(arrays["values"]), shape[0] * shape[1]
     lengths = dict.fromkeys(ARRAYS, entries) | {"starts": rows + 1, "row_error": rows}
@@ -158,10 +158,10 @@ def _block(shape: tuple[int, int], count: int, arrays: Mapping[str, NDArray[Any]
         raise ValueError("starts of rows beyond the entries")
     if entries and not 0 <= columns.min() <= columns.max() < count:  # SciPy would read beyond the end of J
         raise ValueError(f"entries in columns up to {columns.max()} of {count}")
-    return Block(shape, count, **{**checked, "columns": columns.astype(np.int32, copy=False)})
+    return SparseRows(shape, count, **{**checked, "columns": columns.astype(np.int32, copy=False)})
 
 
-def _stored_block(file: Any) -> Block:
+def _stored_block(file: Any) -> SparseRows:
     """The view of an opened file of one view, see `PartialFile`; raises anything for a damaged one."""
     height, width, count = (int(n) for n in file["shape"])
     return _block((height, width), count, {name: file[name] for name in ARRAYS})
@@ -189,7 +189,7 @@ def _npz(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-class PartialFile(Sequence[Block]):
+class PartialFile(Sequence[SparseRows]):
     """A matrix file in the making: finished views in the folder `T.npz.views`, joined by `finish`."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -208,7 +208,7 @@ class PartialFile(Sequence[Block]):
         except Exception:  # whatever a damaged file makes the libraries raise
             return False
 
-    def put(self, number: int, block: Block, fingerprint: str) -> None:
+    def put(self, number: int, block: SparseRows, fingerprint: str) -> None:
         """Keep a finished view."""
         try:
             self.folder.mkdir(exist_ok=True)
@@ -222,13 +222,13 @@ class PartialFile(Sequence[Block]):
     def __len__(self) -> int:
         return self.views
 
-    def __getitem__(self, number: int) -> Block:  # type: ignore[override]  # no slices
+    def __getitem__(self, number: int) -> SparseRows:  # type: ignore[override]  # no slices
         if not 0 <= number < self.views:
             raise IndexError(number)
         with opened(self._view(number)) as file:
             return _stored_block(file)
 
-    def __iter__(self) -> Iterator[Block]:
+    def __iter__(self) -> Iterator[SparseRows]:
         return (self[number] for number in range(self.views))
 
     def finish(self, meta: Mapping[str, Any], areas: NDArray[Any], sensitivity: NDArray[Any]) -> None:

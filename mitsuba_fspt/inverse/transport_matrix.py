@@ -18,11 +18,11 @@ from scipy.sparse.linalg import LinearOperator
 from ..detector.stray_light import StrayLight
 from ..images.image import Image
 from ..images.pixel_axes import CROP
+from ..integral.rows.sparse_rows import SparseRows
 from ..rendering.provenance import same_mesh
 from ..runtime.errors import DetectorError, TransportError
 from .stray_rows import spread_rows
 from .transport_file import contents, write
-from .view_block import Block
 
 if TYPE_CHECKING:
     from ..detector.parameters import DetectorParameters
@@ -50,7 +50,9 @@ class TransportMatrix(LinearOperator):
     metadata : scene, rtol, versions, lens of each view, exit law and digest of each mesh
     """
 
-    def __init__(self, blocks: Sequence[Block], metadata: Mapping[str, Any], areas: Array, sensitivity: Array) -> None:
+    def __init__(
+        self, blocks: Sequence[SparseRows], metadata: Mapping[str, Any], areas: Array, sensitivity: Array
+    ) -> None:
         self.metadata = dict(metadata)
         self.image_shape: tuple[int, int, int] = tuple(self.metadata["image_shape"])
         self.views: list[dict[str, Any]] = [dict(view) for view in self.metadata["views"]]

@@ -1,19 +1,17 @@
-"""Rows of the transport matrix of one view: sparse entries, what is uncertain of them, and how they are computed."""
+"""Block of rows of the transport matrix (Eq. M.20) that belongs to one view: its columns and its computation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
-from scipy.sparse import csr_array
 
 from ..integral.quadrature import Quadrature
+from ..integral.rows.sparse_rows import SparseRows
 from ..runtime.errors import SceneError, TransportError, named
 
 if TYPE_CHECKING:
@@ -23,8 +21,6 @@ if TYPE_CHECKING:
 
 
 ON = ("vertex", "face")
-SAFETY = 2.0  # error over the largest change of a pixel and its neighbours, of which one may be small by chance
-NEIGHBOURS = 3  # pixels across that share their errors
 
 Array = NDArray[np.float64]
 
@@ -38,64 +34,6 @@ class Part:
     digest: str
     law: str
     areas: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Block:
-    """Rows of one view, (h · w, n), row by row from the top left pixel.
-
-    values : entries [mm²], float32
-    columns, starts : their columns, and the first entry of each row, as in a csr_array
-    change : by how much many more cells, pieces or lines of sight would change each entry, over the entry, float16
-    row_error : error of each row's sum [mm²], (h · w), float32
-    """
-
-    shape: tuple[int, int]
-    count: int
-    values: NDArray[np.float32]
-    columns: NDArray[np.int32]
-    starts: NDArray[np.integer]
-    change: NDArray[np.float16]
-    row_error: NDArray[np.float32]
-
-    @cached_property
-    def matrix(self) -> csr_array:
-        """The rows in double precision."""
-        return self._csr(self.values.astype(np.float64))
-
-    def error(self, exitance: Array) -> Array:
-        """Estimated error (h, w) [W] of `matrix @ exitance` (n,) [W/mm²]."""
-        power = self.matrix @ exitance
-        changed = self._csr(self.values * self.change.astype(np.float64)) @ exitance
-        light, sums = self.matrix @ np.abs(exitance), self.matrix.sum(axis=1)
-        mean = self._spread(np.divide(light, sums, out=np.zeros_like(light), where=sums > 0))
-        least = self.least_error * np.abs(power).max(initial=0.0) * (self._spread(np.abs(power)) > 0)
-        return np.maximum(SAFETY * self._spread(np.abs(changed)) + self.row_error * mean, least).reshape(self.shape)
-
-    @property
-    def relative_row_error(self) -> Array:
-        """`row_error` over the largest sum of a row, (h · w); 0 where nothing is seen."""
-        counts = np.diff(self.starts)
-        sums = np.zeros(len(counts))
-        sums[counts > 0] = np.add.reduceat(self.values, self.starts[:-1][counts > 0], dtype=np.float64)
-        return self.row_error / sums.max() if sums.any() else sums
-
-    @property
-    def least_error(self) -> float:
-        """Smallest error that is stated, over the brightest pixel: the rounding of float32."""
-        return 2e-7
-
-    def _spread(self, values: Array) -> Array:
-        """The largest value of each pixel and its neighbours, (h · w)."""
-        return maximum_filter(values.reshape(self.shape), NEIGHBOURS).ravel()
-
-    def _csr(self, values: NDArray[np.floating]) -> csr_array:
-        return csr_array((values, self.columns, self.starts), shape=(len(self.starts) - 1, self.count))
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the arrays."""
-        return sum(value.nbytes for field in fields(self) if isinstance(value := getattr(self, field.name), np.ndarray))
 
 
 def glowing_meshes(scene: mi.Scene) -> list[EmittingSurface]:
@@ -164,7 +102,7 @@ def block_of(
     progress: Callable[[float], None] | None = None,
     *,
     most_bytes: int | None = None,
-) -> Block:
+) -> SparseRows:
     """Rows of one view of a scene, whatever J_n it has.
 
     Raises
@@ -176,7 +114,7 @@ def block_of(
 
     from ..camera.of_sensor import camera_of
     from ..integral.lines.scene_checks import check_rounding
-    from ..integral.rows.sparse_rows import sparse_rows
+    from ..integral.rows.view_rows import view_rows
     from ..jit.recording import recording
     from ..rendering.render import integrator_of
 
@@ -189,7 +127,7 @@ def block_of(
         integrator: Any = integrator_of(scene, "integral")
         check_rounding(camera)
         with recording(), dr.suspend_grad():
-            rows = sparse_rows(
+            return view_rows(
                 scene,
                 camera,
                 lambda: integrator.solve(scene, lens, quadrature),
@@ -198,7 +136,6 @@ def block_of(
                 progress,
                 most_bytes,
             )
-    return Block(**{field.name: getattr(rows, field.name) for field in fields(rows)})
 
 
 def light_left_out_of(scene: mi.Scene, lens: mi.Sensor, rtol: float) -> tuple[float, str] | None:

@@ -17,9 +17,9 @@ import trimesh
 from small_scenes import SCENES, attribute, ball, glow, lens, load_scene, world_scene, write_ply
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.integral.rows.sparse_rows import SparseRows
 from mitsuba_fspt.inverse import transport as module
 from mitsuba_fspt.inverse.transport_file import PartialFile
-from mitsuba_fspt.inverse.view_block import Block
 from mitsuba_fspt.rendering.provenance import mesh_digest, same_mesh
 from mitsuba_fspt.runtime import workers
 from mitsuba_fspt.runtime.errors import SceneError, TransportError
@@ -154,7 +154,7 @@ def test_files_hold_the_last_column(tmp_path, count):
     columns = np.array([count - 1, 3], np.int32)
     light, change = np.array([1, 2], np.float32), np.zeros(2, np.float16)
     partial = PartialFile(tmp_path / "T.npz")
-    partial.put(0, Block((1, 2), count, light, columns, np.array([0, 1, 2]), change, 0 * light), "one")
+    partial.put(0, SparseRows((1, 2), count, light, columns, np.array([0, 1, 2]), change, 0 * light), "one")
     partial.views = 1
     np.testing.assert_array_equal(partial[0].columns, columns)
     assert partial[0].columns.dtype == np.int32
@@ -344,9 +344,9 @@ def test_scenes_without_columns_are_refused(tmp_path):
 
 def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
     """Seen to fail where nothing compares the bytes."""
-    from mitsuba_fspt.integral.rows import sparse_rows
+    from mitsuba_fspt.integral.rows import view_rows
 
-    monkeypatch.setattr(sparse_rows, "available_memory", lambda: 1 << 20)
+    monkeypatch.setattr(view_rows, "available_memory", lambda: 1 << 20)
     scene = load_scene("nylon_cylinder")
     solved = []
     monkeypatch.setattr(type(scene.integrator()), "solve", lambda *given: solved.append(given))

@@ -1,1 +1,1 @@
-"""Rows of the transport matrix and of the derivative by J_n, which are linear in J_n."""
+"""Rows of the transport matrix and of the derivative by J_n (Eq. M.20): the power is linear in J_n."""

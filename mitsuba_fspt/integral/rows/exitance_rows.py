@@ -1,12 +1,12 @@
-"""Rows of the derivative of a picture by J_n, whatever J_n is: P is linear in it.
+"""Rows of the derivative of an image by J_n: P is linear in J_n, so that they do not depend on it (Eq. M.20).
 
 Where all that glows are meshes and J_n is a number or an attribute, the rows are those of the transport matrix
-(`sparse_rows`): forward mode is its product with the tangent of J_n, reverse mode that of its transpose.
+(`view_rows`): forward mode is its product with the tangent of J_n, reverse mode that of its transpose.
 
 Else they are a fixed set of lines of sight for each pixel: P_i = Σ_l w_il J_n(r_il) · profile, with one point r_il
 where each line of sight ends. Forward mode sums the tangent of J_n over the same lines whose weights reverse mode hands
-to the numbers behind J_n: the two are transposes of each other. The sum of the weights of a pixel is made that of the
-picture of J_n = 1 by the integral, so that silhouettes are as right as the picture.
+to the numbers behind J_n: the two are transposes of each other. The weights of a pixel are scaled to the integral's
+image of J_n = 1, so that silhouettes have the errors of that image.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from ...jit.mesh_buffers import triangles
 from ..lines.eq9 import View, eq9, etendue_from_pixel
 from ..pupil.lattices import VECTOR
 from ..quadrature import Quadrature
-from .sparse_rows import SparseRows, columns_on, sparse_rows
+from .sparse_rows import SparseRows
+from .view_rows import CERTAIN, LARGEST_FACTOR, columns_on, view_rows
 
 if TYPE_CHECKING:
     from ..solution import Solution
@@ -38,12 +39,10 @@ if TYPE_CHECKING:
 # A column, the derivative by one value behind J_n, that N lines meet is right to 1/N where J_n is continuous, and to
 # N^(-3/4) where it steps from face to face.
 FEWEST, MOST = 1 << 6, 1 << 14  # lines of a pixel
-# Lines of a picture at rtol 1e-3: columns smaller than a pixel's are less right where the most of them, some two
-# seconds, do not meet them often enough. The least of them take a twentieth of a second.
+# Fewest and most lines of an image at rtol 1e-3, for some 0.05 and 2 s. Columns smaller than a pixel, which even the
+# most lines may meet too rarely, have larger errors.
 LEAST_LINES, MOST_LINES = 1 << 19, 1 << 24
-FINER = 4  # times as many lines where they miss the picture of J_n = 1 by rtol, as often as `MOST_LINES` allow
-CERTAIN = 0.35  # of its estimated error: what that picture is wrong by at the most, as a rule
-LARGEST_FACTOR = 2.0  # on a row
+FINER = 4  # times as many lines where their sum is off the image of J_n = 1 by rtol, as often as `MOST_LINES` allow
 BATCH = 1 << 21  # lines of sight in one kernel: float32 adds no more of them than this to one number
 
 Array = NDArray[np.float64]
@@ -75,10 +74,8 @@ class Rows:
     kept: tuple[Any, ...] = ()
 
     @classmethod
-    def on_meshes(
-        cls, scene: mi.Scene, camera: Camera, quadrature: Quadrature, picture: Solution, kinds: Kinds
-    ) -> Rows:
-        """Rows of the transport matrix for columns of these `kinds_of`, from the `picture` of J_n = 1, as it must be.
+    def on_meshes(cls, scene: mi.Scene, camera: Camera, quadrature: Quadrature, image: Solution, kinds: Kinds) -> Rows:
+        """Rows of the transport matrix for columns of these `kinds_of`, from the `image` of J_n = 1, which it must be.
 
         Raises TransportError where the memory does not suffice.
         """
@@ -86,18 +83,18 @@ class Rows:
         counts = [columns_on(surface.shape, kind) for surface, kind in zip(surfaces, kinds, strict=True)]
         ends = itertools.pairwise(itertools.accumulate(counts, initial=0))
         columns = {surface.mark: slice(*pair) for surface, pair in zip(surfaces, ends, strict=True)}
-        found = sparse_rows(scene, camera, lambda: picture, kinds, quadrature, name="fspt_integral")
-        return cls(picture.power.shape, matrix=found, columns=columns)
+        found = view_rows(scene, camera, lambda: image, kinds, quadrature, name="fspt_integral")
+        return cls(image.power.shape, matrix=found, columns=columns)
 
     @classmethod
     def by_lines(
-        cls, view: View, quadrature: Quadrature, picture: Solution, window: NDArray[np.bool_], sizes: Sizes
+        cls, view: View, quadrature: Quadrature, image: Solution, window: NDArray[np.bool_], sizes: Sizes
     ) -> Rows:
-        """Rows of the pixels in `window` (h, w), from the `picture` of J_n = 1, which all surfaces must now have.
+        """Rows of the pixels in `window` (h, w), from the `image` of J_n = 1, which all surfaces must now have.
 
         sizes : number of values behind J_n, see `sizes_of`
         """
-        power, uncertain = (plane.ravel() / view.camera.etendue for plane in (picture.power, picture.error))
+        power, uncertain = (plane.ravel() / view.camera.etendue for plane in (image.power, image.error))
         tolerance = quadrature.rtol * power.max(initial=0.0)
         pixels = np.flatnonzero(window.ravel() & ((power > 0) | (uncertain > tolerance)))
         lines, groups = _lines_for(quadrature, sizes, len(pixels)), []
@@ -118,10 +115,10 @@ class Rows:
                 )
             )
             pixels, lines = pixels[rough], finer
-        return cls(picture.power.shape, tuple(group for group in groups if len(group.pixels)))
+        return cls(image.power.shape, tuple(group for group in groups if len(group.pixels)))
 
     def forward(self, view: View, quadrature: Quadrature, surfaces: Sequence[EmittingSurface]) -> Array:
-        """Tangent (h, w) [W] of the picture, of that of the numbers behind J_n of these surfaces."""
+        """Tangent (h, w) [W] of the image for the tangents of the numbers behind J_n of these surfaces."""
         if self.matrix is not None:
             change = np.zeros(self.matrix.count)
             with dr.resume_grad():

@@ -22,10 +22,8 @@ from ...jit.mesh_buffers import box_of
 from ...runtime.errors import SceneError
 from ..lines.eq9 import eq9, etendue_from_pixel
 from ..lines.specular import Specular, follow
+from ..surface.pupil_cells import STEPS, STRIDE
 
-# Steps of a Kronecker sequence in four dimensions, 1/g … 1/g⁴ with g⁵ = g + 1, in units of 2⁻³²: whole numbers, so that
-# the sequence stays exact; and the shift from pixel to pixel (golden ratio).
-STEPS, STRIDE = (3679390609, 3152041523, 2700274807, 2313257605), 2654435769
 MOST_HITS = 4  # surfaces that a line meets on average at the most, directly and by way of specular surfaces
 Index = NDArray[np.int64]
 
@@ -50,7 +48,7 @@ def rows_of(
     lines: int,
     specular: Specular | None = None,
 ) -> list[Row]:
-    """What `lines` lines of sight of each of these pixels of the crop window meet, for each emitting mesh.
+    """Faces that `lines` lines of sight of each of these pixels of the crop window meet, for each emitting mesh.
 
     The light is that of J_n = 1 W/mm²; its sum over the lines of a pixel, over their number, is the row's sum. Lines go
     on through and off `specular` shapes; those that meet several surfaces have a row for each.

@@ -1,67 +1,30 @@
-"""Rows of the transport matrix of one view (Eq. M.20), from its columns and, where those are wrong, lines of sight.
-
-The columns come from the surface form, which conserves the light of each. Their sums over a row are then made those of
-the picture of J_n = 1, an independent computation by the pupil form that finds silhouettes and occluders, as far as the
-two differ by more than the picture's own error. Where light reaches the lens through or off specular shapes all rows
-are found by lines of sight. `inverse` keeps these rows as the matrix, derivatives of a picture by J_n are their sums.
-
-Entries stay in single precision: ten bytes each. What is done to all of them is done to some rows at a time.
-"""
+"""Sparse rows of the transport matrix (Eq. M.20) of one view, with the estimated error of their product with J_n."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.ndimage import maximum_filter
+from scipy.sparse import csr_array
 
-from ...camera.camera import Camera
-from ...emission.of_emitter import surfaces_of
-from ...jit.batches import BATCH
-from ...jit.mesh_buffers import triangles
-from ...runtime.errors import TransportError, named
-from ...runtime.memory import available_memory
-from ..lines.occlusion import hides_nothing
-from ..lines.specular import Specular
-from ..lines.visible_window import visible_window
-from ..quadrature import Quadrature
-from ..solution import Solution
-from ..surface.column_canvas import Windows
-from ..surface.column_form import MOST_CHANGE, Columns, column_windows, columns_of
-from ..surface.face_light import ColumnRule, FaceLight
-from .row_form import rows_of
+from ..quadrature import FLOAT32_FLOOR
 
-CERTAIN = 0.35  # of its estimated error: what the picture of J_n = 1 is wrong by at the most, as a rule
-ROUGH = 4.0  # times rtol of the brightest pixel of that picture: rows further from it are computed by lines of sight
-UNREACHED = 0.5  # likewise, where the picture itself did not reach rtol
-ALL_LINES = 2048  # lines of sight a pixel at rtol 1e-3 where all rows are found by them
-ROW_LINES = 4096  # of these pixels at rtol 1e-3, more where they are few
-LINES_LEFT = 1.5  # error over the change by twice the lines: 1/(2^(3/4) - 1), at an edge in focus
-FEWEST_HITS = 64  # on a column, from which on they determine its entry better than the surface form does
-TURNS = 6  # in which rows and columns are scaled to their sums
-LARGEST_FACTOR = 2.0  # on a row; what this leaves is in its error
-ENTRY = 36  # bytes of an entry while columns become rows
-PIXEL = 120  # bytes of a row: the picture of J_n = 1, sums of the row and factors on it, in double precision
-WORK = 3 << 29  # bytes beside the entries
-SOME = 1 << 22  # entries in double precision at a time
-LINES = 1 << 20  # of sight at a time
+SAFETY = 2.0  # error over the largest change of a pixel and its neighbours, of which one may be small by chance
+NEIGHBOURS = 3  # pixels across that share their errors
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False)
 class SparseRows:
-    """Rows of one view, those of the crop window's pixels of `shape` (h, w), row by row from the top left.
+    """Rows (h · w, n) of one view, those of the crop window's pixels of `shape` (h, w), row by row from the top left.
 
     count : number n of columns, those of one mesh after the other
-    values : entries [mm²];  columns, starts : their columns, and the first entry of each row, as in a csr_array
+    values : entries [mm²]
+    columns, starts : their columns, and the first entry of each row, as in a csr_array
     change : by how much many more cells, pieces or lines of sight would change each entry, over the entry
     row_error : error of each row's sum [mm²], (h · w)
     """
@@ -74,329 +37,31 @@ class SparseRows:
     change: NDArray[np.float16]
     row_error: NDArray[np.float32]
 
-    @property
+    @cached_property
     def matrix(self) -> csr_array:
-        """The rows in single precision, (h · w, n)."""
-        return csr_array((self.values, self.columns, self.starts), shape=(len(self.starts) - 1, self.count))
+        """The rows in double precision."""
+        return self._csr(self.values.astype(np.float64))
 
+    def error(self, exitance: Array) -> Array:
+        """Estimated error (h, w) [W] of `matrix @ exitance` (n,) [W/mm²]."""
+        power = self.matrix @ exitance
+        changed = self._csr(self.values * self.change.astype(np.float64)) @ exitance
+        light, sums = self.matrix @ np.abs(exitance), self.matrix.sum(axis=1)
+        mean = self._spread(np.divide(light, sums, out=np.zeros_like(light), where=sums > 0))
+        least = FLOAT32_FLOOR * np.abs(power).max(initial=0.0) * (self._spread(np.abs(power)) > 0)
+        return np.maximum(SAFETY * self._spread(np.abs(changed)) + self.row_error * mean, least).reshape(self.shape)
 
-def columns_on(mesh: mi.Shape, on: str) -> int:
-    """Number of columns of a mesh: of its vertices or of its faces."""
-    return len(triangles(mesh)[0 if on == "vertex" else 1]) // 3
+    @property
+    def relative_row_error(self) -> Array:
+        """`row_error` over the largest sum of a row, (h · w); 0 where nothing is seen."""
+        counts = np.diff(self.starts)
+        sums = np.zeros(len(counts))
+        sums[counts > 0] = np.add.reduceat(self.values, self.starts[:-1][counts > 0], dtype=np.float64)
+        return self.row_error / sums.max() if sums.any() else sums
 
+    def _spread(self, values: Array) -> Array:
+        """The largest value of each pixel and its neighbours, (h · w)."""
+        return maximum_filter(values.reshape(self.shape), NEIGHBOURS).ravel()
 
-def sparse_rows(
-    scene: mi.Scene,
-    camera: Camera,
-    picture: Callable[[], Solution],
-    on: Sequence[str],
-    quadrature: Quadrature,
-    progress: Progress | None = None,
-    most_bytes: int | None = None,
-    name: str = "transport",
-) -> SparseRows:
-    """Rows of one view of a scene whose emitters are meshes, each with J_n = 1 now.
-
-    Parameters
-    ----------
-    picture : computes that of J_n = 1, by `quadrature`; called once the memory is known to suffice
-    on : of each emitter, 'vertex' or 'face'
-    progress : called with the share done
-    most_bytes : that may be allocated; None for what the system says
-    name : of what needs them, for messages
-
-    Raises
-    ------
-    TransportError : the memory does not suffice.
-    """
-    specular = Specular.of(scene, camera, quadrature)
-    if specular:
-        solution = picture()
-        entries = _by_lines(scene, camera, solution, on, quadrature.rtol, specular)
-        sums = np.full(entries.count, np.nan)
-    else:
-        with named(name):
-            laid = _laid_out(scene, camera, on, most_bytes)
-        solution = picture()
-        with named(name):
-            entries, sums = _by_faces(scene, camera, solution, laid, on, quadrature.rtol, progress)
-    least = quadrature.least_error * float(solution.power.max(initial=0.0))
-    return _balanced(entries, sums, solution, np.maximum(solution.error, least), camera.etendue)
-
-
-@dataclass(frozen=True, eq=False)
-class _Entries:
-    """Entries of all rows, in the order of the rows: column, light over that of a filled pixel, relative change."""
-
-    count: int
-    starts: NDArray[np.integer]
-    columns: NDArray[np.int32]
-    light: NDArray[np.float32]
-    change: NDArray[np.float16]
-
-    @classmethod
-    def of(cls, parts: Sequence[Columns], rows: int) -> _Entries:
-        """Those of the columns of several meshes, one after the other, on so many pixels."""
-        ends = np.cumsum([0, *(len(part.exact) for part in parts)])
-        columns, pixels, light, change = (
-            np.concatenate([getattr(part, name) for part in parts]) if len(parts) > 1 else getattr(parts[0], name)
-            for name in ("columns", "pixels", "light", "change")
-        )
-        if len(parts) > 1:
-            columns += np.repeat(ends[:-1], [len(part.light) for part in parts]).astype(np.int32)
-        numbers = np.arange(len(pixels), dtype=np.int32 if len(pixels) < 1 << 31 else np.int64)
-        whole = coo_array((numbers, (pixels, columns)), shape=(rows, int(ends[-1])))
-        whole.has_canonical_format = True  # no two are the same
-        whole = whole.tocsr()
-        return cls(int(ends[-1]), whole.indptr, whole.indices, light[whole.data], change[whole.data])
-
-    def parts(self) -> Iterator[tuple[slice, slice, NDArray[np.int64]]]:
-        """Some rows at a time, with their entries and the row of each entry, counted from the first of them."""
-        first = 0
-        while first < len(self.starts) - 1:
-            last = max(int(np.searchsorted(self.starts, self.starts[first] + SOME, side="right")) - 1, first + 1)
-            row = np.repeat(np.arange(last - first), np.diff(self.starts[first : last + 1]))
-            yield slice(first, last), slice(int(self.starts[first]), int(self.starts[last])), row
-            first = last
-
-    def row_sums(self, factors: Array | None = None) -> Array:
-        """Light of each row, that of a column times its factor."""
-        found = np.zeros(len(self.starts) - 1)
-        for rows, some, row in self.parts():
-            light = self.light[some] if factors is None else self.light[some] * factors[self.columns[some]]
-            found[rows] = np.bincount(row, light, minlength=rows.stop - rows.start)
-        return found
-
-    def column_sums(self, factors: Array | None = None) -> Array:
-        """Light of each column, that of a row times its factor."""
-        found = np.zeros(self.count)
-        for rows, some, row in self.parts():
-            light = self.light[some] if factors is None else self.light[some] * factors[rows][row]
-            found += np.bincount(self.columns[some], light, minlength=self.count)
-        return found
-
-    def where(self, kept: Mask) -> _Entries:
-        """Some of the entries."""
-        if kept.all():
-            return self
-        starts = np.concatenate([[0], np.cumsum(kept)])[self.starts].astype(self.starts.dtype)
-        return _Entries(self.count, starts, self.columns[kept], self.light[kept], self.change[kept])
-
-    def joined(self, others: Sequence[_Entries], pixels: Sequence[NDArray[np.int64]]) -> _Entries:
-        """With others, whose rows are those of these pixels; no entry is in two."""
-        here, parts = np.arange(len(self.starts) - 1), [self, *others]
-        lengths = np.diff(self.starts).astype(np.int64)
-        for other, place in zip(others, pixels, strict=True):
-            lengths[place] += np.diff(other.starts)
-        starts = np.concatenate([[0], np.cumsum(lengths)])
-        free = starts[:-1].copy()
-        arrays = [np.empty(starts[-1], getattr(self, name).dtype) for name in ("columns", "light", "change")]
-        for part, place in zip(parts, [here, *pixels], strict=True):
-            sizes = np.diff(part.starts)
-            to = np.repeat(free[place] - part.starts[:-1], sizes) + np.arange(int(part.starts[-1]))
-            for array, name in zip(arrays, ("columns", "light", "change"), strict=True):
-                array[to] = getattr(part, name)
-            free[place] += sizes
-        return _Entries(self.count, starts, *arrays)
-
-
-def _laid_out(
-    scene: mi.Scene, camera: Camera, on: Sequence[str], most_bytes: int | None
-) -> list[tuple[FaceLight, Windows]]:
-    """Faces of each mesh with the windows of its columns; TransportError where the memory does not hold the entries."""
-    alone, shape = hides_nothing(scene), camera.film.shape
-    offset = camera.film.crop_offset
-    laid = []
-    for surface, kind in zip(surfaces_of(scene), on, strict=True):
-        faces = FaceLight.seen(surface, camera, offset, shape)
-        faces = faces if alone else faces.behind(scene, camera)
-        laid.append((faces, column_windows(faces, columns_on(surface.shape, kind), kind, shape)))
-    _require_memory(sum(windows.pixels for _, windows in laid), math.prod(shape), most_bytes)
-    return laid
-
-
-def _by_faces(
-    scene: mi.Scene,
-    camera: Camera,
-    picture: Solution,
-    laid: list[tuple[FaceLight, Windows]],
-    on: Sequence[str],
-    rtol: float,
-    progress: Progress | None,
-) -> tuple[_Entries, Array]:
-    """Entries from the faces of the meshes and, on rough pixels, from lines of sight; sums of the columns."""
-    columns = []
-    for number, ((faces, windows), kind) in enumerate(zip(laid, on, strict=True)):
-        report = None
-        if progress:
-
-            def report(share: float, first: float = number / len(on)) -> None:
-                progress(first + share / len(on))
-
-        columns.append(columns_of(scene, camera, faces, windows, kind, ColumnRule.of(rtol), report))
-    exact = np.concatenate([part.exact for part in columns])
-    entries = _Entries.of(columns, math.prod(camera.film.shape))
-    del columns
-    laid.clear()  # the work that follows needs the memory
-    rough, cut, outside = _rough(scene, camera, entries, picture, rtol)
-    sums = np.where(exact, entries.column_sums(), np.nan)
-    if outside.any() or cut.any():
-        sizes = np.diff(entries.starts)
-        sums[entries.columns[np.repeat(outside | cut, sizes)]] = np.nan  # the stop takes some of their light
-        entries = entries.where(~np.repeat(outside, sizes))
-    if rough.any():
-        entries = _refined(scene, camera, entries, on, rough, cut, rtol)
-    return entries, sums
-
-
-def _by_lines(
-    scene: mi.Scene, camera: Camera, picture: Solution, on: Sequence[str], rtol: float, specular: Specular
-) -> _Entries:
-    """Entries of all pixels by lines of sight."""
-    pixels = np.flatnonzero(picture.power.ravel() > 0)
-    count = sum(columns_on(surface.shape, kind) for surface, kind in zip(surfaces_of(scene), on, strict=True))
-    lines = int(ALL_LINES * (1e-3 / rtol) ** 0.5) // 2 * 2
-    places = np.array_split(pixels, -(-len(pixels) * lines // LINES)) if pixels.size else []
-    rows = [_rows(scene, camera, some, on, lines, specular) for some in places]
-    none = np.zeros(picture.power.size + 1, np.int64)
-    empty = _Entries(count, none, *(np.zeros(0, kind) for kind in (np.int32, np.float32, np.float16)))
-    return empty.joined(rows, places)
-
-
-def _refined(
-    scene: mi.Scene, camera: Camera, entries: _Entries, on: Sequence[str], rough: Mask, cut: Mask, rtol: float
-) -> _Entries:
-    """The same with the bright entries of rough pixels as lines of sight find them, and the faint ones as they are.
-
-    An entry is bright if the surface form or the lines of sight put it above a threshold; so each entry comes from
-    one of the two, also where one puts it just above and the other just below. In pixels in `cut` all entries are
-    bright: the border of a stop crosses these pixels, and the surface form counts them whole.
-    """
-    pixels = np.flatnonzero(rough)
-    lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
-    places = np.array_split(pixels, max(1, -(-len(pixels) * lines // LINES)))
-    kept, found = np.ones(len(entries.light), bool), []
-    for some in places:
-        rows = _rows(scene, camera, some, on, lines)
-        threshold = np.where(cut[some], 0, FEWEST_HITS / (math.pi * lines))
-        sizes = np.diff(entries.starts)[some]
-        row, met = (np.repeat(np.arange(len(some)), counts) for counts in (sizes, np.diff(rows.starts)))
-        here = np.repeat(entries.starts[some] - np.cumsum(sizes) + sizes, sizes) + np.arange(len(row))
-        bright, bright_met = entries.light[here] >= threshold[row], rows.light >= threshold[met]
-        number_here = row * entries.count + entries.columns[here]
-        number_met = met * entries.count + rows.columns
-        kept[here] = ~bright & ~np.isin(number_here, number_met[bright_met])
-        found.append(rows.where(bright_met | np.isin(number_met, number_here[bright])))
-    return entries.where(kept).joined(found, places)
-
-
-def _rough(
-    scene: mi.Scene, camera: Camera, entries: _Entries, solution: Solution, rtol: float
-) -> tuple[Mask, Mask, Mask]:
-    """Pixels (h · w) whose row the surface form gives wrongly, those that the stop cuts, and those beyond it.
-
-    The first include the second, and those whose sum is far from the picture, or off where that is uncertain.
-    """
-    window = visible_window(scene, camera, everywhere=True)
-    inside, cut = (window.expand(flags.astype(np.float64)).ravel() > 0 for flags in window.field_stop(camera))
-    inside |= math.isinf(camera.lens.seen_field)
-    picture = solution.power.ravel() / camera.etendue
-    off, uncertain = np.abs(picture - entries.row_sums()), solution.error.ravel() / camera.etendue
-    unit = rtol * picture.max(initial=0.0)
-    far = inside & ((off > ROUGH * unit) | (off > UNREACHED * unit) & (uncertain > unit))
-    cut &= ~inside
-    return far | (cut & (picture > 0)), cut, ~(inside | cut)
-
-
-def _rows(
-    scene: mi.Scene,
-    camera: Camera,
-    pixels: NDArray[np.int64],
-    on: Sequence[str],
-    lines: int,
-    specular: Specular | None = None,
-) -> _Entries:
-    """Rows of these pixels by lines of sight; their change follows from half of the lines."""
-    found: list[tuple[Any, ...]] = []
-    first, surfaces = 0, surfaces_of(scene)
-    for surface, kind, row in zip(surfaces, on, rows_of(scene, camera, surfaces, pixels, lines, specular), strict=True):
-        light, half = row.light / lines, np.where(row.line < lines // 2, 2 * row.light / lines, 0)
-        if kind == "face":
-            found.append((row.place, first + row.face, light, half))
-        else:
-            corners = triangles(surface.shape)[1].numpy().reshape(-1, 3)[row.face]
-            found += [
-                (row.place, first + corners[:, k].astype(np.int64), light * row.corners[:, k], half * row.corners[:, k])
-                for k in range(3)
-            ]
-        first += columns_on(surface.shape, kind)
-    place, column, light, half = (np.concatenate(values) for values in zip(*found, strict=True))
-    both = csr_array((light + 1j * half, (place, column)), shape=(len(pixels), first))  # sums both at once
-    both.eliminate_zeros()
-    relative = LINES_LEFT * (
-        1 - np.divide(both.data.imag, both.data.real, out=np.ones(both.nnz), where=both.data.real > 0)
-    )
-    return _Entries(
-        first,
-        both.indptr,
-        both.indices.astype(np.int32),
-        both.data.real.astype(np.float32),
-        np.clip(relative, -MOST_CHANGE, MOST_CHANGE).astype(np.float16),
-    )
-
-
-def _require_memory(entries: int, pixels: int, most_bytes: int | None) -> None:
-    """Raise TransportError where one view, with at the most so many entries, does not fit into memory."""
-    needed = entries * ENTRY + pixels * PIXEL + WORK
-    free = available_memory() if most_bytes is None else most_bytes
-    if free is not None and needed > free:
-        raise TransportError(
-            f"one view has up to {entries} entries and needs {needed} bytes ({needed / 2**30:.1f} GiB) of "
-            f"memory, {free} are free. Give fewer pixels, a crop window, a smaller aperture or a coarser mesh."
-        )
-
-
-def _balanced(found: _Entries, columns: Array, picture: Solution, error: Array, etendue: float) -> SparseRows:
-    """Rows scaled to the `picture` of J_n = 1, with this `error` (h, w) [W], and to these sums of their columns.
-
-    By turns, rows last: both sums are those of one matrix, so that the turns converge. Sums that are NaN are not known.
-    """
-    power, uncertain = picture.power.ravel() / etendue, error.ravel() / etendue
-    before = found.row_sums()
-    wanted = np.where(np.abs(power - before) > CERTAIN * uncertain, power, before)
-    by_row, by_column = np.ones(len(power)), np.ones(found.count)
-    for turn in range(TURNS):
-        by_row *= _factor(wanted, by_row * found.row_sums(by_column))
-        if turn < TURNS - 1:
-            factor = _factor(columns, by_column * found.column_sums(by_row))
-            by_column *= np.where(np.isnan(columns), 1, factor)
-    sums = by_row * found.row_sums(by_column)
-    coarse = np.zeros(len(power))
-    for rows, some, row in found.parts():
-        light = found.light[some] * (1 - found.change[some].astype(np.float64))
-        coarse[rows] = np.bincount(row, light, minlength=rows.stop - rows.start)
-    coarse = _factor(sums, coarse)
-    values, change = np.empty_like(found.light), np.empty_like(found.change)
-    for rows, some, row in found.parts():
-        factor = by_row[rows][row] * by_column[found.columns[some]]
-        values[some] = found.light[some] * factor * etendue
-        scaled = (1 - found.change[some].astype(np.float64)) * coarse[rows][row]
-        relative = 1 - np.divide(scaled, factor, out=np.ones_like(factor), where=factor > 0)
-        change[some] = np.clip(relative, -MOST_CHANGE, MOST_CHANGE)
-    left = np.maximum(np.abs(power - sums), uncertain) * etendue
-    entries = replace(found, light=values, change=change)
-    entries = entries.where(values > 0)  # behind an image-plane stop
-    return SparseRows(
-        error.shape,
-        entries.count,
-        entries.light,
-        entries.columns.astype(np.int32, copy=False),
-        entries.starts,
-        entries.change,
-        left.astype(np.float32),
-    )
-
-
-def _factor(wanted: Array, sums: Array) -> Array:
-    """By what sums are to be multiplied, at most so much."""
-    return np.clip(np.divide(wanted, sums, out=np.ones(len(sums)), where=sums > 0), 0, LARGEST_FACTOR)
+    def _csr(self, values: Array) -> csr_array:
+        return csr_array((values, self.columns, self.starts), shape=(len(self.starts) - 1, self.count))

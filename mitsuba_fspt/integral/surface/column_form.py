@@ -30,9 +30,10 @@ from ..lines.occlusion import hidden
 from . import pupil_cells
 from .column_canvas import ColumnCanvas, Plane, Windows
 from .face_light import CORNERS, ColumnRule, FaceLight, Plan
+from .footprint import SPECK
 
 AROUND = ((0, 0), (1, 0), (1, 1), (0, 1))  # of a cell of the pupil
-SPECK, LEAST_AREA = 2.0**-4, 2.0**-20  # half a side of the square [pixels] that stands for a smaller image [pixels²]
+LEAST_AREA = 2.0**-20  # pixels²: a smaller image is replaced by the square of half a side `SPECK`
 LEAST_HEIGHT = 2.0**-5  # pixels: over a flatter image the density is taken as constant
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
