@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -287,6 +288,18 @@ def test_lens_and_surface_are_shells_whose_members_nobody_uses_below():
                 holder = ast.unparse(node.value).rpartition(".")[2]
                 plugin = holder in ("sensor", "lens", "emitter") or holder.endswith("()")
                 assert not plugin or node.attr in ASKS_PLUGINS.get(name, ()), f"{name}, line {node.lineno}"
+
+
+def test_every_file_of_the_integral_cites_an_equation():
+    """Of the paper or of docs/model.md, as `tests/test_docs.py` checks; folders' descriptions apart."""
+    files = [name for name in NAMES if room_of(name) == "integral" and not name.endswith("__init__.py")]
+    assert not [name for name in files if not re.search(r"Eq\. \d|\bM\.\d", (PACKAGE / name).read_text())]
+
+
+def test_the_integral_calls_its_data_images():
+    """A picture is a drawing (`images/picture.py`); the glossary bans the word for powers on pixels."""
+    files = [name for name in NAMES if room_of(name) == "integral"]
+    assert not [name for name in files if re.search(r"pictures?\b", (PACKAGE / name).read_text(), re.I)]
 
 
 def test_no_star_imports():

@@ -1,4 +1,4 @@
-"""Thresholds of the pupil form's error estimates, all in one place."""
+"""Thresholds of the error estimates of the pupil form (Eq. M.5), all in one place."""
 
 from __future__ import annotations
 
@@ -92,6 +92,6 @@ class Estimator:
     missed_share: float = _bound(6.9, 0.0)
 
     def without(self, name: str) -> Estimator:
-        """The same without the rule of a field."""
+        """A copy in which the rule of one field has no effect."""
         off = {entry.name: entry.metadata["off"] for entry in fields(self)}
         return replace(self, **{name: off[name]})

@@ -1,4 +1,4 @@
-"""Share of the integral's levels that are done, reported after each, and the deadline after which none begins."""
+"""Share of the levels of Eq. 9's integration that is done, and the deadline after which no level begins."""
 
 from __future__ import annotations
 

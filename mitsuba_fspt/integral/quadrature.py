@@ -1,4 +1,4 @@
-"""Accuracy parameters of the deterministic integral."""
+"""Accuracy parameters of the integration of Eq. 9."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 SHORTCUTS = {
     "outside": "pixels outside the effective virtual space (Eq. 4)",
-    "smooth blocks": "single pixels of blocks on which the picture is smooth",
+    "smooth blocks": "single pixels of blocks on which the image is smooth",
     "one line": "three of the first four lines of sight of a pixel",
     "smooth": "all further lines of sight of a pixel",
     "specular": "lines of sight beyond the first surface",

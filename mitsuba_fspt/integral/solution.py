@@ -1,4 +1,4 @@
-"""The picture that the deterministic integral returns."""
+"""The image of P (Eq. 9) that the deterministic integral returns."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .shortcuts import Finding
 
 @dataclass(frozen=True)
 class Solution:
-    """Picture of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
+    """Image of the crop window, arrays (h, w): power [W], estimated absolute error [W], coverage in [0, 1].
 
     rays : lines of sight of all pixels together, in the EXR header `nodes`
     levels : name, pixels and lines of sight of each step of the refinement, as text

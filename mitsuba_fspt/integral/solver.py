@@ -108,7 +108,7 @@ class Solver:
         return None if edition is None else self._faces.recall(edition, lambda: FaceTable.of(shapes))
 
     def _narrow_light(self, view: View, window: Window) -> NarrowLight:
-        """Light of objects and spots that lines of sight may miss; cached."""
+        """Light of bodies and spots that lines of sight may miss; cached."""
         scene, camera, specular = view.scene, view.camera, view.specular
         editions = [edition_of(emitter) for emitter in scene.emitters()]
         through = specular.state() if specular else ()

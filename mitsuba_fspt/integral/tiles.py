@@ -1,4 +1,4 @@
-"""Tiles: parts of a large picture, solved one after the other, so that the memory for work is that of one part.
+"""Tiles: parts of a large image of Eq. 9, solved one after the other, so that the memory for work is that of one part.
 
 Each tile is solved with a rim of neighbours that estimates need, as a crop window is, and all to the same tolerance.
 """
@@ -22,7 +22,7 @@ from .shortcuts import Finding
 from .solution import Solution
 
 SIDE = 2048  # pixels along a tile with its rim; Dr.Jit allocates powers of two
-LARGE = 1 << 26  # pixels: the planes of a larger picture are of float32, as they are in its file
+LARGE = 1 << 26  # pixels: the planes of a larger image are of float32, as they are in its file
 # Beside the planes: bytes that the work on one tile takes; then a pixel, that checks and the file take, and that copies
 # of planes of float64 in float32 take, by the bytes of a value.
 WORK, WRITING = 1 << 30, {4: 2, 8: 14}
@@ -50,7 +50,7 @@ def _split(side: range, most: int) -> list[range]:
 
 
 class Mosaic:
-    """Picture of the crop window of `window`, put together from the solutions of its tiles.
+    """Image of the crop window of `window`, put together from the solutions of its tiles.
 
     Raises SceneError where the memory does not suffice for it.
     """
@@ -73,7 +73,7 @@ class Mosaic:
         self._findings += part.findings
 
     def solution(self, least_error: float, rounding: float) -> Solution:
-        """The whole picture.
+        """The whole image.
 
         least_error : smallest error that is stated, over the brightest pixel
         rounding : by which float32 displaces lines of sight [pixels], 0 where that does not count
@@ -93,7 +93,7 @@ class Mosaic:
         return slice(top, top + tile.full[0]), slice(left, left + tile.full[1])
 
     def _level_errors(self, least_error: float) -> None:
-        """Raise the errors to the least one that follows from the whole picture; parameter as of `solution`."""
+        """Raise the errors to the least one that follows from the whole image; parameters as of `solution`."""
         least = least_error * float(self.power.max(initial=0.0))
         for tile in self.tiles:
             here = self._place(tile)
@@ -101,7 +101,7 @@ class Mosaic:
             np.maximum(error, least, out=error, where=self.coverage[here] > 0)
 
     def _steepest_on(self, here: tuple[slice, slice]) -> NDArray[np.float64]:
-        """`_steepest` on a tile, with what lies around it."""
+        """`_steepest` on a tile, with the pixels around it."""
         first = [max(0, side.start - REACH) for side in here]
         around = tuple(slice(start, side.stop + REACH) for start, side in zip(first, here, strict=True))
         steepest = _steepest(self.power[around].astype(np.float64, copy=False))
@@ -129,7 +129,7 @@ def _require_memory(full: tuple[int, int], size: int) -> None:
 
 
 def _added_levels(levels: Sequence[str]) -> tuple[str, ...]:
-    """What each step of the refinement did, on all tiles together."""
+    """`Solution.levels` of all tiles together: pixels and lines of sight of each step are added up."""
     steps: dict[str, list[str]] = {}
     for text in levels:
         steps.setdefault(text.partition(":")[0], []).append(text.partition(":")[2])
@@ -137,7 +137,7 @@ def _added_levels(levels: Sequence[str]) -> tuple[str, ...]:
 
 
 def _common_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Of each shortcut whether it was taken on any tile; the reason is that of the first such tile, or of the first."""
+    """For each shortcut whether any tile took it, with the reason of the first that did, else of the first tile."""
     shortcuts: dict[str, list[Finding]] = {}
     for finding in findings:
         shortcuts.setdefault(finding.name, []).append(finding)

@@ -89,7 +89,7 @@ class Sight:
 
 @dataclass(frozen=True)
 class View:
-    """What a lens sees of a scene along lines of sight, which begin at the depth `start` [mm], before all surfaces.
+    """A scene as a lens sees it along lines of sight, which begin at the depth `start` [mm], before all surfaces.
 
     Mitsuba moves the limb of a small sphere far from where a ray begins by a share of the distance squared over its
     radius; a late start avoids it.
@@ -125,7 +125,7 @@ class View:
         return cls(scene, camera, start, faces, triangles / math.prod(window.shape), _emitting(shapes), specular)
 
     def integrand(self, position: mi.Point2f, pupil: mi.Point2f, together: bool = False) -> Sight:
-        """Integrand of Eq. 9 in the pupil form on one line of sight, and what the line met.
+        """Integrand of Eq. 9 in the pupil form on one line of sight, and the surfaces that the line met.
 
         position : on the film [pixels]
         pupil : on the unit disc; stands for as large a share of what is open of the pupil

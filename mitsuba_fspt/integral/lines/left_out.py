@@ -1,8 +1,8 @@
 """Light that a method leaves out: what reaches the lens after a scattering reflection, or from points and beams.
 
-Eq. 9 sums what surfaces send to the lens themselves, and specular surfaces lead on. A white table, a second phantom or
-a dent of the phantom itself reflects some of the light once more; Monte Carlo follows it as far as its `max_depth`. A
-short Monte Carlo run estimates how much of the power is missing.
+Eq. 9 sums the light that surfaces emit towards the lens, directly or by way of specular surfaces. A white table, a
+second phantom or a dent of the phantom itself scatters some of the light once more; Monte Carlo follows it as far as
+its `max_depth`. A short Monte Carlo run estimates how much of the power is missing.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SURE = 2.0  # standard errors above which a share is significant
 
 @dataclass
 class LeftOut:
-    """Share of an image's power that a method leaves out, its standard error, and ids of the shapes that send it on.
+    """Share of an image's power that a method leaves out, its standard error, and ids of the shapes that scatter it.
 
     depth : segments of light paths that the method follows; None: the integral
     needed : segments that contain what is counted
@@ -44,7 +44,7 @@ class LeftOut:
     needed: int
 
     def warning(self, least: float) -> str | None:
-        """One line about it; None where it is below `least`, such as rtol, or not significant."""
+        """One line that states the share; None if it is below `least`, such as rtol, or not significant."""
         if not self.share > max(least, SURE * self.error):
             return None
         sends = "scatters light" if self.depth is None else "scatters or leads light on"
@@ -60,7 +60,7 @@ class LeftOut:
 
 
 def light_left_out(scene: mi.Scene, camera: Camera, quadrature: Quadrature, depth: int | None = None) -> LeftOut | None:
-    """Share of the power on the crop window that a method leaves out; None where nothing can be.
+    """Share of the power on the crop window that a method leaves out; None if no shape can scatter light.
 
     depth : segments of the paths that a Monte Carlo follows; None: the integral
     """
@@ -121,7 +121,7 @@ def _sampled(view: View, needed: int, depth: int | None) -> tuple[NDArray[np.flo
 
 
 def scattering_shapes(scene: mi.Scene) -> list[str]:
-    """Ids of the shapes whose BSDF scatters light, those apart that Mitsuba gives to emitters without one: black."""
+    """Ids of the shapes whose BSDF scatters light; the one that Mitsuba gives to emitters without BSDF is black."""
     return [shape.id() for shape in scene.shapes() if scatters(shape.bsdf())]
 
 

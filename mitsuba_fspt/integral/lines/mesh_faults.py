@@ -1,6 +1,6 @@
 """Faults of the meshes that glow: inconsistent orientations, surfaces inside out, and a size unusual for a phantom.
 
-The image of such a scene lacks light of the phantom: a face emits on its outward side alone.
+Eq. 9 lacks the light of such faces: a face emits on its outward side alone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FROM_FILES = ("PLYMesh", "OBJMesh", "SerializedMesh")  # meshes that may be in a
 
 
 def mesh_faults(scene: mi.Scene, camera: Camera) -> list[str]:
-    """One line for each glowing mesh whose faces point to the wrong side, and one for the size of all of them."""
+    """One line for each glowing mesh with faces that point to the wrong side, and one for an unusual size of all."""
     meshes = [surface for surface in surfaces_of(scene) if surface.shape.is_mesh()]
     found = [winding_fault(surface, camera) for surface in meshes]
     if read := [surface.shape for surface in meshes if surface.shape.class_name() in FROM_FILES]:
@@ -28,7 +28,7 @@ def mesh_faults(scene: mi.Scene, camera: Camera) -> list[str]:
 
 
 def size_fault(diagonal: float) -> str | None:
-    """A diagonal of the bounding box of all that glows [mm] that is unusual for a phantom, with a likelier unit."""
+    """The line for a bounding box of all that glows with a diagonal [mm] unusual for a phantom, and a likelier unit."""
     if is_usual(diagonal):
         return None
     found = f"what glows is {diagonal:.3g} mm from corner to corner, unusual for a phantom: one unit of length is 1 mm"
@@ -40,7 +40,7 @@ def size_fault(diagonal: float) -> str | None:
 
 
 def winding_fault(surface: EmittingSurface, camera: Camera) -> str | None:
-    """What is wrong with the orientation of a mesh, None if nothing is; found once for each state of the mesh."""
+    """The fault in the orientation of a mesh, None without one; found once for each state of the mesh."""
     mesh = surface.shape
     buffers = triangles(mesh)
     if not surface.winding or [b.index for b in buffers] != [b.index for b in surface.winding[0]]:
@@ -52,7 +52,7 @@ def winding_fault(surface: EmittingSurface, camera: Camera) -> str | None:
             f"{name}: on {shape.twisted} edges the two faces point to opposite sides; {100 * share:.2g} % of its area "
             "points inward, where it is dark from outside. Repair it, for example by trimesh.repair.fix_winding"
         )
-    # A lens within may look at the walls of a cavity.
+    # A lens inside may take an image of the walls of a cavity.
     if not shape.inside_out or mesh.bbox().contains(mi.ScalarPoint3f(camera.centre)):
         return None
     if shape.inside_out == shape.pieces:

@@ -1,4 +1,4 @@
-"""BSDFs inside other ones: what stands in a mask, a blend or a bump map, and whether lines of sight can follow it.
+"""BSDFs inside a mask, a blend or a bump map, and whether lines of sight can follow their lobes (Eq. M.19).
 
 Mitsuba samples the parts of a `blendbsdf` one at a time by the number of their component. A `mask` passes that number
 on to no BSDF inside it.
@@ -38,7 +38,7 @@ def _children(thing: mi.Object) -> list[mi.Object]:
 
 
 def blended_parts(bsdf: mi.BSDF) -> int:
-    """How many components a BSDF has whose lobes are those of a blend's parts; 0 for one that is no blend."""
+    """Number of components of a blend, whose lobes are those of its parts; 0 for a BSDF that is no blend."""
     blend = any(part.class_name() == "BlendBSDF" for part in nested(bsdf))
     return bsdf.component_count() if blend else 0
 
@@ -55,7 +55,7 @@ def check_followed(scene: mi.Scene) -> None:
 
 
 def _fault(bsdf: mi.BSDF) -> str | None:
-    """What keeps lines of sight from following the specular lobes of a BSDF; None if nothing does."""
+    """The reason why lines of sight cannot follow the specular lobes of a BSDF; None without one."""
     if not (bsdf.flags() & BENDS and blended_parts(bsdf)):
         return None
     kinds = {part.class_name() for part in nested(bsdf)}
@@ -68,7 +68,7 @@ def _fault(bsdf: mi.BSDF) -> str | None:
 
 
 def check_textures(scene: mi.Scene) -> None:
-    """Raise SceneError for a bump map of a texture without a gradient: Mitsuba fails where light meets it."""
+    """Raise SceneError for a bump map of a texture without a gradient, at which Mitsuba fails when light meets it."""
     for shape in scene.shapes():
         for part in nested(shape.bsdf()):
             if part.class_name() == "BumpMap":

@@ -1,4 +1,4 @@
-"""Occlusion between surface and camera, and shapes that cannot occlude themselves."""
+"""Occlusion between surface and camera (α of Eq. 4), and shapes that cannot occlude themselves."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def ray_to_lens(point: mi.Point3f, lens_point: mi.Point3f) -> mi.Ray3f:
 
 
 def clear_of(point: mi.Point3f) -> mi.Float:
-    """How far [mm] from a surface point a ray starts that leaves it, beyond the rounding of its coordinates."""
+    """Distance [mm] from a surface point at which a ray that leaves it starts, above the rounding of coordinates."""
     return CLEAR * dr.max(dr.abs(point), axis=0)
 
 
@@ -49,8 +49,8 @@ def hides_nothing(scene: mi.Scene) -> bool:
     """True for a scene of one shape that no grazing ray from any of its elements meets again.
 
     A test of the mesh edge by edge would miss a shallow dent in a fine mesh, where each edge bends by less than
-    rounding. Elements too narrow for float32 to give them a normal, such as those at the poles of a sphere, have no
-    say as long as they are next to none of the surface.
+    rounding. Rays from elements too narrow for float32 to give them a normal, such as those at the poles of a sphere,
+    do not count if the area of these elements is negligible.
     """
     shapes = scene.shapes()
     if len(shapes) != 1:

@@ -1,4 +1,4 @@
-"""Checks of a scene before it is traced.
+"""Checks of a scene before Eq. 9 is computed for it.
 
 Float32 resolves its lengths and powers, something may glow, J_n is sane, the camera is outside every closed surface, no
 surface lies in another one.
@@ -23,7 +23,7 @@ from .nested_bsdfs import check_textures
 from .specular import specular_bsdf
 
 COARSEST = 0.1  # virtual pixels: the largest displacement of a line of sight by float32
-# W/mm² and W: outside these ranges float32 cannot hold the sums and the faint parts of a picture.
+# W/mm² and W: outside these ranges float32 cannot represent the sums and the faint parts of an image.
 EXITANCES, FAINTEST = (1e-32, 1e32), 1e-36
 STRETCH = 1e-4  # relative: the most that float32 may change lengths and right angles by
 MATRIX_ROUNDING = 1e-6  # of float32, in sums of products
@@ -33,7 +33,7 @@ PARALLEL = 0.999  # cosine of the normals of coincident surfaces; shapes that in
 
 
 def check_scene(scene: mi.Scene, camera: Camera) -> None:
-    """Raise SceneError or ExitanceError where the scene cannot give a picture; the message says how to fix it."""
+    """Raise SceneError or ExitanceError if no image of the scene can be computed; the message says how to fix it."""
     check_film(camera)
     check_rounding(camera)
     if not scene.emitters():
@@ -57,7 +57,7 @@ def check_film(camera: Camera) -> None:
 
 
 def check_rounding(camera: Camera) -> None:
-    """Raise SceneError where float32 moves lines of sight by more than a tenth of a pixel."""
+    """Raise SceneError where float32 displaces lines of sight by more than a tenth of a pixel."""
     if camera.rounding <= COARSEST:
         return
     side = camera.virtual_pitch
@@ -87,7 +87,7 @@ def check_range(surface: EmittingSurface, camera: Camera) -> None:
     if not EXITANCES[0] <= brightest <= EXITANCES[1]:
         raise ExitanceError(
             f"{name} reaches {brightest:.3g} W/mm², single precision needs {EXITANCES[0]:g} … {EXITANCES[1]:g}. Give "
-            "J_n on another scale and rescale the picture, which is linear in it."
+            "J_n on another scale and rescale the image, which is linear in it."
         )
     power = brightest / math.pi * camera.etendue
     if power < FAINTEST:
@@ -98,7 +98,7 @@ def check_range(surface: EmittingSurface, camera: Camera) -> None:
 
 
 def check_placement(shape: mi.Shape) -> None:
-    """Raise SceneError where Mitsuba would trace a sphere, cylinder or disk elsewhere than its `to_world` puts it."""
+    """Raise SceneError for a sphere, cylinder or disk that Mitsuba would trace in another pose than its `to_world`."""
     kind = shape.class_name().lower()
     if kind not in ("sphere", "cylinder", "disk"):
         return
@@ -124,7 +124,7 @@ def check_placement(shape: mi.Shape) -> None:
 
 
 def check_curve(shape: mi.Shape) -> None:
-    """Raise SceneError for a glowing shape whose surface Mitsuba gives no points of."""
+    """Raise SceneError for a glowing shape on whose surface Mitsuba cannot compute points."""
     if shape.class_name() == "LinearCurve":
         raise SceneError(
             f"scene: shape '{shape.id()}' is a linearcurve, on whose surface Mitsuba gives no points to glow. Give a "
@@ -171,10 +171,10 @@ def check_alone(scene: mi.Scene, surface: EmittingSurface) -> None:
 
 
 def _doubled_faces(positions: mi.Float, faces: mi.UInt32) -> int:
-    """How many faces with an area have the same three corners, in any order, as one before."""
+    """Number of faces with an area that have the same three corners, in any order, as an earlier face."""
     corner = positions.numpy().reshape(-1, 3) + np.float32(0)  # -0 becomes 0
     face = faces.numpy().reshape(-1, 3)
-    # One number a place, alike for all vertices there; three of them add up to the face's, in any order.
+    # A hash of each position; the sum of those of three corners identifies a face, in any order.
     number = np.zeros(len(corner), np.uint64)
     for bits in corner.view(np.uint32).T:
         number = (number ^ bits) * np.uint64(0x9E3779B97F4A7C15)
@@ -189,7 +189,7 @@ def _doubled_faces(positions: mi.Float, faces: mi.UInt32) -> int:
 
 
 def check_outside(scene: mi.Scene, camera: Camera) -> None:
-    """Raise SceneError where the lens centre is inside a closed surface: all around it shows its inward side."""
+    """Raise SceneError where the lens centre is inside a closed surface: in all directions it sees an inward side."""
     if not box_of(scene.shapes()).contains(mi.ScalarPoint3f(camera.centre)):
         return
     directions = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], np.float32)

@@ -1,4 +1,4 @@
-"""What a method does not treat, or treats differently, in a scene: one line each, for the metadata and stderr."""
+"""Warnings of light that a method leaves out of a scene's image (Eq. 9) or treats differently, one line each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ VOLUMETRIC = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpat
 
 
 def scene_warnings(scene: mi.Scene, camera: Camera, integrator: mi.Integrator) -> list[str]:
-    """Warnings about a picture of a scene by this integrator."""
+    """Warnings about an image of a scene by this integrator."""
     found = [None if treats_media(integrator) else _media(scene, camera), _blends(scene), diffraction(camera)]
     if integrator.class_name() == "PathIntegrator":
         found.append(_glowing_windows(scene))
@@ -26,7 +26,7 @@ def treats_media(integrator: mi.Integrator) -> bool:
 
 
 def diffraction(camera: Camera) -> str | None:
-    """Diffraction at the diaphragm, which no method contains, where it spreads a point over a pixel or more."""
+    """Diffraction at the diaphragm (Eq. M.32), which no method contains, if it spreads a point over a pixel or more."""
     pixels = camera.airy_radius / camera.pixel_pitch
     if pixels < 1:
         return None
@@ -38,7 +38,7 @@ def diffraction(camera: Camera) -> str | None:
 
 
 def _media(scene: mi.Scene, camera: Camera) -> str | None:
-    """Participating media, through which every method but `volpath` leads light as through a vacuum."""
+    """Participating media, which every method but `volpath` treats as vacuum."""
     media = [shape.id() for shape in scene.shapes() if shape.interior_medium() or shape.exterior_medium()]
     if camera.in_medium:
         media.append("the lens")
@@ -51,7 +51,7 @@ def _media(scene: mi.Scene, camera: Camera) -> str | None:
 
 
 def _blends(scene: mi.Scene) -> str | None:
-    """Blends of specular and scattering parts, of whose specular light Mitsuba's samples lose some."""
+    """Blends of specular and scattering parts: Mitsuba's samples lose some of the specular light."""
     mixed = [shape.id() for shape in scene.shapes() if _mixed(shape.bsdf())]
     if not mixed:
         return None

@@ -211,7 +211,7 @@ def transmission(
 ) -> mi.Float:
     """Share of the light of a surface point that reaches a point of the lens undeviated; 0 where it is occluded.
 
-    Through null lobes alone: what bends light counts as hiding it.
+    Through null lobes alone: a surface that deviates light counts as an occluder.
     """
     if specular is None:
         return dr.select(hidden(scene, point, lens_point, active), 0, mi.Float(1))
@@ -346,7 +346,7 @@ def follow(
         nexts = [_onward(course, lobe, depth) for lobe in lobes]
         best, others = _strongest_first(nexts)
         best.plain = course.plain
-        # What lets light through is no end.
+        # A surface with a null lobe is not the end of the leg.
         found.depth = dr.select(foremost & (best.weight > 0) & ~glows, dr.inf, found.depth)
         on, lost = followed(number, best)
         found.lost += lost
@@ -392,7 +392,7 @@ def strongest_course(
 
 
 def first_met(body: mi.Float) -> mi.UInt32:
-    """Number of the first surface met, 0 for none, from that of all that a line of sight met (`Sight.body`)."""
+    """Number of the first surface met, 0 for none, from the code of all surfaces that a line met (`Sight.body`)."""
     return mi.UInt32(dr.abs(body)) & CODES
 
 
@@ -471,7 +471,7 @@ def _deviated(
 
 
 def _off(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, lift: mi.Float) -> mi.Point3f:
-    """Start of a ray from a surface in this direction, off it by a little more than coordinates are rounded."""
+    """Start of a ray from a surface in this direction, above it by a little more than coordinates are rounded."""
     return mi.Point3f(si.p + dr.mulsign(lift, dr.dot(si.n, direction)) * si.n)
 
 
@@ -500,7 +500,7 @@ def _strongest_first(courses: list[Course]) -> tuple[Course, list[Course]]:
 
 
 def _leads_to_light(specular: Specular, number: mi.UInt32, course: Course) -> mi.Bool:
-    """True where the weight is positive and the last leg meets the box of surfaces that light can come from."""
+    """True where the weight is positive and the last leg meets the box of the surfaces from which light can come."""
     low, high = (
         mi.Vector3f(*(dr.gather(mi.Float, specular.reach, 6 * number + k, course.weight > 0) for k in of))
         for of in (range(3), range(3, 6))

@@ -1,4 +1,4 @@
-"""The scene that lines of sight are traced in: the scene itself, or a robust copy if its ray tracing loses rays."""
+"""Scene in which Eq. 9's lines of sight are traced: the scene itself, or a robust copy if its tracing loses rays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Image of the pupil form during refinement, and the error of pixels on which lines of sight may miss an edge."""
+"""Image of the pupil form (Eq. M.5) during refinement, and the error of pixels on which lines may miss an edge."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Large images by blocks of pixels, between which a smooth image is interpolated.
 
-The pupil form gives the power on square blocks of pixels, as on a film of larger pixels. The polynomial of fourth
+The pupil form (M.5) gives the power on square blocks of pixels, as on a film of larger pixels. The polynomial of fourth
 degree along each axis whose integrals over five blocks are their powers gives the power on the parts of the middle
 one; it keeps the power on the block. Blocks with an edge, and those on which the estimated error of the interpolation
 or the difference to a single pixel exceeds the tolerance, are divided into smaller ones, down to pixels.
@@ -106,21 +106,21 @@ def solve(
     progress: Progress = SILENT,
 ) -> Solution | None:
     """As `pupil_form.solve`, with values between blocks interpolated; None if most blocks are divided into pixels."""
-    picture = _Picture(view, blocks, quadrature, least_peak)
-    while picture.own.any():
-        picture.compute(progress)
-        if picture.blocks.side == 1:
+    image = _BlockImage(view, blocks, quadrature, least_peak)
+    while image.own.any():
+        image.compute(progress)
+        if image.blocks.side == 1:
             break
-        rough = picture.rough()
-        smaller = picture.smaller(rough)
+        rough = image.rough()
+        smaller = image.smaller(rough)
         if smaller.side == 1 and np.count_nonzero(rough) > MOST * rough.size:
             return None
-        picture.part(rough, smaller)
+        image.part(rough, smaller)
     progress(1.0)
-    return picture.solution()
+    return image.solution()
 
 
-class _Picture:
+class _BlockImage:
     """Image on blocks (h, w): `value` [W/mm²/sr], its `error` and `coverage`.
 
     blocks, own : the present size; True where blocks are computed, False where larger ones gave their value
@@ -263,7 +263,7 @@ class _Picture:
         self.blocks, self.coverage = smaller, coverage
 
     def solution(self) -> Solution:
-        """The picture of pixels."""
+        """The image of pixels."""
         etendue, window = self.view.camera.etendue, self.sizes[-1].window
         why = f"{', '.join(self.shares)} are computed for {self.own.size} pixels"
         findings = (Finding("smooth blocks", True, why), *self.findings)
@@ -275,8 +275,8 @@ class _Picture:
 def _refine_blurred(draft: Draft) -> tuple[mi.Float64, mi.Bool]:
     """Refine the blocks of a draft without an edge narrower than a block.
 
-    Where all lines of sight meet what glows, an edge is that of the nearest body, as blurred as this is; steps of J_n
-    bend the picture. Returns the blur radius of the least blurred edge that may be on each block or a neighbour
+    Where all lines of sight meet glowing surfaces, an edge is that of the nearest body and has its blur; steps of J_n
+    bend the image. Returns the blur radius of the least blurred edge that may be on each block or a neighbour
     [blocks], and True where transects were taken.
     """
     rough = first_nodes(draft, np.zeros(draft.grid.shape))

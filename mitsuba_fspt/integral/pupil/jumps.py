@@ -1,4 +1,4 @@
-"""The integral along one transect: its jumps are found by bisection, the pieces between them integrated each."""
+"""Integral of Eq. M.5 along one transect: jumps are found by bisection, the pieces between them integrated each."""
 
 from __future__ import annotations
 

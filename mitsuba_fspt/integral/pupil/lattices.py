@@ -1,8 +1,8 @@
 """Lattices over pixel × pupil, for pixels on which transects do not converge: corners, many edges, rough textures.
 
-A rank-1 lattice in four dimensions is moved by random shifts. The means of the shifts are independent unbiased
-estimates, and their scatter gives the error for any integrand. The points are in such an order that the first 2^m of
-them form a lattice for every m, so that each step adds points to those of the last one.
+A rank-1 lattice in the four dimensions of Eq. M.5 is moved by random shifts. The means of the shifts are independent
+unbiased estimates, and their scatter gives the error for any integrand. The points are in such an order that the first
+2^m of them form a lattice for every m, so that each step adds points to those of the last one.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from .draft import Draft
 if TYPE_CHECKING:
     from ...jit.pixel_grid import PixelArray
 
-# x and y of pixel and pupil. Of a million random vectors, among those none of whose two-dimensional projections has a
-# dual vector below 0.45 of the longest one possible, the one with the least error P₂ (Sloan and Joe 1994) over all
-# of 2¹⁰ … 2¹⁸ points.
+# Generating vector for x and y of pixel and pupil: of a million random ones with no two-dimensional projection whose
+# dual vector is below 0.45 of the longest one possible, that of the least error P₂ (Sloan and Joe 1994) over 2¹⁰ … 2¹⁸
+# points.
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
@@ -119,7 +119,7 @@ class Means:
             for total, column in zip(sums, _run(draft, self.pixels, shift, points + run * FIRST), strict=True):
                 dr.scatter_add(total, column, shift)
             dr.eval(sums)
-        whole = done // (SHIFTS * runs)  # lanes of one pixel follow one another
+        whole = done // (SHIFTS * runs)  # array entries of one pixel follow one another
         draft.count(f"{SHIFTS} lattices of {more}", whole, done * FIRST)
         old, new = (dr.opaque(mi.Float64, share) for share in (points / more, 1 / more))
         radiance, coverage = (

@@ -1,8 +1,8 @@
 """Narrow light: bodies and spots much smaller than a pixel and brighter than everything around them.
 
-Four nodes a pixel detect light from a region as large as a pixel at the phantom, or as its blur disc where that is
-larger. Smaller bodies and spots they may miss, and error estimates from the nodes do not show that. Such light is
-detected from points all over the surfaces; the pixels that it reaches take the surface form.
+Four nodes of Eq. M.5 a pixel detect light from a region as large as a pixel at the phantom, or as its blur disc where
+that is larger. They may miss smaller bodies and spots, and error estimates from the nodes do not show that. Such light
+is detected from points all over the surfaces; the pixels that it reaches take the surface form (M.9).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PixelArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NarrowLight:
-    """Light of narrow spots on each pixel of the window (h, w), of all surfaces on the brightest pixel that is shown,
+    """Light on each pixel of the window (h, w) of narrow spots; on the brightest pixel that is shown of all surfaces;
     and of these on each pixel as if they were in focus.
 
     Mean radiance on film [W/mm²/sr], to a factor of two.
@@ -64,7 +64,7 @@ def points_on_surfaces(scene: mi.Scene, camera: Camera, specular: Specular | Non
 
 
 def narrow_light(points: Points | None, window: Window) -> NarrowLight:
-    """Of the light of points all over the surfaces, that of narrow spots; nothing without points."""
+    """The part of the light of points all over the surfaces that comes from narrow spots; 0 without points."""
     on_pixels = np.zeros(window.shape)
     if points is None or not on_pixels.size:
         return NarrowLight(on_pixels, 0.0, on_pixels)
@@ -113,7 +113,7 @@ class Points:
     radiance : to the lens; 0 where a point has no image, or another body hides it
     area : of the sharp image that it stands for [pixels²]
     cosine, front : the largest cosine of the normal to a point of the pupil; > 0 if the pupil's middle sees the point
-    apart : how far it is from the next; in pixels, or in blur radii where they are larger
+    apart : distance from the next point; in pixels, or in blur radii where these are larger
     blur, x, y : on film [pixels]
     """
 
@@ -135,16 +135,16 @@ class Points:
         return Points(*(column[which] for column in vars(self).values()))
 
     def seen_in(self, window: Window) -> Points:
-        """Those that shine into a window, with places counted from its corner."""
+        """The points whose light reaches a window, with positions relative to its corner."""
         left, top = window.corner
         points = replace(self, x=self.x - left, y=self.y - top)
         return points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
 
     def light(self) -> Column:
-        """Radiance on film [W/mm²/sr] that each gives to a pixel, by itself.
+        """Radiance on film [W/mm²/sr] that each point alone gives to a pixel.
 
-        A blur disc spreads a point's light over so many pixels; discs that overlap add up. More than all of a disc does
-        not come from an element, however wide.
+        A point's light spreads over the pixels of its blur disc; discs that overlap add up. No element gives more than
+        one that covers the whole disc.
         """
         return self.radiance * np.minimum(self.area / (math.pi * self.blur**2 + 1), 1)
 
@@ -153,7 +153,7 @@ class Points:
         return np.round(np.log2(np.maximum(self.blur, 1)))
 
     def near(self, far: float | Column, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """True less than `far` from a picture of this shape."""
+        """True for points less than `far` [pixels] from an image of this shape."""
         (height, width), (x, y) = shape, (self.x, self.y)
         return (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
 
@@ -164,13 +164,13 @@ class Points:
         return moved.near(self.blur, (rows.stop - rows.start, columns.stop - columns.start))
 
     def on_pixels(self, light: Column, shape: tuple[int, int]) -> PixelArray:
-        """Sum of the points' `light` on each pixel of a picture of this shape, where they are seen sharp."""
+        """Sum of the points' `light` on each pixel of an image of this shape, as if all were in focus."""
         here = self.near(0, shape)
         column, row = (np.floor(c[here]).astype(np.int64) for c in (self.x, self.y))
         return _Cells(shape, row * shape[1] + column).sums(light[here])
 
     def cells(self, side: float) -> _Cells:
-        """Square cells of a `side` [pixels]; what is too far off falls into the last."""
+        """Square cells of a `side` [pixels]; points too far away are in the last."""
         column, row = (
             np.clip(np.floor((c - c.min()) / side), 0, LARGEST_GRID - 1).astype(np.int64) for c in (self.x, self.y)
         )
@@ -245,7 +245,7 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
     radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
-    # An element half as thick as a unit covers half of some square by itself: its points are not narrow.
+    # An element half as thick as a unit covers half of some square: its points are not narrow.
     apart = np.repeat(np.where(area < unit**2 * reach, reach / counts, np.inf), counts)
     return Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
 
@@ -301,7 +301,7 @@ def _rim_above(si: mi.SurfaceInteraction3f, camera: Camera) -> mi.Point3f:
 
 
 def _reach(elements: Elements, camera: Camera) -> Column:
-    """How far the corners of each element lie from its middle on the film [pixels]; inf where one has no image."""
+    """Distance on the film of the corners of each element from its middle [pixels]; inf where one has no image."""
     index = dr.arange(mi.UInt32, elements.count)
     centre, _, scale = camera.blur_disc(elements.place(index, mi.Point2f(0.5))[0].p)
     reach = dr.zeros(mi.Float, elements.count)

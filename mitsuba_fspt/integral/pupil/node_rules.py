@@ -1,4 +1,4 @@
-"""Node rules of the pupil form: where lines of sight cross pupil and pixel, and their weights.
+"""Node rules of the pupil form (Eq. M.5): where lines of sight cross pupil and pixel, and their weights.
 
 A rule integrates over the unit disc (pupil) times the square [-½, ½]² (pixel), both with measure 1.
 """
@@ -70,7 +70,7 @@ def four(area: bool) -> Rule:
 def one_spread(laplacian: PixelArray, blur: PixelArray, area: bool) -> PixelArray:
     """Correction of `one`: half the second moments of pixel and blur disc along each axis, 1/12 and r²/4.
 
-    `laplacian` of the picture [1/pixels²], `blur` r [pixels].
+    `laplacian` of the image [1/pixels²], `blur` r [pixels].
     """
     return (float(area) / 24 + blur**2 / 8) * laplacian
 
@@ -79,7 +79,7 @@ def four_turn(curl: PixelArray, laplacian: PixelArray) -> PixelArray:
     """Error of `four` where the blur varies over the image; `curl` is ∂M_x/∂y - ∂M_y/∂x of its moments.
 
     Steps at right angles leave c (∂²f/∂a_x∂y - ∂²f/∂a_y∂x), c = Σ w a_x y = √3/12, of pupil a and pixel (x, y). The
-    moments over the pupil are M = ¼ ∂f/∂a + c (∂f/∂y, -∂f/∂x), so that their curl over the picture holds it.
+    moments over the pupil are M = ¼ ∂f/∂a + c (∂f/∂y, -∂f/∂x), so that their curl over the image contains it.
     """
     c = math.sqrt(3) / 12
     return 4 * c * (curl - c * laplacian)
@@ -124,11 +124,11 @@ def product(level: int, area: bool) -> Rule:
 
 SMOOTH_LEVELS = 3  # levels of transects at which pixels without a jump take a `product` rule
 TRANSECT_LEVELS = (2, 8, 24, 72, 256, 1024)
-# Places across the pupil at each level but the last. With a second edge the mean along a transect has kinks in this
+# Positions across the pupil at each level but the last. With a second edge the mean along a transect has kinks in this
 # coordinate, and is nearly linear in the other two.
 ACROSS = (2, 4, 6, 8, 16)
-# Directions of the other two coordinates from the middle, at each place across the pupil [degrees]. Levels with equal
-# coordinates would miss the same, such as a plate edge-on through the virtual detector plane.
+# Directions of the other two coordinates from the middle, at each position across the pupil [degrees]. Levels with
+# equal coordinates would miss the same bodies, such as a plate edge-on through the virtual detector plane.
 TURNS = {2: [[45], [225]], 8: [[30, 210], [120, 300]] * 2, 24: [[0, 90, 180, 270]] * 6}
 LEAST_NET = 256  # transects from which those across a sharp edge are a net
 # Generating vectors of the lattices of transects across a sharp edge: those of least centred discrepancy.
@@ -181,7 +181,7 @@ def transect_levels(rtol: float, area: bool, most: int) -> list[tuple[int, Along
 
 @dataclass(frozen=True)
 class Transects:
-    """Places in [0, 1]³ of n transects through pixel × pupil, (n, 3), for sharp edges and for blurred ones.
+    """Positions in [0, 1]³ of n transects through pixel × pupil, (n, 3), for sharp edges and for blurred ones.
 
     `sharp` fill the pixel evenly, no two on one line, as the mean has kinks where an edge leaves the pixel; weight 1/n.
     `blurred` have the `weight` (n,) of sum 1, and `trend` (k, n) are orthonormal polynomials on them (on a net nearly)
@@ -203,16 +203,16 @@ class Transects:
 
     @property
     def phase(self) -> NDArray[np.float64]:
-        """Even over any run of them (golden ratio).
+        """Evenly distributed over any successive transects (golden ratio).
 
-        Of two opposite, so that what is odd about the middle of a piece cancels.
+        Opposite for two transects, so that the odd part of the integrand about the middle of a piece cancels.
         """
         phase = np.mod(GOLDEN * (np.arange(len(self)) + 0.5), 1.0)
         return phase if len(self) > 2 else np.array([phase[0], 1 - phase[0]])
 
     @cached_property
     def trend(self) -> NDArray[np.float64]:
-        """Legendre's, up to degree `TREND` across the pupil, linear along the other two places; none on two."""
+        """Legendre's, up to degree `TREND` across the pupil, linear along the other two coordinates; none on two."""
         if len(self) == 2:
             return np.empty((0, 2))
         along, across, pixel = 2 * self.blurred.T - 1
@@ -221,7 +221,7 @@ class Transects:
 
     @cached_property
     def table(self) -> NDArray[np.float32]:
-        """Columns one after the other: `sharp` (3), `blurred` (3), `weight`, `phase`, `trend` (`TRENDS`, 0 on two)."""
+        """Columns one after another: `sharp` (3), `blurred` (3), `weight`, `phase`, `trend` (`TRENDS`, 0 on two)."""
         trend = self.trend if len(self.trend) else np.zeros((TRENDS, len(self)))
         columns = (*self.sharp.T, *self.blurred.T, self.weight, self.phase, *trend)
         return np.concatenate(columns).astype(np.float32)
@@ -229,7 +229,7 @@ class Transects:
 
 @cache
 def transects(count: int) -> Transects:
-    """The transects of a level of `TRANSECT_LEVELS`, by their number: at Gauss's places, at the last level a net."""
+    """The transects of a level of `TRANSECT_LEVELS`, by their number: at Gauss's nodes, at the last level a net."""
     level = TRANSECT_LEVELS.index(count)
     if level == len(ACROSS):
         return Transects(_net(count), _net(count), np.full(count, 1 / count))
@@ -240,10 +240,10 @@ def transects(count: int) -> Transects:
 
 
 def _across_the_pupil(count: int, across: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (n, 3) and weights (n,): Gauss's `across` the pupil, with n/across on the other two axes at each of them.
+    """Nodes (n, 3) and weights (n,): Gauss's `across` the pupil, with n/across on the other two axes at each of them.
 
     These are Gauss's, too, or on a circle: corners of a square, exact to degree 3 for any direction; two opposite ones,
-    exact to degree 2 over all places; one, exact to degree 1.
+    exact to degree 2 over all nodes; one, exact to degree 1.
     """
     y, w = gauss(across)
     each = count // across

@@ -1,4 +1,4 @@
-"""Sums of the integrand over the nodes of a rule, as one loop of one kernel."""
+"""Sums of the integrand of Eq. M.5 over the nodes of a rule, as one loop of one kernel."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Sums:
     contrast : Σ c f, a measure of the integrand's curvature, see `node_rules.Rule` [W/mm²/sr]
     coverage : share of the lines of sight that meet a shape with an `fspt_surface`
     nearest, farthest : depths of the surfaces at which lines of sight end, dark ones too [mm]; inf and 0 without one
-    lost : Σ w cos⁴θ of what is not followed through or off specular surfaces
+    lost : Σ w cos⁴θ times the share of the light that is not followed through or off specular surfaces
     front : least depth of an edge, those of mirrors and panes included [mm]
     """
 

@@ -1,4 +1,4 @@
-"""Nodes over pupil and pixel: one or four on every pixel, twelve where the image is curved or four are wrong."""
+"""Nodes of Eq. M.5 over pupil and pixel: one or four on all pixels, twelve where the image is curved or four fail."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _dark(draft: Draft) -> Mask:
 
 
 def _missed(draft: Draft, light: PixelArray) -> Mask:
-    """Pixels to which surfaces send more light than the lines of sight there and around meet, by far.
+    """Pixels to which surfaces send far more light than lines of sight of the pixel and its neighbours meet.
 
     A body up to √2 pixels wide may lie between single lines of sight.
     """
@@ -129,7 +129,7 @@ def _one_suffices(draft: Draft) -> bool:
 
 
 def _refine(draft: Draft, where: Mask) -> PixelArray:
-    """Twelve nodes on the marked pixels; returns by how much they change the value there, 0 elsewhere."""
+    """Twelve nodes on the marked pixels; returns the change of the value there, 0 elsewhere."""
     seen = apply_nodes(draft, node_rules.twelve(draft.area), where, REFINED)
     difference = dr.select(where, dr.abs(seen.value - draft.value), 0)
     draft.value = dr.select(where, seen.value, draft.value)

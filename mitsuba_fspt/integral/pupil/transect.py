@@ -1,7 +1,7 @@
 """Transects: curves through pixel × pupil that cross every straight edge at right angles to them just once.
 
 Light from a surface point through pupil point a arrives at film position c + r a; r is the signed radius of the blur
-disc. So a straight edge with normal n divides pixel × pupil at one value of n·(p - r a), whatever its blur. A transect
+disc (Eq. M.7). A straight edge with normal n divides pixel × pupil at one value of n·(p - r a) for any blur. A transect
 goes from the smallest to the largest value. Three more coordinates in [0, 1] run along the edge. The mean along a
 transect hardly depends on them: where edges are nearly straight, a few transects suffice.
 """

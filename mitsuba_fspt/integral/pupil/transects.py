@@ -1,4 +1,4 @@
-"""Refinement by transects where the integrand jumps: more of them at each level, until the estimated error is small."""
+"""Refinement by transects where the integrand of Eq. M.5 jumps: more at each level, until the error is small."""
 
 from __future__ import annotations
 
@@ -113,8 +113,8 @@ class _Refinement:
         """Pixels whose value in the draft has a smaller error than that of this level, which lies within that error.
 
         A value beyond it contradicts the earlier error, which was too small, and so does a jump that is new. Without an
-        earlier level the error is 0. The error of the first level, which nothing but its own few transects and a node
-        rule tell, keeps no value.
+        earlier level the error is 0. A value of the first level is not kept, as its error follows from a few transects
+        and a node rule alone.
         """
         agrees = dr.abs(self.value - self.draft.value) <= self.own
         return agrees & (self.own > 0) & (self.own < remaining) & ~first_met

@@ -1,10 +1,10 @@
-"""Windows of pixels on which the light of each column of a transport matrix is accumulated.
+"""Windows of pixels on which the light of each column of the transport matrix (Eq. M.20) is accumulated.
 
-A column (the hat function of a vertex, or a face) brings light to a rectangle of pixels known beforehand. All
-rectangles stand one after the other in one flat buffer. As in `footprint`, edges of polygons add what lies to their
-right, and cumulative sums along the rows complete it; here the density of light varies linearly over a polygon, so that
-a second sum carries what grows with the pixel's column. All sums are of integers: order does not matter, and the light
-is exactly 0 outside a polygon.
+The rectangle of pixels that a column (the hat function of a vertex, or a face) lights is computed beforehand. All
+rectangles lie one after the other in one flat buffer. As in `footprint`, edges of polygons add the light to their
+right, and cumulative sums along the rows complete it; here the density of light varies linearly over a polygon, and a
+second sum contains the part that grows with the pixel's column. All sums are of integers: their order has no effect,
+and the light is exactly 0 outside a polygon.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Windows:
 
     @property
     def areas(self) -> Index:
-        """Pixels of each window (n,), and one more a row, which takes what would lie beyond."""
+        """Pixels of each window (n,), and one more a row, which takes the light to the right of the window."""
         return (self.width + 1) * self.height * (self.width > 0)
 
     def columns(self) -> Index:
@@ -78,7 +78,7 @@ class Windows:
         return (np.arange(len(wide)) - np.repeat(starts, self.areas)) // wide + np.repeat(self.top, self.areas)
 
     def inside(self) -> NDArray[np.bool_]:
-        """False for the entry at the end of each row, which takes what would lie beyond the window."""
+        """False for the entry at the end of each row, which takes the light to the right of the window."""
         return self.columns_of_film() < np.repeat(self.left + self.width, self.areas)
 
     def of(self, columns: NDArray[np.bool_]) -> Windows:
@@ -93,7 +93,7 @@ class ColumnCanvas:
         self.shape, self.windows = shape, windows
         self._starts = np.concatenate([[0], np.cumsum(windows.areas)])
         total = max(int(self._starts[-1]), 1)
-        # What is added to a pixel and all to its right, and how it grows from pixel to pixel.
+        # Light that is added to a pixel and all to its right, and its increase from pixel to pixel.
         self._level, self._slope = (dr.zeros(mi.UInt64, total) for _ in range(2))
         # Of each column its window, and where it starts in the buffer.
         fields = (windows.left, windows.top, windows.width, windows.height, self._starts[:-1])
@@ -104,14 +104,14 @@ class ColumnCanvas:
         dr.eval(self._table, self._level, self._slope)
 
     def light(self) -> NDArray[np.float64]:
-        """What has been accumulated, one window after the other as `Windows.pixels` numbers them."""
+        """The light accumulated so far, one window after the other as `Windows.pixels` numbers them."""
         level, slope = (np.cumsum(mi.Int64(layer).numpy()[: self._starts[-1]]) for layer in (self._level, self._slope))
         slope *= self.windows.columns_of_film()
         level += slope
         return level * QUANTUM
 
     def evaluate(self) -> None:
-        """Run what has been laid, to its end: arrays of launches that wait would fill the memory."""
+        """Run all kernels begun so far to their end: the arrays of waiting ones would fill the memory."""
         dr.eval(self._level, self._slope)
         dr.sync_thread()
 
@@ -125,8 +125,8 @@ class ColumnCanvas:
     ) -> None:
         """Lay light of linear density within a polygon of four corners [pixels] on the windows of several columns.
 
-        `count`: its edges, 3 for a triangle, whose last corner is its first. What lies beside a column's window is
-        dropped; a column without window gets nothing.
+        `count`: its edges, 3 for a triangle, whose last corner is its first. Light beside a column's window is dropped;
+        a column without window gets none.
         """
         turn = _cross(ring[2] - ring[0], ring[3] - ring[1])  # of a triangle, too, twice its area
         # A path all around adds up minus the area, or its opposite.

@@ -1,7 +1,7 @@
-"""How the faces of a mesh are divided for the columns of the transport matrix: cells of the pupil, pieces of a face.
+"""Division of a mesh's faces for columns of the transport matrix (Eq. M.20): cells of the pupil, pieces of a face.
 
-A column (the hat function of a vertex, or a face) takes the same cells of the pupil on all of its faces: through each
-of them its light is continuous, and what is sampled is as smooth as the column, whatever its neighbours take.
+A column (the hat function of a vertex, or a face) takes the same cells of the pupil on all of its faces. Through each
+cell its light is then continuous, so that the sampled light is as smooth as the column, whatever its neighbours take.
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ class FaceLight:
         return self.low[:, 0] <= self.high[:, 0]
 
     def behind(self, scene: mi.Scene, camera: Camera) -> FaceLight:
-        """The same in a scene where one surface may hide another: faces that none of their lines shows are dark."""
+        """The same in a scene where one surface may hide another: faces of which all lines are blocked are dark."""
         bright = np.flatnonzero(self.bright)
         if not bright.size:
             return self
@@ -281,7 +281,7 @@ class FaceLight:
         return Plan(of_columns, np.minimum(cuts, math.isqrt(BATCH) // of_columns), points)
 
     def _nodes(self, rule: ColumnRule, sides: Array, on: str) -> Array:
-        """M of nodes that each face asks for."""
+        """M of the nodes that the accuracy of each face requires."""
         fewest = np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
         error = self.blur / (rule.step if on == "face" else rule.edge)
         many = np.minimum(np.sqrt(rule.coarse_factor * error), rule.coarse * self.blur)
@@ -296,7 +296,7 @@ class FaceLight:
         return np.where(nodes > LEVELS[-1], nodes, np.array(LEVELS)[level])
 
     def _most(self, values: Array | Index | Mask) -> Array | Index | Mask:
-        """The most (V,) of what the bright faces around each vertex have."""
+        """Largest of the `values` (F,) of the bright faces around each vertex, (V,)."""
         found = np.zeros(len(self.cut), values.dtype)
         for k in range(3):
             np.maximum.at(found, self.corners[self.bright, k], values[self.bright])

@@ -1,4 +1,4 @@
-"""Footprints: polygons of light on the film, distributed exactly over the pixels that they overlap.
+"""Footprints: polygons of light of Eq. M.9 on the film, distributed exactly over the pixels that they overlap.
 
 Each edge adds the area to its right to every pixel that it crosses; cumulative sums along the rows turn the edges of a
 polygon into its overlap with every pixel, whatever its size. All sums are of integers: the result does not depend on
@@ -34,7 +34,7 @@ class Canvas:
         self._scales = [dr.opaque(mi.Float64, 1 / quantum) for quantum in quanta]
         self._height, self._width = (dr.opaque(mi.Float64, side) for side in shape)
 
-    def pictures(self) -> list[NDArray[np.float64]]:
+    def images(self) -> list[NDArray[np.float64]]:
         """Each quantity accumulated so far, shape (h, w)."""
         steps = [mi.Int64(layer).numpy().reshape(self.shape) for layer in self.layers]
         return [np.cumsum(step, axis=1) * quantum for step, quantum in zip(steps, self.quanta, strict=True)]

@@ -1,4 +1,4 @@
-"""Glowing shapes of the surface form: their elements, pieces of these, and the pixels that their light can reach."""
+"""Glowing shapes of the surface form (Eq. M.9): their elements, pieces of these, and the pixels that they can light."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells of the pupil: M × M parts of equal area of the unit disc, with their middles, corners and sample points.
+"""Cells of the pupil of Eq. M.9: M × M parts of equal area of the unit disc, with middles, corners and sample points.
 
 The cells are turned against rows and columns of pixels. Middles in rows parallel to these would misplace up to three
 times as much at an edge of J_n along them.
@@ -35,7 +35,7 @@ def strata(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32, number: mi.UInt32) -> tuple
 def middle(i: mi.UInt32, j: mi.UInt32, m: mi.UInt32) -> mi.Point2f:
     """Middle of the pupil's cell (i, j) in the unit disc, moved outwards for M middles to have the disc's blur.
 
-    Their mean r² would be ½ - 1/M², what a cell spreads around its middle is missing.
+    Their mean r² would be ½ - 1/M², without the extent of each cell around its middle.
     """
     return _on_pupil(i, j, m, 0.5, 0.5) * dr.rsqrt(1 - 2 / dr.square(mi.Float(m)))
 

@@ -112,7 +112,7 @@ class _Refinement:
             change = np.where(mark, np.abs(value - self.value), 0)
             recent, last = SAFETY * grid.array(grid.spread_max(grid.flat(change))), recent
             estimate = recent if last is None else np.maximum(recent, CARRIED * last)
-            # All elements with light on a marked pixel were refined: only there is the new picture whole.
+            # Only elements with light on a marked pixel were refined: elsewhere the new image is not complete.
             self.error[mark], self.value[mark], self.coverage[mark] = estimate[mark], value[mark], coverage[mark]
             mark = self.error > self._tolerance(least_peak)
             mark = shown & (mark | where & (self.coverage == 0) & (lines < DARK_LINES))
@@ -167,7 +167,7 @@ class _Refinement:
                 break
             self.peak = peak  # beyond the range of the quanta: once more with larger ones
         self.levels.append(f"{lines} lines a pixel: {np.count_nonzero(mark)} pixels, {rays} lines")
-        return canvas.pictures()
+        return canvas.images()
 
     def _lay(self, canvas: Canvas, batch: Batch) -> float:
         """Lay the light of a batch of lines of sight on the canvas; returns the largest radiance met [W/mm²/sr]."""
