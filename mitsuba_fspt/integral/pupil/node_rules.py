@@ -41,11 +41,11 @@ class Rule:
     def __len__(self) -> int:
         return len(self.weight)
 
-    @cached_property
-    def table(self) -> NDArray[np.float32]:
-        """Pupil x, y, pixel x, y, weight and contrast of all nodes, (6 n,), one column after the other."""
-        columns = (*self.pupil.T, *self.pixel.T, self.weight, self.contrast)
-        return np.concatenate(columns).astype(np.float32)
+    @property
+    def columns(self) -> dict[str, NDArray[np.float64]]:
+        """Coordinates, weight and contrast of all nodes by name, (n,) each."""
+        places = dict(zip(("pupil_x", "pupil_y", "pixel_x", "pixel_y"), (*self.pupil.T, *self.pixel.T), strict=True))
+        return places | {"weight": self.weight, "contrast": self.contrast}
 
 
 @cache
@@ -219,12 +219,13 @@ class Transects:
         legendre = [math.sqrt(2 * k + 1) * Legendre.basis(k)(across) for k in range(1, TREND + 1)]
         return np.stack([*legendre, math.sqrt(3) * along, math.sqrt(3) * pixel])
 
-    @cached_property
-    def table(self) -> NDArray[np.float32]:
-        """Columns one after another: `sharp` (3), `blurred` (3), `weight`, `phase`, `trend` (`TRENDS`, 0 on two)."""
+    @property
+    def columns(self) -> dict[str, NDArray[np.float64]]:
+        """Coordinates `sharp0` … 2, `blurred0` … 2, `weight`, `phase` and trends `trend0` …, 0 on two; (n,) each."""
         trend = self.trend if len(self.trend) else np.zeros((TRENDS, len(self)))
-        columns = (*self.sharp.T, *self.blurred.T, self.weight, self.phase, *trend)
-        return np.concatenate(columns).astype(np.float32)
+        several = {"sharp": self.sharp.T, "blurred": self.blurred.T, "trend": trend}
+        named = {f"{name}{k}": column for name, columns in several.items() for k, column in enumerate(columns)}
+        return named | {"weight": self.weight, "phase": self.phase}
 
 
 @cache

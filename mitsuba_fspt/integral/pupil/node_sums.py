@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.loops import repeat
+from ...jit.tables import Table
 from ..lines.eq9 import Sight, View
 from ..lines.specular import first_met
 from . import node_rules
@@ -49,19 +50,20 @@ ALL = tuple(NOTHING_SEEN)
 
 def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule, names: Sequence[str] = ALL) -> Sums:
     """Sums of one rule for every pixel, in the columns `names`; the others are `NOTHING_SEEN`."""
-    table, count = mi.Float(rule.table), dr.opaque(mi.UInt32, len(rule))
+    table = Table(rule.columns)
     together = view.detail <= NODES_TOGETHER
 
     # Only sums that change are states of the loop; with others Dr.Jit would record its body twice.
     def node(k: mi.UInt32, sums: dict[str, mi.Float], first: _FirstSurfaces | None) -> tuple:
-        ax, ay, dx, dy, weight, null = (dr.gather(mi.Float, table, k + n * count) for n in range(6))
-        sight = view.integrand(centre + mi.Point2f(dx, dy), mi.Point2f(ax, ay), together)
+        pixel, pupil = (mi.Point2f(*(table.gather(f"{of}_{axis}", k) for axis in "xy")) for of in ("pixel", "pupil"))
+        weight, contrast = table.gather("weight", k), table.gather("contrast", k)
+        sight = view.integrand(centre + pixel, pupil, together)
         f, hit = sight.integrand, dr.isfinite(sight.depth)
         more = {
             "value": lambda total: total + weight * f,
-            "contrast": lambda total: total + null * f,
-            "x": lambda total: total + weight * f * ax,
-            "y": lambda total: total + weight * f * ay,
+            "contrast": lambda total: total + contrast * f,
+            "x": lambda total: total + weight * f * pupil.x,
+            "y": lambda total: total + weight * f * pupil.y,
             "coverage": lambda total: total + dr.select(sight.covered, weight, 0),
             "nearest": lambda least: dr.select(hit, dr.minimum(least, sight.depth), least),
             "farthest": lambda most: dr.select(hit, dr.maximum(most, sight.depth), most),
@@ -73,7 +75,7 @@ def apply_rule(view: View, centre: mi.Point2f, rule: node_rules.Rule, names: Seq
     follow_first = view.specular and "front" in names
     first = _FirstSurfaces(mi.Float(-1), mi.Float(math.inf), mi.Bool(False)) if follow_first else None
     summed = [name for name in names if name != "front" and (view.specular or name != "lost")]
-    sums, first = repeat(count, node, {name: mi.Float(NOTHING_SEEN[name]) for name in summed}, first)
+    sums, first = repeat(table.rows, node, {name: mi.Float(NOTHING_SEEN[name]) for name in summed}, first)
     found = Sums(**{name: sums.get(name, mi.Float(nothing)) for name, nothing in NOTHING_SEEN.items()})
     found.front = first.front(found.nearest) if first else found.nearest
     return found

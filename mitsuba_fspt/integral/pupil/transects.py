@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -12,6 +12,7 @@ import mitsuba as mi
 from ...jit.batches import batches
 from ...jit.loops import repeat
 from ...jit.pixel_grid import COVERAGE_ROUNDING, parted
+from ...jit.tables import Table
 from ..estimator import Estimator
 from . import node_rules
 from .draft import Draft
@@ -268,41 +269,76 @@ def apply_transects(
     draft: Draft, where: Mask, edges: Edges, rule: node_rules.Transects, along: node_rules.AlongTransect
 ) -> Means:
     """Means over all transects of a rule at the marked pixels, 0 elsewhere."""
-    index, table = draft.grid.pixels(where), mi.Float(rule.table)
-    images = [draft.grid.full(mi.Float64, 0) for _ in range(8)]
+    index, table = draft.grid.pixels(where), Table(rule.columns)
+    found = _OfPixels(**{field.name: draft.grid.full(mi.Float64, 0) for field in fields(_OfPixels)})
     rays = count = 0
     for part in batches(index, len(rule), draft.progress.batch):
         if count and draft.progress.deadline.passed():
             break
-        *found, traced = _along_transects(draft, part, edges, rule, table, along)
-        columns = *_sums(part, edges, rule, table, found), _second_edge(dr.width(part), rule, found[0], draft.estimator)
-        for image, column in zip(images, columns, strict=True):
-            dr.scatter(image, column, part)
-        dr.eval(images)
-        rays += int(dr.sum(traced)[0])
+        each = _along_transects(draft, part, edges, rule, table, along)
+        of_part = _over_transects(part, edges, rule, table, each, draft.estimator)
+        for field in fields(_OfPixels):
+            dr.scatter(getattr(found, field.name), getattr(of_part, field.name), part)
+        dr.eval(found)
+        rays += int(dr.sum(each.rays)[0])
         count += dr.width(part)
     draft.count(f"{len(rule)} transects", count, rays)
     done = None
     if count < dr.width(index):
         done = draft.grid.full(mi.Bool, False)
         dr.scatter(done, mi.Bool(True), dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, count)))
-    value, coverage, squares, trend, split, several, blur, between = images
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
-    variance = squares - value * value
+    variance = found.squares - found.value * found.value
     spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
-    blurred = spread * dr.safe_sqrt(variance - trend) / number
+    blurred = spread * dr.safe_sqrt(variance - found.trend) / number
     # A sharp edge slants: each transect crosses a part of its own. A second edge may lie between two of them.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
-    sharp = dr.maximum(slant, between)
+    sharp = dr.maximum(slant, found.between)
     return Means(
-        value,
-        coverage,
-        split > 0,
-        several >= estimator.several_share * number,
-        dr.select(edges.sharp, sharp, blurred),
-        blur,
-        done,
+        found.value,
+        found.coverage,
+        jumps=found.split > 0,
+        several=found.several >= estimator.several_share * number,
+        scatter=dr.select(edges.sharp, sharp, blurred),
+        blur=found.blur,
+        done=done,
     )
+
+
+@dataclass
+class _OfTransects:
+    """Results of each transect of some pixels, those of a pixel one after the other.
+
+    value, coverage : means along the transect;  jumps : their number;  rays : number of lines of sight
+    blur : signed blur radius of the edge at the largest jump, 0 without one [pixels]
+    """
+
+    value: mi.Float
+    coverage: mi.Float
+    jumps: mi.UInt32
+    blur: mi.Float
+    rays: mi.UInt32
+
+
+@dataclass
+class _OfPixels:
+    """Results over the transects of each pixel.
+
+    value, coverage, squares : means of the value, the coverage and the squared value
+    trend : sum of the squared trends of the value
+    split, several : number of transects with a jump, and with more than one
+    blur : signed radius of the most blurred edge [pixels]
+    between : error of a second edge between two transects, see `_second_edge`
+    """
+
+    value: mi.Float64
+    coverage: mi.Float64
+    squares: mi.Float64
+    trend: mi.Float64
+    split: mi.Float64
+    several: mi.Float64
+    blur: mi.Float64
+    between: mi.Float64
 
 
 def _along_transects(
@@ -310,65 +346,72 @@ def _along_transects(
     part: mi.UInt32,
     edges: Edges,
     rule: node_rules.Transects,
-    table: mi.Float,
+    table: Table,
     along: node_rules.AlongTransect,
-) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
-    """Value, coverage, number of jumps, signed blur radius of the edge at the largest jump (0 without one) [pixels] and
-    number of lines of sight of each transect of the pixels `part`, those of a pixel one after the other.
-    """
+) -> _OfTransects:
+    """Each transect of the pixels `part`."""
     count = dr.opaque(mi.UInt32, len(rule))
     lane = dr.arange(mi.UInt32, dr.width(part) * len(rule))
     pixel, number = dr.gather(mi.UInt32, part, lane // count), lane % count
     angle, blur = (mi.Float(dr.gather(mi.Float64, image, pixel)) for image in (edges.angle, edges.blur))
-    first = dr.select(dr.gather(mi.Bool, edges.sharp, pixel), mi.UInt32(0), 3)
-    place = mi.Point3f(*(dr.gather(mi.Float, table, (first + k) * count + number) for k in range(3)))
-    phase = dr.gather(mi.Float, table, 7 * count + number)
+    sharp = dr.gather(mi.Bool, edges.sharp, pixel)
+    place = mi.Point3f(*(table.gather_either(sharp, f"sharp{k}", f"blurred{k}", number) for k in range(3)))
+    phase = table.gather("phase", number)
     curve = transect(draft.centres(pixel), angle, blur, place, dr.opaque(mi.Float, float(draft.area)))
     outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
     least, steep = mi.Float(draft.estimator.least_jump * draft.tolerance), draft.estimator.steep
-    value, coverage, jumps, depth, traced = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
+    value, coverage, jumps, depth, rays = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
     # The edge of a weak reflection beside nothing has no depth.
     has_depth = (jumps > 0) & dr.isfinite(depth)
     blur = mi.Float(dr.select(has_depth, draft.camera.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
-    found = value, coverage, jumps, blur, traced
+    found = _OfTransects(value, coverage, jumps, blur, rays)
     dr.eval(found)  # together, as a later reduction of one of them would trace every ray again
     return found
 
 
-def _sums(
-    part: mi.UInt32, edges: Edges, rule: node_rules.Transects, table: mi.Float, found: list[mi.Float]
-) -> list[PixelArray]:
-    """Means over the transects of each pixel of `part`: value, coverage, value squared, sum of the squared trends,
-    number of transects with a jump and with several, blur of the most blurred edge [pixels].
-
-    `found`: value, coverage, jumps, blur as of `_along_transects`.
-    """
+def _over_transects(
+    part: mi.UInt32,
+    edges: Edges,
+    rule: node_rules.Transects,
+    table: Table,
+    found: _OfTransects,
+    estimator: Estimator,
+) -> _OfPixels:
+    """Results over the transects of each pixel of `part`, from those of all its transects."""
     count = dr.opaque(mi.UInt32, len(rule))
     first = dr.arange(mi.UInt32, dr.width(part)) * count
     sharp, even = dr.gather(mi.Bool, edges.sharp, part), dr.opaque(mi.Float, 1 / len(rule))
 
-    def add(k: mi.UInt32, sums: list[PixelArray], trends: list[PixelArray], ends: list[mi.Float]) -> tuple:
-        value, coverage, blur = (dr.gather(mi.Float, found[n], first + k) for n in (0, 1, 3))
-        weight = mi.Float64(dr.select(sharp, even, dr.gather(mi.Float, table, 6 * count + k)))
-        share, jumps = weight * mi.Float64(value), dr.gather(mi.UInt32, found[2], first + k)
-        counts = (dr.select(counted, mi.Float64(1), 0) for counted in (jumps > 0, jumps > 1))
-        terms = share, weight * mi.Float64(coverage), share * mi.Float64(value), *counts
-        sums = [total + term for total, term in zip(sums, terms, strict=True)]
-        polynomials = [dr.gather(mi.Float, table, (8 + n) * count + k) for n in range(len(trends))]
-        trends = [total + share * mi.Float64(p) for total, p in zip(trends, polynomials, strict=True)]
-        return sums, trends, [dr.maximum(ends[0], blur), dr.minimum(ends[1], blur)]
+    def add(k: mi.UInt32, sums: dict[str, PixelArray], trends: list[PixelArray], blurs: tuple) -> tuple:
+        value, coverage, blur = (dr.gather(mi.Float, of, first + k) for of in (found.value, found.coverage, found.blur))
+        weight = mi.Float64(dr.select(sharp, even, table.gather("weight", k)))
+        share, jumps = weight * mi.Float64(value), dr.gather(mi.UInt32, found.jumps, first + k)
+        terms = {
+            "value": share,
+            "coverage": weight * mi.Float64(coverage),
+            "squares": share * mi.Float64(value),
+            "split": dr.select(jumps > 0, mi.Float64(1), 0),
+            "several": dr.select(jumps > 1, mi.Float64(1), 0),
+        }
+        sums = {name: total + terms[name] for name, total in sums.items()}
+        trends = [total + share * mi.Float64(table.gather(f"trend{n}", k)) for n, total in enumerate(trends)]
+        return sums, trends, (dr.maximum(blurs[0], blur), dr.minimum(blurs[1], blur))
 
-    nothing = [mi.Float64(0) for _ in range(5)], [mi.Float64(0) for _ in range(node_rules.TRENDS)]
-    sums, trends, (ahead, behind) = repeat(count, add, *nothing, [mi.Float(-dr.inf), mi.Float(dr.inf)])
-    value, coverage, squares, split, several = sums
-    trend = sum(map(dr.square, trends))
-    return [value, coverage, squares, trend, split, several, mi.Float64(_most_blurred(ahead, behind))]
+    sums = {name: mi.Float64(0) for name in ("value", "coverage", "squares", "split", "several")}
+    trends = [mi.Float64(0) for _ in range(node_rules.TRENDS)]
+    sums, trends, blurs = repeat(count, add, sums, trends, (mi.Float(-dr.inf), mi.Float(dr.inf)))
+    return _OfPixels(
+        **sums,
+        trend=sum(map(dr.square, trends)),
+        blur=mi.Float64(_most_blurred(*blurs)),
+        between=_second_edge(dr.width(part), rule, found.value, estimator),
+    )
 
 
 def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float, estimator: Estimator) -> PixelArray:
     """Error of a second edge between two transects of each pixel, from the `value` of all transects, pixel by pixel.
 
-    In the order of transects across a sharp edge, their place along it increases, so that a second edge gives two
+    In the order of transects across a sharp edge, their position along it increases, so that a second edge gives two
     second differences d that are much larger than the others. √(Σd² − 2 (Σ|d|)²/n) is then √2 times the jump; it is 0
     where all differences vary alike. On a net, where the edge is nearly along many transects, it cuts all but one of
     them evenly: the error is at most the largest |d| over n.

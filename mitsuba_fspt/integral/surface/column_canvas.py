@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from .footprint import along_edges
 
+PLACE = 8  # numbers of a `_Place` in the table, a power of two
 QUANTUM = 2.0**-46  # of the light on a pixel, over that of a pixel filled by 1 W/mm²/sr
 Index = NDArray[np.int64]
 
@@ -86,6 +87,17 @@ class Windows:
         return Windows(self.left, self.top, self.width * columns, self.height * columns)
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Window of one column: `left`, `top`, `width`, `height` on the film [pixels], and its `start` in the buffer."""
+
+    left: mi.Int32
+    top: mi.Int32
+    width: mi.Int32
+    height: mi.Int32
+    start: mi.UInt32
+
+
 class ColumnCanvas:
     """The film of `shape` (h, w) once for every column, but only its `windows`."""
 
@@ -95,11 +107,11 @@ class ColumnCanvas:
         total = max(int(self._starts[-1]), 1)
         # Light that is added to a pixel and all to its right, and its increase from pixel to pixel.
         self._level, self._slope = (dr.zeros(mi.UInt64, total) for _ in range(2))
-        # Of each column its window, and where it starts in the buffer.
-        fields = (windows.left, windows.top, windows.width, windows.height, self._starts[:-1])
-        table = np.stack([*fields, *[0 * windows.left] * 3], -1)
-        self._table = mi.UInt32(np.append(table, np.zeros(8)).astype(np.uint32))
-        self.none = dr.opaque(mi.UInt32, len(table))  # a column without window
+        # The `_Place` of each column, and last of a column without window.
+        table = np.zeros((len(windows.left) + 1, PLACE), np.uint32)
+        table[:-1, :5] = np.stack([windows.left, windows.top, windows.width, windows.height, self._starts[:-1]], -1)
+        self._table = mi.UInt32(table.ravel())
+        self.none = dr.opaque(mi.UInt32, len(windows.left))
         self._size = tuple(dr.opaque(mi.Float64, side) for side in shape[::-1])
         dr.eval(self._table, self._level, self._slope)
 
@@ -135,11 +147,7 @@ class ColumnCanvas:
         high_y = dr.maximum(dr.maximum(ring[0].y, ring[1].y), dr.maximum(ring[2].y, ring[3].y))
         low_x = dr.minimum(dr.minimum(ring[0].x, ring[1].x), dr.minimum(ring[2].x, ring[3].x))
         active &= (low_x < self._size[0]) & (low_y < self._size[1]) & (high_y > 0)
-        places = []
-        for column in columns:
-            left, top, width, height = (dr.gather(mi.Int32, self._fields, 8 * column + k, active) for k in range(4))
-            start = dr.gather(mi.UInt32, self._table, 8 * column + 4, active)
-            places.append((left, top, width, height, start))
+        places = [self._place(column, active) for column in columns]
         scaled = [Plane(way * plane.at, way * plane.x, way * plane.y) for plane in planes]
 
         def add(a: mi.Point2d, b: mi.Point2d, _crosses: mi.Bool) -> None:
@@ -151,11 +159,13 @@ class ColumnCanvas:
 
         along_edges(ring, active, self._size, add, count)
 
-    @property
-    def _fields(self) -> mi.Int32:
-        return mi.Int32(self._table)
+    def _place(self, column: mi.UInt32, active: mi.Bool) -> _Place:
+        """Where a column lies, from the table."""
+        fields, first = mi.Int32(self._table), PLACE * column
+        window = (dr.gather(mi.Int32, fields, first + k, active) for k in range(4))
+        return _Place(*window, start=dr.gather(mi.UInt32, self._table, first + 4, active))
 
-    def _add(self, place: tuple, plane: Plane, pixel: tuple, ends: tuple, at: tuple) -> None:
+    def _add(self, place: _Place, plane: Plane, pixel: tuple, ends: tuple, at: tuple) -> None:
         """Add the light to the right of a part ab of an edge: to its pixel and to all beyond in its row.
 
         pixel : column and row; ends : xa, ya, xb, yb in that pixel; at : the same pixel as whole numbers
@@ -172,11 +182,10 @@ class ColumnCanvas:
         squares = xa * xa + xa * xb + xb * xb
         mixed = ya * (2 * xa + xb) + yb * (xa + 2 * xb)
         beside = dr.round(rise * (0.5 * corner * (xa + xb) + plane.x * squares / 6 + plane.y * mixed / 6))
-        left, top, width, height, start = place
-        x, y = dr.clip(at[0] - left, 0, width), at[1] - top
-        after = dr.clip(at[0] + 1 - left, 0, width)
-        on = (y >= 0) & (y < height) & (width > 0)
-        line = start + mi.UInt32(y) * mi.UInt32(width + 1)
+        x, y = dr.clip(at[0] - place.left, 0, place.width), at[1] - place.top
+        after = dr.clip(at[0] + 1 - place.left, 0, place.width)
+        on = (y >= 0) & (y < place.height) & (place.width > 0)
+        line = place.start + mi.UInt32(y) * mi.UInt32(place.width + 1)
         # Unsigned, because that wraps around below zero and every backend can add it.
         for layer, column_at, amount in (
             (self._level, x, level - beside),

@@ -128,8 +128,8 @@ class Plan:
         return Plan(self.cells[faces], self.cuts[faces], self.points[faces])
 
     def passes(self) -> Iterator[tuple[Index, Index, Index, Mask, Mask]]:
-        """Faces, their M and pieces, whether cells are laid, and the columns (n, 1 or 3) that take light so: by turns
-        those like the first column of a face, like the second if that takes others, and like the third."""
+        """Faces, their M and pieces, whether cells are laid, and the columns (n, 1 or 3) that take light so: in turn
+        those like the first column of a face, like the second where that differs, and like the third."""
         kind = 2 * self.cells + self.points
         for k in range(kind.shape[1]):
             alike = kind == kind[:, k : k + 1]
@@ -172,7 +172,7 @@ class FaceLight:
     def seen(
         cls, surface: EmittingSurface, camera: Camera, origin: tuple[int, int], shape: tuple[int, int]
     ) -> FaceLight:
-        """What `lens` sees of an emitting mesh on the crop window of `shape` (h, w) at `origin` (x, y)."""
+        """Faces of an emitting mesh as `camera` sees them, on the crop window of `shape` (h, w) at `origin` (x, y)."""
         mesh = surface.shape
         positions, faces = triangles(mesh)
         vertices = positions.numpy().reshape(-1, 3).astype(np.float64)
@@ -206,18 +206,18 @@ class FaceLight:
             surface,
             elements,
             corners,
-            low,
-            high,
-            sides,
-            heights,
-            blur,
-            slant,
-            partial,
-            cut,
-            none,
-            lengths,
-            np.zeros(len(corners)),
-            camera.lens.focus_distance / camera.virtual_pitch,
+            low=low,
+            high=high,
+            sides=sides,
+            heights=heights,
+            blur=blur,
+            slant=slant,
+            partial=partial,
+            cut=cut,
+            mixed=none,
+            edges=lengths,
+            crossed=np.zeros(len(corners)),
+            distance=camera.lens.focus_distance / camera.virtual_pitch,
             shadows=False,
         )
 
