@@ -201,7 +201,7 @@ def _background(
 
 
 def _is_in_dn(flat: Counts) -> bool:
-    """False for a flat over its own mean; for a stack of such, one line on stderr tells that its noise is left out."""
+    """False for a flat over its own mean; for a stack of such, a line on stderr says that its noise is left out."""
     if flat.raw or float(np.median(flat.values)) > NORMALISED:
         return True
     if flat.frames > 1:

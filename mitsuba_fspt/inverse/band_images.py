@@ -23,10 +23,10 @@ from .transport_matrix import TransportMatrix
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 LOG = logging.getLogger("mitsuba_fspt")
-# Distance of the matrix's surface from the tissue's border, over the edge of the tetrahedra: the largest, and the one
-# from which on it is told. The sources are wrong by about that distance, which the intervals do not contain.
+# Distance of the matrix's surface from the tissue's border, over the edge of the tetrahedra: the largest one, and that
+# from which on a line reports it. The sources are wrong by about that distance, which intervals do not contain.
 OFF_BORDER = 0.25
-TOLD = 0.02
+REPORTED = 0.02
 STEP = 0.05  # relative change of optical coefficients, for slopes
 
 
@@ -166,7 +166,7 @@ class BandImages:
                 f"locate: the surface of the matrix is up to {away:.3g} mm away from the phantom's border. Give the "
                 "matrix of this phantom's surface; its mesh without to_world is in the frame of the phantom file."
             )
-        if away > TOLD * mesh.edge:
+        if away > REPORTED * mesh.edge:
             LOG.warning(
                 "fspt: locate: the surface of the matrix is up to %.3g mm away from the phantom's border, which the "
                 "stated errors do not contain.",

@@ -1,4 +1,4 @@
-"""Functions ψ for J_n where the mesh is finer than the pictures resolve: linear between some of its vertices.
+"""Functions ψ for J_n where the mesh is finer than the images resolve: linear between some of its vertices.
 
     J_n at a vertex = Σ_k ψ_k c_k,   ψ >= 0,   Σ_k ψ_k = 1,   c_k = J_n at the k-th of the vertices chosen (Eq. M.30)
 
@@ -33,7 +33,7 @@ def coarser(graph: csr_array, points: Array, kinds: Index | None = None) -> tupl
     between.eliminate_zeros()
     chosen = np.flatnonzero(root)
     corners = _triangles(between)
-    alone = ~np.isin(own, corners) & ~root  # around it are no three of them: it stays as it is
+    alone = ~np.isin(own, corners) & ~root  # no triangle of nodes around such a vertex: its J_n is its own unknown
     chosen = np.concatenate([chosen, np.flatnonzero(alone)])
     columns, shares = _coordinates(points, points[chosen], own, corners)
     creased = kinds == CREASE

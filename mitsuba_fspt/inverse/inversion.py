@@ -1,4 +1,4 @@
-"""Result of `invert`: J_n on the surface with its intervals, files and pictures of it."""
+"""Result of `invert`: J_n on the surface with its intervals, its files and its drawing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LOG = logging.getLogger("mitsuba_fspt")
 
 @dataclass(frozen=True, eq=False)
 class Inversion:
-    """Surface flux density J_n from pictures, on the columns of a transport matrix.
+    """Surface flux density J_n from images, on the columns of a transport matrix.
 
     The intervals contain the noise, the numerical error of the matrix, a common factor, and what J_n leaves out that is
     linear on faces (Eq. M.42). They leave out errors of the model: pose, lens, shape, exit law, flat field, factors of
@@ -83,7 +83,7 @@ class Inversion:
 
     @cached_property
     def exitance(self) -> Array:
-        """(n,) J_n [W/mm²]; NaN where the pictures do not determine it."""
+        """(n,) J_n [W/mm²]; NaN where the images do not determine it."""
         return np.where(self.seen, self.solution, np.nan)
 
     @property
@@ -136,7 +136,7 @@ class Inversion:
         if (given[~self.seen] != 0).any():
             count = int(np.sum(given[~self.seen] != 0))
             raise InversionError(
-                f"inversion: weights of {count} columns that no picture determines are not 0. Multiply by R.seen."
+                f"inversion: weights of {count} columns that no image determines are not 0. Multiply by R.seen."
             )
         low, high = self._between(given @ self._drawn())
         return float(low), float(high)
@@ -215,7 +215,7 @@ class Inversion:
         if path.suffix.lower() == ".ply":
             dark = {f"{name}_x": np.where(self.seen, value, 0.0) for name, value in values.items()}
             comments = {"quantity": "exitance", "unit": "W/mm^2", "length_unit": "mm", "power": f"{self.total!r} W"}
-            comments |= {"source": "fspt invert", "seen": "1 where the pictures determine it, else 0"}
+            comments |= {"source": "fspt invert", "seen": "1 where the images determine it, else 0"}
             seen = {"seen_x": self.seen.astype(np.float64)}
             write_ply(path, self.surface.vertices, self.surface.faces, dark | seen, per, comments)
             for name, scale in self.surface.scales.items():

@@ -1,4 +1,4 @@
-"""`invert`: the surface flux density J_n from pictures of several views, with intervals.
+"""`invert`: the surface flux density J_n from images of several views, with intervals.
 
 The power on pixel i is T J, its noise normal with the variance of Eq. M.24 or M.27 of docs/model.md, taken from the
 fitted signal. J >= 0 minimises half of χ² and the penalty of Eq. M.23. Samples are such minima for data and penalty

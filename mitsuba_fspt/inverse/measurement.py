@@ -1,4 +1,4 @@
-"""What the pictures of all views say: power, its noise as a function of the signal, and the pixels that count."""
+"""Measured images of all views: power, its noise as a function of the signal, and the pixels that count."""
 
 from __future__ import annotations
 

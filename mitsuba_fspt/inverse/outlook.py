@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 def is_hopeless(problem: Problem, levels: list[Surface], bounds: Hopeless, report: Progress) -> bool:
-    """True where more unknowns do not explain the images either, or single pixels hold most of χ²; told on stderr.
+    """True if more unknowns do not explain the images either, or most of χ² is on few pixels; reported on stderr.
 
     levels : the surface and coarser ones, as from `Surface.coarser`; without a coarser one the result is False
     """

@@ -115,7 +115,7 @@ def transport(
     progress : called with what is being done and the share done; without it a notebook shows a bar
     parameters : values for `<default>` parameters of the scene; lists are multiplied out, the last one fastest
 
-    As Eq. 9 does, T leaves out the light that surfaces scatter on to the lens; a warning tells the largest share of a
+    As Eq. 9 does, T leaves out the light that surfaces scatter on to the lens; a warning states the largest share of a
     view, for J = 1. The metadata also say in `warnings` on how many pixels `rtol` was not reached, if on any, and what
     is odd about the scene, such as a mesh of inconsistent orientations; `error` estimates the errors of the pixels.
 

@@ -86,7 +86,7 @@ class TransportMatrix(LinearOperator):
         """The transpose of images, (views, height, width) or one Image a view, (n,): Σ_i T[i, j] P[i].
 
         No adjoint in the sense of areas: divide by `areas` for that. Raises TransportError for images of another size,
-        pixel pitch or unit, or in another order, as far as their metadata tell.
+        pixel pitch or unit, or in another order, as far as their metadata contain these.
         """
         return self._rmatvec(self.images(images).ravel())
 
@@ -99,7 +99,7 @@ class TransportMatrix(LinearOperator):
         """Power (views, height, width) [W] of an array, or of one Image a view after the checks of `backward`.
 
         Other differences from the matrix, such as another mesh, are reported in one line on stderr and are no error: a
-        camera's picture has no mesh.
+        camera's image has no mesh.
         """
         if isinstance(images, Image):
             images = [images]

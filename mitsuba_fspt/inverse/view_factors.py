@@ -27,7 +27,7 @@ def checked_factor(verb: str, value: object) -> float:
 class ViewFactors:
     """Factors of views: their ratios as unknowns g of unit variance, and what they have in common.
 
-    No image tells a factor common to all views from a factor of J_n; only the penalty, which is lower for smaller J_n,
+    No image separates a factor common to all views from a factor of J_n; only the penalty, lower for smaller J_n,
     would determine it. The V − 1 unknowns are therefore those of f = 1 + δ E g, with orthonormal columns E whose sums
     over the views are 0.
 

@@ -8,7 +8,7 @@ import time
 from .errors import FsptError
 from .numbers import number
 
-LEAST_TIME = 1e-3  # s: what a part of the work gets when no time is left
+LEAST_TIME = 1e-3  # s: time for a part of the work when none is left
 
 
 class Deadline:

@@ -56,8 +56,8 @@ def require_ply(path: Path, error: type[FsptError]) -> None:
 def require_whole(path: Path, error: type[FsptError]) -> None:
     """Raise `error` for a PLY that ends early, or with a face that names a vertex which does not exist.
 
-    A text without a line break at its end, whose last number may be cut off, is told in one line on stderr. A file that
-    cannot be opened, or with elements other than vertices and triangles, is left to its reader.
+    A text without a line break at its end, whose last number may be cut off, is reported in one line on stderr. A file
+    that cannot be opened, or with elements other than vertices and triangles, is left to its reader.
     """
     try:
         with path.open("rb") as file:  # mapped: of a binary file, the vertices are left to the reader

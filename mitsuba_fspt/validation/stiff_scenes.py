@@ -217,7 +217,7 @@ def power(of: mi.Scene, **accuracy: Any) -> Plane:
 
 
 @cache
-def standard_picture(*objects: Callable[[], SceneObject]) -> Plane:
+def standard_image(*objects: Callable[[], SceneObject]) -> Plane:
     """Power, shape (h, w) [W], of these objects with the standard lens and film; computed once, used by many cases."""
     return power(scene(*(make() for make in objects)))
 
@@ -261,16 +261,14 @@ def shared_area(r: float, s: float, apart: Plane) -> Plane:
 # ---------------------------------------------------------------------- error measures of many cases
 
 
-def peak_error(picture: Plane, truth: Plane) -> float:
+def peak_error(image: Plane, truth: Plane) -> float:
     """Largest error of a pixel, relative to the brightest pixel of the reference `truth`."""
-    return float(np.abs(picture - truth).max() / truth.max())
+    return float(np.abs(image - truth).max() / truth.max())
 
 
-def pixel_error(picture: Plane, truth: Plane) -> float:
+def pixel_error(image: Plane, truth: Plane) -> float:
     """Largest error of a pixel, relative to the reference there; infinite if a pixel that should be 0 is not."""
-    error = np.where(
-        truth == 0, np.where(picture == 0, 0, np.inf), np.abs(picture / np.where(truth == 0, 1, truth) - 1)
-    )
+    error = np.where(truth == 0, np.where(image == 0, 0, np.inf), np.abs(image / np.where(truth == 0, 1, truth) - 1))
     return float(error.max())
 
 
@@ -281,8 +279,8 @@ def cone_error(
     focal, stop = lens.get("focal_length", FOCAL), lens.get("f_number", F_NUMBER)
     t = lens.get("magnification") or focal / (lens.get("focus_distance", FOCUS) - focal)
     side, focus = lens.get("pixel_pitch", PITCH) / t, focal * (1 + 1 / t)
-    picture = power(scene(*objects, film=film or (WIDTH, HEIGHT), **lens), rtol=EXACT)
-    return pixel_error(picture, share * filled_cones(focus, side, focal / stop / 2, nodes, film))
+    image = power(scene(*objects, film=film or (WIDTH, HEIGHT), **lens), rtol=EXACT)
+    return pixel_error(image, share * filled_cones(focus, side, focal / stop / 2, nodes, film))
 
 
 def balance_error(z: float, radius: float, domain: str = "pupil", rtol: float = 10 * EXACT, **lens: Any) -> float:
@@ -296,7 +294,7 @@ def invariance_error(
 ) -> float:
     """Peak error between the standard image and that of a changed scene, whose power is `factor` times as large."""
     of = scene(*(make() for make in objects), at=pose() if pose else None, **changed)
-    return peak_error(power(of) / factor, standard_picture(*objects))
+    return peak_error(power(of) / factor, standard_image(*objects))
 
 
 def domain_error(*objects: SceneObject, **lens: Any) -> float:
@@ -332,7 +330,7 @@ def wall_error(slope: float) -> float:
 def scaled_exitance_error(exitance: float) -> float:
     """Peak error of a sphere of this J_n, against the sphere of 1 W/mm²."""
     scaled = power(scene(sphere(168.0, 6.0, 1.5, -1.0, exitance=exitance)))
-    return peak_error(scaled / exitance, standard_picture(ball))
+    return peak_error(scaled / exitance, standard_image(ball))
 
 
 def two_level_error() -> float:
@@ -343,10 +341,10 @@ def two_level_error() -> float:
     lines = np.linspace(-40, 40, 3)
     vertices, faces = grid(lines, lines, FOCUS)
     bright = vertices[faces].mean(axis=1)[:, 0] > 0
-    picture = power(scene(mesh(vertices, faces, np.where(bright, 1.0, 1e-9))), rtol=EXACT)
+    image = power(scene(mesh(vertices, faces, np.where(bright, 1.0, 1e-9))), rtol=EXACT)
     steps = np.where(np.arange(WIDTH) < WIDTH // 2, 1.0, 1e-9)
     away = np.abs(np.arange(WIDTH) - WIDTH / 2 + 0.5) > 1
-    return pixel_error(picture[:, away], (filled_cones() * steps)[:, away])
+    return pixel_error(image[:, away], (filled_cones() * steps)[:, away])
 
 
 def half_dark_error(border: float) -> float:
@@ -368,9 +366,9 @@ def sliver_error() -> float:
 
 def pinhole_vertex_error() -> float:
     """Pixel error of a pinhole camera whose lines of sight meet the vertices of a mesh, against cos⁴θ."""
-    picture = power(scene(mesh(*pixel_grid(0.5)), model="pinhole"), pixel="centre")
+    image = power(scene(mesh(*pixel_grid(0.5)), model="pinhole"), pixel="centre")
     falloff = over_pixels(lambda x, y: FOCUS**4 / (FOCUS**2 + x**2 + y**2) ** 2, nodes=1)
-    return pixel_error(picture, (PUPIL * SIDE / FOCUS) ** 2 * falloff)
+    return pixel_error(image, (PUPIL * SIDE / FOCUS) ** 2 * falloff)
 
 
 def small_disk_error() -> float:
@@ -403,7 +401,7 @@ def moved_cone_error(pose: Callable[[], Any]) -> float:
 
 def small_film_error(width: int, height: int) -> float:
     """Peak error between a small film and the middle of the standard one; sizes are even, so that pixels coincide."""
-    whole = standard_picture(limb_on_axis)
+    whole = standard_image(limb_on_axis)
     top, left = (HEIGHT - height) // 2, (WIDTH - width) // 2
     part = power(scene(limb_on_axis(), film=(width, height)))
     return float(np.abs(part - whole[top : top + height, left : left + width]).max() / whole.max())
@@ -412,7 +410,7 @@ def small_film_error(width: int, height: int) -> float:
 def crop_error(crop: tuple[int, int, int, int]) -> float:
     """Peak error between a crop window (x, y, width, height) and the same pixels of the whole image."""
     x, y, width, height = crop
-    whole, part = standard_picture(ball), power(scene(ball(), crop=crop))
+    whole, part = standard_image(ball), power(scene(ball(), crop=crop))
     return float(np.abs(part - whole[y : y + height, x : x + width]).max() / whole.max())
 
 
