@@ -53,7 +53,7 @@ def test_links_and_files_exist(page):
         assert list(ROOT.glob(name.rstrip("/").replace("NAME", "*"))), name
 
 
-def test_places_in_the_code_exist():
+def test_files_and_names_of_the_code_exist():
     """The last table of docs/model.md: files below the package, and the names in them."""
     rows = zip(*(cells(ROOT / "docs" / "model.md", "Where it stands in the code", k) for k in (2, 3)), strict=True)
     for files, names in rows:

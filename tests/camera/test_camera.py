@@ -111,12 +111,12 @@ def test_a_point_has_its_image_within_its_blur_disc_and_the_window():
         (lambda t: t.scale([1, 1, -1]), "'to_world' scales lengths or mirrors"),
     ],
 )
-def test_a_place_that_is_no_rigid_motion_is_refused(place, message):
+def test_a_pose_that_is_no_rigid_motion_is_refused(place, message):
     with pytest.raises(OpticsError, match=message):
         camera(to_world=place(mi.Transform4f()))
 
 
-def test_a_camera_is_known_by_its_state():
+def test_equal_states_are_equal_cameras():
     """Equal numbers make equal states; a crop window, a place or an f-number makes another one."""
     crop = Film((40, 32), (3, 5), (10, 8))
     assert camera().state == camera().state

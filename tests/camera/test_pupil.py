@@ -54,7 +54,7 @@ def test_nothing_is_open_between_discs_apart():
 
 
 @pytest.mark.parametrize(("distance", "radius"), MEETING + NESTED)
-def test_even_points_stay_even_on_what_is_open(distance, radius):
+def test_even_points_stay_even_on_the_open_part(distance, radius):
     """Against points of the unit disc that lie in the second one: means and second moments.
 
     Seen to fail with a chord's points left where they are along it, and with the heights of both discs not shared out

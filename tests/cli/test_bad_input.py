@@ -475,7 +475,7 @@ def test_names_of_files_are_no_images():
 # --- odd, but not bad ---
 
 
-def test_a_dark_picture_is_written_and_said_to_be_dark(tmp_path, capfd, monkeypatch):
+def test_a_dark_image_is_written_and_reported_as_dark(tmp_path, capfd, monkeypatch):
     """A sphere that glows inwards: 0 W on every pixel, and on stderr what may be wrong; seen to be silent."""
     monkeypatch.chdir(tmp_path)
     inwards = BALL_XML.replace("<emitter", '<boolean name="flip_normals" value="true"/><emitter')

@@ -132,7 +132,7 @@ def test_what_is_refused(run, arguments, message):
     assert files() == []
 
 
-def test_ctrl_c_tells_which_views_are_written(run, monkeypatch):
+def test_ctrl_c_names_the_views_that_are_written(run, monkeypatch):
     write = verb.Output.write
 
     def interrupted(self, image, output, picture):

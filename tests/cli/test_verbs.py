@@ -109,7 +109,7 @@ LENS_NUMBERS = {
         (["--method", "ptracer", "--spp", "64"], {"method": "ptracer", "seed": 0, "spp": 64, "passes": 32}),
     ],
 )
-def test_the_header_tells_all_and_reproduces_the_file(run, tmp_path, options, told):
+def test_the_header_reproduces_the_file(run, tmp_path, options, told):
     write_scene(tmp_path / "s.xml")
     code, *_ = run("render", "s.xml", *options, "-D", "f_number=4", "-D", "distance=170", "-o", "first.exr")
     assert code == 0
@@ -214,7 +214,7 @@ def test_compare_prints_the_metrics(run, two_images):
     assert f"ratio  {truth.ratio:.6f}" in out
 
 
-def test_compare_tells_of_an_image_without_errors(run, two_images, tmp_path):
+def test_compare_reports_an_image_without_errors(run, two_images, tmp_path):
     image = fspt.read("a.exr")
     fspt.Image(image.power, 1e-12 + 0 * image.power, metadata={"method": "integral"}).write("c.exr")
     code, out, err = run("compare", "c.exr", "b.exr")
@@ -409,7 +409,7 @@ def test_expose_leaves_both_files_or_none(run, two_images, tmp_path, counts):
     assert set(os.listdir(tmp_path)) == before
 
 
-def test_more_pixels_than_memory_holds(run, tmp_path):
+def test_more_pixels_than_the_memory_suffices_for(run, tmp_path):
     sensor = LENS_XML.replace('"width" value="8"', '"width" value="1000000"').replace('value="6"', 'value="1000000"')
     code, _, err = run("render", write_scene(tmp_path / "s.xml", sensor=sensor), "-o", tmp_path / "o.exr")
     assert (code, err.count("\n")) == (2, 1)

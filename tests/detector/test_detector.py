@@ -175,7 +175,7 @@ def test_seed():
     assert (first.electrons != other.electrons).any()
 
 
-def test_binned_pixels_of_a_crop_window_keep_their_places():
+def test_binned_pixels_of_a_crop_window_keep_their_positions():
     """Centres of 2 × 2 pixels are the means of theirs, and the axis is the film's. Fails with unbinned numbers."""
     crop = {"film_width": 40, "film_height": 32, "crop_offset_x": 6, "crop_offset_y": 20}
     image = flat(100.0, 8, pixel_pitch=0.4, magnification=0.5, **crop)
@@ -306,7 +306,7 @@ def test_detectors_that_cannot_exist(name, value, rule):
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_what_is_no_number_is_refused_with_one_that_would_do(name):
+def test_a_value_that_is_no_number_is_refused_with_a_valid_one(name):
     """Seen to fail: 16 for a quantum efficiency, which is 1 at the most."""
     camera = replace(CCD, em_gain=300)
     with pytest.raises(DetectorError, match=f"'{name}' must be a number, got 'many'") as caught:

@@ -134,7 +134,7 @@ def test_dark_charge_and_frames_add_their_noise():
         assert chi2 == pytest.approx(1, abs=4 * (2 / 4096) ** 0.5)
 
 
-def test_a_total_below_zero_is_told(caplog):
+def test_a_total_below_zero_is_reported(caplog):
     """Dark frames scatter about 0 and say nothing; counts 40 DN below the bias are told."""
     dark = np.random.default_rng(5).normal(CCD.bias, CCD.read_noise / CCD.gain, (32, 32))
     CCD.reduce(dark, **SETTINGS)
@@ -209,7 +209,7 @@ def test_files(tmp_path):
     assert read_counts(click).exposure_time == 60
 
 
-def test_another_exposure_time_in_the_file_is_told(tmp_path, caplog):
+def test_another_exposure_time_in_the_file_is_reported(tmp_path, caplog):
     """EXPTIME of 60 s says nothing beside 60 s, and one line beside 30 s, which are used."""
     fits = pytest.importorskip("astropy.io.fits")
     hdu = fits.PrimaryHDU(CCD.expose(ramp(), 60, 650, seed=1).counts)

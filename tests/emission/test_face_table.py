@@ -60,7 +60,7 @@ OBJECTS = MESHES | {
 
 
 @pytest.mark.parametrize("build", OBJECTS.values(), ids=OBJECTS)
-def test_packets_of_lines_of_sight_meet_what_single_ones_meet(build, tmp_path, monkeypatch):
+def test_packets_of_lines_of_sight_meet_the_same_surfaces_as_single_ones(build, tmp_path, monkeypatch):
     """Seen to fail with packets of which one line of sight in sixteen is lost."""
     scene, found = build(tmp_path / "body.ply"), []
     for most in (-1.0, np.inf):
@@ -149,7 +149,7 @@ def test_a_corner_nine_decades_dimmer_than_its_neighbour_keeps_its_light(tmp_pat
     np.testing.assert_allclose(found.numpy(), exitance / np.pi, rtol=1e-6)
 
 
-def test_the_table_follows_what_nobody_tells_of(tmp_path):
+def test_the_table_follows_changes_made_without_notice(tmp_path):
     """A texture updated by itself; faces turned round. Seen to fail with a table made anew only when Mitsuba tells."""
     import mitsuba as mi
 

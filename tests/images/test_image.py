@@ -154,7 +154,7 @@ def test_what_is_no_image(arguments, message):
         (Image([[1.0]], metadata={"lens": (1, 2)}), "'lens' must be text or a number, got tuple"),
     ],
 )
-def test_what_no_file_can_hold(tmp_path, image, message):
+def test_values_that_no_file_can_store(tmp_path, image, message):
     with pytest.raises(ImageError, match=message):
         image.write(tmp_path / "a.exr")
     assert os.listdir(tmp_path) == []
@@ -177,7 +177,7 @@ def test_dark_pixels_may_vanish_and_dark_images_be_written(tmp_path):
         ("/proc/a.exr", "'/proc/a.exr' cannot be written"),
     ],
 )
-def test_places_that_cannot_be_written(tmp_path, name, message):
+def test_paths_that_cannot_be_written(tmp_path, name, message):
     (tmp_path / "folder.exr").mkdir()
     with pytest.raises(ImageError, match=message) as caught:
         picture().write(tmp_path / name)

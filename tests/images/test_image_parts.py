@@ -207,7 +207,7 @@ def test_fits_headers_have_the_keywords_of_other_programs(image, tmp_path):
     assert CCD.reduce(tmp_path / "counts.fits", **SETTINGS).metadata["binning"] == 2
 
 
-def test_parts_of_different_places_are_not_compared(image):
+def test_parts_at_different_positions_are_not_compared(image):
     """Seen to pass with a ratio of 0.74: two halves of an image."""
     upper, lower = image[8:16], image[16:24]
     with pytest.raises(

@@ -74,7 +74,7 @@ def test_electrons_have_their_unit_at_the_bar():
     np.testing.assert_array_equal(np.asarray(exposure), electrons)
 
 
-def test_axes_say_what_they_know(drawn):
+def test_axes_are_in_mm_or_in_pixels(drawn):
     write_png(spot(pixel_pitch=0.1), "a.png")
     write_png(spot(), "a.png")
     detector, pixels = (figure.axes[0] for figure in drawn)

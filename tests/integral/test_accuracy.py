@@ -126,7 +126,7 @@ def test_error_bounds_the_error():
     assert np.concatenate(bounded, axis=None).mean() >= 0.99
 
 
-def test_error_bounds_the_error_on_a_ball_of_five_pixels():
+def test_error_bounds_the_error_on_a_sphere_of_five_pixels():
     """A limb curved within every pixel, and a tenth of a pixel out of focus. Expected: a bound, pixel by pixel.
 
     Seen to fail with transects that fill pixel and pupil less evenly (1.1e-3 of the brightest pixel off, 7e-4 stated),
@@ -151,7 +151,7 @@ def on_axis(depth, radius, f_number, pitch, side=12):
     return planes
 
 
-def test_error_knows_what_float32_makes_of_far_places():
+def test_error_contains_the_rounding_of_float32_far_from_the_origin():
     """Rationale: float32 moves lines of sight of a scene that is turned and 10⁵ mm away from the world's origin.
 
     Expected: larger errors than at the origin, and bounds for 99 pixels of 100. Seen to fail with the rounding of lines
@@ -180,7 +180,7 @@ def test_same_bits_in_every_run():
             np.testing.assert_array_equal(getattr(image, plane), getattr(again, plane))
 
 
-def test_balls_that_poke_into_each_other_are_no_second_surface():
+def test_spheres_that_intersect_are_no_second_surface():
     """One of the points at which a second surface is looked for lies on their common circle; seen to be refused."""
     front = sphere(172.24108170659895, 1.9883699847893401, 0.07712417676777661, 1.5394461159644504)
     back = sphere(172.75838990913695, 2.7974111028847615, 0.45245591722528644, -0.43217559420530804)
@@ -190,7 +190,7 @@ def test_balls_that_poke_into_each_other_are_no_second_surface():
 # --- work ---
 
 
-def test_pixels_that_see_nothing_cost_nothing():
+def test_pixels_outside_the_visible_window_take_no_lines_of_sight():
     """Expected: exactly 0, error 0, coverage 0, and not one line of sight more than the part around the body takes."""
     body = sphere(180.0, 3.0, 9.0, 6.0)
     whole, part = fspt.render(camera_scene(body)), fspt.render(camera_scene(body, crop=(0, 0, 20, 16)))
@@ -204,7 +204,7 @@ def test_pixels_that_see_nothing_cost_nothing():
     assert whole.metadata["nodes"] == part.metadata["nodes"]
 
 
-def test_what_lies_beside_a_crop_window_is_not_refined():
+def test_pixels_beside_a_crop_window_are_not_refined():
     """Expected: of lines of sight that the field takes a tenth for one pixel of 768; the blur disc is 17 pixels wide.
 
     Seen to fail (a half) where all pixels that one blur disc reaches are refined.
@@ -218,7 +218,7 @@ def test_what_lies_beside_a_crop_window_is_not_refined():
 
 @pytest.mark.parametrize("domain", ["pupil", "surface"])
 @pytest.mark.parametrize("depth", [FOCUS, FOCUS + 3])
-def test_tolerance_is_a_share_of_what_a_crop_window_shows(depth, domain):
+def test_tolerance_is_a_share_of_the_brightest_pixel_of_the_crop_window(depth, domain):
     """A ball beside a disk ten times as bright that ends at the edge of the window.
 
     Seen to fail where what is computed around the window counts for the brightest pixel, too: 0.1 of that which is

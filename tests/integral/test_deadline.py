@@ -40,7 +40,7 @@ def scene_of(name):
 
 
 @pytest.mark.parametrize(("name", "batch"), [("ball", progress.BATCH), ("two_spheres", progress.BATCH >> 8)])
-def test_errors_hold_wherever_it_stops(name, batch, monkeypatch):
+def test_errors_bound_the_error_at_any_deadline(name, batch, monkeypatch):
     """Against the image at a tenth of rtol: at most one pixel in a hundred is off by more than its error.
 
     The errors fall, but for jumps that are found late. Seen to fail with the error 0 on pixels that a level has not
@@ -77,7 +77,7 @@ def test_the_surface_form_stops(stop):
     assert found.power.sum() == pytest.approx(truth.power.sum(), rel=0.05)
 
 
-def test_render_says_that_it_stopped(monkeypatch):
+def test_render_reports_that_it_stopped(monkeypatch):
     """Half a millisecond is too little for any refinement; a minute is enough for all of it."""
     scene = scene_of("ball")
     short, long = fspt.render(scene, max_time=5e-4), fspt.render(scene, max_time=60)

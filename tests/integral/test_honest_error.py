@@ -36,7 +36,7 @@ def solid_angle(x, y, z, radius=RADIUS):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("shape", ["sphere", "cylinder"])
-def test_a_shape_far_below_a_pixel_sends_what_its_area_says(shape, seed):
+def test_a_shape_far_below_a_pixel_sends_light_in_proportion_to_its_area(shape, seed):
     """A sphere of 6 um at 570 mm, a pixel 17 times as wide: L π r² Ω, for its field is that of a point. A cylinder
     upright to the axis: L 2 r h Ω where all of it sees the lens at right angles, to the second order of the pupil.
 
@@ -127,7 +127,7 @@ def test_a_finer_rtol_states_no_larger_error(name):
         pytest.param("boxes", 122, 1e-3, [(36, 14)], id="edge of a box along the transects"),
     ],
 )
-def test_the_error_holds_where_two_levels_agree_by_chance(family, seed, rtol, pixels):
+def test_the_error_bounds_the_error_where_two_levels_agree_by_chance(family, seed, rtol, pixels):
     """Pixels with several edges, on which two levels agree, against the float64 reference: within the stated error.
 
     Seen to fail with an error of transects that falls as n^(-3/2) everywhere (up to 1.8 times that stated), with

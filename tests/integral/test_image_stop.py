@@ -90,7 +90,7 @@ def test_the_error_bounds_the_error_and_more_work_lessens_it():
     assert worst[0] > 2 * worst[1]
 
 
-def test_nothing_is_seen_or_computed_beside_the_stop():
+def test_pixels_beside_the_stop_are_dark_and_not_computed():
     """Power, error and coverage 0; as many lines of sight as the pixels around the stop have."""
     inside, beside = pixels(STOP)
     assert beside.sum() > 500

@@ -69,7 +69,7 @@ def test_light_past_a_dark_disk_arrives(disks, dim, max_nodes):
 
 
 @pytest.mark.parametrize("max_nodes", [4, 16])
-def test_few_lines_of_sight_know_what_they_miss(max_nodes):
+def test_errors_of_few_lines_of_sight_contain_what_they_miss(max_nodes):
     """A dark half-plane out of focus before a wide glowing disk, its edge along the pixels; truth: the default.
 
     Expected: the error is a bound. Seen to fail (48 of 288 pixels, 0 W with an error of 0 for 0.14 of the brightest)
@@ -108,7 +108,7 @@ def test_narrow_light_before_a_dark_plate_that_hides_a_wide_body():
     assert fspt.render(scene).power.sum() == pytest.approx(light, rel=1e-2)
 
 
-def test_what_a_dark_rod_leaves_of_a_pixel_is_looked_for_along_its_outline_too():
+def test_light_beside_a_dark_cylinder_is_found_along_its_outline_too():
     """A glowing rod that enters a pixel from the side by a tenth, behind a dark one; against the surface form.
 
     Seen to fail (0 W, error 0.007 of the brightest pixel, for 0.054) where all transects of such a pixel go across the

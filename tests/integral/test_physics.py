@@ -338,7 +338,7 @@ def moments(picture):
     return total, cx, cy, (picture * ((x - cx) ** 2 + (y - cy) ** 2)).sum() / total
 
 
-def test_sharp_picture_is_the_object_times_the_magnification():
+def test_sharp_image_is_the_object_times_the_magnification():
     """Rationale: a disk of radius r at (x, y, u) is a disk of r t/p pixels at W/2 − x t/p, H/2 − y t/p.
 
     Expected: area, centre and mean squared radius R²/2 + 1/6 (the pixel's own), to the cos⁴ falloff across it (1e-3)
@@ -417,7 +417,7 @@ def test_letter_l_is_upright_and_unmirrored(method):
 
 
 @pytest.mark.parametrize("crop", [(5, 7, 22, 13), (17, 12, 8, 9)])
-def test_crop_window_is_a_part_of_the_whole_picture(crop):
+def test_crop_window_is_a_part_of_the_whole_image(crop):
     """Expected: the accuracy asked for, by either of the two pictures."""
     body = sphere(180.0, 8.0, 3.0, -2.0)
     x, y, width, height = crop

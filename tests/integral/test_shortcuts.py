@@ -113,7 +113,7 @@ _QUARTER_TURN = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
 
 
 @pytest.mark.parametrize("build", [shell, dumbbell, torus, inside_out, two_balls])
-def test_what_may_hide_is_looked_for(build, tmp_path):
+def test_occluders_are_searched_for(build, tmp_path):
     assert not found(solved(build(tmp_path / "body.ply"), "surface", rtol=0.3), "occlusion")
 
 
@@ -158,7 +158,7 @@ def test_radiance_that_depends_on_direction_takes_all_lines_of_sight():
     assert not found(solved(world_scene(dull, sensor=lens(24, f_number=100.0))), "one line")
 
 
-def test_what_is_thinner_than_a_pixel_and_between_two_rows_is_seen():
+def test_a_body_thinner_than_a_pixel_between_two_rows_is_found():
     """A plate edge-on through the sharp plane: on each pixel lines of sight from one half of the pupil meet it.
 
     Expected: what random lines of sight find, on every pixel. Seen to fail, dark with no error, with one line of sight
@@ -185,7 +185,7 @@ def test_a_pinhole_takes_one_line_of_sight_a_pixel():
     assert solution.rays < 3 * solution.power.size  # with the rim and the probes; four a pixel would be 5.6
 
 
-def test_the_image_tells_what_was_left_out_and_what_was_not_allowed_to_be():
+def test_metadata_name_the_shortcuts_taken_and_those_switched_off():
     scene = world_scene(ball(), sensor=lens(40))
     image, without = fspt.render(scene, rtol=RTOL), fspt.render(scene, rtol=RTOL, shortcuts=False)
     assert SHORTCUTS["outside"] in image.metadata["left_out"]
@@ -219,7 +219,7 @@ def test_explain_measures_what_each_shortcut_saves():
     assert SHORTCUTS["occlusion"] in {row.what for row in other}
 
 
-def test_no_more_pixels_are_told_of_than_the_picture_has():
+def test_findings_count_no_more_pixels_than_the_image_has():
     """Where the phantom reaches beyond the picture so does what is looked at: pixels around know of silhouettes."""
     solution = solved(world_scene(ball(radius=60.0), sensor=lens(8, f_number=2.8)))
     (outside,) = [finding for finding in solution.findings if finding.name == "outside"]

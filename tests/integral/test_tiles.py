@@ -83,7 +83,7 @@ def test_a_dim_tile_takes_no_more_lines_than_the_bright_one_asks_for(monkeypatch
     assert tiled.error[tiled.coverage > 0].min() == pytest.approx(least, rel=1e-6)
 
 
-def test_one_bright_point_between_the_first_pixels_that_are_looked_at_counts(monkeypatch):
+def test_one_bright_point_between_the_first_evaluated_pixels_counts(monkeypatch):
     """Seen to fail with the brightest pixel sought by lines of sight alone: a sphere of 0.02 mm is on none."""
     shapes = ball(1e-3, 8.0, (0, -10, 0)), ball(100.0, 0.02, (0, 10.013, 3.017))
     scene = world_scene(*shapes, sensor=lens(512, pitch=FIELD / 512))
@@ -113,13 +113,13 @@ def test_tiles_show_every_pixel_of_the_window_once(monkeypatch):
     np.testing.assert_array_equal(count, expected)
 
 
-def test_a_picture_that_fits_is_one_tile_and_an_unseen_one_none():
+def test_a_small_image_is_one_tile_and_an_empty_window_none():
     whole = window((2048, 2048), left=-1, top=-1, shape=(2050, 2050))
     assert tiles_of(whole) == [whole]
     assert tiles_of(window((64, 64), shape=(0, 0))) == []
 
 
-def test_planes_of_large_pictures_are_of_32_bits(monkeypatch):
+def test_planes_of_large_images_have_32_bits(monkeypatch):
     scene = world_scene(ball(), sensor=lens(24))
     assert fspt.render(scene, rtol=1e-2).power.dtype == np.float64
     monkeypatch.setattr(tiles, "LARGE", 24 * 24 - 1)
@@ -163,7 +163,7 @@ def test_available_memory_is_the_least_that_a_file_states(tmp_path, monkeypatch)
     assert memory.available_memory() == 2000
 
 
-def test_progress_is_told_tile_by_tile(monkeypatch):
+def test_progress_is_reported_tile_by_tile(monkeypatch):
     monkeypatch.setattr(tiles, "SIDE", 32)
     told = []
     scene = world_scene(ball(radius=12.0), sensor=lens(64, pitch=0.4))
@@ -177,7 +177,7 @@ def test_progress_is_told_tile_by_tile(monkeypatch):
 
 
 @pytest.mark.parametrize("accuracy", [{}, {"domain": "surface"}])
-def test_progress_is_told_level_by_level(accuracy):
+def test_progress_is_reported_level_by_level(accuracy):
     """From 0 to 1, also where narrow light takes the surface form first. Seen to fail: 0 once."""
     shares = []
     narrow = ball(1.0, 0.05, (0, 12, 9))

@@ -89,7 +89,7 @@ def test_a_gain_of_images_with_stray_light(scene):
     assert found.chi2 == pytest.approx(0.95**2, abs=0.4)
 
 
-def test_degenerate_sets_are_told(scene):
+def test_degenerate_sets_are_reported(scene):
     """Gain and f-number both scale the picture: the message names both, and no small sd is returned."""
     with pytest.raises(InversionError, match="do not determine f_number, gain separately"):
         fspt.calibrate(scene, noisy(scene, 1), free=["f_number", "gain"])
@@ -238,7 +238,7 @@ def test_variance_of_monte_carlo_follows_the_signal():
 
 
 @pytest.mark.slow
-def test_intervals_hold_on_a_fine_film(mono):
+def test_intervals_contain_the_reference_on_a_fine_film(mono):
     """256 samples on 128² pixels: magnification and distance within 3 sd, of at most 3e-5 and 4 µm.
 
     Seen to fail (5 sd) where the edges' standard errors were taken as smaller than they are.

@@ -80,7 +80,7 @@ def test_j_is_that_of_the_whole_mesh(case):
     assert fspt.invert(matrix, images, settings=Settings(unknowns=400)).surface.unknowns == 642
 
 
-def test_rounds_that_do_not_settle_are_told(case, caplog):
+def test_rounds_that_do_not_converge_are_reported(case, caplog):
     matrix, images = case
     assert fspt.invert(matrix, images).converged
     assert not caplog.records

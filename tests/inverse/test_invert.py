@@ -128,7 +128,7 @@ def test_block_pivoting_gives_the_minimum():
 # --- recovery ---
 
 
-def test_pictures_without_noise_give_j_back(case):
+def test_images_without_noise_give_j_back(case):
     """With σ a millionth of the light, J_n comes back to the matrix's own stated numerical error; χ² stays below 1."""
     matrix, exitance = case
     power = matrix.forward(exitance)
@@ -266,7 +266,7 @@ def test_mlem(case):
 # --- intervals ---
 
 
-def test_intervals_hold(case):
+def test_intervals_contain_the_reference_as_often_as_stated(case):
     """Truths of the penalty's own prior, 60 replicates: 90 % of the intervals of vertices hold, and of totals.
 
     The script interval_calibration.py makes the table with 400. Seen to fail (vertices 79 %) with half of the noise in
@@ -363,7 +363,7 @@ def test_a_flat_field_counts(case):
     assert twice.chi2 == pytest.approx(found.chi2, rel=1e-4)
 
 
-def test_a_misfit_is_told(case, caplog):
+def test_a_misfit_is_reported(case, caplog):
     """Images 30 % of whose light moved by a pixel: χ² says so in one line; right ones say nothing."""
     matrix, exitance = case
     images = noisy(matrix, exitance, 1000, 3)
@@ -393,7 +393,7 @@ def test_files(case, tmp_path):
     assert (tmp_path / "report.png").stat().st_size > 10_000
 
 
-def test_a_scale_in_the_scene_is_told(tmp_path, mono, caplog):
+def test_a_scale_in_the_scene_is_reported(tmp_path, mono, caplog):
     """A mesh in cm with a scale of 10: the PLY is in mm, and one line says to leave the scale out; else none."""
     for scale in (1, 10):
         sphere_views(tmp_path)

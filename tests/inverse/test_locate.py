@@ -81,7 +81,7 @@ def test_a_source_from_images_without_noise(case):
     assert found.chi2 < 0.1
 
 
-def test_intervals_hold(case):
+def test_intervals_contain_the_reference_as_often_as_stated(case):
     """Σ z²/n of 48 values of 12 images is 1 ± 0.2. Seen to fail (8) with a hundredth of the shot noise in σ, and (0.16)
     with four times the covariance.
 
@@ -151,7 +151,7 @@ def test_first_positions_do_not_decide(case, sources, electrons, seed):
         assert abs(one.power - true[3]) < 3.5 * one.power_sd
 
 
-def test_intervals_that_are_not_linear_are_told(case, caplog):
+def test_intervals_that_are_not_linear_are_reported(case, caplog):
     """Two sources 1 mm apart: one line, and `linear` is False; 2 mm apart it is True."""
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
         close = case.locate(case.images((2, 1, -1, 1.5), (2, 0, -1, 1), electrons=3000, seed=2), sources=2)
@@ -178,7 +178,7 @@ def test_bands(case):
     assert both.pixels == 2 * one.pixels
 
 
-def test_a_band_that_is_not_given_is_told(case, caplog):
+def test_a_band_that_is_not_given_is_named(case, caplog):
     """The phantom file has bands: images of one without its name would give the power in that band alone."""
     whole = replace(case.described, bands={})
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
@@ -279,7 +279,7 @@ def test_masked_pixels_do_not_count(case):
     assert found.sources[0].position_sd.max() > clean.sources[0].position_sd.max()
 
 
-def test_a_misfit_is_told(case, caplog):
+def test_a_misfit_is_reported(case, caplog):
     """Images that no single source explains: one line, and chi2 far above 1."""
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
         found = case.locate(case.images(SOURCE, OTHER))
@@ -290,7 +290,7 @@ def test_a_misfit_is_told(case, caplog):
 # --- results ---
 
 
-def test_structure_of_the_residuals_is_told(case, caplog):
+def test_structure_of_the_residuals_is_reported(case, caplog):
     """The right images are not told; one view 10 % too bright is, by its name, in `warnings` and in the summary."""
     images = case.images(SOURCE, electrons=3000)
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
@@ -421,7 +421,7 @@ def test_a_surface_that_is_not_the_phantoms(case, tmp_path_factory):
         fspt.locate(case.described, matrix, noisy(matrix, np.ones(matrix.shape[1]), 1000, 0))
 
 
-def test_a_surface_near_the_border_is_told(case, caplog):
+def test_a_surface_near_the_border_is_reported(case, caplog):
     """A mesh displaced by 0.1 mm is used, and one line says that the intervals do not contain it."""
     moved = replace(case.surface, vertices=case.surface.vertices + np.array([0.1, 0, 0]))
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
@@ -447,7 +447,7 @@ def test_more_sources_than_the_images_determine(case, seed, caplog):
         assert "the images do not show that source 2 is there" in caplog.text
 
 
-def test_images_of_noise_alone_are_told(case, caplog):
+def test_images_of_noise_alone_are_reported(case, caplog):
     """A fit to noise has a large p-value and one line; that to a source's own light a small one and none."""
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
         noise = np.random.default_rng(9).normal(size=case.matrix.image_shape)

@@ -82,7 +82,7 @@ def test_metadata_name_a_monte_carlo():
 
 
 @pytest.mark.parametrize(("electrons", "read_noise"), [(0.02, 0.0), (0.5, 0.0), (3.0, 1.0), (1000.0, 3.5)])
-def test_the_right_noise_is_not_told(electrons, read_noise):
+def test_the_right_noise_gives_no_warning(electrons, read_noise):
     """100 images with the stated noise, of few electrons too: at most one is told, and Σ (noise/σ)² has the stated mean
     and variance, to a fifth. Seen to fail (one of two told) with the variance 2 a pixel of normal noise, at 0.02.
     """
@@ -104,7 +104,7 @@ def test_the_right_noise_is_not_told(electrons, read_noise):
     assert np.std(sums) == pytest.approx(expected.variance**0.5, rel=0.2)
 
 
-def test_noise_stated_too_large_is_told(caplog):
+def test_noise_stated_too_large_is_reported(caplog):
     """χ² of 0.1, the mean of ten frames stated as one, and of 0.47 are told with the factor of the intervals' widths.
 
     Half of a numerical error in σ is no noise: χ² of 0.5 is then not told, since the error is a bound.

@@ -44,7 +44,7 @@ class Linear:
 
 
 @pytest.mark.parametrize("prior", [1.0, 0.003])
-def test_noise_is_no_structure(prior):
+def test_noise_without_structure_gives_no_warning(prior):
     """Σ z² of 300 fits has mean and variance of chi-squared to 4 %, 25 %, and no line is told.
 
     Also where the prior holds most unknowns. Seen to fail (mean 0.8) with the identity in place of I − K.
@@ -123,7 +123,7 @@ def sphere(tmp_path_factory, mono):
     return matrix, surface, 1e-3 * (1 + 0.5 * surface.vertices[:, 2] / RADIUS)
 
 
-def test_a_factor_of_a_view_is_told(sphere, caplog, tmp_path):
+def test_a_factor_of_a_view_is_reported(sphere, caplog, tmp_path):
     """One view is 5 % too bright: one line with view and kind, in `warnings`, in the summary and on the report."""
     pytest.importorskip("matplotlib")
     matrix, surface, exitance = sphere

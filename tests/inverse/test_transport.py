@@ -121,7 +121,7 @@ def test_sums_of_columns_are_form_factors_whatever_the_focus(tmp_path, rtol, dep
     assert not matrix.sensitivity[expected == 0].any()
 
 
-def test_sums_of_rows_are_the_picture_of_one_in_closed_form(tmp_path):
+def test_sums_of_rows_are_the_image_of_one_in_closed_form(tmp_path):
     """A plane that fills every cone: A_vd times the configuration factor, to 1e-5; out of focus too.
 
     Seen to fail with cos⁴θ dropped from the columns, 1/π twice, and u² replaced by a constant.
@@ -136,7 +136,7 @@ def test_sums_of_rows_are_the_picture_of_one_in_closed_form(tmp_path):
 
 @pytest.mark.parametrize("on", ["vertex", "face"])
 @pytest.mark.parametrize("depth", [165.0, 205.0])
-def test_products_are_the_pictures_of_renders(tmp_path, on, depth):
+def test_products_are_rendered_images(tmp_path, on, depth):
     """Expected: rtol of the brightest pixel beside the error of a render ten times finer; within `error` on 99 %.
 
     Seen to fail with two columns swapped, and with cosθ_s dropped.
@@ -220,7 +220,7 @@ def test_no_entry_is_lost_between_the_surface_form_and_lines_of_sight(tmp_path):
 
 
 @pytest.mark.parametrize("distance", [8.5, 40.0])
-def test_an_occluder_hides_what_it_hides_in_a_render(tmp_path, distance):
+def test_an_occluder_hides_the_same_faces_as_in_a_rendering(tmp_path, distance):
     """A dark wall before half the body, in focus and not. Expected: as without it, on smooth J_n.
 
     Seen to fail without rows by lines of sight, and without shadow rays and the picture of J_n = 1.
@@ -239,7 +239,7 @@ def test_an_occluder_hides_what_it_hides_in_a_render(tmp_path, distance):
 
 @pytest.mark.parametrize(("rtol", "bound"), [(1e-3, 0.1), (1e-4, 0.01)])
 @pytest.mark.parametrize("depth", [165.0, 200.0])
-def test_a_column_alone_is_the_picture_of_one_vertex(tmp_path, rtol, bound, depth):
+def test_a_column_alone_is_the_image_of_one_vertex(tmp_path, rtol, bound, depth):
     """Vertices in the middle, at the limb and of faces far below a pixel, each rendered alone.
 
     Expected: 10 % of the column's own brightest entry at rtol 1e-3, 1 % at 1e-4.
@@ -307,7 +307,7 @@ def square_at(x, y, turn, bsdf, size=60.0):
     return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
 
 
-def test_light_by_a_white_wall_is_told(tmp_path):
+def test_light_from_a_white_wall_is_reported(tmp_path):
     """The largest share of any view, once, for J = 1; the same as that of an image of J_n = 1."""
     wall = {
         "type": "rectangle",

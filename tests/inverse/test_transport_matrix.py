@@ -95,7 +95,7 @@ def test_the_transpose_is_the_transpose(matrix):
     np.testing.assert_allclose(matrix.backward(power.reshape(matrix.image_shape)), matrix.T @ power, rtol=1e-12)
 
 
-def test_what_it_says_of_itself(matrix):
+def test_its_summary_in_numbers_and_text(matrix):
     """Views as numbers, sums of columns, surface areas, the seen part; J_n of the scene has no say."""
     assert matrix.views == [{"view": view, "f_number": 2.8} for view in (0, 90, 200)]
     assert matrix.image_shape == (3, 12, 14)
@@ -106,7 +106,7 @@ def test_what_it_says_of_itself(matrix):
     assert matrix.seen.all()
 
 
-def test_what_no_camera_sees_has_no_entries(scene_file):
+def test_vertices_that_no_camera_sees_have_no_entries(scene_file):
     """Of a ball one view sees a little less than half; the columns beyond are empty."""
     found = fspt.transport(scene_file)
     away = BODY.vertices[:, 0] < -1.0
@@ -134,7 +134,7 @@ def test_several_meshes_and_sensors(tmp_path):
     assert fspt.transport(whole, sensor=[0]).views == [{"sensor": 0}]
 
 
-def test_a_file_holds_the_matrix(matrix, tmp_path):
+def test_a_file_contains_the_matrix(matrix, tmp_path):
     """The same numbers after `save` and `read_transport`; one view is read alone; float32 loses no more than 6e-8."""
     matrix.save(tmp_path / "T.npz")
     again = fspt.read_transport(tmp_path / "T.npz")
@@ -149,7 +149,7 @@ def test_a_file_holds_the_matrix(matrix, tmp_path):
 
 
 @pytest.mark.parametrize("count", [1 << 16, (1 << 16) + 1])
-def test_files_hold_the_last_column(tmp_path, count):
+def test_files_contain_the_last_column(tmp_path, count):
     """Seen to fail with 16-bit numbers of columns whatever their count."""
     columns = np.array([count - 1, 3], np.int32)
     light, change = np.array([1, 2], np.float32), np.zeros(2, np.float16)
@@ -274,7 +274,7 @@ def test_images_are_held_against_the_views(scene_file, matrix, caplog):
     assert not caplog.records
 
 
-def test_a_digest_knows_a_mesh_wherever_it_is():
+def test_a_digest_of_a_mesh_does_not_depend_on_its_pose():
     """Rotation and translation in single precision keep it; a moved vertex, a mirror and other faces do not."""
     turn = trimesh.transformations.rotation_matrix(1.1, [1, 2, 3])[:3, :3]
     plain = mesh_digest(BODY.vertices.astype(np.float32), BODY.faces)
@@ -342,7 +342,7 @@ def test_scenes_without_columns_are_refused(tmp_path):
         fspt.transport(world_scene(body | {"emitter": glow(attribute()) | law}))
 
 
-def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
+def test_a_matrix_too_large_for_the_memory_is_refused_before_the_work(tmp_path, monkeypatch):
     """Seen to fail where nothing compares the bytes."""
     from mitsuba_fspt.integral.rows import view_rows
 
@@ -355,7 +355,7 @@ def test_what_no_memory_holds_is_said_before(tmp_path, monkeypatch):
     assert not solved
 
 
-def test_an_rtol_that_is_not_reached_is_told(matrix, scene_file, tmp_path, run, monkeypatch):
+def test_an_rtol_that_is_not_reached_is_reported(matrix, scene_file, tmp_path, run, monkeypatch):
     """In the metadata, and as one line of the verb. Here an integral that states a hundredth of the brightest pixel.
 
     Seen to fail without `warnings` in the metadata.

@@ -35,7 +35,7 @@ def test_images_go_there_and_back(grids):
     assert len(some) == MARKED.sum()
 
 
-def test_places_are_numbers_of_the_whole_picture(grids):
+def test_places_are_numbers_of_the_whole_image(grids):
     some, every = grids
     number = np.arange(MARKED.size).reshape(MARKED.shape)
     np.testing.assert_array_equal(laid(some, some.flat(number * 1.0)), laid(some, some.place(some.number)))

@@ -60,7 +60,7 @@ def test_pixel_pitch_is_that_of_the_image_distance():
     assert np.linalg.det(camera.to_world) == pytest.approx(1)
 
 
-def test_what_a_lens_does_not_have_is_told():
+def test_camera_parameters_that_a_lens_lacks_are_reported():
     """f_y 0.5 % larger and a little skew: left out, 0.2 pixels in the corner; more is refused."""
     unequal = K.copy()
     unequal[1, 1] *= 1.005

@@ -163,7 +163,7 @@ def test_small_numbers_of_numpy_are_plain_numbers():
 
 
 @pytest.mark.parametrize("name", [name for name in number_names() if name not in ("magnification", "image_distance")])
-def test_what_is_no_number_is_refused_with_one_that_would_do(name):
+def test_a_value_that_is_no_number_is_refused_with_a_valid_one(name):
     """Seen to fail: 20 for a numerical aperture, which is below 1."""
     good = {"focal_length": 55.0, "f_number": 8.0, "focus_distance": 165.0}
     good |= {"lens_diameter": 30.0} if name != "pupil_magnification" else {}

@@ -83,7 +83,7 @@ def test_a_number_or_a_curve(tmp_path):
         ({"wavelength_nm": 500.0}, "500,0\n600,1\n", "must be > 0 and at most 1, got 0 at 500 nm in '"),
     ],
 )
-def test_what_no_lens_can_have(tmp_path, numbers, text, message):
+def test_invalid_transmittances(tmp_path, numbers, text, message):
     with pytest.raises(OpticsError, match=re.escape(message)):
         transmittance_of(numbers, curve(tmp_path, text) if text else None)
 

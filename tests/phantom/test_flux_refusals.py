@@ -301,7 +301,7 @@ def test_names_that_are_too_long(tmp_path, monkeypatch, arguments):
     assert [path.name for path in tmp_path.iterdir()] == ["m.ply"]
 
 
-def test_what_meshio_cannot_read_has_a_mend(tmp_path):
+def test_the_message_for_a_file_that_meshio_cannot_read_has_a_fix(tmp_path):
     (tmp_path / "m.vtu").write_text("<VTK")
     with pytest.raises(FluxError, match=r"cannot be read by meshio: .*\. Save it anew\."):
         import_flux(tmp_path / "m.vtu")

@@ -106,7 +106,7 @@ def test_power_per_vertex_is_the_integral_of_linear_exitance():
     assert uneven.power == pytest.approx(3 * 6 + (52 - 12) * 1.5)  # top 2 × 3 at 3 W/mm², sides at 1.5 on average
 
 
-def test_negative_values_need_clip_and_clip_tells_their_power():
+def test_negative_values_need_clip_and_clip_reports_their_power():
     values = np.full(12, 0.5)
     values[np.flatnonzero(np.isclose(BOX.area_faces, 3.0))[0]] = -0.01  # half of a 2 × 3 side
     with pytest.raises(ExitanceError, match=r"1 of 12 values are negative, down to -0.01 .*-0.03 W .*--clip"):
@@ -156,7 +156,7 @@ def test_faces_that_contradict_each_other_are_refused():
         import_flux((VERTICES, twisted), np.ones(8))
 
 
-def test_an_open_surface_is_taken_and_said_to_be_open():
+def test_an_open_surface_is_accepted_with_a_warning():
     report = import_flux((VERTICES, FACES[2:]), np.ones(10)).report()
     assert (report["watertight"], report["outward"]) == (False, None)
 
@@ -177,14 +177,14 @@ def test_vertices_that_no_face_uses_do_not_count():
         (np.full(8, 1e-40), {"length_unit": "m"}, "1e-46"),
     ],
 )
-def test_what_single_precision_cannot_hold_is_refused(values, options, largest):
+def test_values_beyond_single_precision_are_refused(values, options, largest):
     """Rationale: J_n = 1e308 was written, and its power told as inf; Mitsuba counts in 32 bits."""
     with pytest.raises(ExitanceError, match=rf"largest value is {largest} W/mm\^2, the renderer holds 1.2e-38 to 3.4e"):
         import_flux(MESH, values, **options)
     assert import_flux(MESH, np.full(8, 1e38)).power == pytest.approx(52e38)
 
 
-def test_vertices_that_single_precision_cannot_hold_are_refused():
+def test_vertices_beyond_single_precision_are_refused():
     with pytest.raises(FluxError, match=r"a vertex lies at 2e\+39 mm, the renderer holds 3.4"):
         import_flux((VERTICES * 1e39, FACES), np.ones(8))
 

@@ -122,7 +122,7 @@ def test_further_numbers_of_the_lens_reach_it():
         ({"pixel_pitch": 1e-12}, OpticsError, "no magnification"),
     ],
 )
-def test_what_no_camera_can_be(given, error, message):
+def test_invalid_cameras(given, error, message):
     with pytest.raises(error, match=re.escape(message)) as caught:
         fspt.scene_xml(CYLINDER, **given)
     assert "\n" not in str(caught.value)
@@ -176,7 +176,7 @@ def test_camera_files_that_cannot_be_used(tmp_path, content, message):
         camera_lens(path)
 
 
-def test_a_front_out_of_focus_is_said(tmp_path, run):
+def test_a_front_out_of_focus_is_reported(tmp_path, run):
     """A plate 60 mm wide and 8 thick: in view 0 its front is 26.3 mm behind the plane through its edges, 30.3 mm from
     the axis. With the magnification that the line gives, a point of the front is imaged to a point.
     """

@@ -67,7 +67,7 @@ def test_other_names_that_mitsuba_reads(tmp_path, per, name, attribute):
 
 
 @pytest.mark.parametrize("names", [("jn",), ("exitance",), ("jn_x", "phi_x"), ("jn_y",), ()])
-def test_names_that_leave_open_what_is_meant(tmp_path, names):
+def test_ambiguous_names(tmp_path, names):
     values = phantom().exitance
     write_ply(tmp_path / "p.ply", VERTICES, FACES, dict.fromkeys(names, values), "vertex", {})
     listed = ", ".join(f"'{name}' on vertices" for name in names) or "none"
@@ -113,7 +113,7 @@ def test_power_of_a_sphere():
         ({"provenance": {"two words": "x"}}, FluxError, r"'two words' is taken or no single word"),
     ],
 )
-def test_what_a_phantom_cannot_be(changes, error, message):
+def test_invalid_phantoms(changes, error, message):
     with pytest.raises(error, match=message):
         phantom(**changes)
 

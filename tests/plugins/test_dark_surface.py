@@ -38,7 +38,7 @@ def by_attribute(path, level):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("body", [by_value, by_bitmap, by_attribute])
-def test_a_dark_body_gives_a_dark_picture_and_a_warning(body, method, tmp_path):
+def test_a_dark_body_gives_a_dark_image_and_a_warning(body, method, tmp_path):
     """Seen to fail: refused; then with `ptracer` drawing points from a distribution without any mass."""
     image = fspt.render(camera_scene(body(tmp_path, 0.0)), **METHODS[method])
     assert image.shape == (HEIGHT, WIDTH)

@@ -52,7 +52,7 @@ def test_errors_of_others_stay_as_they_are(mono):
     assert isinstance(caught.value.__cause__, KeyError)
 
 
-def test_a_picture_is_returned_as_before(mono):
+def test_an_image_is_returned_as_before(mono):
     picture = mi.render(world_scene(ball(), sensor=lens(8)), seed=3)
     assert picture.shape == (8, 8, 1)
     assert mi.render.__name__ == "render"

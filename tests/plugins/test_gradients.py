@@ -150,7 +150,7 @@ def test_texels_of_a_bitmap():
 
 
 @pytest.mark.parametrize("on", ["vertex", "face"])
-def test_forward_mode_is_the_picture_of_the_tangent(on, tmp_path):
+def test_forward_mode_is_the_image_of_the_tangent(on, tmp_path):
     """By the surface form, which finds the steps between small faces more exactly."""
     scene = mesh_scene(tmp_path, on)
     key = f"shape_0.{on}_exitance"

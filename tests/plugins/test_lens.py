@@ -233,7 +233,7 @@ def test_three_methods_agree_for_every_kind_of_camera(name):
 
 
 @pytest.mark.parametrize("method", ["integral", "path", "ptracer"])
-def test_a_crop_window_is_cut_out_of_the_picture(method):
+def test_a_crop_window_is_cut_out_of_the_image(method):
     options = {} if method == "integral" else {"spp": 2000}
     crop = {"crop_offset_x": 4, "crop_offset_y": 7, "crop_width": 5, "crop_height": 3}
     film = {"type": "hdrfilm", "width": 12, "height": 12, "pixel_format": "luminance"}
@@ -281,7 +281,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_an_updated_parameter_changes_the_picture_as_in_a_fresh_scene(name):
+def test_an_updated_parameter_changes_the_image_as_in_a_fresh_scene(name):
     value = CHANGES[name]
     scene, fresh = (world_scene(ball(), sensor=lens(size=12, pitch=1.0, **s)) for s in ({}, {name: value}))
     before = fspt.render(scene, max_nodes=4)
@@ -333,7 +333,7 @@ def test_the_lens_owns_its_film_and_brings_a_sampler():
     assert own.sampler().sample_count() == 9
 
 
-def test_to_string_tells_every_parameter():
+def test_to_string_lists_every_parameter():
     settings = {"lens_diameter": 30.0, "diaphragm_distance": 5.0}
     text = str(mi.load_dict(lens(**settings)))
     for name in ("model = diaphragm", "focal_length = 55", "f_number = 8", "magnification = 0.5", "pixel_pitch = 0.8"):

@@ -160,7 +160,7 @@ def test_spectra_that_the_lens_refuses(curve, spectrum, tmp_path):
         ({"transmittance_curve": 3.0, "wavelength_nm": 600.0}, "must be the name of a CSV file, got 3.0"),
     ],
 )
-def test_what_the_lens_refuses(settings, message):
+def test_parameters_that_the_lens_refuses(settings, message):
     scene = {"type": "scene", "camera": lens(**settings), "ball": {"type": "sphere"}}
     with pytest.raises(SceneError, match=re.escape(message)) as caught:
         fspt.load(scene)

@@ -442,7 +442,7 @@ def test_the_power_is_differentiable_in_the_exitance():
 
 
 @pytest.mark.parametrize("domain", ["pupil", "surface"])
-def test_slivers_on_which_no_place_is_found_are_no_harm(domain, tmp_path):
+def test_slivers_without_surface_points_have_no_effect(domain, tmp_path):
     """Seen to fail, refused, with every NaN between vertices taken for bad data."""
     square = [(0, -5, -5), (0, 5, -5), (0, 5, 5), (0, -5, 5), (0, 0, 5), (0, 1e-15, 0), (0, 0, 0)]
     faces = [(0, 1, 2), (0, 2, 3)]

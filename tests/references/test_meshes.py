@@ -50,7 +50,7 @@ def cast(mesh: TriangleMesh, origin, direction):
 
 
 @pytest.mark.parametrize("closed", [True, False])
-def test_rasteriser_sees_what_rays_see(closed):
+def test_rasteriser_agrees_with_traced_rays(closed):
     """Rationale: scan conversion with a depth buffer and ray casting look along the same lines of sight.
     Expected: the same image to 1e-11, with occlusion, perspective, exitance per face and dark backs.
     """
@@ -89,7 +89,7 @@ def test_doubled_faces_shine_once_and_insides_are_dark():
     assert turned.max() == 0
 
 
-def test_fine_mesh_of_a_ball_converges_to_the_ball():
+def test_fine_mesh_of_a_sphere_converges_to_the_sphere():
     """Rationale: inscribed triangles miss a sphere by O(h²).
     Expected: order 2 of the whole power under halved edges, 1e-3 of it at last, a pixel RMS of 1e-3.
     """
@@ -105,7 +105,7 @@ def test_fine_mesh_of_a_ball_converges_to_the_ball():
     np.testing.assert_allclose(np.log2(np.divide(off[:2], off[1:])), 2, atol=0.2)
 
 
-def test_mesh_truth_meets_the_closed_form():
+def test_mesh_reference_meets_the_closed_form():
     """Rationale: two triangles across all lines of sight are the analytic sheet. Expected: to 1e-6."""
     plane = sheet(400.0)
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
@@ -117,7 +117,7 @@ def test_mesh_truth_meets_the_closed_form():
     assert 0 < error.max() < 1e-6 * power.max()
 
 
-def test_mesh_truth_states_its_error():
+def test_mesh_reference_states_its_error():
     """Rationale: independent shifts make the standard error honest, and only hard pixels need refinement.
     Expected: the RMS error against a finer run is within a factor of two of the one stated, at both levels.
     """
@@ -132,7 +132,7 @@ def test_mesh_truth_states_its_error():
     assert rms(bound) / truth.max() < stated[1] < stated[0] / 2 < 1e-3
 
 
-def test_mesh_truth_of_a_region_is_that_of_the_whole():
+def test_mesh_reference_of_a_region_is_that_of_the_whole():
     lens = camera(width=24, height=20, pixel_pitch=0.25)
     mesh = ball_mesh([0, 0, 180.0], 4.0, 3)
     region = np.zeros((20, 24), bool)

@@ -108,7 +108,7 @@ def test_a_dark_back_hides_what_lies_behind():
     np.testing.assert_allclose(power[:, 3:], free[:, 3:], rtol=1e-12)
 
 
-def test_picture_is_upright_and_not_mirrored():
+def test_image_is_upright_and_not_mirrored():
     """Rationale: +y of the camera frame is up, +x left, as in Mitsuba; row 0 is at the top."""
     power, _ = pupil_form(camera(), [Sphere([5.0, 4.0, 165.0], 1.0)], uniform, 256, "lattice")
     assert np.unravel_index(power.argmax(), power.shape) == (0, 0)

@@ -49,7 +49,7 @@ def test_the_depth_and_the_share_are_in_the_metadata(images):
     assert three.metadata["light_left_out"] == 0
 
 
-def test_every_method_that_leaves_it_out_says_so(images):
+def test_every_method_that_leaves_it_out_reports_it(images):
     integral, straight, three = (image.metadata.get("warnings", "") for image in images)
     assert "which Eq. 9 leaves out. Render with method path and max_depth 3 to see it" in integral
     assert "after more than max_depth = 1 segments, which are left out. Give max_depth = 3 to see it" in straight
@@ -72,7 +72,7 @@ def test_compare_names_the_light_of_one_image(images):
     assert same.z_test.p_value > 1e-3
 
 
-def test_mirrors_that_too_few_segments_do_not_reach_are_told():
+def test_mirrors_beyond_the_longest_path_are_reported():
     """A mirror behind the ball: one segment shows none of it, and the integral contains it."""
     mirror = {"type": "rectangle", "to_world": PLACE().translate([-8, 0, 0]).rotate([0, 1, 0], 90).scale(20)}
     scene = world_scene(ball(), mirror | {"bsdf": {"type": "conductor"}}, sensor=lens(**FILM))

@@ -84,7 +84,7 @@ def test_shapes_that_move_alone_are_moved_in_place_and_the_image_is_that_of_the_
     assert np.array_equal(live.image(values).power, wanted.power)
 
 
-def test_a_mesh_that_is_written_again_is_loaded_again(mono, tmp_path):
+def test_a_mesh_file_that_changed_is_loaded_again(mono, tmp_path):
     """Half the size, a quarter of the power: the silhouette's area counts."""
     path = tmp_path / "body.obj"
     faces = "f 1 2 3\nf 1 3 4\n"

@@ -27,7 +27,7 @@ def scene():
     )
 
 
-def test_a_picture_has_power_error_coverage_and_its_story(scene):
+def test_an_image_has_power_error_coverage_and_metadata(scene):
     image = fspt.render(scene)
     assert image.power.shape == image.error.shape == image.coverage.shape == (8, 8)
     assert 0 < image.error.max() < 2e-2 * image.power.max()
@@ -104,7 +104,7 @@ def test_the_standard_error_of_monte_carlo_is_its_scatter(scene, method):
 
 
 @pytest.mark.parametrize("method", ["path", "ptracer"])
-def test_what_no_sample_met_has_the_error_of_a_single_one(method):
+def test_pixels_that_no_sample_met_have_the_error_of_a_single_one(method):
     """Expected: the light that few samples miss on the pixels of the rim is within some errors. Fails with none (0)."""
     scene = world_scene(ball(radius=3.0), sensor=lens(size=48, pixel_pitch=0.1, f_number=2.8))
     exact = fspt.render(scene, rtol=1e-3).power
@@ -119,7 +119,7 @@ def test_what_no_sample_met_has_the_error_of_a_single_one(method):
     assert (missed < 4 * error).mean() > 0.9
 
 
-def test_what_no_sample_missed_beside_a_border_has_the_error_of_a_single_miss():
+def test_pixels_at_a_border_that_no_sample_missed_have_the_error_of_a_single_miss():
     """Expected: the darkness that few samples find on pixels inside a blurred rim is within some errors.
 
     Fails for one in twelve of these pixels, by 26 errors, with their scatter alone.
@@ -198,7 +198,7 @@ def test_the_scenes_own_monte_carlo_is_taken():
 
 
 @pytest.mark.parametrize("options", [{"max_nodes": 40}, {"method": "path", "spp": 4}])
-def test_progress_is_told(scene, options):
+def test_progress_is_reported(scene, options):
     told = []
     fspt.render(scene, progress=lambda what, share: told.append((what, share)), **options)
     assert {what for what, _ in told} == ({"integrating"} if "max_nodes" in options else {"sampling"})
@@ -208,7 +208,7 @@ def test_progress_is_told(scene, options):
     assert max(shares) <= 1
 
 
-def test_exitance_scales_the_picture_and_nothing_clips():
+def test_exitance_scales_the_image_without_clipping():
     """Twelve decades."""
     sums = [fspt.render(world_scene(ball(j)), max_nodes=4).power.sum() / j for j in (1e-6, 1.0, 1e6)]
     np.testing.assert_allclose(sums, sums[0], rtol=1e-5)
@@ -241,7 +241,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_settings_that_mean_nothing_are_refused(scene, name):
+def test_settings_without_effect_are_refused(scene, name):
     options, message = WRONG[name]
     with pytest.raises(SceneError) as refused:
         fspt.render(scene, **options)
@@ -262,7 +262,7 @@ def test_numbers_of_numpy_and_arrays_without_axes_are_numbers(scene, tmp_path):
     image.write(tmp_path / "a.exr")
 
 
-def test_a_scene_of_another_variant_is_told_from_what_is_no_scene(scene):
+def test_a_scene_of_another_variant_has_a_message_of_its_own(scene):
     """Seen to fail: 'Broadcast from type mitsuba.Shape to type mitsuba.Shape failed'."""
     before = mi.variant()
     mi.set_variant("llvm_ad_rgb")
@@ -283,7 +283,7 @@ def test_only_a_lens_makes_watts():
             fspt.render(scene, **options)
 
 
-def test_a_dark_picture_keeps_the_warning_of_light_left_out(mono):
+def test_a_dark_image_keeps_the_warning_of_light_left_out(mono):
     """A surface that faces a wall behind it: no light comes straight, some by the wall, and both are told.
 
     Seen to fail: that the picture is dark took the place of the light left out.
@@ -296,7 +296,7 @@ def test_a_dark_picture_keeps_the_warning_of_light_left_out(mono):
     assert dark.startswith("the picture is dark")
 
 
-def test_a_wall_that_light_outside_the_picture_shines_on_is_told(mono):
+def test_a_wall_lit_from_outside_the_image_is_reported(mono):
     """No emitter is in the picture: Monte Carlo shows the wall, the integral nothing, and says so.
 
     Seen to fail: without a pixel that can see an emitter nothing was estimated.

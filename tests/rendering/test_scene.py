@@ -145,7 +145,7 @@ def test_a_name_in_a_text_is_read_as_mitsuba_does(tmp_path):
     assert read_xml(tmp_path / "s.xml", {"f": "2"}).fill_in("$f_n") == "2.5"
 
 
-def test_files_are_looked_for_beside_the_scene_and_nowhere_after(tmp_path, monkeypatch):
+def test_files_are_searched_beside_the_scene_and_nowhere_else(tmp_path, monkeypatch):
     (tmp_path / "scene").mkdir()
     (tmp_path / "elsewhere").mkdir()
     sheet(tmp_path / "scene" / "sheet.ply")
@@ -341,7 +341,7 @@ def test_textures_nest_in_a_scene_file(tmp_path):
 # --- what may change after loading ---
 
 
-def test_updating_a_number_scales_the_picture():
+def test_updating_a_number_scales_the_image():
     scene = world_scene(ball(1e-3))
     before = fspt.render(scene, max_nodes=4).power
     parameters = mi.traverse(scene)
@@ -390,7 +390,7 @@ def test_updating_to_values_that_cannot_be_is_refused_at_every_render(graded, va
     assert fspt.render(scene, max_nodes=4).power.max() > 0
 
 
-def test_a_moved_shape_is_seen_where_it_went():
+def test_a_moved_shape_is_rendered_in_its_new_pose():
     scene = world_scene(ball(radius=2.0), sensor=lens(size=9))
     parameters = mi.traverse(scene)
     parameters["shape_0.to_world"] = mi.Transform4f().translate([0, 4, 0]).scale(2)
@@ -421,7 +421,7 @@ llvm_only = pytest.mark.skipif(not mi.variant().startswith("llvm"), reason="Embr
 
 
 @llvm_only
-def test_load_turns_robust_tracing_on_whatever_the_file_says(aligned):
+def test_load_turns_robust_tracing_on_for_any_setting_of_the_file(aligned):
     plain, ours = mi.load_file(str(aligned)), fspt.load(aligned)
     assert lost_rays(plain, lens_centre(plain)) > 0
     assert lost_rays(ours, lens_centre(ours)) == 0
@@ -450,7 +450,7 @@ def test_texts_and_dictionaries_are_traced_robustly_too(aligned, monkeypatch):
     assert lost_rays(plain, lens_centre(plain)) > 0
 
 
-def test_a_scene_that_no_robust_mode_mends_is_taken_as_it_is(aligned, monkeypatch, capfd):
+def test_a_scene_that_robust_tracing_does_not_correct_is_left_as_it_is(aligned, monkeypatch, capfd):
     scene = fspt.load(aligned)
     monkeypatch.setattr(robust_tracing, "lost_rays", lambda *_: 3)
     assert robust_tracing.robust_scene(scene, lens_centre(scene)) is scene
@@ -458,7 +458,7 @@ def test_a_scene_that_no_robust_mode_mends_is_taken_as_it_is(aligned, monkeypatc
 
 
 @llvm_only
-def test_the_integral_is_right_where_the_scene_lost_rays_and_says_so(aligned, capfd):
+def test_the_integral_is_right_in_a_scene_that_loses_rays_and_reports_it(aligned, capfd):
     truth = fspt.render(fspt.load(aligned), pixel="centre")
     scene = mi.load_file(str(aligned))
     level = mi.log_level()

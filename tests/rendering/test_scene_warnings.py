@@ -23,13 +23,13 @@ def told(scene, **settings):
 
 @pytest.mark.parametrize("settings", [{}, {"method": "path", "spp": 4}])
 @pytest.mark.parametrize("side", ["interior", "exterior"])
-def test_a_medium_is_told(side, settings):
+def test_a_medium_is_reported(side, settings):
     scene = world_scene(ball(), box(**{side: ABSORBING}), sensor=lens(**SMALL))
     assert f"shape_1 {MEDIUM}" in told(scene, **settings)
     assert MEDIUM not in told(world_scene(ball(), box(), sensor=lens(**SMALL)), **settings)
 
 
-def test_a_medium_around_the_lens_is_told():
+def test_a_medium_around_the_lens_is_reported():
     assert f"camera {MEDIUM}" in told(world_scene(ball(), sensor=lens(**SMALL, medium=ABSORBING)))
 
 
@@ -38,7 +38,7 @@ def test_volpath_treats_media():
     assert told(scene, spp=4) == ""
 
 
-def test_a_medium_is_told_on_stderr(run, tmp_path):
+def test_a_medium_is_reported_on_stderr(run, tmp_path):
     slab = """
     <shape type="cube" id="fog">
         <transform name="to_world"><scale value="12"/></transform>
@@ -52,7 +52,7 @@ def test_a_medium_is_told_on_stderr(run, tmp_path):
     assert warned.count("\n") == 1
 
 
-def test_a_blend_of_mirror_and_white_is_told():
+def test_a_blend_of_mirror_and_white_is_reported():
     """Mitsuba divides a mirror's light by the density of the scattering part: at half and half it loses up to 24 %."""
     mirror = {"type": "conductor"}
     rectangle = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 9, 0])}
@@ -66,7 +66,7 @@ def test_a_blend_of_mirror_and_white_is_told():
 
 
 @pytest.mark.parametrize("bsdf", [{"type": "null"}, {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}])
-def test_a_glowing_surface_that_lets_light_pass_is_told_for_path(bsdf):
+def test_a_glowing_surface_that_lets_light_pass_is_reported_for_path(bsdf):
     """The integral takes J_n as it is, Mitsuba's path dims it by the share that passes."""
     scene, bare = (world_scene(ball() | more, sensor=lens(**SMALL)) for more in ({"bsdf": bsdf}, {}))
     assert "shape_0 glows and lets light pass" in told(scene, method="path", spp=4)
@@ -75,7 +75,7 @@ def test_a_glowing_surface_that_lets_light_pass_is_told_for_path(bsdf):
 
 
 @pytest.mark.parametrize("settings", [{"rtol": 0.1}, {"method": "path", "spp": 4}])
-def test_diffraction_is_told_from_one_pixel_on(settings):
+def test_diffraction_is_reported_from_one_pixel_on(settings):
     """On pixels of 1.8 mm, 1.22 · 600 nm · N · 1.5 is one pixel at f/1639."""
     for f_number, pixels in ((1600, 0.976), (1700, 1.037)):
         image = fspt.render(world_scene(ball(), sensor=lens(**SMALL, f_number=f_number)), **settings)

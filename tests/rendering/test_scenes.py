@@ -73,7 +73,7 @@ def test_committed_mesh_is_what_the_script_makes(made):
     np.testing.assert_array_equal(mesh.vertices, fresh.vertices)
 
 
-def test_committed_picture_is_what_the_script_makes():
+def test_committed_image_is_what_the_script_makes():
     with OpenEXR.File(str(SCENES / "textured_sphere.exr")) as file:
         (name,) = file.channels()
         pixels = file.channels()[name].pixels
@@ -131,7 +131,7 @@ def test_l_is_flat_faces_x_and_is_no_mirror_image_of_itself():
     assert (y, z) == pytest.approx((-180 * 3 / 204, -180 * 3 / 204), rel=1e-6)
 
 
-def test_sphere_picture_has_the_f_on_longitude_0_stem_west():
+def test_sphere_image_has_the_f_on_longitude_0_stem_west():
     picture = make_scenes.sphere_picture()
     assert picture.shape == (256, 512)
     centred = np.roll(picture, 256, axis=1)  # longitude 0 in the middle
@@ -297,7 +297,7 @@ def test_all_scenes_are_listed_here():
 
 
 @pytest.mark.parametrize(("distance", "tilt"), [(165, 0), (100, 0), (370, 0), (165, 55), (165, -55)])
-def test_uniform_disk_fills_every_cone_where_it_says_so(distance, tilt):
+def test_uniform_disk_fills_the_image_from_the_whole_pupil(distance, tilt):
     """Lines from the edge of the f/2.8 pupil through the picture's corners meet the front of the disk."""
     u, half = 165.0, 256 * 0.108  # mm; half of the virtual detector = 128 pixels of 0.108 mm / 0.5
     corner = half * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])

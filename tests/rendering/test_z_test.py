@@ -33,7 +33,7 @@ def scaled(image, factor):
 
 
 @pytest.mark.parametrize("spp", [16, 64, 256])
-def test_correct_pictures_pass_as_often_as_they_should(pictures, spp):
+def test_correct_images_pass_as_often_as_they_should(pictures, spp):
     """Rationale: p of two correct pictures is uniform in 0 … 1, whatever the samples; at most it is too large.
 
     Expected, of 20 pairs: mean 1/2 - 0.2 (three standard deviations) … 0.8, none below 1e-3 (all 20 above it: 98 %),

@@ -220,7 +220,7 @@ def test_llvm_is_taken_where_there_is_no_cuda(hardware: SimpleNamespace) -> None
 
 
 @pytest.mark.parametrize("llvm", [(-1, -1, -1), (16, 0, 6)])
-def test_where_nothing_works_one_line_says_what_to_install(
+def test_without_a_backend_one_line_names_what_to_install(
     hardware: SimpleNamespace, llvm: libllvm.Version, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A machine whose only library of that name is broken."""
@@ -247,7 +247,7 @@ def test_where_nothing_works_one_line_says_what_to_install(
         assert part in message
 
 
-def test_where_nothing_works_no_variant_is_set() -> None:
+def test_without_a_backend_no_variant_is_set() -> None:
     """In a process that sees no CUDA device and is told of an LLVM that is not there."""
     script = """
 import mitsuba_fspt, mitsuba

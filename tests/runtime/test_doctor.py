@@ -42,7 +42,7 @@ def test_a_broken_llvm_is_a_line_of_the_report(monkeypatch: pytest.MonkeyPatch) 
         ("raise ImportError('no such driver')", "ImportError: no such driver"),
     ],
 )
-def test_a_trial_that_dies_is_told_in_one_line(script: str, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_that_dies_is_reported_in_one_line(script: str, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_TRIAL", script)
     assert doctor.run_trial("llvm_ad_mono") == reason
 
@@ -53,7 +53,7 @@ def test_a_trial_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor.run_trial("llvm_ad_mono") == "did not finish within 0.5 s"
 
 
-def test_a_missing_package_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> str:
         raise metadata.PackageNotFoundError(name)
 

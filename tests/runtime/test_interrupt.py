@@ -39,7 +39,7 @@ def test_an_interrupt_that_became_another_exception_is_one_again(mono):
         dr.while_loop((mono.UInt32(0),), lambda k: k < 3, body)
 
 
-def test_an_interrupt_of_a_destructor_is_not_told_but_comes_again(monkeypatch):
+def test_an_interrupt_of_a_destructor_is_not_printed_but_raised_again(monkeypatch):
     """Python can but print it, and the command line promises one line. Seen to fail with its hook left alone."""
     told = []
     monkeypatch.setattr(sys, "unraisablehook", told.append)
@@ -60,7 +60,7 @@ def test_what_was_wrong_without_ctrl_c_stays_what_it_was():
         raise RuntimeError("of its own")
 
 
-def test_our_own_errors_say_what_is_wrong_after_ctrl_c_too():
+def test_our_own_errors_are_raised_after_ctrl_c_too():
     def say():
         with pytest.raises(KeyboardInterrupt):
             press()

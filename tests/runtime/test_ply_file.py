@@ -77,7 +77,7 @@ def test_a_whole_ply_is_read(tmp_path, content):
     fspt.load(write_scene(tmp_path / "s.xml", shapes=SHAPE))
 
 
-def test_a_text_without_its_last_line_break_is_read_and_told(tmp_path, caplog):
+def test_a_text_without_its_last_line_break_is_read_with_a_warning(tmp_path, caplog):
     """Programs that join lines leave it out; of a file that was cut there, the last number may lack digits."""
     (tmp_path / "m.ply").write_bytes(text_ply()[:-1])
     assert len(fspt.Phantom.read(tmp_path / "m.ply").faces) == 8

@@ -20,7 +20,7 @@ FEW = {"likely": 4, "random": 2}
 
 
 @pytest.mark.parametrize(("family", "seed"), SCENES)
-def test_stated_errors_hold(family, seed):
+def test_stated_errors_bound_the_errors(family, seed):
     """Of six pixels each, four of them where errors are likely, none is beyond its own error at rtol 1e-2."""
     found = audit.audited(family, seed, 1e-2, **FEW)
     assert (found.beyond_error, found.silent, found.beyond_random) == (0, 0, 0)
@@ -28,14 +28,14 @@ def test_stated_errors_hold(family, seed):
 
 
 @pytest.mark.parametrize(("family", "seed"), [("boxes", 0), ("meshes", 1)])
-def test_stated_errors_of_the_matrix_hold(family, seed):
+def test_stated_errors_of_the_matrix_bound_the_errors(family, seed):
     """As for pictures, with J_n random on vertices and on faces."""
     found = audit.audited(family, seed, 1e-2, **FEW, matrix=True)
     assert (found.beyond_error, found.silent, found.beyond_random) == (0, 0, 0)
     assert found.largest <= 1e-2
 
 
-def test_wrong_pictures_are_noticed(monkeypatch):
+def test_wrong_images_are_noticed(monkeypatch):
     """A picture that is 3 % too bright: beyond rtol and beyond its errors on bright pixels, silently."""
     render = audit._rendered
 

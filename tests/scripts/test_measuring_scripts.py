@@ -66,7 +66,7 @@ def test_scaling_measures_every_setting(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.count("the logarithm") == 2
 
 
-def test_start_time_tells_what_the_kernels_cost(tmp_path, monkeypatch, capsys):
+def test_start_time_gives_the_time_of_the_kernels(tmp_path, monkeypatch, capsys):
     scene = write_scene(tmp_path / "ball.xml")
     monkeypatch.setattr(sys, "argv", ["start_time.py", "--scene", str(scene), "--rounds", "1"])
     start_time.main()
@@ -82,7 +82,7 @@ def four_nodes(scene, lens, least_rtol):
     return [converge_methods.integral(scene, lens, "pupil", (1.0,))], {}
 
 
-def test_work_precision_makes_the_truth_once_and_counts_from_it(tmp_path, monkeypatch, capsys):
+def test_work_precision_computes_the_reference_once(tmp_path, monkeypatch, capsys):
     """The real command on the real scene, with a truth of few points of the pupil and one setting of one method.
 
     Expected: a second run takes the file of the first, the CSV file names it, and four lines of sight a pixel agree

@@ -48,7 +48,7 @@ def test_border_of_a_disc_lies_at_its_radius(radius):
     assert paper_stops.peak_to_border(power, 0.05)[1] == pytest.approx(radius + 1.8, abs=0.25)
 
 
-def test_the_nearer_border_counts_and_one_outside_the_picture_does_not():
+def test_the_nearer_border_counts_and_one_outside_the_image_does_not():
     power = disc(40.0, 10.0, 2.0)
     power[:, :40] = np.maximum(power[:, :40], 0.9)  # light up to the left edge
     assert paper_stops.peak_to_border(power, 0.5)[1] == pytest.approx(10.0, abs=0.05)
@@ -93,7 +93,7 @@ def test_binning_sums_and_keeps_the_scale():
     np.testing.assert_allclose(paper_common.places(found), [-0.3, 0.3])
 
 
-def test_tables_fill_their_places_in_a_text(tmp_path):
+def test_tables_are_written_between_their_marks(tmp_path):
     table = Table("one", {"view": "", "ME": ".3f"}, [("left", 0.12345), ("back", None)])
     text = tmp_path / "text.md"
     text.write_text("before\n<!-- table: one -->\nold\n<!-- /table -->\nafter\n", encoding="utf-8")

@@ -58,7 +58,7 @@ def test_no_order_where_errors_do_not_fall_with_the_work():
 
 
 @pytest.mark.usefixtures("mono")
-def test_what_takes_longer_than_the_budget_is_left_out_and_says_so():
+def test_settings_beyond_the_budget_are_left_out_and_named():
     def prepare(value):
         def run():
             time.sleep(0.05 * value)
@@ -109,7 +109,7 @@ def test_ratio_is_paired_so_that_a_slow_round_does_not_decide():
     assert found(ours, peer).ratio("a", "b", 1e-3) is None
 
 
-def test_text_and_json_hold_what_was_found():
+def test_text_and_json_contain_the_results():
     told = found(row(rays=100, rms=1e-2), row(rays=10000, rms=1e-4, seconds=(0.05, 0.05)), stated=3e-5)
     text = told.render_text()
     assert "skipped: b: no surface" in text
@@ -178,7 +178,7 @@ def test_every_method_comes_nearer_with_its_knob(tmp_path):
 
 
 @pytest.mark.usefixtures("mono", "short")
-def test_a_dark_picture_is_refused():
+def test_a_dark_image_is_refused():
     scene = small_scenes.camera_scene(small_scenes.sphere(200.0, 10.0, x=400.0))
     with pytest.raises(SceneError, match="dark"):
         fspt.converge(scene)
@@ -231,7 +231,7 @@ def test_raw_rays_are_as_many_as_asked_for():
 
 
 @pytest.mark.usefixtures("mono", "short")
-def test_reference_is_as_near_to_the_closed_form_as_it_says():
+def test_reference_meets_the_closed_form_within_its_error():
     """Rationale: a uniform disk that fills every cone has a picture in closed form. Expected: within the stated error.
 
     The statement is no empty one: below 1e-5 of the peak.
@@ -246,7 +246,7 @@ def test_reference_is_as_near_to_the_closed_form_as_it_says():
     assert "surface form" in made.check
 
 
-def test_reference_states_what_its_check_cannot_explain(monkeypatch):
+def test_reference_states_the_difference_that_its_check_cannot_explain(monkeypatch):
     """A form that is off by 1 % where it claims nothing is told off by the other one."""
 
     def finest(scene, lens, domain, seconds):
@@ -354,7 +354,7 @@ def test_a_budget_too_short_for_any_setting_is_refused(tmp_path, capfd):
 
 
 @pytest.mark.usefixtures("in_a_folder_of_its_own")
-def test_without_matplotlib_it_says_so_before_the_work(tmp_path, capfd, monkeypatch):
+def test_without_matplotlib_it_stops_before_the_work(tmp_path, capfd, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     monkeypatch.setattr(converge, "converge", lambda *_, **__: pytest.fail("the work began"))
     assert app.run(["converge", "s.xml"]) == 2

@@ -142,7 +142,7 @@ def test_values_are_numbers_arrays_text_or_one_alone(scene):
     assert rows[1].file.name == "s_f_number=5.6_distance=170.exr"
 
 
-def test_values_that_no_file_name_holds_stay_apart(tmp_path):
+def test_values_that_no_file_name_can_contain_stay_apart(tmp_path):
     shapes = '<default name="note" value=""/>' + BALL_XML.replace("<shape", '<shape id="$note"')
     path = write_scene(tmp_path / "m.xml", shapes=shapes)
     rows = fspt.sweep(path, {"note": ["a/b", "a-b"]}, "o")
@@ -273,7 +273,7 @@ def test_a_second_run_renders_what_is_missing_broken_or_another(scene, tmp_path,
     assert index_without_times(tmp_path / "o") == index
 
 
-def test_the_report_tells_what_was_rendered_from_what_was_there(run):
+def test_the_report_separates_new_images_from_those_kept(run):
     """Seen to fail with the time of all images, old ones too, called the time of rendering."""
     assert run("sweep", "s.xml", "-D", "f_number=2.8,8")[0] == 0
     _, out, _ = run("sweep", "s.xml", "-D", "f_number=2.8,8,11")

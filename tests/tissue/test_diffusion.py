@@ -52,7 +52,7 @@ def nylon() -> DiffusionSolution:
 @pytest.mark.parametrize(
     ("order", "local", "total"), [(1, (1.8, 1.8e-3), (1.8, 3.5e-3)), (2, (2.4, 1.6e-4), (3.8, 3.6e-5))]
 )
-def test_order_of_convergence_on_a_ball(order: int, local: tuple[float, float], total: tuple[float, float]) -> None:
+def test_order_of_convergence_on_a_sphere(order: int, local: tuple[float, float], total: tuple[float, float]) -> None:
     """Rationale: a point source 3 mm off the middle of a ball is exact by a Legendre series.
 
     Expected behaviour: J_n falls as edge^(order + 1), measured 2.08 and 2.65 (the meshes are not quite similar), the
@@ -190,7 +190,7 @@ def test_regions_of_the_same_optics_change_nothing(nylon: DiffusionSolution) -> 
     assert dark.solved.exited < 0.98 * nylon.solved.exited
 
 
-def test_a_ball_of_light_outside_is_a_brighter_point() -> None:
+def test_a_sphere_of_light_seen_from_outside_is_a_brighter_point() -> None:
     """Rationale: mean value property, φ of a uniform ball outside = point · 3 (x cosh x - sinh x)/x³, x = ka.
 
     On the border φ and its slope have no jump, inside the equation holds, by differences. Seen to fail
@@ -225,7 +225,7 @@ def test_free_field_without_absorption() -> None:
     np.testing.assert_allclose(ball.fluence(points), exact, rtol=3e-6)
 
 
-def test_rod_nodes_are_uniform() -> None:
+def test_cylinder_nodes_are_uniform() -> None:
     """Rationale: shares sum to 1, the mean is the centre, second moments are L²/12 along and r²/4 across.
 
     Expected behaviour: for a skew axis too. Seen to fail with nodes uniform in radius instead of its square.

@@ -49,7 +49,7 @@ def test_file_layout(tmp_path: Path) -> None:
     assert np.frombuffer(content[48:], "<f4").tolist() == list(range(24))
 
 
-def test_voxels_hold_the_fluence(nylon: DiffusionSolution, volume: Volume) -> None:
+def test_voxels_contain_the_fluence(nylon: DiffusionSolution, volume: Volume) -> None:
     """Rationale: every voxel whose middle is in the true cylinder has the fluence there, to float32."""
     z, y, x = np.meshgrid(*centres(volume), indexing="ij")
     inside = (np.hypot(x, y) < 15) & (np.abs(z) < 15)

@@ -87,7 +87,7 @@ def test_the_documented_example(tmp_path: Path) -> None:
     }
 
 
-def test_everything_a_file_can_say(tmp_path: Path) -> None:
+def test_every_key_of_a_phantom_file(tmp_path: Path) -> None:
     """Every kind of source and region, and all that has a default."""
     text = SMALL.replace("musp = 1", 'musp = 1\nn = 1.4\na = "haskell"') + (
         '[[sources]]\nshape = "sphere"\ncentre = [0, 0.5, 1]\nradius = 0.5\n'
@@ -250,7 +250,7 @@ def test_flux_solve(tmp_path: Path) -> None:
         ("edge = 2\n", "edge = 1e-300\n", r"geometry: .* about inf tetrahedra.* Give an edge above 0\.1 mm"),
     ],
 )
-def test_what_no_memory_holds_is_refused_before_the_work(
+def test_a_mesh_too_large_for_the_memory_is_refused_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, message: str
 ) -> None:
     """Rationale: the process was killed for its memory after a minute, without a word."""
@@ -260,7 +260,7 @@ def test_what_no_memory_holds_is_refused_before_the_work(
         described(tmp_path, SMALL.replace(old, new)).solve()
 
 
-def test_a_filling_that_no_memory_holds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_filling_too_large_for_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cube of 1 mm³ has 8.5 regular tetrahedra of 1 mm. The mesher is not asked."""
     monkeypatch.setitem(sys.modules, "pytetwild", object())
     cube = trimesh.creation.box((1.0, 1.0, 1.0))

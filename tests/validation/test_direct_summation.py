@@ -29,7 +29,7 @@ def summed(*shapes, minimum=20000, **lens):
 
 
 @pytest.mark.parametrize("depth", [120.0, 230.0])
-def test_sum_over_points_carries_what_enters_the_diaphragm(depth):
+def test_sum_over_points_is_the_power_that_enters_the_diaphragm(depth):
     """Rationale: fine enough, the sum is Eq. 9, before and behind the sharp plane: Σ P = J_n A sin²θ on the axis.
 
     Expected: 1 %, by pixel centres in a blur disc of some 40 pixels; cos⁴ over a patch of 2 mm is 1e-4.
@@ -45,7 +45,7 @@ def test_sum_over_points_comes_to_the_integral_far_from_the_sharp_plane():
     assert np.abs(summed(body, minimum=1 << 18) - truth).max() < 0.02 * truth.max()
 
 
-def test_sum_over_points_is_sparse_beside_the_sharp_plane_and_misses_what_lies_in_it():
+def test_sum_over_points_is_sparse_beside_the_virtual_detector_plane_and_misses_bodies_in_it():
     """Rationale: the blur disc shrinks below a pixel and hits a centre by luck; in the plane itself it never does."""
     near = summed(patch(FOCUS + 1), minimum=288, f_number=22.0, pixel_pitch=0.05)
     inside = near[HEIGHT // 2 - 6 : HEIGHT // 2 + 6, WIDTH // 2 - 6 : WIDTH // 2 + 6]
@@ -62,7 +62,7 @@ def test_points_that_face_away_or_are_hidden_give_nothing():
     np.testing.assert_allclose(both, alone, rtol=0, atol=1e-6 * alone.max())
 
 
-def test_picture_is_upright():
+def test_image_is_upright():
     """A patch up and to the right (x < 0, y > 0 of the camera frame) shines above and to the right of the middle."""
     power = summed(patch(230.0, x=-4.0, y=3.0))
     row, column = (power.sum(axis=1 - axis) @ np.arange(power.shape[axis]) / power.sum() for axis in (0, 1))

@@ -17,7 +17,7 @@ CASES = [case for case in stiff_cases.cases() if not case.slow]
 
 @pytest.mark.usefixtures("mono")
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_row_holds(case):
+def test_row_meets_its_bound(case):
     result = check(case)
     assert result.ok, result.render_text()
 

@@ -76,7 +76,7 @@ def read_out(page, column, row):
     return float(power), float(error)
 
 
-def test_a_drag_moves_the_picture_and_the_read_out_is_the_number_in_the_exr(page, tmp_path):
+def test_a_drag_moves_the_image_and_the_read_out_is_the_number_in_the_exr(page, tmp_path):
     before = read_out(page, 20, 20)
     box = page.locator('input[type=range][name="a:f_number"]').bounding_box()
     middle = box["y"] + box["height"] / 2

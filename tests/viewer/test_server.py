@@ -76,7 +76,7 @@ def test_a_stranger_gets_no_channel(address, fault):
             open_page(changed, "http://example.org" if fault == "origin" else None)
 
 
-def test_pictures_are_those_of_render_and_requests_that_make_no_sense_are_told(address):
+def test_images_are_those_of_render_and_invalid_requests_are_refused(address):
     with open_page(address) as page:
         hello, _ = receive(page)
         assert [slider["name"] for slider in hello["sliders"]] == ["f_number", "turn"]

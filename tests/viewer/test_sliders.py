@@ -17,7 +17,7 @@ def sliders(text, **given):
 
 
 @pytest.mark.parametrize("scene", sorted(SCENES.glob("*.xml")), ids=lambda path: path.stem)
-def test_sliders_of_the_scenes_hold_their_values_and_leave_out_size_accuracy_and_seeds(scene):
+def test_sliders_of_the_scenes_have_their_values_and_leave_out_size_accuracy_and_seeds(scene):
     found = sliders_of(read_xml(scene, {}))
     assert "f_number" in {slider.name for slider in found}
     for slider in found:

@@ -43,7 +43,7 @@ def mixed_xml(tmp_path):
 
 
 @pytest.mark.parametrize("settings", [{}, {"method": "path", "spp": 4}])
-def test_faces_that_turn_both_ways_are_told(tmp_path, settings):
+def test_faces_of_both_orientations_are_reported(tmp_path, settings):
     """A third of the faces points inward, and as much of the power is missing."""
     assert MIXED in told(sphere(tmp_path / "mixed.ply", TURNED), **settings)
     assert told(sphere(tmp_path / "right.ply"), **settings) == ""
@@ -59,7 +59,7 @@ def test_faces_that_turn_both_ways_are_told(tmp_path, settings):
         ({"inverted": True, "flip_normals": True}, False),
     ],
 )
-def test_a_closed_surface_inside_out_is_said_to_be(tmp_path, shape, inside_out):
+def test_a_closed_surface_inside_out_is_reported(tmp_path, shape, inside_out):
     ball = sphere(tmp_path / "ball.ply", inverted=shape.pop("inverted", False))
     scene = world_scene(ball | shape, sensor=lens(**FILM))
     found = mesh_faults.mesh_faults(scene, scene.sensors()[0].camera)
@@ -72,7 +72,7 @@ def test_the_walls_of_a_cavity_around_the_lens_are_right(tmp_path):
     assert mesh_faults.mesh_faults(scene, scene.sensors()[0].camera) == []
 
 
-def test_a_mesh_in_metres_is_told(tmp_path):
+def test_a_mesh_in_metres_is_reported(tmp_path):
     assert "If its mesh is in m, scale it by 1000" in told(sphere(tmp_path / "ball.ply", radius=0.01))
     assert mesh_faults.size_fault(1e5) == (
         "what glows is 1e+05 mm from corner to corner, unusual for a phantom: one unit of length is 1 mm"
@@ -103,7 +103,7 @@ def test_a_mesh_is_examined_once(tmp_path, monkeypatch):
         ("explain",),
     ],
 )
-def test_every_verb_tells_it_in_one_line(run, tmp_path, mixed_xml, verb):
+def test_every_verb_reports_it_in_one_line(run, tmp_path, mixed_xml, verb):
     name, *options = verb
     code, _, warned = run(name, mixed_xml, *(text.format(out=tmp_path) for text in options))
     assert code == 0

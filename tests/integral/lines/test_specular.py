@@ -61,7 +61,7 @@ def agrees_with_path(scene, spp=1024, seed=3, **settings):
 
 
 @pytest.mark.parametrize("window", [pane(80, PANE), slab(80)], ids=["thin", "solid"])
-def test_a_window_lets_through_what_fresnel_says(window):
+def test_a_window_transmits_the_share_of_fresnels_equations(window):
     far = disk(FOCUS)
     bare, seen = (power(camera_scene(far, bodies=bodies, f_number=16), rtol=1e-4) for bodies in ((), (window,)))
     middle = slice(HEIGHT // 2 - 2, HEIGHT // 2 + 2), slice(WIDTH // 2 - 2, WIDTH // 2 + 2)
@@ -122,7 +122,7 @@ def test_two_mirrors_in_turn():
     assert abs(shifted.power - direct.power).max() < 2e-3 * direct.power.max()
 
 
-def test_a_mask_of_even_opacity_scales_the_picture():
+def test_a_mask_of_even_opacity_scales_the_image():
     far, mask = sphere(150, 9), pane(80, {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}})
     seen, bare = (fspt.render(camera_scene(far, bodies=b), rtol=1e-3) for b in ((mask,), ()))
     assert abs(seen.power - 0.7 * bare.power).max() < 1e-3 * bare.power.max()
@@ -235,7 +235,7 @@ def test_what_is_cut_off_is_in_the_error():
     assert (missing <= few.error + many.error).all()
 
 
-def test_coverage_counts_what_glows_through_what_lets_light_pass():
+def test_coverage_counts_glowing_surfaces_behind_windows():
     plate = {"type": "rectangle", "to_world": place(100, size=2.0), "bsdf": {"type": "diffuse"}}
     cases = {"bare": (), "pane": (pane(80, PANE),), "plate": (plate,), "both": (plate, pane(80, PANE))}
     scenes = {k: camera_scene(disk(FOCUS, 6), bodies=b, crop=(20, 14, 10, 4)) for k, b in cases.items()}

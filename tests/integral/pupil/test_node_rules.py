@@ -87,7 +87,7 @@ def test_rule_is_exact_to_its_degree_and_not_beyond(name, degree, pupil_only):
 
 
 @pytest.mark.parametrize("blur", [0.0, 0.3, 1.0, -4.0])
-def test_four_nodes_over_the_area_are_exact_to_degree_3_in_what_blurs_like_a_picture(blur):
+def test_four_nodes_over_the_area_are_exact_to_degree_3_for_functions_of_p_minus_r_a(blur):
     """Functions of blur · pupil + pixel: whatever the blur, before or behind the virtual detector plane.
 
     Seen to fail with steps along the place on the pupil in place of across it.
@@ -100,7 +100,7 @@ def test_four_nodes_over_the_area_are_exact_to_degree_3_in_what_blurs_like_a_pic
         assert rule.weight @ square == pytest.approx(blur**2 / 4 + 1 / 12, rel=1e-13)
 
 
-def test_four_turn_is_what_four_nodes_have_too_much_where_the_blur_changes():
+def test_four_turn_is_the_error_of_four_nodes_where_the_blur_changes():
     """Of f = (x + β a_x)(y + β a_y), β = 0.7 + 0.03 x - 0.02 y: the mean over pupil and pixel is known."""
     rule, (y, x) = node_rules.four(area=True), np.mgrid[-4:5, -4:5].astype(float)
 
@@ -117,7 +117,7 @@ def test_four_turn_is_what_four_nodes_have_too_much_where_the_blur_changes():
 
 
 @pytest.mark.parametrize("name", ["four", "four over area", "twelve", "twelve over area"])
-def test_contrast_is_blind_to_planes_and_sees_curvature(name):
+def test_contrast_is_zero_on_planes_and_not_on_curved_functions(name):
     rule = RULES[name]
     linear = np.hstack([np.ones((len(rule), 1)), rule.pupil, rule.pixel])
     np.testing.assert_allclose(rule.contrast @ linear, 0, atol=1e-15)
@@ -149,7 +149,7 @@ def test_product_rule_is_exact_where_the_pupil_matters(level, area):
 
 
 @pytest.mark.parametrize("count", node_rules.TRANSECT_LEVELS)
-def test_places_of_transects_lie_in_the_cube_and_are_as_many_as_asked(count):
+def test_positions_of_transects_lie_in_the_cube_in_the_requested_number(count):
     places = node_rules.transects(count)
     assert len(places) == count
     assert places.weight.sum() == pytest.approx(1, abs=1e-13)
@@ -159,7 +159,7 @@ def test_places_of_transects_lie_in_the_cube_and_are_as_many_as_asked(count):
 
 
 @pytest.mark.parametrize(("count", "degree"), [(2, 1), (8, 2), (24, 3), (72, 5), (256, 7)])
-def test_few_places_are_exact_for_polynomials(count, degree):
+def test_few_positions_are_exact_for_polynomials(count, degree):
     """Expected: means of x^i y^j z^k over the cube, 1/((i+1)(j+1)(k+1)), up to the degree in all and no further."""
     places = node_rules.transects(count)
 
@@ -173,7 +173,7 @@ def test_few_places_are_exact_for_polynomials(count, degree):
 
 
 @pytest.mark.parametrize("count", node_rules.TRANSECT_LEVELS)
-def test_trend_is_orthonormal_on_the_places(count):
+def test_trend_is_orthonormal_on_the_positions(count):
     """So that the sum of squared coefficients is what a trend adds to the variance; on a net but nearly."""
     places = node_rules.transects(count)
     trend = places.trend
@@ -184,7 +184,7 @@ def test_trend_is_orthonormal_on_the_places(count):
 
 
 @pytest.mark.parametrize("count", [256, 1024])
-def test_many_places_are_a_net(count):
+def test_many_positions_are_a_net(count):
     """One place in every box of volume 1/n whose sides are powers of ½: 2^i × 2^j × 2^k boxes in all."""
     place = node_rules.transects(count).sharp
     m = count.bit_length() - 1
@@ -195,7 +195,7 @@ def test_many_places_are_a_net(count):
 
 
 @pytest.mark.parametrize("count", node_rules.TRANSECT_LEVELS)
-def test_places_for_sharp_edges_lie_on_even_lines_across_the_pixel(count):
+def test_positions_for_sharp_edges_lie_on_even_lines_across_the_pixel(count):
     sharp = node_rules.transects(count).sharp
     np.testing.assert_allclose(np.sort(sharp[:, 2]), (np.arange(count) + 0.5) / count, atol=1e-12)
     # What is odd about the middle of the pupil cancels.
@@ -203,7 +203,7 @@ def test_places_for_sharp_edges_lie_on_even_lines_across_the_pixel(count):
 
 
 @pytest.mark.parametrize("count", node_rules.STEPS)
-def test_places_for_sharp_edges_fill_the_cube_most_evenly(count):
+def test_positions_for_sharp_edges_have_the_least_discrepancy(count):
     """Where a silhouette is curved within the pixel, and a little out of focus, nothing else makes them converge."""
 
     def unevenness(steps):
@@ -229,7 +229,7 @@ def test_levels_take_no_more_lines_of_sight_than_a_pixel_may(area):
     assert counts == node_rules.TRANSECT_LEVELS
 
 
-def test_every_level_looks_further_along_its_transects_and_so_does_a_smaller_rtol():
+def test_accuracy_along_transects_grows_with_level_and_smaller_rtol():
     levels = [dataclasses.astuple(node_rules.along_transect(level, 1e-3)) for level in range(4)]
     assert np.all(np.diff(levels, axis=0) > 0)
     coarse, fine = node_rules.along_transect(0, 1e-2), node_rules.along_transect(0, 1e-5)

@@ -97,7 +97,7 @@ def share_of_corner(place, weight, blur, other, turn):
 
 
 @pytest.mark.parametrize(("blur", "other"), [(4.0, 2.5), (-4.0, 3.0), (1.0, 0.5)])
-def test_transects_across_the_pupil_know_the_share_of_a_corner(blur, other):
+def test_transects_across_the_pupil_give_the_share_of_a_corner(blur, other):
     """Where a second edge crosses the first one transects kink across the pupil, and little along their other places.
 
     Expected: 24 of them right to 6e-3 of the whole; 27, three on each axis, miss it by more than twice that.
@@ -117,7 +117,7 @@ def test_transects_across_the_pupil_know_the_share_of_a_corner(blur, other):
     assert cube > 2 * few
 
 
-def test_scatter_says_where_transects_kink_and_where_they_only_lean():
+def test_scatter_is_large_at_kinks_and_small_at_slopes():
     """One ball before another, both blurred: 24 transects against 1024, on the pixels that silhouettes part.
 
     Expected: no less than the error wherever that is a thousandth of the peak, but for one pixel in twenty; and on most
@@ -158,7 +158,7 @@ def share_of_edge(offset, normal, blur):
 
 @pytest.mark.parametrize("turn", [0.0, 12.0, 40.0])
 @pytest.mark.parametrize("shift", [-14.0, 20.0], ids=["nearer", "farther"])
-def test_eight_transects_know_the_share_of_a_straight_edge(shift, turn):
+def test_eight_transects_give_the_share_of_a_straight_edge(shift, turn):
     """Half a plane that glows all alike, out of focus, at any angle to the pixels; small angles, cos⁴θ is 1.
 
     Expected: the segment of the blur disc averaged over the pixel, to 3e-4 of the whole wherever the edge passes.

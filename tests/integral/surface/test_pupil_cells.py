@@ -40,7 +40,7 @@ def of_the_disc(offset, direction, radius):
 
 
 @pytest.mark.parametrize(("radius", "cells"), [(1.0, 8), (2.0, 8), (4.0, 16), (8.0, 32), (8.0, 8), (16.0, 16)])
-def test_an_edge_is_misplaced_as_the_rule_says(mono, radius, cells):
+def test_an_edge_is_misplaced_by_the_error_of_the_rule(mono, radius, cells):
     """Expected: at the most edge_factor · r/M² of the step, coarse_factor below `coarse` · r cells.
 
     Seen to fail with cells that are not turned, 0.15 to 0.18 in place of 0.12, and with middles not moved outwards.

@@ -150,7 +150,7 @@ def test_pixel_centres():
     np.testing.assert_allclose(surface.power, pupil.power, atol=3e-2 * pupil.power.max())
 
 
-def test_crop_window_is_a_part_of_the_whole_picture():
+def test_crop_window_is_a_part_of_the_whole_image():
     """Expected: the accuracy asked for, the brightest pixel of either picture in the part."""
     x, y, width, height = crop = (15, 9, 12, 10)
     whole, part = (
@@ -289,7 +289,7 @@ def test_light_from_beyond_all_surfaces_is_refused(domain):
         fspt.render(sky, domain=domain)
 
 
-def test_a_small_ball_far_out_of_focus():
+def test_a_small_sphere_far_out_of_focus():
     """Rationale: the radiance on film is J_n/π times the mean of cos⁴θ over the lines of sight that meet the ball.
 
     Expected: rtol on every pixel, and no more claimed. Fails (5e-3) where cosines are those of spots that differ from
