@@ -2,7 +2,7 @@
 
     python scripts/interval_calibration.py [--replicates 400] [--fixed 500] [--samples 200] [--workers 2]
 
-A sphere of 642 vertices, 4 views of 16 x 16 pixels. The pictures come from a transport matrix of rtol 1e-4, the
+A sphere of 642 vertices, 4 views of 16 x 16 pixels. The images come from a transport matrix of rtol 1e-4, the
 inversion uses one of rtol 3e-3: its numerical error is part of the test. *Prior*: J_n is drawn from the penalty's own
 prior (mean 1e-3 W/mm², correlation length 3 mm, standard deviation about 15 %), the weight is given. *Fixed*: three
 distributions of J_n, the weight is found. Columns: share of the 90 %
@@ -57,7 +57,7 @@ SCENE = """<scene version="3.0.0">
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Matrix of the pictures, matrix of the inversion, its surface, penalty, and the weight of the prior [mm²]."""
+    """Matrix of the images, matrix of the inversion, its surface, penalty, and the weight of the prior [mm²]."""
 
     true: fspt.TransportMatrix
     used: fspt.TransportMatrix

@@ -5,7 +5,7 @@
 The cylinder's J_n needs the solver: fspt flux solve scenes/nylon_cylinder.toml -o scenes/nylon_cylinder.ply
 
 Lengths in mm, exitance in W/mm². The world of all scenes: z up, the camera on the +x axis, so that +y is to
-the right of the picture.
+the right of the image.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def _total(pictures: dict[str, Pictures]) -> Table:
 
 
 def _draw(pictures: dict[str, Pictures], path: Path) -> None:
-    """Pictures by the integral, and profiles at z_d = 0, 2, 4 mm against both kinds of Monte Carlo."""
+    """Images by the integral, and profiles at z_d = 0, 2, 4 mm against both kinds of Monte Carlo."""
     drawn = figure(11.0, 8.6)
     axes = drawn.subplots(3, 3)
     for k, (view, images) in enumerate(pictures.items()):

@@ -106,7 +106,7 @@ def solve(name: str, folder: Path, **finer: Any) -> Path:
 def photograph(
     phantom: Path, view: float, lens: dict[str, Any], *, law: str = "lambert", **settings: Any
 ) -> fspt.Image:
-    """Picture of `stage`; `settings` of it, and of fspt.render."""
+    """Image of `stage`; `settings` of it, and of fspt.render."""
     own = {name: settings.pop(name) for name in ("size", "pitch") if name in settings}
     return fspt.render(stage(phantom, view, lens, law=law, **own), **settings)
 
@@ -159,7 +159,7 @@ def binned(image: fspt.Image, side: int) -> fspt.Image:
 
 
 def places(image: fspt.Image) -> Array:
-    """Middle of each column [mm on the virtual detector plane], from the middle of the picture."""
+    """Middle of each column [mm on the virtual detector plane], from the middle of the image."""
     side = float(image.metadata["pixel_pitch"]) / float(image.metadata["magnification"])
     return (np.arange(image.shape[1]) + 0.5 - image.shape[1] / 2) * side
 

@@ -82,7 +82,7 @@ def expose(image: fspt.Image, source: float = SOURCE, seed: int = 5) -> tuple[fs
 
 
 def _draw(pictures: Pictures, path: Path) -> None:
-    """Fig. 9, and the row through the brightest pixel, each picture over its own maximum as ME and CF take it."""
+    """Fig. 9, and the row through the brightest pixel, each image over its own maximum as ME and CF take it."""
     drawn = figure(13.5, 3.1)
     axes = drawn.subplots(1, 4)
     wide = f"{LENSES[1]:.1f}"

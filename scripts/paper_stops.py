@@ -47,7 +47,7 @@ def ratio_per_stop(f_numbers: Array, values: Array) -> Array:
 
 
 def peak_to_border(power: Array, share: float = BORDER) -> tuple[float, float]:
-    """Column of the peak and its distance to the nearer border of the picture, both in pixels.
+    """Column of the peak and its distance to the nearer border of the image, both in pixels.
 
     The peak is the vertex of the parabola through the brightest pixel and its neighbours in the row. The border is
     where, outwards along that row, the power first falls below `share` of the peak, between pixel centres by a

@@ -86,7 +86,7 @@ def main() -> None:
 
 
 def draft_of(names: list[str], f_number: float) -> Draft:
-    """Draft of the picture of these spheres, with its first four nodes."""
+    """Draft of the image of these spheres, with its first four nodes."""
     import mitsuba as mi
 
     from mitsuba_fspt.integral.lines.eq9 import View

@@ -70,7 +70,7 @@ class Batches:
 
 
 def summed(image: fspt.Image, rows: Sequence[slice], columns: Sequence[slice]) -> fspt.Image:
-    """Picture of the sums over rectangles of pixels that do not overlap; errors as of independent pixels."""
+    """Image of the sums over rectangles of pixels that do not overlap; errors as of independent pixels."""
 
     def sums(values: Array) -> Array:
         return np.array([[values[row, column].sum() for column in columns] for row in rows])

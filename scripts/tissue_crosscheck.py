@@ -7,13 +7,13 @@ nylon_cylinder_tissue.xml, the same tissue for Mitsuba's `volpath`, with the sam
 are added to each view until the standard error of Σ P is below `--until-error`; they stay in the folder `--batches`,
 from which the next run goes on.
 
-With the source at mid-height the exact pictures are their own mirror images: top to bottom in every view, in front
-and from the back left to right also. ME, CF and the profiles are therefore taken of the mean of the Monte Carlo picture
+With the source at mid-height the exact images are their own mirror images: top to bottom in every view, in front
+and from the back left to right also. ME, CF and the profiles are therefore taken of the mean of the Monte Carlo image
 and its mirror images (columns *raw*: without); the ratios of powers are the same with and without.
 
 `ratio` is Σ P/Σ P of the law over the Monte Carlo, `peak` over the pixels above half of the calculated maximum, `limb`
 over the outermost pixel that the phantom fills, left and right; each with the standard error of the Monte Carlo.
-Pictures have pixels of 1 mm. A profile is the power along a band 2 mm high about z_d = 0, 2 and 4 mm on the detector
+Images have pixels of 1 mm. A profile is the power along a band 2 mm high about z_d = 0, 2 and 4 mm on the detector
 (the paper's Fig. 5), in steps of 1 mm across the CCD's 27 mm; its CF is Pearson's over those 27 values. `noise`: the
 CF that an exact law would have, given the standard errors.
 
@@ -86,7 +86,7 @@ def solve(description: PhantomFile, folder: Path) -> DiffusionSolution:
 
 
 def calculated(folder: Path, law: str, view: str) -> fspt.Image:
-    """Picture of the solved phantom under a law; its time has the emitters' tables in it."""
+    """Image of the solved phantom under a law; its time has the emitters' tables in it."""
     start = time.perf_counter()
     emission = "last_flight" if law == "transport" else law
     image = photograph(folder / "phantom.ply", VIEWS[view], LENS, law=emission, size=FINE, pitch=PITCH)
@@ -98,7 +98,7 @@ def calculated(folder: Path, law: str, view: str) -> fspt.Image:
 
 
 def coarse(image: fspt.Image) -> fspt.Image:
-    """The picture in pixels of 1 mm."""
+    """The image in pixels of 1 mm."""
     parts = [slice(k, k + BIN) for k in range(0, FINE, BIN)]
     return summed(image, parts, parts)
 
@@ -117,7 +117,7 @@ def profile(image: fspt.Image, height: float) -> tuple[Array, Array]:
 
 
 def noise_cf(power: Array, error: Array) -> float:
-    """CF that independent errors leave of a picture without fault, 1/√(1 + ⟨σ²⟩/var P)."""
+    """CF that independent errors leave of an image without fault, 1/√(1 + ⟨σ²⟩/var P)."""
     return float(1 / math.sqrt(1 + np.square(error).mean() / power.var()))
 
 
@@ -145,7 +145,7 @@ def powers(view: str, law: str, image: fspt.Image, truth: fspt.Image) -> list[st
 
 
 def shapes(view: str, law: str, image: fspt.Image, truth: fspt.Image) -> list[Any]:
-    """A line of the table of ME and CF, of pictures and of profiles; `image` and `truth` in the pixels of the film."""
+    """A line of the table of ME and CF, of images and of profiles; `image` and `truth` in the pixels of the film."""
     axes = SYMMETRY[view]
     raw, even = coarse(truth), mirrored(coarse(truth), axes)
     found = fspt.compare(coarse(image), even)

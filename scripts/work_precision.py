@@ -4,7 +4,7 @@
                                      [--readme README.md]
 
 f/2.8, focused on the phantom's front, magnification 0.5, 256 x 256 pixels. `fspt converge` measures, writes
-nylon_cylinder_converge.csv and .png and prints the ratios. It counts errors from the float64 reference's picture,
+nylon_cylinder_converge.csv and .png and prints the ratios. It counts errors from the float64 reference's image,
 arrays power and error [W], the error being the one that the reference states of itself; this shares no code with the
 plugins, takes minutes, and is made once. With --readme the last table is written into that file, too.
 """
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def write_truth(path: Path) -> None:
-    """The reference's picture and its stated error, as a file."""
+    """The reference's image and its stated error, as a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     camera = ReferenceCamera(55, 2.8, 165, 0.108, 256, 256, look_at([180, 0, 0], [0, 0, 0], [0, 0, 1]))
     power, error = mesh_truth(camera, load_ply(ROOT / "scenes" / "nylon_cylinder.ply"))

@@ -95,7 +95,7 @@ def sphere(z, radius, x=0.0, y=0.0):
 
 
 def power(of, **accuracy):
-    """Picture of a scene by the integral, (h, w) [W]."""
+    """Image of a scene by the integral, (h, w) [W]."""
     return fspt.render(of, method="integral", **accuracy).power
 
 

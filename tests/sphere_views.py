@@ -1,4 +1,4 @@
-"""A sphere in four views for the tests of inversion: its scene file, its transport matrix, noisy pictures."""
+"""A sphere in four views for the tests of inversion: its scene file, its transport matrix, noisy images."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def sphere_views(folder, subdivisions=2, **options):
 
 
 def noisy(matrix, exitance, electrons, seed, read_noise=3.5, **metadata):
-    """Pictures with `electrons` on the brightest pixel, Poisson and read noise."""
+    """Images with `electrons` on the brightest pixel, Poisson and read noise."""
     power, rng = matrix.forward(exitance), np.random.default_rng(seed)
     per_watt = electrons / power.max()
     counted = rng.poisson(power * per_watt) + read_noise * rng.standard_normal(power.shape)

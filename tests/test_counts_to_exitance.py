@@ -16,7 +16,7 @@ def run(name, *arguments):
 
 
 def test_counts_to_exitance(tmp_path, mono):
-    """The total is in its interval, which is a few percent wide; the picture of the result is that of the phantom."""
+    """The total is in its interval, which is a few percent wide; the image of the result is that of the phantom."""
     found = run("counts_to_exitance", tmp_path)
     assert found["low"] < found["true"] < found["high"]
     assert 0 < found["high"] - found["low"] < 0.05 * found["total"]

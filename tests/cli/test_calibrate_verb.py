@@ -52,7 +52,7 @@ def test_values_and_the_fitted_scene(run, folder):
 
 
 def test_undetermined_parameters_are_reported(run, folder):
-    """Gain and f-number scale the picture alike: exit code 2, the combination on stderr and as JSON, no file."""
+    """Gain and f-number scale the image alike: exit code 2, the combination on stderr and as JSON, no file."""
     arguments = ("calibrate", folder / "ball.xml", folder / "image.exr", "--free", "f_number,gain", "--json")
     code, out, err = run(*arguments, "-o", folder / "fitted.xml")
     assert (code, err.count("\n")) == (2, 1)

@@ -185,7 +185,7 @@ def test_a_flat_through_the_lens_is_divided_by_the_screen(mono):
 
 
 def limb_of(image):
-    """Pixels (h, w) of the outer part of a sphere's picture, without its blurred edge."""
+    """Pixels (h, w) of the outer part of a sphere's image, without its blurred edge."""
     rows, columns = np.indices(image.shape)
     radius = np.hypot(rows - image.shape[0] / 2 + 0.5, columns - image.shape[1] / 2 + 0.5)
     edge = radius[image.power > 0.5 * image.power.max()].max()

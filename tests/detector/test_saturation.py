@@ -20,7 +20,7 @@ CAMERAS = [CCD, replace(CCD, gain=10.0), replace(CCD, gain=0.5), replace(CCD, ga
 
 
 def exposed(shape, electrons, seed=1, camera=CCD):
-    """Counts of a picture of this shape (h, w) with so many electrons at its brightest."""
+    """Counts of an image of this shape (h, w) with so many electrons at its brightest."""
     return camera.expose(fspt.Image(shape * electrons / PER_WATT), 60, 650, seed=seed).counts
 
 

@@ -44,7 +44,7 @@ def test_who_sees_the_tip_of_a_small_checkerboard_gets_its_light():
     """A rectangle of 5 x 5 texels, two pixels high, against counting over the pupil at pixels' centres.
 
     To its left the centre of one pixel is lit through a hundredth of the pupil. Seen to fail (0 W, error 0, for 0.016
-    of the brightest pixel) where the rectangle's upper and lower edges, which the picture around changes across more,
+    of the brightest pixel) where the rectangle's upper and lower edges, which the image around changes across more,
     tell which way to look for it at all levels; and where those whom the surface form lights are not asked for their
     silhouette.
     """

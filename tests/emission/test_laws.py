@@ -190,7 +190,7 @@ def test_three_independent_ways_agree(law):
 
 
 def test_fresnel_pixels_over_lambert_pixels():
-    """In the middle of the picture their ratio is the profile's."""
+    """In the middle of the image their ratio is the profile's."""
     exact, lambert = (fspt.render(glowing_sphere(law)[0], method="integral", max_nodes=16) for law in (FRESNEL, {}))
     tilt = np.sqrt(1 - 2 * 0.7**2 / 3 / 9)  # the mean over a pixel of 0.7 mm beside the middle
     ratio = exact.power[5:7, 5:7] / lambert.power[5:7, 5:7]
@@ -278,7 +278,7 @@ def test_last_flight_is_the_same_in_both_domains():
 
 
 def test_fluence_updated_by_itself_is_followed():
-    """Expected: the picture of a scene that had it from the start. Seen to fail where J_n alone is looked at anew."""
+    """Expected: the image of a scene that had it from the start. Seen to fail where J_n alone is looked at anew."""
     scene, emitter = glowing_sphere(last_flight(*STEEP))
     fspt.render(scene, method="integral", rtol=1e-2)
     turned = sloping(1.0, (-0.1, 0.05, 0.1))

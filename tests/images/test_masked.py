@@ -1,4 +1,4 @@
-"""Masked pixels, such as saturated ones, hold 0 W: comparison, regions and totals of pictures leave them out."""
+"""Masked pixels, such as saturated ones, hold 0 W: comparison, regions and totals of images leave them out."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ def test_the_wavelength_of_a_filter_is_that_of_the_image():
 
 def test_xarray_has_units_and_mm():
     """x to the right and y up, mm on the virtual detector plane; labels find the pixel that the disk lights."""
-    scene = camera_scene(disk(165, 3.0, x=-8.0, y=5.0))  # the camera's +x is to the left of the picture
+    scene = camera_scene(disk(165, 3.0, x=-8.0, y=5.0))  # the camera's +x is to the left of the image
     image = fspt.render(scene, method="integral", rtol=1e-2)
     data = image.to_xarray()
     assert data.power.dims == ("y", "x")

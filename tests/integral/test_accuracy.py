@@ -51,7 +51,7 @@ CASES = [
 
 @cache
 def pictures(name, view, f_number, part):
-    """Picture at RTOL; power on its pixels and the standard error of that [W], by the reference."""
+    """Image at RTOL; power on its pixels and the standard error of that [W], by the reference."""
     phantom = load_scene(name, view=view, f_number=f_number, crop=part)
     return fspt.render(phantom, rtol=RTOL), *reference(name, view, f_number, part)
 

@@ -40,7 +40,7 @@ def test_a_shape_far_below_a_pixel_sends_light_in_proportion_to_its_area(shape, 
     """A sphere of 6 um at 570 mm, a pixel 17 times as wide: L π r² Ω, for its field is that of a point. A cylinder
     upright to the axis: L 2 r h Ω where all of it sees the lens at right angles, to the second order of the pupil.
 
-    Expected: the error of the picture's power is within the error stated of its pixels, 1e-3 at the most.
+    Expected: the error of the image's power is within the error stated of its pixels, 1e-3 at the most.
     Seen to fail (sphere: 9e-3 off, 5e-5 stated) with areas from the derivatives of Mitsuba's rounded points.
     """
     import mitsuba as mi

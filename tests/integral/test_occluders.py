@@ -55,7 +55,7 @@ DIM = list(zip([1e-7] * 4, PAST, [20_000, 200_000, 200_000, 20_000], strict=True
 @pytest.mark.parametrize(("dim", "disks", "max_nodes"), [*((0, disks, 200_000) for disks in PAST), *DIM])
 def test_light_past_a_dark_disk_arrives(disks, dim, max_nodes):
     """Seen to fail where outlines of what is dark settle a pixel: off by 0.05 to 0.23 of the brightest pixel, zeros
-    without an error. In the last case four nodes meet but the dark disk, and the picture was black; in packets of rays,
+    without an error. In the last case four nodes meet but the dark disk, and the image was black; in packets of rays,
     which pass by the dark disk here and there, 0.35 of the peak shines through it. A disk that glows ever so little
     changes nothing: it settles no pixel either.
     """

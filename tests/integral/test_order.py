@@ -64,7 +64,7 @@ def uniform(depth, radius, f_number=F_NUMBER, magnification=0.5):
 
 
 def rippled(depth, wave, half=13.0, texels=512):
-    """A sheet with J_n = 1 + cos(wave · x) / 2, linear between texels of 50 µm, and its picture by Gauss's rule."""
+    """A sheet with J_n = 1 + cos(wave · x) / 2, linear between texels of 50 µm, and its image by Gauss's rule."""
     import mitsuba as mi
 
     place = ((np.arange(texels) + 0.5) / texels * 2 - 1) * half

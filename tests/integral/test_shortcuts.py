@@ -1,4 +1,4 @@
-"""What the integral leaves out: taken where it may be, not where it may not, and the picture is the same without."""
+"""What the integral leaves out: taken where it may be, not where it may not, and the image is the same without."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ def test_explain_measures_what_each_shortcut_saves():
 
 
 def test_findings_count_no_more_pixels_than_the_image_has():
-    """Where the phantom reaches beyond the picture so does what is looked at: pixels around know of silhouettes."""
+    """Where the phantom reaches beyond the image so does what is looked at: pixels around know of silhouettes."""
     solution = solved(world_scene(ball(radius=60.0), sensor=lens(8, f_number=2.8)))
     (outside,) = [finding for finding in solution.findings if finding.name == "outside"]
     assert (outside.taken, outside.why) == (False, "64 of 64 pixels can see what glows")

@@ -1,4 +1,4 @@
-"""Large films in tiles: the same picture as in one piece, to one tolerance, in memory that is bounded and told."""
+"""Large films in tiles: the same image as in one piece, to one tolerance, in memory that is bounded and told."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def scene_of(name, side=512):
 
 
 def both(scene, monkeypatch, **accuracy):
-    """Pictures in one piece and in tiles."""
+    """Images in one piece and in tiles."""
     whole = fspt.render(scene, **accuracy)
     monkeypatch.setattr(tiles, "SIDE", SIDE)
     return whole, fspt.render(scene, **accuracy)

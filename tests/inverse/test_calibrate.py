@@ -23,7 +23,7 @@ def scene(tmp_path_factory, mono):
 
 
 def noisy(scene, seed, share=0.01, **parameters):
-    """Picture of the scene with independent normal noise of 1 % of its brightest pixel."""
+    """Image of the scene with independent normal noise of 1 % of its brightest pixel."""
     power = fspt.render(fspt.load(scene, **parameters), rtol=1e-5).power.astype(float)
     sigma = np.full(power.shape, share * power.max())
     return fspt.Image(power + sigma * np.random.default_rng(seed).standard_normal(power.shape), sigma)
@@ -56,7 +56,7 @@ def test_warnings_about_the_scene_are_told_once(scene, monkeypatch, caplog):
 
 
 def test_monte_carlo_gives_the_parameters_of_its_scene(scene):
-    """A picture by `path` with its own standard error; gain beside the distance."""
+    """An image by `path` with its own standard error; gain beside the distance."""
     image = fspt.render(fspt.load(scene, distance=164), method="path", spp=512, seed=4)
     found = fspt.calibrate(scene, image, free=["distance", "gain"])
     assert found.values["gain"] == pytest.approx(1, abs=4 * found.sd["gain"])
@@ -65,9 +65,9 @@ def test_monte_carlo_gives_the_parameters_of_its_scene(scene):
 
 
 def test_electrons_of_another_source_give_the_parameters(scene, tmp_path):
-    """The file that `expose` writes of the scene with a source far below 1 W: the pictures are of that source, too.
+    """The file that `expose` writes of the scene with a source far below 1 W: the images are of that source, too.
 
-    Seen not to come to an end without the power of the source in the pictures.
+    Seen not to come to an end without the power of the source in the images.
     """
     image = fspt.render(fspt.load(scene, distance=164), rtol=1e-3)
     ccd = fspt.Detector.typical_ccd()
@@ -79,7 +79,7 @@ def test_electrons_of_another_source_give_the_parameters(scene, tmp_path):
 
 
 def test_a_gain_of_images_with_stray_light(scene):
-    """5 % of glare over the film is in the pictures, too: the gain is 1. Seen to fail (0.95, 30 sd) without it."""
+    """5 % of glare over the film is in the images, too: the gain is 1. Seen to fail (0.95, 30 sd) without it."""
     image = noisy(scene, 3, share=0.002)
     power = image.power.astype(float)
     power = 0.95 * power + 0.05 * power.mean()
@@ -90,7 +90,7 @@ def test_a_gain_of_images_with_stray_light(scene):
 
 
 def test_degenerate_sets_are_reported(scene):
-    """Gain and f-number both scale the picture: the message names both, and no small sd is returned."""
+    """Gain and f-number both scale the image: the message names both, and no small sd is returned."""
     with pytest.raises(InversionError, match="do not determine f_number, gain separately"):
         fspt.calibrate(scene, noisy(scene, 1), free=["f_number", "gain"])
 
@@ -116,7 +116,7 @@ def test_a_flat_view_does_not_determine_focus_magnification_and_gain(tmp_path, m
 
 @pytest.mark.parametrize(("apart", "rough"), [(3e-4, 0.0), (0.0, 1e-4)])
 def test_each_sign_of_a_degenerate_set_counts(apart, rough):
-    """Pictures that are linear in two parameters with nearly the same slope; equal slopes under numerical noise.
+    """Images that are linear in two parameters with nearly the same slope; equal slopes under numerical noise.
 
     The first is seen by the condition number alone, the second by the slope that depends on the step alone.
     """
@@ -253,7 +253,7 @@ def test_intervals_contain_the_reference_on_a_fine_film(mono):
 
 @pytest.mark.slow
 def test_pose_of_the_nylon_cylinder(mono):
-    """One picture by `path`, 512 samples: view to 0.1 degrees, distance to 0.02 mm, magnification to 5e-4, within 4 sd.
+    """One image by `path`, 512 samples: view to 0.1 degrees, distance to 0.02 mm, magnification to 5e-4, within 4 sd.
 
     The start is 0.7 degrees, 0.4 mm and 1.3e-3 away.
     """

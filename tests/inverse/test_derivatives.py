@@ -52,7 +52,7 @@ def difference(law, at, step):
 
 
 def relative(found, expected):
-    """Relative error in the norm of the picture, and that which is stated."""
+    """Relative error in the norm of the image, and that which is stated."""
     return (np.linalg.norm(found.value - expected), np.linalg.norm(found.error)) / np.linalg.norm(expected)
 
 
@@ -106,7 +106,7 @@ def test_a_half_plane_that_is_shifted(tmp_path, mono):
 def test_silhouettes_move(tmp_path, mono):
     """A sphere that goes away: the power on all pixels is that of form factors (M.9), silhouettes included, to 3e-3.
 
-    Each pixel by Richardson's differences of finer pictures, within the stated error of some percent.
+    Each pixel by Richardson's differences of finer images, within the stated error of some percent.
     """
     scene = write_scene(tmp_path / "ball.xml")
     found = fspt.derivatives(scene, ["distance"])["distance"]

@@ -1,4 +1,4 @@
-"""J_n from pictures: operator and solver against independent ones, recovery, totals, intervals, and bad input."""
+"""J_n from images: operator and solver against independent ones, recovery, totals, intervals, and bad input."""
 
 from __future__ import annotations
 
@@ -326,7 +326,7 @@ def test_ends_of_intervals_are_ranks_of_draws(case):
 
 
 def test_exposures_and_images_in_watts_agree(case, tmp_path):
-    """`expose` on rendered pictures: the Exposures, their files, and their electrons over η t λ/(hc) give one J_n."""
+    """`expose` on rendered images: the Exposures, their files, and their electrons over η t λ/(hc) give one J_n."""
     matrix, exitance = case
     detector = fspt.Detector.typical_ccd()
     scale = 3e-18 / matrix.forward(exitance).max()

@@ -31,7 +31,7 @@ def told(case, images, caplog, **options):
 
 @pytest.mark.parametrize("wrong", ["pose", "order"])
 def test_images_of_another_pose_are_hopeless(case, caplog, wrong):
-    """Pictures displaced by a third of the sphere, or views in another order: the first line on stderr says so."""
+    """Images displaced by a third of the sphere, or views in another order: the first line on stderr says so."""
     matrix, _, exitance = case
     images = noisy(matrix, exitance, 3000, 0)
     if wrong == "order":

@@ -199,7 +199,7 @@ def test_no_entry_is_lost_between_the_surface_form_and_lines_of_sight(tmp_path):
     the other just below it.
 
     Expected: a share of a row above 0.3 % is in the matrix at another rtol as well; the power of the rows is that of
-    `render` within both errors. Seen to fail, with 0.5 % of a row lost and its picture 3 times `error` too dark,
+    `render` within both errors. Seen to fail, with 0.5 % of a row lost and its image 3 times `error` too dark,
     where such an entry was in neither of the two.
     """
     body = trimesh.creation.icosphere(4)
@@ -223,7 +223,7 @@ def test_no_entry_is_lost_between_the_surface_form_and_lines_of_sight(tmp_path):
 def test_an_occluder_hides_the_same_faces_as_in_a_rendering(tmp_path, distance):
     """A dark wall before half the body, in focus and not. Expected: as without it, on smooth J_n.
 
-    Seen to fail without rows by lines of sight, and without shadow rays and the picture of J_n = 1.
+    Seen to fail without rows by lines of sight, and without shadow rays and the image of J_n = 1.
     """
     import mitsuba as mi
 

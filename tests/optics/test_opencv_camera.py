@@ -36,7 +36,7 @@ def scene(sensor, point):
 def test_points_appear_where_opencv_projects_them(point, mono):
     """Centre of light within 0.05 pixels of the projection: a sphere's image is off its centre's by less than 0.01.
 
-    Pose, upright picture, row 0 at the top, pixel pitch and principal point each move it by pixels: seen to fail with
+    Pose, upright image, row 0 at the top, pixel pitch and principal point each move it by pixels: seen to fail with
     Rᵀ for R, without the signs of x and y, without the crop, and with whole numbers at the corners of pixels.
     """
     camera = fspt.camera_from_opencv(K, RVEC[:, None], TVEC[:, None], width=WIDTH, height=HEIGHT)

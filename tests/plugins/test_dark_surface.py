@@ -1,4 +1,4 @@
-"""Surfaces whose J_n is 0 everywhere: an optimiser's start, a dark control. Dark pictures, and a warning."""
+"""Surfaces whose J_n is 0 everywhere: an optimiser's start, a dark control. Dark images, and a warning."""
 
 from __future__ import annotations
 

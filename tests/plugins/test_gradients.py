@@ -1,4 +1,4 @@
-"""Gradients of `mi.render` by what is behind `exitance`: against the transport matrix and differences of pictures."""
+"""Gradients of `mi.render` by what is behind `exitance`: against the transport matrix and differences of images."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def attached(scene, key):
 
 
 def backward(scene, key, gradient=WAVE):
-    """Gradient of Σ gradient · picture by one parameter."""
+    """Gradient of Σ gradient · image by one parameter."""
     parameters = attached(scene, key)
     dr.clear_grad(parameters[key])
     dr.backward(dr.sum(mi.render(scene, parameters) * mi.TensorXf(gradient), axis=None))
@@ -59,14 +59,14 @@ def backward(scene, key, gradient=WAVE):
 
 
 def forward(scene, key, tangent):
-    """Tangent (h, w, 1) of the picture for that of one parameter."""
+    """Tangent (h, w, 1) of the image for that of one parameter."""
     parameters = attached(scene, key)
     dr.set_grad(parameters[key], type(parameters[key])(tangent))
     return np.array(dr.forward_to(mi.render(scene, parameters)))
 
 
 def moved(scene, key, change):
-    """Picture (h, w, 1) [W] with a parameter changed by so much."""
+    """Image (h, w, 1) [W] with a parameter changed by so much."""
     parameters = mi.traverse(scene)
     old = type(parameters[key])(dr.detach(parameters[key]))
     parameters[key] = old + change
@@ -120,7 +120,7 @@ def test_a_dark_surface_has_its_gradient(tmp_path):
 
 
 def test_a_number(monkeypatch):
-    """The picture is linear in it, so that the derivative is the picture of 1 W/mm², by however few lines of sight.
+    """The image is linear in it, so that the derivative is the image of 1 W/mm², by however few lines of sight.
 
     Seen to fail without the exit law's 1/π, and without the factors on the rows.
     """
@@ -134,7 +134,7 @@ def test_a_number(monkeypatch):
 
 
 def test_texels_of_a_bitmap():
-    """Differences of two pictures are exact, for the picture is linear."""
+    """Differences of two images are exact, for the image is linear."""
     texels = 1e-3 * (1.5 + np.sin(np.arange(8) + np.arange(6)[:, None]))
     scene = bitmap_scene(texels, rtol=1e-4)
     key = "shape_0.emitter.exitance.data"
@@ -182,7 +182,7 @@ def test_forward_and_reverse_mode_are_transposes(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("on", ["vertex", "bitmap"])
 def test_latent_numbers_and_several_batches(tmp_path, monkeypatch, on):
-    """J_n = s · J with a factor s: the chain from s to the picture stands through all batches of reverse mode."""
+    """J_n = s · J with a factor s: the chain from s to the image stands through all batches of reverse mode."""
     monkeypatch.setattr(exitance_rows, "BATCH", 1 << 15)
     if on == "vertex":
         scene, key = mesh_scene(tmp_path, on), "shape_0.vertex_exitance"
@@ -215,7 +215,7 @@ def test_an_optimisation_recovers_a_bitmap():
         losses.append(float(loss.array[0]))
     found = np.array(optimiser[key])[..., 0]
     assert losses[-1] < 1e-2 * losses[0]
-    # The four middle texels of the near side fill most of the picture.
+    # The four middle texels of the near side fill most of the image.
     near = np.s_[1:3, [0, 7]]
     np.testing.assert_allclose(found[near], truth[near], rtol=0.15)
     assert not found[:, 3:5].any()

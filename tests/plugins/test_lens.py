@@ -209,7 +209,7 @@ def test_a_crop_window_is_a_part_of_the_film():
     np.testing.assert_allclose(share[inside] * 30 * 12, light[inside] * 64 * 64, rtol=1e-5)
 
 
-# --- pictures ---
+# --- images ---
 
 
 def pictures(settings, spp=4000):

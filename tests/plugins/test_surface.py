@@ -459,7 +459,7 @@ def test_slivers_without_surface_points_have_no_effect(domain, tmp_path):
 
 @pytest.mark.parametrize("integrator", ["fspt_integral", "path", "ptracer"])
 def test_a_rendered_scene_can_be_freed_and_keeps_its_names(integrator, tmp_path):
-    """Each scene once stayed in memory for good after its first picture, and its shapes were renamed."""
+    """Each scene once stayed in memory for good after its first image, and its shapes were renamed."""
     vertices = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
     path = write_ply(tmp_path / "sheet.ply", vertices, [(0, 1, 2), (0, 2, 3)], vertex=[1, 2, 3, 4])
     gc.collect()

@@ -1,4 +1,4 @@
-"""A scene that changes in place gives the pictures of scenes that are loaded."""
+"""A scene that changes in place gives the images of scenes that are loaded."""
 
 from __future__ import annotations
 

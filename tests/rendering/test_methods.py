@@ -56,7 +56,7 @@ def phantom(name):
 
 @cache
 def passes(name, method, spp=256, seed=1):
-    """Independent pictures [W], (PASSES, HEIGHT, WIDTH): their scatter is all that is known of their noise."""
+    """Independent images [W], (PASSES, HEIGHT, WIDTH): their scatter is all that is known of their noise."""
     import mitsuba as mi
 
     of = phantom(name)

@@ -93,7 +93,7 @@ def test_monte_carlo_repeats_by_its_seed(scene, method):
 
 @pytest.mark.parametrize("method", ["path", "ptracer"])
 def test_the_standard_error_of_monte_carlo_is_its_scatter(scene, method):
-    """Mean z² between independent pictures is near 1 (1.07 for errors from 32 passes)."""
+    """Mean z² between independent images is near 1 (1.07 for errors from 32 passes)."""
     images = [fspt.render(scene, method=method, spp=64, seed=seed) for seed in range(8)]
     power = np.array([image.power for image in images])
     error = np.array([image.error for image in images])
@@ -286,7 +286,7 @@ def test_only_a_lens_makes_watts():
 def test_a_dark_image_keeps_the_warning_of_light_left_out(mono):
     """A surface that faces a wall behind it: no light comes straight, some by the wall, and both are told.
 
-    Seen to fail: that the picture is dark took the place of the light left out.
+    Seen to fail: that the image is dark took the place of the light left out.
     """
     wall = {**disk(165, 100.0), "bsdf": {"type": "diffuse", "reflectance": 0.8}}
     image = fspt.render(camera_scene(disk(120, 10.0, tilt=180), bodies=[wall]), method="integral")
@@ -297,7 +297,7 @@ def test_a_dark_image_keeps_the_warning_of_light_left_out(mono):
 
 
 def test_a_wall_lit_from_outside_the_image_is_reported(mono):
-    """No emitter is in the picture: Monte Carlo shows the wall, the integral nothing, and says so.
+    """No emitter is in the image: Monte Carlo shows the wall, the integral nothing, and says so.
 
     Seen to fail: without a pixel that can see an emitter nothing was estimated.
     """

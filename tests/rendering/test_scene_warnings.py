@@ -17,7 +17,7 @@ def box(**more):
 
 
 def told(scene, **settings):
-    """The warnings of a picture by this method, "" without any."""
+    """The warnings of an image by this method, "" without any."""
     return fspt.render(scene, **settings).metadata.get("warnings", "")
 
 

@@ -298,7 +298,7 @@ def test_all_scenes_are_listed_here():
 
 @pytest.mark.parametrize(("distance", "tilt"), [(165, 0), (100, 0), (370, 0), (165, 55), (165, -55)])
 def test_uniform_disk_fills_the_image_from_the_whole_pupil(distance, tilt):
-    """Lines from the edge of the f/2.8 pupil through the picture's corners meet the front of the disk."""
+    """Lines from the edge of the f/2.8 pupil through the image's corners meet the front of the disk."""
     u, half = 165.0, 256 * 0.108  # mm; half of the virtual detector = 128 pixels of 0.108 mm / 0.5
     corner = half * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
     turn = np.linspace(0, 2 * np.pi, 73)

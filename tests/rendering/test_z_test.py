@@ -1,4 +1,4 @@
-"""The z-test of real pictures: correct ones pass as often as they should, and a wrong one does not."""
+"""The z-test of real images: correct ones pass as often as they should, and a wrong one does not."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def scaled(image, factor):
 
 @pytest.mark.parametrize("spp", [16, 64, 256])
 def test_correct_images_pass_as_often_as_they_should(pictures, spp):
-    """Rationale: p of two correct pictures is uniform in 0 … 1, whatever the samples; at most it is too large.
+    """Rationale: p of two correct images is uniform in 0 … 1, whatever the samples; at most it is too large.
 
     Expected, of 20 pairs: mean 1/2 - 0.2 (three standard deviations) … 0.8, none below 1e-3 (all 20 above it: 98 %),
     at most 4 below 0.05 (0.26 % have more). The silhouettes' few events make p too large rather than too small.
@@ -52,7 +52,7 @@ def test_correct_images_pass_as_often_as_they_should(pictures, spp):
 def test_integral_against_path(cylinder, pictures):
     """Where the noise exceeds the integral's bound, chi2 is about 1, and was 0.05 with the bound as a deviation.
 
-    A picture that is 1 % too bright is found, on either side.
+    An image that is 1 % too bright is found, on either side.
     """
     integral = fspt.render(cylinder, rtol=1e-4)
     for image in pictures[1024]:

@@ -29,14 +29,14 @@ def test_stated_errors_bound_the_errors(family, seed):
 
 @pytest.mark.parametrize(("family", "seed"), [("boxes", 0), ("meshes", 1)])
 def test_stated_errors_of_the_matrix_bound_the_errors(family, seed):
-    """As for pictures, with J_n random on vertices and on faces."""
+    """As for images, with J_n random on vertices and on faces."""
     found = audit.audited(family, seed, 1e-2, **FEW, matrix=True)
     assert (found.beyond_error, found.silent, found.beyond_random) == (0, 0, 0)
     assert found.largest <= 1e-2
 
 
 def test_wrong_images_are_noticed(monkeypatch):
-    """A picture that is 3 % too bright: beyond rtol and beyond its errors on bright pixels, silently."""
+    """An image that is 3 % too bright: beyond rtol and beyond its errors on bright pixels, silently."""
     render = audit._rendered
 
     def wrong(made, rtol):

@@ -29,7 +29,7 @@ def test_half_per_full_stop_whatever_the_nominal_numbers():
 
 
 def disc(centre, radius, blur):
-    """Picture of a disc, brightest in its middle at the column `centre` [pixels], its edge a ramp of width `blur`."""
+    """Image of a disc, brightest in its middle at the column `centre` [pixels], its edge a ramp of width `blur`."""
     y, x = np.mgrid[0:61, 0:91]
     away = np.hypot(x - centre, y - 30)
     return np.clip((radius - away) / blur + 0.5, 0, 1) * (1 - 1e-3 * away**2 / radius**2)

@@ -45,9 +45,9 @@ def test_mirror_image_halves_the_variance_but_on_the_axis(axes, power, error):
 
 
 def test_errors_of_mirrored_noise_are_true():
-    """Rationale: z² of the mean with its mirror images, about the exact picture, is 1 on average, axis or not.
+    """Rationale: z² of the mean with its mirror images, about the exact image, is 1 on average, axis or not.
 
-    Expected: 2000 pictures of 5 × 4 pixels, 40,000 z of which mirrored ones are alike: ± 0.02. Seen to fail (1.2) with
+    Expected: 2000 images of 5 × 4 pixels, 40,000 z of which mirrored ones are alike: ± 0.02. Seen to fail (1.2) with
     the pixels on the axis given the error of two.
     """
     rng = np.random.default_rng(1)
@@ -68,7 +68,7 @@ def test_sums_add_power_and_the_squares_of_errors():
 
 
 def test_bands_lie_about_their_heights():
-    """A picture whose power is its row's height on the detector: the mean over each band is the band's z_d."""
+    """An image whose power is its row's height on the detector: the mean over each band is the band's z_d."""
     fine, pitch = tissue_crosscheck.FINE, tissue_crosscheck.PITCH
     height = (fine / 2 - 0.5 - np.arange(fine)) * pitch
     bands = tissue_crosscheck.bands(picture(np.tile(height[:, None], fine)))

@@ -232,7 +232,7 @@ def test_raw_rays_are_as_many_as_asked_for():
 
 @pytest.mark.usefixtures("mono", "short")
 def test_reference_meets_the_closed_form_within_its_error():
-    """Rationale: a uniform disk that fills every cone has a picture in closed form. Expected: within the stated error.
+    """Rationale: a uniform disk that fills every cone has an image in closed form. Expected: within the stated error.
 
     The statement is no empty one: below 1e-5 of the peak.
     """
@@ -345,7 +345,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capfd, arguments, to
 
 @pytest.mark.usefixtures("mono", "short", "in_a_folder_of_its_own")
 def test_a_budget_too_short_for_any_setting_is_refused(tmp_path, capfd):
-    """Seen to fail with a ValueError of the picture."""
+    """Seen to fail with a ValueError of the drawing."""
     assert app.run(["converge", "s.xml", "--budget", "1e-9", "--rounds", "1"]) == 2
     out, err = capfd.readouterr()
     assert out == ""

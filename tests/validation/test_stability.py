@@ -24,7 +24,7 @@ def test_row_meets_its_bound(case):
 
 @pytest.mark.parametrize("stretch", [(1.0005, 1, 1), (-1, 1, 1)])
 def test_a_lens_that_stretches_or_mirrors_is_refused(mono, stretch):
-    """Rationale: 5e-4 in length is 1e-3 in power; a mirrored picture is a wrong one."""
+    """Rationale: 5e-4 in length is 1e-3 in power; a mirrored image is a wrong one."""
     place = mono.ScalarTransform4f().rotate([0.6, 0, 0.8], 50).scale(list(stretch))
     with pytest.raises(RuntimeError, match="'to_world' scales lengths or mirrors"):
         stiff_scenes.scene(stiff_scenes.ball(), at=place)

@@ -28,7 +28,7 @@ def sphere(path, turned=0, inverted=False, radius=5.0):
 
 
 def told(shape, **settings):
-    """The warnings of a picture of one shape, "" without any."""
+    """The warnings of an image of one shape, "" without any."""
     scene = world_scene(shape, sensor=lens(**FILM))
     return fspt.render(scene, **(settings or {"rtol": 0.5})).metadata.get("warnings", "")
 
@@ -80,7 +80,7 @@ def test_a_mesh_in_metres_is_reported(tmp_path):
 
 
 def test_a_mesh_is_examined_once(tmp_path, monkeypatch):
-    """Pictures through another lens, and with another J_n, do not repeat the work."""
+    """Images through another lens, and with another J_n, do not repeat the work."""
     calls = []
     once = mesh_faults.closure
     monkeypatch.setattr(mesh_faults, "closure", lambda *mesh: calls.append(mesh) or once(*mesh))

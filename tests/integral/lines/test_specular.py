@@ -55,7 +55,7 @@ def mirrored(point, z, tilt):
 
 
 def agrees_with_path(scene, spp=1024, seed=3, **settings):
-    """The p-value of the integral's picture beside Mitsuba's path tracer."""
+    """The p-value of the integral's image beside Mitsuba's path tracer."""
     image = fspt.render(scene, method="integral", rtol=1e-3, **settings)
     return fspt.compare(image, fspt.render(scene, method="path", spp=spp, seed=seed)).z_test.p_value
 
@@ -87,7 +87,7 @@ def test_a_window_agrees_with_the_path_tracer(window):
 @pytest.mark.parametrize("bsdf", [PERFECT, {"type": "roughconductor", "alpha": 0.0, "material": "none"}])
 @pytest.mark.parametrize("depth", [FOCUS, 150.0])
 def test_a_mirror_shows_the_mirrored_phantom(bsdf, depth):
-    """Two spheres, one of them off the axis, so that a picture the wrong way round would be seen."""
+    """Two spheres, one of them off the axis, so that an image the wrong way round would be seen."""
     share, seen = 0.9, [(np.array([0.0, 3.0, depth]), 5.0), (np.array([7.0, -2.0, depth - 4]), 2.0)]
     mirror = pane(80, bsdf | {"specular_reflectance": share}, tilt=45)
     real = [{"type": "sphere", "center": mirrored(p, 80, 45).tolist(), "radius": r} for p, r in seen]

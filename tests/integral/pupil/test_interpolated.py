@@ -1,4 +1,4 @@
-"""Large pictures by blocks: power of blocks kept, errors that hold, edges found."""
+"""Large images by blocks: power of blocks kept, errors that hold, edges found."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def finer_scene(*shapes, size=(40 * FINER, 32 * FINER), crop=None, **optics):
 
 
 def solved(scene, without=(), **accuracy):
-    """Picture by the pupil form, without some of the shortcuts."""
+    """Image by the pupil form, without some of the shortcuts."""
     import mitsuba as mi
 
     quadrature = Quadrature(**{"rtol": 1e-2} | accuracy, shortcuts_off=frozenset(without))
@@ -108,7 +108,7 @@ def test_interpolated_pixels_are_within_their_errors(shapes, optics, accuracy, t
     off = np.abs(found.power - exact.power)
     peak = found.power.max()
     assert (off <= found.error + exact.error).mean() > 1 - 1e-4
-    assert off.max() <= 2 * rtol * peak  # each of the two pictures is within rtol
+    assert off.max() <= 2 * rtol * peak  # each of the two images is within rtol
     assert found.error.max() <= 1.001 * rtol * peak
 
 

@@ -45,7 +45,7 @@ def looked_at():
 
 
 def laid(draft, means, name):
-    """Picture of a column of the means, 0 elsewhere."""
+    """Image of a column of the means, 0 elsewhere."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""The surface form of Eq. 9: the same picture as the pupil form, found from the other end."""
+"""The surface form of Eq. 9: the same image as the pupil form, found from the other end."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ CASES = [
 
 
 def both(of, rtol=RTOL, **accuracy):
-    """Pictures by the surface form, at `rtol`, and by the pupil form, ten times finer."""
+    """Images by the surface form, at `rtol`, and by the pupil form, ten times finer."""
     return fspt.render(of, domain="surface", rtol=rtol, **accuracy), fspt.render(of, rtol=rtol / 10, **accuracy)
 
 
@@ -151,7 +151,7 @@ def test_pixel_centres():
 
 
 def test_crop_window_is_a_part_of_the_whole_image():
-    """Expected: the accuracy asked for, the brightest pixel of either picture in the part."""
+    """Expected: the accuracy asked for, the brightest pixel of either image in the part."""
     x, y, width, height = crop = (15, 9, 12, 10)
     whole, part = (
         fspt.render(camera_scene(sphere(180.0, 8.0), crop=c), domain="surface", rtol=RTOL) for c in (None, crop)
@@ -324,7 +324,7 @@ def power_of_ball(row, column, depth, radius, x, y, sub=12, points=3000):
 
 def test_a_thin_tube_far_away():
     """Rationale: Mitsuba knows the limb of a cylinder by a share of its distance squared over its radius, so lines of
-    sight begin just before what there is. Expected: one picture by both forms. Fails (1.3e-2) from the lens on.
+    sight begin just before what there is. Expected: one image by both forms. Fails (1.3e-2) from the lens on.
     """
     import mitsuba as mi
 
@@ -367,7 +367,7 @@ def test_a_spot_on_a_wall_of_two_faces_adds_its_light(domain):
     """Disks of a tenth of a pixel's width, three times as bright as the wall in focus behind them.
 
     Expected: rtol against what they cover and what they add. Seen to fail, by 3.6e-3 of the brightest pixel, where a
-    face that is wider than the picture counts as if all its light fell on one pixel, which rtol then is counted from.
+    face that is wider than the image counts as if all its light fell on one pixel, which rtol then is counted from.
     """
     pitch = 0.5
     wall = {"type": "rectangle", "to_world": mi_turned(0, 0, 180.0, 6.0)}
