@@ -29,9 +29,9 @@ from .derivatives import scene_text, varied_value
 from .measurement import noise_of, tell_misfit, told
 
 Array = NDArray[np.float64]
-Picture = Image | Exposure | str | os.PathLike[str]
+GivenImage = Image | Exposure | str | os.PathLike[str]
 GAIN = "gain"  # reserved name: a factor on all powers
-KEPT = 2**28  # bytes of pictures that are not computed again, 256 MB
+KEPT = 2**28  # bytes of renderings that are not computed again, 256 MB
 PITCH_TOLERANCE = 1e-6  # relative: of the pixel pitch, which files may hold in single precision
 
 
@@ -81,7 +81,7 @@ class Calibration:
 
 def calibrate(
     scene: str | os.PathLike[str],
-    images: Picture | Sequence[Picture],
+    images: GivenImage | Sequence[GivenImage],
     /,
     *,
     free: Sequence[str],
@@ -96,13 +96,13 @@ def calibrate(
         C = fspt.calibrate("scene.xml", image, free=["view", "magnification"])
         C.values["view"], C.sd["view"]   # degrees, where the scene turns by degrees
 
-    The scene's own values are the start: its picture must overlap that of the images.
+    The scene's own values are the start: its rendering must overlap that of the images.
 
     Parameters
     ----------
     scene : name or text of a scene file
     images : one a view, in the order of the views: Image with its standard error, as of `reduce` or of Monte Carlo, or
-        Exposure; or the name of a file of either. Masked pixels are left out. The scene's pictures take the light
+        Exposure; or the name of a file of either. Masked pixels are left out. The scene's renderings take the light
         source's power that an image was scaled to
     free : names of parameters, common to all views, or `gain`, a factor on all powers
     sensor : number of the sensor
@@ -129,10 +129,10 @@ def calibrate(
     with reported(progress) as report:
         powers = [image.metadata.get("source_power") for image in found]
         strays = [StrayLight.of(image.metadata, image.shape) for image in found]
-        pictures = _Pictures(scene, names, views, powers, strays, sensor, settings.rtol or 1e-4, report)
-        pictures(start)
-        data = measured_of(found, views, pictures.first, len(names), sampled)
-        fitted = CalibrationFit(names, start, data, pictures, settings).solved()
+        renderings = _Renderings(scene, names, views, powers, strays, sensor, settings.rtol or 1e-4, report)
+        renderings(start)
+        data = measured_of(found, views, renderings.first, len(names), sampled)
+        fitted = CalibrationFit(names, start, data, renderings, settings).solved()
     return _calibration(names, data, fitted, os.fspath(scene))
 
 
@@ -195,12 +195,12 @@ def _noise(images: Sequence[Image]) -> float:
     return float(np.median(values) / max(max(float(image.power.max()) for image in images), 1e-300))
 
 
-class _Pictures:
+class _Renderings:
     """Power and numerical error [W] of all views, (views, h, w), as a function of the values of the free parameters.
 
-    powers : of the light source [W] by which the image of each view was scaled, and its picture is, or None
-    strays : stray light that the image of each view has, and its picture gets (Eq. M.38)
-    first : the pictures of the first call
+    powers : of the light source [W] by which the image of each view was scaled, and its rendering is, or None
+    strays : stray light that the image of each view has, and its rendering gets (Eq. M.38)
+    first : the renderings of the first call
     """
 
     def __init__(
@@ -258,27 +258,27 @@ class _Pictures:
 def measured_of(
     images: Sequence[Image],
     views: Sequence[Mapping[str, str]],
-    pictures: Sequence[Image],
+    renderings: Sequence[Image],
     parameters: int,
     sampled: bool = False,
 ) -> Measured:
-    """Pixels of the images, after checks against the views and the scene's pictures."""
-    for number, (image, picture) in enumerate(zip(images, pictures, strict=True)):
-        if image.shape != picture.shape:
+    """Pixels of the images, after checks against the views and the scene's renderings."""
+    for number, (image, rendering) in enumerate(zip(images, renderings, strict=True)):
+        if image.shape != rendering.shape:
             raise InversionError(
-                f"calibrate: image {number} has the shape {image.shape}, the scene's film {picture.shape}. Give "
+                f"calibrate: image {number} has the shape {image.shape}, the scene's film {rendering.shape}. Give "
                 "images of the same film."
             )
-        pitch, own = (float(i.metadata.get("pixel_pitch", np.nan)) for i in (image, picture))
+        pitch, own = (float(i.metadata.get("pixel_pitch", np.nan)) for i in (image, rendering))
         if abs(pitch - own) > PITCH_TOLERANCE * own:
             raise InversionError(
                 f"calibrate: image {number} has a pixel pitch of {pitch:g} mm, the scene {own:g} mm. Give images of "
                 "the same film."
             )
     _require_order(images, views)
-    noise = noise_of((len(images), *pictures[0].shape), images, sampled=sampled, verb="calibrate")
+    noise = noise_of((len(images), *renderings[0].shape), images, sampled=sampled, verb="calibrate")
     masks = np.stack([np.zeros(i.shape, bool) if i.mask is None else i.mask for i in images])
-    lit = np.stack([picture.power for picture in pictures]) > 0  # no sample need have met such a pixel
+    lit = np.stack([rendering.power for rendering in renderings]) > 0  # no sample need have met such a pixel
     used = ((noise.shot + noise.other > 0) | (noise.sampled[:, None, None] & lit)) & ~masks
     if used.sum() <= parameters:
         raise InversionError(

@@ -1,6 +1,6 @@
-"""Least squares of `calibrate`: parameters, their covariance, and what the pictures do not determine.
+"""Least squares of `calibrate`: parameters, their covariance, and what the images do not determine.
 
-    σ_i² = P_i/k + σ_other² + e_i² (Eq. M.24, P the fitted picture),   C = (Jᵀ J)⁻¹ + g² b bᵀ,   J = ∂(P/σ)/∂p
+    σ_i² = P_i/k + σ_other² + e_i² (Eq. M.24, P the fitted image),   C = (Jᵀ J)⁻¹ + g² b bᵀ,   J = ∂(P/σ)/∂p
 
 with b = (Jᵀ J)⁻¹ Jᵀ P/σ, the change of the parameters by a common factor of the powers, and g its uncertainty: Eq. M.26
 of docs/model.md.
@@ -19,7 +19,7 @@ from ..runtime.errors import InversionError
 from .measurement import Chi2, Noise
 
 Array = NDArray[np.float64]
-Pictures = Callable[[Array], tuple[Array, Array]]
+Images = Callable[[Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,15 @@ class CalibrationSettings:
 
     rtol : of the integrals; None: a tenth of the median noise over the brightest pixel, in `rtols`
     rtols : least and largest rtol that the noise chooses
-    change : of the picture by a step of the differences, root mean square over that of the picture, for an rtol of
-        1e-4, and in proportion to rtol^½. The slopes are then right to about 0.5 %, half of it from the pictures and
+    change : of the image by a step of the differences, root mean square over that of the image, for an rtol of
+        1e-4, and in proportion to rtol^½. The slopes are then right to about 0.5 %, half of it from the images and
         half from the step; at an rtol of 1e-3 to 3 %.
     chi2 : change of Σ (residual/σ)² at which the fit ends: 1e-2 leaves parameters within 0.1 of their sd
     reweighted : relative change of the standard deviations, root mean square, at which they count as converged
-    nearby : steps of the differences within which slopes are taken again; they then belong to a picture that differs by
+    nearby : steps of the differences within which slopes are taken again; they then belong to an image that differs by
         less than half of `change`
-    rounds : most rounds of standard deviations;  evaluations : most pictures of a round beside those of slopes
-    reach : of the first step of the fit, in steps of the differences: 20 of them change a picture by a tenth
+    rounds : most rounds of standard deviations;  evaluations : most images of a round beside those of slopes
+    reach : of the first step of the fit, in steps of the differences: 20 of them change an image by a tenth
     condition : of the Jacobian with columns of length 1, above which parameters count as not determined separately: the
         combination that is least determined then has a standard deviation so many times that of each parameter alone
     doubtful : share of its slope by which a combination's slope may change with a doubled step. Above it the standard
@@ -121,7 +121,7 @@ class _AtMinimum(Exception):
 class CalibrationFit:
     """Fit of parameters `names` to what was `measured`.
 
-    pictures : values (p,) → power and numerical error, (views, h, w) [W];  start : (p,) values
+    images : values (p,) → power and numerical error, (views, h, w) [W];  start : (p,) values
 
     Inside, y (p,) are the distances from the start in units of the steps of the differences.
     """
@@ -131,33 +131,33 @@ class CalibrationFit:
         names: tuple[str, ...],
         start: Array,
         measured: Measured,
-        pictures: Pictures,
+        images: Images,
         settings: CalibrationSettings,
     ) -> None:
         self.names, self.start, self.measured, self.settings = names, start, measured, settings
-        self._pictures = pictures
+        self._images = images
         self._steps = np.ones(len(start))
         self._kept: tuple[Array, Array] | None = None  # y of the last slopes, and these
 
     def solved(self) -> Fitted:
-        """Minimum of Σ (residual/σ)², with σ of its own picture."""
+        """Minimum of Σ (residual/σ)², with σ of its own image."""
         y = np.zeros(len(self.start))
-        picture, numerical = self._pictures(self.start)
-        self._steps = self._chosen_steps(picture)
-        sigma = self.measured.sigma(picture, numerical)
+        image, numerical = self._images(self.start)
+        self._steps = self._chosen_steps(image)
+        sigma = self.measured.sigma(image, numerical)
         self._require_determined(y, sigma)
         for _ in range(self.settings.rounds):
             y = self._minimum(y, sigma)
-            picture, numerical = self._pictures(self._values(y))
-            before, sigma = sigma, self.measured.sigma(picture, numerical)
+            image, numerical = self._images(self._values(y))
+            before, sigma = sigma, self.measured.sigma(image, numerical)
             if np.sqrt(np.mean((sigma / before - 1) ** 2)) < self.settings.reweighted:
                 break
         slopes, condition = self._require_determined(y, sigma)
         used = self.measured.used
-        residual = ((picture - self.measured.power) / sigma)[used]
-        noise = self.measured.noise.chi2(picture, sigma, used)
+        residual = ((image - self.measured.power) / sigma)[used]
+        noise = self.measured.noise.chi2(image, sigma, used)
         inverse = np.linalg.inv(slopes.T @ slopes)
-        factor = inverse @ (slopes.T @ (picture / sigma)[used])  # Eq. M.26
+        factor = inverse @ (slopes.T @ (image / sigma)[used])  # Eq. M.26
         covariance = inverse + self.measured.gain_error**2 * np.outer(factor, factor)
         scale = np.outer(self._steps, self._steps)
         return Fitted(self._values(y), covariance * scale, float(residual @ residual), noise, condition)
@@ -184,7 +184,7 @@ class CalibrationFit:
             values = zip(self.names, self._values(found.x), strict=True)
             shown = ", ".join(f"{name} = {value:.6g}" for name, value in values)
             raise InversionError(
-                f"calibrate: the fit has not ended after {self.settings.evaluations} pictures, at {shown}. Start "
+                f"calibrate: the fit has not ended after {self.settings.evaluations} images, at {shown}. Start "
                 "nearer, with other <default> values."
             )
         return np.asarray(found.x, np.float64)
@@ -195,7 +195,7 @@ class CalibrationFit:
     def _slopes_beyond(self, y: Array, sigma: Array) -> Array:
         """Slopes at y; raises _AtMinimum where no step lowers Σ (residual/σ)² by more than the fit's end.
 
-        Of a smaller change the errors of the pictures would be the larger part, and the search only tries ever shorter
+        Of a smaller change the errors of the images would be the larger part, and the search only tries ever shorter
         steps.
         """
         slopes, residual = self._slopes(y, sigma), self._residual(y, sigma)
@@ -205,7 +205,7 @@ class CalibrationFit:
         return slopes
 
     def _power(self, y: Array) -> Array:
-        return self._pictures(self._values(y))[0]
+        return self._images(self._values(y))[0]
 
     def _slopes(self, y: Array, sigma: Array) -> Array:
         """(pixels that count, p) of residuals: differences a step to both sides; those of a point nearby if there."""
@@ -214,21 +214,23 @@ class CalibrationFit:
         return (self._kept[1] / sigma[..., None])[self.measured.used]
 
     def _slope(self, y: Array, way: Array, length: float = 1.0) -> Array:
-        """Change of the pictures [W] along a way."""
+        """Change of the images [W] along a way."""
         return (self._power(y + length * way) - self._power(y - length * way)) / (2 * length)
 
     def _chosen_steps(self, first: Array) -> Array:
-        """Step of each parameter that changes the picture by `CalibrationSettings.change`, to a factor of 3."""
+        """Step of each parameter that changes the image by `CalibrationSettings.change`, to a factor of 3."""
         used, goal = self.measured.used, self.settings.change
         light = np.linalg.norm(first[used])
         if not light > 0:
-            raise InversionError("calibrate: the scene's picture is dark where the images are not masked. Check both.")
+            raise InversionError(
+                "calibrate: the scene's image is dark where the measured ones are not masked. Check both."
+            )
         steps = np.empty(len(self.start))
         for k, (name, value) in enumerate(zip(self.names, self.start, strict=True)):
             step, change = 3e-3 * (abs(value) or 1.0), 0.0
             while step < 100 * max(abs(value), 10.0):
                 moved = self.start + step * (np.arange(len(self.start)) == k)
-                change = float(np.linalg.norm((self._pictures(moved)[0] - first)[used]) / light)
+                change = float(np.linalg.norm((self._images(moved)[0] - first)[used]) / light)
                 if goal / 3 <= change <= 3 * goal:
                     break
                 step *= float(np.clip(goal / max(change, 1e-300), 0.02, 30))

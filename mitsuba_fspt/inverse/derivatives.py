@@ -93,17 +93,17 @@ def derivatives(
     values = {name: varied_value(xml, name) for name in _listed(names)}
     accuracy = steps.rtol if rtol is None else rtol
 
-    def picture(change: Mapping[str, float]) -> Image:
+    def image(change: Mapping[str, float]) -> Image:
         return render(load(file, **{**parameters, **change}), method="integral", sensor=sensor, rtol=accuracy)
 
-    return {name: _Differences(name, value, picture, steps).best() for name, value in values.items()}
+    return {name: _Differences(name, value, image, steps).best() for name, value in values.items()}
 
 
 class _Differences:
-    """Central differences of a picture by one parameter at its value, for steps of any power of 2 of the first."""
+    """Central differences of an image by one parameter at its value, for steps of any power of 2 of the first."""
 
-    def __init__(self, name: str, value: float, picture: Callable[[Mapping[str, float]], Image], steps: Steps) -> None:
-        self._name, self._value, self._picture, self._steps = name, value, picture, steps
+    def __init__(self, name: str, value: float, image: Callable[[Mapping[str, float]], Image], steps: Steps) -> None:
+        self._name, self._value, self._image, self._steps = name, value, image, steps
         self._first = steps.first * (abs(value) or 1.0)
         self._known: dict[int, tuple[Array, Array]] = {}
 
@@ -133,7 +133,7 @@ class _Differences:
         """Central difference and the errors of its integrals."""
         if doubled not in self._known:
             step = self._first * 2.0**doubled
-            high, low = (self._picture({self._name: self._value + sign * step}) for sign in (1, -1))
+            high, low = (self._image({self._name: self._value + sign * step}) for sign in (1, -1))
             slope = (high.power.astype(np.float64) - low.power) / (2 * step)
             error: Array = np.asarray(high.error, np.float64) + np.asarray(low.error, np.float64)
             self._known[doubled] = slope, error / (2 * step)
