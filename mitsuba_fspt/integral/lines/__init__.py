@@ -1,1 +1,1 @@
-"""Lines of sight: Eq. 9 on one of them, what they meet, and checks of the scene that they are traced in."""
+"""Lines of sight: Eq. 9 on a single one, the surfaces that it meets, and checks of the scene in which it is traced."""

@@ -34,7 +34,7 @@ class LeftOut:
     """Share of an image's power that a method leaves out, its standard error, and ids of the shapes that scatter it.
 
     depth : segments of light paths that the method follows; None: the integral
-    needed : segments that contain what is counted
+    needed : segments of the longest paths that are counted
     """
 
     share: float

@@ -12,7 +12,7 @@ from .specular import Specular
 
 
 def visible_window(scene: mi.Scene, camera: Camera, everywhere: bool = False) -> Window:
-    """Window of the pixels with a line of sight into the bounding box of emitting surfaces; all if it holds the lens.
+    """Window of the pixels with a line of sight into the bounding box of emitting surfaces; all if the lens is in it.
 
     `everywhere`: all pixels. Emitters other than `fspt_surface` count with the bounding box of the scene; mirrors and
     glass, in which light is seen, count, too.

@@ -54,7 +54,7 @@ def integrate_transect(
     jumps, places = found.jumps, found.places()
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
-    # Pieces 0 … jumps between -1, the places and 1; an outer one is dark if all its lines of sight miss the phantom.
+    # Pieces 0 … jumps between -1, the jumps and 1; an outer one is dark if all its lines of sight miss the phantom.
     def integrate(
         piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, value: mi.Float, coverage: mi.Float, rays: mi.UInt32
     ) -> tuple:

@@ -158,7 +158,7 @@ class Points:
         return (x > -far) & (x < width + far) & (y > -far) & (y < height + far)
 
     def shown_in(self, window: Window) -> NDArray[np.bool_]:
-        """True where a blur disc reaches what is shown of a window."""
+        """True where a blur disc reaches the shown part of a window."""
         rows, columns = window.inner
         moved = replace(self, x=self.x - columns.start, y=self.y - rows.start)
         return moved.near(self.blur, (rows.stop - rows.start, columns.stop - columns.start))

@@ -64,7 +64,7 @@ class Rows:
     """The rows of all pixels of a crop window that see anything; `shape` (h, w).
 
     groups : by lines of sight. matrix : of the transport matrix, with the columns of each emitter by its mark
-    kept : arrays whose indices tell whether the rows are still right
+    kept : arrays whose indices show whether the rows are still valid
     """
 
     shape: tuple[int, int]

@@ -63,5 +63,5 @@ class SparseRows:
         """The largest value of each pixel and its neighbours, (h · w)."""
         return maximum_filter(values.reshape(self.shape), NEIGHBOURS).ravel()
 
-    def _csr(self, values: Array) -> csr_array:
+    def _csr(self, values: NDArray[np.floating]) -> csr_array:
         return csr_array((values, self.columns, self.starts), shape=(len(self.starts) - 1, self.count))

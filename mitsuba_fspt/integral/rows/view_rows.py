@@ -80,7 +80,7 @@ def view_rows(
     on : of each emitter, 'vertex' or 'face'
     progress : called with the share done
     most_bytes : that may be allocated; None for what the system says
-    name : of what needs them, for messages
+    name : of the caller, for messages
 
     Raises
     ------
@@ -103,7 +103,7 @@ def view_rows(
 
 @dataclass(frozen=True, eq=False)
 class _Entries:
-    """Entries of all rows, in the order of the rows: column, light over that of a filled pixel, relative change."""
+    """Entries in the order of the rows: column, light over that of a filled pixel (T/G, M.20), relative change."""
 
     count: int
     starts: NDArray[np.integer]
@@ -179,7 +179,7 @@ class _Entries:
 def _laid_out(
     scene: mi.Scene, camera: Camera, on: Sequence[str], most_bytes: int | None
 ) -> list[tuple[FaceLight, Windows]]:
-    """Faces of each mesh with the windows of its columns; TransportError where the memory does not hold the entries."""
+    """Faces of each mesh with the windows of its columns; TransportError if the memory is too small for the entries."""
     alone, shape = hides_nothing(scene), camera.film.shape
     offset = camera.film.crop_offset
     laid = []
@@ -269,7 +269,7 @@ def _refined(
 def _rough(
     scene: mi.Scene, camera: Camera, entries: _Entries, solution: Solution, rtol: float
 ) -> tuple[Mask, Mask, Mask]:
-    """Pixels (h · w) whose row the surface form gives wrongly, those that the stop cuts, and those beyond it.
+    """Pixels (h · w) on which the surface form is wrong, those that the stop cuts, and those beyond it.
 
     The first include the second, rows whose sum is far from the image, and rows that differ from an uncertain image.
     """

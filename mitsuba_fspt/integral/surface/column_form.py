@@ -39,7 +39,7 @@ FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, 
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
 MOST_WORK = 1 << 23  # entries of windows that are accumulated at a time
 LEFT = 1 / 3  # error over the change by twice the cells and pieces, of second order
-MOST_CHANGE = 6e4  # relative, that float16 holds
+MOST_CHANGE = 6e4  # relative, below the largest number of float16
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

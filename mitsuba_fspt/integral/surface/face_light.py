@@ -26,7 +26,7 @@ from . import pupil_cells
 CORNERS = ((0, 0), (1, 0), (0, 1))  # of a face, in the square that `Elements.place` maps to it
 MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for float32, and of the blur radius, for cells
 RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
-INWARD = 0.05  # of a face: how far from its sides rays start that look for the edge of a shadow
+INWARD = 0.05  # of a face: distance from its sides at which rays start that search for the edge of a shadow
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
 # M of columns of several faces: neighbours mostly take the same.
 LEVELS = (4, 6, 8, 10, 12, 16, 20, 24, 28, 32, 36, 40, 44, 50, 56, 64)

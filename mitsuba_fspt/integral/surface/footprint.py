@@ -24,7 +24,7 @@ class Canvas:
     """Film of `shape` (h, w) that accumulates several quantities, each in integer multiples of its quantum.
 
     `centres` False: a pixel gets the light on its area; True: the density at its centre times that area. A pixel
-    holds up to 2⁶² quanta, a polygon `DENSEST` quanta a pixel.
+    has up to 2⁶² quanta, a polygon `DENSEST` quanta a pixel.
     """
 
     def __init__(self, shape: tuple[int, int], quanta: Sequence[float], centres: bool) -> None:
