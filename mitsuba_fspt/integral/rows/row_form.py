@@ -89,7 +89,7 @@ def rows_of(
 
 
 class _Hits:
-    """Where so many `lanes`, lines of sight, meet emitting meshes; one lane may meet several."""
+    """Hits of a number of lines of sight, `lanes`, on emitting meshes; one line may meet several."""
 
     def __init__(
         self, surfaces: Sequence[EmittingSurface], elements: Sequence[Elements], lanes: int, most: int
@@ -97,10 +97,8 @@ class _Hits:
         self._meshes = list(zip(surfaces, elements, strict=True))
         self._lane, self._most = dr.arange(mi.UInt32, lanes), most * lanes
         self._counts = [dr.zeros(mi.UInt32) for _ in surfaces]
-        self._stored = [
-            [dr.zeros(kind, self._most) for kind in (mi.UInt32, mi.UInt32, mi.Float, mi.Float, mi.Float, mi.Float)]
-            for _ in surfaces
-        ]
+        kinds = {"lane": mi.UInt32, "face": mi.UInt32} | dict.fromkeys(("a", "b", "c", "radiance"), mi.Float)
+        self._stored = [{name: dr.zeros(kind, self._most) for name, kind in kinds.items()} for _ in surfaces]
 
     def note(self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, weight: mi.Float, met: mi.Bool) -> None:
         """Store the intersections that lie on the outward side of an emitting mesh."""
@@ -110,14 +108,15 @@ class _Hits:
             mine = outward & (si.shape == mi.ShapePtr(surface.shape))
             si.prim_index = dr.select(mine, index, 0)  # another mesh may have more faces than this one
             radiance = weight * surface.law.profile(si, -ray.d, mine)
-            face, weights = own.weigh(si)
+            face, (a, b, c) = own.weigh(si)
             kept = mine & (radiance > 0)
             slot = dr.scatter_inc(count, mi.UInt32(0), kept)
-            for array, column in zip(stored, (self._lane, face, *weights, radiance), strict=True):
-                dr.scatter(array, column, slot, kept & (slot < self._most))
+            hits = {"lane": self._lane, "face": face, "a": a, "b": b, "c": c, "radiance": radiance}
+            for name, array in stored.items():
+                dr.scatter(array, hits[name], slot, kept & (slot < self._most))
 
     def stored(self) -> Iterator[tuple[mi.UInt32, mi.UInt32, list[mi.Float], mi.Float]]:
-        """Of each mesh lane, face, weights of its corners and radiance of every hit, in an order that does not change.
+        """For each mesh the line, face, weights of its corners and radiance of every hit, in a reproducible order.
 
         Threads store them in any order. Raises SceneError where lines meet more surfaces than there is room for.
         """
@@ -129,10 +128,10 @@ class _Hits:
                     f"transport: {dr.width(self._lane)} lines of sight meet glowing surfaces {number} times by way of "
                     f"specular shapes, at most {MOST_HITS} each are kept. Give a larger rtol."
                 )
-            keys = [array.numpy()[:number] for array in (stored[5], stored[1], stored[0])]
+            keys = [stored[name].numpy()[:number] for name in ("radiance", "face", "lane")]
             order = mi.UInt32(np.lexsort(keys).astype(np.uint32))
-            lane, face, a, b, c, radiance = (dr.gather(type(array), array, order) for array in stored)
-            yield lane, face, [a, b, c], radiance
+            hits = {name: dr.gather(type(array), array, order) for name, array in stored.items()}
+            yield hits["lane"], hits["face"], [hits[corner] for corner in "abc"], hits["radiance"]
 
 
 def _nothing(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Float:
