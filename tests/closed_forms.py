@@ -1,4 +1,4 @@
-"""Exact solutions of the diffusion equation for the tests: a ball, a slab of two layers. Lengths in mm, powers in W.
+"""Exact solutions of the diffusion equation for the tests: a sphere, a slab of two layers. Lengths in mm, powers in W.
 
 Written from the equations alone; shares nothing with the package.
 """
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 def ball_exitance(
     radius: float, offset: float, mua: float, musp: float, a: float, cosine: Array, orders: int = 40
 ) -> Array:
-    """J_n [1/mm²] per watt at angles of given cosine from a point source, `offset` off the middle of a ball.
+    """J_n [1/mm²] per watt at angles of given cosine from a point source, `offset` off the middle of a sphere.
 
     exp(-kd)/(4πd) = k/(2π²) Σ (2l + 1) i_l(k offset) k_l(kr) P_l(cos); each order meets the boundary
     condition alone.

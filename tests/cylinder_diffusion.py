@@ -31,7 +31,7 @@ ANGULAR_ORDERS = 56
 
 @dataclass(frozen=True)
 class Phantom:
-    """Homogeneous cylinder about the z axis, centred at the origin, a uniform ball of light at (x, 0, z).
+    """Homogeneous cylinder about the z axis, centred at the origin, a uniform sphere of light at (x, 0, z).
 
     `radius`, `height`, `source_x` (0 <= source_x < radius), `source_z`, `source_diameter` [mm]; `mua`, `musp`
     [1/mm]; `index` of the tissue relative to air, no unit.
@@ -63,7 +63,7 @@ class Phantom:
 
     @property
     def ball(self) -> float:
-        """φ outside a uniform ball over φ of a point in its centre (mean value property), no unit, >= 1."""
+        """φ outside a uniform sphere over φ of a point in its centre (mean value property), no unit, >= 1."""
         x = self.decay * self.source_diameter / 2
         return 1.0 if x == 0 else float(3 * (x * np.cosh(x) - np.sinh(x)) / x**3)
 

@@ -139,7 +139,7 @@ def test_an_existing_scene_stays(run, folder):
 
 
 def completions(typed):
-    """What the shell is told to offer for the last word of a command line."""
+    """What the shell offers for the last word of a command line."""
     words = typed.split(" ")
     environment = os.environ | {
         "_FSPT_COMPLETE": "complete_bash",

@@ -135,7 +135,7 @@ def test_dark_charge_and_frames_add_their_noise():
 
 
 def test_a_total_below_zero_is_reported(caplog):
-    """Dark frames scatter about 0 and say nothing; counts 40 DN below the bias are told."""
+    """Dark frames scatter about 0 and say nothing; counts 40 DN below the bias are reported."""
     dark = np.random.default_rng(5).normal(CCD.bias, CCD.read_noise / CCD.gain, (32, 32))
     CCD.reduce(dark, **SETTINGS)
     assert not caplog.records

@@ -14,7 +14,7 @@ FLOAT32 = 1e-6  # of the brightest pixel
 
 
 def ply(path, *, per=None, exitance=None, **settings):
-    """A dented ball of 320 faces, its J_n a number, or rough values per vertex or face."""
+    """A dented sphere of 320 faces, its J_n a number, or rough values per vertex or face."""
     body = trimesh.creation.icosphere(2, radius=5)
     body.vertices *= 1 - 0.3 * np.exp(-((body.vertices - (4, 0, 2)) ** 2).sum(axis=1))[:, None]
     values = np.random.default_rng(3).uniform(0, 1e-3, len(body.vertices if per == "vertex" else body.faces))

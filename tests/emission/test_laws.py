@@ -1,4 +1,4 @@
-"""The laws of emission: each carries J_n, and every way Mitsuba asks for the radiance tells the same law."""
+"""The laws of emission: each carries J_n, and all of Mitsuba's calls for the radiance give the same law."""
 
 from __future__ import annotations
 
@@ -278,7 +278,7 @@ def test_last_flight_is_the_same_in_both_domains():
 
 
 def test_fluence_updated_by_itself_is_followed():
-    """Expected: the image of a scene that had it from the start. Seen to fail where J_n alone is looked at anew."""
+    """Expected: the image of a scene that had it from the start. Seen to fail where J_n alone is evaluated again."""
     scene, emitter = glowing_sphere(last_flight(*STEEP))
     fspt.render(scene, method="integral", rtol=1e-2)
     turned = sloping(1.0, (-0.1, 0.05, 0.1))

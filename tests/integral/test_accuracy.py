@@ -1,6 +1,6 @@
-"""What is promised of the integral: the accuracy asked for at every pixel, an honest error, work where it is needed.
+"""Promises of the integral: the requested accuracy on every pixel, an error that bounds it, work where it is needed.
 
-The truth is computed in float64 NumPy without any code of the integral: by rows for spheres, by a depth buffer for
+The reference is computed in float64 NumPy without any code of the integral: by rows for spheres, by a depth buffer for
 meshes. Both state their own standard error, a tenth of the accuracy asked for in most cases, a third at worst.
 """
 
@@ -181,7 +181,7 @@ def test_same_bits_in_every_run():
 
 
 def test_spheres_that_intersect_are_no_second_surface():
-    """One of the points at which a second surface is looked for lies on their common circle; seen to be refused."""
+    """One of the points at which a second surface is searched for lies on their common circle; seen to be refused."""
     front = sphere(172.24108170659895, 1.9883699847893401, 0.07712417676777661, 1.5394461159644504)
     back = sphere(172.75838990913695, 2.7974111028847615, 0.45245591722528644, -0.43217559420530804)
     assert fspt.render(camera_scene(back, front), rtol=0.1).power.any()
@@ -219,7 +219,7 @@ def test_pixels_beside_a_crop_window_are_not_refined():
 @pytest.mark.parametrize("domain", ["pupil", "surface"])
 @pytest.mark.parametrize("depth", [FOCUS, FOCUS + 3])
 def test_tolerance_is_a_share_of_the_brightest_pixel_of_the_crop_window(depth, domain):
-    """A ball beside a disk ten times as bright that ends at the edge of the window.
+    """A sphere beside a disk ten times as bright that ends at the edge of the window.
 
     Seen to fail where what is computed around the window counts for the brightest pixel, too: 0.1 of that which is
     shown, 0.04 in the surface form.
@@ -234,7 +234,7 @@ def test_tolerance_is_a_share_of_the_brightest_pixel_of_the_crop_window(depth, d
 def test_smooth_pixels_take_four_lines_of_sight(pixel):
     """Expected: 4 at every pixel of a uniform disk, and twelve more at the one of sixteen that is probed.
 
-    The unseen rim of two pixels around the film counts, too.
+    The rim of two pixels around the film, which is not in the image, counts, too.
     """
     picture = fspt.render(camera_scene(disk(FOCUS), f_number=8.0), pixel=pixel)
     assert picture.metadata["nodes"] == (4 + 12 / 16) * (WIDTH + 4) * (HEIGHT + 4)

@@ -1,4 +1,4 @@
-"""What is left is reported: pixels beyond rtol in the metadata and on stderr, light that may be missed in the error."""
+"""Pixels beyond rtol are in the metadata and on stderr, light that may be missed is in the error."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def checker():
 
 
 def part_of(family, seed, crop):
-    """A random scene, of which `crop` is looked at."""
+    """A random scene, of which `crop` is rendered."""
     scene = random_scene(family, seed).scene()
     look_at_crop(scene, *crop)
     return scene
@@ -149,7 +149,7 @@ def test_the_error_bounds_the_error_where_two_levels_agree_by_chance(family, see
 @pytest.mark.parametrize("z", [210.0, 240.0])
 def test_light_too_weak_for_the_search_is_in_the_error(z):
     """A dim spot 0.27 pixels wide behind the virtual detector plane; the surface form, which meets all of it, is
-    the truth.
+    the reference.
 
     Seen to fail with the weak light left out: 34 and 62 pixels of 0 W with an error of 0.
     """

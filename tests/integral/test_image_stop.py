@@ -108,7 +108,7 @@ def test_pixels_beside_the_stop_are_dark_and_not_computed():
 @pytest.mark.parametrize("method", ["path", "ptracer"])
 @pytest.mark.parametrize("borders", [{}, {"f_number": 11.0, "lens_diameter": 6.0, "diaphragm_distance": 30.0}])
 def test_monte_carlo_agrees_where_silhouettes_cross_the_border(method, borders):
-    """A blurred ball beside the axis, partly behind the stop. Seen to fail with the stop left out of ptracer."""
+    """A blurred sphere beside the axis, partly behind the stop. Seen to fail with the stop left out of ptracer."""
     body = sphere(150.0, 6.0, 7.0, -3.0)
     view = camera_scene(body, image_stop_diameter=STOP, **borders)
     inside, beside = pixels(STOP)
@@ -191,7 +191,7 @@ def test_a_stop_below_a_pixel_is_refused():
 
 @pytest.mark.parametrize("domain", ["pupil", "surface"])
 def test_narrow_light_on_a_pixel_that_the_stop_cuts_is_in_the_error(domain):
-    """Rationale: light from the surface knows no stop, and lines of sight may miss a spot of a tenth of a pixel; then
+    """Rationale: the surface form ignores the stop, and lines of sight may miss a spot of a tenth of a pixel; then
     the pixel was 0 with an error of 0, and another one the brightest.
     """
     place = np.array([5.6, 0.2]) * SIDE  # on a pixel that the border cuts, inside the stop

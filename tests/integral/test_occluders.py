@@ -1,4 +1,4 @@
-"""Light that comes past a dark body out of focus, against float64 references that know where outlines lie."""
+"""Light that comes past a dark body out of focus, against float64 references with exact outlines."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ DIM = list(zip([1e-7] * 4, PAST, [20_000, 200_000, 200_000, 20_000], strict=True
 
 @pytest.mark.parametrize(("dim", "disks", "max_nodes"), [*((0, disks, 200_000) for disks in PAST), *DIM])
 def test_light_past_a_dark_disk_arrives(disks, dim, max_nodes):
-    """Seen to fail where outlines of what is dark settle a pixel: off by 0.05 to 0.23 of the brightest pixel, zeros
+    """Seen to fail where dark outlines end a pixel's refinement: off by 0.05 to 0.23 of the brightest pixel, zeros
     without an error. In the last case four nodes meet but the dark disk, and the image was black; in packets of rays,
     which pass by the dark disk here and there, 0.35 of the peak shines through it. A disk that glows ever so little
     changes nothing: it settles no pixel either.
@@ -70,10 +70,10 @@ def test_light_past_a_dark_disk_arrives(disks, dim, max_nodes):
 
 @pytest.mark.parametrize("max_nodes", [4, 16])
 def test_errors_of_few_lines_of_sight_contain_what_they_miss(max_nodes):
-    """A dark half-plane out of focus before a wide glowing disk, its edge along the pixels; truth: the default.
+    """A dark half-plane out of focus before a wide glowing disk, its edge along the pixels; reference: the default.
 
     Expected: the error is a bound. Seen to fail (48 of 288 pixels, 0 W with an error of 0 for 0.14 of the brightest)
-    where nodes that all meet the dark plane know nothing of the pixels around.
+    where nodes that all meet the dark plane take no account of the pixels around.
     """
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], 180)
     behind, before = (mi.ScalarTransform4f().translate(place) for place in ([0, 0, FOCUS], [0, 18.7, 100]))
@@ -109,7 +109,7 @@ def test_narrow_light_before_a_dark_plate_that_hides_a_wide_body():
 
 
 def test_light_beside_a_dark_cylinder_is_found_along_its_outline_too():
-    """A glowing rod that enters a pixel from the side by a tenth, behind a dark one; against the surface form.
+    """A glowing cylinder that enters a pixel from the side by a tenth, behind a dark one; against the surface form.
 
     Seen to fail (0 W, error 0.007 of the brightest pixel, for 0.054) where all transects of such a pixel go across the
     dark outline.

@@ -1,8 +1,8 @@
 """How fast both forms of Eq. 9 converge: a fitted order of the error in lines of sight, a ceiling of the last error.
 
 Work is `Solution.rays`, the lines of sight of all pixels together; the error is the RMS over all pixels, relative to
-the brightest one. The truth is float64 NumPy: the closed form of the filled cone, Gauss's rule where all is smooth, and
-references/rows.py at silhouettes. A fit ends above three times the truth's own error or, where that is less, the
+the brightest one. Its reference is float64 NumPy: closed form of the filled cone, Gauss's rule where all is smooth, and
+references/rows.py at silhouettes. A fit ends above three times the reference's own error or, where that is less, the
 FLOAT32 floor.
 """
 
@@ -119,7 +119,7 @@ def test_surface_form_where_all_is_smooth(build):
 # --- where a silhouette crosses the pixels ---
 
 
-# Pitch, nodes of the truth, and objects from near to far: kind, centre, radius. All edges are out of focus.
+# Pitch, nodes of the reference, and objects from near to far: kind, centre, radius. All edges are out of focus.
 EDGED = {
     "disk": (0.6, 1 << 17, ("disk", (-37.0, -15.0, 140.0), 40.0)),
     "sphere": (0.6, 1 << 17, ("sphere", (-40.0, -15.0, 225.0), 40.0)),
@@ -129,7 +129,7 @@ EDGED = {
 
 
 def edged(name):
-    """Scene, truth and the truth's RMS error relative to the brightest pixel."""
+    """Scene, reference and its RMS error relative to the brightest pixel."""
     pitch, _, *objects = EDGED[name]
     make = {"disk": disk, "sphere": sphere}
     shapes = [make[kind](z, radius, x, y) for kind, (x, y, z), radius in objects]

@@ -1,4 +1,4 @@
-"""What the integral leaves out: taken where it may be, not where it may not, and the image is the same without."""
+"""Shortcuts of the integral: taken where they are valid, not elsewhere, and the image is the same without them."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def shell(path):
 
 
 def dumbbell(path):
-    """Two balls in one mesh, one behind the other: each is convex, both are not."""
+    """Two spheres in one mesh, one behind the other: each is convex, both are not."""
     balls = [trimesh.creation.icosphere(3, radius=3).apply_translation([x, 1.5, 0]) for x in (-5, 5)]
     return world_scene(mesh_of(trimesh.util.concatenate(balls), path))
 
@@ -123,7 +123,7 @@ def test_a_wide_pupil_and_a_wide_blur_take_all_lines_of_sight():
 
 
 def with_slivers_at_its_pole(path):
-    """A ball on a grid in both angles whose last row of faces is 1e-15 mm wide at sin π, as floats have it."""
+    """A sphere on a grid in both angles whose last row of faces is 1e-15 mm wide at sin π, as floats have it."""
     rings = 40
     theta, phi = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.arange(rings) * 2 * np.pi / rings, indexing="ij")
     across = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1).reshape(-1, 3)
@@ -136,12 +136,12 @@ def with_slivers_at_its_pole(path):
 
 
 def test_faces_that_float32_gives_no_direction_have_no_say(tmp_path):
-    """Seen to fail with rays from all faces: those at the pole meet the ball."""
+    """Seen to fail with rays from all faces: those at the pole meet the sphere."""
     assert found(solved(with_slivers_at_its_pole(tmp_path / "body.ply"), "surface", rtol=0.3), "occlusion")
 
 
 def dented(path):
-    """A ball with a shallow dent around its waist, so fine a mesh that no edge tells."""
+    """A sphere with a shallow dent around its waist, in a mesh so fine that no single edge shows it."""
     body = trimesh.creation.uv_sphere(radius=5, count=[800, 60])
     body.vertices *= (1 - 0.1 * np.exp(-((body.vertices[:, 2] / 1.5) ** 2)))[:, None]
     return world_scene(mesh_of(body, path))
@@ -159,7 +159,7 @@ def test_radiance_that_depends_on_direction_takes_all_lines_of_sight():
 
 
 def test_a_body_thinner_than_a_pixel_between_two_rows_is_found():
-    """A plate edge-on through the sharp plane: on each pixel lines of sight from one half of the pupil meet it.
+    """A plate edge-on through z = u: on each pixel lines of sight from one half of the pupil meet it.
 
     Expected: what random lines of sight find, on every pixel. Seen to fail, dark with no error, with one line of sight
     a pixel and nothing more where none meets anything; and by 0.4 of the peak, for a hundredth, where three levels of
@@ -220,7 +220,7 @@ def test_explain_measures_what_each_shortcut_saves():
 
 
 def test_findings_count_no_more_pixels_than_the_image_has():
-    """Where the phantom reaches beyond the image so does what is looked at: pixels around know of silhouettes."""
+    """Where the phantom extends beyond the image, pixels around it are evaluated too: silhouettes may cross them."""
     solution = solved(world_scene(ball(radius=60.0), sensor=lens(8, f_number=2.8)))
     (outside,) = [finding for finding in solution.findings if finding.name == "outside"]
     assert (outside.taken, outside.why) == (False, "64 of 64 pixels can see what glows")

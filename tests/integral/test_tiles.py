@@ -1,4 +1,4 @@
-"""Large films in tiles: the same image as in one piece, to one tolerance, in memory that is bounded and told."""
+"""Large films in tiles: the same image as in one piece, to one tolerance, in memory that is bounded and stated."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_tiles_and_one_piece_agree_within_the_errors_of_both(name, accuracy, mon
     assert ((whole.error > 0) == (tiled.error > 0)).mean() > 0.999
     np.testing.assert_allclose(tiled.coverage, whole.coverage, atol=0.05)
     assert tiled.metadata["nodes"] < 1.3 * whole.metadata["nodes"]
-    # What a step did is told once, for all tiles together.
+    # What a step did is reported once, for all tiles together.
     steps = [level.partition(":")[0] for level in tiled.metadata["levels"].split("; ")]
     assert len(steps) == len(set(steps))
 

@@ -98,7 +98,7 @@ def test_degenerate_sets_are_reported(scene):
 def test_a_flat_view_does_not_determine_focus_magnification_and_gain(tmp_path, mono):
     """A disk that faces a lens of f/22: distance, magnification and gain change size and brightness, two numbers.
 
-    Only the blur, far below a pixel, tells them apart.
+    Only the blur, far below a pixel, separates them.
     """
     disk = """<shape type="disk"><transform name="to_world"><scale value="2"/><rotate y="1" angle="90"/></transform>
         <emitter type="fspt_surface"><float name="exitance" value="1e-3"/></emitter></shape>"""

@@ -69,7 +69,7 @@ def ratios(found, *sources):
 
 
 def test_a_source_from_images_without_noise(case):
-    """Position to 2 µm and power to 0.1 %: errors of the finite elements. The series knows nothing of them.
+    """Position to 2 µm and power to 0.1 %: errors of the finite elements. The series has none of them.
 
     Seen to fail (power 2 %) with a boundary factor 2 % larger.
     """
@@ -291,7 +291,7 @@ def test_a_misfit_is_reported(case, caplog):
 
 
 def test_structure_of_the_residuals_is_reported(case, caplog):
-    """The right images are not told; one view 10 % too bright is, by its name, in `warnings` and in the summary."""
+    """The right images are not reported; one view 10 % too bright is, by its name, in `warnings` and in the summary."""
     images = case.images(SOURCE, electrons=3000)
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
         assert case.locate(images).warnings == ()

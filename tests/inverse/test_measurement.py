@@ -83,8 +83,8 @@ def test_metadata_name_a_monte_carlo():
 
 @pytest.mark.parametrize(("electrons", "read_noise"), [(0.02, 0.0), (0.5, 0.0), (3.0, 1.0), (1000.0, 3.5)])
 def test_the_right_noise_gives_no_warning(electrons, read_noise):
-    """100 images with the stated noise, of few electrons too: at most one is told, and Σ (noise/σ)² has the stated mean
-    and variance, to a fifth. Seen to fail (one of two told) with the variance 2 a pixel of normal noise, at 0.02.
+    """100 images with the stated noise, of few electrons too: at most one warns, and Σ (noise/σ)² has the stated mean
+    and variance, to a fifth. Seen to fail (one of two warns) with the variance 2 a pixel of normal noise, at 0.02.
     """
     rng, per_watt = np.random.default_rng(3), 1e3
     true = electrons / per_watt * np.ones((1, 20, 20))
@@ -105,9 +105,9 @@ def test_the_right_noise_gives_no_warning(electrons, read_noise):
 
 
 def test_noise_stated_too_large_is_reported(caplog):
-    """χ² of 0.1, the mean of ten frames stated as one, and of 0.47 are told with the factor of the intervals' widths.
+    """χ² of 0.1, the mean of ten frames stated as one, and of 0.47 give the factor of the intervals' widths.
 
-    Half of a numerical error in σ is no noise: χ² of 0.5 is then not told, since the error is a bound.
+    Half of a numerical error in σ is no noise: χ² of 0.5 is then not reported, since the error is a bound.
     """
     shape, used = (1, 40, 40), np.ones((1, 40, 40), bool)
     noise = Noise(np.zeros(shape), np.ones(shape), np.zeros(1, bool))

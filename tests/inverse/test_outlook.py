@@ -1,4 +1,4 @@
-"""A first fit on few unknowns tells in seconds where images are not those of the surface."""
+"""A first fit on few unknowns shows in seconds that images are not those of the surface."""
 
 from __future__ import annotations
 

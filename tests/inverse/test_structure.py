@@ -1,4 +1,4 @@
-"""Structure in residuals: false alarms and sizes on linear models, and what `invert` tells of a wrong image."""
+"""Structure in residuals: false alarms and sizes on linear models, and the report of `invert` about a wrong image."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Linear:
 
 @pytest.mark.parametrize("prior", [1.0, 0.003])
 def test_noise_without_structure_gives_no_warning(prior):
-    """Σ z² of 300 fits has mean and variance of chi-squared to 4 %, 25 %, and no line is told.
+    """Σ z² of 300 fits has mean and variance of chi-squared to 4 %, 25 %, and no line is reported.
 
     Also where the prior holds most unknowns. Seen to fail (mean 0.8) with the identity in place of I − K.
     """
@@ -107,7 +107,7 @@ def test_what_the_fit_absorbs_is_no_cause():
 
 
 def test_errors_in_common_are_no_structure():
-    """An error of one sign over a view, of the size that is stated, is not told; stated as 0 it is."""
+    """An error of one sign over a view, of the size that is stated, is not reported; stated as 0 it is."""
     model, rng = Linear(), np.random.default_rng(3)
     extra = 0.7 * np.repeat([1.0, -1.0], SIDE**2)
     residual = [model.residual(rng, extra) for _ in range(10)]

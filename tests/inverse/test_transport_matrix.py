@@ -107,7 +107,7 @@ def test_its_summary_in_numbers_and_text(matrix):
 
 
 def test_vertices_that_no_camera_sees_have_no_entries(scene_file):
-    """Of a ball one view sees a little less than half; the columns beyond are empty."""
+    """Of a sphere one view sees a little less than half; the columns beyond are empty."""
     found = fspt.transport(scene_file)
     away = BODY.vertices[:, 0] < -1.0
     assert not found.sensitivity[away].any()

@@ -213,7 +213,7 @@ def test_a_crop_window_is_a_part_of_the_film():
 
 
 def pictures(settings, spp=4000):
-    """Integral, path and ptracer of a ball, off the axis, and the Monte Carlo errors."""
+    """Integral, path and ptracer of a sphere, off the axis, and the Monte Carlo errors."""
     scene = world_scene(ball(2e-3, center=(6, 1.5, -1)), sensor=lens(size=12, pitch=0.9, **settings))
     return [
         fspt.render(scene),
@@ -254,7 +254,7 @@ def test_a_crop_window_is_cut_out_of_the_image(method):
     [("integral", (1, 1)), ("integral", (7, 1)), ("integral", (2, 2)), ("path", (1, 7)), ("ptracer", (7, 1))],
 )
 def test_films_of_a_row_a_column_or_one_pixel(method, size):
-    """A sheet in the sharp plane that fills every line of sight: J_n A_vd sin²θ on each pixel near the axis."""
+    """A sheet in focus that fills every line of sight: J_n A_vd sin²θ on each pixel near the axis."""
     place = mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale([15, 15, 1])
     scene = world_scene(
         {"type": "rectangle", "to_world": place, "emitter": glow(1e-3)}, sensor=lens(size=size, pitch=2.0)

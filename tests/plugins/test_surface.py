@@ -1,6 +1,6 @@
 """`fspt_surface` as an emitter: what is sampled, its density and its radiance tell one story, the true J_n.
 
-The truth of each case is its formula for J_n and for the power of patches, in NumPy; no function of the plugin.
+The reference of each case is its formula for J_n and for the power of patches, in NumPy; no function of the plugin.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def attempt(function, *arguments, **options):
         return f"{type(error).__name__}: {error}"
 """
 
-# A mesh with an attribute and a ball far brighter than 1, that hides a part of it.
+# A mesh with an attribute and a sphere far brighter than 1, that hides a part of it.
 PICTURES = """
 import mitsuba_fspt as fspt
 import mitsuba as mi

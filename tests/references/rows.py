@@ -1,4 +1,4 @@
-"""Eq. 9 in float64 NumPy, exact along the rows of the film: the truth at silhouettes of spheres and disks.
+"""Eq. 9 in float64 NumPy, exact along the rows of the film: the reference at silhouettes of spheres and disks.
 
 For one point of the pupil and one height y on the virtual detector plane, the lines of sight that meet a sphere or a
 disk are those between two known x. So the silhouettes are exact along x; the three other coordinates, two of the pupil

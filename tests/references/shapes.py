@@ -30,7 +30,7 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class Sphere:
-    """Ball of `radius` [mm] about `centre`; emits outwards."""
+    """Sphere of `radius` [mm] about `centre`; emits outwards."""
 
     centre: ArrayLike
     radius: float

@@ -40,7 +40,7 @@ def test_uniform_sheet_meets_the_closed_form(distance, pixel):
 
 @pytest.mark.parametrize("focus_distance", [165.0, 190.0, 230.0])
 def test_power_is_conserved_at_every_focus(focus_distance):
-    """Rationale: Σ P = ∫_S J_n f dS knows no focus: refocusing makes and loses no light.
+    """Rationale: Σ P = ∫_S J_n f dS does not depend on the focus: refocusing conserves the light.
     Expected: to 1e-4, the silhouette's error at 2048 lines of sight a pixel.
     """
     lens = camera(focus_distance=focus_distance, width=26, height=24, pixel_pitch=0.32, to_world=pose())

@@ -1,4 +1,4 @@
-"""Light that a method does not follow: its depth is in the metadata, its share is told, and `compare` names it."""
+"""Light that a method does not follow: its depth is in the metadata, its share is reported, and `compare` names it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PLACE = mi.ScalarTransform4f
 
 
 def on_a_table(*more):
-    """A ball above a white table, seen from the side."""
+    """A sphere above a white table, seen from the side."""
     table = {
         "type": "rectangle",
         "to_world": PLACE().translate([0, 0, -5.5]).scale(30),
@@ -73,7 +73,7 @@ def test_compare_names_the_light_of_one_image(images):
 
 
 def test_mirrors_beyond_the_longest_path_are_reported():
-    """A mirror behind the ball: one segment shows none of it, and the integral contains it."""
+    """A mirror behind the sphere: one segment shows none of it, and the integral contains it."""
     mirror = {"type": "rectangle", "to_world": PLACE().translate([-8, 0, 0]).rotate([0, 1, 0], 90).scale(20)}
     scene = world_scene(ball(), mirror | {"bsdf": {"type": "conductor"}}, sensor=lens(**FILM))
     path = {"method": "path", "spp": 16}

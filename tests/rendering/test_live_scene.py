@@ -154,7 +154,7 @@ def test_the_surface_point_behind_a_mirror_and_a_pane(mono):
     assert (place.shape, place.by_way_of, place.exitance) == ("box", ("mirror", "pane"), pytest.approx(2))
     assert place.position[1] == pytest.approx(36, abs=1e-4)
     assert place.depth == pytest.approx(96, abs=1e-3)
-    # The disc of a point of the sharp plane that the straight line of sight would meet at this depth.
+    # The disc of a point of the virtual detector plane that the straight line of sight would meet at this depth.
     assert place.radius == pytest.approx(6.25 * 54 / 96 * 75 / 150 / 0.5, rel=1e-4)
     assert (place.column, place.row) == pytest.approx((16.5, 12.5), abs=0.05)
 

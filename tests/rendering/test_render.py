@@ -19,7 +19,7 @@ from mitsuba_fspt.runtime.errors import SceneError  # noqa: E402
 
 @pytest.fixture(scope="module")
 def scene():
-    """Two cameras on one ball: 0 sees it as in every test here, 1 is stopped down and has another film."""
+    """Two cameras on one sphere: 0 sees it as in every test here, 1 is stopped down and has another film."""
     second = lens(size=(5, 4), f_number=16.0)
     return mi.load_dict(
         {"type": "scene", "integrator": {"type": "fspt_integral", "rtol": 1e-2}, "a": lens(size=8), "b": second}
@@ -284,7 +284,7 @@ def test_only_a_lens_makes_watts():
 
 
 def test_a_dark_image_keeps_the_warning_of_light_left_out(mono):
-    """A surface that faces a wall behind it: no light comes straight, some by the wall, and both are told.
+    """A surface that faces a wall behind it: no light comes straight, some by the wall, and both are reported.
 
     Seen to fail: that the image is dark took the place of the light left out.
     """

@@ -410,7 +410,7 @@ def lens_centre(scene):
 
 @pytest.fixture
 def aligned(tmp_path):
-    """A sheet in the sharp plane with a vertex in every pixel's middle, in a file that asks for no robust mode."""
+    """A sheet in focus with a vertex in every pixel's middle, in a file that asks for no robust mode."""
     sheet(tmp_path / "grid.ply", cells=16, half=8 * 1.6)
     shapes = PLY_XML.format(name="grid.ply") + '<boolean name="embree_use_robust_intersections" value="false"/>'
     sensor = LENS_XML.replace('value="8"', 'value="7"').replace('value="6"', 'value="7"')

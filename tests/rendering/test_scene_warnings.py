@@ -1,4 +1,4 @@
-"""What a method does not treat in a scene is told in the metadata and in one line on stderr."""
+"""What a method does not treat in a scene is reported in the metadata and in one line on stderr."""
 
 from __future__ import annotations
 

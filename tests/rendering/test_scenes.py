@@ -173,7 +173,7 @@ def reciprocity(phantom, points, normals, weights, values, source=None):
     """∫ J_n (ψ + ∂ψ/∂n / h) dS over ψ at the source, for waves ψ = exp(k s·r) in several directions s; all 1.
 
     Green's second identity: ∇²ψ = k²ψ inside and ∂φ/∂n = -h φ leave no other J_n of a source of 1 W. `source`
-    (N, 3): points the light comes from in equal parts; the phantom's own ball where left out.
+    (N, 3): points the light comes from in equal parts; the phantom's own sphere where left out.
     """
     directions = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
     wave = np.exp(phantom.decay * points @ directions.T)
@@ -194,7 +194,7 @@ def reciprocity(phantom, points, normals, weights, values, source=None):
     ],
 )
 def test_exitance_obeys_green_s_identity(phantom):
-    """Rationale: the identity holds for every wave and knows nothing of modes or Bessel functions.
+    """Rationale: the identity holds for every wave and needs no modes or Bessel functions.
 
     Expected: 1 to the accuracy of the series. Seen to fail with the h of the side's denominator dropped, the
     wall's part of the caps dropped, source_z of the wrong sign on one cap, and `ball` = 1.

@@ -248,7 +248,7 @@ def test_without_a_backend_one_line_names_what_to_install(
 
 
 def test_without_a_backend_no_variant_is_set() -> None:
-    """In a process that sees no CUDA device and is told of an LLVM that is not there."""
+    """In a process that sees no CUDA device and is given the name of an LLVM that does not exist."""
     script = """
 import mitsuba_fspt, mitsuba
 refused = attempt(mitsuba_fspt.runtime.backend.ensure_variant)

@@ -83,12 +83,12 @@ def four_nodes(scene, lens, least_rtol):
 
 
 def test_work_precision_computes_the_reference_once(tmp_path, monkeypatch, capsys):
-    """The real command on the real scene, with a truth of few points of the pupil and one setting of one method.
+    """The real command on the real scene, with a reference of few points of the pupil and one setting of one method.
 
     Expected: a second run takes the file of the first, the CSV file names it, and four lines of sight a pixel agree
     with it to twice the error that it states, so that both have the same camera and the same scene. Seen to fail with
     the truth focused 3 mm away (2.4e-3 for 6e-4), with its camera turned, with another stop, and with another name of
-    the option that takes the truth.
+    the option that takes the reference.
     """
     truths = []
 

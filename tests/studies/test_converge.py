@@ -147,7 +147,7 @@ def short(monkeypatch):
 def test_every_method_comes_nearer_with_its_knob(tmp_path):
     """Expected: nearer by a third at the least; 64 times the samples give a factor of 8 by the law of Monte Carlo.
 
-    A ball behind the sharp plane, as blurred as the sum over points needs it.
+    A sphere behind the virtual detector plane, as blurred as the sum over points needs it.
     """
     scene = small_scenes.camera_scene(small_scenes.sphere(220.0, 6.0), exitance=1e-3)
     told = fspt.converge(scene, rounds=1, budget=100.0)
@@ -247,7 +247,7 @@ def test_reference_meets_the_closed_form_within_its_error():
 
 
 def test_reference_states_the_difference_that_its_check_cannot_explain(monkeypatch):
-    """A form that is off by 1 % where it claims nothing is told off by the other one."""
+    """A form that is wrong by 1 % where it states no error is found so by the other one."""
 
     def finest(scene, lens, domain, seconds):
         power, error = np.full((2, 2), 1.0), np.full((2, 2), 1e-3)

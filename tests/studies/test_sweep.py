@@ -46,7 +46,7 @@ PLY_XML = """
 
 @pytest.fixture(autouse=True)
 def scene(tmp_path, monkeypatch):
-    """A ball before a lens of 8 × 6 pixels in a folder of its own, with the parameters f_number and distance."""
+    """A sphere before a lens of 8 × 6 pixels in a folder of its own, with the parameters f_number and distance."""
     monkeypatch.chdir(tmp_path)
     return write_scene(tmp_path / "s.xml", integrator='<integrator type="fspt_integral"/>').relative_to(tmp_path)
 
@@ -325,7 +325,7 @@ def test_a_change_of_what_makes_an_image_makes_it_anew(tmp_path, calls, what):
 
 @pytest.mark.parametrize("where", ["", "sub", "deep"])
 def test_a_change_of_what_an_included_file_includes_makes_an_image_anew(tmp_path, calls, where):
-    """The first name depends on a parameter. Seen to fail: the image of the old ball stayed, with its old row."""
+    """The first name depends on a parameter. Seen to fail: the image of the old sphere stayed, with its old row."""
     for folder in ("sub", "deep/sub"):
         (tmp_path / folder).mkdir(parents=True)
     include = '<scene version="3.0.0">{}<include filename="inner.xml"/></scene>'

@@ -53,7 +53,7 @@ def nylon() -> DiffusionSolution:
     ("order", "local", "total"), [(1, (1.8, 1.8e-3), (1.8, 3.5e-3)), (2, (2.4, 1.6e-4), (3.8, 3.6e-5))]
 )
 def test_order_of_convergence_on_a_sphere(order: int, local: tuple[float, float], total: tuple[float, float]) -> None:
-    """Rationale: a point source 3 mm off the middle of a ball is exact by a Legendre series.
+    """Rationale: a point source 3 mm off the middle of a sphere is exact by a Legendre series.
 
     Expected behaviour: J_n falls as edge^(order + 1), measured 2.08 and 2.65 (the meshes are not quite similar), the
     exit power as edge^(2 order), measured 1.99 and 4.22; each with its slope and a ceiling for the finest mesh, 1.3
@@ -110,7 +110,7 @@ def test_slab_of_two_layers(upper: Medium) -> None:
 def test_endless_medium() -> None:
     """Rationale: far from every border φ = P exp(-kr)/(4πDr), whatever the body.
 
-    Expected behaviour: in a ball of 40 mm, 20 decay lengths, to 1e-4 out to 15 mm. Seen to fail with 2π for
+    Expected behaviour: in a sphere of 40 mm, 20 decay lengths, to 1e-4 out to 15 mm. Seen to fail with 2π for
     4π.
     """
     medium = Medium(0.08, 1.0)
@@ -179,7 +179,7 @@ def test_linear_in_the_sources(nylon: DiffusionSolution) -> None:
 
 
 def test_regions_of_the_same_optics_change_nothing(nylon: DiffusionSolution) -> None:
-    """Rationale: a label alone is no border; a darker ball takes light away."""
+    """Rationale: a label alone is no border; a darker sphere takes light away."""
     inside = nylon.mesh.inside(Sphere((-4.0, 0.0, 0.0), 5))
     assert 0 < inside.sum() < len(inside)
     mesh = Tetrahedra(nylon.mesh.vertices, nylon.mesh.cells, inside, nylon.mesh.snap)
@@ -191,7 +191,7 @@ def test_regions_of_the_same_optics_change_nothing(nylon: DiffusionSolution) -> 
 
 
 def test_a_sphere_of_light_seen_from_outside_is_a_brighter_point() -> None:
-    """Rationale: mean value property, φ of a uniform ball outside = point · 3 (x cosh x - sinh x)/x³, x = ka.
+    """Rationale: mean value property, φ of a uniform sphere outside = point · 3 (x cosh x - sinh x)/x³, x = ka.
 
     On the border φ and its slope have no jump, inside the equation holds, by differences. Seen to fail
     with the factor left at 1.
@@ -217,7 +217,7 @@ def test_a_sphere_of_light_seen_from_outside_is_a_brighter_point() -> None:
 
 
 def test_free_field_without_absorption() -> None:
-    """Rationale: µa = 0 is the limit 1/(4πDr), no 0/0; inside a ball the parabola q (3a² - r²)/(6D)."""
+    """Rationale: µa = 0 is the limit 1/(4πDr), no 0/0; inside a sphere the parabola q (3a² - r²)/(6D)."""
     ball = FreeField(np.zeros((1, 3)), np.array([2.0]), np.ones(1), 0.36, 0.0)
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0]])
     density = 3 / (4 * np.pi * 8)
@@ -292,7 +292,7 @@ def test_report(nylon: DiffusionSolution) -> None:
 
 
 def test_locate_finds_the_cell(nylon: DiffusionSolution) -> None:
-    """Rationale: points made inside known cells are found there; points outside are told apart."""
+    """Rationale: points made inside known cells are found there; points outside are separated."""
     mesh = nylon.mesh
     rng = np.random.default_rng(1)
     weights, cells = rng.dirichlet(np.ones(4), 3000), rng.integers(len(mesh.cells), size=3000)

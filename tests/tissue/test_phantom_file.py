@@ -191,7 +191,7 @@ def test_surface_without_a_mesher(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_surface_through_the_mesher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rationale: the mesher fills a ball, and curved elements on its surface give the exact total from its middle.
+    """Rationale: the mesher fills a sphere, and curved elements on its surface give the exact total from its middle.
 
     Expected behaviour: within 0.1 %, ripple below 0.5 %. Seen to fail with the border left where the mesher put it
     (0.5 % of the total).

@@ -1,4 +1,4 @@
-"""Eq. 9 summed over surface points, as the paper does it: right where it is fine enough, lost near the sharp plane."""
+"""Eq. 9 summed over surface points, as the paper does it: right where it is fine enough, lost near z = u."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def summed(*shapes, minimum=20000, **lens):
 
 @pytest.mark.parametrize("depth", [120.0, 230.0])
 def test_sum_over_points_is_the_power_that_enters_the_diaphragm(depth):
-    """Rationale: fine enough, the sum is Eq. 9, before and behind the sharp plane: Σ P = J_n A sin²θ on the axis.
+    """Rationale: fine enough, the sum is Eq. 9, before and behind z = u: Σ P = J_n A sin²θ on the axis.
 
     Expected: 1 %, by pixel centres in a blur disc of some 40 pixels; cos⁴ over a patch of 2 mm is 1e-4.
     Seen to fail with D for D/2.

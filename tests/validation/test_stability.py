@@ -1,4 +1,4 @@
-"""Stiff and extreme cases: every row of `fspt stability` holds, and the runner tells one that does not."""
+"""Stiff and extreme cases: every row of `fspt stability` meets its bound, and the runner names one that does not."""
 
 from __future__ import annotations
 

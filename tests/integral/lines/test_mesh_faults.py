@@ -1,4 +1,4 @@
-"""Meshes that glow on the wrong side are told by every route, once for each state of the mesh."""
+"""Meshes that glow on the wrong side are reported by every route, once for each state of the mesh."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def sphere(path, turned=0, inverted=False, radius=5.0):
 
 
 def told(shape, **settings):
-    """The warnings of an image of one shape, "" without any."""
+    """The warnings about an image of one shape, "" without any."""
     scene = world_scene(shape, sensor=lens(**FILM))
     return fspt.render(scene, **(settings or {"rtol": 0.5})).metadata.get("warnings", "")
 

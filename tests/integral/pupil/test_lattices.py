@@ -1,4 +1,4 @@
-"""Lattices over pixel × pupil: no bias, an error that holds, and rtol reached where transects do not settle."""
+"""Lattices over pixel × pupil: no bias, a valid error, and rtol reached where transects do not converge."""
 
 from __future__ import annotations
 

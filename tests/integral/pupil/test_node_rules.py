@@ -1,4 +1,4 @@
-"""Node rules: exact where they say so, and no further."""
+"""Node rules: exact to the stated degree, and no further."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def test_transects_at_least_double_from_level_to_level():
 
 @pytest.mark.parametrize("area", [False, True])
 def test_levels_take_no_more_lines_of_sight_than_a_pixel_may(area):
-    """Expected: as many levels as fit, and all of them in what an integrator allows when it is not told."""
+    """Expected: as many levels as fit, and all of them in what an integrator allows by default."""
     first = node_rules.along_transect(0, 1e-3)
     assert node_rules.transect_levels(1e-3, area, 2 * first.rays - 1) == []
     assert node_rules.transect_levels(1e-3, area, 2 * first.rays) == [(2, first)]

@@ -118,7 +118,7 @@ def test_transects_across_the_pupil_give_the_share_of_a_corner(blur, other):
 
 
 def test_scatter_is_large_at_kinks_and_small_at_slopes():
-    """One ball before another, both blurred: 24 transects against 1024, on the pixels that silhouettes part.
+    """One sphere before another, both blurred: 24 transects against 1024, on the pixels that silhouettes part.
 
     Expected: no less than the error wherever that is a thousandth of the peak, but for one pixel in twenty; and on most
     pixels, which see one edge alone, little. Fails without KINK, and if the trend is not taken off (1.1e-2).
@@ -190,9 +190,9 @@ def test_eight_transects_give_the_share_of_a_straight_edge(shift, turn):
 
 
 def test_a_transect_is_split_where_it_enters_one_body_leaves_it_for_another_and_leaves_that():
-    """One ball before another, transects from side to side: dark, one, the other, dark.
+    """One sphere before another, transects from side to side: dark, one, the other, dark.
 
-    Expected: the mean over 4000 points of the same transect to 1e-3. Fails if only two jumps are looked for (3e-2).
+    Expected: the mean over 4000 points of the same transect to 1e-3. Fails if only two jumps are searched for (3e-2).
     """
     balls = [
         {"type": "sphere", "center": [x, y, 0], "radius": 2.0, "emitter": glow(j)}

@@ -1,4 +1,4 @@
-"""The surface form of Eq. 9: the same image as the pupil form, found from the other end."""
+"""The surface form of Eq. 9: the same image as by the pupil form, from elements of the surface."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ def test_the_rim_of_a_disk_aslant_sends_light(tilt):
 
 
 def test_a_mesh_sends_light_from_its_faces_however_smoothly_it_is_shaded(tmp_path):
-    """A ball of 80 faces, its normals interpolated. Expected: the accuracy asked for, the sum to 1e-3.
+    """A sphere of 80 faces, its normals interpolated. Expected: the accuracy asked for, the sum to 1e-3.
 
-    Seen to fail, by 9e-2 and 5e-3, with directions told in the frame that the mesh is shaded in.
+    Seen to fail, by 9e-2 and 5e-3, with directions given in the shading frame.
     """
     body = trimesh.creation.icosphere(1, radius=8.0)
     path = write_ply(tmp_path / "ball.ply", body.vertices + np.array([0, 0, 180.0]), body.faces)
@@ -84,7 +84,7 @@ def test_a_mesh_sends_light_from_its_faces_however_smoothly_it_is_shaded(tmp_pat
 
 
 def test_a_shadows_border_lies_where_lines_of_sight_find_it():
-    """A ball before a disk, 2 m from the world's origin. Expected: the accuracy asked for, the sum to 1e-3.
+    """A sphere before a disk, 2 m from the world's origin. Expected: the accuracy asked for, the sum to 1e-3.
 
     Seen to fail, by 5e-2 and 2e-3, with the renderer's rays, which begin 9e-5 of that distance off the surface.
     """
@@ -290,7 +290,7 @@ def test_light_from_beyond_all_surfaces_is_refused(domain):
 
 
 def test_a_small_sphere_far_out_of_focus():
-    """Rationale: the radiance on film is J_n/π times the mean of cos⁴θ over the lines of sight that meet the ball.
+    """Rationale: the radiance on film is J_n/π times the mean of cos⁴θ over the lines of sight that meet the sphere.
 
     Expected: rtol on every pixel, and no more claimed. Fails (5e-3) where cosines are those of spots that differ from
     line to line, instead of those of a piece's middle.
@@ -307,12 +307,12 @@ def test_a_small_sphere_far_out_of_focus():
 
 
 def power_of_ball(row, column, depth, radius, x, y, sub=12, points=3000):
-    """Power on a pixel from a ball, by sub² points of the pixel, each through points of its image on the pupil [W]."""
+    """Power on a pixel of a sphere, by sub² points of the pixel, each through points of its image on the pupil [W]."""
     place = (np.arange(sub) + 0.5) / sub
     across, down = (np.ravel(n) for n in np.meshgrid(place, place))
     virtual = (((WIDTH / 2 - column - across) + 1j * (HEIGHT / 2 - row - down)) * SIDE)[:, None]
     centre = x + 1j * y
-    stretch = FOCUS / (FOCUS - depth)  # from the ball to the lens, seen from the virtual detector plane
+    stretch = FOCUS / (FOCUS - depth)  # from the sphere to the lens, seen from the virtual detector plane
     seen = 1.1 * radius * stretch
     a = virtual + stretch * (centre - virtual) + seen * (even_disc(points).T @ [1, 1j])
     c, d = centre - a, virtual - a
@@ -323,7 +323,7 @@ def power_of_ball(row, column, depth, radius, x, y, sub=12, points=3000):
 
 
 def test_a_thin_tube_far_away():
-    """Rationale: Mitsuba knows the limb of a cylinder by a share of its distance squared over its radius, so lines of
+    """Rationale: Mitsuba's limb of a cylinder is off by a share of its distance squared over its radius, so lines of
     sight begin just before what there is. Expected: one image by both forms. Fails (1.3e-2) from the lens on.
     """
     import mitsuba as mi
