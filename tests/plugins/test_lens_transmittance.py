@@ -148,7 +148,7 @@ def test_spectra_that_the_lens_refuses(curve, spectrum, tmp_path):
         ({"spectrum": str(tmp_path / "down.csv")}, "the wavelengths must ascend, got 500 nm in row 2"),
         ({"spectrum": 3.0}, "'spectrum' must be the name of a CSV file, got 3.0"),
     ):
-        test_what_the_lens_refuses(settings, message)
+        test_parameters_that_the_lens_refuses(settings, message)
 
 
 @pytest.mark.parametrize(
