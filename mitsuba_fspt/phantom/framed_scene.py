@@ -183,7 +183,7 @@ def framed_text(
     """
     numbers = _numbers(focal_length=focal_length, f_number=f_number, pixel_pitch=pixel_pitch, rtol=rtol, view=view)
     film = {"width": _pixels("width", width), "height": _pixels("height", height)}
-    known = ("model", *number_names(), *LIGHT, CURVE, SPECTRUM)
+    known = ("model", "distortion", *number_names(), *LIGHT, CURVE, SPECTRUM)
     if unknown := [name for name in lens if name not in known]:
         raise SceneError(f"scene: 'fspt_lens' has no parameter {unknown[0]}. Leave it out, or give {', '.join(known)}.")
     lens |= _files(lens, Path.cwd())  # the text may be saved anywhere

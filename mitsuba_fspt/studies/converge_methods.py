@@ -157,6 +157,7 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
     numbers = {name: float(value[0]) for name, value in own.items() if isinstance(value, mi.Float64)}
     numbers.pop("wavelength_nm", None)  # belongs to a curve; `numbers` has the curve's transmittance there
     numbers["transmittance"] = camera.filters.transmittance
+    bent = {} if camera.lens.distortion is None else {"distortion": str(camera.lens.distortion)}
     film = camera.film
     names = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
     sizes = (*film.size, *film.crop_size, *film.crop_offset)
@@ -164,6 +165,7 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
         {
             "type": "fspt_lens",
             **numbers,
+            **bent,
             "model": camera.lens.model.name,
             "to_world": mi.ScalarTransform4f(np.array(camera.placement).reshape(4, 4)),
             "film": {"type": "hdrfilm", "pixel_format": "luminance", **dict(zip(names, sizes, strict=True))},

@@ -199,12 +199,19 @@ def test_methods_that_do_not_apply_are_left_out_with_the_reason():
 
 
 @pytest.mark.usefixtures("mono")
-def test_lens_with_another_sampler_is_the_same_lens():
-    """Expected: the same lines of sight to a bit, also in a crop window and with a second border."""
+@pytest.mark.parametrize(
+    "settings",
+    [{"lens_diameter": 30.0, "diaphragm_distance": 20.0}, {"pupil_magnification": 0.8, "distortion": "-1.5, 4"}],
+    ids=["border", "compound"],
+)
+def test_lens_with_another_sampler_is_the_same_lens(settings):
+    """Expected: the same lines of sight to a bit, in a crop window, with a second border, and with distortion.
+
+    Seen to fail without the distortion of the copy.
+    """
     import mitsuba as mi
 
-    borders = {"lens_diameter": 30.0, "diaphragm_distance": 20.0}
-    lens = small_scenes.camera_scene(small_scenes.disk(FOCUS), crop=(3, 5, 20, 10), **borders).sensors()[0]
+    lens = small_scenes.camera_scene(small_scenes.disk(FOCUS), crop=(3, 5, 20, 10), **settings).sensors()[0]
     copy = converge_methods.lens_with(lens, "stratified")
     assert copy.sampler().class_name() == "StratifiedSampler"
     assert [int(n) for n in (*copy.film().crop_size(), *copy.film().crop_offset())] == [20, 10, 3, 5]
