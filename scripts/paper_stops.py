@@ -34,7 +34,7 @@ def naive_sum(scene: Any) -> fspt.Image:
     """Eq. 9 summed over the centres of the phantom's faces, as the paper does it."""
     from mitsuba_fspt.validation import direct_summation
 
-    return fspt.Image(direct_summation.solve(scene, scene.sensors()[0])[0])
+    return fspt.Image(direct_summation.solve(scene, scene.sensors()[0].camera)[0])
 
 
 # ---------------------------------------------------------------------- numbers

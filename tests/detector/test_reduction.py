@@ -319,6 +319,7 @@ def test_a_reduced_image_is_no_rendered_one(mono, how):
         "airy_radius",
     }
     kept |= {"magnification", "image_distance", "t_stop", "diaphragm_distance", "diaphragm_diameter", "transmittance"}
+    kept |= {"pupil_magnification"}
     by_hand = CCD.reduce(exposure.counts, **SETTINGS, pixel_pitch=0.4, metadata=image.metadata)
     for found in (reduced(exposure), by_hand):
         assert set(found.metadata) & set(image.metadata) == kept | {"pixel_pitch"}

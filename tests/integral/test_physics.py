@@ -60,7 +60,7 @@ def test_uniform_disk_meets_the_closed_form(distance, pixel):
     Seen to fail with cos⁴θ → cos³θ (3e-2), 1/π dropped, (p/t)² → p² (A_vd without 1/t²), u² → v².
     """
     disk_scene = load_scene("uniform_disk", distance=distance, f_number=2.8)
-    side = disk_scene.sensors()[0].pixel_pitch / MAGNIFICATION
+    side = disk_scene.sensors()[0].camera.pixel_pitch / MAGNIFICATION
     picture = power(disk_scene, rtol=1e-5, pixel=pixel)
     np.testing.assert_allclose(picture, filled(side, 1 if pixel == "centre" else 6), rtol=1e-5)
 
@@ -402,7 +402,7 @@ def test_letter_l_is_upright_and_unmirrored(method):
     letter = load_scene("l_shape")
     sampling = {} if method == "integral" else {"spp": 32, "seed": 1}
     picture = fspt.render(letter, method=method, **sampling).power
-    pixels_per_mm = MAGNIFICATION / letter.sensors()[0].pixel_pitch
+    pixels_per_mm = MAGNIFICATION / letter.sensors()[0].camera.pixel_pitch
 
     def lit(right, up):
         column, row = int(WIDTH / 2 + right * pixels_per_mm), int(HEIGHT / 2 - up * pixels_per_mm)

@@ -52,7 +52,7 @@ def test_power_of_a_filled_cone():
 def test_the_sum_over_points_has_it():
     shapes = sphere(160, 9, 3, -2), disk(190, 14, -8)
     clear, dim = (camera_scene(*shapes, transmittance=share) for share in (1.0, TAU))
-    powers = [direct_summation.solve(scene, scene.sensors()[0], 400)[0] for scene in (clear, dim)]
+    powers = [direct_summation.solve(scene, scene.sensors()[0].camera, 400)[0] for scene in (clear, dim)]
     np.testing.assert_allclose(powers[1], TAU * powers[0], rtol=1e-12)
 
 

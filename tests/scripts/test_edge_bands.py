@@ -25,8 +25,8 @@ def test_a_cube_face_on_shows_its_front_or_by_a_wide_pupil_all_edges(f_number, e
     Seen to fail with the radius of the pupil left out (4 edges at f/1).
     """
     cube = trimesh.creation.box((10, 10, 10)).apply_translation((0, 0, 165))
-    lens = camera_scene(disk(165.0), f_number=f_number).sensors()[0]
-    assert len(edge_bands.silhouette(cube, lens)) == edges
+    camera = camera_scene(disk(165.0), f_number=f_number).sensors()[0].camera
+    assert len(edge_bands.silhouette(cube, camera)) == edges
 
 
 def test_a_band_has_the_area_of_a_stadium():

@@ -23,7 +23,7 @@ def summed(*shapes, minimum=20000, **lens):
     from mitsuba_fspt.validation import direct_summation
 
     scene = small_scenes.camera_scene(*shapes, **lens)
-    power, pairs = direct_summation.solve(scene, scene.sensors()[0], minimum)
+    power, pairs = direct_summation.solve(scene, scene.sensors()[0].camera, minimum)
     assert pairs >= (power > 0).sum()
     return power
 
