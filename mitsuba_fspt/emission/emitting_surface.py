@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..jit.recording import evaluated_outside, scene_is_checked
-from ..runtime.errors import ExitanceError
+from ..runtime.errors import ExitanceError, SceneError
 from . import exitance
 from .elements import ElementDistribution, elements_of
 from .face_probe import Probe
@@ -78,7 +78,15 @@ class EmittingSurface:
     # ------------------------------------------------------------------ checks
 
     def check(self) -> None:
-        """Raise ExitanceError if J_n or the exit law does not fit the shape; repeated only after a change."""
+        """Raise ExitanceError if J_n or the exit law does not fit the shape; repeated only after a change.
+
+        Raises SceneError for a shape whose surface Mitsuba gives no points of.
+        """
+        if self.shape.class_name() == "LinearCurve":
+            raise SceneError(
+                f"scene: shape '{self.shape.id()}' is a linearcurve, on whose surface Mitsuba gives no points to glow. "
+                "Give a bsplinecurve, cylinders or a mesh."
+            )
         source = exitance.ExitanceState.of(self.shape, self.exitance)
         # Mitsuba does not inform an emitter of new values on its mesh, or of objects that are updated separately.
         if self._source and (self._source.state() != source.state() or self.law.renewed()):
@@ -102,7 +110,7 @@ class EmittingSurface:
             return self._source is not None
         try:
             self.check()
-        except ExitanceError:
+        except (ExitanceError, SceneError):
             if scene_is_checked():
                 return False
             raise

@@ -351,7 +351,9 @@ def test_a_flat_field_counts(case):
     k, read = (images[0].metadata[name] for name in ("electrons_per_watt", "read_noise"))
     flat = np.where(np.arange(16)[None, :] < 8, 1.0, 1 / 3) * np.ones((16, 1))
     stated = [
-        fspt.Image(i.power, np.sqrt(np.maximum(i.power * k * flat, 0) + read**2) / (k * flat), metadata=i.metadata)
+        fspt.Image(
+            i.power, np.sqrt(np.maximum(i.power * k * flat, 0) + read**2) / (k * flat), metadata=i.metadata, flat=flat
+        )
         for i in images
     ]
     found = fspt.invert(matrix, stated, weight=10.0)

@@ -39,7 +39,6 @@ def check_scene(scene: mi.Scene, camera: Camera) -> None:
     if not scene.emitters():
         raise SceneError("scene: nothing glows. Give a shape an emitter of type 'fspt_surface' with its 'exitance'.")
     for surface in surfaces_of(scene):
-        check_curve(surface.shape)
         surface.check()
         check_range(surface, camera)
         check_placement(surface.shape)
@@ -120,15 +119,6 @@ def check_placement(shape: mi.Shape) -> None:
         raise SceneError(
             f"scene: 'to_world' of {kind} '{shape.id()}' stretches or shears it, which it cannot follow. Give a "
             "rotation (about an axis of length 1), a translation and one scale, or a mesh."
-        )
-
-
-def check_curve(shape: mi.Shape) -> None:
-    """Raise SceneError for a glowing shape on whose surface Mitsuba cannot compute points."""
-    if shape.class_name() == "LinearCurve":
-        raise SceneError(
-            f"scene: shape '{shape.id()}' is a linearcurve, on whose surface Mitsuba gives no points to glow. Give a "
-            "bsplinecurve, cylinders or a mesh."
         )
 
 
