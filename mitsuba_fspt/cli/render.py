@@ -117,7 +117,7 @@ def render(
     parameters of scene_xml.
     """
     framing = framing_of(view, focal_length, f_number, camera)
-    shots = _shots(scene, output, scenes_of(scene, definitions(define), framing))
+    shots = _shots(scene, output, scenes_of(scene, definitions(define), framing), png)
     _check_outputs(shots, [scene, camera] if camera else [scene], png)
     light = required_scaling(source_power, unit, wavelength_nm, spectrum)
     settings = {"method": method, "rtol": rtol, "domain": domain, "shortcuts": shortcuts, "spp": spp, "seed": seed}
@@ -190,12 +190,19 @@ def required_scaling(
     return light
 
 
-def _shots(scene: Path, output: Path | None, scenes: list[GivenScene]) -> list[Shot]:
-    """The scenes with the images to write: the name that was given, of several views with the view in the name."""
+def _shots(scene: Path, output: Path | None, scenes: list[GivenScene], png: bool) -> list[Shot]:
+    """The scenes with the images to write: the name that was given, of several views with the view in the name.
+
+    Raises ImageError for an image or picture that cannot be written, before the scene is read.
+    """
     output = output or Path((scene.stem or "image") + ".exr")
     suffix = output.suffix or ".exr"
     several = [output.with_name(f"{output.stem}_view{one.view}{suffix}") for one in scenes]
     outputs = [output] if len(scenes) == 1 else several
+    for written in outputs:
+        require_image(written)
+        if png:
+            require_picture(written.with_suffix(".png"))
     sources = [SceneSource.of(one.scene, one.parameters) for one in scenes]
     return [Shot(*shot) for shot in zip(scenes, sources, outputs, strict=True)]
 
@@ -206,12 +213,9 @@ def _picture(shot: Shot, png: bool) -> Path | None:
 
 
 def _check_outputs(shots: list[Shot], inputs: list[Path], png: bool) -> None:
-    """Raise ImageError for an image or picture that cannot be written, or that would overwrite what is read."""
+    """Raise ImageError for an image or picture that would overwrite what is read."""
     for shot in shots:
-        require_image(shot.output)
         picture = _picture(shot, png)
-        if picture:
-            require_picture(picture)
         read = shot.source.files() if isinstance(shot.given.scene, Path) else inputs
         for written in (shot.output, picture) if picture else (shot.output,):
             require_apart(written, read, error=ImageError)
