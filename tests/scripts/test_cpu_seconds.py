@@ -30,10 +30,7 @@ def test_asleep():
 
 
 def test_dearest_tests_and_the_limit(tmp_path):
-    """0.6 s of a worker and of its child count, sleep does not; the total has all, and a limit below it fails.
-
-    Seen to fail with wall times, without the children, and without the workers' totals.
-    """
+    """0.6 s of a worker and of its child count, sleep does not; the total has all, and a limit below it fails."""
     (tmp_path / "test_busy.py").write_text(BUSY)
     plugins = ("-p", "no:cacheprovider", "-p", "xdist", "-p", "cpu_seconds")
     command = [sys.executable, "-m", "pytest", "-q", *plugins, "-n", "2", "--cpu-limit", "1", "test_busy.py"]

@@ -21,6 +21,9 @@ from small_scenes import (
 )
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.integral.lines.eq9 import View
+from mitsuba_fspt.integral.lines.specular import Specular
+from mitsuba_fspt.integral.lines.visible_window import visible_window
 from mitsuba_fspt.runtime.errors import SceneError
 
 QUARTER = (12, 9, 8, 7)  # crop window: of a sphere on the axis the upper left quarter, limb and middle
@@ -77,6 +80,18 @@ def test_a_plate_of_glass_moves_the_focus():
     unmoved = power(camera_scene(disk(depth, radius=6.0), **rim), rtol=3e-4)
     assert abs(behind - THROUGH * in_air).max() < PEAK_MISS * behind.max()
     assert abs(behind - THROUGH * unmoved).max() > 5 * PEAK_MISS * behind.max()
+
+
+def test_depth_behind_a_plate_is_the_apparent_one():
+    """A line of sight on the axis ends at z - d (1 - 1/n), by which the blur is estimated.
+
+    Seen to fail where lengths in the glass count whole.
+    """
+    scene = camera_scene(disk(190.0, radius=40.0), bodies=(slab(80),))
+    camera = scene.sensors()[0].camera
+    view = View.of(scene, camera, visible_window(scene, camera), None, Specular.of(scene, camera))
+    seen = view.integrand(mi.Point2f(WIDTH / 2, HEIGHT / 2), mi.Point2f(0, 0))
+    assert float(seen.depth[0]) == pytest.approx(190.0 - THICK * (1 - 1 / N), abs=1e-3)
 
 
 @pytest.mark.parametrize("window", [pane(80, PANE, tilt=20), slab(80)], ids=["thin", "solid"])
