@@ -102,8 +102,8 @@ MUTANTS = (
     Mutant(
         "image-plane stop",
         "camera/camera.py",
-        "dr.squared_norm(x) <= dr.square(self._stop_radius)",
-        "dr.squared_norm(x) >= 0",
+        "<= dr.square(self._stop_radius)",
+        ">= 0",
         ("tests/integral/test_image_stop.py", LENS),
     ),
     Mutant(
@@ -151,8 +151,8 @@ MUTANTS = (
     Mutant(
         "place of the entrance pupil",
         "optics/models/diaphragm.py",
-        "Disc(-depth / (u - depth)",
-        "Disc(depth / (u - depth)",
+        "Disc(-depth / (focus_distance - depth)",
+        "Disc(depth / (focus_distance - depth)",
         ("tests/optics/test_thin_lens.py", LENS),
     ),
     Mutant(
@@ -264,7 +264,7 @@ MUTANTS = (
         "optics/transmittance.py",
         "light.through(curve) if curve else light",
         "light",
-        ("tests/plugins/test_lens_transmittance.py::test_a_spectrum_has_the_mean_of_the_curve",),
+        ("tests/plugins/test_lens_transmittance.py",),
     ),
     Mutant(
         "rows of a product of curves",

@@ -197,8 +197,9 @@ def _shots(scene: Path, output: Path | None, scenes: list[GivenScene], png: bool
     """
     output = output or Path((scene.stem or "image") + ".exr")
     suffix = output.suffix or ".exr"
-    several = [output.with_name(f"{output.stem}_view{one.view}{suffix}") for one in scenes]
-    outputs = [output] if len(scenes) == 1 else several
+    outputs = [output]
+    if len(scenes) > 1:
+        outputs = [output.with_name(f"{output.stem}_view{one.view}{suffix}") for one in scenes]
     for written in outputs:
         require_image(written)
         if png:

@@ -255,8 +255,8 @@ def _shown(image: ImageData | Electrons, unit: str, light: Light | None) -> Conv
         return in_unit(image, unit, light)
     if unit != "W" or light is not None:
         raise ImageError(
-            f"picture: electrons have no unit '{unit}' and no light to choose. Leave both out, or draw the image that "
-            "was exposed."
+            f"picture: electrons have no unit '{unit}' and no wavelength or spectrum. Leave both out, or draw the "
+            "image that was exposed."
         )
     return Converted(image.electrons.astype(np.float64), None, "electrons", "e-", None)
 

@@ -129,6 +129,8 @@ class FsptLens(mi.Sensor):
         """The camera with the present numbers; OpticsError if their last update was refused."""
         if self._fault:
             raise self._fault
+        if Film.of(self.film()) != self._camera.film:  # updated by itself, of which Mitsuba does not inform the lens
+            self._update()
         return self._camera
 
     def prepare_model(self, name: str) -> None:

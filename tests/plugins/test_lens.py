@@ -306,6 +306,16 @@ def test_the_focus_may_be_given_in_three_ways(focus):
     assert camera.camera.lens.focus_distance != pytest.approx(U)
 
 
+def test_a_film_that_is_updated_by_itself_is_followed():
+    """Mitsuba does not inform a sensor of it. Seen to fail with the camera of the film before."""
+    camera = mi.load_dict(lens())
+    film = mi.traverse(camera.film())
+    film["crop_offset"], film["crop_size"] = [3, 2], [10, 5]
+    film.update()
+    assert camera.camera.film.crop_offset == (3, 2)
+    assert camera.camera.film.shape == (5, 10)
+
+
 def test_an_impossible_update_is_refused():
     camera = mi.load_dict(lens())
     parameters = mi.traverse(camera)
