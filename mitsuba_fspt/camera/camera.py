@@ -37,7 +37,8 @@ class Camera:
     film : its size and crop window
     to_world : rotation and translation; the lens centre is at the origin of the camera frame and looks along +z
     filters : what lens and filters let through
-    in_medium : True if a participating medium surrounds the lens, through which lines of sight pass as through a vacuum
+    in_medium : id of the lens if a participating medium surrounds it, through which lines of sight pass as through a
+        vacuum; empty without one
 
     Attributes
     ----------
@@ -60,7 +61,7 @@ class Camera:
         film: Film,
         to_world: mi.Transform4f | None = None,
         filters: Filters = NO_FILTERS,
-        in_medium: bool = False,
+        in_medium: str = "",
     ) -> None:
         if not 0 < pixel_pitch < float("inf"):
             raise OpticsError(

@@ -147,7 +147,9 @@ class FsptLens(mi.Sensor):
             filters = Filters.of(light, self._curve, self._spectrum)
         dr.make_opaque(self.m_to_world)
         to_world = mi.Transform4f(self.m_to_world)  # a copy: a reference to this object's member would be a cycle
-        camera = self._camera = Camera(lens, pitch, Film.of(self.film()), to_world, filters, self._in_medium)
+        camera = self._camera = Camera(
+            lens, pitch, Film.of(self.film()), to_world, filters, self.id() if self._in_medium else ""
+        )
         passed = filters.transmittance
         self._etendue = dr.opaque(mi.Float, camera.etendue * flat_share())
         self._solid_angle = dr.opaque(mi.Float, camera.etendue / (passed * camera.virtual_pitch**2))

@@ -41,7 +41,7 @@ def _media(scene: mi.Scene, camera: Camera) -> str | None:
     """Participating media, which every method but `volpath` treats as vacuum."""
     media = [shape.id() for shape in scene.shapes() if shape.interior_medium() or shape.exterior_medium()]
     if camera.in_medium:
-        media.append("the lens")
+        media.append(camera.in_medium)
     if not media:
         return None
     return (
