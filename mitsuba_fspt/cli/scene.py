@@ -26,7 +26,8 @@ def new(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="cylinder|mouse|rig", help="What it shows.", autocompletion=lambda: ["cylinder", "mouse", "rig"]
+            help="cylinder, mouse, rig or a scene of this package, such as nylon_cylinder.",
+            autocompletion=lambda: _names(),
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Scene to write, .xml, which must not exist.")],
@@ -45,9 +46,13 @@ def new(
 
     cylinder glows evenly. mouse is PHANTOM.ply as 'fspt flux' writes it. The
     camera sees all of it from every side, as with 'fspt render PHANTOM.ply'.
-    rig is the cylinder before two mirrors, three views in one picture.
+    rig is the cylinder before two mirrors, three views in one picture. Other
+    names are those of scenes of this package, written with their data beside
+    them: l_shape, mirror_rig, nylon_cylinder, nylon_cylinder_tissue,
+    textured_sphere, two_spheres and uniform_disk.
     """
     from ..phantom.framed_scene import camera_lens
+    from ..phantom.shipped_scenes import copy_scene, shipped_scenes
     from ..phantom.starter_scenes import starter_scene
 
     require_writable(output, ".xml", SceneError)
@@ -56,9 +61,21 @@ def new(
     options: dict[str, Any] = {"focal_length": focal_length, "f_number": f_number}
     given = {key: value for key, value in options.items() if value is not None}
     settings = (camera_lens(camera) if camera else {}) | typed(definitions(define)) | given
-    text = starter_scene(name, phantom, **settings)
-    with atomic_path(output, SceneError) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    if name in shipped_scenes():
+        if settings or phantom:
+            raise SceneError(f"scene new: {name} is copied as it is. Leave options out; give them to 'fspt render'.")
+        copy_scene(name, output)
+    else:
+        text = starter_scene(name, phantom, **settings)
+        with atomic_path(output, SceneError) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     print_result(
         f"{output}: render it by 'fspt render {output}'", {"output": str(output)}, as_json=as_json, quiet=quiet
     )
+
+
+def _names() -> list[str]:
+    """Names for the completion by the shell."""
+    from ..phantom.shipped_scenes import shipped_scenes
+
+    return ["cylinder", "mouse", "rig", *shipped_scenes()]

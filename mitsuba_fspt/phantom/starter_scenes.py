@@ -11,6 +11,7 @@ import numpy as np
 from ..optics.focused_lens import FOCUS
 from ..runtime.errors import SceneError
 from .framed_scene import Outline, framed_text, scene_xml
+from .shipped_scenes import shipped_scenes
 
 RADIUS, HEIGHT = 15.0, 30.0  # mm, of the cylinder: the paper's phantom
 EXITANCE = 1e-4  # W/mm²
@@ -86,7 +87,8 @@ def starter_scene(name: str, phantom: str | os.PathLike[str] | None = None, **ca
     SceneError : there is no scene of this name, `phantom` is missing or not used by it; further as `scene_xml`.
     """
     if name not in STARTERS:
-        raise SceneError(f"scene new: the name must be one of {', '.join(STARTERS)}, got '{name}'. Give one of these.")
+        names = ", ".join([*STARTERS, *shipped_scenes()])
+        raise SceneError(f"scene new: the name must be one of {names}, got '{name}'. Give one of these.")
     return STARTERS[name](phantom, camera)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 from small_scenes import SCENES
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.phantom.shipped_scenes import shipped_scenes
 from mitsuba_fspt.phantom.starter_scenes import STARTERS
 
 FILM = ["-D", "width=32", "-D", "height=32", "-D", "pixel_pitch=0.864"]
@@ -156,7 +158,7 @@ def test_the_shell_completes_verbs_options_and_words():
     assert "stability" not in completions("fspt r")
     assert {"--rtol"} == set(completions("fspt render a.xml --rt"))
     assert completions("fspt render a.xml --method p") == ["path", "ptracer"]
-    assert completions("fspt scene new m") == ["mouse"]
+    assert completions("fspt scene new m") == ["mouse", "mirror_rig"]
     assert completions("fspt sweep a.xml --format t") == ["tif"]
     assert completions("fspt render a.xml --unit p") == ["photons/s", "p/s/cm2/sr"]
 
@@ -168,3 +170,26 @@ def test_the_starter_scenes_are_well_formed(run, name):
     defaults = {node.get("name") for node in root.iter("default")}
     used = {text[1:] for node in root.iter() for text in node.attrib.values() if text.startswith("$")}
     assert {name.split(",")[0] for name in used} == defaults
+
+
+@pytest.mark.parametrize("name", shipped_scenes())
+def test_a_scene_of_the_package_is_copied_with_its_data(run, name):
+    """Byte for byte; a second copy takes the data that is there. Seen to fail without the data files."""
+    assert run("scene", "new", name, "-o", "my.xml", "--quiet") == (0, "", "")
+    assert run("scene", "new", name, "-o", "again.xml", "--quiet") == (0, "", "")
+    for file in set(os.listdir()) - {"my.xml", "again.xml", "phantom.ply"}:
+        assert Path(file).read_bytes() == (SCENES / file).read_bytes()
+    assert Path("my.xml").read_bytes() == (SCENES / f"{name}.xml").read_bytes()
+    for file in re.findall(r'value="([\w]+\.(?:ply|exr))"', Path("my.xml").read_text()):
+        assert Path(file).is_file()
+
+
+def test_a_copy_overwrites_no_other_data(run):
+    Path("l_shape.ply").write_text("mine")
+    code, out, err = run("scene", "new", "l_shape", "-o", "my.xml")
+    assert (code, out) == (2, "")
+    assert err == "fspt: scene new: 'l_shape.ply' exists with another content. Give -o in another folder.\n"
+    assert sorted(os.listdir()) == ["l_shape.ply", "phantom.ply"]
+    code, _, err = run("scene", "new", "l_shape", "-o", "my.xml", "--f-number", "2")
+    assert code == 2
+    assert err.startswith("fspt: scene new: l_shape is copied as it is.")
