@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+import sys
 from importlib.metadata import version as installed
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "mitsuba_fspt"
 author = "The mitsuba_fspt developers"
 version = release = installed("mitsuba-fspt")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "fspt_pages"]
 html_theme = "furo"
 html_title = f"{project} {version}"
 default_role = "code"  # `name` in docstrings
