@@ -35,6 +35,7 @@ REDUCTION, RADIOMETRY = "tests/detector/test_reduction.py", "tests/images/test_r
 CAMERAS = "tests/detector/test_cameras.py"
 LIGHT = "tests/optics/test_light.py"
 STRAY = "tests/detector/test_stray_light.py"
+VIGNETTING, MEASURED_VIGNETTING = "tests/optics/test_vignetting.py", "tests/detector/test_measured_vignetting.py"
 TISSUE, INVERT = "tests/tissue/test_diffusion.py", "tests/inverse/test_invert.py"
 
 
@@ -182,6 +183,83 @@ MUTANTS = (
         "open_share * self.camera.film_map.area_share(position)",
         "open_share",
         ("tests/optics/test_distortion.py",),
+    ),
+    Mutant(
+        "vignetting of the integral",
+        "integral/solver.py",
+        "found = whole.darkened(camera.shares)",
+        "found = whole",
+        (VIGNETTING,),
+    ),
+    Mutant(
+        "tolerance behind a vignetting",
+        "integral/solver.py",
+        "finer = replace(quadrature, rtol=left * quadrature.rtol)",
+        "finer = quadrature",
+        (VIGNETTING,),
+    ),
+    Mutant(
+        "vignetting of sampled lines of sight",
+        "plugins/lens.py",
+        "area_share(position) * self._camera.share_at(position)",
+        "area_share(position)",
+        (VIGNETTING,),
+    ),
+    Mutant(
+        "vignetting of traced particles",
+        "plugins/lens.py",
+        "self._passed * camera.share_at(position)",
+        "self._passed",
+        (VIGNETTING,),
+    ),
+    Mutant(
+        "vignetting of the matrix",
+        "integral/rows/view_rows.py",
+        "factor * etendue[rows][row]",
+        "factor * etendue.max()",
+        (VIGNETTING,),
+    ),
+    Mutant(
+        "vignetting of a tangent",
+        "integral/rows/exitance_rows.py",
+        "(tangent * view.camera.pixel_etendues)",
+        "(tangent * view.camera.etendue)",
+        ("tests/plugins/test_gradients.py",),
+    ),
+    Mutant(
+        "vignetting of a gradient",
+        "integral/rows/exitance_rows.py",
+        "gradient.ravel() * view.camera.pixel_etendues",
+        "gradient.ravel() * view.camera.etendue",
+        ("tests/plugins/test_gradients.py",),
+    ),
+    Mutant(
+        "vignetting of the etendue map",
+        "images/radiometry.py",
+        "whole * _shares(vignetting, shape, known)",
+        "whole",
+        (VIGNETTING,),
+    ),
+    Mutant(
+        "vignetting of the light left out",
+        "integral/lines/left_out.py",
+        "etendue *= camera.share_at(position)",
+        "etendue *= 1.0",
+        (VIGNETTING,),
+    ),
+    Mutant(
+        "vignetting of the uniform source",
+        "optics/uniform_source.py",
+        "power * vignetting.on_pixels(pixel_pitch, size, (0, 0), size)",
+        "power",
+        (MEASURED_VIGNETTING,),
+    ),
+    Mutant(
+        "pixels' response in a measured vignetting",
+        "detector/vignetting.py",
+        "ratio / response.response",
+        "ratio",
+        (MEASURED_VIGNETTING,),
     ),
     Mutant(
         "lens plane behind OpenCV's centre",

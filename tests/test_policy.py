@@ -27,7 +27,7 @@ ARROWS = {
     "camera": {"runtime", "optics", "jit"},
     "emission": {"runtime", "optics", "jit"},
     "integral": {"runtime", "phantom", "jit", "camera", "emission"},
-    "plugins": {"runtime", "optics", "jit", "camera", "emission", "integral"},
+    "plugins": {"runtime", "optics", "images", "jit", "camera", "emission", "integral"},
     "rendering": {"runtime", "optics", "images", "jit", "camera", "emission", "integral"},
     "detector": {"runtime", "optics", "images", "rendering"},
     "validation": {"runtime", "optics", "jit", "camera", "emission", "integral", "rendering"},

@@ -15,6 +15,7 @@ from ..optics.discs import defocus
 from ..optics.pixel_etendue import full_etendue
 from ..optics.thin_lens import Lens
 from ..optics.transmittance import Filters
+from ..optics.vignetting import Vignetting
 from ..runtime.errors import OpticsError, named
 from .film import Film
 from .film_map import FilmMap
@@ -39,11 +40,13 @@ class Camera:
     filters : what lens and filters let through
     in_medium : id of the lens if a participating medium surrounds it, through which lines of sight pass as through a
         vacuum; empty without one
+    vignetting : measured shares of the light that pass beyond Eq. 9; None where all does
 
     Attributes
     ----------
     virtual_pitch : side p/t of a virtual pixel [mm]
     etendue : τ A_vd A_pupil/u² [mm² sr] (Eq. M.6), the factor between mean radiance on film and power on a pixel
+    shares : of each pixel of the crop window by the vignetting (h, w) (Eq. M.45); None without
     film_map, pupil : from film positions to the virtual detector plane, and from there to the lens plane
     placement : the matrix of `to_world`, row by row
     rounding : largest displacement of a line of sight by float32 on the virtual detector plane [virtual pixels]
@@ -62,6 +65,7 @@ class Camera:
         to_world: mi.Transform4f | None = None,
         filters: Filters = NO_FILTERS,
         in_medium: str = "",
+        vignetting: Vignetting | None = None,
     ) -> None:
         if not 0 < pixel_pitch < float("inf"):
             raise OpticsError(
@@ -87,7 +91,11 @@ class Camera:
         width, height = film.size
         with named("fspt_lens"):
             self.film_map = FilmMap(lens, (0.5 * width, 0.5 * height), self.virtual_pitch)
+            self.vignetting, self.shares = vignetting, None
+            if vignetting is not None:
+                self.shares = vignetting.on_pixels(pixel_pitch, film.size, film.crop_offset, film.crop_size)
         self.pupil = Pupil(lens)
+        self._shares = None if self.shares is None else mi.Float(self.shares.ravel().astype(np.float32))
         # Opaque, so that a new value needs no compilation.
         dr.make_opaque(self.to_world)
         self._u = dr.opaque(mi.Float, lens.focus_distance)
@@ -96,7 +104,7 @@ class Camera:
     @property
     def state(self) -> tuple[object, ...]:
         """All numbers that an image depends on but the filters', which scale it."""
-        return (self.lens, self.pixel_pitch, self.placement, self.film)
+        return (self.lens, self.pixel_pitch, self.placement, self.film, self.vignetting and self.vignetting.digest)
 
     @property
     def centre(self) -> tuple[float, float, float]:
@@ -111,7 +119,13 @@ class Camera:
     def numbers(self) -> dict[str, float | int | str]:
         """Numbers of the lens and its pixels by name, for an image's metadata: lengths in mm, wavelength in nm."""
         light = self.filters.numbers(self.lens.f_number)
-        return self.lens.numbers() | light | {"pixel_pitch": self.pixel_pitch} | self.film.numbers()
+        darker = self.vignetting.metadata() if self.vignetting else {}
+        return self.lens.numbers() | darker | light | {"pixel_pitch": self.pixel_pitch} | self.film.numbers()
+
+    @property
+    def pixel_etendues(self) -> float | NDArray[np.float64]:
+        """`etendue` times the share of each pixel of the crop window, (h · w,); one number without vignetting."""
+        return self.etendue if self.shares is None else self.etendue * self.shares.ravel()
 
     @property
     def airy_wavelength_nm(self) -> float:
@@ -124,7 +138,7 @@ class Camera:
         return self.lens.airy_radius(self.airy_wavelength_nm)
 
     def coarser(self, side: int) -> Camera:
-        """The same camera without filters, with a film on the same axis whose pixels are `side` times as wide."""
+        """The same camera without filters and vignetting, on whose film a pixel is `side` times as wide."""
         film = Film.whole(*(-(-n // side) for n in self.film.size))
         return Camera(self.lens, self.pixel_pitch * side, film, self.to_world)
 
@@ -174,6 +188,17 @@ class Camera:
     def through_stop(self, position: mi.Point2f) -> mi.Bool:
         """True if a film position [pixels] lies inside the image-plane stop."""
         return dr.squared_norm(self.film_map.ideal_to_plane(position)) <= dr.square(self._stop_radius)
+
+    def share_at(self, position: mi.Point2f) -> mi.Float | float:
+        """Share that the vignetting leaves of the light at a position of the crop window [pixels of the film]."""
+        if self._shares is None:
+            return 1.0
+        (width, height), (left, top) = self.film.crop_size, self.film.crop_offset
+        x, y = (
+            dr.clip(mi.Int32(dr.floor(place)) - dr.opaque(mi.Int32, first), 0, dr.opaque(mi.Int32, count - 1))
+            for place, first, count in ((position.x, left, width), (position.y, top, height))
+        )
+        return dr.gather(mi.Float, self._shares, mi.UInt32(y * dr.opaque(mi.Int32, width) + x))
 
     # ------------------------------------------------------------------ light of a point
 

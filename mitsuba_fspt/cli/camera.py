@@ -15,6 +15,7 @@ from .terminal import print_result
 
 if TYPE_CHECKING:
     from ..optics.light import Light
+    from ..optics.transmittance import Filters
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 NOMINAL_NM = 600.0  # wavelength of the Airy disc where none is given
@@ -44,17 +45,20 @@ def check(
 
     Working f-number, T-stop, field of view, scale, depth of field at a blur
     of one pixel, Airy radius, illumination and distortion in the corner, and
-    electrons per joule at a wavelength or spectrum, if there is a [detector].
+    electrons per joule at a wavelength or spectrum, that of the lens if it has
+    one, if there is a [detector].
     The focus is in [lens] or given by -D: focus_distance, magnification or
     image_distance.
     """
     from ..optics.light import Light
 
-    table = camera_table(file, definitions(define))
-    light = None
+    table, light = camera_table(file, definitions(define)), None
     if wavelength_nm is not None or spectrum is not None:
         light = Light.given(wavelength_nm, spectrum, OpticsError, "camera check")
-    record = _numbers(file, table, light) | {"electrons_per_joule": None if light is None else _electrons(file, light)}
+    with named(f"'{file}' [lens]"):
+        filters = _filters(table, light)
+        record = _numbers(table, filters, light or filters.light)
+    record["electrons_per_joule"] = _electrons(file, light or filters.light)
     finite = {name: None if value == math.inf else value for name, value in record.items()}
     finite["depth_of_field"] = [None if value == math.inf else value for value in record["depth_of_field"]]
     print_result(_text(record), finite, as_json=as_json, quiet=quiet)
@@ -63,46 +67,67 @@ def check(
 def camera_table(file: Path, given: dict[str, str]) -> dict[str, Any]:
     """The table [lens] of a camera file with values by -D; OpticsError where a name is missing or that of no lens."""
     from ..optics.thin_lens import number_names
-    from ..phantom.framed_scene import CURVE, camera_lens
+    from ..phantom.framed_scene import CURVE, SPECTRUM, VIGNETTING, camera_lens
 
     table = camera_lens(file) | typed(given)
     if missing := [name for name in ("focal_length", "f_number", "pixel_pitch") if name not in table]:
         raise OpticsError(f"'{file}' [lens]: '{missing[0]}' is missing. Give it, or -D {missing[0]}=VALUE.")
     known = {*number_names(), "model", "distortion", "pixel_pitch", "width", "height"}
-    if unknown := [name for name in table if name not in known | {"transmittance", CURVE, "wavelength_nm"}]:
+    others = {"transmittance", CURVE, SPECTRUM, VIGNETTING, "wavelength_nm"}
+    if unknown := [name for name in table if name not in known | others]:
         raise OpticsError(f"'{file}' [lens]: '{unknown[0]}' is no parameter of a lens. Leave it out or correct it.")
     return table
 
 
-def _numbers(file: Path, table: dict[str, Any], light: Light | None) -> dict[str, Any]:
+def _filters(table: dict[str, Any], light: Light | None) -> Filters:
+    """What the lens lets through, for its own light or the given one behind it."""
+    from ..optics.light import read_spectrum
+    from ..optics.transmittance import CURVE, SPECTRUM, Curve, Filters
+
+    given: dict[str, float] = {name: float(table[name]) for name in ("transmittance", "wavelength_nm") if name in table}
+    spectrum = read_spectrum(table[SPECTRUM], OpticsError) if SPECTRUM in table else None
+    curve = Curve.read(table[CURVE]) if CURVE in table else None
+    if curve and spectrum is None and light and light.wavelength_nm is not None:
+        given.setdefault("wavelength_nm", light.wavelength_nm)
+    filters = Filters.of(given, curve, spectrum)
+    if light and filters.light and not light.same(filters.light):
+        raise OpticsError(f"{light.argument}, but the lens is for {filters.light}. Leave one of them out.")
+    return filters
+
+
+def _numbers(table: dict[str, Any], filters: Filters, light: Light | None) -> dict[str, Any]:
     """The record of `CameraNumbers`, with the film's size and the wavelength of the Airy disc."""
+    from ..images.vignetting_file import read_vignetting
     from ..optics.camera_numbers import CameraNumbers
     from ..optics.thin_lens import Lens, number_names
-    from ..optics.transmittance import Curve, transmittance_of
-    from ..phantom.framed_scene import CURVE
+    from ..optics.vignetting import VIGNETTING
 
-    with named(f"'{file}' [lens]"):
-        lens = Lens.focused(**{name: table[name] for name in (*number_names(), "model", "distortion") if name in table})
-        filters: dict[str, float] = {
-            name: float(table[name]) for name in ("transmittance", "wavelength_nm") if name in table
-        }
-        if CURVE in table and light is not None and light.wavelength_nm is not None:
-            filters.setdefault("wavelength_nm", light.wavelength_nm)
-        passed = transmittance_of(filters, Curve.read(table[CURVE]) if CURVE in table else None)
-        size = int(table.get("width", FILM[0])), int(table.get("height", FILM[1]))
-        mean = light.mean_wavelength_nm if light else filters.get("wavelength_nm", NOMINAL_NM)
-        found = CameraNumbers.of(lens, float(table["pixel_pitch"]), size, transmittance=passed, wavelength_nm=mean)
+    lens = Lens.focused(**{name: table[name] for name in (*number_names(), "model", "distortion") if name in table})
+    size = int(table.get("width", FILM[0])), int(table.get("height", FILM[1]))
+    mean = light.mean_wavelength_nm if light else NOMINAL_NM
+    found = CameraNumbers.of(
+        lens,
+        float(table["pixel_pitch"]),
+        size,
+        transmittance=filters.transmittance,
+        wavelength_nm=mean,
+        vignetting=read_vignetting(table[VIGNETTING]) if VIGNETTING in table else None,
+    )
     return asdict(found) | {"width": size[0], "height": size[1], "airy_wavelength_nm": mean}
 
 
-def _electrons(file: Path, light: Light) -> float | None:
-    """Electrons per joule on a pixel of the file's detector (Eq. M.43); None without a table [detector]."""
+def _electrons(file: Path, light: Light | None) -> float | None:
+    """Electrons per joule on a pixel of the file's detector (Eq. M.43); None without a table [detector] or a light.
+
+    The detector is read in any case: its contradictions are refused.
+    """
     from ..detector.detector import Detector
     from ..runtime.toml_file import read_toml
 
     if "detector" not in read_toml(file, OpticsError):
         return None
-    return Detector.from_toml(file).electrons_per_joule(light)
+    detector = Detector.from_toml(file)
+    return None if light is None else detector.electrons_per_joule(light)
 
 
 def _text(record: dict[str, Any]) -> str:

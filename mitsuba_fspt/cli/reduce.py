@@ -14,6 +14,7 @@ from ..runtime.atomic_files import require_apart
 from ..runtime.backend import quiet_mitsuba
 from ..runtime.errors import DetectorError, ImageError, OpticsError, SceneError
 from ..runtime.progress_bar import progress_bar
+from .measured_vignetting import Flats, measured, text_of
 from .options import (
     AsJson,
     Parameters,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from ..images.image import Image
     from ..optics.light import Light
     from ..optics.thin_lens import Lens
+    from ..optics.vignetting import Vignetting
 
 FILES = ".tif, .fits, .npy"
 Bias = Annotated[
@@ -74,15 +76,26 @@ Scene = Annotated[
 ]
 Frames = Annotated[int | None, typer.Option(metavar="N", help="Number of frames that a single one is the mean of.")]
 BadPixels = Annotated[Path | None, typer.Option(metavar="FILE", help="Frame that is not 0 on the pixels to mask.")]
+VignettingFile = Annotated[
+    Path | None, typer.Option(metavar="V.exr", help="Write the vignetting that the flat of the lens of --scene shows.")
+]
+SensorFlat = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Flat without the lens, for --vignetting; else the pixels' response is in it."),
+]
+CountsFiles = Annotated[
+    list[Path] | None, typer.Argument(metavar="COUNTS...", help=".tif, .fits, .npy, or a click folder.")
+]
+Output = Annotated[Path | None, typer.Option("-o", "--output", help="Image to write, .exr; of several OUT_0.exr, …")]
 Calibrate = Annotated[
     bool, typer.Option("--calibrate", help="The counts show a uniform source; write CALIBRATED.toml.")
 ]
 
 
 def reduce(
-    counts: Annotated[list[Path], typer.Argument(metavar="COUNTS...", help=".tif, .fits, .npy, or a click folder.")],
-    detector: Annotated[Path, typer.Option(metavar="CAMERA.toml", help="Camera with a table [detector].")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Image to write, .exr; of several OUT_0.exr, …")],
+    counts: CountsFiles = None,
+    detector: Annotated[Path | None, typer.Option(metavar="CAMERA.toml", help="Camera with a [detector].")] = None,
+    output: Output = None,
     wavelength_nm: WavelengthNm = None,
     spectrum: SpectrumFile = None,
     exposure_time: Time = None,
@@ -94,6 +107,8 @@ def reduce(
     flat_kind: FlatKind = None,
     flat_dark: FlatDark = None,
     scene: Scene = None,
+    vignetting: VignettingFile = None,
+    sensor_flat: SensorFlat = None,
     define: Parameters = None,
     frames: Frames = None,
     bad_pixels: BadPixels = None,
@@ -113,26 +128,58 @@ def reduce(
     integrating sphere, through the lens of the table [lens]: the output is the
     camera's TOML with the quantum efficiency that it shows. The transmittance of
     [lens] is not part of it; without one there, that of the lens is.
-    """
-    from ..detector.detector import Detector
-    from ..detector.reduction import Corrections
-    from ..optics.light import Light
 
-    camera = Detector.from_toml(detector)
-    light = Light.of_image({}, Light.given(wavelength_nm, spectrum, DetectorError, "reduce"), DetectorError, "reduce")
-    given = dict(exposure_time=exposure_time, light=light, binning=binning, pixel_pitch=pixel_pitch)
+    With --vignetting and no COUNTS the flat of kind lens, over --sensor-flat,
+    gives the vignetting of the lens of --scene.
+    """
     level = float(flat_dark) if flat_dark is not None and is_number(flat_dark) else flat_dark
+    if vignetting is not None or sensor_flat is not None:
+        flats = Flats(flat, flat_kind, level, sensor_flat, counts, output)
+        record = measured(vignetting, flats, detector, scene, lambda: _loaded(scene, define))
+        print_result(text_of(record), record, as_json=as_json, quiet=quiet)
+        return
+    counts, detector, output = _required(counts, detector, output)
     _require_output(output, calibrate, radiance is not None or radiance_error != 0)
-    names = _outputs(output, len(counts))
-    inputs = [*counts, detector, *(Path(p) for p in (bias, dark, flat, flat_dark, bad_pixels, scene, spectrum) if p)]
-    for name in names:
-        require_apart(name, inputs, error=ImageError)
-    corrections = Corrections(bias, dark, flat, flat_kind, level, _loaded(scene, define), bad_pixels, cosmic_rays)
+    others = (bias, dark, flat, flat_dark, bad_pixels, scene, spectrum)
+    names = _outputs(output, len(counts), [*counts, detector, *(Path(path) for path in others if path)])
+    camera, light = _camera_and_light(detector, wavelength_nm, spectrum, loaded := _loaded(scene, define))
+    given = dict(exposure_time=exposure_time, light=light, binning=binning, pixel_pitch=pixel_pitch)
+    corrections = _corrections(bias, dark, flat, flat_kind, level, loaded, bad_pixels, cosmic_rays)
     images = _reduced(camera, counts, frames, given, corrections, quiet)
     if calibrate:
         record = _calibrated(camera, images, detector, output, radiance, radiance_error)
         print_result(_calibrated_text(record), record, as_json=as_json, quiet=quiet)
         return
+    _write(images, names, as_json, quiet)
+
+
+def _required(counts: list[Path] | None, detector: Path | None, output: Path | None) -> tuple[list[Path], Path, Path]:
+    """The files that are needed unless a vignetting is measured; DetectorError for a missing one."""
+    for name, value in (("COUNTS", counts), ("--detector", detector), ("-o", output)):
+        if not value:
+            raise DetectorError(f"reduce: {name} is missing. Give 'fspt reduce COUNTS --detector CAMERA.toml -o OUT'.")
+    return counts, detector, output  # type: ignore[return-value]  # all are there
+
+
+def _camera_and_light(
+    detector: Path, wavelength_nm: float | None, spectrum: Path | None, scene: mi.Scene | None
+) -> tuple[Detector, Light]:
+    """The detector, and the light at it: the given one, or that of the scene's lens."""
+    from ..detector.detector import Detector
+    from ..detector.reduction import light_of
+
+    return Detector.from_toml(detector), light_of({}, scene, wavelength_nm, spectrum)
+
+
+def _corrections(*given: Any) -> Corrections:
+    """What corrects the counts, in the order of `Corrections`."""
+    from ..detector.reduction import Corrections
+
+    return Corrections(*given)
+
+
+def _write(images: list[Image], names: list[Path], as_json: bool, quiet: bool) -> None:
+    """Write all images, and say what is in them."""
     for image, name in zip(images, names, strict=True):
         image.write(name)
     records = [_record(image, name) for image, name in zip(images, names, strict=True)]
@@ -162,10 +209,16 @@ def _reduced(
     return images
 
 
-def _outputs(output: Path, count: int) -> list[Path]:
-    """Names of the images: `output` of a single one, else OUT_00, OUT_01, …, which sort in their order."""
+def _outputs(output: Path, count: int, inputs: list[Path]) -> list[Path]:
+    """Names of the images: `output` of a single one, else OUT_00, OUT_01, …, which sort in their order.
+
+    Raises ImageError where one of them is an input.
+    """
     digits = len(str(count - 1))
-    return [output] if count == 1 else [output.with_stem(f"{output.stem}_{k:0{digits}d}") for k in range(count)]
+    names = [output] if count == 1 else [output.with_stem(f"{output.stem}_{k:0{digits}d}") for k in range(count)]
+    for name in names:
+        require_apart(name, inputs, error=ImageError)
+    return names
 
 
 def _loaded(scene: Path | None, define: list[str] | None) -> mi.Scene | None:
@@ -235,8 +288,8 @@ def _calibrated(
         )
     image = images[0]
     light = Light.of_image(image.metadata, None, DetectorError, "calibrate")
-    lens, transmittance = _lens(toml, light)
-    power = uniform_power(lens, radiance, float(image.metadata["pixel_pitch"]), image.shape, transmittance)
+    lens, transmittance, vignetting = _lens(toml, light)
+    power = uniform_power(lens, radiance, float(image.metadata["pixel_pitch"]), image.shape, transmittance, vignetting)
     found = calibrated(camera, image, power, error)
     found.to_toml(output)
     frame = Exposed(float(image.metadata["exposure_time"]), light)
@@ -256,26 +309,35 @@ def _calibrated_text(record: dict[str, Any]) -> str:
     )
 
 
-def _lens(toml: Path, light: Light) -> tuple[Lens, float]:
-    """Lens of the table [lens] with its borders, and its transmittance for a light at the detector."""
-    from ..optics.light import read_spectrum
+def _lens(toml: Path, light: Light) -> tuple[Lens, float, Vignetting | None]:
+    """Lens of the table [lens] with its borders, its transmittance for a light at the detector, and its vignetting."""
+    from ..images.vignetting_file import read_vignetting
     from ..optics.thin_lens import Lens, number_names
-    from ..optics.transmittance import CURVE, SPECTRUM, Curve, transmittance_of
+    from ..optics.vignetting import VIGNETTING
     from ..phantom.framed_scene import camera_lens
 
     table = camera_lens(toml)
     if missing := [name for name in ("focal_length", "f_number") if name not in table]:
         raise DetectorError(f"'{toml}' [lens]: '{missing[0]}' is missing, which --calibrate needs. Give it.")
     lens = Lens.focused(**{name: table[name] for name in (*number_names(), "model", "distortion") if name in table})
+    vignetting = read_vignetting(table[VIGNETTING]) if VIGNETTING in table else None
+    return lens, _transmittance(table, toml, light), vignetting
+
+
+def _transmittance(table: dict[str, Any], toml: Path, light: Light) -> float:
+    """Transmittance of the table [lens] for a light at the detector."""
+    from ..optics.light import read_spectrum
+    from ..optics.transmittance import CURVE, SPECTRUM, Curve, transmittance_of
+
     given = {name: table[name] for name in ("transmittance",) if name in table}
     curve = Curve.read(table[CURVE]) if CURVE in table else None
     if SPECTRUM in table:
-        return lens, transmittance_of(given, curve, read_spectrum(table[SPECTRUM], OpticsError))
+        return transmittance_of(given, curve, read_spectrum(table[SPECTRUM], OpticsError))
     if curve is None:
-        return lens, transmittance_of(given, None)
+        return transmittance_of(given, None)
     if light.wavelength_nm is None:
         raise DetectorError(
             f"--calibrate: the mean of 'transmittance_curve' in '{toml}' does not follow from a spectrum at the "
             "detector. Give 'spectrum' there, that before the filters, or 'transmittance', a number."
         )
-    return lens, transmittance_of(given | {"wavelength_nm": light.wavelength_nm}, curve)
+    return transmittance_of(given | {"wavelength_nm": light.wavelength_nm}, curve)

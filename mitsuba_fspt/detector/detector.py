@@ -28,7 +28,7 @@ from ..optics.light import Light, Spectrum
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
 from .parameters import RECORDED, DetectorParameters
-from .reduction import Corrections, Exposed, reduce_counts
+from .reduction import Corrections, Exposed, light_of, reduce_counts
 from .stray_light import StrayLight
 
 if TYPE_CHECKING:
@@ -170,7 +170,8 @@ class Detector(DetectorParameters):
         ----------
         counts : (h, w) or (frames, h, w) [DN], or the name of a .tif, .fits, .npy file or of a click folder
         exposure_time : [s] of one frame, > 0
-        wavelength_nm, spectrum : of the light at the detector, see `expose`; neither: that in `metadata`
+        wavelength_nm, spectrum : of the light at the detector, see `expose`; neither: that in `metadata`, or that
+            which the lens of `scene` passes
         binning : side of the square of pixels that was read out as one; None: that of the file, else 1
         pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene;
             None: that of the file, if the detector has none of its own
@@ -196,8 +197,7 @@ class Detector(DetectorParameters):
         ImageError : a file cannot be read, or a stack has the shape (h, w, frames).
         SceneError, OpticsError, BackendError : the scene has no usable lens; a package is not installed.
         """
-        given = Light.given(wavelength_nm, spectrum, DetectorError, "reduce")
-        light = Light.of_image(metadata or {}, given, DetectorError, "reduce")
+        light = light_of(metadata or {}, scene, wavelength_nm, spectrum)
         exposed = Exposed(exposure_time, light, binning, pixel_pitch)
         corrections = Corrections(bias, dark, flat, flat_kind, flat_dark, scene, bad_pixels, cosmic_rays)
         return reduce_counts(self, counts, exposed, corrections, frames=frames, metadata=metadata)

@@ -68,7 +68,7 @@ class FlatField:
 
 def flat_field(
     detector: DetectorParameters,
-    flat: Frame,
+    flat: Frame | Counts,
     kind: str | None,
     scene: Scene | None,
     shape: tuple[int, int],

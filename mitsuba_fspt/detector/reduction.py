@@ -29,6 +29,7 @@ from ..images.image import Image, image_or_exposure
 from ..images.noise_model import NoiseModel
 from ..images.pixel_map import DIGEST, MAP, recorded_map
 from ..optics.light import Light
+from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time
@@ -37,6 +38,7 @@ from .parameters import MAPPED, RECORDED, DetectorParameters, Own
 from .saturation import full_pixels, saturated
 
 if TYPE_CHECKING:
+    from ..optics.light import Spectrum
     from .flat_field import Scene
 
 Array = NDArray[np.float64]
@@ -153,6 +155,22 @@ class Corrections:
             given = np.asarray(given)
             given = given.astype(np.uint8) if given.dtype == bool else given
         return frame_like(given, "bad_pixels", shape).values != 0
+
+
+def light_of(
+    metadata: Mapping[str, Any], scene: Scene | None, wavelength_nm: float | None, spectrum: Spectrum | None
+) -> Light:
+    """The light at the detector: that of the image's metadata or of the scene's lens, or else the given one.
+
+    Raises
+    ------
+    DetectorError : there is none, or another one is given than the image or the lens has.
+    """
+    known: Mapping[str, Any] = metadata
+    if scene is not None and Light.recorded(metadata, DetectorError, "reduce") is None:
+        known = lens_numbers(scene)[0]
+    given = Light.given(wavelength_nm, spectrum, DetectorError, "reduce")
+    return Light.of_image(known, given, DetectorError, "reduce")
 
 
 def reduce_counts(

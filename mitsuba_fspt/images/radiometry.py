@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from ..optics.light import Light
 from ..optics.pixel_etendue import pixel_etendues
 from ..optics.thin_lens import Lens, number_names
+from ..optics.vignetting import Vignetting
 from ..runtime.errors import ImageError, OpticsError
 from .formats import Metadata, write_planes
 from .image_data import ImageData
 from .pixel_axes import PixelAxes
+from .vignetting_file import recorded_vignetting
 
 UNITS = {"W": "power", "photons/s": "photon_rate", "p/s/cm2/sr": "radiance"}  # with the quantity of each
 RADIANCE = "photons/s/cm²/sr"
@@ -109,4 +111,18 @@ def etendue_of(shape: tuple[int, int], known: Metadata) -> Plane:
         raise ImageError(f"image: its metadata describe no lens: {cause}") from cause
     axes = PixelAxes.of(shape, known | {"magnification": lens.magnification})
     passed, pixel = float(known.get("transmittance", 1.0)), str(known.get("pixel", "area"))
-    return pixel_etendues(lens, axes.step, axes.x, -axes.y, passed, pixel)
+    whole = pixel_etendues(lens, axes.step, axes.x, -axes.y, passed, pixel)
+    try:
+        vignetting = recorded_vignetting(known)
+        return whole if vignetting is None else whole * _shares(vignetting, shape, known)
+    except OpticsError as cause:
+        raise ImageError(f"image: {cause}") from cause
+
+
+def _shares(vignetting: Vignetting, shape: tuple[int, int], known: Metadata) -> Plane:
+    """Shares of the pixels (h, w) of an image with the metadata `known`."""
+    height, width = shape
+    film = round(float(known.get("film_width", width))), round(float(known.get("film_height", height)))
+    first = float(known.get("crop_offset_x", 0)), float(known.get("crop_offset_y", 0))
+    bins = int(known.get("binning", 1))
+    return vignetting.on_pixels(float(known["pixel_pitch"]), film, first, (width, height), bins)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,10 @@ class Solution:
         if not peak > 0:
             return 0, 0.0
         return int(np.count_nonzero(self.error > rtol * peak)), float(self.error.max() / peak)
+
+    def darkened(self, shares: NDArray[np.float64]) -> Solution:
+        """The image behind a vignetting that leaves each pixel a share (h, w) of its power (Eq. M.45)."""
+        return replace(self, power=self.power * shares, error=self.error * shares)
 
     def completed_by(self, rest: Solution) -> Solution:
         """This partial solution on its own pixels, unless `rest` states a smaller error there; `rest` elsewhere."""

@@ -30,7 +30,7 @@ from .progress import Progress
 from .pupil import interpolated, pupil_form
 from .pupil.interpolated import Blocks, blocks_of
 from .pupil.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
-from .quadrature import Quadrature
+from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
 from .surface import surface_form
@@ -72,6 +72,28 @@ class Solver:
         SceneError, ExitanceError : as in `check_scene`, or the scene has an environment emitter, or the memory does not
             suffice for the film.
         """
+        deadline = deadline or Deadline()
+        whole = self._whole(scene, camera, quadrature, progress, narrow, deadline)
+        if camera.shares is None:
+            return whole
+        found = whole.darkened(camera.shares)
+        if found.beyond(quadrature.rtol)[0] > whole.beyond(quadrature.rtol)[0] and not deadline.passed():
+            # The vignetting takes more of the brightest pixel than of others, whose errors count in terms of that.
+            left = max(float(found.power.max() / whole.power.max()), FLOAT32_FLOOR / quadrature.rtol)
+            finer = replace(quadrature, rtol=left * quadrature.rtol)
+            found = self._whole(scene, camera, finer, progress, narrow, deadline).darkened(camera.shares)
+        return found
+
+    def _whole(
+        self,
+        scene: mi.Scene,
+        camera: Camera,
+        quadrature: Quadrature,
+        progress: Callable[[float], None] | None,
+        narrow: bool,
+        deadline: Deadline,
+    ) -> Solution:
+        """The image without vignetting."""
         check_scene(scene, camera)
         check_surfaces_alone(scene)
         check_followed(scene)
@@ -85,7 +107,7 @@ class Solver:
                 traced = self.traced(scene, camera)
                 faces = self._faces_of(traced) if quadrature.takes("record") else None
                 view = View.of(traced, camera, window, faces, specular)
-                self._fill(mosaic, view, quadrature, Progress(progress, deadline=deadline or Deadline()), narrow)
+                self._fill(mosaic, view, quadrature, Progress(progress, deadline=deadline), narrow)
             # Smaller displacements are random.
             rounding = camera.rounding if camera.rounding >= LEAST_DISPLACEMENT else 0.0
             solution = mosaic.solution(quadrature.least_error, rounding)

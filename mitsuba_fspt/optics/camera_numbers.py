@@ -11,6 +11,7 @@ from .distortion import distorted
 from .pixel_etendue import pixel_etendues
 from .thin_lens import Lens
 from .transmittance import t_stop
+from .vignetting import Vignetting
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class CameraNumbers:
     scale : side of a pixel in that plane
     depth_of_field : depths between which the blur disc of a point on the axis is at most a pixel wide (M.8)
     airy_radius : on the film (M.32), in `airy_pixels` also in pixels
-    corner_illumination : power on a corner pixel over that on the middle, of a uniform source
+    corner_illumination : power on a corner pixel over that on the middle, of a uniform source, with the vignetting
     corner_distortion : change of the corner's distance from the middle, over that distance; 0 without distortion
     """
 
@@ -50,6 +51,7 @@ class CameraNumbers:
         *,
         transmittance: float = 1.0,
         wavelength_nm: float = 600.0,
+        vignetting: Vignetting | None = None,
     ) -> CameraNumbers:
         """Numbers of a lens before a film of `size` (width, height) pixels [mm of pitch].
 
@@ -60,6 +62,9 @@ class CameraNumbers:
         x = side * np.array([0.5 - width / 2, 0.0 if width % 2 else 0.5])
         y = side * np.array([0.5 - height / 2, 0.0 if height % 2 else 0.5])
         powers = pixel_etendues(lens, side, x, y)
+        if vignetting is not None:
+            shares = vignetting.on_pixels(pixel_pitch, size, (0, 0), size)
+            powers = powers * shares[np.ix_((0, height // 2), (0, width // 2))]
         radius = lens.airy_radius(wavelength_nm)
         return cls(
             focus_distance=lens.focus_distance,

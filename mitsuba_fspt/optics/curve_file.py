@@ -58,7 +58,7 @@ def read_rows(
         raise error(f"'{name}' = '{path}' is no text. Give a CSV of {columns}.") from cause
     rows = [line.partition("#")[0].strip() for line in lines]
     rows = [row for row in rows if row]
-    if rows and not rows[0][0].isdigit():
+    if rows and _is_title(rows[0]):
         rows = rows[1:]
     fix = f"Give rows of {columns.replace(', ', ',')} such as {example}."
     try:
@@ -72,6 +72,15 @@ def read_rows(
         raise error(f"'{name}' = '{path}' has {table.shape[1] if table.size else 'no'} columns, must have 2. {fix}")
     wavelengths, values = table.T
     return wavelengths, values
+
+
+def _is_title(row: str) -> bool:
+    """True for a row that does not begin with a number."""
+    try:
+        float(row.partition(",")[0])
+    except ValueError:
+        return True
+    return False
 
 
 def require_range(path: str | os.PathLike[str], name: str, wavelengths: Array, error: type[FsptError]) -> None:

@@ -17,6 +17,7 @@ from ..optics.focused_lens import FOCUS
 from ..optics.thin_lens import Lens, number_names
 from ..optics.transmittance import CURVE, SPECTRUM
 from ..optics.transmittance import NUMBERS as LIGHT
+from ..optics.vignetting import VIGNETTING
 from ..runtime.errors import OpticsError, SceneError
 from ..runtime.numbers import number, whole
 from ..runtime.toml_file import read_toml
@@ -183,7 +184,7 @@ def framed_text(
     """
     numbers = _numbers(focal_length=focal_length, f_number=f_number, pixel_pitch=pixel_pitch, rtol=rtol, view=view)
     film = {"width": _pixels("width", width), "height": _pixels("height", height)}
-    known = ("model", "distortion", *number_names(), *LIGHT, CURVE, SPECTRUM)
+    known = ("model", "distortion", VIGNETTING, *number_names(), *LIGHT, CURVE, SPECTRUM)
     if unknown := [name for name in lens if name not in known]:
         raise SceneError(f"scene: 'fspt_lens' has no parameter {unknown[0]}. Leave it out, or give {', '.join(known)}.")
     lens |= _files(lens, Path.cwd())  # the text may be saved anywhere
@@ -226,7 +227,8 @@ def front_behind_focus(outline: Outline, values: Mapping[str, float], view: floa
 def camera_lens(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Keywords of `scene_xml` from the table [lens] of a camera's TOML file; other tables are not read.
 
-    A key `name` is for people and left out; files of `transmittance_curve` and `spectrum` are beside the TOML.
+    A key `name` is for people and left out. Files of `transmittance_curve`, `spectrum` and `vignetting` are beside the
+    TOML.
 
     Raises
     ------
@@ -244,7 +246,7 @@ def camera_lens(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _files(lens: Mapping[str, Any], folder: Path) -> dict[str, str]:
     """Paths of the files that the numbers of a lens name, relative to a folder."""
-    return {name: str(folder / lens[name]) for name in (CURVE, SPECTRUM) if isinstance(lens.get(name), str)}
+    return {name: str(folder / lens[name]) for name in (CURVE, SPECTRUM, VIGNETTING) if isinstance(lens.get(name), str)}
 
 
 @dataclass(frozen=True, eq=False)

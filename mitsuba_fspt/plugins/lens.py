@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..camera.camera import Camera
 from ..camera.film import Film
+from ..images.vignetting_file import read_vignetting
 from ..integral.lines.eq9 import etendue_from_pixel
 from ..jit.spectra import flat_share
 from ..optics import curve_file
@@ -14,6 +15,7 @@ from ..optics.light import read_spectrum
 from ..optics.thin_lens import Lens, number_names
 from ..optics.transmittance import CURVE, SPECTRUM, Curve, Filters
 from ..optics.transmittance import NUMBERS as FILTER_NUMBERS
+from ..optics.vignetting import VIGNETTING, Vignetting
 from ..runtime.errors import OpticsError, named
 from .film import default_sampler, number, own_film
 
@@ -58,6 +60,10 @@ class FsptLens(mi.Sensor):
        - "k1, k2[, p1, p2[, k3]]", OpenCV's model and order, on slopes from the centre of the entrance pupil, x to the
          right and y downwards in the upright image. Power is conserved: a film pixel sees its preimage. Not with
          diaphragm_distance.
+     * - vignetting
+       - |string|
+       - Share of the light that passes beyond Eq. 9: CSV file with ascending rows of image height in mm, from 0 on, and
+         share in (0, 1]; or an image file of the film's shape. Each pixel has one share, of a curve its mean.
      * - model
        - |string|
        - diaphragm (default) | hrrt (no diaphragm, D = lens_diameter) | pinhole (one line of sight a point) |
@@ -104,7 +110,7 @@ class FsptLens(mi.Sensor):
             raise OpticsError(f"fspt_lens: '{missing[0]}' is missing. Give it as a float.")
         self._model = str(props.get("model", "diaphragm"))
         self._distortion = props.get("distortion")
-        self._curve, self._spectrum = _curve_of(props), _spectrum_of(props)
+        self._curve, self._spectrum, self._vignetting = _curve_of(props), _spectrum_of(props), _vignetting_of(props)
         if self._curve is None:
             self._numbers.setdefault("transmittance", mi.Float64(1.0))
         self.m_needs_sample_2 = self.m_needs_sample_3 = True
@@ -147,9 +153,8 @@ class FsptLens(mi.Sensor):
             filters = Filters.of(light, self._curve, self._spectrum)
         dr.make_opaque(self.m_to_world)
         to_world = mi.Transform4f(self.m_to_world)  # a copy: a reference to this object's member would be a cycle
-        camera = self._camera = Camera(
-            lens, pitch, Film.of(self.film()), to_world, filters, self.id() if self._in_medium else ""
-        )
+        medium = self.id() if self._in_medium else ""
+        camera = self._camera = Camera(lens, pitch, Film.of(self.film()), to_world, filters, medium, self._vignetting)
         passed = filters.transmittance
         self._etendue = dr.opaque(mi.Float, camera.etendue * flat_share())
         self._solid_angle = dr.opaque(mi.Float, camera.etendue / (passed * camera.virtual_pitch**2))
@@ -167,15 +172,15 @@ class FsptLens(mi.Sensor):
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Line of sight through a uniform point of the crop window and a uniform point of the pupil, and its weight.
 
-        The weight is the étendue of a pixel times τ cos⁴θ [mm² sr], 0 where no light passes; spectral variants multiply
-        it by the weight of the wavelengths.
+        The weight is the étendue of a pixel times τ cos⁴θ [mm² sr] and the share of its vignetting, 0 where no light
+        passes; spectral variants multiply it by the weight of the wavelengths.
         """
         film = self.film()
         position = sample2 * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
         pupil = mi.warp.square_to_uniform_disk_concentric(sample3)
         ray, cos_theta, passes = self._camera.line_of_sight(position, pupil)
         passes &= self._camera.passes_borders(position, pupil)
-        share = self._camera.film_map.area_share(position)
+        share = self._camera.film_map.area_share(position) * self._camera.share_at(position)
         wavelengths, spectrum = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         ray.time, ray.wavelengths = time, wavelengths
         return ray, spectrum * (etendue_from_pixel(cos_theta, passes, share) * self._etendue)
@@ -185,13 +190,15 @@ class FsptLens(mi.Sensor):
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """Direction from `it` to a uniform point of the pupil, with the film position at which its light arrives.
 
-        The weight is τ A_pupil cosθ/d² [sr] over the number of crop pixels, by which light tracers multiply again.
+        The weight is τ A_pupil cosθ/d² [sr] times the share of the vignetting there, over the number of crop pixels, by
+        which light tracers multiply again.
         """
         film = self.film()
         pupil = mi.warp.square_to_uniform_disk_concentric(sample)
         camera = self._camera
         position, lens_point, weight, _ = camera.arrival(it.p, pupil)
         active = active & camera.through_stop(position)
+        passed = self._passed * camera.share_at(position)
         position -= mi.Vector2f(film.crop_offset())
         size = mi.Vector2f(film.crop_size())
         inside = active & (weight > 0) & dr.all((position >= 0) & (position < size))
@@ -202,7 +209,7 @@ class FsptLens(mi.Sensor):
         ds.dist = dr.norm(ds.d)
         ds.d /= ds.dist
         ds.pdf = dr.select(inside, dr.rcp(solid_angle), 0)
-        return ds, mi.Spectrum(dr.select(inside, self._passed * solid_angle / (size.x * size.y), 0))
+        return ds, mi.Spectrum(dr.select(inside, passed * solid_angle / (size.x * size.y), 0))
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
         """Density [1/sr] that `sample_direction` has written into `ds`; other records are not supported."""
@@ -215,7 +222,7 @@ class FsptLens(mi.Sensor):
     def to_string(self) -> str:
         rows = [f"  {name} = {float(value[0]):g}," for name, value in self._numbers.items()]
         rows += [f"  distortion = {self._distortion},"] if self._distortion else []
-        files = {CURVE: self._curve, SPECTRUM: self._spectrum}
+        files = {CURVE: self._curve, SPECTRUM: self._spectrum, VIGNETTING: self._vignetting}
         rows += [f"  {name} = {curve.file}," for name, curve in files.items() if curve]
         return "\n".join(["FsptLens[", f"  model = {self._model},", *rows, f"  film = {self.film()}", "]"])
 
@@ -236,13 +243,22 @@ def _spectrum_of(props: mi.Properties) -> curve_file.Curve | None:
         return read_spectrum(path, OpticsError)
 
 
+def _vignetting_of(props: mi.Properties) -> Vignetting | None:
+    """Vignetting of the file that the scene names; None if it names none."""
+    if (path := _file_of(props, VIGNETTING)) is None:
+        return None
+    with named("fspt_lens"):
+        return read_vignetting(path)
+
+
 def _file_of(props: mi.Properties, key: str) -> str | None:
     """Path of the file that a property names, searched for as Mitsuba searches for bitmaps; None without it."""
     if key not in props:
         return None
     name = props[key]
     if not isinstance(name, str) or not name:
-        raise OpticsError(f"fspt_lens: '{key}' must be the name of a CSV file, got {name!r}. Give a text.")
+        kind = "CSV file or image" if key == VIGNETTING else "CSV file"
+        raise OpticsError(f"fspt_lens: '{key}' must be the name of a {kind}, got {name!r}. Give a text.")
     return str(mi.file_resolver().resolve(name))
 
 

@@ -18,7 +18,7 @@ LISTS = {  # attributes that hold one or several numbers, by element
 }
 OF_THE_LENS = (
     *("f_number", "magnification", "image_distance", "pixel_pitch", "lens_diameter", "diaphragm_distance"),
-    *("pupil_magnification", "distortion"),
+    *("pupil_magnification", "distortion", "vignetting"),
 )
 CAMERAS = ("perspective", "thinlens", "orthographic")  # of Mitsuba
 NEEDED = {"bitmap": ("filename", "data", "bitmap"), "volume": ("volume",)}  # without one, the texture crashes Mitsuba

@@ -158,6 +158,7 @@ def lens_with(lens: mi.Sensor, sampler: str) -> mi.Sensor:
     numbers.pop("wavelength_nm", None)  # belongs to a curve; `numbers` has the curve's transmittance there
     numbers["transmittance"] = camera.filters.transmittance
     bent = {} if camera.lens.distortion is None else {"distortion": str(camera.lens.distortion)}
+    bent |= {} if camera.vignetting is None else {"vignetting": camera.vignetting.file}
     film = camera.film
     names = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
     sizes = (*film.size, *film.crop_size, *film.crop_offset)

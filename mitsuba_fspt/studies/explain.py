@@ -106,7 +106,7 @@ def explain(
         rows.append(_row(finding, *saved))
     if (left_out := integrator.light_left_out(scene, lens, quadrature)) is not None:
         rows.append(_scattered(left_out))
-    return [*rows, _diffraction(lens), *_never_done(scene, variant)]
+    return [*rows, *_real_lens(lens), _diffraction(lens), *_never_done(scene, variant)]
 
 
 def _saved(
@@ -134,6 +134,19 @@ def _scattered(left_out: LeftOut) -> Explanation:
     share, error = 100 * left_out.share, 100 * left_out.error
     why = f"about {share:.2g} % (± {error:.1g} %) of the power, from {', '.join(left_out.bodies) or 'points and beams'}"
     return Explanation("light after a scattering reflection", True, why)
+
+
+def _real_lens(lens: mi.Sensor) -> list[Explanation]:
+    """Rows for what a real lens adds to a thin one; a lens without it has no such work."""
+    from ..camera.of_sensor import camera_of
+
+    camera = camera_of(lens)
+    magnified, bent, darker = camera.lens.pupil_magnification, camera.lens.distortion, camera.vignetting
+    return [
+        Explanation("pupil magnification", magnified == 1, f"P = {magnified:g}"),
+        Explanation("distortion", bent is None, "the lens has none" if bent is None else f"by {bent}"),
+        Explanation("measured vignetting", darker is None, darker.file if darker else "the lens has none"),
+    ]
 
 
 def _diffraction(lens: mi.Sensor) -> Explanation:

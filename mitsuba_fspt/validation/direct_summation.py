@@ -49,7 +49,8 @@ def solve(scene: mi.Scene, camera: Camera, minimum: int = 1) -> tuple[Plane, int
                 pairs += len(index)
                 _add(power, scene, camera, emitter, elements, index, pixel)
                 dr.eval(power)
-    return camera.filters.transmittance * power.numpy().reshape(height, width), pairs
+    shares = 1.0 if camera.shares is None else camera.shares
+    return camera.filters.transmittance * shares * power.numpy().reshape(height, width), pairs
 
 
 def _pairs(elements: Elements, camera: Camera) -> Iterator[tuple[Index, Index]]:

@@ -66,6 +66,29 @@ def test_the_table_has_a_line_for_each_number(run, camera):
     ]
 
 
+def test_vignetting_and_light_of_the_lens(run, camera, tmp_path):
+    """Shares of the corner multiply its illumination; electrons are those of the light behind the filters."""
+    (tmp_path / "v.csv").write_text("0,1\n20,0.6\n")
+    (tmp_path / "band.csv").write_text("600,1\n700,1\n")
+    (tmp_path / "filter.csv").write_text("500,0\n700,0.8\n")
+    plain = json.loads(run("camera", "check", camera, "-D", "magnification=0.1", "--json")[1])
+    more = 'vignetting = "v.csv"\nspectrum = "band.csv"\ntransmittance_curve = "filter.csv"\n'
+    camera.write_text(CAMERA.replace("transmittance = 0.81\n", more))
+    code, out, err = run("camera", "check", camera, "-D", "magnification=0.1", "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    corner = math.hypot(511.5, 511.5) * 0.013
+    share = (1 - 0.02 * corner) / (1 - 0.02 * math.hypot(0.5, 0.5) * 0.013)
+    assert found["corner_illumination"] / plain["corner_illumination"] == pytest.approx(share, rel=1e-4)
+    assert found["t_stop"] == pytest.approx(1.4 / math.sqrt(0.6))  # the mean of the curve over the band
+    mean = (700**3 - 600**3) / 3 - 500 * (700**2 - 600**2) / 2
+    mean /= (700**2 - 600**2) / 2 - 500 * 100
+    assert found["electrons_per_joule"] == pytest.approx(0.9 * mean * 1e-9 / (6.62607015e-34 * 299792458), rel=1e-6)
+    code, out, err = run("camera", "check", camera, "-D", "magnification=0.1", "--wavelength-nm", 660)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "but the lens is for" in err
+
+
 @pytest.mark.parametrize(
     ("define", "message"),
     [

@@ -27,12 +27,13 @@ VALUES = {"vertex": SMOOTH, "face": SMOOTH[BODY.faces].mean(axis=1)}
 WAVE = np.sin(np.arange(SIZE[0]) / 2 + np.arange(SIZE[1])[:, None] / 3)[..., None].astype(np.float32)
 
 
-def mesh_scene(folder, on, values=None, rtol=RTOL):
+def mesh_scene(folder, on, values=None, rtol=RTOL, sensor=None):
     """An icosphere out of focus before the lens, with its J_n on vertices or faces."""
     path = write_ply(folder / f"{on}.ply", BODY.vertices, BODY.faces, **{on: VALUES[on] if values is None else values})
     body = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute(f"{on}_exitance"))}
     integrator = {"type": "fspt_integral", "rtol": rtol}
-    return world_scene(body, sensor=lens(SIZE, distance=172.0, f_number=2.8), integrator=integrator)
+    sensor = sensor or lens(SIZE, distance=172.0, f_number=2.8)
+    return world_scene(body, sensor=sensor, integrator=integrator)
 
 
 def bitmap_scene(texels, rtol=RTOL, **more):
@@ -75,6 +76,29 @@ def moved(scene, key, change):
     parameters[key] = old
     parameters.update()
     return picture
+
+
+@pytest.mark.parametrize("behind", ["mesh", "bitmap"])
+def test_vignetting_is_in_both_modes(behind, tmp_path):
+    """Shares of the pixels multiply the tangent, and the gradient by the image. Seen to fail without either."""
+    shares = np.random.default_rng(5).uniform(0.3, 1.0, SIZE[::-1])
+    np.save(tmp_path / "v.npy", shares)
+    texels = np.random.default_rng(6).uniform(1, 2, (4, 4))
+
+    def scene(**more):
+        if behind == "bitmap":
+            return bitmap_scene(texels, **more)
+        return mesh_scene(tmp_path, "vertex", sensor=lens(SIZE, distance=172.0, f_number=2.8, **more))
+
+    key, tangent = {
+        "mesh": ("shape_0.vertex_exitance", SMOOTH),
+        "bitmap": ("shape_0.emitter.exitance.data", texels[..., None]),
+    }[behind]
+    dim, clear = scene(vignetting=str(tmp_path / "v.npy")), scene()
+    expected = shares[..., None] * forward(clear, key, tangent)
+    np.testing.assert_allclose(forward(dim, key, tangent), expected, rtol=2e-5, atol=1e-6 * expected.max())
+    weighted = backward(clear, key, (WAVE * shares[..., None]).astype(np.float32))
+    np.testing.assert_allclose(backward(dim, key), weighted, rtol=1e-4, atol=1e-6 * np.abs(weighted).max())
 
 
 @pytest.mark.parametrize("on", ["vertex", "face"])

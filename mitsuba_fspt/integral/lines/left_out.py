@@ -112,11 +112,15 @@ def _sampled(view: View, needed: int, depth: int | None) -> tuple[NDArray[np.flo
         at_one_wavelength(ray)
         found = scalar(path.sample(view.scene, sampler, mi.RayDifferential3f(ray), None, passes)[0])
         etendue = etendue_from_pixel(cos_theta, passes, open_share * camera.film_map.area_share(position))
+        etendue *= camera.share_at(position)
         dr.eval(found, etendue)
         return found, etendue, position, pupil
 
     total, etendue, position, pupil = radiance(needed)
-    counted = view.integrand(position, pupil).integrand if depth is None else radiance(depth)[0] * etendue
+    if depth is None:
+        counted = view.integrand(position, pupil).integrand * view.camera.share_at(position)
+    else:
+        counted = radiance(depth)[0] * etendue
     return tuple(column.numpy().astype(np.float64) for column in (total * etendue, counted))
 
 

@@ -94,7 +94,7 @@ class Rows:
 
         sizes : number of values behind J_n, see `sizes_of`
         """
-        power, uncertain = (plane.ravel() / view.camera.etendue for plane in (image.power, image.error))
+        power, uncertain = (plane.ravel() / view.camera.pixel_etendues for plane in (image.power, image.error))
         tolerance = quadrature.rtol * power.max(initial=0.0)
         pixels = np.flatnonzero(window.ravel() & ((power > 0) | (uncertain > tolerance)))
         lines, groups = _lines_for(quadrature, sizes, len(pixels)), []
@@ -137,7 +137,7 @@ class Rows:
                 change = dr.grad(radiance)
             light = eq9(mi.Float64(change), mi.Float64(part.etendue))
             tangent[part.pixels] = (dr.block_sum(light, part.lines)).numpy() * part.factors
-        return tangent.reshape(self.shape) * view.camera.etendue
+        return (tangent * view.camera.pixel_etendues).reshape(self.shape)
 
     def backward(
         self, view: View, quadrature: Quadrature, surfaces: Sequence[EmittingSurface], gradient: Array
@@ -151,8 +151,9 @@ class Rows:
                     dr.backward_from(values * mi.Float(weights[self.columns[surface.mark]].astype(np.float32)))
             dr.eval()
             return
+        of_pixels = gradient.ravel() * view.camera.pixel_etendues
         for part in self._parts(view, quadrature):
-            of_row = mi.Float(gradient.ravel()[part.pixels] * part.factors * view.camera.etendue)
+            of_row = mi.Float(of_pixels[part.pixels] * part.factors)
             weight = eq9(dr.gather(mi.Float, of_row, part.row), part.etendue)
             with dr.resume_grad():
                 radiance = part.radiance(surfaces)

@@ -98,7 +98,7 @@ def view_rows(
         with named(name):
             entries, sums = _by_faces(scene, camera, solution, laid, on, quadrature.rtol, progress)
     least = quadrature.least_error * float(solution.power.max(initial=0.0))
-    return _balanced(entries, sums, solution, np.maximum(solution.error, least), camera.etendue)
+    return _balanced(entries, sums, solution, np.maximum(solution.error, least), camera.pixel_etendues)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,9 +276,10 @@ def _rough(
     window = visible_window(scene, camera, everywhere=True)
     inside, cut = (window.expand(flags.astype(np.float64)).ravel() > 0 for flags in window.field_stop(camera))
     inside |= math.isinf(camera.lens.seen_field)
-    power = solution.power.ravel() / camera.etendue
-    off, uncertain = np.abs(power - entries.row_sums()), solution.error.ravel() / camera.etendue
-    unit = rtol * power.max(initial=0.0)
+    etendue = camera.pixel_etendues
+    power = solution.power.ravel() / etendue
+    off, uncertain = np.abs(power - entries.row_sums()), solution.error.ravel() / etendue
+    unit = rtol * float(solution.power.max(initial=0.0)) / etendue
     far = inside & ((off > ROUGH * unit) | (off > UNREACHED * unit) & (uncertain > unit))
     cut &= ~inside
     return far | (cut & (power > 0)), cut, ~(inside | cut)
@@ -332,11 +333,14 @@ def _require_memory(entries: int, pixels: int, most_bytes: int | None) -> None:
         )
 
 
-def _balanced(found: _Entries, columns: Array, image: Solution, error: Array, etendue: float) -> SparseRows:
+def _balanced(found: _Entries, columns: Array, image: Solution, error: Array, etendue: float | Array) -> SparseRows:
     """Rows scaled to the `image` of J_n = 1, with this `error` (h, w) [W], and to the given sums of the columns.
+
+    etendue : of all pixels, or of each (h · w,) [mm² sr]
 
     Rows and columns are scaled in turn, rows last; this converges, as one matrix has both sums. NaN: an unknown sum.
     """
+    etendue = np.broadcast_to(etendue, error.size)
     power, uncertain = image.power.ravel() / etendue, error.ravel() / etendue
     before = found.row_sums()
     wanted = np.where(np.abs(power - before) > CERTAIN * uncertain, power, before)
@@ -351,7 +355,7 @@ def _balanced(found: _Entries, columns: Array, image: Solution, error: Array, et
     values, change = np.empty_like(found.light), np.empty_like(found.change)
     for rows, some, row in found.parts():
         factor = by_row[rows][row] * by_column[found.columns[some]]
-        values[some] = found.light[some] * factor * etendue
+        values[some] = found.light[some] * factor * etendue[rows][row]
         scaled = (1 - found.change[some].astype(np.float64)) * coarse[rows][row]
         relative = 1 - np.divide(scaled, factor, out=np.ones_like(factor), where=factor > 0)
         change[some] = np.clip(relative, -MOST_CHANGE, MOST_CHANGE)
