@@ -142,7 +142,7 @@ def reduce(
     _require_output(output, calibrate, radiance is not None or radiance_error != 0)
     others = (bias, dark, flat, flat_dark, bad_pixels, scene, spectrum)
     names = _outputs(output, len(counts), [*counts, detector, *(Path(path) for path in others if path)])
-    camera, light = _camera_and_light(detector, wavelength_nm, spectrum, loaded := _loaded(scene, define))
+    camera, light = _camera_and_light(detector, wavelength_nm, spectrum, flat_kind, loaded := _loaded(scene, define))
     given = dict(exposure_time=exposure_time, light=light, binning=binning, pixel_pitch=pixel_pitch)
     corrections = _corrections(bias, dark, flat, flat_kind, level, loaded, bad_pixels, cosmic_rays)
     images = _reduced(camera, counts, frames, given, corrections, quiet)
@@ -162,13 +162,14 @@ def _required(counts: list[Path] | None, detector: Path | None, output: Path | N
 
 
 def _camera_and_light(
-    detector: Path, wavelength_nm: float | None, spectrum: Path | None, scene: mi.Scene | None
+    detector: Path, wavelength_nm: float | None, spectrum: Path | None, flat_kind: str | None, scene: mi.Scene | None
 ) -> tuple[Detector, Light]:
-    """The detector, and the light at it: the given one, or that of the scene's lens."""
+    """The detector, and the light at it: the given one, or that of the scene's lens for a flat through it."""
     from ..detector.detector import Detector
     from ..detector.reduction import light_of
 
-    return Detector.from_toml(detector), light_of({}, scene, wavelength_nm, spectrum)
+    through = scene if flat_kind == "lens" else None
+    return Detector.from_toml(detector), light_of({}, through, wavelength_nm, spectrum)
 
 
 def _corrections(*given: Any) -> Corrections:

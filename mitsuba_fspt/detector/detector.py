@@ -197,7 +197,8 @@ class Detector(DetectorParameters):
         ImageError : a file cannot be read, or a stack has the shape (h, w, frames).
         SceneError, OpticsError, BackendError : the scene has no usable lens; a package is not installed.
         """
-        light = light_of(metadata or {}, scene, wavelength_nm, spectrum)
+        through = scene if flat is not None and flat_kind == "lens" else None
+        light = light_of(metadata or {}, through, wavelength_nm, spectrum)
         exposed = Exposed(exposure_time, light, binning, pixel_pitch)
         corrections = Corrections(bias, dark, flat, flat_kind, flat_dark, scene, bad_pixels, cosmic_rays)
         return reduce_counts(self, counts, exposed, corrections, frames=frames, metadata=metadata)

@@ -140,6 +140,23 @@ def sphere_inside(file):
     }  # fmt: skip
 
 
+def test_the_light_of_the_lens_is_that_of_the_counts(files, run):
+    """A flat through the scene's lens needs no wavelength where that lens has one; another one is refused."""
+    (files / "f.csv").write_text("600,0.5\n700,0.9\n")
+    text = (files / "s.xml").read_text()
+    filters = '<string name="transmittance_curve" value="f.csv"/><float name="wavelength_nm" value="660"/>'
+    place = '<transform name="to_world">'
+    (files / "w.xml").write_text(text.replace(place, filters + place))
+    flat = ("--flat", files / "lens.npy", "--flat-kind", "lens", "--scene", files / "w.xml")
+    camera = ("--detector", files / "camera.toml", "--exposure-time", 1, "-o", files / "P.exr")
+    given = ("reduce", files / "sensor.npy", *flat, *camera)
+    assert run(*given)[0] == 0
+    assert fspt.read(files / "P.exr").metadata["wavelength_nm"] == 660
+    code, out, err = run(*given, "--wavelength-nm", 700)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "but the image was rendered for 660 nm" in err
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
