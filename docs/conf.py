@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 project = "mitsuba_fspt"
 author = "The mitsuba_fspt developers"
 version = release = installed("mitsuba-fspt")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "fspt_pages"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_gallery.gen_gallery", "fspt_pages"]
 html_theme = "furo"
 html_title = f"{project} {version}"
 default_role = "code"  # `name` in docstrings
@@ -20,6 +20,16 @@ myst_heading_anchors = 3
 myst_fence_as_directive = ["math"]  # equations as GitHub shows them
 suppress_warnings = ["myst.xref_missing"]  # links to files of the repository that are no pages
 autodoc_member_order = "bysource"
+
+exclude_patterns = ["gallery/*.ipynb", "gallery/*.json", "gallery/*.md5", "gallery/*.zip"]
+sphinx_gallery_conf = {
+    "examples_dirs": "../examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"/(?!matrix_in_c)[^/]*$",  # CIL comes from conda alone; CUQIpy is not installed
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+}
 
 ENTRY = re.compile(r"([*\w]+(?:, [*\w]+)*) : (.*)")
 

@@ -1,4 +1,6 @@
-"""From the counts of four views to J_n with intervals, and back to the images.
+"""
+From counts to J_n with intervals, and back to the images
+=========================================================
 
     python examples/counts_to_exitance.py [FOLDER]
 
@@ -10,15 +12,17 @@ image that is rendered from the result and the original one.
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import trimesh
 
 import mitsuba_fspt as fspt
 
 VIEWS = [0, 90, 180, 270]
-CAMERA = {"focal_length": 55, "f_number": 2.8, "magnification": 0.5, "width": 48, "height": 48, "pixel_pitch": 0.25}
+CAMERA = {"focal_length": 55, "f_number": 2.8, "magnification": 0.5, "width": 40, "height": 40, "pixel_pitch": 0.3}
 EXPOSURE = {"exposure_time": 60.0, "wavelength_nm": 660.0}  # s, nm
 
 
@@ -58,6 +62,12 @@ def main(folder: Path) -> dict[str, float]:
     rendered = fspt.render(fspt.load(again, view=0), rtol=1e-4)
     agreement = fspt.compare(rendered, pictures[0])
 
+    _, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6))
+    pictures[0].plot(left)
+    left.set_title("rendered from the phantom")
+    rendered.plot(right)
+    right.set_title("rendered from J_n of the counts")
+
     seen_power = float(matrix.areas[found.seen] @ phantom.exitance[found.seen])
     print(f"power of what is seen: {found.total:.4g} W, 90 %: {low:.4g} to {high:.4g} W")
     print(f"that of the phantom there: {seen_power:.4g} W")
@@ -65,5 +75,8 @@ def main(folder: Path) -> dict[str, float]:
     return {"total": found.total, "low": low, "high": high, "true": seen_power, "cf": agreement.cf, "chi2": found.chi2}
 
 
+# %%
+# The power of the surface lies in its interval.
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("out"))
+    numbers = main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(tempfile.mkdtemp()))
+    assert numbers["low"] < numbers["true"] < numbers["high"]

@@ -1,4 +1,9 @@
-"""A TransportMatrix as an operator of CIL, which installs from conda: `conda install -c ccpi cil`."""
+"""
+The matrix in CIL
+=================
+
+A TransportMatrix as an operator of CIL, which installs from conda: `conda install -c ccpi cil`.
+"""
 
 import numpy as np
 from cil.framework import VectorGeometry
@@ -6,6 +11,7 @@ from cil.optimisation.algorithms import LSQR
 from cil.optimisation.operators import LinearOperator
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.phantom.shipped_scenes import FOLDER
 
 
 class Transport(LinearOperator):
@@ -29,9 +35,11 @@ class Transport(LinearOperator):
         return out
 
 
-T = fspt.transport("scenes/nylon_cylinder.xml", view=[0, 90, 180, 270], width=32, height=32, pixel_pitch=0.864)
+T = fspt.transport(FOLDER / "nylon_cylinder.xml", view=[0, 90, 180, 270], width=32, height=32, pixel_pitch=0.864)
 operator = Transport(T)
 power = operator.direct(operator.domain.allocate(1e-3))
 solver = LSQR(initial=operator.domain.allocate(0), operator=operator, data=power)
 solver.run(20)
 print(solver.solution.as_array().max())
+misfit = float(abs(T @ solver.solution.as_array() - power.as_array()).max() / power.as_array().max())
+assert misfit < 0.05

@@ -63,7 +63,7 @@ MODULES = {
     "view": ["starlette", "uvicorn", "websockets"],
     "cluster": ["distributed"],
     "reduce": ["ccdproc"],
-    "docs": ["sphinx", "myst_parser", "furo"],
+    "docs": ["sphinx", "myst_parser", "furo", "sphinx_gallery"],
 }
 
 
