@@ -92,12 +92,14 @@ def _views(phantom: Path, parameters: dict[str, str], framing: dict[str, Any]) -
     views = several("view", framing.pop("view", parameters.get("view", "0")))
     if wrong := [view for view in views if not is_number(view) or views.count(view) > 1]:
         raise SceneError(f"--view: must be different numbers of degrees, got '{wrong[0]}'. Give for example 0,90,180.")
-    text, outline = text_and_outline(phantom, **lens | numbers | framing)
+    settings = lens | numbers | framing
+    text, outline = text_and_outline(phantom, **settings)
+    magnified = float(settings.get("pupil_magnification", 1.0))
     scenes, defaults = [], read_text(text, {}).defaults
     for view in views:
         values = defaults | {"view": view}
         origin = " ".join([str(phantom), *(f"{name}={value}" for name, value in values.items())])
         placed = {name: float(number) for name, number in values.items()}
-        warning = front_behind_focus(outline, placed, float(view))
+        warning = front_behind_focus(outline, placed, float(view), magnified)
         scenes.append(GivenScene(text, {"view": view}, view, origin, warning))
     return scenes

@@ -13,6 +13,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..optics.distortion import distorted
 from ..optics.focused_lens import FOCUS
 from ..optics.thin_lens import Lens, number_names
 from ..optics.transmittance import CURVE, SPECTRUM
@@ -191,7 +192,8 @@ def framed_text(
     frame = Frame(outline, focal_length, f_number, numbers["pixel_pitch"], film, lens)
     found = dict(zip(("magnification", "distance"), frame.placed(magnification, distance), strict=True))
     values = numbers | found | film | dict(parameters or {})
-    if notes == FOCUSED and (behind := front_behind_focus(outline, values, numbers["view"])):
+    magnified = float(lens.get("pupil_magnification", 1.0))
+    if notes == FOCUSED and (behind := front_behind_focus(outline, values, numbers["view"], magnified)):
         notes += f"\n          {behind}."
     size = " x ".join(f"{side:.4g}" for side in outline.size)
     camera = {"focal_length": values["focal_length"], "f_number": values["f_number"]}
@@ -204,7 +206,9 @@ def framed_text(
     )
 
 
-def front_behind_focus(outline: Outline, values: Mapping[str, float], view: float) -> str | None:
+def front_behind_focus(
+    outline: Outline, values: Mapping[str, float], view: float, pupil_magnification: float = 1.0
+) -> str | None:
     """That the front is out of focus in a view [degrees], by how much, and the remedy; None where its blur is small.
 
     values : of the text's `<default>` parameters; a blur radius of one pixel counts as small
@@ -213,8 +217,9 @@ def front_behind_focus(outline: Outline, values: Mapping[str, float], view: floa
     u, z = focal_length * (1 + 1 / values["magnification"]), distance - outline.front(view)
     if not z > u:
         return None
-    v = focal_length * (1 + values["magnification"])
-    blur = focal_length / values["f_number"] / 2 * v * (1 / u - 1 / z) / values["pixel_pitch"]
+    depth = focal_length * (1 - 1 / pupil_magnification)  # of the entrance pupil (Eq. M.39)
+    blur = values["magnification"] * focal_length / values["f_number"] / 2 * (z - u) / (z - depth)
+    blur /= values["pixel_pitch"]
     if blur <= 1:
         return None
     sharp = focal_length / (z - focal_length)
@@ -349,18 +354,30 @@ class Frame:
     def _filled(self, magnification: float) -> float:
         """Share that the phantom covers of the film's width or height in its widest view; the larger of the two.
 
-        A silhouette at the depth z and the angle α to the optical axis extends to v (tan α + R (1/u - 1/z)) on the
-        detector, with the pupil's radius R and the distances u, v of focus and image.
+        A silhouette at the distance z from the entrance pupil and the angle α to the optical axis extends to the slope
+        tan α + R (1/ℓ - 1/z), with the pupil's radius R and its distance ℓ from the focus; at F (1 + t/P) times that,
+        distorted, lies its image (Eqs. M.41, M.44).
         """
-        u, v = self.focal_length * (1 + 1 / magnification), self.focal_length * (1 + magnification)
-        pupil = self.focal_length / self.f_number / 2
+        lens = self._lens(magnification)
+        u, pupil = lens.pupil_distance, self.focal_length / self.f_number / 2
         radius = self.outline.radius
         axis = u + radius
         across = radius / math.sqrt(u * (u + 2 * radius)) + pupil * (1 / u - 1 / axis)
         depths = u + (radius - self.outline.radii)  # > 0 however far a vertex lies
         up = float((self.outline.heights / depths + pupil * (1 / u - 1 / depths)).max())
+        if lens.distortion is not None:
+            corners = np.array([[across, across, 0], [0, up, up]])  # of the outline's rectangle, and its sides
+            signs = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])[:, :, None]
+            ends = signs * corners[:, None]
+            x, y = distorted(ends[0], ends[1], lens.distortion.coefficients)
+            across, up = float(np.abs(x).max()), float(np.abs(y).max())
         half = {name: pixels * self.pixel_pitch / 2 for name, pixels in self.film.items()}
-        return v * max(across / half["width"], up / half["height"])
+        return lens.magnification * u * max(across / half["width"], up / half["height"])
+
+    def _lens(self, magnification: float) -> Lens:
+        """The lens as far as the place and the distortion of images depend on it, focused at this magnification."""
+        given = {name: self.lens[name] for name in ("pupil_magnification", "distortion") if name in self.lens}
+        return Lens.focused(self.focal_length, self.f_number, magnification=magnification, **given)  # type: ignore[arg-type]
 
 
 def _pixels(name: str, value: int) -> int:

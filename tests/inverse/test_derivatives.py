@@ -56,6 +56,27 @@ def relative(found, expected):
     return (np.linalg.norm(found.value - expected), np.linalg.norm(found.error)) / np.linalg.norm(expected)
 
 
+def test_a_distorted_field_by_k1(tmp_path, mono):
+    """By a coefficient inside the text of `distortion`, against differences of images at steps of our own.
+
+    Of a uniform field P = A_vd f(r) times the Jacobian: the corner changes by about -4 r² of its power.
+    """
+    more = '<string name="distortion" value="$k1, 0.2, 0.01, 0"/>\n        <transform name="to_world">'
+    sensor = '<default name="k1" value="-0.3"/>' + LENS_XML.replace('<transform name="to_world">', more)
+    scene = write_scene(tmp_path / "s.xml", sensor=sensor, shapes=DISK)
+    found = fspt.derivatives(scene, ["k1"])["k1"]
+
+    def image(k1):
+        return fspt.render(fspt.load(scene, k1=k1), rtol=1e-5).power.astype(np.float64)
+
+    expected = difference(image, -0.3, 0.5)
+    off, stated = relative(found, expected)
+    assert off < 1e-3
+    assert off < 3 * stated + 1e-4
+    corner = (3.5 * 0.8 / 82.5) ** 2 + (2.5 * 0.8 / 82.5) ** 2
+    assert found.value[0, 0] / image(-0.3)[0, 0] == pytest.approx(-4 * corner, rel=0.05)
+
+
 @pytest.mark.parametrize("loaded", [True, False])
 def test_a_filled_field_by_f_number_and_focus(tmp_path, mono, loaded):
     """A disc fills every cone of lines of sight: P = J A_vd f (Eq. M.17), so that dP/dN and dP/du are known.

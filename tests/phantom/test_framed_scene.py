@@ -74,6 +74,20 @@ def test_the_phantom_fills_most_of_the_film_and_is_whole_in_every_view(tmp_path,
     assert 0.75 < np.max(widest, axis=0)[side] <= 1
 
 
+@pytest.mark.parametrize(
+    "more", [{"pupil_magnification": 0.4}, {"distortion": "1.5, 0"}, {"distortion": "-1.5, 3", "f_number": 8.0}]
+)
+def test_it_fills_the_film_of_a_real_lens(tmp_path, more):
+    """Pincushion and barrel are seen to fail for the thin lens. A pupil's magnification moves only what is out of focus:
+    in focus the scale is t whatever P is, and the case passes for the thin lens, too.
+    """
+    film = {"focal_length": 12, "width": 40, "height": 32, "pixel_pitch": 0.5}
+    lit = fspt.render(fspt.load(fspt.scene_xml(box(tmp_path / "box.ply"), **film | more), view=30), rtol=1e-2).coverage
+    rows = np.flatnonzero((lit > 0).any(axis=1))
+    assert 0 < rows[0] < 4
+    assert 28 <= rows[-1] < 31
+
+
 def test_the_bounding_box_stays_in_the_middle(tmp_path):
     """Turned by 180°, a box far from the origin is the mirror image of itself: by the world's axis it were gone."""
     text = fspt.scene_xml(box(tmp_path / "box.ply"), width=32, height=32, pixel_pitch=0.8)
