@@ -78,7 +78,7 @@ def test_the_phantom_fills_most_of_the_film_and_is_whole_in_every_view(tmp_path,
     "more", [{"pupil_magnification": 0.4}, {"distortion": "1.5, 0"}, {"distortion": "-1.5, 3", "f_number": 8.0}]
 )
 def test_it_fills_the_film_of_a_real_lens(tmp_path, more):
-    """Pincushion and barrel are seen to fail for the thin lens. A pupil's magnification moves only what is out of focus:
+    """Pincushion and barrel are seen to fail for the thin lens. A pupil magnification moves only what is out of focus:
     in focus the scale is t whatever P is, and the case passes for the thin lens, too.
     """
     film = {"focal_length": 12, "width": 40, "height": 32, "pixel_pitch": 0.5}
