@@ -1,13 +1,14 @@
 """Veiling glare in a picture of front and back: J_n of the nylon cylinder's dark side with and without it in the model.
 
-    python scripts/stray_light.py [--shares 0.01,0.03] [--samples 50] [-o docs/stray_light.csv]
+    python scripts/stray_light.py [--shares 0.01,0.03] [--samples 50] [--exposures 8] [-o docs/stray_light.csv]
 
 scenes/mirror_rig.xml (192 × 64 pixels of 0.135 mm): the side next to the source is seen directly, the dark side by two
 mirrors. A typical CCD exposes with the share g of the light spread evenly over the film, 40,000 electrons on the
 brightest pixel. `invert` gets the image once with its metadata, which name the glare, and once without them. Table:
 for each share and sector of 30 degrees around the axis, |z| < 12 mm, the power that leaves it over the true one, its
 90 % interval, and the glare over the sector's light. Sectors count from the source's side; the dark side lies at 180
-degrees.
+degrees. With --exposures OUT_exposures.csv takes the table's place: of so many exposures to the first share, the number
+of the sectors' intervals that miss the true power.
 """
 
 from __future__ import annotations
@@ -41,14 +42,31 @@ def sectors(vertices: Array) -> tuple[Array, NDArray[np.bool_]]:
     return middles.astype(float), (apart <= SECTOR / 2) & side
 
 
+def exposed(power: Array, share: float, seed: int) -> tuple[fspt.Image, float]:
+    """Reduced image of a CCD with a share of glare, and the factor by which the power was multiplied."""
+    ccd = replace(fspt.Detector.typical_ccd(), pixel_pitch=None, veiling_glare=share)
+    metadata = {"pixel_pitch": FILM["pixel_pitch"]}
+    watt = ELECTRONS / ccd.expected(fspt.Image(power, metadata=metadata), **LIGHT).mean.max()
+    return reduced(ccd.expose(fspt.Image(power * watt, metadata=metadata), **LIGHT, seed=seed)), float(watt)
+
+
+def misses(matrix: fspt.TransportMatrix, share: float, samples: int, seed: int) -> int:
+    """Number of sectors whose interval misses the true power in one exposure."""
+    phantom = fspt.Phantom.read(PHANTOM)
+    image, watt = exposed(matrix.forward(phantom.exitance)[0], share, seed)
+    found, count = fspt.invert(matrix, image, samples=samples, seed=seed), 0
+    for part in sectors(phantom.vertices)[1]:
+        weights = np.where(part & found.seen, matrix.areas, 0.0)
+        low, high = found.interval(weights)
+        count += not low <= float(weights @ phantom.exitance) * watt <= high
+    return count
+
+
 def rows_of(matrix: fspt.TransportMatrix, share: float, samples: int) -> tuple[list[list[object]], fspt.Image]:
     """Rows of the table for a share of glare, and the reduced image."""
     phantom = fspt.Phantom.read(PHANTOM)
     power = matrix.forward(phantom.exitance)[0]
-    ccd = replace(fspt.Detector.typical_ccd(), pixel_pitch=None, veiling_glare=share)
-    metadata = {"pixel_pitch": FILM["pixel_pitch"]}
-    watt = ELECTRONS / ccd.expected(fspt.Image(power, metadata=metadata), **LIGHT).mean.max()
-    image = reduced(ccd.expose(fspt.Image(power * watt, metadata=metadata), **LIGHT, seed=1))
+    image, watt = exposed(power, share, 1)
     blind = replace(image, metadata={k: v for k, v in image.metadata.items() if "glare" not in k})
     middles, parts = sectors(phantom.vertices)
     found = {"with": fspt.invert(matrix, image, samples=samples, seed=1)}
@@ -100,6 +118,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--shares", default="0.01,0.03", help="of glare, the first one for the picture")
     parser.add_argument("--samples", type=int, default=50, help="random draws of the intervals")
+    parser.add_argument("--exposures", type=int, default=0, help="whose intervals are counted; 0: the table instead")
     parser.add_argument("--matrix", type=Path, help="T.npz of an earlier run")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs/stray_light.csv")
     options = parser.parse_args()
@@ -110,6 +129,12 @@ def main() -> None:
         matrix = fspt.transport(SCENE, **FILM, rtol=3e-3)
         if options.matrix:
             matrix.save(options.matrix)
+    if options.exposures:
+        counts = [[seed, misses(matrix, shares[0], options.samples, seed)] for seed in range(1, options.exposures + 1)]
+        path = options.output.with_stem(f"{options.output.stem}_exposures")
+        with path.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([["seed", "intervals that miss, of 12"], *counts])
+        return
     found = [rows_of(matrix, share, options.samples) for share in shares]
     rows = [row for part, _ in found for row in part]
     columns = ["share of glare", "azimuth [degree]", "glare over light"]

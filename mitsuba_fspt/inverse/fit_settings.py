@@ -47,6 +47,8 @@ class Settings:
     weight : change of log(weight) at which it counts as converged: 1/10 of its own uncertainty for 200 determined
         unknowns
     probes : random vectors for the number of determined unknowns, whose relative error is about (2/(probes γ))^½
+    responses : fits of `mlem` where the pixels' response has an error, each with that error's share of the light of the
+        fit before it
     first : weight to begin with, over that at which data and penalty have the same trace
     darkest : of the reference, the least ρ of the penalty: below it J_n is no better known than its noise
     seen : of the largest sensitivity per area, the least at which a vertex counts as seen
@@ -73,6 +75,7 @@ class Settings:
     averaged: int = 4
     weight: float = 0.01
     probes: int = 8
+    responses: int = 3
     first: float = 100.0
     darkest: float = 0.05
     seen: float = 0.01

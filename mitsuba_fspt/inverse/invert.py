@@ -332,9 +332,12 @@ class Problem:
             raise InversionError(
                 "invert: method 'mlem' needs electrons, not watts with error=. Give images of 'fspt reduce'."
             )
-        background = self.measurement.other[self.rows] / shot**2
         power = self.measurement.power[self.rows]
-        x, gap = mlem(self.transport, power, 1 / shot, background, self.settings.mlem, lambda s: report("fit", s))
+        light, x, gap = 0 * power, np.zeros(0), np.inf
+        for _ in range(self.settings.responses if np.any(self.measurement.noise.relative) else 1):
+            background = self.measurement.background(self.rows, light)
+            x, gap = mlem(self.transport, power, 1 / shot, background, self.settings.mlem, lambda s: report("fit", s))
+            light = self.signal(x)  # of which the error of the pixels' response is a share
         numerical = self._numerical(x)
         return Fit(x, self._sigma(self.signal(x), numerical), numerical, 0 * numerical, 0.0, 0.0, 2 * gap)
 
@@ -346,7 +349,7 @@ class Problem:
         start = Minima(normal, solve, self.bounds, self.settings.columns).near(right[:, None], state.x)
         found = minimise(normal, right[:, None], start, self.bounds, solve, accuracy)
         x = found.x[:, 0]
-        determined, correction = self._fitted_noise(design, solve, state.sigma, probes)
+        determined, correction = self._fitted_noise(design, solve, state, probes)
         if weight is None:  # Eq. M.25, of J_n
             rough = max(self.smoothness.energy(x[:count] - self.mean), 1e-300)
             weight = max(determined - self._determined_factors(solve), 1e-3 * determined) / rough
@@ -368,17 +371,19 @@ class Problem:
         unit[self.surface.unknowns + own, own] = 1
         return count - float(np.trace(solve(unit)[self.surface.unknowns :]))
 
-    def _fitted_noise(self, design: csr_array, solve: Solve, sigma: Array, probes: Array) -> tuple[float, Array]:
+    def _fitted_noise(self, design: csr_array, solve: Solve, state: Fit, probes: Array) -> tuple[float, Array]:
         """γ, the number of unknowns that the data determine, and the correction of the data (N,) [W] (Eq. M.25, M.29).
 
         Both are of K = σ⁻¹ T (H + w Q)⁻¹ Tᵀ σ⁻¹, the change of the fitted pixels with the measured ones: γ = tr K, by
         random vectors `probes` (N, k). A pixel that is too bright by chance has too large a fitted signal, too large a
         variance, and counts less; the correction is the power that it loses so.
         """
-        found = (design @ solve(design.T @ (probes / sigma[:, None]))) / sigma[:, None]
+        sigma = state.sigma[:, None]
+        found = (design @ solve(design.T @ (probes / sigma))) / sigma
         count = probes.shape[1]
         share = np.einsum("nk,nk->n", found, probes - found) / count
-        return float(np.einsum("nk,nk->", probes, found) / count), self.measurement.shot[self.rows] * share
+        slope = self.measurement.slope(self.rows, self.signal(state.x))
+        return float(np.einsum("nk,nk->", probes, found) / count), slope * share
 
     def _normal(self, design: csr_array, sigma: Array, weight: float) -> tuple[csr_array, Solve]:
         """H + w Q with H = TᵀT/σ², and what solves it."""

@@ -194,6 +194,20 @@ class Measurement:
         power, noise = without_glare(power, noise, masks, stray.glare)
         return cls(np.where(masks, 0, power).ravel(), noise, masks.ravel(), found, without_glare_of(matrix, stray))
 
+    @property
+    def relative(self) -> Array:
+        """(N,) relative standard error of the pixels' response."""
+        return np.broadcast_to(self.noise.relative, self.noise.shot.shape).ravel()
+
+    def slope(self, rows: NDArray[np.int64], signal: Array) -> Array:
+        """Slope [W] of the variance of the pixels `rows` with a fitted signal [W] (Eq. M.29); 0 for a Monte Carlo."""
+        return np.asarray(self.shot[rows] + 2 * self.relative[rows] ** 2 * np.maximum(signal, 0))
+
+    def background(self, rows: NDArray[np.int64], signal: Array) -> Array:
+        """Variance [e⁻] of the pixels `rows` beside their shot noise for a fitted signal [W] (Eq. M.28)."""
+        variance = self.other[rows] + (self.relative[rows] * np.maximum(signal, 0)) ** 2
+        return np.asarray(variance / self.shot[rows] ** 2)
+
     def sigma(self, rows: NDArray[np.int64], signal: Array, numerical: Array, verb: str) -> Array:
         """Standard deviation [W] of the pixels `rows` for a fitted signal and its numerical error [W] (Eq. M.24).
 
