@@ -185,6 +185,20 @@ MUTANTS = (
         ("tests/optics/test_distortion.py",),
     ),
     Mutant(
+        "slope of the response's error (M.29)",
+        "inverse/measurement.py",
+        "self.shot[rows] + 2 * self.relative[rows] ** 2 * np.maximum(signal, 0)",
+        "self.shot[rows]",
+        (INVERT,),
+    ),
+    Mutant(
+        "response's error in MLEM (M.28)",
+        "inverse/measurement.py",
+        "self.other[rows] + (self.relative[rows] * np.maximum(signal, 0)) ** 2",
+        "self.other[rows]",
+        (INVERT,),
+    ),
+    Mutant(
         "vignetting of the integral",
         "integral/solver.py",
         "found = whole.darkened(camera.shares)",

@@ -8,10 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.parsers.expat import ExpatError, ParserCreate
 
+from ..optics.transmittance import CURVE, SPECTRUM
+from ..optics.vignetting import VIGNETTING
 from ..rendering.scene_xml import read_xml
 from ..runtime.atomic_files import atomic_path, require_apart
 from ..runtime.errors import InversionError
 
+FILES = ("filename", CURVE, SPECTRUM, VIGNETTING)  # properties that name files beside the scene
 TAG = re.compile(rb"""<default\b(?:[^>"']|"[^"]*"|'[^']*')*>""")
 VALUE = re.compile(rb"""(\bvalue\s*=\s*)("[^"]*"|'[^']*')""")
 
@@ -32,7 +35,7 @@ def require_files_found(scene: str | os.PathLike[str], path: str | os.PathLike[s
     """Raise InversionError if files that the scene names beside it, such as meshes, are not beside `path`, too."""
     here, there = Path(scene).parent, Path(path).parent
     nodes = read_xml(Path(scene), {}).nodes
-    for name in [node.get("value") for node in nodes if node.get("name") == "filename"]:
+    for name in [node.get("value") for node in nodes if node.get("name") in FILES]:
         if name and not Path(name).is_absolute() and (here / name).exists() and not (there / name).exists():
             raise InversionError(
                 f"output file '{path}': the scene names '{name}' beside it, which is not in '{there}'. Write it into "

@@ -90,10 +90,11 @@ def test_bad_input(run, folder, monkeypatch, arguments, words):
     assert files(folder) == before
 
 
-def test_a_fitted_scene_that_would_not_find_its_mesh_is_refused(run, tmp_path):
+@pytest.mark.parametrize(("kind", "name"), [("shape", "filename"), ("sensor", "vignetting"), ("sensor", "spectrum")])
+def test_a_fitted_scene_that_would_not_find_its_files_is_refused(run, tmp_path, kind, name):
     (tmp_path / "other").mkdir()
     (tmp_path / "mesh.ply").write_text("ply\n")
-    mesh = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape>'
+    mesh = f'<{kind} type="ply"><string name="{name}" value="mesh.ply"/></{kind}>'
     text = f'<scene version="3.0.0"><default name="distance" value="165"/>{mesh}</scene>'
     (tmp_path / "mesh.xml").write_text(text)
     arguments = (tmp_path / "mesh.xml", tmp_path / "none.exr", "--free", "distance")

@@ -25,7 +25,9 @@ from small_scenes import (
 )
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.rendering.live_scene import LiveScene
 from mitsuba_fspt.runtime.errors import ImageError, SceneError
+from mitsuba_fspt.studies.explain import explain
 from mitsuba_fspt.validation import direct_summation
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -167,6 +169,20 @@ def test_the_light_left_out_counts_with_its_shares(tmp_path):
         image = fspt.render(scene, method="integral", rtol=1e-2)
         found[name] = image.metadata["light_left_out"]
     assert found["clear"] > 3 * found["dim"] > 0
+
+
+def test_drafts_of_the_viewer_have_it_and_explain_names_it(curve, tmp_path):
+    more = f'<string name="vignetting" value="{curve}"/>\n        <transform name="to_world">'
+    write_scene(tmp_path / "dim.xml", sensor=LENS_XML.replace('<transform name="to_world">', more))
+    write_scene(tmp_path / "clear.xml")
+    dim, clear = (LiveScene(tmp_path / f"{name}.xml") for name in ("dim", "clear"))
+    x, y = (np.arange(8) - 3.5) * 0.8, (np.arange(6) - 2.5)[:, None] * 0.8
+    shares = np.interp(np.hypot(x, y), HEIGHTS, SHARES)
+    for one, other in ((dim.draft({}), clear.draft({})), (dim.image({}), clear.image({}))):
+        np.testing.assert_allclose(one.power, shares * other.power, atol=4e-3 * other.power.max())
+    rows = {row.what: row for row in explain(tmp_path / "dim.xml", rtol=1e-1)}
+    assert (rows["measured vignetting"].left_out, rows["measured vignetting"].why) == (False, curve)
+    assert rows["distortion"].left_out
 
 
 def test_derivatives_have_it(curve):
