@@ -48,15 +48,13 @@ def cases() -> Iterator[tuple[str, object, trimesh.Trimesh]]:
     """Name, scene and mesh [mm] of each case: the nylon cylinder, and a ring that hides a part of itself."""
     import mitsuba as mi
 
+    from mitsuba_fspt.jit.mesh_buffers import new_mesh
+
     for f_number in F_NUMBERS:
         scene = fspt.load("scenes/nylon_cylinder.xml", f_number=f_number)
         yield "cylinder", scene, trimesh.load("scenes/nylon_cylinder.ply", process=False)
     ring = trimesh.creation.torus(**RING).apply_transform(trimesh.transformations.rotation_matrix(0.3, [0, 1, 0]))
-    shape = mi.Mesh("ring", len(ring.vertices), len(ring.faces), props=glowing())
-    parameters = mi.traverse(shape)
-    parameters["vertex_positions"] = np.float32(ring.vertices).ravel()
-    parameters["faces"] = np.uint32(ring.faces).ravel()
-    parameters.update()
+    shape = new_mesh("ring", np.float32(ring.vertices).ravel(), np.uint32(ring.faces).ravel(), glowing())
     for f_number in F_NUMBERS:
         lens = {
             "type": "fspt_lens",

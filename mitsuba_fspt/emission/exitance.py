@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..jit.mesh_buffers import triangles
+from ..jit.mesh_buffers import flat, triangles
 from ..jit.spectra import at_one_wavelength, scalar
 from ..runtime.errors import ExitanceError
 from .elements import elements_of
@@ -89,7 +89,7 @@ class ExitanceState:
         on_mesh = {} if name is None else mi.traverse(shape)
         numbers = (n for key in ("value", "scale") if key in parameters for n in np.ravel(parameters[key]))
         return cls(
-            mi.Float(on_mesh[name]) if name in on_mesh else None,
+            mi.Float(flat(on_mesh[name])) if name in on_mesh else None,
             mi.Float(parameters["data"].array) if "data" in parameters else None,
             tuple(map(float, numbers)),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..jit.mesh_buffers import set_triangles, triangles
+from ..jit.mesh_buffers import new_mesh, triangles
 from ..jit.robust_tracing import traced_robustly
 
 REACH = 1e-4  # of the largest coordinate: the ray runs from this distance before the surface to as much behind it
@@ -42,5 +42,4 @@ class Probe:
 
 def _bare_copy(mesh: mi.Shape) -> mi.Mesh:
     """Mesh with the triangles of `mesh` and nothing else."""
-    positions, faces = triangles(mesh)
-    return set_triangles(mi.Mesh("copy", dr.width(positions) // 3, dr.width(faces) // 3), positions, faces)
+    return new_mesh("copy", *triangles(mesh))

@@ -9,17 +9,20 @@ from typing import Any
 
 import mitsuba as mi
 
+from ..runtime.backend import SUPPORTED, refusal
 from ..runtime.errors import BackendError, FsptError
 
 _NAMES = ("surface", "lens", "integral")
-_registered: set[str] = set()
+# Kept when the module is reloaded, as Mitsuba 3.10 does after each switch of the variant.
+_registered: set[str] = globals().get("_registered", set())
 
 
 def register() -> None:
     """Register `fspt_surface`, `fspt_lens` and `fspt_integral` with the active variant, once per variant.
 
     The classes derive from the active variant's base classes, so their modules are executed once for every variant.
-    Scalar variants get plugins that refuse: Python plugins are very slow there, and mesh attribute emitters crash.
+    Scalar variants get plugins that refuse: Python plugins are very slow there, and mesh attribute emitters crash. So do
+    Metal variants, which have no float64.
     """
     variant = mi.variant()
     if variant is None:
@@ -28,7 +31,7 @@ def register() -> None:
     if variant in _registered:
         return
     _refuse_in("scalar_rgb")
-    if variant.startswith("scalar"):
+    if not variant.startswith(SUPPORTED):
         _refuse_in(variant)
         return
     _registered.add(variant)
@@ -68,7 +71,7 @@ def _end_in_own_errors() -> None:
 
 
 def _refuse_in(variant: str) -> None:
-    """Register plugins that refuse a scalar variant.
+    """Register plugins that refuse a variant which is not supported.
 
     In every variant `mi.load_dict` asks scalar_rgb for the kind of a plugin's name. If the name is unknown there, it
     takes equal emitters of two shapes for one and the same emitter, which cannot belong to both.
@@ -80,7 +83,7 @@ def _refuse_in(variant: str) -> None:
 
     def refuse(props: mi.Properties) -> None:
         raise BackendError(
-            f"{props.plugin_name()}: {variant} is scalar, mitsuba_fspt needs a vectorised variant. "
+            f"{props.plugin_name()}: {refusal(variant)} "
             "Call mi.set_variant('llvm_ad_mono') or 'cuda_ad_mono' before loading the scene."
         )
 

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 Matrix = NDArray[np.float64]  # (4, 4), acts on homogeneous coordinates [mm]
-VECTORS = {"vertex_positions": 1.0, "vertex_normals": 0.0}  # of a mesh, with their fourth homogeneous coordinate
 
 
 class MovedShapes:
@@ -57,11 +56,13 @@ class MovedShapes:
         """Set one parameter to its first value, moved."""
         import mitsuba as mi
 
-        kind = name.rsplit(".", 1)[-1]
-        if kind in VECTORS:
+        from ..jit.mesh_buffers import motions_of, shaped_like
+
+        fourth = motions_of([name], name.rpartition(".")[0] + ".").get(name)
+        if fourth is not None:
             home = self._home.setdefault(name, np.array(parameters[name], np.float64).reshape(-1, 3))
-            moved = home @ motion[:3, :3].T + VECTORS[kind] * motion[:3, 3]
-            parameters[name] = type(parameters[name])(moved.astype(np.float32).ravel())
+            moved = home @ motion[:3, :3].T + fourth * motion[:3, 3]
+            parameters[name] = shaped_like(parameters[name], moved.astype(np.float32).ravel())
         else:
             home = self._home.setdefault(name, np.array(parameters[name].matrix, np.float64).reshape(4, 4))
             parameters[name] = mi.Transform4f(motion @ home)
@@ -69,6 +70,9 @@ class MovedShapes:
 
 def _places(shape: mi.Shape, parameters: mi.SceneParameters) -> list[str]:
     """Names of the parameters that determine the position of a shape; empty if it has none of them."""
-    kinds = tuple(VECTORS) if shape.is_mesh() else ("to_world",)
-    names = [f"{shape.id()}.{kind}" for kind in kinds if f"{shape.id()}.{kind}" in parameters]
-    return [name for name in names if name.endswith("to_world") or np.size(parameters[name])]
+    from ..jit.mesh_buffers import motions_of
+
+    if shape.is_mesh():
+        return [name for name in motions_of(parameters, f"{shape.id()}.") if np.size(parameters[name])]
+    placement = f"{shape.id()}.to_world"
+    return [placement] if placement in parameters else []

@@ -32,6 +32,7 @@ INSTALL = (
     "conda: conda install -c conda-forge libllvm19 (on Windows libllvm-c19). "
     f"Or set {libllvm.ENVIRONMENT_NAME} to the library's file before Python starts."
 )
+SUPPORTED = ("llvm_", "cuda_")  # beginnings of the variants' names
 
 
 class ImportWatch:
@@ -50,7 +51,7 @@ class ImportWatch:
         """None in all cases: the finders behind this one find the module."""
         if name == "drjit":
             self.before_drjit()
-        elif name.startswith(("mitsuba.llvm_", "mitsuba.cuda_", "mitsuba.scalar_")):
+        elif name.startswith(("mitsuba.llvm_", "mitsuba.cuda_", "mitsuba.scalar_", "mitsuba.metal_")):
             require_working_llvm(name.removeprefix("mitsuba."))
             sys.modules["mitsuba"].detail.add_variant_callback(_on_variant)
         return None
@@ -135,7 +136,7 @@ def ensure_variant() -> str:
 
     Raises
     ------
-    BackendError : the active variant is scalar, its LLVM does not work, or no backend works.
+    BackendError : the active variant is none of LLVM and CUDA, its LLVM does not work, or no backend works.
     """
     import mitsuba
 
@@ -143,9 +144,9 @@ def ensure_variant() -> str:
     if active is None:
         active = choose_variant()
         mitsuba.set_variant(active)
-    elif active.startswith("scalar"):
+    elif not active.startswith(SUPPORTED):
         raise BackendError(
-            f"the active variant {active} is scalar, mitsuba_fspt needs a vectorised one."
+            f"the active variant {refusal(active)}"
             " Call mi.set_variant('llvm_ad_mono') or 'cuda_ad_mono' first, or set none."
         )
     require_working_llvm(active)
@@ -154,6 +155,13 @@ def ensure_variant() -> str:
     if drjit.thread_count() < 2:  # on one core
         set_threads(2)
     return active
+
+
+def refusal(variant: str) -> str:
+    """Reason why a variant that is none of `SUPPORTED` cannot be used."""
+    if variant.startswith("scalar"):
+        return f"{variant} is scalar, mitsuba_fspt needs a vectorised variant."
+    return f"{variant} is none of LLVM and CUDA, mitsuba_fspt needs one of these: Metal has no float64."
 
 
 def set_threads(count: int) -> None:

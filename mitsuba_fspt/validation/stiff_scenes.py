@@ -134,7 +134,7 @@ def mesh(
     def shape_at(pose: mi.ScalarTransform4f) -> mi.Mesh:
         import mitsuba as mi
 
-        from ..jit.mesh_buffers import set_triangles
+        from ..jit.mesh_buffers import add_attribute, new_mesh
 
         matrix = np.array(pose.matrix, np.float64)
         texture: Any = exitance
@@ -143,11 +143,11 @@ def mesh(
             texture = {"type": "mesh_attribute", "name": f"{kind}_exitance"}
         props = mi.Properties()
         props["glow"] = mi.load_dict({"type": "fspt_surface", "exitance": texture, **(law or {})})
-        built = mi.Mesh("mesh", len(vertices), len(faces), props=props)
-        if np.ndim(exitance):
-            built.add_attribute(f"{kind}_exitance", 1, np.asarray(exitance, np.float32))  # type: ignore[arg-type]
         positions = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
-        return set_triangles(built, positions.ravel(), faces.ravel())
+        built = new_mesh("mesh", positions.ravel(), faces.ravel(), props)
+        if np.ndim(exitance):
+            add_attribute(built, f"{kind}_exitance", np.asarray(exitance, np.float32))
+        return built
 
     return shape_at
 
