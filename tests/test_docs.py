@@ -54,6 +54,28 @@ def test_links_and_files_exist(page):
         assert list(ROOT.glob(name.rstrip("/").replace("NAME", "*"))), name
 
 
+def anchors(page):
+    """Anchors of a page's headings, as GitHub and MyST make them."""
+    titles = re.findall(r"^#+ (.+)$", text_of(page), re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_anchors_exist(page):
+    """Seen to fail with a letter left out of one."""
+    for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", text_of(page)):
+        assert anchor in anchors(page.parent / target if target else page), f"{target}#{anchor}"
+
+
+def test_blocks_of_python_can_be_compiled():
+    """Of all pages; `scripts/release-check` runs those of README.md and docs/python.md."""
+    for page in PAGES:
+        for number, block in enumerate(
+            re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M)
+        ):
+            compile(block, f"{page.name}, block {number}", "exec")
+
+
 def test_files_and_names_of_the_code_exist():
     """The last table of docs/model.md: files below the package, and the names in them."""
     rows = zip(*(cells(ROOT / "docs" / "model.md", "Where it stands in the code", k) for k in (2, 3)), strict=True)

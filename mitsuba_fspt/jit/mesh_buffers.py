@@ -1,10 +1,10 @@
 """Buffers of Mitsuba's meshes. Only this file uses their names and shapes, which change in Mitsuba 3.10.
 
-Mitsuba 3.9 has flat arrays `vertex_positions` (3 V,), `vertex_normals` (3 V,), `faces` (3 F,) and attributes (d V,), and
-fills a mesh after its construction. Mitsuba 3.10 has tensors `positions` (P, 3), `normals`, `faces` (F, 3) and attributes
-(V, d); vertices may share positions, so that `geometric_faces()` has the indices of positions, and a mesh is made from
-its data. Both are told apart by what the objects have, not by the version. 3.10 was not released when this was written:
-the tests imitate it.
+Mitsuba 3.9 has flat arrays `vertex_positions` (3 V,), `vertex_normals` (3 V,), `faces` (3 F,) and attributes (d V,),
+and fills a mesh after its construction. Mitsuba 3.10 has tensors `positions` (P, 3), `normals`, `faces` (F, 3) and
+attributes (V, d); vertices may share positions, so that `geometric_faces()` has the indices of positions, and a mesh is
+made from its data. Both are told apart by what the objects have, not by the version. 3.10 was not released when this
+was written: the tests imitate it.
 """
 
 from __future__ import annotations

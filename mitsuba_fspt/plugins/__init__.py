@@ -21,8 +21,8 @@ def register() -> None:
     """Register `fspt_surface`, `fspt_lens` and `fspt_integral` with the active variant, once per variant.
 
     The classes derive from the active variant's base classes, so their modules are executed once for every variant.
-    Scalar variants get plugins that refuse: Python plugins are very slow there, and mesh attribute emitters crash. So do
-    Metal variants, which have no float64.
+    Scalar variants get plugins that refuse: Python plugins are very slow there, and mesh attribute emitters crash.
+    Metal variants do, too, for they have no float64.
     """
     variant = mi.variant()
     if variant is None:
