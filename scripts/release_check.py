@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[1]
 STEPS = ("build", "extras", "readme", "suite", "lowest", "pythons")
 PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 COPIED = ("tests", "scenes", "examples", "scripts", "docs", "pyproject.toml", "README.md", "CONTRIBUTING.md")
-SHORT = ("tests/optics", "tests/phantom", "tests/cli/test_scene_new.py")
+SHORT = ("tests/phantom/test_phantom.py", "tests/phantom/test_framed_scene.py", "tests/optics/test_thin_lens.py")
 # Tests of the checkout itself: its pages, its scripts, its git.
 OF_CHECKOUT = ("tests/test_docs.py", "tests/scripts", "tests/cli/test_verbs.py")
 IN_WHEEL = (
@@ -289,7 +289,7 @@ def check_readme(release: Release, checks: Checks) -> None:
             continue
         command = ["bash", "-euo", "pipefail", "-c", line]
         checks.check("readme: " + line, lambda command=command: call(command, folder, **environment) and None)
-    for number, block in enumerate(readme_blocks("python"), 1):
+    for number, block in enumerate(readme_blocks("python"), 1):  # after the commands, in their folder
         checks.check(
             f"readme: Python block {number}", lambda block=block: release.run(interpreter, "-c", block, cwd=folder)[:0]
         )
@@ -368,15 +368,26 @@ def interpreter_of(version: str) -> str | None:
     return None
 
 
+def direct_requirements(wheel: Path, extras: Sequence[str]) -> list[str]:
+    """Requirements of a wheel and of these extras, without the marker of the extra."""
+    found = []
+    for line in metadata_of(wheel)[0].get_all("Requires-Dist", []):
+        extra = re.search(r"""extra == ['"](\w+)['"]""", line)
+        if extra is None or extra[1] in extras:
+            plain = re.sub(r"""\s*(?:and)?\s*extra == ['"]\w+['"]""", "", line)
+            found.append(re.sub(r";\s*$", "", plain))
+    return found
+
+
 def check_lowest(release: Release, checks: Checks, tests: Sequence[str]) -> None:
     found = [python for python in map(interpreter_of, PYTHONS) if python]
     extras = ["llvm", *(name for name in MODULES if name not in ("docs", "mesher"))]
 
     def check() -> str:
         python = found[0] if found else sys.executable
-        interpreter = release.install(
-            "lowest", extras, "pytest>=8", "pytest-xdist>=3.5", python=python, resolution="lowest-direct"
-        )
+        direct = direct_requirements(release.wheel, extras)  # named, so that uv counts them as direct ones
+        others = [*direct, "pytest>=8", "pytest-xdist>=3.5"]
+        interpreter = release.install("lowest", extras, *others, python=python, resolution="lowest-direct")
         release.renders(interpreter)
         names = "mitsuba", "drjit", "numpy", "scipy", "trimesh", "OpenEXR", "typer", "rich", "matplotlib", "astropy"
         code = f"from importlib.metadata import version as v; print(', '.join(n + ' ' + v(n) for n in {names!r}))"
