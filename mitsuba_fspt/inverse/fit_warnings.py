@@ -40,7 +40,7 @@ def fit_warnings(
     solve = factor(csr_array(problem.hessian(design, fit.sigma, fit.weight)[free][:, free]))
     between, edge = problem.between(fit.x)
     common = hstack([common_errors(fit.numerical / fit.sigma, views), csr_array((between / fit.sigma)[:, None])])
-    residual = (measurement.power[rows] - signal) / fit.sigma
+    residual = (measurement.power[rows] + fit.correction - signal) / fit.sigma  # Eq. M.29
     found = structure(residual, slopes, solve, Patterns.of(views), csr_array(common))
     right = slopes.T @ (between / fit.sigma)
     largest = float(max(right @ solve(right), 0.0) ** 0.5)

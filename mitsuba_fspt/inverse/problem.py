@@ -30,6 +30,9 @@ class Fit(Protocol):
     def numerical(self) -> Array: ...
 
     @property
+    def correction(self) -> Array: ...
+
+    @property
     def weight(self) -> float: ...
 
     @property

@@ -47,6 +47,8 @@ class StructureSettings:
     chance : probability of a false alarm by noise, of all patterns together, and of the most likely one
     noise : least share of a direction's variance that is noise of the images. The rest is variance of J_n
         that the penalty smooths away; in directions with more of it, the test would be one of the prior
+    rougher : variance of J_n in a direction, over that of the prior. The weight is a mean over all roughness (Eq. M.25);
+        where few features of J_n have most of it, each has many times its share
     absorbed : least share of a direction that the fit leaves in the residuals; below it rounding counts
     named : most causes that are named
     shown : least share of the squared length of a cause that the residuals show. What the fit absorbs but for less, as
@@ -55,6 +57,7 @@ class StructureSettings:
 
     chance: float = 1e-4
     noise: float = 0.5
+    rougher: float = 25.0
     absorbed: float = 1e-3
     named: int = 3
     shown: float = 1e-2
@@ -147,7 +150,8 @@ def structure(
     noise = mean - down.T @ lift + fitted  # Zᵀ(I − K)²Z
     common = _dense(z.T @ known) - lift.T @ _dense(slopes.T @ known)
     kept = _directions(cross, mean, noise, settings)
-    covariance = kept.T @ (mean + common @ common.T) @ kept
+    smoothed = (settings.rougher - 1) * (mean - noise)
+    covariance = kept.T @ (mean + smoothed + common @ common.T) @ kept
     white = kept @ np.linalg.inv(np.linalg.cholesky(covariance)).T if kept.size else kept
     score = white.T @ (z.T @ residual)
     effect = white.T @ mean * patterns.lengths
