@@ -234,6 +234,8 @@ class Detector(DetectorParameters):
         """Mean charge of each pixel read out before the register, (h, w) [e-]."""
         if (darkest := image.power.min()) < 0:
             raise DetectorError(f"detector: power must be >= 0 on every pixel, got {darkest:g} W. Render it again.")
+        if image.mask is not None and image.mask.any():
+            LOG.warning("fspt: expose: %d masked pixels have no known power; they get no light.", image.mask.sum())
         power = self._with_stray_light(image)
         electrons = _binned(power * (exposure_time * self.electrons_per_joule(light)), binning)
         pitch = image.metadata.get("pixel_pitch")
@@ -289,7 +291,7 @@ class Detector(DetectorParameters):
 
         Parameters
         ----------
-        image : power [W], shape (h, w)
+        image : power [W], shape (h, w); masked pixels get no light, and a line says so
         exposure_time : [s], 0 … 1e12 (0 gives a bias frame)
         wavelength_nm : of the light in vacuum [nm], 200 … 2500
         spectrum : of the light at the detector in its place, a CSV file of nm, relative power per nm, ascending. None

@@ -118,3 +118,10 @@ def test_the_verbs_say_so(run, true, saturated, tmp_path, monkeypatch):
     code, out, err = run("plot", "true.npz", "seen.npz", "--json")
     assert (code, json.loads(out)["masked"]) == (0, [0, 192])
     assert err == "fspt: plot: total powers leave out masked pixels: 192 of seen.npz.\n"
+
+
+def test_expose_reports_that_masked_pixels_get_no_light(saturated, caplog):
+    """Seen to fail: nothing was said, and the counts of masked pixels are those of the dark."""
+    again = Detector.typical_ccd().expose(saturated, 600, 650)
+    assert "expose: 192 masked pixels have no known power" in caplog.text
+    assert again.counts[saturated.mask].max() < 600 < again.counts[~saturated.mask].min()
