@@ -47,8 +47,8 @@ class StructureSettings:
     chance : probability of a false alarm by noise, of all patterns together, and of the most likely one
     noise : least share of a direction's variance that is noise of the images. The rest is variance of J_n
         that the penalty smooths away; in directions with more of it, the test would be one of the prior
-    rougher : variance of J_n in a direction, over that of the prior. The weight is a mean over all roughness (Eq. M.25);
-        where few features of J_n have most of it, each has many times its share
+    rougher : variance of J_n in a direction, over that of the prior. The weight is a mean over all roughness
+        (Eq. M.25); where few features of J_n have most of it, each has many times its share
     absorbed : least share of a direction that the fit leaves in the residuals; below it rounding counts
     named : most causes that are named
     shown : least share of the squared length of a cause that the residuals show. What the fit absorbs but for less, as

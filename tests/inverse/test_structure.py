@@ -34,7 +34,7 @@ class Linear:
         self.inverse = np.linalg.inv(self.slopes.T @ self.slopes + np.eye(10) / prior**2)
 
     def residual(self, rng, extra=0.0, rougher=1.0):
-        """Residual over σ of a fit to noise, to unknowns of `rougher` times the prior's sd, and to `extra` (N,) over σ."""
+        """Residual over σ of a fit to noise, unknowns of `rougher` times the prior's sd, and `extra` (N,) over σ."""
         unknowns = rougher * self.prior * rng.standard_normal(10)
         data = self.slopes @ unknowns + rng.standard_normal(len(self.rows)) + extra
         return data - self.slopes @ (self.inverse @ (self.slopes.T @ data))

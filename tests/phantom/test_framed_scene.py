@@ -36,8 +36,8 @@ def box(path, size=(20, 8, 60), centre=(100, -40, 7), face=False):
 def test_it_is_the_shipped_scene_to_the_last_bit(view):
     """Seen to fail with the turn clockwise, and with the camera focused on the axis."""
     text = fspt.scene_xml(CYLINDER, focal_length=55, f_number=8, magnification=0.5, **SMALL)
-    image = fspt.render(fspt.load(text, view=view))
-    shipped = fspt.render(fspt.load(SCENES / "nylon_cylinder.xml", view=view, **SMALL))
+    image = fspt.render(fspt.load(text, view=view, rtol=1e-2))
+    shipped = fspt.render(fspt.load(SCENES / "nylon_cylinder.xml", view=view, rtol=1e-2, **SMALL))
     assert shipped.power.max() > 0
     np.testing.assert_array_equal(image.power, shipped.power)
 
@@ -63,7 +63,7 @@ def test_the_phantom_fills_most_of_the_film_and_is_whole_in_every_view(tmp_path,
     )
     widest = []
     for view in (0, 30, 90, 150):
-        image = fspt.render(fspt.load(text, view=view), rtol=1e-2)
+        image = fspt.render(fspt.load(text, view=view), rtol=0.1)
         lit = image.coverage > 0
         rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
         assert rows[0] > 0
@@ -91,7 +91,7 @@ def test_it_fills_the_film_of_a_real_lens(tmp_path, more):
 def test_the_bounding_box_stays_in_the_middle(tmp_path):
     """Turned by 180°, a box far from the origin is the mirror image of itself: by the world's axis it were gone."""
     text = fspt.scene_xml(box(tmp_path / "box.ply"), width=32, height=32, pixel_pitch=0.8)
-    powers = [fspt.render(fspt.load(text, view=view)).power for view in (0, 180)]
+    powers = [fspt.render(fspt.load(text, view=view), rtol=2e-3).power for view in (0, 180)]
     assert powers[0].max() > 0
     np.testing.assert_allclose(powers[1], powers[0], rtol=0, atol=2e-3 * powers[0].max())
 
@@ -155,7 +155,9 @@ def test_a_file_with_another_name_of_the_exitance_gives_the_same_image(tmp_path)
     """Seen to fail with the attribute vertex_exitance, which that file does not have."""
     phantom = fspt.Phantom.read(box(tmp_path / "own.ply"))
     write_any_ply(tmp_path / "other.ply", phantom.vertices, phantom.faces, {"jn_x": phantom.exitance}, phantom.per, {})
-    own, other = (fspt.render(fspt.scene_xml(tmp_path / f"{name}.ply", **SMALL)).power for name in ("own", "other"))
+    own, other = (
+        fspt.render(fspt.scene_xml(tmp_path / f"{name}.ply", rtol=0.1, **SMALL)).power for name in ("own", "other")
+    )
     assert own.any()
     np.testing.assert_array_equal(own, other)
 
@@ -194,7 +196,7 @@ def test_a_front_out_of_focus_is_reported(tmp_path, run):
     """A plate 60 mm wide and 8 thick: in view 0 its front is 26.3 mm behind the plane through its edges, 30.3 mm from
     the axis. With the magnification that the line gives, a point of the front is imaged to a point.
     """
-    path, film = box(tmp_path / "plate.ply", (8, 60, 6)), {"width": 120, "height": 80, "pixel_pitch": 0.2}
+    path, film = box(tmp_path / "plate.ply", (8, 60, 6)), {"width": 60, "height": 40, "pixel_pitch": 0.4}
     text = fspt.scene_xml(path, **film)
     told = re.search(
         r"In view 0 the front lies ([\d.]+) mm behind .* magnification = (\S+) with distance = (\S+) f", text

@@ -20,7 +20,7 @@ import drjit as dr  # isort: skip  # after the package, which chooses its LLVM
 pytestmark = pytest.mark.usefixtures("mono")
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = (16, 12)
-RTOL = 1e-3
+RTOL = 4e-3
 BODY = trimesh.creation.icosphere(2, radius=4.0)  # 162 vertices, 320 faces
 SMOOTH = np.exp(-((BODY.vertices - [4, 1, 1]) ** 2).sum(axis=1) / 20).astype(np.float32)
 VALUES = {"vertex": SMOOTH, "face": SMOOTH[BODY.faces].mean(axis=1)}
@@ -160,7 +160,7 @@ def test_a_number(monkeypatch):
 def test_texels_of_a_bitmap():
     """Differences of two images are exact, for the image is linear."""
     texels = 1e-3 * (1.5 + np.sin(np.arange(8) + np.arange(6)[:, None]))
-    scene = bitmap_scene(texels, rtol=1e-4)
+    scene = bitmap_scene(texels, rtol=4e-4)
     key = "shape_0.emitter.exitance.data"
     found = backward(scene, key).reshape(texels.shape)
     largest = float(np.abs(found).max())
@@ -179,7 +179,7 @@ def test_forward_mode_is_the_image_of_the_tangent(on, tmp_path):
     scene = mesh_scene(tmp_path, on)
     key = f"shape_0.{on}_exitance"
     tangent = VALUES[on][::-1].copy()
-    expected = fspt.render(mesh_scene(tmp_path, on, tangent), domain="surface", rtol=RTOL / 10, max_nodes=1 << 16)
+    expected = fspt.render(mesh_scene(tmp_path, on, tangent), domain="surface", rtol=RTOL / 4)
     off = np.abs(forward(scene, key, tangent)[..., 0] - expected.power)
     assert (off - expected.error).max() <= RTOL * expected.power.max()
 
@@ -230,7 +230,7 @@ def test_an_optimisation_recovers_a_bitmap():
     parameters, losses = mi.traverse(scene), []
     optimiser = mi.ad.Adam(lr=4e-4, params={key: parameters[key]})
     unit = float(np.max(goal))
-    for _ in range(60):
+    for _ in range(40):
         optimiser[key] = dr.maximum(optimiser[key], 0)
         parameters.update(optimiser)
         loss = dr.mean(dr.square((mi.render(scene, parameters) - goal) / unit), axis=None)

