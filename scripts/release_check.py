@@ -51,6 +51,7 @@ IN_WHEEL = (
     "mitsuba_fspt/viewer/page/view.js",
     "mitsuba_fspt/viewer/page/view.css",
     "mitsuba_fspt/phantom/starter_scenes.py",
+    "mitsuba_fspt/tissue/absorbers/water.csv",
 )
 IN_SDIST = ("scenes/nylon_cylinder.ply", "tests/conftest.py", "docs/model.md", "scripts/test", "examples", "setup.py")
 MODULES = {

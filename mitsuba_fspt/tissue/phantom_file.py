@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,8 @@ from ..optics.boundary import boundary_a
 from ..optics.media import Medium, Source
 from ..optics.shapes import Cylinder, Shape, Sphere
 from ..runtime.errors import FluxError, named
+from ..runtime.wavelength import wavelength
+from .composition import Absorbers, reduced_scattering
 from .cylinder_mesh import cylinder_tetrahedra
 from .diffusion import Progress, solve
 from .finite_elements import import_skfem
@@ -20,6 +23,9 @@ from .mesher import read_tetrahedra
 from .solution import DiffusionSolution
 from .tetrahedra import Tetrahedra
 from .toml_table import Table
+
+ABSORBERS = ("blood", "water", "fat")  # keys of a band in place of mua; saturation goes with blood
+SCATTERING = ("scattering", "scattering_power")  # keys in place of musp
 
 
 @dataclass(frozen=True)
@@ -194,6 +200,29 @@ def _medium(table: Table, n: float) -> Medium:
     return Medium(table.number("mua"), table.number("musp"), table.number("n", n))
 
 
+def _band_medium(table: Table, n: float, wavelength_nm: float | None) -> Medium:
+    """Medium of a table of [bands.NAME], by its coefficients or by its composition at the band's wavelength."""
+    composed = [key for key in ABSORBERS if key in table.left]
+    scattered = [key for key in SCATTERING if key in table.left]
+    for given, other in ((composed, "mua"), (scattered, "musp")):
+        if given and other in table.left:
+            raise FluxError(f"'{other}' and '{given[0]}' exclude each other. Give one of them.")
+    if (composed or scattered) and wavelength_nm is None:
+        raise FluxError(f"'{(composed + scattered)[0]}' needs 'wavelength_nm' of the band. Give nm, for example 660.")
+    at = wavelength_nm or math.nan
+    if composed:
+        saturation = table.number("saturation") if {"blood", "saturation"} <= table.left.keys() else None
+        blood, water, fat = (table.number(key, getattr(Absorbers, key)) for key in ABSORBERS)
+        mua = Absorbers(blood, saturation, water, fat).mua(at)
+    else:
+        mua = table.number("mua")
+    if scattered:
+        musp = reduced_scattering(table.number("scattering"), table.number("scattering_power"), at)
+    else:
+        musp = table.number("musp")
+    return Medium(mua, musp, table.number("n", n))
+
+
 def _region(table: Table, n: float) -> Region:
     """Region of a table of [[regions]]; its refractive index is that of [optical] unless it names one."""
     where = table.whole("label") if "label" in table.left else _shape(table, ("sphere", "cylinder"))
@@ -219,9 +248,14 @@ def _bands(table: Table, media: tuple[Medium, ...]) -> dict[str, Band]:
                 f"{own.name}: 'share' must be in (0, 1], got {share:g}. Give the part of a source's power that is "
                 "emitted in the band."
             )
-        with named(own.name):
-            found = tuple(_medium(part, of.n) for part, of in zip([own, *regions], media, strict=True))
-        bands[name] = Band(share, found)
+        at = own.number("wavelength_nm") if "wavelength_nm" in own.left else None
+        if at is not None:
+            wavelength(f"{own.name}: 'wavelength_nm'", at, FluxError)
+        found = []
+        for part, of in zip([own, *regions], media, strict=True):
+            with named(part.name):
+                found.append(_band_medium(part, of.n, at))
+        bands[name] = Band(share, tuple(found))
         for part in (own, *regions):
             part.done()
     return bands

@@ -18,6 +18,7 @@ from mitsuba_fspt.optics.shapes import Cylinder, Sphere
 from mitsuba_fspt.phantom.phantom import Phantom
 from mitsuba_fspt.runtime.errors import BackendError, FluxError
 from mitsuba_fspt.tissue import phantom_file
+from mitsuba_fspt.tissue.composition import Absorbers
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import solve
 from mitsuba_fspt.tissue.mesher import read_tetrahedra, tetrahedralize
@@ -80,6 +81,7 @@ def test_the_documented_example(tmp_path: Path) -> None:
     assert defaults == {
         "n": f"{phantom.medium.n:g}",
         "power": f"{phantom.sources[0].power:g}",
+        **{name: f"{getattr(Absorbers(), name):g}" for name in ("blood", "water", "fat")},
         "[mesh] edge": f"{PhantomFile.edge:g}",
         "[mesh] order": f"{PhantomFile.order:g}",
         "[output] edge": f"{PhantomFile.surface_edge:g}",
