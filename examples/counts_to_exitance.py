@@ -22,7 +22,7 @@ import trimesh
 import mitsuba_fspt as fspt
 
 VIEWS = [0, 90, 180, 270]
-CAMERA = {"focal_length": 55, "f_number": 2.8, "magnification": 0.5, "width": 40, "height": 40, "pixel_pitch": 0.3}
+CAMERA = {"focal_length": 55, "f_number": 2.8, "magnification": 0.5, "width": 48, "height": 48, "pixel_pitch": 0.25}
 EXPOSURE = {"exposure_time": 60.0, "wavelength_nm": 660.0}  # s, nm
 
 
