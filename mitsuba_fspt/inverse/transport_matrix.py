@@ -29,6 +29,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
+# What a real lens adds: name, key by which images and views are compared, and its value for a lens without it.
+REAL_LENS: dict[str, tuple[str, object]] = {
+    "pupil_magnification": ("pupil_magnification", 1.0),
+    "distortion": ("distortion", "none"),
+    "vignetting": ("vignetting_digest", "none"),
+}
 PITCH_TOLERANCE = 1e-6  # relative: of the pixel pitch, which files may hold in single precision
 
 
@@ -362,6 +368,10 @@ def _differences(
     for name in ("focal_length", "f_number", "magnification", "model"):
         if name in metadata and name in lens and metadata[name] != lens[name] and name not in other:
             notes.append(f"image {number} has {name} = {metadata[name]}, its view of the matrix {lens[name]}.")
+    for name, (key, usual) in REAL_LENS.items() if "focal_length" in metadata else ():
+        if metadata.get(key, usual) != lens.get(key, usual) and name not in other:
+            given = (of.get(name, usual) for of in (metadata, lens))
+            notes.append("image {} has {} = {}, its view of the matrix {}.".format(number, name, *given))
     return notes
 
 

@@ -127,7 +127,7 @@ def test_the_tolerance_is_that_of_the_dimmed_image(tmp_path):
     assert image.error.max() <= 1e-2 * image.power.max()
 
 
-def test_the_matrix_and_the_units_have_it(patches, tmp_path):
+def test_the_matrix_and_the_units_have_it(patches, tmp_path, caplog):
     """T @ J is the image; radiances are those of the lens without it, from which the étendue has the share, too.
 
     Seen to fail with `camera.etendue` in place of `pixel_etendues` in `view_rows`, and without the share in
@@ -146,6 +146,11 @@ def test_the_matrix_and_the_units_have_it(patches, tmp_path):
     )
     assert T.metadata["lenses"][0]["vignetting"] == str(tmp_path / "small.npy")
     plain = fspt.render(fspt.scene_xml(ply, **film), rtol=1e-3)
+    caplog.clear()
+    T.images([image])
+    assert not caplog.text
+    T.images([plain])
+    assert f"image 0 has vignetting = none, its view of the matrix {tmp_path / 'small.npy'}" in caplog.text
     expected = patches[0][:16, :16] * plain.power
     np.testing.assert_allclose(image.power, expected, atol=1e-3 * expected.max())
     with_it, without = (one.to_radiance(660).values for one in (image, plain))
