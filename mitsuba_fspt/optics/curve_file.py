@@ -75,7 +75,9 @@ def read_rows(
 
 
 def _is_title(row: str) -> bool:
-    """True for a row that does not begin with a number."""
+    """True for a row that does not begin with a number, nor with a digit: that one is a row that went wrong."""
+    if row[0].isdigit():
+        return False
     try:
         float(row.partition(",")[0])
     except ValueError:
