@@ -52,6 +52,7 @@ IN_WHEEL = (
     "mitsuba_fspt/viewer/page/view.css",
     "mitsuba_fspt/phantom/starter_scenes.py",
     "mitsuba_fspt/tissue/absorbers/water.csv",
+    "mitsuba_fspt/optics/dyes/eosin_y.csv",
 )
 IN_SDIST = ("scenes/nylon_cylinder.ply", "tests/conftest.py", "docs/model.md", "scripts/test", "examples", "setup.py")
 MODULES = {
