@@ -37,6 +37,7 @@ LIGHT = "tests/optics/test_light.py"
 STRAY = "tests/detector/test_stray_light.py"
 VIGNETTING, MEASURED_VIGNETTING = "tests/optics/test_vignetting.py", "tests/detector/test_measured_vignetting.py"
 TISSUE, INVERT = "tests/tissue/test_diffusion.py", "tests/inverse/test_invert.py"
+COMPOSITION = "tests/tissue/test_composition.py"
 
 
 @dataclass(frozen=True)
@@ -368,6 +369,20 @@ MUTANTS = (
         "self.mean_wavelength_nm * METRE / PLANCK_TIMES_LIGHT",
         "650 * METRE / PLANCK_TIMES_LIGHT",
         (DETECTOR,),
+    ),
+    Mutant(
+        "decadic extinction of haemoglobin (M.46)",
+        "tissue/composition.py",
+        '"deoxyhaemoglobin": math.log(10) * ',
+        '"deoxyhaemoglobin": ',
+        (COMPOSITION,),
+    ),
+    Mutant(
+        "power law of scattering (M.46)",
+        "tissue/composition.py",
+        "** -scattering_power",
+        "** scattering_power",
+        (COMPOSITION,),
     ),
     Mutant(
         "mean of efficiency times wavelength",
