@@ -146,7 +146,7 @@ class Release:
         interpreter = folder / "bin" / "python"
         what = f"{self.wheel}[{','.join(extras)}]" if extras else str(self.wheel)
         find = ["--no-index", "--find-links", self.wheelhouse] if self.wheelhouse else []
-        more = ["--resolution", options["resolution"]] if "resolution" in options else []
+        more = ["--resolution", options["resolution"], "--only-binary", ":all:"] if "resolution" in options else []
         call([uv, "pip", "install", "-q", *find, *more, "--python", interpreter, what, *others], self.work)
         call([uv, "pip", "check", "-q", "--python", interpreter], self.work)
         return interpreter
