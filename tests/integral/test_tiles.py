@@ -18,10 +18,10 @@ from mitsuba_fspt.runtime.errors import SceneError
 
 pytestmark = pytest.mark.usefixtures("mono")
 FIELD = 256 * 0.108  # mm
-SIDE = 160  # of a tile
+SIDE = 110  # of a tile
 
 
-def scene_of(name, side=384):
+def scene_of(name, side=256):
     return load_scene(name, width=side, height=side, pixel_pitch=FIELD / side, f_number=2.8)
 
 
