@@ -140,6 +140,10 @@ class EmittingSurface:
         """True if J_n is a mesh attribute, and so linear on every face."""
         return bool(self._source) and self._source.attribute is not None and self.shape.is_mesh()
 
+    def exitance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
+        """J_n [W/mm²] at the corners of every face of a mesh; None if it is not linear on the faces."""
+        return exitance.at_corners(self.shape, self.exitance) if self.shape.is_mesh() else None
+
     def radiance_at_corners(self) -> tuple[mi.Float, mi.Float, mi.Float] | None:
         """Radiance [W/mm²/sr] at the corners of every face of a mesh; None if it is not linear or not Lambert's."""
         corners = exitance.at_corners(self.shape, self.exitance) if self.is_isotropic() else None

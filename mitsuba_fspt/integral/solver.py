@@ -33,7 +33,7 @@ from .pupil.narrow import NarrowLight, narrow_light, peak_of_points, points_on_s
 from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
-from .surface import surface_form
+from .surface import face_image, surface_form
 from .tiles import Mosaic
 
 LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
@@ -191,14 +191,21 @@ class Solver:
             peak = max(narrow.brightest / 2, least_peak)
         if specular and specular.bending:  # the surface form contains only light that goes straight to the lens
             where = np.zeros(window.shape, bool)
-        if where.any() and not progress.deadline.passed():
-            known = surface_form.solve(scene, camera, window, quadrature, where, peak, progress.part(0, 2), specular)
-            known = _with_dark_coverage(known, view, window)
-            rest = pupil_form.solve(view, window, quadrature, narrow.in_focus, known, least_peak, progress.part(1, 2))
-            solution = known.completed_by(rest)
-        else:
+        by_faces = None
+        if not (everywhere or specular) and face_image.applies(scene, quadrature):
+            by_faces = face_image.FaceImage(scene, camera, window, quadrature, peak)
+        light, form = narrow.in_focus, partial(pupil_form.solve, view, window, quadrature)
+        if progress.deadline.passed():
             where = np.zeros(window.shape, bool)
-            solution = pupil_form.solve(view, window, quadrature, narrow.in_focus, None, least_peak, progress)
+        if by_faces:
+            solution = form(light, None, least_peak, progress, by_faces, where)
+        elif where.any():
+            part = progress.part(0, 2)
+            known = surface_form.solve(scene, camera, window, quadrature, where, peak, part, specular)
+            known = _with_dark_coverage(known, view, window)
+            solution = known.completed_by(form(light, known, least_peak, progress.part(1, 2)))
+        else:
+            solution = form(light, None, least_peak, progress)
         findings = (Finding("smooth blocks", False, why), *solution.findings)
         if not narrow.on_pixels.any():
             return replace(solution, findings=findings)

@@ -187,7 +187,7 @@ class LiveScene:
         if not is_integral(integrator):
             return render(scene, sensor=self.sensor, spp=DRAFT_SAMPLES)
         own = integrator.quadrature
-        quadrature = replace(own, rtol=max(own.rtol, rtol), max_nodes=min(own.max_nodes, max_nodes))
+        quadrature = replace(own, rtol=max(own.rtol, rtol), max_nodes=min(own.most_nodes, max_nodes))
         solution = integrator.solve(scene, lens, quadrature, narrow=False)
         how = {"method": "integral", "rtol": quadrature.rtol}
         return Image(solution.power, solution.error, solution.coverage, how | camera_of(lens).numbers())

@@ -231,7 +231,7 @@ WRONG = {
     "rtol as text": ({"rtol": "1e-3"}, "'rtol' must be a number, got '1e-3'. Give for example 1e-3"),
     "rtol beyond floats": ({"rtol": 10**400}, "'rtol' must be in (0, 1), got inf"),
     "rtol in a list": ({"rtol": np.array([1e-3])}, "'rtol' must be a number, got array([0.001]). Give"),
-    "half a node": ({"max_nodes": 100.5}, "'max_nodes' must be a whole number, got 100.5. Give for example 4194304"),
+    "half a node": ({"max_nodes": 100.5}, "'max_nodes' must be a whole number, got 100.5. Give for example 65536"),
     "nodes without end": ({"max_nodes": float("inf")}, "'max_nodes' must be a whole number, got inf"),
     "sensor as text": ({"sensor": "0"}, "'sensor' must be a whole number, got '0'. Give for example 0"),
     "half a sample": ({"method": "path", "spp": 16.5}, "'spp' must be a whole number, got 16.5. Give for example 256"),

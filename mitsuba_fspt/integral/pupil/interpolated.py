@@ -281,7 +281,7 @@ def _refine_blurred(draft: Draft) -> tuple[mi.Float64, mi.Bool]:
     """
     rough = first_nodes(draft, np.zeros(draft.grid.shape))
     quadrature, enough = draft.quadrature, dr.opaque(mi.Float64, BLURRED)
-    levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)[:LEVELS]
+    levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.most_nodes - BOTH)[:LEVELS]
     if not draft.progress.deadline.passed():
         rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
     least = -draft.grid.spread_max(-draft.least_blur)

@@ -35,7 +35,7 @@ def refine_by_lattices(draft: Draft) -> None:
     The error of a pixel is at least `missed_share` over the number of points times the brightest value around; on
     pixels that another solution gives, times the brightest surface.
     """
-    most = min(1 << (draft.quadrature.max_nodes // SHIFTS).bit_length() >> 1, MOST)  # a power of two
+    most = min(1 << (draft.quadrature.most_nodes // SHIFTS).bit_length() >> 1, MOST)  # a power of two
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
     if most < FIRST or not dr.any(above):
         return

@@ -11,7 +11,8 @@ lattices of lines of sight, whose scatter gives the error. Each line of sight is
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -37,6 +38,11 @@ from .transects import integrate_by_transects
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ...jit.pixel_grid import Mask
+
+# Lines of sight of a pixel that twelve nodes leave above the tolerance, as of a straight silhouette; the same where the
+# faces are projected in any case, for narrow light.
+FIRST_LINES, BESIDE_NARROW = 70, 600
 
 FEW = 1 << 18  # pixels of the coarse lattice for a lower bound of the brightest pixel
 MARGIN = 0.9  # share of their brightest value that counts, for the error of twelve nodes
@@ -50,35 +56,123 @@ def solve(
     given: Solution | None = None,
     least_peak: float = 0.0,
     progress: Progress = SILENT,
+    by_faces: ByFaces | None = None,
+    narrow: NDArray[np.bool_] | None = None,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window, to the accuracy of `quadrature`.
 
     Only pixels of the `window` are computed, the others are dark. `light`: of surfaces as if in focus, see
     `NarrowLight`. Pixels that the partial solution `given` has are not refined. `least_peak`: lower bound of the
-    brightest pixel's mean radiance on film [W/mm²/sr]. `progress` is called after every level.
+    brightest pixel's mean radiance on film [W/mm²/sr]. `progress` is called after every level. `by_faces`,
+    `narrow` as of `refine`.
     """
     draft = Draft(view, window, quadrature, given, least_peak, progress)
-    refine(draft, light)
+    refine(draft, light, by_faces, narrow)
     return draft.solution()
 
 
-def refine(draft: Draft, light: NDArray[np.float64]) -> None:
-    """All steps of the refinement on the pixels of a draft; `light` as of `solve`."""
+def refine(
+    draft: Draft,
+    light: NDArray[np.float64],
+    by_faces: ByFaces | None = None,
+    narrow: NDArray[np.bool_] | None = None,
+) -> None:
+    """All steps of the refinement on the pixels of a draft; `light` as of `solve`.
+
+    `by_faces` gives the pixels that twelve nodes, or some transects, leave above the tolerance from the faces of all
+    surfaces if lines of sight are expected to take more time. Pixels that are `narrow` (h, w), whose light
+    lines of sight may miss, take their value from the faces in any case.
+    """
     quadrature, progress = draft.quadrature, draft.progress
     rough = first_nodes(draft, light)
-    levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.max_nodes - BOTH)
+    levels = node_rules.transect_levels(quadrature.rtol, draft.area, quadrature.most_nodes - BOTH)
     progress(1 / (2 + len(levels)))
-    if quadrature.max_nodes >= BOTH and not progress.deadline.passed():
+    if quadrature.most_nodes >= BOTH and not progress.deadline.passed():
         rough = twelve_nodes(draft, rough, transects_follow=bool(levels))
     progress(2 / (2 + len(levels)))
+    faces = None
+    if by_faces:
+        faces = _Faces(draft, by_faces, np.zeros(draft.window.shape, bool) if narrow is None else narrow)
+        beside = narrow is not None and narrow.any()
+        rough = faces(rough, (BESIDE_NARROW if beside else FIRST_LINES) if levels else 0.0)
     if not levels:
         draft.spread_error(rough)
     elif dr.any(rough):
-        integrate_by_transects(draft, rough, levels)
+        integrate_by_transects(draft, rough, levels, faces=faces)
     draft.restore_given_errors()
     if levels:
         refine_by_lattices(draft)
     progress(1.0)
+
+
+class ByFaces(Protocol):
+    """The image of pixels that are marked in (h, w), from the faces of all surfaces.
+
+    peak : lower bound of the brightest pixel's mean radiance on film [W/mm²/sr]
+    """
+
+    def cost(self, marked: NDArray[np.bool_], peak: float, most: float = math.inf) -> float:
+        """Lines of sight in whose time it is computed; a number above `most` may be too small."""
+        ...
+
+    def run(self, marked: NDArray[np.bool_], peak: float, progress: Progress) -> Solution:
+        """The image, complete on the marked pixels."""
+        ...
+
+
+@dataclass
+class _Faces:
+    """Gives rough pixels of a draft their value `by_faces`, once; they count as given from then on.
+
+    narrow : pixels (h, w) that get it in any case; set to False if the deadline leaves no time for them
+    """
+
+    draft: Draft
+    by_faces: ByFaces
+    narrow: NDArray[np.bool_]
+    taken: bool = False
+
+    def __call__(self, rough: Mask, lines: float) -> Mask:
+        """The rough pixels without those that get their value from faces, if that takes less time than as many `lines`
+        of sight for each of them."""
+        draft, grid = self.draft, self.draft.grid
+        allowed = grid.array(draft.shown & draft.computed & ~(draft.clipped | draft.outside))
+        wanted, forced = grid.array(rough) & allowed, self.narrow & allowed
+        if not self.taken and draft.progress.deadline.passed():
+            self.narrow[:] = False
+            return rough
+        if self.taken or not (wanted | forced).any():
+            return rough
+        # Of a pixel with an edge twelve nodes may be far too bright.
+        certain = dr.max(dr.select(draft.shown & ~grid.flat(forced), draft.value - draft.error, 0))
+        peak = max(float(draft.at_least_peak(certain)[0]), 0.0)
+        least = self.by_faces.cost(forced, peak) if forced.any() else 0.0
+        most = least + lines * np.count_nonzero(wanted & ~forced)
+        if self.by_faces.cost(wanted | forced, peak, most) > most:
+            wanted = forced
+        if not (wanted | forced).any():
+            return rough
+        self.taken = True
+        found = self.by_faces.run(wanted | forced, peak, Progress(deadline=draft.progress.deadline))
+        return rough & ~self._give(found, grid.flat(wanted | forced), grid.flat(forced), peak)
+
+    def _give(self, found: Solution, wanted: Mask, forced: Mask, peak: float) -> Mask:
+        """Set the values, errors and coverage that are better; returns the pixels that are not refined further."""
+        draft, grid, window = self.draft, self.draft.grid, self.draft.window
+        power, error = (grid.flat(window.cut(image) / draft.camera.etendue) for image in (found.power, found.error))
+        brightest = dr.maximum(dr.max(dr.select(wanted, power, 0)), dr.opaque(mi.Float64, peak))
+        taken = wanted & ((error < draft.error) | forced)
+        done = taken & ((error <= dr.opaque(mi.Float64, draft.quadrature.rtol) * brightest) | forced)
+        draft.value, draft.error = dr.select(taken, power, draft.value), dr.select(taken, error, draft.error)
+        draft.set_coverage(dr.select(taken, grid.flat(window.cut(found.coverage)), draft.coverage))
+        draft.given, draft.given_error = (
+            dr.select(done, new, old) for new, old in ((power, draft.given), (error, draft.given_error))
+        )
+        draft.computed &= ~done
+        draft.rays += found.rays
+        draft.levels += found.levels
+        dr.eval(draft.value, draft.error, draft.given, draft.given_error, draft.computed)
+        return done
 
 
 def peak_of_few(view: View, window: Window, quadrature: Quadrature) -> float:

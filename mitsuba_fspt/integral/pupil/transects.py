@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -23,20 +24,31 @@ from .transect import transect
 if TYPE_CHECKING:
     from ...jit.pixel_grid import Mask, PixelArray
 
+# Lines of sight that pixels which take these levels are expected to take, but no more than a quarter of the most.
+HARD = {1: 600, 3: 1 << 14}
 DARK_LEVELS = 3  # levels of transects that are taken while no line of sight of the image has met light
 FAR = 1e30  # depth [mm] at which larger ones are clipped; the blur of an edge is finite there
 
 
 def integrate_by_transects(
-    draft: Draft, rough: Mask, levels: list[tuple[int, node_rules.AlongTransect]], among: Mask | None = None
+    draft: Draft,
+    rough: Mask,
+    levels: list[tuple[int, node_rules.AlongTransect]],
+    among: Mask | None = None,
+    faces: Callable[[Mask, float], Mask] | None = None,
 ) -> None:
     """Refine the `rough` pixels, and those around on which the same edge may lie, by transects.
 
     levels : number of transects of each level, and the accuracy along each
     among : pixels that may be refined; None: all that influence a pixel of the crop window
+    faces : gives some of the marked pixels their value from the faces of all surfaces, if that is quicker than so many
+        lines of sight each, and returns the others
     """
     refinement = _Refinement(draft, rough, draft.wanted() if among is None else draft.wanted() & among)
     for level, (count, along) in enumerate(levels):
+        if faces and level in HARD and dr.any(refinement.where):
+            lines = min(HARD[level], draft.quadrature.most_nodes / 4)
+            refinement.leave(faces(refinement.where, lines))
         if not dr.any(refinement.where):
             break
         if draft.progress.deadline.passed():
@@ -69,6 +81,12 @@ class _Refinement:
         self.remaining, self.own = (draft.grid.full(mi.Float64, 0) for _ in range(2))
         self.count = 0
         self.means: Means | None = None
+
+    def leave(self, where: Mask) -> None:
+        """Continue on the pixels `where` alone; the others have got their values from elsewhere."""
+        self.own = dr.select(self.where & ~where, 0, self.own)
+        self.where = where
+        dr.eval(self.own, self.where)
 
     def refine(self, level: int, rule: node_rules.Transects, along: node_rules.AlongTransect) -> None:
         """One level: new values and errors, and the pixels that take the next level."""

@@ -102,7 +102,7 @@ class Rows:
             sums = _sums(view, quadrature, RowGroup(lines, pixels.astype(np.uint32), np.ones(len(pixels), np.float32)))
             off = np.abs(power[pixels] - sums)
             finer, rough = FINER * lines, off > tolerance
-            if finer > min(FINER * MOST, quadrature.max_nodes) or finer * np.count_nonzero(rough) > MOST_LINES // 2:
+            if finer > min(FINER * MOST, quadrature.most_nodes) or finer * np.count_nonzero(rough) > MOST_LINES // 2:
                 rough[:] = False
             wanted = np.where(off > CERTAIN * uncertain[pixels], power[pixels], sums)
             factors = np.divide(wanted, sums, out=np.ones(len(pixels)), where=sums > 0)
@@ -201,7 +201,7 @@ def _lines_for(quadrature: Quadrature, sizes: Sizes, pixels: int) -> int:
     hits = smooth / quadrature.rtol + stepped / quadrature.rtol ** (4 / 3)
     scale = math.sqrt(1e-3 / quadrature.rtol)
     wanted = float(np.clip(hits, LEAST_LINES * scale, MOST_LINES * scale)) / max(pixels, 1)
-    most = math.log2(min(MOST, max(FEWEST, quadrature.max_nodes)))
+    most = math.log2(min(MOST, max(FEWEST, quadrature.most_nodes)))
     return 1 << int(np.clip(round(math.log2(max(wanted, 1))), math.log2(FEWEST), most))
 
 

@@ -13,7 +13,7 @@ order in both, so that a third of the difference is left.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +44,8 @@ MOST_CHANGE = 6e4  # relative, below the largest number of float16
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+# Density of light, the polygon that it fills with the number of its edges, and where there is any.
+Laid = tuple[list[Plane], list[mi.Point2d], mi.UInt32, mi.Bool]
 
 
 @dataclass(frozen=True)
@@ -134,12 +136,7 @@ def _kept(
     some = some[fine[some] > rule.drop * brightest[column[some]]]
     column, fine, coarse = column[some].astype(np.int32), fine[some], coarse[some]
     y, x = windows.rows_of_film()[some], windows.columns_of_film()[some]
-    offset = camera.film.crop_offset
-    left, top = mi.Float(x + float(offset[0])), mi.Float(y + float(offset[1]))
-    even = np.zeros(len(some))
-    for a in GAUSS if some.size else ():
-        for b in GAUSS:
-            even += falloff(camera, mi.Point2f(left + a, top + b)).numpy() / len(GAUSS) ** 2
+    even = falloff_on_pixels(camera, x, y, camera.film.crop_offset)
     change = np.clip(LEFT * (fine - coarse) / fine, -MOST_CHANGE, MOST_CHANGE)
     return column, (y * shape[1] + x).astype(np.int32), (even * fine).astype(np.float32), change.astype(np.float16)
 
@@ -161,12 +158,9 @@ def _laid(
         items = np.stack([index[some], cells, cuts, points, taken @ (1 << np.arange(taken.shape[1]))])
         for run in batch_slices((items[1] * items[2]) ** 2):
             part = items[:, run]
-            row, number = numbered((part[1] * part[2]) ** 2)
-            row = mi.UInt32(row.astype(np.uint32))
-            face, m, cut, at, mask = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in part)
-            # Array entries beyond the last line gather 0, and whole numbers divided by 0 end the process.
-            lines = _Lines(face, dr.maximum(m, 1), dr.maximum(cut, 1), at > 0, mi.UInt32(number.astype(np.uint32)))
-            planes, ring, count, active = lines.image(scene, camera, faces, on)
+            lines = FaceLines.numbered(part[:4])
+            face, mask = lines.face, dr.gather(mi.UInt32, mi.UInt32(part[4].astype(np.uint32)), lines.row)
+            planes, ring, count, active = lines.columns(scene, camera, faces, on)
             columns = [face] if on == "face" else [dr.gather(mi.UInt32, corners, 3 * face + k) for k in range(3)]
             columns = [dr.select(mask & (1 << k) != 0, column, canvas.none) for k, column in enumerate(columns)]
             canvas.lay(columns, planes, ring, count, active)
@@ -175,20 +169,51 @@ def _laid(
 
 
 @dataclass(frozen=True)
-class _Lines:
-    """Lines of sight of one launch: face, M, pieces along a side, whether cells are laid, number within the face."""
+class FaceLines:
+    """Lines of sight of one launch: face, M, pieces along a side, whether cells are laid, number within the face, row
+    of the item."""
 
     face: mi.UInt32
     m: mi.UInt32
     cut: mi.UInt32
     points: mi.Bool
     number: mi.UInt32
+    row: mi.UInt32
 
-    def image(
-        self, scene: mi.Scene, camera: Camera, faces: FaceLight, on: str
-    ) -> tuple[list[Plane], list[mi.Point2d], mi.UInt32, mi.Bool]:
-        """Density of the light of each column, the polygon on the crop window that it fills with the number of
-        its edges, and where there is any."""
+    @classmethod
+    def numbered(cls, items: Index) -> FaceLines:
+        """All lines of n `items` (4, n): face, M, pieces along a side, whether cells are laid."""
+        row, number = numbered((items[1] * items[2]) ** 2)
+        row = mi.UInt32(row.astype(np.uint32))
+        face, m, cut, at = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in items)
+        # Array entries beyond the last line gather 0, and whole numbers divided by 0 end the process.
+        return cls(face, dr.maximum(m, 1), dr.maximum(cut, 1), at > 0, mi.UInt32(number.astype(np.uint32)), row)
+
+    def columns(self, scene: mi.Scene, camera: Camera, faces: FaceLight, on: str) -> Laid:
+        """The light of J_n = 1 of each column of the face, on the crop window."""
+        image = self._image(scene, camera, faces, camera.film.crop_offset)
+        return image.laid([image.values] if on == "face" else image.of_corners())
+
+    def light(
+        self,
+        scene: mi.Scene,
+        camera: Camera,
+        faces: FaceLight,
+        exitance: Sequence[mi.Float],
+        corner: tuple[float, float],
+    ) -> Laid:
+        """The light of J_n with the values `exitance` at the three corners of each face, and the coverage, on a film
+        whose first pixel has this `corner` (x, y)."""
+        image = self._image(scene, camera, faces, corner)
+        levels = [mi.Float64(dr.gather(mi.Float, own, self.face)) for own in exitance]
+        light = [
+            sum((w[c] * level for w, level in zip(image.of_corners(), levels, strict=True)), mi.Float64(0))
+            for c in range(3)
+        ]
+        return image.laid([light, [image.cover] * 3])
+
+    def _image(self, scene: mi.Scene, camera: Camera, faces: FaceLight, corner: tuple[float, float]) -> _Image:
+        """The image of the lines' pieces through the nodes, or of the nodes' cells through the pieces."""
         m, elements, face = self.m, faces.elements, self.face
         part, i, j = self.number // (m * m), self.number % m, self.number // m % m
         node = pupil_cells.middle(i, j, m)
@@ -201,19 +226,19 @@ class _Lines:
             spot, _ = elements.place(face, within, self.cut, part)
             _, to, _, _ = camera.arrival(spot.p, aim)
             active &= ~hidden(scene, spot.p, to, active)
-        origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in camera.film.crop_offset))
+        origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in corner))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)
         for at in CORNERS:
-            corner, _ = elements.place(face, mi.Point2f(*at), self.cut, part)
-            position, to, _, cos_theta = camera.arrival(corner.p, node)
-            profile = faces.surface.law.profile(middle, dr.normalize(to - corner.p), active)
+            end, _ = elements.place(face, mi.Point2f(*at), self.cut, part)
+            position, to, _, cos_theta = camera.arrival(end.p, node)
+            profile = faces.surface.law.profile(middle, dr.normalize(to - end.p), active)
             cos4 = mi.Float64(etendue_from_pixel(cos_theta, True, camera.film_map.area_share(position)))
             images.append(mi.Point2d(position - origin))
             values.append(eq9(mi.Float64(profile), cos4))
             mean += cos4 / 3
             b = of_part(part, self.cut, mi.warp.square_to_uniform_triangle(mi.Point2f(*at)))
             shares.append([mi.Float64(1 - b.x - b.y), mi.Float64(b.x), mi.Float64(b.y)])
-            depths.append(mi.Float64(camera.blur_disc(corner.p)[2]))
+            depths.append(mi.Float64(camera.blur_disc(end.p)[2]))
             active &= dr.isfinite(position.x) & dr.isfinite(position.y)
         centre, radius, side = camera.blur_disc(middle.p)
         active &= side > 0
@@ -229,9 +254,36 @@ class _Lines:
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
         # The falloff over the film, which is not linear over a large piece, is put back pixel by pixel.
         even = [falloff(camera, mi.Point2f(image) + origin) for image in images]
-        values = [etendue / (light_area * mean * f) * value for f, value in zip(even, values, strict=True)]
-        weights = [values] if on == "face" else _weights(values, shares, depths)
-        return [_plane(images, w, turn, self.points | flat) for w in weights], ring, count, active
+        cover = etendue / (light_area * mean)
+        values = [cover / f * value for f, value in zip(even, values, strict=True)]
+        return _Image(images, values, shares, depths, turn, self.points | flat, cover, ring, count, active)
+
+
+@dataclass(frozen=True)
+class _Image:
+    """Images of pieces of faces: the three corners, the density of the light of J_n = 1 there, over the falloff of the
+    film, the share of each corner of the face there, the depth up to a factor; twice the signed area, and whether the
+    density is constant; the density of the coverage; and the polygon that the light fills, see `Laid`."""
+
+    corners: list[mi.Point2d]
+    values: list[mi.Float64]
+    shares: list[list[mi.Float64]]
+    depths: list[mi.Float64]
+    turn: mi.Float64
+    constant: mi.Bool
+    cover: mi.Float64
+    ring: list[mi.Point2d]
+    count: mi.UInt32
+    active: mi.Bool
+
+    def of_corners(self) -> list[list[mi.Float64]]:
+        """Density at the corners of the light of J_n = 1 at each corner of the face."""
+        return _weights(self.values, self.shares, self.depths)
+
+    def laid(self, densities: list[list[mi.Float64]]) -> Laid:
+        """The image with these densities at its corners."""
+        planes = [_plane(self.corners, values, self.turn, self.constant) for values in densities]
+        return planes, self.ring, self.count, self.active
 
 
 def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:
@@ -239,6 +291,16 @@ def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:
     x = mi.Point2d(camera.film_map.to_plane(position)) * (1 - camera.lens.discs[0].shift)
     squared = dr.square(dr.opaque(mi.Float64, camera.lens.focus_distance))
     return dr.square(squared / (squared + dr.squared_norm(x))) * mi.Float64(camera.film_map.area_share(position))
+
+
+def falloff_on_pixels(camera: Camera, x: Index, y: Index, corner: tuple[float, float]) -> Array:
+    """Mean of `falloff` over pixels (n,), in columns x and rows y from the `corner` (x, y) on the film."""
+    left, top = mi.Float(x + float(corner[0])), mi.Float(y + float(corner[1]))
+    even = np.zeros(len(x))
+    for a in GAUSS if x.size else ():
+        for b in GAUSS:
+            even += falloff(camera, mi.Point2f(left + a, top + b)).numpy() / len(GAUSS) ** 2
+    return even
 
 
 def _weights(

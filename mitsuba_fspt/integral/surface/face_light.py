@@ -27,6 +27,7 @@ CORNERS = ((0, 0), (1, 0), (0, 1))  # of a face, in the square that `Elements.pl
 MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for float32, and of the blur radius, for cells
 RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
 INWARD = 0.05  # of a face: distance from its sides at which rays start that search for the edge of a shadow
+FEWEST_SHADED = 2  # pieces along a side where one surface may hide another: with half of them the light differs
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
 # M of columns of several faces: neighbours mostly take the same.
 LEVELS = (4, 6, 8, 10, 12, 16, 20, 24, 28, 32, 36, 40, 44, 50, 56, 64)
@@ -122,6 +123,14 @@ class Plan:
     def halved(self) -> Plan:
         """Half as many cells and pieces, where there are enough."""
         return Plan(np.maximum(2 * (self.cells // 4), 2), np.maximum((self.cuts + 1) // 2, 1), self.points)
+
+    def doubled(self, pieces: Mask) -> Plan:
+        """Twice as many cells, and pieces of faces that are marked in `pieces` (F,)."""
+        return replace(self, cells=2 * self.cells, cuts=np.where(pieces[:, None], 2 * self.cuts, self.cuts))
+
+    def at_least(self, other: Plan) -> Plan:
+        """This plan, with as many cells as an `other` one."""
+        return replace(self, cells=np.maximum(self.cells, other.cells))
 
     def of(self, faces: Index) -> Plan:
         """The same of some of the faces."""
@@ -256,13 +265,7 @@ class FaceLight:
         """How the faces are divided: the cheaper of nodes with images of pieces and pieces with images of cells."""
         sides = np.minimum(self.sides, LONGEST)
         nodes = self._nodes(rule, sides, on)
-        shaded = np.where(self.mixed, sides / rule.shadow, 0)
-        small = sides < 2 * self.blur + 1
-        shaded = np.where(small, np.minimum(shaded, np.sqrt(self.crossed * sides / rule.displaced)), shaded)
-        pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
-        # Within a pixel perspective misplaces nothing.
-        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant / (8 * rule.perspective)), sides))
-        pieces = np.maximum(np.ceil(pieces), 1)
+        pieces = self._pieces(rule)
         cells = np.where(self.partial, rule.partial, rule.cells)
         largest = np.minimum(rule.point, np.cbrt(rule.speckle / rule.speckle_factor) * np.sqrt(self.blur))
         smaller = np.maximum(np.ceil(sides / np.maximum(largest, 1 / LONGEST)), pieces)
@@ -280,9 +283,42 @@ class FaceLight:
         cuts = np.where(points, smaller[:, None], pieces[:, None]).astype(np.int64)
         return Plan(of_columns, np.minimum(cuts, math.isqrt(BATCH) // of_columns), points)
 
+    def image_plan(self, rule: ColumnRule, brightness: Array, contrast: Array) -> Plan:
+        """How the faces are divided for an image, given the `brightness` (F,) of each and its change along the face,
+        both over the brightness of the image.
+
+        M is that of the error at an edge, which grows with the brightness; so each face is as accurate as if it glowed
+        alone, and neighbours may differ in M.
+        """
+        error = self.blur * brightness / rule.step
+        many = np.minimum(np.sqrt(rule.coarse_factor * error), rule.coarse * self.blur)
+        nodes = np.maximum(np.sqrt(rule.edge_factor * error), many)
+        cells = (2 * np.ceil(nodes / 2)).clip(self._fewest(rule), rule.most).astype(np.int64)
+        cuts = np.minimum(self._pieces(rule, contrast, cells).astype(np.int64), math.isqrt(BATCH) // cells)
+        return Plan(cells[:, None], cuts[:, None], np.zeros((len(cells), 1), bool))
+
+    def _pieces(self, rule: ColumnRule, contrast: Array | float = 1.0, cells: Index | None = None) -> Array:
+        """Pieces along a side that are laid through nodes; `contrast`: largest change of the light along a face.
+
+        cells : M, over which the shadows' errors of pieces are averaged, where these are taken for an image
+        """
+        sides = np.minimum(self.sides, LONGEST)
+        larger = 1.0 if cells is None else np.maximum(cells / rule.mixed, 1)
+        shaded = np.where(self.mixed, np.maximum(sides / (rule.shadow * larger), FEWEST_SHADED), 0)
+        small = sides < 2 * self.blur + 1
+        shaded = np.where(small, np.minimum(shaded, np.sqrt(self.crossed * sides / rule.displaced)), shaded)
+        pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
+        # Within a pixel perspective misplaces nothing.
+        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant * contrast / (8 * rule.perspective)), sides))
+        return np.maximum(np.ceil(pieces), 1)
+
+    def _fewest(self, rule: ColumnRule) -> Index:
+        """Least M of each face."""
+        return np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
+
     def _nodes(self, rule: ColumnRule, sides: Array, on: str) -> Array:
         """M of the nodes that the accuracy of each face requires."""
-        fewest = np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
+        fewest = self._fewest(rule)
         error = self.blur / (rule.step if on == "face" else rule.edge)
         many = np.minimum(np.sqrt(rule.coarse_factor * error), rule.coarse * self.blur)
         nodes = np.maximum(np.sqrt(rule.edge_factor * error), many)

@@ -81,7 +81,7 @@ class Glow:
 
     def batches(self, lines: int, mark: NDArray[np.bool_]) -> Iterator[Batch]:
         """The lines of sight of all elements with light on a marked pixel, some `BATCH` at a time."""
-        index = self._touching(mark)
+        index = np.flatnonzero(touching(self.low, self.high, mark))
         cells = cells_of(lines)
         cuts = np.round(self.sides[index] * math.sqrt(lines) / cells).astype(np.int64)
         cuts = cuts.clip(1, max(math.isqrt(BATCH) // cells, 1))
@@ -94,16 +94,6 @@ class Glow:
         # along a line through it, by its density 1/(π r²).
         misplaced = MISPLACED * self.sides**2 * self.steps / (self.sides + math.pi / 2 * self.blur**2)
         return replace(self, sides=np.where(misplaced > tolerance, np.maximum(self.sides, 1), self.sides))
-
-    def _touching(self, mark: NDArray[np.bool_]) -> Index:
-        """Elements with a marked pixel in their bounds, by the sums over all rectangles that begin at pixel (0, 0)."""
-        total = np.zeros((mark.shape[0] + 1, mark.shape[1] + 1), np.int64)
-        total[1:, 1:] = mark.cumsum(0).cumsum(1)
-        size = np.array(mark.shape[::-1])
-        left, top = np.clip(np.floor(self.low), 0, size).astype(np.int64).T
-        right, bottom = np.clip(np.floor(self.high) + 1, 0, size).astype(np.int64).T
-        marked = total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left]
-        return np.flatnonzero((marked > 0) & (right > left) & (bottom > top))
 
     @classmethod
     def seen(cls, emitter: mi.Emitter, camera: Camera, window: Window, rtol: float, skip_dark: bool) -> Glow:
@@ -158,6 +148,21 @@ class Glow:
             int(dark.sum()),
             bool(small),
         )
+
+
+def touching(low: Plane, high: Plane, mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """True for bounds `low` … `high` (n, 2) [pixels] with a marked pixel in them.
+
+    By the sums over all rectangles that begin at pixel (0, 0).
+    """
+    total = np.zeros((mark.shape[0] + 1, mark.shape[1] + 1), np.int64)
+    total[1:, 1:] = mark.cumsum(0).cumsum(1)
+    size = np.array(mark.shape[::-1])
+    empty = ~(low <= high).all(axis=1, keepdims=True)
+    left, top = np.clip(np.floor(np.where(empty, 0, low)), 0, size).astype(np.int64).T
+    right, bottom = np.clip(np.floor(np.where(empty, -1, high)) + 1, 0, size).astype(np.int64).T
+    marked = total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left]
+    return (marked > 0) & (right > left) & (bottom > top)
 
 
 def _area(a: Plane, b: Plane, c: Plane, d: Plane) -> Plane:

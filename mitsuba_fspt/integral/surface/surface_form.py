@@ -130,7 +130,7 @@ class _Refinement:
         """Lines of sight a pixel of the image at the last level; `partial`: the pupil form follows."""
         bright = HANDED_ON_PEAK * self._tolerance(least_peak) / self.quadrature.rtol
         most = HANDED_ON if partial and most_radiance(self.scene) <= bright else MOST_LINES
-        return max(min(self.quadrature.max_nodes, most), FIRST_LINES * FIRST_GROWTH)
+        return max(min(self.quadrature.most_nodes, most), FIRST_LINES * FIRST_GROWTH)
 
     def _tolerance(self, least_peak: float) -> float:
         """Tolerance [W/mm²/sr]."""

@@ -1,0 +1,257 @@
+"""Eq. 9 by faces: the image of meshes on which J_n is linear, whatever the sizes of face, blur disc and pixel.
+
+As for columns of the transport matrix, every face sends its light through M × M nodes of the pupil. Through one node
+the images of all faces tile the film without a gap, and the light of each, linear over it, is distributed exactly over
+the pixels: each node gives the exact image of a pinhole. Only the pupil is sampled. So light that is narrower than a
+pixel, faces edge-on and many small faces cost no more than others, and lines of sight are needed only where one surface
+may hide another. M and the pieces of faces double from level to level; the error follows from the change, as both
+errors are of second order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from ...camera.camera import Camera
+from ...camera.window import Window
+from ...emission.emitting_surface import EmittingSurface
+from ...emission.of_emitter import surfaces_of
+from ...jit.batches import batch_slices
+from ...jit.mesh_buffers import triangles
+from ...jit.pixel_grid import Grid
+from ...runtime.deadline import Deadline
+from ..lines.eq9 import most_radiance
+from ..lines.occlusion import hides_nothing
+from ..progress import SILENT, Progress
+from ..quadrature import Quadrature
+from ..solution import Solution
+from .column_canvas import ColumnCanvas, Windows
+from .column_form import FaceLines, falloff_on_pixels
+from .face_light import ColumnRule, FaceLight, Plan
+from .glow import touching
+
+# Error over the largest last change of a pixel and of its neighbours, over twice what is left of it. Two images with
+# few nodes may agree by chance: the least error of the second level over the tolerance, for which M is chosen there,
+# and its factor from level to level.
+SAFETY, EXPECTED, FALL = 0.75, 0.3, 0.25
+CARRIED = 0.4  # least error over that of the level before, as two levels may agree by chance
+DISPLACED = 2e-4  # pixels by which float32 displaces the images of faces against lines of sight
+MOST_LEVELS, MOST_CELLS = 6, 512  # levels; largest M at the second level
+# Largest radiance over that of the brightest pixel that M is chosen for; brighter faces, of which the pixel or the lens
+# sees a part, may need more.
+BRIGHTEST = 4.0
+# Lines of sight in whose time one image of a piece is laid, and one face of the scene is prepared; time of the first
+# levels over that of the third.
+LINES, PREPARED, FIRST_LEVELS = 3, 60, 4 / 3
+
+Plane = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def applies(scene: mi.Scene, quadrature: Quadrature) -> bool:
+    """True if all emitters are meshes whose J_n is linear on every face, and pixels count by their area."""
+    surfaces = surfaces_of(scene)
+    return (
+        quadrature.pixel == "area"
+        and len(surfaces) == len(scene.emitters())
+        and all(s.shape.is_mesh() and s.law.linear and s.exitance_at_corners() is not None for s in surfaces)
+    )
+
+
+class FaceImage:
+    """The pixels of a `window` by faces, for scenes to which this `applies`."""
+
+    def __init__(
+        self, scene: mi.Scene, camera: Camera, window: Window, quadrature: Quadrature, least_peak: float = 0.0
+    ) -> None:
+        self.scene, self.camera, self.window, self.quadrature = scene, camera, window, quadrature
+        self.surfaces = surfaces_of(scene)
+        self.most = max(s.brightest for s in self.surfaces) or 1.0  # J_n in units of which light is laid [W/mm²]
+        self.value, self.error, self.coverage = (np.zeros(window.shape) for _ in range(3))
+        self.least_peak = least_peak
+        self.rays = 0
+        self.levels: list[str] = []
+
+    @cached_property
+    def alone(self) -> bool:
+        """True if nothing hides a part of a surface."""
+        return hides_nothing(self.scene)
+
+    @cached_property
+    def faces(self) -> list[FaceLight]:
+        """Faces of each mesh as the camera sees them."""
+        window = self.window
+        seen = [FaceLight.seen(s, self.camera, window.corner, window.shape) for s in self.surfaces]
+        return seen if self.alone else [faces.behind(self.scene, self.camera) for faces in seen]
+
+    @cached_property
+    def exitance(self) -> list[tuple[mi.Float, ...]]:
+        """J_n at the corners of the faces of each mesh, over the largest."""
+        return [_over(self.most, surface) for surface in self.surfaces]
+
+    @cached_property
+    def radiance(self) -> list[tuple[Plane, Plane]]:
+        """Largest radiance of each face, and its change along the face [W/mm²/sr]."""
+        found = []
+        for surface, corners in zip(self.surfaces, self.exitance, strict=True):
+            unit = self.most / (math.pi if surface.is_isotropic() else 1)
+            values = unit * np.array([corner.numpy() for corner in corners], np.float64)
+            found.append((values.max(axis=0), np.ptp(values, axis=0)))
+        return found
+
+    @cached_property
+    def falloff(self) -> Plane:
+        """Falloff of the film's light, mean over each pixel."""
+        y, x = np.divmod(np.arange(math.prod(self.window.shape)), self.window.shape[1])
+        return falloff_on_pixels(self.camera, x, y, self.window.corner).reshape(self.window.shape)
+
+    def run(self, where: NDArray[np.bool_], least_peak: float, progress: Progress = SILENT) -> Solution:
+        """Power [W], error [W] and coverage of the crop window, complete on the pixels marked in `where` (h, w).
+
+        least_peak : lower bound of the brightest pixel's mean radiance on film [W/mm²/sr]
+
+        From the third level on, a level is entered only if its images take less time than the lines of sight that its
+        pixels may take otherwise.
+        """
+        shown, mark = self.window.shown(), where
+        self.rays, self.levels = 0, []
+        self.error = np.zeros(self.window.shape)
+        rule, grid = ColumnRule.of(self.quadrature.rtol), Grid(self.window.shape)
+        recent = None
+        plans = [plan.halved().halved() for plan in self._plans(rule, least_peak)]
+        if mark.any() and (first := self._level(plans, _wider(mark), None)):
+            self.value, self.coverage = first
+        for level in range(1, MOST_LEVELS):
+            if not mark.any() or progress.deadline.passed():
+                break
+            around = _wider(mark)
+            plans = self._finer(plans, rule, level, least_peak)
+            if level > 1 and LINES * self._cost(plans, around) > self._worth(mark):
+                break
+            if (found := self._level(plans, around, progress.deadline)) is None:
+                break
+            value, coverage = found
+            change = np.where(around, np.abs(value - self.value), 0)
+            recent, last = SAFETY * grid.array(grid.spread_max(grid.flat(change))), recent
+            estimate = recent if last is None else np.maximum(recent, CARRIED * last)
+            least = EXPECTED * FALL ** (level - 2) * self.quadrature.rtol * self._peak(least_peak)
+            estimate = np.maximum(estimate, least)
+            self.error[mark] = estimate[mark]
+            self.value[around], self.coverage[around] = value[around], coverage[around]
+            mark = shown & where & (self.error > self.quadrature.rtol * self._peak(least_peak))
+            progress(level / MOST_LEVELS)
+        if recent is None:
+            self.error = grid.array(grid.spread_max(grid.flat(self.value)))
+        error = np.maximum(self.error, self.quadrature.least_error * self.window.brightest(self.value))
+        error += DISPLACED * _steepest(self.value)
+        error[self.coverage == 0] = self.error[self.coverage == 0]
+        power, error = (self.window.expand(image) * self.camera.etendue for image in (self.value, error))
+        coverage = self.window.expand(np.clip(self.coverage, 0, 1))
+        complete = self.window.expand(where.astype(np.float64)) > 0
+        progress(1.0)
+        return Solution(power, error, coverage, self.rays, tuple(self.levels), complete)
+
+    def _finer(self, plans: list[Plan], rule: ColumnRule, level: int, least_peak: float) -> list[Plan]:
+        """The plans of the next level: at the second level with all cells that the accuracy requires, as the brightest
+        pixel is known from the first one; half of them before, twice as many after that."""
+        doubled = [plan.doubled(faces.mixed) for plan, faces in zip(plans, self.faces, strict=True)]
+        if level > 2:
+            return doubled
+        wanted = self._plans(rule, least_peak)
+        if level == 1:
+            wanted = [plan.halved() for plan in wanted]
+        return [plan.at_least(least) for plan, least in zip(wanted, doubled, strict=True)]
+
+    def _worth(self, mark: NDArray[np.bool_]) -> float:
+        """Lines of sight that other rules may take on the marked pixels."""
+        return self.quadrature.most_nodes / 2 * np.count_nonzero(mark)
+
+    def cost(self, mark: NDArray[np.bool_], least_peak: float, most: float = math.inf) -> float:
+        """Lines of sight in whose time the first three levels are computed on the marked pixels.
+
+        least_peak : as of `run`
+        most : a larger number may be too small
+        """
+        prepared = PREPARED * sum(dr.width(triangles(surface.shape)[1]) for surface in self.surfaces) / 3
+        if prepared > most:
+            return prepared
+        images = self._cost(self._plans(ColumnRule.of(self.quadrature.rtol), least_peak), mark)
+        return FIRST_LEVELS * LINES * images + prepared
+
+    def _peak(self, least_peak: float) -> float:
+        """Lower bound of the brightest pixel [W/mm²/sr]."""
+        return max(self.window.brightest(self.value), least_peak, self.least_peak)
+
+    def _plans(self, rule: ColumnRule, least_peak: float) -> list[Plan]:
+        peak = self._peak(least_peak) or most_radiance(self.scene)
+        rule = replace(rule, most=MOST_CELLS)
+        plans = []
+        for faces, (most, change) in zip(self.faces, self.radiance, strict=True):
+            # The blur evens out what perspective misplaces within a face.
+            change = change * np.minimum(faces.sides / (1 + faces.blur), 1)
+            plans.append(faces.image_plan(rule, *(np.minimum(one / peak, BRIGHTEST) for one in (most, change))))
+        return plans
+
+    def _touching(self, mark: NDArray[np.bool_]) -> list[Index]:
+        """Faces of each mesh whose light may reach a marked pixel."""
+        return [np.flatnonzero(faces.bright & touching(faces.low, faces.high, mark)) for faces in self.faces]
+
+    def _cost(self, plans: list[Plan], mark: NDArray[np.bool_]) -> int:
+        """Number of images of pieces, or of cells, that a level lays."""
+        some = (plan.of(index) for plan, index in zip(plans, self._touching(mark), strict=True))
+        return sum(int(((plan.cells * plan.cuts) ** 2).sum()) for plan in some)
+
+    def _level(
+        self, plans: list[Plan], mark: NDArray[np.bool_], deadline: Deadline | None
+    ) -> tuple[Plane, Plane] | None:
+        """Value and coverage on marked pixels, incomplete on others; None where the deadline passes before the end."""
+        height, width = self.window.shape
+        whole = np.zeros(2, np.int64)
+        windows = Windows(whole, whole, whole + width, whole + height)
+        canvas = ColumnCanvas(self.window.shape, windows)
+        columns = [dr.opaque(mi.UInt32, k) for k in range(2)]
+        laid = 0
+        for faces, plan, corners, index in zip(self.faces, plans, self.exitance, self._touching(mark), strict=True):
+            own = plan.of(index)
+            items = np.stack([index, own.cells[:, 0], own.cuts[:, 0], own.points[:, 0]])
+            counts = (items[1] * items[2]) ** 2
+            laid += int(counts.sum())
+            for run in batch_slices(counts):
+                if deadline and deadline.passed():
+                    return None
+                lines = FaceLines.numbered(items[:, run])
+                planes, ring, count, active = lines.light(self.scene, self.camera, faces, corners, self.window.corner)
+                canvas.lay(columns, planes, ring, count, active)
+                canvas.evaluate()
+        self.rays += laid
+        self.levels.append(f"images of faces: {np.count_nonzero(mark)} pixels, {laid} images")
+        light = canvas.light().reshape(2, height, width + 1)[..., :width]
+        return light[0] * self.falloff * self.most, light[1]
+
+
+def _steepest(image: Plane) -> Plane:
+    """Largest difference (h, w) of each pixel and its neighbours to one of them."""
+    return np.asarray(maximum_filter(image, 3) - minimum_filter(image, 3))
+
+
+def _wider(mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The marked pixels and their neighbours, whose changes count for the error."""
+    return np.asarray(maximum_filter(mark, 3))
+
+
+def _over(unit: float, surface: EmittingSurface) -> tuple[mi.Float, ...]:
+    """J_n at the corners of every face, in this unit."""
+    corners = surface.exitance_at_corners()
+    if corners is None:
+        raise TypeError(f"J_n of {surface.shape.id()} is not linear on its faces")
+    scaled = tuple(corner * dr.opaque(mi.Float, 1 / unit) for corner in corners)
+    dr.eval(scaled)
+    return scaled
