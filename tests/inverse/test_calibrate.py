@@ -22,9 +22,9 @@ def scene(tmp_path_factory, mono):
     return write_scene(tmp_path_factory.mktemp("calibrate") / "ball.xml")
 
 
-def noisy(scene, seed, share=0.01, **parameters):
+def noisy(scene, seed, share=0.01, rtol=1e-5, **parameters):
     """Image of the scene with independent normal noise of 1 % of its brightest pixel."""
-    power = fspt.render(fspt.load(scene, **parameters), rtol=1e-5).power.astype(float)
+    power = fspt.render(fspt.load(scene, **parameters), rtol=rtol).power.astype(float)
     sigma = np.full(power.shape, share * power.max())
     return fspt.Image(power + sigma * np.random.default_rng(seed).standard_normal(power.shape), sigma)
 
@@ -87,6 +87,21 @@ def test_a_gain_of_images_with_stray_light(scene):
     found = fspt.calibrate(scene, fspt.Image(power, image.error, metadata=known), free=["gain"])
     assert found.values["gain"] == pytest.approx(1, abs=4 * found.sd["gain"])
     assert found.chi2 == pytest.approx(0.95**2, abs=0.4)
+
+
+def test_a_number_of_the_distortion_comes_back(tmp_path, mono):
+    """k1 as a `<default>` inside the string, of an 8 mm lens with a wide film before four spheres, within 4 sd."""
+    text = '<string name="distortion" value="$k1, 0.01, 0, 0"/><transform name="to_world">'
+    sensor = LENS_XML.replace('<transform name="to_world">', text).replace('value="55"', 'value="8"')
+    sensor = '<default name="k1" value="-0.1"/>' + sensor.replace('value="0.8"', 'value="1.6"')
+    ball = """<shape type="sphere"><point name="center" x="0" y="{}" z="{}"/><float name="radius" value="2"/>
+        <emitter type="fspt_surface"><float name="exitance" value="1e-3"/></emitter></shape>"""
+    shapes = "".join(ball.format(y, z) for y in (-8, 8) for z in (-5, 5))
+    wide = write_scene(tmp_path / "wide.xml", sensor=sensor, shapes=shapes)
+    wide.write_text(wide.read_text().replace('value="165"', 'value="26"'))
+    found = fspt.calibrate(wide, noisy(wide, 1, rtol=5e-4, k1=-0.08), free=["k1"])
+    assert abs(found.values["k1"] + 0.08) < 4 * found.sd["k1"]
+    assert 0 < found.sd["k1"] < 0.02
 
 
 def test_degenerate_sets_are_reported(scene):

@@ -147,7 +147,7 @@ print(json.dumps(answers))
 
 
 def test_metal_variants_are_refused_in_one_line(monkeypatch, mono):
-    """By `load`, and by the plugins under plain Mitsuba. Seen to fail, registered as in LLVM variants, before."""
+    """By `load`, and by the plugins under plain Mitsuba."""
     from types import SimpleNamespace
 
     import mitsuba_fspt as fspt

@@ -221,11 +221,11 @@ def test_transects_at_least_double_from_level_to_level():
 
 @pytest.mark.parametrize("area", [False, True])
 def test_levels_take_no_more_lines_of_sight_than_a_pixel_may(area):
-    """Expected: as many levels as fit, and all of them in what an integrator allows by default."""
+    """Expected: as many levels as fit, and all of them in what an integrator allows at that rtol."""
     first = node_rules.along_transect(0, 1e-3)
     assert node_rules.transect_levels(1e-3, area, 2 * first.rays - 1) == []
     assert node_rules.transect_levels(1e-3, area, 2 * first.rays) == [(2, first)]
-    counts = tuple(count for count, _ in node_rules.transect_levels(1e-6, area, Quadrature().max_nodes))
+    counts = tuple(count for count, _ in node_rules.transect_levels(1e-6, area, Quadrature(rtol=1e-6).most_nodes))
     assert counts == node_rules.TRANSECT_LEVELS
 
 

@@ -31,8 +31,8 @@ def by_faces(scene: mi.Scene):
 def test_power_is_within_its_error(seed):
     """Random meshes, convex or not, with J_n on vertices or faces, against the float64 reference on eight pixels.
 
-    Expected: the stated error, which is at most `RTOL`. Seen to fail with images of faces through all nodes alike,
-    without the cosine of the faces, and with J_n of the first corner on the whole face.
+    Expected: the stated error, which is at most `RTOL`. Seen to fail without the falloff over the
+    film, and with J_n of the first corner on the whole face.
     """
     made = random_scene("meshes", seed)
     image = by_faces(made.scene())
