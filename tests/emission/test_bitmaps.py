@@ -84,7 +84,7 @@ def test_texels_of_half_a_pixel_reach_rtol():
     rectangle = {"type": "rectangle", "to_world": place.scale([half, half, 1]), "emitter": emitter}
     optics = {"f_number": 64.0, "magnification": None, "focus_distance": 180.0, "to_world": None}
     scene = world_scene(rectangle, sensor=lens(size=(width, height), pitch=0.572, **optics))
-    image, camera = fspt.render(scene), scene.sensors()[0].camera
+    image, camera = fspt.render(scene, max_nodes=1 << 22), scene.sensors()[0].camera
 
     within = (np.arange(400) + 0.5) / 400 - 0.5
     y, x = (camera.virtual_pitch * ((n - 1) / 2 - np.arange(n)[:, None] - within).ravel() for n in (height, width))

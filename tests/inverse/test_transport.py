@@ -188,7 +188,7 @@ def test_noise_on_faces_smaller_than_a_pixel(tmp_path, on):
     matrix = fspt.transport(scene, on=on, rtol=RTOL)
     exitance = 1.0 * (np.random.default_rng(4).random(matrix.shape[1]) < 0.2)
     shine(scene, on, exitance)
-    image = fspt.render(scene, method="integral", rtol=RTOL / 4)
+    image = fspt.render(scene, method="integral", rtol=RTOL / 4, max_nodes=1 << 22)
     off = np.abs(matrix.forward(exitance)[0] - image.power)
     assert image.error.max() <= RTOL / 2 * image.power.max()
     assert (off - image.error).max() <= RTOL * image.power.max()
