@@ -30,7 +30,8 @@ class Quadrature:
     pixel : 'area' integrates over the pixel, 'centre' takes its centre times its area as the paper does
     max_nodes : largest number of lines of sight of a pixel, four in any case (domain 'surface': on average, 256 …
         65,536 in any case); bounds the time; where it is reached, `error` may exceed rtol. None, the default: 65,536,
-        below rtol 1e-3 more, with the power 4/3 of 1/rtol to 2²² at the most
+        below rtol 1e-3 more, with the power 4/3 of 1/rtol to 2²² at the most; lattices on few pixels also take more,
+        as long as all of them take at most 2²⁴ together
     max_specular : largest number of specular surfaces on a line of sight, 0 … 64 (default 8); light beyond is in the
         error
     shortcuts_off : names of `SHORTCUTS` that are not taken; shortcuts change the image by less than rtol

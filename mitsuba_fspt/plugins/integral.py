@@ -54,8 +54,8 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
      * - max_nodes
        - |int|
        - Largest number of lines of sight per pixel, at least four (Default: 65536, below rtol 1e-3 more, up to 4194304
-         at 5e-5). Where it is reached, the error is larger than requested and stated. In domain surface it is the mean
-         per pixel, at least 256 and at most 65536.
+         at 5e-5; few pixels take more, together at most 17 million). Where it is reached, the error is larger than
+         requested and stated. In domain surface it is the mean per pixel, at least 256 and at most 65536.
      * - max_specular
        - |int|
        - Largest number of specular surfaces (null, thin and solid glass, mirrors, masks) that a line of sight passes

@@ -16,6 +16,7 @@ import mitsuba as mi
 from ...jit.batches import batches
 from ...jit.loops import repeat
 from ..lines.eq9 import most_radiance
+from ..quadrature import Quadrature
 from .draft import Draft
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
+# Lines of sight that all pixels together may take in any case unless `max_nodes` is given: few pixels cost little.
+TOGETHER = 1 << 24
 
 
 def refine_by_lattices(draft: Draft) -> None:
@@ -35,17 +38,18 @@ def refine_by_lattices(draft: Draft) -> None:
     The error of a pixel is at least `missed_share` over the number of points times the brightest value around; on
     pixels that another solution gives, times the brightest surface.
     """
-    most = min(1 << (draft.quadrature.most_nodes // SHIFTS).bit_length() >> 1, MOST)  # a power of two
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
-    if most < FIRST or not dr.any(above):
+    if _most_points(draft.quadrature, 1) < FIRST or not dr.any(above):
         return
     deadline, tolerance = draft.progress.deadline, draft.tolerance
     brightest = dr.select(
         draft.computed, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
     )
     means, points = Means.none(draft.grid.pixels(above)), 0
-    while points < most and not deadline.passed():
-        more = min(GROWTH * points or FIRST, most)
+    while not deadline.passed():
+        more = min(GROWTH * points or FIRST, _most_points(draft.quadrature, dr.width(means.pixels)))
+        if more <= points:
+            break
         means, points = means.refined(draft, points, more), more
         if not dr.width(means.pixels):  # the deadline left no time for the first of them
             break
@@ -64,6 +68,14 @@ def refine_by_lattices(draft: Draft) -> None:
         if not dr.any(left):
             break
         means = means.of(left)
+
+
+def _most_points(quadrature: Quadrature, pixels: int) -> int:
+    """Points of the largest lattice on so many pixels, a power of two."""
+    lines = quadrature.most_nodes
+    if quadrature.max_nodes is None:
+        lines = max(lines, TOGETHER // pixels)
+    return min(1 << (lines // SHIFTS).bit_length() >> 1, MOST)
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 # Lines of sight of a pixel that twelve nodes leave above the tolerance, as of a straight silhouette; the same where the
 # faces are projected in any case, for narrow light.
 FIRST_LINES, BESIDE_NARROW = 70, 600
+# Rounding of sums of faces' light along a row of pixels, over the brightest pixel. A value of lines of sight from which
+# they differ by less is kept: beside a far brighter surface it is more exact.
+ROUNDING = 1e-12
 
 FEW = 1 << 18  # pixels of the coarse lattice for a lower bound of the brightest pixel
 MARGIN = 0.9  # share of their brightest value that counts, for the error of twelve nodes
@@ -163,6 +166,8 @@ class _Faces:
         brightest = dr.maximum(dr.max(dr.select(wanted, power, 0)), dr.opaque(mi.Float64, peak))
         taken = wanted & ((error < draft.error) | forced)
         done = taken & ((error <= dr.opaque(mi.Float64, draft.quadrature.rtol) * brightest) | forced)
+        same = dr.abs(power - draft.value) <= dr.opaque(mi.Float64, ROUNDING) * brightest
+        power = dr.select(same, draft.value, power)
         draft.value, draft.error = dr.select(taken, power, draft.value), dr.select(taken, error, draft.error)
         draft.set_coverage(dr.select(taken, grid.flat(window.cut(found.coverage)), draft.coverage))
         draft.given, draft.given_error = (

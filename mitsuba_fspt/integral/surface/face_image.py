@@ -191,7 +191,7 @@ class FaceImage:
         return max(self.window.brightest(self.value), least_peak, self.least_peak)
 
     def _plans(self, rule: ColumnRule, least_peak: float) -> list[Plan]:
-        peak = self._peak(least_peak) or most_radiance(self.scene)
+        peak = self._peak(least_peak) or most_radiance(self.scene) or 1.0
         rule = replace(rule, most=MOST_CELLS)
         plans = []
         for faces, (most, change) in zip(self.faces, self.radiance, strict=True):
