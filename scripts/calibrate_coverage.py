@@ -16,13 +16,13 @@ of chi2, and of sd.
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
+from csv_table import write_rows
 from numpy.typing import NDArray
 
 import mitsuba_fspt as fspt
@@ -150,10 +150,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "calibrate_coverage.csv")
     arguments = parser.parse_args()
     rows = table(arguments.seeds, arguments.direct)
-    with arguments.output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(arguments.output, rows)
 
 
 if __name__ == "__main__":

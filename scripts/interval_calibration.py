@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from csv_table import write_rows
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
@@ -172,10 +173,7 @@ def main() -> None:
             kept = [dict(row) for row in csv.DictReader(file) if row["truth"] not in truths]
     rows = kept + table(truths, arguments.replicates, arguments.fixed, arguments.samples, arguments.workers)
     rows.sort(key=lambda row: TRUTHS.index(str(row["truth"])))
-    with arguments.output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(arguments.output, rows)
 
 
 if __name__ == "__main__":

@@ -19,13 +19,13 @@ true ones. *law*: images with Fresnel's exit law, a matrix with Lambert's. The l
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+from csv_table import write_rows
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -196,10 +196,7 @@ def main() -> None:
     for case in (case for case in CASES if case.table in arguments.tables.split(",")):
         table.append(numbers_of(case, scene, arguments.spp, arguments.samples, arguments.seeds, arguments.report))
         print(table[-1], flush=True)
-    with arguments.output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, table[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(table)
+    write_rows(arguments.output, table)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from typing import Any
 import location_coverage as phantom
 import numpy as np
 import trimesh
+from csv_table import write_rows
 from numpy.typing import NDArray
 
 import mitsuba_fspt as fspt
@@ -145,10 +146,7 @@ def main() -> None:
     made = {"invert": lambda: invert_rows(arguments.phantom), "locate": locate_rows}
     for row in (row for verb in verbs for row in made[verb]()):
         rows[str(row["case"])] = row
-        with arguments.output.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, row, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows.values())
+        write_rows(arguments.output, rows.values())
 
 
 if __name__ == "__main__":

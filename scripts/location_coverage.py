@@ -14,7 +14,6 @@ of `locate` [s], other processes at work.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -24,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import tests_folder  # noqa: F401
+from csv_table import write_rows
 from cylinder_diffusion import Phantom, exitance
 from numpy.typing import NDArray
 
@@ -147,10 +147,7 @@ def main() -> None:
             jobs = [(case, arguments.edge, seed) for seed in range(arguments.seeds)]
             rows.append(row(case, list(pool.map(replicate, *zip(*jobs, strict=True)))))
             print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
-    with arguments.output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(arguments.output, rows)
 
 
 if __name__ == "__main__":

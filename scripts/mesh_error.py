@@ -15,7 +15,6 @@ without the error of the mesh (Eq. M.42).
 from __future__ import annotations
 
 import argparse
-import csv
 import logging
 import tempfile
 from collections.abc import Iterator
@@ -25,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from csv_table import write_rows
 from interval_calibration import SCENE
 from numpy.typing import NDArray
 
@@ -140,10 +140,7 @@ def main() -> None:
         for truth in ("same triangles", "sphere")
         for row in cases(level, truth, arguments.seeds, arguments.electrons)
     ]
-    with arguments.output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(arguments.output, rows)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from typing import Any
 import location_coverage
 import numpy as np
 import tests_folder  # noqa: F401
+from csv_table import write_rows
 from cylinder_views import TOML, cylinder_views, exact
 from interval_calibration import READ_NOISE, SCENE, case, fixed
 from numpy.typing import NDArray
@@ -189,10 +190,7 @@ def main() -> None:
             rows.append(row(*one))
             print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
     rows.sort(key=lambda one: str(one["verb"]))
-    with arguments.output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(arguments.output, rows)
 
 
 if __name__ == "__main__":

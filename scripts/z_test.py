@@ -10,10 +10,10 @@ p, share of pairs below 0.05, mean of chi2.
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 
 import numpy as np
+from csv_table import write_rows
 
 import mitsuba_fspt as fspt
 
@@ -49,10 +49,7 @@ def main() -> None:
     for samples in SAMPLES:
         rows.append(row(samples, arguments.pairs))
         print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
-    with arguments.output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(arguments.output, rows)
 
 
 if __name__ == "__main__":
