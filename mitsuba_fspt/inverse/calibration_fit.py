@@ -3,7 +3,8 @@
     σ_i² = P_i/k + σ_other² + e_i² (Eq. M.24, P the fitted image),   C = (Jᵀ J)⁻¹ + g² b bᵀ,   J = ∂(P/σ)/∂p
 
 with b = (Jᵀ J)⁻¹ Jᵀ P/σ, the change of the parameters by a common factor of the powers, and g its uncertainty: Eq. M.26
-of docs/model.md.
+of docs/model.md. J comes from differences to both sides where the fit starts and where it ends, and from the images of
+the search between (Broyden, Math. Comp. 19, 577 (1965)), each of which a slope would cost two of for each parameter.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class CalibrationSettings:
     reweighted : relative change of the standard deviations, root mean square, at which they count as converged
     nearby : steps of the differences within which slopes are taken again; they then belong to an image that differs by
         less than half of `change`
-    rounds : most rounds of standard deviations;  evaluations : most images of a round beside those of slopes
+    rounds : most rounds of standard deviations and slopes;  evaluations : most images of a round beside those of slopes
     reach : of the first step of the fit, in steps of the differences: 20 of them change an image by a tenth
     condition : of the Jacobian with columns of length 1, above which parameters count as not determined separately: the
         combination that is least determined then has a standard deviation so many times that of each parameter alone
@@ -118,6 +119,25 @@ class _AtMinimum(Exception):
         super().__init__()
 
 
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """Slopes [W] of the images by y, (views, h, w, p), at `y` (p,), where the images are `power`.
+
+    measured : they are differences to both sides at `y`, not the secants of a search
+    """
+
+    y: Array
+    power: Array
+    slopes: Array
+    measured: bool
+
+    def at(self, y: Array, power: Array) -> Slopes:
+        """The slopes that give the images at both places and differ from these least (Broyden's update)."""
+        step = y - self.y
+        missing = (power - self.power - self.slopes @ step) / (step @ step)
+        return Slopes(y.copy(), power, self.slopes + missing[..., None] * step, False)
+
+
 class CalibrationFit:
     """Fit of parameters `names` to what was `measured`.
 
@@ -137,7 +157,9 @@ class CalibrationFit:
         self.names, self.start, self.measured, self.settings = names, start, measured, settings
         self._images = images
         self._steps = np.ones(len(start))
-        self._kept: tuple[Array, Array] | None = None  # y of the last slopes, and these
+        self._kept = Slopes(
+            np.full(len(start), np.inf), np.empty(0), np.empty(0), False
+        )  # of no place
 
     def solved(self) -> Fitted:
         """Minimum of Σ (residual/σ)², with σ of its own image."""
@@ -150,8 +172,10 @@ class CalibrationFit:
             y = self._minimum(y, sigma)
             image, numerical = self._images(self._values(y))
             before, sigma = sigma, self.measured.sigma(image, numerical)
-            if np.sqrt(np.mean((sigma / before - 1) ** 2)) < self.settings.reweighted:
+            known = self._are_measured(y)
+            if known and np.sqrt(np.mean((sigma / before - 1) ** 2)) < self.settings.reweighted:
                 break
+            self._slopes(y, sigma)
         slopes, condition = self._require_determined(y, sigma)
         used = self.measured.used
         residual = ((image - self.measured.power) / sigma)[used]
@@ -196,9 +220,13 @@ class CalibrationFit:
         """Slopes at y; raises _AtMinimum where no step lowers Σ (residual/σ)² by more than the fit's end.
 
         Of a smaller change the errors of the images would be the larger part, and the search only tries ever shorter
-        steps.
+        steps. With secants for slopes the search ends after its first short step, for measured slopes to go on with.
         """
-        slopes, residual = self._slopes(y, sigma), self._residual(y, sigma)
+        if self._is_near(y) and not self._kept.measured:
+            raise _AtMinimum(y)
+        if not self._is_near(y):
+            self._kept = self._kept.at(y, self._power(y))
+        slopes, residual = self._whitened(sigma), self._residual(y, sigma)
         step = np.linalg.lstsq(slopes, residual)[0]
         if np.sum((slopes @ step) ** 2) <= self.settings.chi2:
             raise _AtMinimum(y)
@@ -207,11 +235,24 @@ class CalibrationFit:
     def _power(self, y: Array) -> Array:
         return self._images(self._values(y))[0]
 
+    def _are_measured(self, y: Array) -> bool:
+        """True where the slopes that are kept are differences to both sides at y or nearby."""
+        return self._kept.measured and self._is_near(y)
+
+    def _is_near(self, y: Array) -> bool:
+        """True where y is so near the place of the slopes that are kept that these are taken again."""
+        return bool(np.abs(self._kept.y - y).max() <= self.settings.nearby)
+
     def _slopes(self, y: Array, sigma: Array) -> Array:
         """(pixels that count, p) of residuals: differences a step to both sides; those of a point nearby if there."""
-        if self._kept is None or np.abs(self._kept[0] - y).max() > self.settings.nearby:
-            self._kept = y.copy(), np.stack([self._slope(y, one) for one in np.eye(len(y))], axis=-1)
-        return (self._kept[1] / sigma[..., None])[self.measured.used]
+        if not self._are_measured(y):
+            slopes = np.stack([self._slope(y, one) for one in np.eye(len(y))], axis=-1)
+            self._kept = Slopes(y.copy(), self._power(y), slopes, True)
+        return self._whitened(sigma)
+
+    def _whitened(self, sigma: Array) -> Array:
+        """(pixels that count, p) slopes of residuals: those that are kept, in standard deviations."""
+        return (self._kept.slopes / sigma[..., None])[self.measured.used]
 
     def _slope(self, y: Array, way: Array, length: float = 1.0) -> Array:
         """Change of the images [W] along a way."""
