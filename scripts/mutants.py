@@ -343,14 +343,14 @@ MUTANTS = (
     # Windows and mirrors
     Mutant(
         "weight of a specular course",
-        "integral/lines/specular.py",
+        "integral/lines/courses.py",
         "found.radiance + course.weight * radiance",
         "found.radiance + radiance",
         ("tests/integral/lines/test_specular.py",),
     ),
     Mutant(
         "apparent depth behind glass",
-        "integral/lines/specular.py",
+        "integral/lines/courses.py",
         "dr.select(met, pi.t, 0) * cosine / course.index",
         "dr.select(met, pi.t, 0) * cosine",
         ("tests/integral/lines/test_specular.py",),

@@ -39,6 +39,16 @@ class Solution:
         """The image behind a vignetting that leaves each pixel a share (h, w) of its power (Eq. M.45)."""
         return replace(self, power=self.power * shares, error=self.error * shares)
 
+    def plus(self, rest: Solution) -> Solution:
+        """The image with the light of a `rest` added; coverage and findings are those of this one."""
+        return replace(
+            self,
+            power=self.power + rest.power,
+            error=self.error + rest.error,
+            rays=self.rays + rest.rays,
+            levels=self.levels + tuple(f"other courses, {level}" for level in rest.levels),
+        )
+
     def completed_by(self, rest: Solution) -> Solution:
         """This partial solution on its own pixels, unless `rest` states a smaller error there; `rest` elsewhere."""
         better = self.where & (self.error <= rest.error)

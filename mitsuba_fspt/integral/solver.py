@@ -39,6 +39,9 @@ from .tiles import Mosaic
 LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
 NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
 UNCERTAINTY = 2.0  # largest ratio of that light and its estimate
+PLAIN = 0.8  # of rtol: tolerance of the light by plain courses (`Specular.part`); the rest is that of all others
+OTHERS = 4  # largest number of lines of sight of a pixel over that for all other courses
+FAINTER = 0.1  # least weight of these over that of plain ones
 
 
 class Solver:
@@ -204,6 +207,8 @@ class Solver:
             known = surface_form.solve(scene, camera, window, quadrature, where, peak, part, specular)
             known = _with_dark_coverage(known, view, window)
             solution = known.completed_by(form(light, known, least_peak, progress.part(1, 2)))
+        elif specular and specular.bending and specular.branching:
+            solution = _by_courses(view, window, quadrature, light, least_peak, progress)
         else:
             solution = form(light, None, least_peak, progress)
         findings = (Finding("smooth blocks", False, why), *solution.findings)
@@ -247,6 +252,33 @@ def _refuse_bending(specular: Specular | None, quadrature: Quadrature) -> None:
             f"fspt_integral: 'domain' = surface follows light straight to the camera, but {', '.join(specular.names)} "
             "reflects or refracts it. Set it to pupil."
         )
+
+
+def _by_courses(
+    view: View,
+    window: Window,
+    quadrature: Quadrature,
+    light: NDArray[np.float64],
+    least_peak: float,
+    progress: Progress,
+) -> Solution:
+    """Solution by the pupil form, for the light by plain courses of lines of sight and by all others one by one.
+
+    Of every window the reflected light is much fainter than the transmitted one, so that few lines of sight suffice for
+    it. A line of sight takes one leg a surface along a plain course; the number of all courses grows as a product.
+    """
+    if view.specular is None:
+        raise TypeError("no specular surfaces")
+    plain, others = (replace(view.specular, part=part) for part in ("plain", "others"))
+    views = [replace(view, specular=own) for own in (plain, replace(others, least=FAINTER * others.least))]
+    shares = [replace(quadrature, rtol=max(share * quadrature.rtol, FLOAT32_FLOOR)) for share in (PLAIN, 1 - PLAIN)]
+    few = max(quadrature.most_nodes // OTHERS, 1)
+    if quadrature.max_nodes is not None:
+        shares[0] = replace(shares[0], max_nodes=max(quadrature.max_nodes - few, 1))
+    shares[1] = replace(shares[1], max_nodes=few)
+    image = pupil_form.solve(views[0], window, shares[0], light, None, least_peak, progress.part(0, 2))
+    peak = max(float((image.power - image.error).max(initial=0.0)) / view.camera.etendue, least_peak)
+    return image.plus(pupil_form.solve(views[1], window, shares[1], light, None, peak, progress.part(1, 2)))
 
 
 def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solution:

@@ -271,7 +271,8 @@ def _surfaces(
     import drjit as dr
     import mitsuba as mi
 
-    from ..integral.lines.specular import Specular, strongest_course
+    from ..integral.lines.courses import strongest_course
+    from ..integral.lines.specular import Specular
 
     specular = Specular.of(scene, camera, even_if_none=True)
     found = []

@@ -27,7 +27,8 @@ from ...jit.mesh_buffers import box_of, face_count
 from ...jit.spectra import at_one_wavelength, scalar
 from ...runtime.plugin_types import is_surface
 from ..shortcuts import Finding
-from .specular import Specular, follow
+from .courses import follow
+from .specular import Specular
 
 if TYPE_CHECKING:
     from ...camera.window import Window

@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ...jit.loops import repeat
+from ..lines.courses import first_met
 from ..lines.eq9 import View
-from ..lines.specular import first_met
 from .node_rules import MOST_JUMPS, AlongTransect
 from .node_sums import TRANSECTS_TOGETHER
 from .transect import Transect

@@ -11,8 +11,8 @@ import mitsuba as mi
 
 from ...jit.loops import repeat
 from ...jit.tables import Table
+from ..lines.courses import first_met
 from ..lines.eq9 import Sight, View
-from ..lines.specular import first_met
 from . import node_rules
 
 # Triangles a pixel up to which packets of neighbouring lines of sight are traced faster than single ones: of a node on

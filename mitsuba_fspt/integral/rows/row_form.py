@@ -20,8 +20,9 @@ from ...emission.emitting_surface import EmittingSurface
 from ...jit.batches import batches
 from ...jit.mesh_buffers import box_of
 from ...runtime.errors import SceneError
+from ..lines.courses import follow
 from ..lines.eq9 import eq9, etendue_from_pixel
-from ..lines.specular import Specular, follow
+from ..lines.specular import Specular
 from ..surface.pupil_cells import STEPS, STRIDE
 
 MOST_HITS = 4  # surfaces that a line meets on average at the most, directly and by way of specular surfaces

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -21,6 +23,7 @@ from small_scenes import (
 )
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.camera.of_sensor import camera_of
 from mitsuba_fspt.integral.lines.eq9 import View
 from mitsuba_fspt.integral.lines.specular import Specular
 from mitsuba_fspt.integral.lines.visible_window import visible_window
@@ -238,6 +241,36 @@ def test_a_beam_splitter_shows_both_phantoms():
     splitter = pane(80, PANE, size=40, tilt=45)
     both = camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,), crop=QUARTER)
     assert agrees_with_path(both) > 1e-3
+
+
+def test_light_by_plain_courses_and_by_all_others_adds_up():
+    """On every line of sight; both parts are refined by themselves, as reflections in windows are faint."""
+    scene = camera_scene(sphere(FOCUS, 8), bodies=(slab(60), pane(100, PANE, tilt=3)))
+    camera = camera_of(scene.sensors()[0])
+    whole = View.of(scene, camera, visible_window(scene, camera), specular=Specular.of(scene, camera))
+    assert whole.specular.branching
+    x, y, turn, radius = np.random.default_rng(0).uniform(size=(4, 512)).astype(np.float32)
+    film = mi.Point2f(x * WIDTH, y * HEIGHT)
+    pupil = mi.Point2f(radius * np.cos(6.28 * turn), radius * np.sin(6.28 * turn))
+    views = [replace(whole, specular=replace(whole.specular, part=part)) for part in ("all", "plain", "others")]
+    sights = [view.integrand(film, pupil) for view in views]
+    light, plain, others = (sight.integrand.numpy().astype(float) for sight in sights)
+    assert plain + others == pytest.approx(light, rel=1e-5)
+    lost, *parts = (sight.lost.numpy().astype(float) for sight in sights)
+    assert sum(parts) == pytest.approx(lost, rel=1e-5)
+    # Two reflections between window and plate, of 4 % or 8 % each.
+    assert 5e-4 < others.max() / plain.max() < 2e-2
+    assert (sights[0].covered == sights[1].covered).numpy().all()
+
+
+def test_other_courses_than_plain_ones_take_few_lines_of_sight():
+    """Their light, some thousandths, is smooth enough for nodes; one image of all courses has transects alike."""
+    scene = camera_scene(sphere(FOCUS, 8), bodies=(slab(60), pane(100, PANE, tilt=3)), crop=QUARTER)
+    levels = [level.split(": ") for level in fspt.render(scene, rtol=3e-2).metadata["levels"].split("; ")]
+    pixels = {name: int(count.split()[0]) for name, count in levels}
+    assert pixels["2 transects"] > 60
+    assert pixels["other courses, 4 nodes"] == pixels["4 nodes"]
+    assert pixels.get("other courses, 2 transects", 0) < 10
 
 
 def test_what_is_cut_off_is_in_the_error():
