@@ -157,9 +157,7 @@ class CalibrationFit:
         self.names, self.start, self.measured, self.settings = names, start, measured, settings
         self._images = images
         self._steps = np.ones(len(start))
-        self._kept = Slopes(
-            np.full(len(start), np.inf), np.empty(0), np.empty(0), False
-        )  # of no place
+        self._kept = Slopes(np.full(len(start), np.inf), np.empty(0), np.empty(0), False)  # of no place
 
     def solved(self) -> Fitted:
         """Minimum of Σ (residual/σ)², with σ of its own image."""
