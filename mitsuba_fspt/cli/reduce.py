@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from ..detector.counts import Counts
     from ..detector.detector import Detector
-    from ..detector.reduction import Corrections, Exposed
+    from ..detector.reduction import Exposed
     from ..images.image import Image
     from ..optics.light import Light
     from ..optics.thin_lens import Lens
@@ -144,7 +144,8 @@ def reduce(
     names = _outputs(output, len(counts), [*counts, detector, *(Path(path) for path in others if path)])
     camera, light = _camera_and_light(detector, wavelength_nm, spectrum, flat_kind, loaded := _loaded(scene, define))
     given = dict(exposure_time=exposure_time, light=light, binning=binning, pixel_pitch=pixel_pitch)
-    corrections = _corrections(bias, dark, flat, flat_kind, level, loaded, bad_pixels, cosmic_rays)
+    frame_files = dict(bias=bias, dark=dark, flat=flat, flat_kind=flat_kind, flat_dark=level, scene=loaded)
+    corrections = frame_files | dict(bad_pixels=bad_pixels, cosmic_rays=cosmic_rays)
     images = _reduced(camera, counts, frames, given, corrections, quiet)
     if calibrate:
         record = _calibrated(camera, images, detector, output, radiance, radiance_error)
@@ -172,13 +173,6 @@ def _camera_and_light(
     return Detector.from_toml(detector), light_of({}, through, wavelength_nm, spectrum)
 
 
-def _corrections(*given: Any) -> Corrections:
-    """What corrects the counts, in the order of `Corrections`."""
-    from ..detector.reduction import Corrections
-
-    return Corrections(*given)
-
-
 def _write(images: list[Image], names: list[Path], as_json: bool, quiet: bool) -> None:
     """Write all images, and say what is in them."""
     for image, name in zip(images, names, strict=True):
@@ -192,21 +186,21 @@ def _reduced(
     files: list[Path],
     frames: int | None,
     given: dict[str, Any],
-    corrections: Corrections,
+    corrections: dict[str, Any],
     quiet: bool,
 ) -> list[Image]:
-    """Images of all files of counts, with one flat field; `given` as of `_exposed`."""
+    """Images of all files of counts, with one flat field; `given` as of `_exposed`, `corrections` of `Corrections`."""
     from ..detector.counts import read_counts
-    from ..detector.reduction import reduce_counts
+    from ..detector.reduction import Corrections, reduce_counts
 
-    images = []
+    applied, images = Corrections(**corrections), []
     with progress_bar(quiet) as report:
         for number, path in enumerate(files):
             report(f"reducing {path.name}", number / len(files))
             found = read_counts(path, frames)
             exposed = _exposed(path, found, camera, given)
-            corrections = replace(corrections, flat=corrections.flat_field(camera, found, exposed))
-            images.append(reduce_counts(camera, found, exposed, corrections))
+            applied = replace(applied, flat=applied.flat_field(camera, found, exposed))
+            images.append(reduce_counts(camera, found, exposed, applied))
     return images
 
 

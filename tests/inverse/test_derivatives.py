@@ -130,10 +130,10 @@ def test_silhouettes_move(tmp_path, mono):
     Each pixel by Richardson's differences of finer images, within the stated error of some percent.
     """
     scene = write_scene(tmp_path / "ball.xml")
-    found = fspt.derivatives(scene, ["distance"])["distance"]
+    found = fspt.derivatives(scene, ["distance"], rtol=1e-3)["distance"]
 
     def law(distance):
-        return fspt.render(fspt.load(scene, distance=distance), method="integral", rtol=1e-5).power.astype(np.float64)
+        return fspt.render(fspt.load(scene, distance=distance), method="integral", rtol=1e-4).power.astype(np.float64)
 
     off, stated = relative(found, difference(law, 165.0, 3.3))
     assert off <= stated <= 0.05

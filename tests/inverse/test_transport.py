@@ -137,7 +137,7 @@ def test_sums_of_rows_are_the_image_of_one_in_closed_form(tmp_path):
 @pytest.mark.parametrize("on", ["vertex", "face"])
 @pytest.mark.parametrize("depth", [165.0, 205.0])
 def test_products_are_rendered_images(tmp_path, on, depth):
-    """Expected: rtol of the brightest pixel beside the error of a render ten times finer; within `error` on 99 %.
+    """Expected: rtol of the brightest pixel beside the error of a render four times finer; within `error` on 99 %.
 
     Seen to fail with two columns swapped, and with cosθ_s dropped.
     """
@@ -146,7 +146,7 @@ def test_products_are_rendered_images(tmp_path, on, depth):
     matrix = fspt.transport(scene, on=on, rtol=RTOL)
     for name, exitance in exitances(on).items():
         shine(scene, on, exitance)
-        image = fspt.render(scene, method="integral", rtol=RTOL / 10)
+        image = fspt.render(scene, method="integral", rtol=RTOL / 4)
         off = np.abs(matrix.forward(exitance)[0] - image.power)
         beyond = off - image.error
         assert beyond.max() <= RTOL * image.power.max(), name
@@ -231,15 +231,14 @@ def test_an_occluder_hides_the_same_faces_as_in_a_rendering(tmp_path, distance):
     scene = body_scene(tmp_path, extra=[{"type": "rectangle", "to_world": place}])
     matrix, exitance = fspt.transport(scene, rtol=RTOL), exitances("vertex")["smooth"]
     shine(scene, "vertex", exitance)
-    image = fspt.render(scene, method="integral", rtol=RTOL / 10)
+    image = fspt.render(scene, method="integral", rtol=RTOL / 4)
     off = np.abs(matrix.forward(exitance)[0] - image.power)
     assert (off - image.error).max() <= RTOL * image.power.max()
     assert matrix.sensitivity.sum() < 0.8 * fspt.transport(body_scene(tmp_path), rtol=RTOL).sensitivity.sum()
 
 
-@pytest.mark.parametrize(("rtol", "bound"), [(1e-3, 0.1), (1e-4, 0.01)])
-@pytest.mark.parametrize("depth", [165.0, 200.0])
-def test_a_column_alone_is_the_image_of_one_vertex(tmp_path, rtol, bound, depth):
+@pytest.mark.parametrize(("depth", "rtol", "bound"), [(165.0, 1e-3, 0.1), (200.0, 1e-3, 0.1), (165.0, 1e-4, 0.01)])
+def test_a_column_alone_is_the_image_of_one_vertex(tmp_path, depth, rtol, bound):
     """Vertices in the middle, at the limb and of faces far below a pixel, each rendered alone.
 
     Expected: 10 % of the column's own brightest entry at rtol 1e-3, 1 % at 1e-4.
@@ -280,7 +279,7 @@ def test_every_lens_and_exit_law(tmp_path, optics):
     scene = body_scene(tmp_path, **optics)
     matrix, exitance = fspt.transport(scene, rtol=RTOL), exitances("vertex")["decades"]
     shine(scene, "vertex", exitance)
-    image = fspt.render(scene, method="integral", rtol=RTOL / 10)
+    image = fspt.render(scene, method="integral", rtol=RTOL / 4)
     off = np.abs(matrix.forward(exitance)[0] - image.power)
     assert (off - image.error).max() <= RTOL * image.power.max()
 
@@ -336,7 +335,7 @@ def test_rows_go_on_through_windows_and_off_mirrors(tmp_path, where, crop):
     body = BODY.vertices @ TURN.T
     exitance = 1 + 0.9 * np.sin(body[:, 1] / 3) * np.cos(body[:, 2] / 4)
     shine(scene, "vertex", exitance)
-    image = fspt.render(scene, rtol=RTOL / 10)
+    image = fspt.render(scene, rtol=RTOL / 4)
     off = abs(matrix.forward(exitance)[0] - image.power)
     assert (off <= matrix.error(exitance)[0] + image.error).mean() > 0.995
     assert off.max() < 3 * RTOL * image.power.max()

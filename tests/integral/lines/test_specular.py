@@ -61,9 +61,10 @@ def mirrored(point, z, tilt):
 
 
 def agrees_with_path(scene, spp=1024, seed=3, **settings):
-    """The p-value of the integral's image beside Mitsuba's path tracer."""
+    """True where the image of the integral, which is not dark, is that of Mitsuba's path tracer: p > 1e-3."""
     image = fspt.render(scene, method="integral", rtol=1e-3, **settings)
-    return fspt.compare(image, fspt.render(scene, method="path", spp=spp, seed=seed)).z_test.p_value
+    p = fspt.compare(image, fspt.render(scene, method="path", spp=spp, seed=seed)).z_test.p_value
+    return image.power.max() > 0 and p > 1e-3
 
 
 @pytest.mark.parametrize("window", [pane(80, PANE), slab(80)], ids=["thin", "solid"])
@@ -99,11 +100,12 @@ def test_depth_behind_a_plate_is_the_apparent_one():
 
 @pytest.mark.parametrize("window", [pane(80, PANE, tilt=20), slab(80)], ids=["thin", "solid"])
 def test_a_window_agrees_with_the_path_tracer(window):
-    assert agrees_with_path(camera_scene(sphere(150, 9, x=3), bodies=(window,), crop=(2, 10, 9, 6))) > 1e-3
+    assert agrees_with_path(camera_scene(sphere(150, 9, x=3), bodies=(window,), crop=(2, 10, 9, 6)))
 
 
-@pytest.mark.parametrize("bsdf", [PERFECT, {"type": "roughconductor", "alpha": 0.0, "material": "none"}])
-@pytest.mark.parametrize("depth", [FOCUS, 150.0])
+@pytest.mark.parametrize(
+    ("bsdf", "depth"), [(PERFECT, FOCUS), ({"type": "roughconductor", "alpha": 0.0, "material": "none"}, 150.0)]
+)
 def test_a_mirror_shows_the_mirrored_phantom(bsdf, depth):
     """Two spheres, one of them off the axis, so that an image the wrong way round would be seen."""
     share, seen = 0.9, [(np.array([0.0, 3.0, depth]), 5.0), (np.array([7.0, -2.0, depth - 4]), 2.0)]
@@ -121,22 +123,22 @@ def test_a_mirror_whose_edge_cuts_the_field(z):
     """A small mirror at 45° hides half of a sphere and shows another one beside it."""
     mirror = pane(z, PERFECT, size=4.0, x=-3.0, tilt=45)
     scene = camera_scene(sphere(170, 8), sphere(z, 6, x=30), bodies=(mirror,), crop=(16, 12, 12, 4))
-    assert agrees_with_path(scene, spp=4096) > 1e-3
+    assert agrees_with_path(scene, spp=4096)
 
 
 def test_three_views_on_one_detector():
     scene = fspt.load(SCENES / "mirror_rig.xml", width=96, height=32, pixel_pitch=0.27)
-    assert agrees_with_path(scene, spp=256) > 1e-3
-    views = fspt.render(scene).coverage.sum(axis=0) > 0
+    assert agrees_with_path(scene, spp=256)
+    views = fspt.render(scene, rtol=1e-2).coverage.sum(axis=0) > 0
     assert np.count_nonzero(np.diff(views.astype(int)) == 1) == 3
 
 
 def test_two_mirrors_in_turn():
     """A periscope: two parallel mirrors at 45° shift the line of sight sideways by 40 mm."""
     mirrors = (pane(70, PERFECT, size=[18, 18, 1], tilt=45), pane(70, PERFECT, size=[25, 25, 1], x=40, tilt=225))
-    half = (10, 7, 20, 9)
-    shifted = fspt.render(camera_scene(sphere(125, 6, x=40), bodies=mirrors, crop=half), rtol=1e-3)
-    direct = fspt.render(camera_scene(sphere(FOCUS, 6), crop=half), rtol=1e-3)
+    quarter = (10, 7, 10, 9)
+    shifted = fspt.render(camera_scene(sphere(125, 6, x=40), bodies=mirrors, crop=quarter), rtol=1e-3)
+    direct = fspt.render(camera_scene(sphere(FOCUS, 6), crop=quarter), rtol=1e-3)
     assert abs(shifted.power - direct.power).max() < 2e-3 * direct.power.max()
 
 
@@ -184,7 +186,7 @@ def test_a_mirror_in_another_bsdf_reflects_its_share():
             {"type": "twosided", "nested": half},
         ]
         bare += [PERFECT | {"specular_reflectance": r} for r in (share, share, share + 0.2 * (1 - share))]
-    scenes = (camera_scene(sphere(80, 5, x=70), bodies=strips(bsdfs), crop=QUARTER) for bsdfs in (inside, bare))
+    scenes = (camera_scene(sphere(80, 5, x=70), bodies=strips(bsdfs), crop=(16, 9, 4, 7)) for bsdfs in (inside, bare))
     seen, due = (power(scene, rtol=4e-3) for scene in scenes)
     assert due.max() > 0
     assert abs(seen - due).max() < 4e-3 * due.max()
@@ -201,7 +203,7 @@ def test_a_mirror_in_another_bsdf_reflects_its_share():
 )
 def test_masks_and_blends_agree_with_the_path_tracer(bsdf):
     splitter = pane(80, bsdf, size=40, tilt=45)
-    assert agrees_with_path(camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,))) > 1e-3
+    assert agrees_with_path(camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,), crop=QUARTER))
 
 
 GLASSES = {"a": {"type": "dielectric", "int_ior": 1.3}, "b": {"type": "dielectric"}}
@@ -232,15 +234,14 @@ def test_total_reflection_in_a_prism(tmp_path):
         "bsdf": {"type": "dielectric", "int_ior": n, "ext_ior": 1.0},
     }
     scene = camera_scene(sphere(90, 5, x=80), bodies=(prism,), f_number=8, crop=QUARTER)
-    assert agrees_with_path(scene) > 1e-3
-    assert power(scene, rtol=1e-3).max() > 0
+    assert agrees_with_path(scene)
 
 
 def test_a_beam_splitter_shows_both_phantoms():
     """Its reflection is no ghost that may be left out."""
     splitter = pane(80, PANE, size=40, tilt=45)
     both = camera_scene(sphere(150, 6), sphere(80, 5, x=70), bodies=(splitter,), crop=QUARTER)
-    assert agrees_with_path(both) > 1e-3
+    assert agrees_with_path(both)
 
 
 def test_light_by_plain_courses_and_by_all_others_adds_up():
@@ -309,7 +310,7 @@ def test_narrow_light_in_a_mirror_is_in_the_error():
     scene = camera_scene(tiny, disk(300, 3.0, x=60), bodies=(pane(80, PERFECT, tilt=45),), crop=around)
     direct = fspt.render(camera_scene(sphere(160, 0.05, y=1.0), crop=around), rtol=1e-3)
     assert direct.power.max() > 0
-    image = fspt.render(scene, rtol=1e-3)
+    image = fspt.render(scene, rtol=4e-3)
     assert (abs(image.power - direct.power) <= image.error + direct.error).all()
 
 

@@ -296,9 +296,10 @@ def test_a_small_sphere_far_out_of_focus():
     line to line, instead of those of a piece's middle.
     """
     depth, radius, x, y = 120.0, 0.4, 1.0, -2.0
-    picture = fspt.render(camera_scene(sphere(depth, radius, x, y)), domain="surface", rtol=1e-3)
+    quarter = (0, 0, WIDTH // 2, HEIGHT // 2)
+    picture = fspt.render(camera_scene(sphere(depth, radius, x, y), crop=quarter), domain="surface", rtol=1e-3)
     rows, columns = np.nonzero(picture.power > 0)
-    pick = slice(None, None, 6)
+    pick = slice(None, None, 3)
     expected = [
         power_of_ball(row, column, depth, radius, x, y) for row, column in zip(rows[pick], columns[pick], strict=True)
     ]
