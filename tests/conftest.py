@@ -9,6 +9,8 @@ import signal
 
 import pytest
 
+import mitsuba_fspt  # noqa: F401  # before any test imports Mitsuba: it chooses the LLVM that Dr.Jit binds
+
 pytest_plugins = ["cpu_seconds"]
 
 # A shell's background jobs inherit that Ctrl-C is ignored, and so would all that tests start.
@@ -19,8 +21,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def mono():
     """Mitsuba in the variant llvm_ad_mono, quiet but for errors."""
     import mitsuba as mi
-
-    import mitsuba_fspt  # noqa: F401  # registers the plugins
 
     if mi.variant() != "llvm_ad_mono":
         mi.set_variant("llvm_ad_mono")
