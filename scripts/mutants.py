@@ -37,6 +37,7 @@ LIGHT = "tests/optics/test_light.py"
 STRAY = "tests/detector/test_stray_light.py"
 VIGNETTING, MEASURED_VIGNETTING = "tests/optics/test_vignetting.py", "tests/detector/test_measured_vignetting.py"
 TISSUE, INVERT = "tests/tissue/test_diffusion.py", "tests/inverse/test_invert.py"
+SP3 = "tests/tissue/test_sp3.py"
 COMPOSITION = "tests/tissue/test_composition.py"
 
 
@@ -552,10 +553,25 @@ MUTANTS = (
     ),
     Mutant(
         "2 A of the boundary condition",
-        "tissue/finite_elements.py",
-        "u * v / (2 * self.factor)",
-        "u * v / self.factor",
+        "tissue/light_models.py",
+        "1 / (2 * factors[:, None, None])",
+        "1 / factors[:, None, None]",
         (TISSUE,),
+    ),
+    Mutant(
+        "2/3 of phi_2 in the fluence of SP3",
+        "tissue/light_models.py",
+        "np.array([1, -2 / 3])",
+        "np.array([1, 0])",
+        (SP3,),
+    ),
+    Mutant("curvature of the border", "tissue/light_models.py", "* curvature, self", "* 0 * curvature, self", (SP3,)),
+    Mutant(
+        "light along the border in J_n",
+        "tissue/solution.py",
+        "return outward + self._interpolated(self.solved.lateral, cells, local)",
+        "return outward",
+        (SP3,),
     ),
     Mutant(
         "4 pi of the free field",

@@ -131,7 +131,7 @@ def locate_case(truth: str, cause: str) -> Callable[[float, int], Any]:
     exitance = exact(surface.vertices, [SOURCE])
     if cause == "inclusion":
         other = described(more=INCLUSION)
-        tissue = Tissue(other.checked_mesh(), other.band(None).media, a=other.a, order=other.order)
+        tissue = Tissue(other.checked_mesh(), other.band(None).media, model=other.model, a=other.a, order=other.order)
         exitance = SOURCE[3] * tissue.solve([Source(Sphere(SOURCE[:3]))]).exitance_at(surface.vertices)
     power = matrix.forward(exitance)
     if cause == "factor":

@@ -43,7 +43,7 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.optics.media import Medium
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.tissue.phantom_file import PhantomFile
-from mitsuba_fspt.tissue.solution import DiffusionSolution
+from mitsuba_fspt.tissue.solution import TissueSolution
 
 ROOT = Path(__file__).resolve().parent.parent
 VIEWS = {"front": 0, "left": 90, "back": 180}
@@ -77,7 +77,7 @@ def decay(mua: float, musp: float) -> float:
     return (low + high) / 2
 
 
-def solve(description: PhantomFile, folder: Path) -> DiffusionSolution:
+def solve(description: PhantomFile, folder: Path) -> TissueSolution:
     """The phantom solved, and in a folder phantom.ply and fluence.vol of it."""
     solution = description.solve()
     solution.phantom(description.surface_edge).write(folder / "phantom.ply")

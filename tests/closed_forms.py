@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 from scipy.special import eval_legendre, j0, spherical_in, spherical_kn
 
 Array = NDArray[np.float64]
@@ -80,3 +81,33 @@ def layers_fluence(
     else:
         raise ValueError("height must be that of a face")
     return (j0(np.outer(across, s)) * (g * s * weight)).sum(axis=1) / (2 * np.pi)
+
+
+def coupled_ball_exitance(
+    radius: float,
+    offset: float,
+    diffusion: Array,
+    reaction: Array,
+    source: Array,
+    border: Array,
+    lateral: float,
+    cosine: Array,
+    orders: int = 40,
+) -> Array:
+    """As `ball_exitance` for -c ∇²φ + C φ = s q with c ∂φ/∂n = -(H φ) + τ ∇_t²φ_1 (in the first equation)."""
+    squares, vectors = eigh(reaction, np.diag(diffusion))
+    k, power = np.sqrt(squares), vectors.T @ source
+    result = np.zeros_like(cosine)
+    for order in range(orders):
+        matrix = border.copy()
+        matrix[0, 0] += lateral * order * (order + 1) / radius**2
+        # Both functions of each mode over their values on the border, which under- and overflow.
+        decayed = spherical_kn(order, k * radius)
+        decay = k * spherical_kn(order, k * radius, derivative=True)
+        growth = k * spherical_in(order, k * radius, derivative=True) / spherical_in(order, k * radius)
+        own = power * k / (2 * np.pi**2) * (2 * order + 1) * spherical_in(order, k * offset)
+        right = -(diffusion * (vectors @ (own * decay)) + matrix @ (vectors @ (own * decayed)))
+        mirror = np.linalg.solve(diffusion[:, None] * vectors * growth + matrix @ vectors, right)
+        outward = matrix @ (vectors @ (own * decayed + mirror))
+        result += outward[0] * eval_legendre(order, cosine)
+    return result

@@ -18,6 +18,7 @@ shape = "cylinder"
 radius = {RADIUS}
 height = {HEIGHT}
 [optical]
+model = "diffusion"
 mua = 0.05
 musp = 1.0
 [bands.red]

@@ -1,4 +1,4 @@
-"""`fspt flux`: surface flux density from other codes and from diffusion, as a phantom to render."""
+"""`fspt flux`: surface flux density from other codes and from SP3 or diffusion, as a phantom to render."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def solve(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Solve the diffusion equation in a phantom and write its surface with J_n.
+    """Solve SP3 or diffusion in a phantom and write its surface with J_n.
 
     The surface's power is what leaves by finite elements; absorbed and exit
     power together are the sources' to the balance printed.

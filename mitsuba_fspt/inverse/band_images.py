@@ -143,7 +143,7 @@ class BandImages:
         cells, local = mesh.locate(points)
         weights = np.maximum(np.column_stack([1 - local.sum(axis=1), local]), 0)
         weights /= weights.sum(axis=1, keepdims=True)
-        weights /= 2 * np.asarray(self.tissue.factors)[mesh.region[cells], None]
+        weights *= self.tissue.linear.equations.border[mesh.region[cells], 0]
         rows = np.repeat(np.arange(len(points)), 4)
         shape = len(points), len(mesh.vertices)
         return csr_array(self.transport @ csr_array((weights.ravel(), (rows, mesh.cells[cells].ravel())), shape))

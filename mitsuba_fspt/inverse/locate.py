@@ -1,6 +1,6 @@
 """`locate`: light sources inside a phantom, from images of its surface.
 
-J_n of a point source is the solution of the diffusion equation (see `tissue.diffusion`), its image T J_n.
+J_n of a point source is the solution of SP3 or of the diffusion equation (see `tissue.diffusion`), its image T J_n.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def locate(
         S.sources[0].position, S.sources[0].position_interval  # mm, in the frame of phantom.toml
 
     The intervals contain the noise of the images, the numerical error of the matrix and `gain_error`, not errors of the
-    optical coefficients, of the shape, of inclusions left out, of pose and lens, or of the diffusion equation itself.
+    optical coefficients, of the shape, of inclusions left out, of pose and lens, or of SP3 or diffusion itself.
     `warnings` name what the residuals show of these: their χ², and structure over views and around the sources (M.34).
 
     Parameters
@@ -246,7 +246,7 @@ def _band_images(
         )
     bands = []
     for one, (surface, measurement, optics) in zip(given, read, strict=True):
-        tissue = Tissue(mesh, optics.media, a=described.a, order=described.order, repeated=True)
+        tissue = Tissue(mesh, optics.media, model=described.model, a=described.a, order=described.order, repeated=True)
         with renamed("locate", one.label):
             bands.append(BandImages.of(one.name, measurement.matrix, surface, measurement, tissue, optics.share))
     return bands

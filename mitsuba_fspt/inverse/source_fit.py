@@ -1,4 +1,4 @@
-"""Least squares over the positions and powers of point sources: Levenberg and Marquardt, with the diffusion equation.
+"""Least squares over the positions and powers of point sources: Levenberg and Marquardt, with SP3 or diffusion.
 
 Positions and powers >= 0 minimise Σ (residual/σ)² with the variances of Eq. M.24; their covariance is that of
 Eq. M.26, J the slopes with positions and powers. The powers of given positions follow from linear least squares.

@@ -2,10 +2,10 @@
 
     P = B K⁻¹ p,   B = share · T S/(2A)
 
-p: power of the vertices [W]; K: matrix of the diffusion equation in finite elements of order 1; S: values at the points
-of the surface from those at the vertices; T: transport matrix. K has one sparse factor for all sources, so that a
-thousand of them take seconds. A point source is known to about the length of an edge in it: what needs more accuracy
-takes the solution with the source's own free field (see `tissue.diffusion`).
+p: power of the vertices [W]; K: matrix of the diffusion equation, under SP3 too, in finite elements of order 1; S:
+values at the points of the surface from those at the vertices; T: transport matrix. K has one sparse factor for all
+sources, so that a thousand of them take seconds. A point source is known to about the length of an edge in it: what
+needs more accuracy takes the solution with the source's own free field (see `tissue.diffusion`).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class SourceGrid:
         return cls(
             mesh,
             inner,
-            tuple(factor(csr_array(band.tissue.linear().system.matrix)) for band in bands),
+            tuple(factor(csr_array(band.tissue.linear.system.matrix)) for band in bands),
             tuple(csr_array(band.share * band.from_fluence()) for band in bands),
             np.concatenate([band.power for band in bands]),
             np.concatenate([band.flat_sigma() for band in bands]),

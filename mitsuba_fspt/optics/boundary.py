@@ -26,7 +26,7 @@ def robin_a(n: float) -> float:
     ------
     FluxError : n is below 1 or above 100.
     """
-    n = _index(n)
+    n = index_of(n)
     face_on = ((n - 1) / (n + 1)) ** 2
     critical = math.sqrt(1 - 1 / n**2)
     return (2 / (1 - face_on) - 1 + critical**3) / (1 - critical**2)
@@ -43,7 +43,7 @@ def haskell_a(n: float) -> float:
     ------
     FluxError : n is below 1 or above 100.
     """
-    n = _index(n)
+    n = index_of(n)
     # As a function of the outer cosine (µ dµ = µ_o dµ_o / n²) the transmittance has no kink at the critical angle.
     # It is steep at grazing exit for n near 1, where the nodes µ_o = x² are dense.
     x, weight = np.polynomial.legendre.leggauss(64)
@@ -84,7 +84,7 @@ def fresnel_transmittance(cos_inner: NDArray[np.float64], n: float) -> NDArray[n
     return np.where(cos_outer > 0, transmittance, 0.0)
 
 
-def _index(n: float) -> float:
+def index_of(n: float) -> float:
     """`n` as a float; FluxError if it is below 1 or above 100."""
     if not 1 <= n <= LARGEST_INDEX:
         raise FluxError(

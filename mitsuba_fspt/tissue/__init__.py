@@ -1,1 +1,1 @@
-"""Light in tissue: the diffusion equation by finite elements, from sources to J_n on the surface."""
+"""Light in tissue: SP3 and diffusion by finite elements, from sources to J_n on the surface."""

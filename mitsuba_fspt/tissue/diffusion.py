@@ -1,6 +1,4 @@
-"""Diffusion equation of light in tissue, solved by finite elements.
-
-    -∇·(D ∇φ) + µa φ = q inside,   φ + 2 A D ∂φ/∂n = 0 on the border,   D = 1/(3 (µa + µs')).
+"""Light in tissue by the SP3 equations or the diffusion equation (`light_models`), solved by finite elements.
 
 The solution is split, φ = φ_f + w. φ_f is the closed-form field of the sources in infinite tissue that has the optical
 coefficients at the source everywhere; it contains the singularity of point sources. The finite elements solve for the
@@ -8,7 +6,7 @@ smooth rest w only. Elements of both orders therefore converge at their full rat
 positions of the sources.
 
     mesh = cylinder_tetrahedra(radius=15, height=30, edge=1.5)
-    solution = solve(mesh, [Medium(0.0138, 0.91, 1.37)], [Source(Sphere((8, 0, 0)))])
+    solution = solve(mesh, [Medium(0.0138, 0.91, 1.37)], [Source(Sphere((8, 0, 0)))], model="diffusion")
     solution.solved.exited                                # 0.3128 W of 1 W
     solution.phantom(edge=0.35).write("phantom.ply")
 """
@@ -17,16 +15,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optics.boundary import boundary_a
 from ..optics.media import Medium, Source
 from ..runtime.errors import FluxError
+from .border_curvature import mean_curvature
 from .finite_elements import Solved, System
-from .free_field import FreeField
-from .solution import DiffusionSolution
+from .free_field import SourceField
+from .light_models import DEFAULT, Equations, equations
+from .solution import TissueSolution
 from .tetrahedra import OUTSIDE, Tetrahedra, depth
 
 Progress = Callable[[str], None]
@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 LARGEST_IMBALANCE = 1e-5
+SMOOTHED = 1.0  # mean free paths over which the border's curvature is smoothed, as the radiance there follows it
 
 
 def solve(
@@ -41,42 +42,45 @@ def solve(
     media: Sequence[Medium],
     sources: Sequence[Source],
     *,
+    model: str = DEFAULT,
     a: str | float = "robin",
     order: int = 2,
     progress: Progress | None = None,
-) -> DiffusionSolution:
-    """Solution of the diffusion equation on a mesh, with its power balance.
+) -> TissueSolution:
+    """Light in tissue on a mesh, with its power balance.
 
     Parameters
     ----------
     mesh : tetrahedra of the tissue; `media[label]` fills its region `label`
     media : absorption, reduced scattering and refractive index of each region
     sources : at least one; their shapes must lie inside the mesh
-    a : boundary factor A: 'robin' or 'haskell' (from the n of each region, see `optics.boundary`), or a number
+    model : "sp3" or "diffusion"
+    a : boundary factor A of diffusion: 'robin' or 'haskell' (from the n of each region, see `optics.boundary`), or a
+        number
     order : 1 or 2, of the tetrahedra
     progress : called with the name of each stage
 
     Raises
     ------
     FluxError : no source, a source outside the mesh or too close to its border, a region without medium, another
-        order, or no convergence.
+        order or model, a boundary factor beside "sp3", or no convergence.
     BackendError : scikit-fem or SciPy is missing.
     """
     report = progress or (lambda stage: None)
     report("assemble")
-    tissue = Tissue(mesh, media, a=a, order=order)
+    tissue = Tissue(mesh, media, model=model, a=a, order=order)
     report("solve")
     return tissue.solve(sources)
 
 
 class Tissue:
-    """Tissue without sources: mesh, media, boundary factors and the finite elements, which serve any sources.
+    """Tissue without sources: mesh, media, equations and the finite elements, which serve any sources.
 
     Arguments as of `solve`; `repeated`: it will be solved for many sources, see `System`.
 
     Raises
     ------
-    FluxError : a region without medium, or another order.
+    FluxError : a region without medium, another order or model, or a boundary factor beside "sp3".
     BackendError : scikit-fem or SciPy is missing.
     """
 
@@ -85,6 +89,7 @@ class Tissue:
         mesh: Tetrahedra,
         media: Sequence[Medium],
         *,
+        model: str = DEFAULT,
         a: str | float = "robin",
         order: int = 2,
         repeated: bool = False,
@@ -96,31 +101,32 @@ class Tissue:
                 f"solve: the mesh has regions {mesh.region.min()} to {mesh.region.max()}, media are given for 0 "
                 f"to {len(media) - 1}. Give one a region."
             )
-        self.mesh, self.media, self._a, self._order = mesh, tuple(media), a, order
-        self.factors = tuple(boundary_a(a, medium.n) for medium in media)
-        self.system = System(mesh, order, [m.diffusion for m in media], [m.mua for m in media], self.factors, repeated)
+        self.mesh, self.media, self.model, self._a, self._order = mesh, tuple(media), model, a, order
+        self.equations = equations(model, self.media, a)
+        self.curvature = np.zeros(len(mesh.vertices))
+        if self.equations.bend.any():
+            self.curvature = mean_curvature(mesh, SMOOTHED * max(1 / (m.mua + m.musp) for m in media))
+        self.system = System(mesh, order, self.equations, self.curvature, repeated)
 
+    @cached_property
     def linear(self) -> Tissue:
-        """The same tissue with finite elements of order 1."""
-        return Tissue(self.mesh, self.media, a=self._a, order=1)
+        """The same tissue with finite elements of order 1 under the diffusion equation: coarse, and fast."""
+        return Tissue(self.mesh, self.media, model="diffusion", a=self._a, order=1)
 
     def of_media(self, media: Sequence[Medium]) -> Tissue:
         """The same tissue and elements with other media."""
-        return Tissue(self.mesh, media, a=self._a, order=self._order)
+        return Tissue(self.mesh, media, model=self.model, a=self._a, order=self._order)
 
     def places(self, points: Array) -> tuple[Index, Array]:
         """Cells (N,) and local coordinates (N, 3) of `points` (N, 3) [mm], for `exitance_at` of any solution."""
-        nothing = Solved(np.zeros(self.system.basis.N), 0.0, 0.0, 0)
-        return DiffusionSolution(self.mesh, self.system.basis, self.media, self.factors, (), 0.0, nothing).places(
-            points
-        )
+        count = self.system.basis.N
+        nothing = Solved(np.zeros((self.equations.components, count)), np.zeros(count), 0.0, 0.0, 0)
+        return self._solution((), 0.0, nothing).places(points)
 
-    def solve(self, sources: Sequence[Source]) -> DiffusionSolution:
+    def solve(self, sources: Sequence[Source]) -> TissueSolution:
         """Solution for these sources; raises FluxError as `solve`."""
-        fields = _free_fields(self.mesh, self.media, sources)
-        solved = self.system.solve(fields)
-        power = math.fsum(source.power for source in sources)
-        solution = DiffusionSolution(self.mesh, self.system.basis, self.media, self.factors, fields, power, solved)
+        fields = _free_fields(self.mesh, self.equations, sources)
+        solution = self._solution(fields, math.fsum(source.power for source in sources), self.system.solve(fields))
         if abs(solution.balance) > LARGEST_IMBALANCE:
             raise FluxError(
                 f"solve: absorbed + exited power is {1 + solution.balance:.6g} of the source's. A source is too close "
@@ -128,8 +134,12 @@ class Tissue:
             )
         return solution
 
+    def _solution(self, fields: tuple[SourceField, ...], power: float, solved: Solved) -> TissueSolution:
+        basis = self.system.basis
+        return TissueSolution(self.mesh, basis, self.media, self.equations, self.curvature, fields, power, solved)
 
-def _free_fields(mesh: Tetrahedra, media: Sequence[Medium], sources: Sequence[Source]) -> tuple[FreeField, ...]:
+
+def _free_fields(mesh: Tetrahedra, equations: Equations, sources: Sequence[Source]) -> tuple[SourceField, ...]:
     """Free field of the sources of each region; every node of a source belongs to the region that contains it."""
     if not sources:
         raise FluxError("solve: there is no source. Give at least one.")
@@ -147,5 +157,5 @@ def _free_fields(mesh: Tetrahedra, media: Sequence[Medium], sources: Sequence[So
     fields = []
     for label in np.unique(labels):
         own = labels == label
-        fields.append(FreeField(centres[own], radii[own], powers[own], media[label].diffusion, media[label].mua))
+        fields.append(SourceField.of(equations, int(label), centres[own], radii[own], powers[own]))
     return tuple(fields)

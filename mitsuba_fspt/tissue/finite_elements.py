@@ -1,12 +1,13 @@
-"""Finite elements of the diffusion equation: matrix, load, solution and power balance, by scikit-fem.
+"""Finite elements of diffusion or SP3 (`light_models`): matrix, load, solution and power balance, by scikit-fem.
 
-With D_f, µ_f the optics of the free field φ_f of the sources, the rest w = φ - φ_f satisfies for every test
-function v
+With c_f, C_f the optics of the free field φ_f of the sources, the rest w = φ - φ_f satisfies for every test function v
+and each component i, where repeated j are summed over,
 
-    ∫ (D ∇w·∇v + µa w v) dV + ∮ w v/(2A) dS
-        = -∮ (φ_f/(2A) + D_f ∂φ_f/∂n) v dS - ∫ [(D - D_f) ∇φ_f·∇v + (µa - µ_f) φ_f v] dV,
+    ∫ (c_i ∇w_i·∇v + C_ij w_j v) dV + ∮ H_ij w_j v dS
+        = -∮ (H_ij φ_fj + c_fi ∂φ_fi/∂n) v dS - ∫ [(c_i - c_fi) ∇φ_fi·∇v + (C_ij - C_fij) φ_fj v] dV,
 
-where the last integral runs over the regions whose optics differ from the source's.
+where the last integral runs over the regions whose optics differ from the source's. For i = 1 the border has also
+∮ τ ∇_t w_1·∇_t v dS on the left and -∮ τ ∇_t φ_f1·∇_t v dS on the right.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import block_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from ..runtime.errors import BackendError, FluxError
-from .free_field import FreeField
+from .free_field import SourceField
+from .light_models import Equations
 from .tetrahedra import Tetrahedra
 
 Array = NDArray[np.float64]
@@ -39,9 +41,13 @@ BORDER_DEGREE = 8
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Rest w at the nodes [W/mm²], power absorbed inside and power leaving through the border [W]."""
+    """Rest w at the nodes, (m, N) [W/mm²], power absorbed inside and power leaving through the border [W].
+
+    lateral : -∇_t·(τ ∇_t φ_1) at the nodes of the border, (N,) [W/mm²], its part of J_n
+    """
 
     rest: Array
+    lateral: Array
     absorbed: float
     exited: float
     iterations: int
@@ -50,7 +56,7 @@ class Solved:
 class System:
     """Discrete problem on one mesh: `basis` of the cells, `border` basis of the boundary facets.
 
-    `diffusion` [mm], `mua` [1/mm] and `factors` A hold one number per region; `order` is 1 or 2. Elements of
+    `equations` of the mesh's regions; `curvature` of the border at the vertices [1/mm]; `order` is 1 or 2. Elements of
     order 2 have a curved border if the mesh has a `snap`. `repeated`: many sources will be solved for, so that factors
     of the matrix of linear elements, once, take less time than iterations without them.
 
@@ -60,63 +66,82 @@ class System:
     """
 
     def __init__(
-        self,
-        mesh: Tetrahedra,
-        order: int,
-        diffusion: Sequence[float],
-        mua: Sequence[float],
-        factors: Sequence[float],
-        repeated: bool = False,
+        self, mesh: Tetrahedra, order: int, equations: Equations, curvature: Array, repeated: bool = False
     ) -> None:
         skfem = import_skfem()
         self.element = skfem.ElementTetP2() if order == 2 else skfem.ElementTetP1()
-        self.repeated = repeated
+        self.equations, self.repeated = equations, repeated
         grid = _grid(skfem, mesh, order)
         self.basis = skfem.Basis(grid, self.element, intorder=2 * order)
         self.border = _border_basis(skfem, grid, self.element)
-        # One row per cell or facet, to broadcast over its quadrature points.
-        self.diffusion = np.asarray(diffusion)[mesh.region][:, None]
-        self.mua = np.asarray(mua)[mesh.region][:, None]
-        self.factor = np.asarray(factors)[mesh.region[grid.f2t[0, self.border.find]]][:, None]
+        self.region = mesh.region  # of each cell
+        region = mesh.region[grid.f2t[0, self.border.find]]
+        self.outward = self._outward(region, curvature)
+        self.lateral = equations.lateral[region, None]  # τ of the facets
 
-    def solve(self, fields: Sequence[FreeField]) -> Solved:
+    def _outward(self, region: Index, curvature: Array) -> Array:
+        """H at the quadrature points of the boundary facets, (m, m, F, Q)."""
+        x, y = self.border.X
+        corners = curvature[self.border.mesh.facets[:, self.border.find]]
+        values = np.einsum("kf,kq->fq", corners, np.stack([1 - x - y, x, y]))
+        matrix = self.equations.border_at(np.repeat(region, len(x)), values.ravel())
+        return np.asarray(np.moveaxis(matrix, 0, 2).reshape(*matrix.shape[1:], *values.shape))
+
+    def solve(self, fields: Sequence[SourceField]) -> Solved:
         """Rest w = φ − φ_f, where φ_f is the sum of the sources' free fields, with the absorbed and the exit power.
 
         Raises
         ------
         FluxError : no convergence.
         """
-        load, exited, absorbed = np.zeros(self.basis.N), 0.0, 0.0
+        load, exited, absorbed = np.zeros((self.equations.components, self.basis.N)), 0.0, 0.0
+        lateral = np.zeros(self.basis.N)
         for field in fields:
-            fluence, flux, outflow = self._on_border(field)
-            load -= self._integrate(self.border, fluence / (2 * self.factor) + flux)
-            exited += (fluence / (2 * self.factor) * self.border.dx).sum()
-            # µ_f φ_f is the divergence of D_f ∇φ_f + P r/(4πr³), a field without singularity.
-            absorbed += ((flux + outflow) * self.border.dx).sum()
+            values, flux, outflow, along = self._on_border(field)
+            outward = np.einsum("ijfq,jfq->ifq", self.outward, values)
+            for i, total in enumerate(outward + flux):
+                load[i] -= self._integrate(self.border, total)
+            if self.lateral.any():
+                lateral += self._integrate(self.border, np.zeros_like(outflow), self.lateral * along)
+            exited += (outward[0] * self.border.dx).sum()
+            # Σ C_1j φ_fj is the divergence of c_1 ∇φ_f1 + P r/(4πr³), a field without singularity.
+            absorbed += ((flux[0] + outflow) * self.border.dx).sum()
             other, difference = self._in_other_regions(field)
             load -= other
             absorbed += difference
-        rest, iterations = self._conjugate_gradients(load)
-        inside, outside = self.basis.interpolate(rest), self.border.interpolate(rest)
-        absorbed += (self.mua * inside * self.basis.dx).sum()
-        exited += (outside / (2 * self.factor) * self.border.dx).sum()
-        return Solved(rest, float(absorbed), float(exited), iterations)
+        load[0] -= lateral
+        rest, iterations = self._conjugate_gradients(load.ravel())
+        rest = rest.reshape(load.shape)
+        for j, component in enumerate(rest):
+            inside, outside = self.basis.interpolate(component), self.border.interpolate(component)
+            absorbed += (self._reaction(0, j) * inside * self.basis.dx).sum()
+            exited += (self.outward[0, j] * outside * self.border.dx).sum()
+        if self.lateral.any():
+            lateral = self._over_border(lateral + self._lateral_matrix @ rest[0])
+        return Solved(rest, lateral, float(absorbed), float(exited), iterations)
 
-    def _on_border(self, field: FreeField) -> tuple[Array, Array, Array]:
-        """φ_f, D_f ∂φ_f/∂n and P n·r/(4πr³) [W/mm²] at the quadrature points of the boundary facets, (F, Q)."""
+    def _reaction(self, i: int, j: int) -> Array:
+        """C_ij [1/mm] of each cell, (T, 1), to broadcast over its quadrature points."""
+        return np.asarray(self.equations.reaction[self.region, i, j, None])
+
+    def _on_border(self, field: SourceField) -> tuple[Array, Array, Array, Array]:
+        """φ_f and c_f ∂φ_f/∂n (m, F, Q), P n·r/(4πr³) (F, Q) [W/mm²], ∇_t φ_f1 (3, F, Q) at the facets' nodes."""
         points = np.asarray(self.border.global_coordinates())
         normals = np.asarray(self.border.normals).reshape(3, -1).T
-        fluence, gradient, outflow = field.with_gradient(points.reshape(3, -1).T)
-        flux = field.diffusion * (gradient * normals).sum(axis=1)
+        values, gradient, outflow = field.with_gradient(points.reshape(3, -1).T)
+        slope = np.einsum("ind,nd->in", gradient, normals)
+        flux = field.diffusion[:, None] * slope
         through = (outflow * normals).sum(axis=1)
+        along = (gradient[0] - slope[0][:, None] * normals).T
         shape = points.shape[1:]
-        return fluence.reshape(shape), flux.reshape(shape), through.reshape(shape)
+        return values.reshape(-1, *shape), flux.reshape(-1, *shape), through.reshape(shape), along.reshape(3, *shape)
 
-    def _in_other_regions(self, field: FreeField) -> tuple[Array, float]:
-        """∫ [(D - D_f) ∇φ_f·∇v + (µa - µ_f) φ_f v] dV of every test function, and ∫ (µa - µ_f) φ_f dV [W]."""
-        changed = (self.diffusion != field.diffusion) | (self.mua != field.mua)
-        other = np.flatnonzero(changed[:, 0])
-        load, power = np.zeros(self.basis.N), 0.0
+    def _in_other_regions(self, field: SourceField) -> tuple[Array, float]:
+        """∫ [(c - c_f) ∇φ_f·∇v + (C - C_f) φ_f v] dV of each test function (m, N), ∫ Σ (C - C_f)_1j φ_fj dV [W]."""
+        equations = self.equations
+        differs = np.array([not equations.same(region, field.region) for region in range(len(equations.diffusion))])
+        other = np.flatnonzero(differs[self.region])
+        load, power = np.zeros((equations.components, self.basis.N)), 0.0
         # ∇φ_f is steep near a source: cells there are integrated by a rule on many small tetrahedra.
         near = self._near(other, field.centres)
         skfem = import_skfem()
@@ -129,11 +154,13 @@ class System:
                 continue
             basis = skfem.Basis(self.basis.mesh, self.element, quadrature=rule, elements=cells)
             points = np.asarray(basis.global_coordinates())
-            fluence, gradient, _ = field.with_gradient(points.reshape(3, -1).T)
-            fluence = (self.mua[cells] - field.mua) * fluence.reshape(points.shape[1:])
-            gradient = (self.diffusion[cells] - field.diffusion) * gradient.T.reshape(points.shape)
-            load += self._integrate(basis, fluence, gradient)
-            power += float((fluence * basis.dx).sum())
+            values, gradient, _ = field.with_gradient(points.reshape(3, -1).T)
+            reaction = (equations.reaction - equations.reaction[field.region])[self.region[cells]]
+            values = np.einsum("tij,jtq->itq", reaction, values.reshape(-1, *points.shape[1:]))
+            diffusion = (equations.diffusion - equations.diffusion[field.region])[self.region[cells]]
+            for i, (value, slope) in enumerate(zip(values, gradient, strict=True)):
+                load[i] += self._integrate(basis, value, diffusion[:, i, None] * slope.T.reshape(points.shape))
+            power += float((values[0] * basis.dx).sum())
         return load, power
 
     def _near(self, cells: Index, centres: Array) -> NDArray[np.bool_]:
@@ -146,7 +173,7 @@ class System:
         return np.asarray(cKDTree(centres).query(middle.T)[0] < 2 * size)
 
     def _conjugate_gradients(self, load: Array) -> tuple[Array, int]:
-        """Solution of the linear system, shape (N,), with `_preconditioner`, and the number of iterations.
+        """Solution of the linear system, shape (m N,), with `_preconditioner`, and the number of iterations.
 
         SciPy's conjugate gradients take dot products by threaded BLAS, whose threads wait for each other on a busy
         machine: five times the time.
@@ -175,14 +202,22 @@ class System:
         """Inverse of the diagonal; for `repeated`, and the solution by linear elements added to it.
 
         A function that is linear in the cells has the mean of its ends at the middles of edges. With P that map,
-        P K₁⁻¹ Pᵀ, K₁ = PᵀKP, solves for all that is smooth, and the diagonal for the rest.
+        P K₁⁻¹ Pᵀ, K₁ = PᵀKP, solves for all that is smooth, and the diagonal for the rest. Only φ₁ has such a part:
+        φ₂ decays within a mean free path, and its matrix is close to one of masses.
         """
         jacobi = 1 / self.matrix.diagonal()
         if not self.repeated:
             return lambda residual: jacobi * residual
-        linear = self._from_linear()
-        solve = splu(csc_array(linear.T @ self.matrix @ linear), permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve
-        return lambda residual: jacobi * residual + linear @ solve(linear.T @ residual)
+        linear, count = self._from_linear(), self.basis.N
+        first = linear.T @ self.matrix[:count, :count] @ linear
+        solve = splu(csc_array(first), permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve
+
+        def precondition(residual: Array) -> Array:
+            result = jacobi * residual
+            result[:count] += linear @ solve(linear.T @ residual[:count])
+            return result
+
+        return precondition
 
     def _from_linear(self) -> Any:
         """(N, V) values at the nodes of functions that are linear in each cell, from those at its vertices."""
@@ -198,11 +233,52 @@ class System:
 
     @cached_property
     def matrix(self) -> Any:
-        """Sparse matrix (N, N) of the left side of the module's equation [mm]."""
+        """Sparse matrix (m N, m N) of the left side of the module's equation [mm], component after component."""
+        count = self.equations.components
+        blocks = [[None] * count for _ in range(count)]
+        for i in range(count):
+            for j in range(i, count):
+                blocks[i][j] = blocks[j][i] = self._block(i, j)
+        return csr_array(block_array(blocks, format="csr"))
+
+    def _block(self, i: int, j: int) -> Any:
+        """Part (N, N) of the matrix that takes component j to equation i; it is symmetric."""
         skfem = import_skfem()
-        volume = skfem.BilinearForm(lambda u, v, w: self.diffusion * (u.grad * v.grad).sum(axis=0) + self.mua * u * v)
-        surface = skfem.BilinearForm(lambda u, v, w: u * v / (2 * self.factor))
-        return volume.assemble(self.basis) + surface.assemble(self.border)
+        reaction, diffusion = self._reaction(i, j), self.equations.diffusion[self.region, i, None]
+        border = self.outward[i, j]
+        surface = skfem.BilinearForm(lambda u, v, w: border * u * v)
+        if i == j:
+            volume = skfem.BilinearForm(lambda u, v, w: diffusion * (u.grad * v.grad).sum(axis=0) + reaction * u * v)
+        else:
+            volume = skfem.BilinearForm(lambda u, v, w: reaction * u * v)
+        matrix = volume.assemble(self.basis) + surface.assemble(self.border)
+        return matrix + self._lateral_matrix if i == j == 0 and self.lateral.any() else matrix
+
+    @cached_property
+    def _lateral_matrix(self) -> Any:
+        """∮ τ ∇_t u·∇_t v dS, (N, N)."""
+        skfem = import_skfem()
+
+        def form(u: Any, v: Any, w: Any) -> Any:
+            across = (u.grad * w.n).sum(axis=0) * (v.grad * w.n).sum(axis=0)
+            return self.lateral * ((u.grad * v.grad).sum(axis=0) - across)
+
+        return skfem.BilinearForm(form).assemble(self.border)
+
+    @cached_property
+    def _over_border(self) -> Callable[[Array], Array]:
+        """From integrals ∮ f v dS of each test function, (N,), to f at the nodes of the border, (N,), 0 inside."""
+        skfem = import_skfem()
+        nodes = self.basis.get_dofs(self.basis.mesh.boundary_facets()).flatten()
+        mass = skfem.BilinearForm(lambda u, v, w: u * v).assemble(self.border)
+        solve = splu(csc_array(mass[nodes][:, nodes]), permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve
+
+        def divided(integrals: Array) -> Array:
+            values = np.zeros_like(integrals)
+            values[nodes] = solve(integrals[nodes])
+            return values
+
+        return divided
 
     @staticmethod
     def _integrate(basis: Any, value: Array, gradient: Array | None = None) -> Array:

@@ -19,8 +19,9 @@ from .composition import Absorbers, reduced_scattering
 from .cylinder_mesh import cylinder_tetrahedra
 from .diffusion import Progress, solve
 from .finite_elements import import_skfem
+from .light_models import DEFAULT, check_model
 from .mesher import read_tetrahedra
-from .solution import DiffusionSolution
+from .solution import TissueSolution
 from .tetrahedra import Tetrahedra
 from .toml_table import Table
 
@@ -79,7 +80,7 @@ class PhantomFile:
     `bands`: other optical coefficients, those in a band of wavelengths, by its name.
 
     `edge` of the tetrahedra, `surface_edge` of the surface's triangles and `voxel` [mm]; `order` 1 or 2 of the finite
-    elements; `a` name or value of the boundary factor.
+    elements; `model` of the light, "sp3" or "diffusion"; `a` name or value of the boundary factor of diffusion.
     """
 
     geometry: CylinderGeometry | MeshGeometry
@@ -92,6 +93,7 @@ class PhantomFile:
     surface_edge: float = 0.35
     voxel: float = 0.4
     bands: Mapping[str, Band] = field(default_factory=dict)
+    model: str = DEFAULT
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> PhantomFile:
@@ -118,7 +120,10 @@ class PhantomFile:
             output.number("edge", cls.surface_edge),
             output.number("voxel", cls.voxel),
             _bands(file.table("bands", {}), (medium, *(part.medium for part in regions))),
+            optical.text("model", cls.model),
         )
+        with named(optical.name):
+            check_model(result.model, result.a)
         boundary_a(result.a, medium.n)
         for table in (optical, mesh, output, file):
             table.done()
@@ -148,7 +153,7 @@ class PhantomFile:
             region[inside] = number
         return replace(mesh, region=region)
 
-    def solve(self, progress: Progress | None = None, band: str | None = None) -> DiffusionSolution:
+    def solve(self, progress: Progress | None = None, band: str | None = None) -> TissueSolution:
         """Solution for the phantom on its mesh, in a band or with the coefficients of no band; see `diffusion.solve`.
 
         In a band the sources have their share of the power.
@@ -158,7 +163,7 @@ class PhantomFile:
             progress("mesh")
         mesh = self.checked_mesh()
         sources = [replace(source, power=optics.share * source.power) for source in self.sources]
-        return solve(mesh, optics.media, sources, a=self.a, order=self.order, progress=progress)
+        return solve(mesh, optics.media, sources, model=self.model, a=self.a, order=self.order, progress=progress)
 
     def band(self, name: str | None) -> Band:
         """Band of this name; without a name, the coefficients of no band and all of the sources' power.

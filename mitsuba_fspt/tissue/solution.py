@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,13 @@ from numpy.typing import NDArray
 
 from ..optics.media import Medium
 from ..phantom.phantom import Phantom
-from ..phantom.surface_mesh import face_areas
+from ..phantom.surface_mesh import boundary, face_areas
 from ..runtime.errors import FluxError
 from .border_surface import nearest_points, refined_border
 from .finite_elements import Solved
 from .fluence_volume import Volume, voxel_box
-from .free_field import FreeField
+from .free_field import SourceField
+from .light_models import Equations
 from .tetrahedra import OUTSIDE, Tetrahedra, depth
 
 Array = NDArray[np.float64]
@@ -29,17 +31,18 @@ NEARBY = 0.5  # barycentric distance from a cell beyond which straight edges are
 
 
 @dataclass(frozen=True, eq=False)
-class DiffusionSolution:
+class TissueSolution:
     """Solution φ: sum of the free `fields` of the sources and the rest `solved.rest` in the `basis` on `mesh`.
 
-    `media` and boundary `factors` A: one per region of the mesh; `source_power` [W].
+    `media` and `equations` of the regions of the mesh; `curvature` of its border at the vertices; `source_power` [W].
     """
 
     mesh: Tetrahedra
     basis: Any
     media: tuple[Medium, ...]
-    factors: tuple[float, ...]
-    fields: tuple[FreeField, ...]
+    equations: Equations
+    curvature: Array
+    fields: tuple[SourceField, ...]
     source_power: float
     solved: Solved
 
@@ -67,19 +70,24 @@ class DiffusionSolution:
         }
 
     def fluence_at(self, points: Array, core: float = 0.0) -> Array:
-        """φ [W/mm²] at `points` (N, 3) [mm] in the tissue, shape (N,).
+        """Fluence [W/mm²] at `points` (N, 3) [mm] in the tissue, shape (N,).
 
         For points just outside, w is that of a nearby point of the border. Closer than `core` [mm] to a point source φ
         is set constant; with core 0 it is infinite at the source.
         """
         cells, local = self.places(points)
-        return self._fluence(points, cells, local, core)
+        return np.asarray(self.equations.source @ self._components(points, cells, local, core))
 
     def exitance_at(self, points: Array, places: tuple[Index, Array] | None = None) -> Array:
-        """J_n = φ/(2A) [W/mm²] at `points` (N, 3) [mm] of the border, shape (N,); `places` of them, where known."""
+        """J_n = -c_1 ∂φ_1/∂n by the boundary condition [W/mm²], φ/(2A) for diffusion, shape (N,).
+
+        points : (N, 3) [mm] of the border;  places : of them, where known
+        """
         cells, local = places or self.places(points)
-        factor = np.asarray(self.factors)[self.mesh.region[cells]]
-        return self._fluence(points, cells, local, 0.0) / (2 * factor)
+        outward = self._outward(cells, local, self._components(points, cells, local, 0.0))[0]
+        if not self.equations.lateral.any():
+            return outward
+        return outward + self._interpolated(self.solved.lateral, cells, local)
 
     def phantom(self, edge: float) -> Phantom:
         """Border as a phantom with J_n on its vertices; triangle edges are about `edge` [mm] > 0 or shorter.
@@ -109,8 +117,8 @@ class DiffusionSolution:
         clipped = np.maximum(exitance, 0)
         scale = self.solved.exited / float(areas @ clipped[faces].mean(axis=1))
         provenance = {
-            "source": "diffusion equation by finite elements",
-            "boundary_factor": " ".join(f"{factor:.6g}" for factor in self.factors),
+            "source": f"{self.equations.title} by finite elements",
+            "boundary": "; ".join(" ".join(f"{h:.6g}" for h in border[0]) for border in self.equations.border),
             "media": "; ".join(f"mua {m.mua:g}/mm, musp {m.musp:g}/mm, n {m.n:g}" for m in self.media),
             "source_power": f"{self.source_power!r} W",
             "scale": f"{scale!r}",
@@ -121,8 +129,8 @@ class DiffusionSolution:
     def volume(self, voxel: float) -> Volume:
         """φ [W/mm²] at the centres of cubes of edge `voxel` [mm], in a box wider than the tissue by a cube or more.
 
-        Outside, φ is continued from the nearest point of the border as exp(-distance/(2AD)), the slope of the
-        boundary condition, so that trilinear interpolation up to the surface meets no jump.
+        Outside, φ is continued from the nearest point of the border exponentially with the slope of the boundary
+        condition there, so that trilinear interpolation up to the surface meets no jump.
 
         Raises
         ------
@@ -138,7 +146,9 @@ class DiffusionSolution:
         inside = depth(local) > -OUTSIDE
         fluence = np.empty(len(points))
         # The mean of 1/r over a cube about its centre is 1/(0.42 edge): the value of a voxel with a point source.
-        fluence[inside] = self._fluence(points[inside], cells[inside], local[inside], 0.42 * voxel)
+        fluence[inside] = self.equations.source @ self._components(
+            points[inside], cells[inside], local[inside], 0.42 * voxel
+        )
         nearest = self._snap(nearest_points(points[~inside], border[faces]))
         fluence[~inside] = self._continued(points[~inside], nearest)
         return Volume(fluence.reshape(x.shape).astype(np.float32), low, high)
@@ -146,10 +156,26 @@ class DiffusionSolution:
     def _continued(self, points: Array, nearest: Array) -> Array:
         """φ [W/mm²] at `points` outside the tissue, from the `nearest` points of the border."""
         cells, local = self.places(nearest)
-        region = self.mesh.region[cells]
-        length = np.array([2 * a * m.diffusion for a, m in zip(self.factors, self.media, strict=True)])[region]
-        distance = np.linalg.norm(points - nearest, axis=1)
-        return self._fluence(nearest, cells, local, 0.0) * np.exp(-distance / length)
+        components = self._components(nearest, cells, local, 0.0)
+        fluence = self.equations.source @ components
+        slope = self.equations.source @ (
+            self._outward(cells, local, components) / self.equations.diffusion[self.mesh.region[cells]].T
+        )
+        rate = np.maximum(slope / np.where(fluence > 0, fluence, np.inf), 0)
+        return np.asarray(fluence * np.exp(-rate * np.linalg.norm(points - nearest, axis=1)))
+
+    def _outward(self, cells: Index, local: Array, components: Array) -> Array:
+        """H φ [W/mm²], the outward flux of each component, (m, N), from the components on the border."""
+        corners = self.mesh.cells[cells]
+        weights = np.column_stack([1 - local.sum(axis=1), local]) * self._on_border[corners]
+        weights /= weights.sum(axis=1, keepdims=True).clip(1e-300)
+        curvature = (weights * self.curvature[corners]).sum(axis=1)
+        return np.einsum("nij,jn->in", self.equations.border_at(self.mesh.region[cells], curvature), components)
+
+    @cached_property
+    def _on_border(self) -> NDArray[np.bool_]:
+        """True for the vertices of the mesh on its border, (V,)."""
+        return np.isin(np.arange(len(self.mesh.vertices)), boundary(self.mesh.vertices, self.mesh.cells)[0])
 
     def _border(self, edge: float) -> tuple[Array, Index]:
         """Vertices and faces of the border, with edges of about `edge` [mm] or less, on the true surface."""
@@ -160,11 +186,15 @@ class DiffusionSolution:
         """Points near the border, moved onto the true border if the mesh has a `snap`."""
         return points if self.mesh.snap is None else self.mesh.snap(points)
 
-    def _fluence(self, points: Array, cells: Index, local: Array, core: float) -> Array:
-        """φ [W/mm²] at `points` with known cells and local coordinates; `core` as in `fluence_at`."""
+    def _components(self, points: Array, cells: Index, local: Array, core: float) -> Array:
+        """φ_i [W/mm²], (m, N), at `points` with known cells and local coordinates; `core` as in `fluence_at`."""
+        rest = self._interpolated(self.solved.rest, cells, local)
+        return np.asarray(rest + sum(field.components(points, core) for field in self.fields))
+
+    def _interpolated(self, nodes: Array, cells: Index, local: Array) -> Array:
+        """Values (…, n) at points in cells of a function with values (…, N) at the nodes."""
         dofs = self.basis.element_dofs[:, cells]
-        rest = sum(self.solved.rest[dof] * shape for dof, shape in zip(dofs, self._shapes(local), strict=True))
-        return np.asarray(rest + sum(field.fluence(points, core) for field in self.fields))
+        return np.asarray(sum(nodes[..., dof] * shape for dof, shape in zip(dofs, self._shapes(local), strict=True)))
 
     def _shapes(self, local: Array) -> list[Array]:
         """Basis functions of a cell at local coordinates (N, 3), each of shape (N,)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +14,17 @@ from mitsuba_fspt.optics.boundary import robin_a
 from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Cylinder, Sphere
 from mitsuba_fspt.runtime.errors import FluxError
-from mitsuba_fspt.tissue import finite_elements
+from mitsuba_fspt.tissue import diffusion, finite_elements
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
-from mitsuba_fspt.tissue.diffusion import solve
 from mitsuba_fspt.tissue.free_field import FreeField
-from mitsuba_fspt.tissue.solution import DiffusionSolution
+from mitsuba_fspt.tissue.solution import TissueSolution
 from mitsuba_fspt.tissue.tetrahedra import Tetrahedra, depth
 
 skfem = pytest.importorskip("skfem")
 
 Array = NDArray[np.float64]
 NYLON = Medium(0.0138, 0.91, 1.37)
+solve = partial(diffusion.solve, model="diffusion")
 POINT = Source(Sphere((8.0, 0.0, 0.0)))
 
 
@@ -44,7 +45,7 @@ def circle(radius: float, cosine: Array) -> Array:
 
 
 @pytest.fixture(scope="module")
-def nylon() -> DiffusionSolution:
+def nylon() -> TissueSolution:
     """The cylinder R 15, H 30 with a point source 8 mm off the axis at mid height, on a coarse mesh."""
     return solve(cylinder_tetrahedra(15, 30, 3), [NYLON], [POINT])
 
@@ -141,7 +142,7 @@ def test_independent_monte_carlo(n: float, exit_fraction: float, peak: float) ->
     assert -0.022 < other.solved.exited / exit_fraction - 1 < -0.016
 
 
-def test_power_balance(nylon: DiffusionSolution) -> None:
+def test_power_balance(nylon: TissueSolution) -> None:
     """Rationale: absorbed + exited = source to 1e-5, and absorbed is what ∫ µa φ dV by another rule says.
 
     The other rule: Gauss points in spherical coordinates about the source, so that r² takes 1/r away. Seen to
@@ -166,7 +167,7 @@ def test_power_balance(nylon: DiffusionSolution) -> None:
     assert NYLON.mua * (ray @ solid_angle) == pytest.approx(nylon.solved.absorbed, rel=1e-3)
 
 
-def test_linear_in_the_sources(nylon: DiffusionSolution) -> None:
+def test_linear_in_the_sources(nylon: TissueSolution) -> None:
     """Rationale: two sources give the sum of what each gives alone; power counts once."""
     second = Source(Sphere((-3.0, 5.0, 4.0), 1.5), 3.0)
     both = solve(nylon.mesh, [NYLON], [POINT, second])
@@ -178,7 +179,7 @@ def test_linear_in_the_sources(nylon: DiffusionSolution) -> None:
     assert both.solved.exited == pytest.approx(nylon.solved.exited + alone.solved.exited, rel=1e-9)
 
 
-def test_regions_of_the_same_optics_change_nothing(nylon: DiffusionSolution) -> None:
+def test_regions_of_the_same_optics_change_nothing(nylon: TissueSolution) -> None:
     """Rationale: a label alone is no border; a darker sphere takes light away."""
     inside = nylon.mesh.inside(Sphere((-4.0, 0.0, 0.0), 5))
     assert 0 < inside.sum() < len(inside)
@@ -242,7 +243,7 @@ def test_cylinder_nodes_are_uniform() -> None:
     assert np.ptp(Cylinder((0.0, 0.0, 0.0), 4).nodes(1).centres[:, :2]) == 0
 
 
-def test_surface_of_the_paper(nylon: DiffusionSolution, tmp_path: Path) -> None:
+def test_surface_of_the_paper(nylon: TissueSolution, tmp_path: Path) -> None:
     """Rationale: what a camera gets: 40,000 vertices on the true cylinder, closed, with the finite elements' power.
 
     Expected behaviour: one scale factor, within 2e-4 of 1; the file below 4 MB.
@@ -279,7 +280,7 @@ def test_no_imprint_of_the_mesh(order: int) -> None:
         assert np.ptp(values) / values.mean() < (0.01 if order == 1 else 0.002)
 
 
-def test_report(nylon: DiffusionSolution) -> None:
+def test_report(nylon: TissueSolution) -> None:
     """The report's numbers fit each other."""
     report = nylon.report()
     assert report["nodes"] == 6951
@@ -291,7 +292,7 @@ def test_report(nylon: DiffusionSolution) -> None:
     assert stages == ["assemble", "solve"]
 
 
-def test_locate_finds_the_cell(nylon: DiffusionSolution) -> None:
+def test_locate_finds_the_cell(nylon: TissueSolution) -> None:
     """Rationale: points made inside known cells are found there; points outside are separated."""
     mesh = nylon.mesh
     rng = np.random.default_rng(1)

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import struct
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import mitsuba_fspt  # noqa: F401  (before Dr.Jit)
+from mitsuba_fspt.optics.boundary import robin_a
 from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Sphere
 from mitsuba_fspt.runtime.errors import FluxError
+from mitsuba_fspt.tissue import diffusion
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
-from mitsuba_fspt.tissue.diffusion import solve
 from mitsuba_fspt.tissue.fluence_volume import Volume, voxel_box
-from mitsuba_fspt.tissue.solution import DiffusionSolution
+from mitsuba_fspt.tissue.solution import TissueSolution
 
 pytest.importorskip("skfem")
 NYLON = Medium(0.0138, 0.91, 1.37)
+solve = partial(diffusion.solve, model="diffusion")
 
 
 @pytest.fixture(scope="module")
-def nylon() -> DiffusionSolution:
+def nylon() -> TissueSolution:
     return solve(cylinder_tetrahedra(15, 30, 3), [NYLON], [Source(Sphere((8.0, 0.0, 0.0)))])
 
 
 @pytest.fixture(scope="module")
-def volume(nylon: DiffusionSolution) -> Volume:
+def volume(nylon: TissueSolution) -> Volume:
     return nylon.volume(0.6)
 
 
@@ -49,7 +52,7 @@ def test_file_layout(tmp_path: Path) -> None:
     assert np.frombuffer(content[48:], "<f4").tolist() == list(range(24))
 
 
-def test_voxels_contain_the_fluence(nylon: DiffusionSolution, volume: Volume) -> None:
+def test_voxels_contain_the_fluence(nylon: TissueSolution, volume: Volume) -> None:
     """Rationale: every voxel whose middle is in the true cylinder has the fluence there, to float32."""
     z, y, x = np.meshgrid(*centres(volume), indexing="ij")
     inside = (np.hypot(x, y) < 15) & (np.abs(z) < 15)
@@ -60,7 +63,7 @@ def test_voxels_contain_the_fluence(nylon: DiffusionSolution, volume: Volume) ->
     assert np.isfinite(volume.values).all()
 
 
-def test_continuation_outside(nylon: DiffusionSolution, volume: Volume) -> None:
+def test_continuation_outside(nylon: TissueSolution, volume: Volume) -> None:
     """Rationale: beyond the border φ goes on as exp(-distance/(2AD)): the boundary condition's slope, positive.
 
     Seen to fail with the distance left out and with A for 2A.
@@ -69,7 +72,7 @@ def test_continuation_outside(nylon: DiffusionSolution, volume: Volume) -> None:
     across = np.hypot(x, y)
     beside = (across > 15) & (np.abs(z) < 14)
     border = np.column_stack([x * 15 / across, y * 15 / across, z])[beside]
-    length = 2 * nylon.factors[0] * NYLON.diffusion
+    length = 2 * robin_a(NYLON.n) * NYLON.diffusion
     expected = nylon.fluence_at(border) * np.exp(-(across[beside] - 15) / length)
     # The nearest point is sought on flat triangles of 0.6 mm and so up to 0.02 mm beside the true one, along a slope
     # of 0.5/mm.
@@ -77,7 +80,7 @@ def test_continuation_outside(nylon: DiffusionSolution, volume: Volume) -> None:
     assert volume.values.min() > 0
 
 
-def test_mitsuba_reads_it(nylon: DiffusionSolution, volume: Volume, tmp_path: Path) -> None:
+def test_mitsuba_reads_it(nylon: TissueSolution, volume: Volume, tmp_path: Path) -> None:
     """Rationale: Mitsuba's gridvolume gives the fluence back where it is asked, up to the border itself.
 
     Expected behaviour: trilinear interpolation on voxels of 0.6 mm is within 1 % rms; x, y and z are not exchanged
@@ -115,7 +118,7 @@ def test_box() -> None:
 
 @pytest.mark.parametrize(("voxel", "message"), [(0.0, "'voxel' must be > 0"), (1e-3, "Give larger ones")])
 def test_too_many_voxels_are_refused_before_the_border_is_cut(
-    nylon: DiffusionSolution, monkeypatch: pytest.MonkeyPatch, voxel: float, message: str
+    nylon: TissueSolution, monkeypatch: pytest.MonkeyPatch, voxel: float, message: str
 ) -> None:
     monkeypatch.setattr("mitsuba_fspt.tissue.solution.refined_border", None)
     with pytest.raises(FluxError, match=message):

@@ -91,7 +91,7 @@ def test_the_documented_example(tmp_path: Path) -> None:
 
 def test_every_key_of_a_phantom_file(tmp_path: Path) -> None:
     """Every kind of source and region, and all that has a default."""
-    text = SMALL.replace("musp = 1", 'musp = 1\nn = 1.4\na = "haskell"') + (
+    text = SMALL.replace("musp = 1", 'musp = 1\nn = 1.4\nmodel = "diffusion"\na = "haskell"') + (
         '[[sources]]\nshape = "sphere"\ncentre = [0, 0.5, 1]\nradius = 0.5\n'
         '[[sources]]\nshape = "cylinder"\ncentre = [0, 0, 0]\nradius = 0\nlength = 2\naxis = [0, 1, 0]\npower = 3\n'
         '[[regions]]\nshape = "sphere"\ncentre = [-2, 0, 0]\nradius = 2\nmua = 0.1\nmusp = 2\n'
@@ -99,7 +99,7 @@ def test_every_key_of_a_phantom_file(tmp_path: Path) -> None:
     )
     phantom = described(tmp_path, text)
     assert phantom.medium == Medium(0.05, 1, 1.4)
-    assert phantom.a == "haskell"
+    assert (phantom.model, phantom.a) == ("diffusion", "haskell")
     assert phantom.sources == (
         Source(Sphere((1, 0, -1)), 2.5),
         Source(Sphere((0, 0.5, 1), 0.5), 1),
@@ -125,7 +125,17 @@ def test_every_key_of_a_phantom_file(tmp_path: Path) -> None:
         ("radius = 6", "raduis = 6\nradius = 6", r"\[geometry\]: 'raduis' means nothing here"),
         ('shape = "cylinder"', 'shape = "cube"', "'shape' must be one of cylinder, got 'cube'"),
         ("mua = 0.05", "mua = -1", "'mua' must be >= 0"),
-        ("musp = 1", "musp = 1\na = 'exact'", "'a' must be robin, haskell or a number > 0, got 'exact'"),
+        (
+            "musp = 1",
+            "musp = 1\nmodel = 'diffusion'\na = 'exact'",
+            "'a' must be robin, haskell or a number > 0, got 'exact'",
+        ),
+        (
+            "musp = 1",
+            "musp = 1\na = 2.5",
+            r"\[optical\]: 'a' is of the diffusion equation, got 2.5 beside the model sp3",
+        ),
+        ("musp = 1", "musp = 1\nmodel = 'p3'", r"\[optical\]: 'model' must be one of sp3, diffusion, got 'p3'"),
         ("[mesh]", "[mesh]\norder = 2.0", "'order' must be a whole number"),
         ("[mesh]", "[mesh]\norder = 3", "'order' must be 1 or 2, got 3"),
         ("centre = [1, 0, -1]", "centre = [1, 0]", r"\[\[sources\]\] number 1: 'centre' must be three numbers"),

@@ -1,0 +1,307 @@
+"""SP3 and the diffusion equation against photons one by one: exit power of spheres and cylinders, in all and by bins.
+
+    python scripts/tissue_models.py [--photons 8e6] [--edge 1.5] [--page docs/emission.md] [-o docs/tissue_models.csv]
+    python scripts/tissue_models.py --border [--photons 3e6]
+
+Lengths of the phantoms are in mean free paths of µs' = 1/mm. Each line is one phantom: body, depth of the source's
+surface, µa, n. Columns: standard error of the total by photons [%], and for both models deviation of the total, of the
+brightest bin, and largest deviation of a bin beyond twice its standard error, over the bins whose standard error is
+below 1 % [%]. Bins of a sphere are rings of 12° about the axis of the source; of a cylinder, seven sectors by three
+heights of its side, and two halves of its caps.
+
+`--border` prints the two numbers of an index that Eq. M.48 takes from photons: β, the fall of the extrapolation length
+with the curvature of the border, from spheres with a source in the middle, as the length with which the SP3 equations
+give the photons' exit power; and δ, its fall with the wave number along the border, from a sphere of 15 mean free paths
+with a source 3 or 4 below the surface, by least squares of J_n.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import tests_folder  # noqa: F401
+from closed_forms import coupled_ball_exitance
+from csv_table import write_rows
+from numpy.typing import NDArray
+from paper_common import Table, fill
+from scipy.optimize import brentq, minimize_scalar
+
+from mitsuba_fspt.optics.media import Medium, Source
+from mitsuba_fspt.optics.shapes import Sphere
+from mitsuba_fspt.optics.sp3_boundary import extrapolation_length, sp3_boundary
+from mitsuba_fspt.runtime import backend
+from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
+from mitsuba_fspt.tissue.diffusion import solve
+from mitsuba_fspt.tissue.finite_elements import import_skfem
+from mitsuba_fspt.tissue.light_models import MODELS, equations
+from mitsuba_fspt.tissue.tetrahedra import Tetrahedra
+
+backend.ensure_variant()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+from photon_walk import BATCHES, Body, Emitter, Optics, exit_power  # noqa: E402
+
+Array = NDArray[np.float64]
+ROOT = Path(__file__).resolve().parent.parent
+RING = math.pi / 15  # of the bins of a sphere
+SECTORS = np.radians([0, 12, 25, 45, 70, 100, 140, 180])
+HEIGHTS = np.array([0, 0.15, 0.4, 1.0])  # bounds of |z| over half the height
+RULE = 6  # Gauss' nodes a bin and direction
+KNOWN = 0.01  # largest relative standard error of a bin that counts
+
+
+@dataclass(frozen=True)
+class Case:
+    """A phantom: body, depth of the source [mm], µa, n; radius of the source, and g of the phase function."""
+
+    body: Body
+    depth: float
+    mua: float
+    n: float
+    ball: float = 0.0
+    g: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Body and what is special."""
+        r, h = self.body.radius, self.body.height
+        name = f"cylinder {r:g} × {h:g}" if h else f"sphere {r:g}"
+        name += f", source of radius {self.ball:g}" if self.ball else ""
+        return name + (f", g = {self.g:g}" if self.g else "")
+
+    @property
+    def centre(self) -> tuple[float, float, float]:
+        """Of the source: on the z axis of a sphere, on the x axis of a cylinder."""
+        at = self.body.radius - self.depth - self.ball
+        return (at, 0.0, 0.0) if self.body.height else (0.0, 0.0, at)
+
+
+LARGE, SMALL, THIN = Body(15), Body(8), Body(10, 30)
+CASES = (
+    Case(LARGE, 3, 0.005, 1.37),
+    Case(LARGE, 3, 0.03, 1.37),
+    Case(LARGE, 3, 0.1, 1.37),
+    Case(LARGE, 3, 0.03, 1.33),
+    Case(LARGE, 3, 0.03, 1.5),
+    Case(LARGE, 6, 0.005, 1.5),
+    Case(LARGE, 6, 0.03, 1.37),
+    Case(LARGE, 6, 0.1, 1.33),
+    Case(LARGE, 3, 0.03, 1.37, ball=2),
+    Case(LARGE, 4, 0.03, 1.37, g=0.9),
+    Case(SMALL, 3, 0.03, 1.37),
+    Case(SMALL, 5, 0.1, 1.5),
+    Case(THIN, 3, 0.005, 1.37),
+    Case(THIN, 3, 0.03, 1.5),
+    Case(THIN, 4, 0.09, 1.37),
+    Case(THIN, 6, 0.03, 1.37),
+    Case(THIN, 6, 0.1, 1.5),
+    Case(Body(15, 30), 7, 0.0138, 1.37),
+)
+
+
+def ball(radius: float, edge: float) -> Tetrahedra:
+    """Tetrahedra of a sphere with edges of about `edge` [mm] or less."""
+    skfem = import_skfem()
+    for refinements in range(1, 7):
+        grid = skfem.MeshTet1.init_ball(refinements)
+        mesh = Tetrahedra(
+            radius * grid.p.T,
+            grid.t.T,
+            snap=lambda points: points * (radius / np.linalg.norm(points, axis=1, keepdims=True)),
+        )
+        if mesh.edge < 1.2 * edge:
+            break
+    return mesh
+
+
+# ---------------------------------------------------------------------- bins of the surface
+
+
+def bins(body: Body) -> tuple[Callable[[mi.Point3f], mi.UInt32], list[tuple[Array, Array]]]:
+    """Function from points to numbers of bins for the photons, and points (k, 3) and areas (k,) of each bin's nodes."""
+    if not body.height:
+        polar = np.linspace(0, math.pi, round(math.pi / RING) + 1)
+        return _ring, [_on_sphere(body.radius, *ends) for ends in pairwise(polar)]
+    sides = [_on_side(body, sector, height) for sector in pairwise(SECTORS) for height in pairwise(HEIGHTS)]
+    return lambda p: _sector(body, p), [*sides, _on_cap(body, 0), _on_cap(body, math.pi / 2)]
+
+
+def _ring(p: mi.Point3f) -> mi.UInt32:
+    angle = dr.acos(dr.clip(p.z / dr.norm(p), -1, 1))
+    return dr.minimum(mi.UInt32(angle / RING), round(math.pi / RING) - 1)
+
+
+def _sector(body: Body, p: mi.Point3f) -> mi.UInt32:
+    angle, height = dr.abs(dr.atan2(p.y, p.x)), dr.abs(p.z) / (body.height / 2)
+    sector = sum((dr.select(angle >= bound, mi.UInt32(1), mi.UInt32(0)) for bound in SECTORS[1:-1]), mi.UInt32(0))
+    row = sum((dr.select(height >= bound, mi.UInt32(1), mi.UInt32(0)) for bound in HEIGHTS[1:-1]), mi.UInt32(0))
+    side = sector * (len(HEIGHTS) - 1) + row
+    first_cap = (len(SECTORS) - 1) * (len(HEIGHTS) - 1)
+    cap = dr.select(p.x > 0, mi.UInt32(first_cap), mi.UInt32(first_cap + 1))
+    return dr.select(height > 1 - 1e-5, cap, side)
+
+
+def _nodes(low: float, high: float) -> tuple[Array, Array]:
+    x, weight = np.polynomial.legendre.leggauss(RULE)
+    return (low + high) / 2 + (high - low) / 2 * x, (high - low) / 2 * weight
+
+
+def _on_sphere(radius: float, low: float, high: float) -> tuple[Array, Array]:
+    cosine, weight = _nodes(math.cos(high), math.cos(low))
+    turn = 2 * math.pi * np.arange(12) / 12
+    u, t = (grid.ravel() for grid in np.meshgrid(cosine, turn, indexing="ij"))
+    sine = np.sqrt(1 - u**2)
+    points = radius * np.column_stack([sine * np.cos(t), sine * np.sin(t), u])
+    return points, np.repeat(weight, 12) * (2 * math.pi / 12 * radius**2)
+
+
+def _on_side(body: Body, sector: tuple[float, float], height: tuple[float, float]) -> tuple[Array, Array]:
+    (t, wt), (z, wz) = _nodes(*sector), _nodes(*(body.height / 2 * np.array(height)))
+    turn, up = (grid.ravel() for grid in np.meshgrid(t, z, indexing="ij"))
+    points = np.column_stack([body.radius * np.cos(turn), body.radius * np.sin(turn), up])
+    return points, 4 * body.radius * np.outer(wt, wz).ravel()  # mirror images in y and z
+
+
+def _on_cap(body: Body, first: float) -> tuple[Array, Array]:
+    (r2, wr), (t, wt) = _nodes(0, 1), _nodes(first, first + math.pi / 2)
+    square, turn = (grid.ravel() for grid in np.meshgrid(r2, t, indexing="ij"))
+    r = body.radius * np.sqrt(square)
+    points = np.column_stack([r * np.cos(turn), r * np.sin(turn), np.full(len(r), body.height / 2)])
+    return points, 4 * body.radius**2 / 2 * np.outer(wr, wt).ravel()
+
+
+# ---------------------------------------------------------------------- comparison
+
+
+def solved(case: Case, model: str, edge: float, places: Sequence[tuple[Array, Array]]) -> tuple[float, Array, float]:
+    """Exit power in all and by bins of 1 W under a model, and CPU seconds."""
+    body, start = case.body, time.process_time()
+    mesh = cylinder_tetrahedra(body.radius, body.height, edge) if body.height else ball(body.radius, edge)
+    medium = Medium(case.mua, 1.0, case.n)
+    solution = solve(mesh, [medium], [Source(Sphere(case.centre, case.ball))], model=model)
+    values = np.array([areas @ solution.exitance_at(points) for points, areas in places])
+    return solution.solved.exited, values, time.process_time() - start
+
+
+def row(case: Case, photons: int, edge: float) -> dict[str, object]:
+    """A line of the table."""
+    bin_of, places = bins(case.body)
+    optics = Optics(case.mua, 1.0, case.n, case.g)
+    batches = exit_power(case.body, optics, Emitter(case.centre, case.ball), bin_of, len(places), photons)
+    power, error = batches.mean(axis=0), batches.std(axis=0, ddof=1) / math.sqrt(BATCHES)
+    total, total_error = batches.sum(axis=1).mean(), batches.sum(axis=1).std(ddof=1) / math.sqrt(BATCHES)
+    area = np.array([areas.sum() for _, areas in places])
+    known = np.flatnonzero(error < KNOWN * power)
+    brightest = known[np.argmax(power[known] / area[known])]
+    line: dict[str, object] = {"phantom": case.name, "depth": case.depth, "mua": case.mua, "n": case.n}
+    line |= {"photons": photons, "bins": len(known)}
+    line["error"] = 100 * total_error / total
+    for model in MODELS:
+        exited, values, seconds = solved(case, model, edge, places)
+        deviation = values / power - 1
+        beyond = np.maximum(np.abs(deviation) - 2 * error / power, 0) * np.sign(deviation)
+        line[f"{model}_total"] = 100 * (exited / total - 1)
+        line[f"{model}_peak"] = 100 * deviation[brightest]
+        line[f"{model}_bin"] = 100 * beyond[known[np.argmax(np.abs(beyond[known]))]]
+        line[f"{model}_rms"] = 100 * math.sqrt(np.average(deviation[known] ** 2, weights=power[known]))
+        line[f"{model}_seconds"] = seconds
+    return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in line.items()}
+
+
+def page_table(rows: Sequence[dict[str, object]]) -> Table:
+    """The table of the page."""
+    columns = {"phantom": "", "depth": "g", "µa": "g", "n": "g", "± total": ".2f"}
+    columns |= {f"{model}, {what}": "+.1f" for model in MODELS for what in ("total", "peak", "bins")}
+    keys = ["phantom", "depth", "mua", "n", "error"]
+    keys += [f"{model}_{what}" for model in MODELS for what in ("total", "peak", "bin")]
+    return Table("tissue-models", columns, [[line[key] for key in keys] for line in rows])
+
+
+def print_border(photons: int) -> None:
+    """Print β by n and radius with its standard error, and δ by n and depth with the rms of J_n without and with it."""
+    for n in (1.0, 1.1, 1.2, 1.33, 1.4, 1.5, 1.7):
+        for radius, mua in ((6.0, 0.02), (12.0, 0.02), (24.0, 0.006)):
+            value, error = curvature_of(n, radius, mua, photons)
+            print(f"n {n:g}  R {radius:g}  beta {value:.3f} ± {error:.3f}", flush=True)
+        for depth, mua in ((3.0, 0.03), (4.0, 0.005)):
+            value, before, after = lateral_of(n, depth, mua, photons)
+            print(f"n {n:g}  depth {depth:g}  delta {value:.3f}  rms {before:.4f} to {after:.4f}", flush=True)
+
+
+def curvature_of(n: float, radius: float, mua: float, photons: int) -> tuple[float, float]:
+    """β by a sphere with a source in its middle, and its standard error."""
+    batches = exit_power(Body(radius), Optics(mua, 1.0, n), Emitter((0, 0, 0)), lambda p: mi.UInt32(0), 1, photons)
+    power, error = batches.mean(), batches.std(ddof=1) / math.sqrt(BATCHES)
+    flat, scale = extrapolation_length(n), radius * (1 + mua)
+
+    def exited(length: float) -> float:
+        border = sp3_boundary(n).copy()
+        border[0, 0] += (1 / length - 1 / flat) / 3
+        found = equations("sp3", [Medium(mua, 1.0, n)])
+        optics = found.diffusion[0], found.reaction[0], found.source
+        central = coupled_ball_exitance(radius, 0.0, *optics, border, 0.0, np.zeros(1), orders=1)[0]
+        return float(4 * math.pi * radius**2 * central)
+
+    length = brentq(lambda z: exited(z) / power - 1, 0.2 * flat, 1.5 * flat)
+    slope = (exited(1.01 * flat) / exited(flat) - 1) / (0.01 * flat)
+    return (flat - length) * scale, error / power / abs(slope) * scale
+
+
+def lateral_of(n: float, depth: float, mua: float, photons: int) -> tuple[float, float, float]:
+    """δ by a sphere with a source near the surface, and the rms of J_n over that of J_n, without it and with it."""
+    radius, count = 15.0, 180
+    batches = exit_power(
+        Body(radius),
+        Optics(mua, 1.0, n),
+        Emitter((0, 0, radius - depth)),
+        lambda p: dr.minimum(mi.UInt32(dr.acos(dr.clip(p.z / dr.norm(p), -1, 1)) * (count / math.pi)), count - 1),
+        count,
+        photons,
+    )
+    bounds = np.cos(np.linspace(0, math.pi, count + 1))
+    area, cosine = 2 * math.pi * radius**2 * (bounds[:-1] - bounds[1:]), (bounds[:-1] + bounds[1:]) / 2
+    exitance = batches.mean(axis=0) / area
+    found = equations("sp3", [Medium(mua, 1.0, n)])
+    border = found.border_at(np.zeros(1, dtype=np.int64), np.array([1 / radius]))[0]
+    optics = found.diffusion[0], found.reaction[0], found.source
+    unit = 1 / (3 * extrapolation_length(n) ** 2 * (1 + mua) ** 2)
+
+    def rms(value: float) -> float:
+        solved = coupled_ball_exitance(radius, radius - depth, *optics, border, value * unit, cosine, orders=50)
+        return math.sqrt((area @ (solved - exitance) ** 2) / (area @ exitance**2))
+
+    best = minimize_scalar(rms, bounds=(-0.5, 6), method="bounded")
+    return float(best.x), rms(0.0), float(best.fun)
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--photons", type=float, default=8e6, help="of each phantom")
+    options.add_argument("--edge", type=float, default=1.5, help="of the tetrahedra [mm]")
+    options.add_argument("--page", type=Path, default=ROOT / "docs" / "emission.md", help="page with the table")
+    options.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "tissue_models.csv")
+    options.add_argument("--border", action="store_true", help="print β and δ, and end")
+    given = options.parse_args()
+    photons = int(given.photons) // BATCHES * BATCHES
+    if given.border:
+        print_border(photons)
+        return
+    rows = []
+    for case in CASES:
+        rows.append(row(case, photons, given.edge))
+        print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
+    write_rows(given.output, rows)
+    if given.page.exists():
+        fill(given.page, [page_table(rows)])
+
+
+if __name__ == "__main__":
+    main()
