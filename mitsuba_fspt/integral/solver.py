@@ -39,7 +39,7 @@ from .tiles import Mosaic
 LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
 NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
 UNCERTAINTY = 2.0  # largest ratio of that light and its estimate
-PLAIN = 0.8  # of rtol: tolerance of the light by plain courses (`Specular.part`); the rest is that of all others
+PLAIN = 0.7  # of rtol: tolerance of the light by plain courses (`Specular.part`); the rest is that of all others
 OTHERS = 4  # largest number of lines of sight of a pixel over that for all other courses
 FAINTER = 0.1  # least weight of these over that of plain ones
 

@@ -138,7 +138,7 @@ def follow(
         found.lost += lost
         if not branches:
             return best, foremost & on, found, alive & on, pending, stack
-        for other in others:
+        for other in others if specular.part != "plain" else [_straight(others)]:
             push, lost = followed(number, other)
             found.lost += lost
             stack.write(other, pending, push)
@@ -288,6 +288,14 @@ def _strongest_first(courses: list[Course]) -> tuple[Course, list[Course]]:
         others.append(dr.select(stronger, best, course))
         best = dr.select(stronger, course, best)
     return best, others
+
+
+def _straight(courses: list[Course]) -> Course:
+    """Of some courses with one more lobe each the one that leads straight on; any of them if there is none."""
+    found = courses[0]
+    for course in courses[1:]:
+        found = dr.select(course.plain > 0, course, found)
+    return found
 
 
 def _leads_to_light(specular: Specular, number: mi.UInt32, course: Course) -> mi.Bool:

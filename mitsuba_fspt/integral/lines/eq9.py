@@ -175,8 +175,9 @@ class View:
         """Exit law's radiance [W/mm²/sr] where a ray ends, by record on any shape and with any law."""
         if self.faces:
             return self.faces.radiance(pi, ray.d)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
-        return scalar(si.emitter(self.scene).eval(si))
+        glows = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active=glows)
+        return dr.select(glows, scalar(si.emitter(self.scene, glows).eval(si, glows)), 0)
 
 
 def most_radiance(scene: mi.Scene) -> float:

@@ -8,10 +8,12 @@ unbiased estimates, and their scatter gives the error for any integrand. The poi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...jit.batches import batches
 from ...jit.loops import repeat
@@ -20,7 +22,9 @@ from ..quadrature import Quadrature
 from .draft import Draft
 
 if TYPE_CHECKING:
-    from ...jit.pixel_grid import PixelArray
+    from collections.abc import Callable
+
+    from ...jit.pixel_grid import Mask, PixelArray
 
 # Generating vector for x and y of pixel and pupil: of a million random ones with no two-dimensional projection whose
 # dual vector is below 0.45 of the longest one possible, that of the least error P₂ (Sloan and Joe 1994) over 2¹⁰ … 2¹⁸
@@ -28,6 +32,7 @@ if TYPE_CHECKING:
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
+LEGS = 8  # lines of sight that one through or off specular surfaces counts as, unless `max_nodes` is given
 # Lines of sight that all pixels together may take in any case unless `max_nodes` is given: few pixels cost little.
 TOGETHER = 1 << 24
 
@@ -39,15 +44,17 @@ def refine_by_lattices(draft: Draft) -> None:
     pixels that another solution gives, times the brightest surface.
     """
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
-    if _most_points(draft.quadrature, 1) < FIRST or not dr.any(above):
-        return
     deadline, tolerance = draft.progress.deadline, draft.tolerance
+    most_points = partial(_most_points, draft.quadrature, LEGS if draft.view.specular else 1)
+    if most_points(1) < FIRST or not dr.any(above):
+        return
+    above = _largest_errors(draft, above, most_points)
     brightest = dr.select(
         draft.computed, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
     )
     means, points = Means.none(draft.grid.pixels(above)), 0
     while not deadline.passed():
-        more = min(GROWTH * points or FIRST, _most_points(draft.quadrature, dr.width(means.pixels)))
+        more = min(GROWTH * points or FIRST, most_points(dr.width(means.pixels)))
         if more <= points:
             break
         means, points = means.refined(draft, points, more), more
@@ -70,11 +77,20 @@ def refine_by_lattices(draft: Draft) -> None:
         means = means.of(left)
 
 
-def _most_points(quadrature: Quadrature, pixels: int) -> int:
-    """Points of the largest lattice on so many pixels, a power of two."""
+def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]) -> Mask:
+    """The marked pixels, or as many of them as may take the first lattice: those of the largest errors."""
+    error = dr.select(above, draft.error, 0).numpy()
+    count = int(np.count_nonzero(error))
+    while most_points(count) < FIRST:
+        count //= 2
+    return above & (draft.error >= dr.opaque(mi.Float64, np.partition(error, -count)[-count]))
+
+
+def _most_points(quadrature: Quadrature, legs: int, pixels: int) -> int:
+    """Points of the largest lattice on so many pixels, a power of two, of lines of sight that count as so many."""
     lines = quadrature.most_nodes
     if quadrature.max_nodes is None:
-        lines = max(lines, TOGETHER // pixels)
+        lines = max(lines, TOGETHER // pixels) // legs
     return min(1 << (lines // SHIFTS).bit_length() >> 1, MOST)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,18 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.integral.lines.eq9 import View
 from mitsuba_fspt.integral.lines.visible_window import visible_window
 from mitsuba_fspt.integral.pupil.draft import Draft
-from mitsuba_fspt.integral.pupil.lattices import FIRST, GROWTH, MOST, VECTOR, Means
+from mitsuba_fspt.integral.pupil.lattices import (
+    FIRST,
+    GROWTH,
+    LEGS,
+    MOST,
+    SHIFTS,
+    TOGETHER,
+    VECTOR,
+    Means,
+    _largest_errors,
+    _most_points,
+)
 from mitsuba_fspt.integral.quadrature import Quadrature
 
 RADIUS = 4.3  # mm, of the disk
@@ -113,3 +125,26 @@ def test_every_size_of_lattice_is_even():
             lengths = np.hypot(h, other)[h != 0]
             assert lengths.min() > 0.45 * math.sqrt(points * 2 / math.sqrt(3))
         points *= GROWTH
+
+
+def test_where_all_pixels_would_take_too_many_lines_those_of_the_largest_errors_take_them(looked_at):
+    """Lines of sight by way of specular surfaces count as `LEGS`; seen to fail where all of the pixels take them."""
+    import drjit as dr
+    import mitsuba as mi
+
+    draft, _ = looked_at
+    most_points = partial(_most_points, draft.quadrature, LEGS)
+    few = TOGETHER // LEGS // (SHIFTS * FIRST)
+    assert most_points(few) == FIRST > most_points(few + 1)
+    before, count = draft.error, len(draft.grid)
+    try:
+        draft.error = mi.Float64(1 + np.random.default_rng(0).permutation(count))
+        taken = _largest_errors(draft, draft.grid.full(mi.Bool, True), most_points)
+        chosen = dr.select(taken, draft.error, 0).numpy()
+    finally:
+        draft.error = before
+    number = np.count_nonzero(chosen)
+    assert few / 2 < number <= few
+    assert chosen[chosen > 0].min() == count - number + 1
+    # With `max_nodes` given, no line counts as more than one.
+    assert _most_points(Quadrature(max_nodes=1 << 16), LEGS, 1) == _most_points(Quadrature(max_nodes=1 << 16), 1, 1)
