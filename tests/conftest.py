@@ -6,6 +6,7 @@ import contextlib
 import gc
 import importlib
 import signal
+import warnings
 
 import pytest
 
@@ -59,9 +60,11 @@ def loaded():
 
     Seen to cost 0.17 s of each test without: 200,000 objects of modules that were imported meanwhile were searched.
     """
-    for name in LIBRARIES.split():
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of one library about another
+        for name in LIBRARIES.split():
+            with contextlib.suppress(ImportError):
+                importlib.import_module(name)
     gc.collect()
     gc.freeze()
 
