@@ -64,12 +64,14 @@ def exit_power(
     batch = dr.arange(mi.UInt32, photons) % BATCHES
     power = dr.zeros(mi.Float64, BATCHES * bins)
     mus = optics.musp / (1 - optics.g)
-    albedo = mus / (optics.mua + mus)
+    # Opaque: other coefficients and places make no other kernel.
+    total, albedo = (dr.opaque(mi.Float, value) for value in (optics.mua + mus, mus / (optics.mua + mus)))
+    centre = mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in emitter.centre))
 
     def step(
         p: mi.Point3f, d: mi.Vector3f, weight: mi.Float, active: mi.Bool, sampler: mi.PCG32
     ) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Bool, mi.PCG32]:
-        flight = -dr.log(1 - sampler.next_float32()) / (optics.mua + mus)
+        flight = -dr.log(1 - sampler.next_float32()) / total
         reach, normal = _way_out(body, p, d)
         inside = flight < reach
         choice, first, second = sampler.next_float32(), sampler.next_float32(), sampler.next_float32()
@@ -84,7 +86,7 @@ def exit_power(
         active = active & ~leaves & ~(small & (choice >= SURVIVAL))
         return p, d, dr.select(small, weight / SURVIVAL, weight), active, sampler
 
-    start = mi.Point3f(*emitter.centre) + _in_ball(sampler) * emitter.radius
+    start = centre + _in_ball(sampler) * emitter.radius
     state = (start, _on_sphere(sampler), dr.full(mi.Float, 1.0, photons), dr.full(mi.Bool, True, photons), sampler)
     dr.while_loop(state, lambda p, d, weight, active, sampler: active, step)
     return np.array(power).reshape(BATCHES, bins) * (BATCHES / photons)

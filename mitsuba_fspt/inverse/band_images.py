@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -111,6 +112,11 @@ class BandImages:
         x, y, z = (float(value) for value in position)
         solution = self.tissue.solve([Source(Sphere((x, y, z)))])
         return self.share * solution.exitance_at(self.surface.vertices, self._places)
+
+    def image_of(self, sources: Sequence[Source], tissue: Tissue) -> Array:
+        """(N,) power on the pixels [W] of sources, with their power over all bands, in a tissue on the same mesh."""
+        solution = tissue.solve(sources)
+        return np.asarray(self.share * (self.transport @ solution.exitance_at(self.surface.vertices, self._places)))
 
     def slopes(self, positions: Array, powers: Array) -> dict[str, Array]:
         """(N,) change of the power on the pixels [W] by relative changes of the tissue's coefficients.

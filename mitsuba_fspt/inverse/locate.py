@@ -22,10 +22,11 @@ from ..runtime.errors import InversionError, renamed
 from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
 from ..tissue.diffusion import Tissue
-from ..tissue.phantom_file import PhantomFile
+from ..tissue.phantom_file import PhantomFile, Spread
 from .band_images import BandImages
 from .location import Location
 from .measurement import Measurement, tell_misfit, told
+from .optics_fit import Coefficient, OpticsFit, unknowns
 from .source_fit import LocationSettings, SourceFit
 from .source_grid import SourceGrid
 from .surface import Surface
@@ -50,6 +51,7 @@ def locate(
     mask: ArrayLike | Mapping[str, ArrayLike] | None = None,
     gain_error: float | None = None,
     gain_per_view: float = 0.0,
+    band_correlation: float = 0.0,
     sampled: bool = False,
     confidence: float = 0.9,
     scene: object = None,
@@ -61,14 +63,13 @@ def locate(
         S = fspt.locate("phantom.toml", T, images)
         S.sources[0].position, S.sources[0].position_interval  # mm, in the frame of phantom.toml
 
-    The intervals contain the noise of the images, the numerical error of the matrix and `gain_error`, not errors of the
-    optical coefficients, of the shape, of inclusions left out, of pose and lens, or of SP3 or diffusion itself.
-    `warnings` name what the residuals show of these: their χ², and structure over views and around the sources (M.34).
+    The intervals contain the noise of the images, the numerical error of the matrix, `gain_error`, and errors of
+    coefficients that the phantom file states (`mua_sd`, …), which are fitted along; not those of shape, inclusions left
+    out, pose, lens, or of SP3 or diffusion itself, of which `warnings` tell what the residuals show (M.34).
 
     Parameters
     ----------
-    phantom : TOML file of `fspt flux solve`, or a PhantomFile: shape, optical coefficients, mesh; its own sources are
-        not used
+    phantom : TOML file of `fspt flux solve`, or a PhantomFile: shape, coefficients, mesh; its sources are not used
     matrix : of `transport` or `read_transport`, for the surface of this phantom. The mesh in the scene's PLY file,
         before `to_world`, is in the frame of the phantom file, as `fspt flux solve` writes it.
     images : one Image, Exposure or name of a file of either per view, in the order of the views; or an array of powers
@@ -76,29 +77,29 @@ def locate(
     sources : number of point sources, 1 … 20
     error, mask, gain_error, gain_per_view, sampled, scene : as in `invert`
     confidence, settings : of the intervals, in (0, 1); accuracy of the fit
+    band_correlation : correlation of the bands' factors (`gain_error`), 0 … 1; 1: one factor common to all bands
     progress : function of the present step (text) and the share done (0 … 1); None: a bar in notebooks
 
-    Images in several bands of wavelengths: `matrix` and `images`, and `error` and `mask` if given, are dictionaries
-    with the names of the tables [bands.NAME] of the phantom file, which hold the optical coefficients in a band and the
-    share of the sources' power that is emitted in it. `power` is that of all bands. Factors of the bands' images
-    (`gain_error`) are independent.
+    Images in several bands: `matrix` and `images`, and `error` and `mask` if given, are dictionaries with the names of
+    the tables [bands.NAME] of the phantom file. `power` is that of all bands.
 
     Raises
     ------
-    InversionError : an option outside its range, bands that differ, images without light or without an error, a surface
-        that is not the phantom's border, sources that the images do not determine, or a source so close to the border
-        that the mesh does not resolve it.
+    InversionError : an option outside its range, bands that differ, images without light or error, a surface that is
+        not the phantom's border, sources that the images do not determine, or one too close to the border for the mesh.
     TransportError, DetectorError, ImageError : as in `invert`.
     FluxError : the phantom file cannot be used, or has no such band.
     BackendError : scikit-fem, or the mesher that the phantom needs, is missing.
     """
     count, confidence, accuracy = _checked(sources, confidence, settings)
-    factors = checked_factor("locate", gain_per_view)
+    gains = checked_factor("locate", gain_per_view), _checked_correlation(band_correlation)
     given = _given(matrix, images, error, mask)
     described = _described(phantom)
     with reported(progress) as report:
         bands = _band_images(described, given, gain_error, sampled, scene, report)
-        return _located(bands, count, confidence, accuracy, factors, report)
+        return _located(
+            bands, [described.band(one.name).spreads for one in given], count, confidence, accuracy, gains, report
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +132,14 @@ def _checked(sources: int, confidence: float, settings: LocationSettings | None)
             "accuracy."
         )
     return count, confidence, settings or LocationSettings()
+
+
+def _checked_correlation(value: object) -> float:
+    """The correlation of the bands' factors; InversionError where it is outside [0, 1]."""
+    correlation = number("locate: 'band_correlation'", value, InversionError, "0.5")
+    if not 0 <= correlation <= 1:
+        raise InversionError(f"locate: 'band_correlation' must be in [0, 1], got {correlation:g}. Give for example 1.")
+    return correlation
 
 
 def _given(matrix: TransportMatrix | Mapping[str, TransportMatrix], images: Any, error: Any, mask: Any) -> list[_Given]:
@@ -168,14 +177,15 @@ def _given(matrix: TransportMatrix | Mapping[str, TransportMatrix], images: Any,
 
 def _located(
     bands: Sequence[BandImages],
+    spreads: Sequence[Sequence[Spread]],
     count: int,
     confidence: float,
     settings: LocationSettings,
-    gain_per_view: float,
+    gains: tuple[float, float],
     report: Progress,
 ) -> Location:
-    """Sources and density that fit the images of all bands."""
-    fit = SourceFit(bands, settings, report, gain_per_view)
+    """Sources and density that fit the images of all bands; `gains`: gain_per_view and band_correlation."""
+    fit = SourceFit(bands, settings, report, gains[0])
     if len(fit.power) <= 4 * count:
         raise InversionError(
             f"locate: {len(fit.power)} pixels do not determine the {4 * count} numbers of {count} sources. Give more "
@@ -183,9 +193,13 @@ def _located(
         )
     report("first positions", 0.0)
     grid = SourceGrid.of(bands)
-    found = fit.best(grid, count)
+    found, optics = fit.best(grid, count), dict[str, Coefficient]()
+    if uncertain := unknowns(spreads):
+        own = OpticsFit(fit, uncertain, report)
+        found = own.refined(found)
+        optics = own.coefficients(found)
     noise = fit.covariance(found)
-    covariance, z = noise + fit.by_factors(found, noise), float(norm.ppf((1 + confidence) / 2))
+    covariance, z = noise + fit.by_factors(found, noise, gains[1]), float(norm.ppf((1 + confidence) / 2))
     linear = fit.is_linear(found, noise, z)
     if not linear:
         LOG.warning(
@@ -205,7 +219,7 @@ def _located(
     density = replace(grid, sigma=found.sigma, power=power).density(report)
     warnings = tell_misfit("locate", found.cost, len(fit.power), 4 * count, fit.noise(found))
     warnings += told("locate", fit.structure(found).lines())
-    return Location.of(fit, found, covariance, z, p_values, linear, density, confidence, warnings)
+    return Location.of(fit, found, covariance, z, p_values, linear, density, confidence, warnings, optics)
 
 
 def _described(phantom: object) -> PhantomFile:

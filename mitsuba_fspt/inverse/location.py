@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, InversionError
 from ..tissue.tetrahedra import Tetrahedra
+from .optics_fit import Coefficient
 from .source_fit import PointSources, SourceFit
 
 Array = NDArray[np.float64]
@@ -79,6 +80,7 @@ class Location:
     residual : (measured − fitted)/sigma, in the same form
     gain_per_view : relative standard deviation of a factor of each view, fitted as well and contained in the intervals
     view_factors : (views,) these factors, of all bands one after the other; `fitted` contains them
+    optics : uncertain coefficients by name, such as "mua", "red.mua", "regions.0.mua", with `value` and `sd`
     warnings : lines of stderr on what the residuals say of the model and of the stated errors
     """
 
@@ -98,6 +100,7 @@ class Location:
     gain_per_view: float
     view_factors: Array
     warnings: tuple[str, ...] = ()
+    optics: Mapping[str, Coefficient] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -111,6 +114,7 @@ class Location:
         density: Array,
         confidence: float,
         warnings: Sequence[str] = (),
+        optics: Mapping[str, Coefficient] | None = None,
     ) -> Location:
         """Result of a fit, with intervals of z standard deviations to both sides."""
         each = zip(found.values.reshape(-1, 4), np.sqrt(np.diag(covariance)).reshape(-1, 4), p_values, strict=True)
@@ -131,6 +135,7 @@ class Location:
             gain_per_view=fit.gain_per_view,
             view_factors=fit.factors(found),
             warnings=tuple(warnings),
+            optics=optics or {},
         )
 
     def summary(self) -> dict[str, Any]:
@@ -146,6 +151,7 @@ class Location:
             "gain_error": self.gain_error,
             "gain_per_view": self.gain_per_view,
             "view_factors": self.view_factors.tolist(),
+            "optics": {name: {"value": one.value, "sd": one.sd} for name, one in self.optics.items()},
             "warnings": list(self.warnings),
         }
 

@@ -128,21 +128,43 @@ class SourceFit:
     def __init__(
         self, bands: Sequence[BandImages], settings: LocationSettings, report: Progress, gain_per_view: float = 0.0
     ) -> None:
-        self.bands, self.settings, self.gain_per_view = bands, settings, gain_per_view
+        self.bands, self.settings, self.gain_per_view = list(bands), settings, gain_per_view
         self._report, self._share = report, 0.0  # of the steps that are done
         self.power = np.concatenate([band.power for band in bands])
         ends = np.cumsum([0, *(len(band.rows) for band in bands)])
-        self._parts = [slice(*part) for part in pairwise(ends)]
+        self.parts = [slice(*part) for part in pairwise(ends)]  # of each band
+        # Uncertain coefficients (see OpticsFit): change of the pixels per standard deviation (N, P) [W], and what their
+        # present values have of it (N,) [W], which counts as if it were measured in addition.
+        self.uncertain, self.offset = np.empty((len(self.power), 0)), np.zeros(len(self.power))
         first = np.cumsum([0, *(band.matrix.image_shape[0] for band in bands)])
         self.view = np.concatenate([band.view + start for band, start in zip(bands, first, strict=False)])
 
     def factors(self, found: PointSources) -> Array:
         """(views,) most likely factors of the views, of all bands one after the other."""
-        return 1 + self.gain_per_view * found.noise.unknowns((self.power - found.signal) / found.sigma)
+        count = len(found.noise.squares)
+        return 1 + self.gain_per_view * self.common(found)[:count] if self.gain_per_view else np.ones(count)
+
+    def common(self, found: PointSources) -> Array:
+        """Most likely unknowns of variance 1: of the views, if they have factors, and of the uncertain coefficients."""
+        return found.noise.all_unknowns((self._target - found.signal) / found.sigma)
+
+    @property
+    def _target(self) -> Array:
+        """(N,) power that sources and what is uncertain make [W]."""
+        return self.power + self.offset
+
+    def joint_covariance(self, found: PointSources) -> Array:
+        """Covariance of the `values`, the views' factors and the uncertain coefficients, over their prior sd."""
+        slopes = np.column_stack([found.changes / found.sigma[:, None], found.noise.all_columns])
+        prior = np.repeat([0.0, 1.0], [found.changes.shape[1], found.noise.all_columns.shape[1]])
+        return np.asarray(np.linalg.inv(slopes.T @ slopes + np.diag(prior)))
 
     def fitted(self, found: PointSources) -> Array:
-        """(N,) fitted power [W], with the factors of the views."""
-        return np.asarray(found.signal * self.factors(found)[self.view])
+        """(N,) fitted power [W], with the factors of the views and the coefficients as fitted."""
+        fitted = found.signal * self.factors(found)[self.view] - self.offset
+        if self.uncertain.size:
+            fitted += self.uncertain @ self.common(found)[-self.uncertain.shape[1] :]
+        return np.asarray(fitted)
 
     def free(self, found: PointSources) -> int:
         """Number of pixels less that of the parameters, at least 1."""
@@ -150,14 +172,14 @@ class SourceFit:
 
     def noise(self, found: PointSources) -> list[Chi2]:
         """Σ (noise/σ)² of each band as its stated noise makes it."""
-        each = zip(self.bands, self._parts, strict=True)
+        each = zip(self.bands, self.parts, strict=True)
         return [b.measurement.chi2(b.rows, found.signal[own], found.sigma[own]) for b, own in each]
 
     def structure(self, found: PointSources) -> Structure:
         """Test of the residuals for structure: over views, around sources, by coefficients of the tissue."""
         views, known, tissue = list[Seen](), [], list[tuple[str, str, Array]]()
         light = found.columns * found.powers / found.sigma[:, None]
-        for band, own, exitance in zip(self.bands, self._parts, found.exitance, strict=True):
+        for band, own, exitance in zip(self.bands, self.parts, found.exitance, strict=True):
             fitted = band.measurement.as_images(band.rows, found.signal[own])[0]
             names = [label if band.name is None else f"{band.name}: {label}" for label in view_labels(band.matrix)]
             seen = views_of(names, fitted, band.rows, found.sigma[own])
@@ -172,12 +194,8 @@ class SourceFit:
                 tissue.append((kind, where, slope))
         places = np.concatenate([band.places() for band in self.bands])
         rings = [(light[:, k], np.linalg.norm(places - at, axis=1)) for k, at in enumerate(found.positions)]
-        slopes = found.changes / found.sigma[:, None]
-        prior = np.zeros(slopes.shape[1])
-        if self.gain_per_view:
-            slopes = np.column_stack([slopes, found.noise.columns.toarray()])
-            prior = np.concatenate([prior, np.ones(slopes.shape[1] - len(prior))])
-        inverse = np.linalg.inv(slopes.T @ slopes + np.diag(prior))
+        slopes = np.column_stack([found.changes / found.sigma[:, None], found.noise.all_columns])
+        inverse = self.joint_covariance(found)
         errors = csr_array(block_diag(known, format="csr"))
         residual = (self.power - self.fitted(found)) / found.sigma
         return structure(residual, slopes, lambda x: inverse @ x, Patterns.of(views, rings, tissue), errors)
@@ -187,7 +205,7 @@ class SourceFit:
 
         NaN on pixels that are masked or do not see the surface.
         """
-        images = [band.image(values[own]) for band, own in zip(self.bands, self._parts, strict=True)]
+        images = [band.image(values[own]) for band, own in zip(self.bands, self.parts, strict=True)]
         if self.bands[0].name is None:
             return images[0]
         return {str(band.name): image for band, image in zip(self.bands, images, strict=True)}
@@ -206,7 +224,7 @@ class SourceFit:
                 continue
             tried.add(places)
             try:
-                found.append(self._minimum(start))
+                found.append(self.minimum(start))
             except InversionError as error:
                 failed = error
             else:
@@ -216,7 +234,7 @@ class SourceFit:
             raise failed
         return min(found, key=lambda one: one.unlikelihood).sorted()
 
-    def _minimum(self, positions: Array) -> PointSources:
+    def minimum(self, positions: Array) -> PointSources:
         """Sources of least Σ (residual/σ)² from these first positions; σ is that of the last step."""
         settings, damping = self.settings, self.settings.damping
         even = np.concatenate([band.flat_sigma() for band in self.bands])
@@ -230,7 +248,7 @@ class SourceFit:
             slopes = found.slopes
             lengths = np.linalg.norm(slopes, axis=0)
             normal = slopes.T @ slopes / np.outer(lengths, lengths)
-            right = slopes.T @ found.residual(self.power) / lengths
+            right = slopes.T @ found.residual(self._target) / lengths
             if flat == settings.patience or right @ np.linalg.lstsq(normal, right)[0] < settings.chi2:
                 return found
             tried, border = None, False
@@ -263,15 +281,19 @@ class SourceFit:
             )
         return np.asarray(np.linalg.inv(slopes.T @ slopes))
 
-    def by_factors(self, found: PointSources, covariance: Array) -> Array:
-        """(4K, 4K) covariance of the `values` by the uncertain factor of each band, `gain_error` (Eq. M.26)."""
-        slopes, total = found.slopes, np.zeros_like(covariance)
-        for band, own in zip(self.bands, self._parts, strict=True):
+    def by_factors(self, found: PointSources, covariance: Array, correlation: float = 0.0) -> Array:
+        """(4K, 4K) covariance of the `values` by the uncertain factors of the bands, `gain_error` (Eq. M.26).
+
+        correlation : of the factors of any two bands
+        """
+        slopes, changes = found.slopes, list[Array]()
+        for band, own in zip(self.bands, self.parts, strict=True):
             signal = np.zeros_like(found.signal)
             signal[own] = found.signal[own]
             change = covariance @ (slopes.T @ found.noise.over(signal))
-            total += band.measurement.gain_error**2 * np.outer(change, change)
-        return total
+            changes.append(band.measurement.gain_error * change)
+        each, common = np.array(changes), np.sum(changes, axis=0)
+        return (1 - correlation) * each.T @ each + correlation * np.outer(common, common)
 
     def p_values(self, found: PointSources, places: int) -> Array:
         """(K,) probability, at most, that noise alone makes a source fit as well as each of these.
@@ -279,7 +301,7 @@ class SourceFit:
         At each of `places` positions a source that is not there lowers Σ (residual/σ)² by chi-squared of 4 degrees of
         freedom, position and power, with the other sources free; Bonferroni's bound over the positions.
         """
-        slopes, residual = found.slopes, found.residual(self.power)
+        slopes, residual = found.slopes, found.residual(self._target)
         values = np.empty(len(found.powers))
         for k, power in enumerate(found.powers):
             others = np.linalg.qr(np.delete(slopes, np.s_[4 * k : 4 * k + 4], axis=1))[0]
@@ -312,7 +334,7 @@ class SourceFit:
     def _residual_at(self, found: PointSources, values: Array) -> Array:
         """(N,) residual over the σ of `found` for other `values` (4K,); raises FluxError as `BandImages.exitance`."""
         positions, powers = values.reshape(-1, 4)[:, :3], values.reshape(-1, 4)[:, 3]
-        return found.noise.over(self.power - self._images(positions)[1] @ powers)
+        return found.noise.over(self._target - self._images(positions)[1] @ powers)
 
     def _tried(self, positions: Array, noise: PixelNoise, below: float) -> tuple[PointSources | None, bool]:
         """Sources at these positions with the powers > 0 that fit best; False where the tissue has no solution there.
@@ -331,14 +353,15 @@ class SourceFit:
 
     def _weighted(self, found: PointSources, noise: PixelNoise) -> PointSources:
         """The same positions with the powers >= 0 that fit best for another noise."""
-        powers, length = nnls(noise.over(found.columns), noise.over(self.power))
+        powers, length = nnls(noise.over(found.columns), noise.over(self._target))
         return replace(found, powers=powers, noise=noise, cost=length**2)
 
     def _noise(self, found: PointSources) -> PixelNoise:
         """Noise of the pixels for the fitted signal, with the numerical error of the matrices (Eq. M.24)."""
         each = zip(self.bands, found.exitance, strict=True)
         sigma = np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each])
-        return PixelNoise(sigma, self.gain_per_view * found.signal / sigma, self.view)
+        others = self.uncertain / sigma[:, None] if self.uncertain.size else None
+        return PixelNoise(sigma, self.gain_per_view * found.signal / sigma, self.view, others)
 
     def _gradient(self, position: Array, column: Array) -> Array:
         """(N, 3) change of a source's image, `column` (N,), per mm along x, y and z; raises FluxError at the border."""

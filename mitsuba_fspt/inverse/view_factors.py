@@ -67,21 +67,37 @@ class ViewFactors:
 
 @dataclass(frozen=True, eq=False)
 class PixelNoise:
-    """Noise of pixels that are fitted, with the factors of their views: covariance σ (I + Σ_v q_v q_vᵀ) σ.
+    """Noise of pixels that are fitted, with what they have in common: covariance σ (I + Σ_k q_k q_kᵀ) σ.
+
+    The q_k are the columns of the views' factors, and `others`.
 
     sigma : (N,) σ [W]
     common : (N,) q, change over σ of each pixel by one standard deviation of its view's factor; 0 without factors
     view : (N,) number of the view of each pixel
+    others : (N, P) change over σ of each pixel by one standard deviation of other uncertain numbers
     """
 
     sigma: Array
     common: Array
     view: NDArray[np.int64]
+    others: Array | None = None
 
     @cached_property
     def squares(self) -> Array:
         """(views,) |q_v|²."""
         return np.bincount(self.view, self.common**2).astype(np.float64)
+
+    @cached_property
+    def all_columns(self) -> Array:
+        """(N, views + P) the columns of the views, if they have factors, and the others."""
+        others = np.empty((len(self.view), 0)) if self.others is None else self.others
+        return np.column_stack([self.columns.toarray(), others]) if self.common.any() else others
+
+    @cached_property
+    def _directions(self) -> tuple[Array, Array]:
+        """Orthonormal columns U (N, k) and squares s² (k,) with Σ q qᵀ = U s² Uᵀ."""
+        left, singular, _ = np.linalg.svd(self.all_columns, full_matrices=False)
+        return left, singular**2
 
     @cached_property
     def columns(self) -> csr_array:
@@ -92,6 +108,9 @@ class PixelNoise:
     def over(self, values: Array) -> Array:
         """`values` (N, …) [W] over the root of the covariance: (I + q qᵀ)^-½ = I − (1 − (1 + |q|²)^-½) q qᵀ/|q|²."""
         over = (values.T / self.sigma).T
+        if self.others is not None:
+            left, squares = self._directions
+            return np.asarray(over - left @ ((1 - (1 + squares) ** -0.5) * (left.T @ over).T).T)
         if not self.common.any():
             return np.asarray(over)
         share = (1 - (1 + self.squares) ** -0.5) / np.where(self.squares > 0, self.squares, 1.0)
@@ -101,7 +120,14 @@ class PixelNoise:
         """(views,) most likely g_v for residuals (N,) over σ."""
         return np.asarray((self.columns.T @ residual) / (1 + self.squares))
 
+    def all_unknowns(self, residual: Array) -> Array:
+        """(views + P,) most likely unknowns of `all_columns` for residuals (N,) over σ."""
+        columns = self.all_columns
+        return np.asarray(np.linalg.solve(columns.T @ columns + np.eye(columns.shape[1]), columns.T @ residual))
+
     @property
     def log_determinant(self) -> float:
         """ln of the determinant of the covariance, σ in W."""
+        if self.others is not None:
+            return float(2 * np.log(self.sigma).sum() + np.log1p(self._directions[1]).sum())
         return float(2 * np.log(self.sigma).sum() + np.log1p(self.squares).sum())

@@ -113,9 +113,9 @@ class Tissue:
         """The same tissue with finite elements of order 1 under the diffusion equation: coarse, and fast."""
         return Tissue(self.mesh, self.media, model="diffusion", a=self._a, order=1)
 
-    def of_media(self, media: Sequence[Medium]) -> Tissue:
+    def of_media(self, media: Sequence[Medium], repeated: bool = False) -> Tissue:
         """The same tissue and elements with other media."""
-        return Tissue(self.mesh, media, model=self.model, a=self._a, order=self._order)
+        return Tissue(self.mesh, media, model=self.model, a=self._a, order=self._order, repeated=repeated)
 
     def places(self, points: Array) -> tuple[Index, Array]:
         """Cells (N,) and local coordinates (N, 3) of `points` (N, 3) [mm], for `exitance_at` of any solution."""

@@ -29,6 +29,31 @@ ABSORBERS = ("blood", "water", "fat")  # keys of a band in place of mua; saturat
 SCATTERING = ("scattering", "scattering_power")  # keys in place of musp
 
 
+COEFFICIENTS = ("mua", "musp", "n")
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Relative standard deviations of the coefficients `mua`, `musp` and `n` of a medium, each in [0, 1).
+
+    Raises
+    ------
+    FluxError : one is outside [0, 1).
+    """
+
+    mua: float = 0.0
+    musp: float = 0.0
+    n: float = 0.0
+
+    def __post_init__(self) -> None:
+        for key in COEFFICIENTS:
+            if not 0 <= getattr(self, key) < 1:
+                raise FluxError(
+                    f"'{key}_sd' must be in [0, 1), got {getattr(self, key):g}. Give a relative standard "
+                    "deviation, for example 0.1."
+                )
+
+
 @dataclass(frozen=True)
 class CylinderGeometry:
     """Cylinder about the z axis, centred at the origin: `radius` and `height` [mm]."""
@@ -56,21 +81,23 @@ class MeshGeometry:
 
 @dataclass(frozen=True)
 class Region:
-    """Part of the tissue with its own `medium`; `where`: a shape, or a label of the mesh file."""
+    """Part of the tissue: `where`, a shape or a label of the mesh file, its `medium`, and the `spread` of that."""
 
     where: Shape | int
     medium: Medium
+    spread: Spread = Spread()
 
 
 @dataclass(frozen=True)
 class Band:
     """Band of wavelengths: `share` of a source's power that is emitted in it, in (0, 1], and the `media` in it.
 
-    media : of the tissue outside the regions, then of each region
+    media, spreads : of the tissue outside the regions, then of each region; no `spreads`: the media are exact
     """
 
     share: float
     media: tuple[Medium, ...]
+    spreads: tuple[Spread, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -80,7 +107,8 @@ class PhantomFile:
     `bands`: other optical coefficients, those in a band of wavelengths, by its name.
 
     `edge` of the tetrahedra, `surface_edge` of the surface's triangles and `voxel` [mm]; `order` 1 or 2 of the finite
-    elements; `model` of the light, "sp3" or "diffusion"; `a` name or value of the boundary factor of diffusion.
+    elements; `model` of the light, "sp3" or "diffusion"; `a` name or value of the boundary factor of diffusion;
+    `spread` of the medium.
     """
 
     geometry: CylinderGeometry | MeshGeometry
@@ -94,6 +122,7 @@ class PhantomFile:
     voxel: float = 0.4
     bands: Mapping[str, Band] = field(default_factory=dict)
     model: str = DEFAULT
+    spread: Spread = Spread()
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> PhantomFile:
@@ -107,8 +136,8 @@ class PhantomFile:
         file = Table.load(path)
         optical = file.table("optical")
         mesh, output = file.table("mesh", {}), file.table("output", {})
-        medium = _medium(optical, 1.37)
-        regions = tuple(_region(table, medium.n) for table in file.tables("regions"))
+        medium, spread = _medium(optical, 1.37), _spread(optical, Spread())
+        regions = tuple(_region(table, medium.n, spread) for table in file.tables("regions"))
         result = cls(
             _geometry(file.table("geometry"), path.parent),
             medium,
@@ -119,8 +148,9 @@ class PhantomFile:
             mesh.whole("order", cls.order),
             output.number("edge", cls.surface_edge),
             output.number("voxel", cls.voxel),
-            _bands(file.table("bands", {}), (medium, *(part.medium for part in regions))),
+            _bands(file.table("bands", {}), (Region(0, medium, spread), *regions)),
             optical.text("model", cls.model),
+            spread,
         )
         with named(optical.name):
             check_model(result.model, result.a)
@@ -173,7 +203,8 @@ class PhantomFile:
         FluxError : there is no such band.
         """
         if name is None:
-            return Band(1.0, (self.medium, *(part.medium for part in self.regions)))
+            spreads = self.spread, *(part.spread for part in self.regions)
+            return Band(1.0, (self.medium, *(part.medium for part in self.regions)), spreads)
         if name not in self.bands:
             known = f"The bands are {', '.join(self.bands)}" if self.bands else "It has no bands"
             raise FluxError(f"band '{name}' is not in the phantom file. {known}; add a table [bands.{name}].")
@@ -205,6 +236,12 @@ def _medium(table: Table, n: float) -> Medium:
     return Medium(table.number("mua"), table.number("musp"), table.number("n", n))
 
 
+def _spread(table: Table, default: Spread) -> Spread:
+    """Spread of the keys mua_sd, musp_sd and n_sd."""
+    with named(table.name):
+        return Spread(*(table.number(f"{key}_sd", getattr(default, key)) for key in COEFFICIENTS))
+
+
 def _band_medium(table: Table, n: float, wavelength_nm: float | None) -> Medium:
     """Medium of a table of [bands.NAME], by its coefficients or by its composition at the band's wavelength."""
     composed = [key for key in ABSORBERS if key in table.left]
@@ -228,23 +265,23 @@ def _band_medium(table: Table, n: float, wavelength_nm: float | None) -> Medium:
     return Medium(mua, musp, table.number("n", n))
 
 
-def _region(table: Table, n: float) -> Region:
-    """Region of a table of [[regions]]; its refractive index is that of [optical] unless it names one."""
+def _region(table: Table, n: float, spread: Spread) -> Region:
+    """Region of a table of [[regions]]; its refractive index and spread are those of [optical] unless it names them."""
     where = table.whole("label") if "label" in table.left else _shape(table, ("sphere", "cylinder"))
-    result = Region(where, _medium(table, n))
+    result = Region(where, _medium(table, n), _spread(table, spread))
     table.done()
     return result
 
 
-def _bands(table: Table, media: tuple[Medium, ...]) -> dict[str, Band]:
-    """Bands of the tables [bands.NAME]; refractive indices are those of `media` unless they name others."""
+def _bands(table: Table, parts: tuple[Region, ...]) -> dict[str, Band]:
+    """Bands of the tables [bands.NAME]; refractive indices and spreads are those of `parts` unless they name others."""
     bands = {}
     for name in list(table.left):
         own = table.table(name)
         regions = own.tables("regions")
-        if len(regions) != len(media) - 1:
+        if len(regions) != len(parts) - 1:
             raise FluxError(
-                f"{own.name}: {len(regions)} tables [[bands.{name}.regions]] for {len(media) - 1} [[regions]]. Give "
+                f"{own.name}: {len(regions)} tables [[bands.{name}.regions]] for {len(parts) - 1} [[regions]]. Give "
                 "one for each, in their order."
             )
         share = own.number("share")
@@ -256,11 +293,12 @@ def _bands(table: Table, media: tuple[Medium, ...]) -> dict[str, Band]:
         at = own.number("wavelength_nm") if "wavelength_nm" in own.left else None
         if at is not None:
             wavelength(f"{own.name}: 'wavelength_nm'", at, FluxError)
-        found = []
-        for part, of in zip([own, *regions], media, strict=True):
+        media, spreads = list[Medium](), list[Spread]()
+        for part, of in zip([own, *regions], parts, strict=True):
             with named(part.name):
-                found.append(_band_medium(part, of.n, at))
-        bands[name] = Band(share, tuple(found))
+                media.append(_band_medium(part, of.medium.n, at))
+            spreads.append(_spread(part, of.spread))
+        bands[name] = Band(share, tuple(media), tuple(spreads))
         for part in (own, *regions):
             part.done()
     return bands

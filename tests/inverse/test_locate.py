@@ -7,6 +7,7 @@ import logging
 import re
 from contextlib import suppress
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,14 +17,15 @@ from sphere_views import noisy, passes_of, sphere_views
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.band_images import BandImages
 from mitsuba_fspt.inverse.measurement import Measurement
+from mitsuba_fspt.inverse.optics_fit import unknowns
 from mitsuba_fspt.inverse.source_grid import SourceGrid
 from mitsuba_fspt.inverse.surface import Surface
-from mitsuba_fspt.optics.media import Source
+from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Sphere
 from mitsuba_fspt.phantom.phantom import Phantom
 from mitsuba_fspt.runtime.errors import FluxError, InversionError, TransportError
 from mitsuba_fspt.tissue.diffusion import Tissue
-from mitsuba_fspt.tissue.phantom_file import PhantomFile
+from mitsuba_fspt.tissue.phantom_file import PhantomFile, Spread
 
 pytest.importorskip("skfem")
 SOURCE = (2.5, 1.0, -1.0, 2.0)  # x, y, z [mm], power [W]
@@ -366,6 +368,7 @@ def test_summary_and_file(case, tmp_path):
         ({"sources": 1.5}, "'sources'"),
         ({"confidence": 1}, r"'confidence' must be in \(0, 1\)"),
         ({"gain_error": 2}, "locate: 'gain_error'"),
+        ({"band_correlation": 1.5}, r"'band_correlation' must be in \[0, 1\], got 1.5"),
         ({"settings": 3}, "'settings' must be LocationSettings, got int"),
         ({"mask": {"red": None}}, "'mask' is a dictionary"),
     ],
@@ -484,12 +487,66 @@ def test_sp3(case):
     assert other.chi2 > 2 > 1.1 > found.chi2
 
 
+# --- uncertain coefficients ---
+
+
+def test_uncertain_coefficients(case):
+    """True µa and µs' are 0.91 and 1.09 of the file's: with mua_sd and musp_sd they are found, and intervals hold.
+
+    Without them the power is 6 sd off. Seen to fail with the tissue left as it was after the first round.
+    """
+    wrong = replace(case.described, medium=Medium(0.055, 0.92))
+    images = case.images(SOURCE, seed=1)
+    exact, fitted = (
+        fspt.locate(replace(wrong, spread=spread), case.matrix, images, scene=case.surface)
+        for spread in (Spread(), Spread(0.1, 0.1))
+    )
+    assert exact.optics == {}
+    assert np.abs(ratios(exact, SOURCE)).max() > 5
+    assert np.abs(ratios(fitted, SOURCE)).max() < 2.5
+    assert set(fitted.optics) == {"mua", "musp"}
+    mua, musp = fitted.optics["mua"], fitted.optics["musp"]
+    assert abs(mua.value - 0.05) < 2.5 * mua.sd < 2.5 * 0.8 * 0.0055
+    assert abs(musp.value - 1.0) < 2.5 * musp.sd < 2.5 * 0.0921
+    assert fitted.sources[0].power_sd > 4 * exact.sources[0].power_sd
+    assert fitted.summary()["optics"]["mua"] == {"value": mua.value, "sd": mua.sd}
+
+
+def test_names_of_uncertain_coefficients():
+    """In a band, in a region, in a region of a band; only those with an sd > 0."""
+    named = [SimpleNamespace(name=name) for name in (None, "red")]
+    spreads = [(Spread(mua=0.1), Spread(n=0.02)), (Spread(), Spread(musp=0.2))]
+    assert [one.name(named) for one in unknowns(spreads)] == ["mua", "regions.0.n", "red.regions.0.musp"]
+
+
+def test_band_correlation(case):
+    """Rationale: a factor of sd g common to all bands is one of the power; of N independent ones g/√N is left.
+
+    Power and share are the same in both bands. Seen to fail with the correlation left out.
+    """
+    band = {name: replace(case.described.bands["red"], share=0.5) for name in ("red", "green")}
+    described = replace(case.described, bands=band)
+    images = dict.fromkeys(band, case.images(SOURCE, electrons=3000, gain_error=0.1))
+    sd = [
+        fspt.locate(described, dict.fromkeys(band, case.matrix), images, scene=case.surface, band_correlation=rho)
+        .sources[0]
+        .power_sd
+        for rho in (0.0, 1.0)
+    ]
+    noise = fspt.locate(described, dict.fromkeys(band, case.matrix), images, scene=case.surface, gain_error=0.0)
+    by_gain = np.sqrt(np.square(sd) - noise.sources[0].power_sd ** 2) / noise.sources[0].power
+    np.testing.assert_allclose(by_gain, [0.1 / np.sqrt(2), 0.1], rtol=0.02)
+
+
 # --- work that ends ---
 
 
 @pytest.mark.parametrize("model", ["diffusion", "sp3"])
 def test_solutions_by_factors_are_those_by_iterations(case, model):
-    """φ with the factor of linear elements is that with the diagonal alone, to 1e-8, in a third of the iterations."""
+    """φ with the factor of linear elements is that with the diagonal alone, to 1e-8, in a third of the iterations.
+
+    In half of them with SP3, whose second component has no such part.
+    """
     mesh = replace(case.described, edge=0.9).checked_mesh()
     found = []
     for repeated in (False, True):
@@ -498,7 +555,7 @@ def test_solutions_by_factors_are_those_by_iterations(case, model):
     points = case.surface.vertices
     one, other = (solution.exitance_at(points, tissue.places(points)) for solution in found)
     np.testing.assert_allclose(other, one, rtol=1e-8)
-    assert found[1].solved.iterations < found[0].solved.iterations / 3
+    assert found[1].solved.iterations < found[0].solved.iterations / (3 if model == "diffusion" else 2)
 
 
 def test_two_sources_for_one_end_soon(case, monkeypatch):

@@ -22,7 +22,7 @@ from mitsuba_fspt.tissue.composition import Absorbers
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import solve
 from mitsuba_fspt.tissue.mesher import read_tetrahedra, tetrahedralize
-from mitsuba_fspt.tissue.phantom_file import Band, CylinderGeometry, PhantomFile, Region
+from mitsuba_fspt.tissue.phantom_file import Band, CylinderGeometry, PhantomFile, Region, Spread
 
 pytest.importorskip("skfem")
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -76,7 +76,9 @@ def test_the_documented_example(tmp_path: Path) -> None:
     plain = PhantomFile(phantom.geometry, phantom.medium, phantom.sources, phantom.regions, bands=phantom.bands)
     assert phantom == plain
     assert phantom.regions[0].medium == Medium(0.05, 1.2, 1.37)
-    assert phantom.bands == {"red": Band(0.3, (Medium(0.01, 0.85, 1.37), Medium(0.04, 1.1, 1.37)))}
+    assert phantom.bands == {
+        "red": Band(0.3, (Medium(0.01, 0.85, 1.37), Medium(0.04, 1.1, 1.37)), (Spread(), Spread()))
+    }
     defaults = {name: value for name, value in re.findall(r"^\| `(.*?)` \|.* ([\d.]+) where left out", page, re.M)}
     assert defaults == {
         "n": f"{phantom.medium.n:g}",
@@ -135,6 +137,8 @@ def test_every_key_of_a_phantom_file(tmp_path: Path) -> None:
             "musp = 1\na = 2.5",
             r"\[optical\]: 'a' is of the diffusion equation, got 2.5 beside the model sp3",
         ),
+        ("musp = 1", "musp = 1\nmua_sd = 1.5", r"\[optical\]: 'mua_sd' must be in \[0, 1\), got 1.5\. Give a relative"),
+        ("musp = 1", "musp = 1\nn_sd = -0.1", r"'n_sd' must be in \[0, 1\), got -0.1"),
         ("musp = 1", "musp = 1\nmodel = 'p3'", r"\[optical\]: 'model' must be one of sp3, diffusion, got 'p3'"),
         ("[mesh]", "[mesh]\norder = 2.0", "'order' must be a whole number"),
         ("[mesh]", "[mesh]\norder = 3", "'order' must be 1 or 2, got 3"),
@@ -325,6 +329,16 @@ def test_bands(tmp_path: Path) -> None:
     assert phantom.band("red").media == (Medium(0.01, 0.9, 1.4), Medium(0.2, 0.8, 1.37))
     assert phantom.band(None).media == (Medium(0.05, 1, 1.37), Medium(0.3, 1, 1.37))
     assert phantom.solve(band="red").source_power == pytest.approx(0.25 * 2.5)
+
+
+def test_spreads(tmp_path: Path) -> None:
+    """Regions and bands have the relative sd of [optical] unless they name others; no band has those of [optical]."""
+    text = SMALL.replace("musp = 1\n", "musp = 1\nmua_sd = 0.1\nn_sd = 0.01\n", 1) + BANDS.replace(
+        "mua = 0.01", "mua = 0.01\nmusp_sd = 0.2\nmua_sd = 0"
+    ).replace("mua = 0.3", "mua = 0.3\nmua_sd = 0.3")
+    phantom = described(tmp_path, text)
+    assert phantom.band(None).spreads == (Spread(0.1, 0, 0.01), Spread(0.3, 0, 0.01))
+    assert phantom.band("red").spreads == (Spread(0, 0.2, 0.01), Spread(0.3, 0, 0.01))
 
 
 @pytest.mark.parametrize(

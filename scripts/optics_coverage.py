@@ -1,0 +1,216 @@
+"""Coverage of the intervals of `locate` where optical coefficients are known to 10 %, from images of photons.
+
+    python scripts/optics_coverage.py [--placements 40] [--three 40] [--photons 3e6] [-o docs/optics_coverage.csv]
+
+A point source of 1 W at a random place of a cylinder of 16 by 16 mm, 3 to 7 mm below its side and 4 mm or more below
+its caps, in four views of 24² pixels from the side. The true µa and µs' of each band are the nominal ones times
+1 + 0.1 N(0, 1), n is 1.37. J_n of the images is that of photons one by one (`photon_walk`) in bins of 1 mm, and shares
+nothing with the solver; the images have 300 electrons on the brightest pixel of each band. `locate` has the nominal
+coefficients with `mua_sd` and `musp_sd` of 0.1, or without.
+
+Columns: placements, and those that `locate` refused; shares of the 90 % intervals that contain x, y, z, and the power;
+rms error of the position over all directions [mm] and of the power [%]; rms of the errors over their stated sd, of
+positions and of powers; mean chi2; rms error of the coefficients before and after the fit [%]; median CPU seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from csv_table import write_rows
+from numpy.typing import NDArray
+
+import mitsuba_fspt as fspt
+from mitsuba_fspt.inverse.surface import Surface
+from mitsuba_fspt.optics.media import Medium, Source
+from mitsuba_fspt.optics.shapes import Sphere
+from mitsuba_fspt.runtime import backend
+from mitsuba_fspt.runtime.errors import FsptError
+from mitsuba_fspt.tissue.phantom_file import Band, CylinderGeometry, PhantomFile, Spread
+
+backend.ensure_variant()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+from photon_walk import Body, Emitter, Optics, exit_power  # noqa: E402
+
+Array = NDArray[np.float64]
+ROOT = Path(__file__).resolve().parent.parent
+RADIUS, HEIGHT, INDEX = 8.0, 16.0, 1.37
+VIEWS = [0, 90, 180, 270]
+SD = 0.1
+ELECTRONS, READ_NOISE = 300, 3.5
+TURNS, ROWS, RINGS = 50, 16, 8  # bins: around, along the side, across a cap
+BANDS = {"red": (0.4, 0.02, 1.1), "green": (0.35, 0.05, 1.0), "blue": (0.25, 0.1, 0.9)}  # share, µa, µs' [1/mm]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Matrix and surface of the cylinder."""
+
+    matrix: fspt.TransportMatrix
+    surface: Surface
+
+    @classmethod
+    def of(cls, folder: Path) -> Setup:
+        """Matrix of the four views."""
+        phantom(()).solve().phantom(0.8).write(folder / "cylinder.ply")
+        camera = {"focal_length": 55, "f_number": 2.8, "width": 24, "height": 24, "pixel_pitch": 0.4}
+        text = fspt.scene_xml(folder / "cylinder.ply", **camera)
+        (folder / "cylinder.xml").write_text(text, encoding="utf-8")
+        matrix = fspt.transport(folder / "cylinder.xml", view=VIEWS, rtol=1e-3)
+        return cls(matrix, Surface.of(matrix))
+
+
+def phantom(names: tuple[str, ...], spread: Spread = Spread()) -> PhantomFile:  # noqa: B008
+    """The cylinder with its nominal coefficients; `spread` of each band's."""
+    bands = {name: Band(BANDS[name][0], (Medium(BANDS[name][1], BANDS[name][2], INDEX),), (spread,)) for name in names}
+    return PhantomFile(
+        CylinderGeometry(RADIUS, HEIGHT),
+        Medium(0.05, 1.0, INDEX),
+        (Source(Sphere((0.0, 0.0, 0.0))),),
+        edge=1.5,
+        bands=bands,
+    )
+
+
+def place(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Random place 3 to 7 mm below the side, and 4 mm or more below the caps."""
+    while True:
+        x, y, z = (float(value) for value in rng.uniform(-1, 1, 3) * (RADIUS, RADIUS, HEIGHT / 2 - 4))
+        if 3 <= RADIUS - math.hypot(x, y) <= 7:
+            return x, y, z
+
+
+def bin_of(p: mi.Point3f) -> mi.UInt32:
+    """Number of the bin of a point of the surface: the side, then the lower and the upper cap."""
+    turn = dr.minimum(mi.UInt32((dr.atan2(p.y, p.x) / (2 * dr.pi) + 0.5) * TURNS), TURNS - 1)
+    row = dr.minimum(mi.UInt32((p.z / HEIGHT + 0.5) * ROWS), ROWS - 1)
+    ring = dr.minimum(mi.UInt32(dr.sqrt(p.x * p.x + p.y * p.y) / RADIUS * RINGS), RINGS - 1)
+    on_cap = dr.abs(p.z) > HEIGHT / 2 * (1 - 1e-5)
+    cap = ROWS * TURNS + (dr.select(p.z > 0, mi.UInt32(RINGS), mi.UInt32(0)) + ring) * TURNS + turn
+    return dr.select(on_cap, cap, row * TURNS + turn)
+
+
+def photon_exitance(points: Array, mua: float, musp: float, at: tuple[float, float, float], photons: int) -> Array:
+    """J_n [W/mm²] of 1 W at the points (V, 3) of the surface, linear between the bins' centres."""
+    count = (ROWS + 2 * RINGS) * TURNS
+    power = exit_power(Body(RADIUS, HEIGHT), Optics(mua, musp, INDEX), Emitter(at), bin_of, count, photons).mean(axis=0)
+    ring = np.pi * RADIUS**2 / RINGS**2 * (2 * np.arange(RINGS) + 1) / TURNS
+    area = np.concatenate([np.full(ROWS, 2 * np.pi * RADIUS * HEIGHT / ROWS / TURNS), ring, ring])
+    exitance = power.reshape(-1, TURNS) / area[:, None]
+    turn = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * TURNS - 0.5
+    on_cap = np.abs(points[:, 2]) > HEIGHT / 2 - 1e-6
+    rows = [(~on_cap, 0, ROWS, (points[:, 2] / HEIGHT + 0.5) * ROWS - 0.5)]
+    across = np.hypot(points[:, 0], points[:, 1]) / RADIUS * RINGS - 0.5
+    for sign, first in ((-1, ROWS), (1, ROWS + RINGS)):
+        rows.append((on_cap & (points[:, 2] * sign > 0), first, RINGS, across))
+    result = np.empty(len(points))
+    for own, first, number, row in rows:
+        low = np.clip(np.floor(row[own]).astype(int), 0, number - 2)
+        up = row[own] - low  # below 0 and above 1 at the rim: continued linearly
+        left = np.floor(turn[own]).astype(int)
+        right = turn[own] - left
+        table = exitance[first : first + number]
+        near, far = (table[low + k] for k in (0, 1))
+        index = np.arange(len(low))
+        each = [(1 - right) * one[index, left % TURNS] + right * one[index, (left + 1) % TURNS] for one in (near, far)]
+        result[own] = (1 - up) * each[0] + up * each[1]
+    return np.maximum(result, 0)
+
+
+def replicate(setup: Setup, names: tuple[str, ...], fitted: bool, photons: int, seed: int) -> dict[str, Array] | None:
+    """Errors of one placement; None where `locate` refuses it."""
+    rng = np.random.default_rng(seed)
+    at, images, true = place(rng), {}, {}
+    for name in names:
+        share, mua, musp = BANDS[name]
+        true[f"{name}.mua"], true[f"{name}.musp"] = np.array([mua, musp]) * (
+            1 + SD * rng.standard_normal(2).clip(-3, 3)
+        )
+        exitance = photon_exitance(setup.surface.vertices, true[f"{name}.mua"], true[f"{name}.musp"], at, photons)
+        power = share * setup.matrix.forward(exitance)
+        per_watt = ELECTRONS / power.max()
+        counted = rng.poisson(power * per_watt) + READ_NOISE * rng.standard_normal(power.shape)
+        metadata = {"electrons_per_watt": per_watt, "read_noise": READ_NOISE}
+        images[name] = [fspt.Image(plane / per_watt, metadata=metadata) for plane in counted]
+    described = phantom(names, Spread(SD, SD) if fitted else Spread())
+    start = time.process_time()
+    try:
+        found = fspt.locate(described, dict.fromkeys(names, setup.matrix), images, scene=setup.surface)
+    except FsptError as error:
+        print(f"seed {seed}: {error}", flush=True)
+        return None
+    source = found.sources[0]
+    low, high = source.position_interval
+    coefficients = np.array([[BANDS[n][k] for k in (1, 2)] for n in names]).ravel()
+    actual = np.array([true[f"{n}.{key}"] for n in names for key in ("mua", "musp")])
+    best = np.array([found.optics[name].value for name in true]) if fitted else coefficients
+    return {
+        "inside": ((low <= at) & (at <= high)).astype(float),
+        "power_inside": np.array([float(source.power_interval[0] <= 1 <= source.power_interval[1])]),
+        "position": source.position - at,
+        "power": np.array([source.power - 1]),
+        "position_z": (source.position - at) / source.position_sd,
+        "power_z": np.array([(source.power - 1) / source.power_sd]),
+        "chi2": np.array([found.chi2]),
+        "before": coefficients / actual - 1,
+        "after": best / actual - 1,
+        "seconds": np.array([time.process_time() - start]),
+    }
+
+
+def row(setup: Setup, names: tuple[str, ...], fitted: bool, photons: int, placements: int) -> dict[str, object]:
+    """A line of the table."""
+    each = [replicate(setup, names, fitted, photons, seed) for seed in range(placements)]
+    kept = [one for one in each if one is not None]
+    of = {key: np.array([one[key] for one in kept]) for key in kept[0]}
+
+    def rms(values: Array) -> float:
+        return float(np.sqrt(np.mean(values**2)))
+
+    numbers = {
+        "holds_position": of["inside"].mean(),
+        "holds_power": of["power_inside"].mean(),
+        "position_mm": math.sqrt(3) * rms(of["position"]),
+        "power_percent": 100 * rms(of["power"]),
+        "position_over_sd": rms(of["position_z"]),
+        "power_over_sd": rms(of["power_z"]),
+        "chi2": of["chi2"].mean(),
+        "coefficients_before_percent": 100 * rms(of["before"]),
+        "coefficients_after_percent": 100 * rms(of["after"]),
+        "seconds": float(np.median(of["seconds"])),
+    }
+    line: dict[str, object] = {"bands": len(names), "coefficients": "fitted along" if fitted else "taken as exact"}
+    line |= {"placements": placements, "refused": placements - len(kept)}
+    return line | {name: float(f"{value:.3g}") for name, value in numbers.items()}
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--placements", type=int, default=40, help="with one band")
+    options.add_argument("--three", type=int, default=40, help="placements with three bands")
+    options.add_argument("--photons", type=float, default=3e6, help="of each image")
+    options.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "optics_coverage.csv")
+    given = options.parse_args()
+    logging.getLogger("mitsuba_fspt").setLevel(logging.ERROR)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        setup = Setup.of(Path(folder))
+        for names, placements in ((("green",), given.placements), (tuple(BANDS), given.three)):
+            for fitted in (True, False):
+                if placements:
+                    rows.append(row(setup, names, fitted, int(given.photons) // 32 * 32, placements))
+                    print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
+                    write_rows(given.output, rows)
+
+
+if __name__ == "__main__":
+    main()
