@@ -57,20 +57,27 @@ def explain(
     as_json: Rows = False,
     quiet: Quiet = False,
 ) -> None:
-    """List the integral's shortcuts on a scene, with reason and time saved; 'render --no-shortcuts' takes none.
+    """List the integral's shortcuts on a scene, with reason and time saved, and lines of sight and seconds by step.
+
+    'render --no-shortcuts' takes no shortcuts. Last come the ten pixels with most lines of sight.
 
     Of PHANTOM.ply, the scene is that of 'fspt render PHANTOM.ply'.
     """
     with progress_bar(quiet):
         from ..rendering.render import warnings_of
         from ..rendering.scene import load
-        from ..studies.explain import HEADER, explain
+        from ..studies.explain import HEADER, WORK_HEADER, explain, work
 
         quiet_mitsuba()
         given = one_scene(scene, definitions(define), framing_of(view, focal_length, f_number, camera))
         loaded = load(given.scene, **given.parameters)
         rows = explain(loaded, sensor=sensor, rtol=rtol, domain=domain)
+        steps = work(loaded, sensor=sensor, rtol=rtol, domain=domain)
         warnings = [*warnings_of(loaded, sensor), *filter(None, [given.warning])]
-    table = "\n".join([HEADER, *(row.render_text() for row in rows)])
-    print_result(table, [row.to_dict() for row in rows], as_json=as_json, quiet=quiet)
+    table = "\n".join(
+        [HEADER, *(row.render_text() for row in rows), "", WORK_HEADER, *(step.render_text() for step in steps)]
+    )
+    print_result(
+        table, [*(row.to_dict() for row in rows), *(step.to_dict() for step in steps)], as_json=as_json, quiet=quiet
+    )
     print_warnings(scene, warnings)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from ..jit.batches import BATCH
 from ..runtime.deadline import Deadline
+from .work_log import WorkLog
 
 TIMED_BATCHES = 16  # times as many batches with a deadline, which is exceeded by one of them at most
 
@@ -17,12 +18,14 @@ class Progress:
 
     report : called with the share of the whole that is done; None: nothing is reported
     deadline : after which no further level or batch of lines of sight begins
+    log : of the work, None: none is kept
     """
 
     report: Callable[[float], None] | None = None
     start: float = 0.0
     stop: float = 1.0
     deadline: Deadline = field(default_factory=Deadline)
+    log: WorkLog | None = None
 
     def __call__(self, done: float) -> None:
         """Report that the share `done`, in [0, 1], of this part is done."""
@@ -32,7 +35,8 @@ class Progress:
     def part(self, number: int, count: int) -> Progress:
         """The part of this `number`, from 0, of `count` equal parts."""
         width = (self.stop - self.start) / count
-        return Progress(self.report, self.start + number * width, self.start + (number + 1) * width, self.deadline)
+        ends = self.start + number * width, self.start + (number + 1) * width
+        return Progress(self.report, *ends, self.deadline, self.log)
 
     @property
     def batch(self) -> int:

@@ -35,6 +35,7 @@ from .shortcuts import Finding
 from .solution import Solution
 from .surface import face_image, surface_form
 from .tiles import Mosaic
+from .work_log import WorkLog
 
 LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
 NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
@@ -61,6 +62,7 @@ class Solver:
         *,
         narrow: bool = True,
         deadline: Deadline | None = None,
+        log: WorkLog | None = None,
     ) -> Solution:
         """Power, error and coverage of the camera's crop window.
 
@@ -68,23 +70,23 @@ class Solver:
         tile. With `narrow` = False, objects and spots that lines of sight may miss are neither searched for nor
         contained in the error; that is meant for drafts of an image that is computed in full afterwards. After the
         `deadline` no pixel is refined further: its error is that of the level it has reached. Every pixel takes four
-        lines of sight in any case.
+        lines of sight in any case. `log` takes the work of each step.
 
         Raises
         ------
         SceneError, ExitanceError : as in `check_scene`, or the scene has an environment emitter, or the memory does not
             suffice for the film.
         """
-        deadline = deadline or Deadline()
-        whole = self._whole(scene, camera, quadrature, progress, narrow, deadline)
+        state = Progress(progress, deadline=deadline or Deadline(), log=log)
+        whole = self._whole(scene, camera, quadrature, state, narrow)
         if camera.shares is None:
             return whole
         found = whole.darkened(camera.shares)
-        if found.beyond(quadrature.rtol)[0] > whole.beyond(quadrature.rtol)[0] and not deadline.passed():
+        if found.beyond(quadrature.rtol)[0] > whole.beyond(quadrature.rtol)[0] and not state.deadline.passed():
             # The vignetting takes more of the brightest pixel than of others, whose errors count in terms of that.
             left = max(float(found.power.max() / whole.power.max()), FLOAT32_FLOOR / quadrature.rtol)
             finer = replace(quadrature, rtol=left * quadrature.rtol)
-            found = self._whole(scene, camera, finer, progress, narrow, deadline).darkened(camera.shares)
+            found = self._whole(scene, camera, finer, state, narrow).darkened(camera.shares)
         return found
 
     def _whole(
@@ -92,9 +94,8 @@ class Solver:
         scene: mi.Scene,
         camera: Camera,
         quadrature: Quadrature,
-        progress: Callable[[float], None] | None,
+        progress: Progress,
         narrow: bool,
-        deadline: Deadline,
     ) -> Solution:
         """The image without vignetting."""
         check_scene(scene, camera)
@@ -110,7 +111,7 @@ class Solver:
                 traced = self.traced(scene, camera)
                 faces = self._faces_of(traced) if quadrature.takes("record") else None
                 view = View.of(traced, camera, window, faces, specular)
-                self._fill(mosaic, view, quadrature, Progress(progress, deadline=deadline), narrow)
+                self._fill(mosaic, view, quadrature, progress, narrow)
             # Smaller displacements are random.
             rounding = camera.rounding if camera.rounding >= LEAST_DISPLACEMENT else 0.0
             solution = mosaic.solution(quadrature.least_error, rounding)

@@ -24,6 +24,7 @@ from ..integral.rows.exitance_rows import Rows
 from ..integral.shortcuts import SHORTCUTS
 from ..integral.solution import Solution
 from ..integral.solver import Solver
+from ..integral.work_log import WorkLog
 from ..runtime.cached_value import CachedValue
 from ..runtime.deadline import Deadline
 from ..runtime.errors import SceneError, named
@@ -85,13 +86,14 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         *,
         narrow: bool = True,
         deadline: Deadline | None = None,
+        log: WorkLog | None = None,
     ) -> Solution:
         """Power, error and coverage of the sensor's crop window, by `quadrature` or the integrator's own.
 
         Arguments and errors as of `Solver.solve`; SceneError for a sensor that is no `fspt_lens`.
         """
         wanted = quadrature or self.quadrature
-        return self._solver.solve(scene, camera_of(sensor), wanted, progress, narrow=narrow, deadline=deadline)
+        return self._solver.solve(scene, camera_of(sensor), wanted, progress, narrow=narrow, deadline=deadline, log=log)
 
     def light_left_out(
         self, scene: mi.Scene, sensor: mi.Sensor, quadrature: Quadrature | None = None

@@ -1,4 +1,5 @@
-"""The shortcuts that the integral takes in a scene, the reasons, and the share of the work that each saves."""
+"""The shortcuts that the integral takes in a scene, with reasons and the share of the work that each saves; and where
+the work goes: lines of sight and seconds of each step, and the pixels that take most lines of sight."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..integral.shortcuts import SHORTCUTS, Finding
+from ..integral.work_log import WorkLog
 from ..rendering.render import integrator_of, sensor_of
 from ..rendering.scene import loaded
 from ..runtime import backend
@@ -70,6 +72,32 @@ class Explanation:
         return asdict(self)
 
 
+@dataclass(frozen=True)
+class Work:
+    """One row about the work: a step of the integration, or one of the pixels that take most lines of sight.
+
+    what : name of the step; "pixel x, y" with column and row on the film
+    pixels, lines : that took the step; lines of sight of all of them together
+    seconds : of the step; None for a pixel
+    """
+
+    what: str
+    pixels: int
+    lines: int
+    seconds: float | None = None
+
+    def render_text(self) -> str:
+        """The row as text: what, pixels, lines of sight, seconds."""
+        seconds = "" if self.seconds is None else f"{self.seconds:.2f} s"
+        return f"{self.what:<{WHAT_WIDTH}} {self.pixels:>9} {self.lines:>12} {seconds:>10}"
+
+    def to_dict(self) -> dict[str, str | int | float | None]:
+        """The row as plain data for JSON."""
+        return asdict(self)
+
+
+DEAREST = 10  # pixels that are listed
+WORK_HEADER = f"{'':<{WHAT_WIDTH}} {'pixels':>9} {'lines':>12} {'time':>10}"
 HEADER = f"{'':<{WHAT_WIDTH}} {'':<9} {'lines':>6} {'time':>{len(NO_GAIN)}}  (saved)"
 
 
@@ -87,11 +115,7 @@ def explain(
     """
     scene = loaded(scene)
     variant = backend.ensure_variant()
-    lens: Any = sensor_of(scene, sensor)
-    integrator: Any = integrator_of(scene, "integral")
-    wanted = {name: value for name, value in (("rtol", rtol), ("domain", domain)) if value is not None}
-    with named("fspt_integral"):
-        quadrature = replace(integrator.quadrature, **wanted)
+    lens, integrator, quadrature = _parts(scene, sensor, rtol, domain)
 
     def solve(quadrature: Quadrature) -> tuple[Solution, float]:
         start = time.perf_counter()
@@ -107,6 +131,38 @@ def explain(
     if (left_out := integrator.light_left_out(scene, lens, quadrature)) is not None:
         rows.append(_scattered(left_out))
     return [*rows, *_real_lens(lens), _diffraction(lens), *_never_done(scene, variant)]
+
+
+def work(
+    scene: mi.Scene | str | os.PathLike[str],
+    *,
+    sensor: int = 0,
+    rtol: float | None = None,
+    domain: str | None = None,
+) -> list[Work]:
+    """One row for every step of the integration, in order, then the `DEAREST` pixels; parameters as of `explain`.
+
+    The image is computed twice: kernels may be compiled first.
+    """
+    scene = loaded(scene)
+    backend.ensure_variant()
+    lens, integrator, quadrature = _parts(scene, sensor, rtol, domain)
+    from ..camera.of_sensor import camera_of
+
+    integrator.solve(scene, lens, quadrature)
+    log = WorkLog(camera_of(lens).pixel_pitch)
+    integrator.solve(scene, lens, quadrature, log=log)
+    steps = [Work(name, *numbers) for name, numbers in log.steps.items()]
+    return [*steps, *(Work(f"pixel {x}, {y}", 1, lines) for x, y, lines in log.dearest(DEAREST))]
+
+
+def _parts(scene: mi.Scene, sensor: int, rtol: float | None, domain: str | None) -> tuple[Any, Any, Quadrature]:
+    """The sensor, the integrator and its accuracy, with these parameters in place of its own."""
+    integrator: Any = integrator_of(scene, "integral")
+    wanted = {name: value for name, value in (("rtol", rtol), ("domain", domain)) if value is not None}
+    with named("fspt_integral"):
+        quadrature = replace(integrator.quadrature, **wanted)
+    return sensor_of(scene, sensor), integrator, quadrature
 
 
 def _saved(

@@ -7,13 +7,14 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from small_scenes import SCENES, attribute, ball, glow, lens, world_scene, write_ply
+from small_scenes import SCENES, attribute, ball, glow, lens, load_scene, world_scene, write_ply
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.cli import app
 from mitsuba_fspt.integral.quadrature import Quadrature
 from mitsuba_fspt.integral.shortcuts import SHORTCUTS
 from mitsuba_fspt.runtime.errors import SceneError
+from mitsuba_fspt.studies.explain import work
 
 RTOL = 1e-2
 
@@ -219,6 +220,21 @@ def test_explain_measures_what_each_shortcut_saves():
     assert SHORTCUTS["occlusion"] in {row.what for row in other}
 
 
+@pytest.mark.parametrize("name", ["two_spheres", "mirror_rig"])
+def test_work_of_the_steps_adds_up(name):
+    """The steps contain all lines of sight, and the dearest pixels lie where the image has an edge."""
+    scene = load_scene(name, (12, 8, 14, 10))
+    rows = work(scene, rtol=0.03)
+    steps = [row for row in rows if row.seconds is not None]
+    assert sum(row.lines for row in steps) == fspt.render(scene, rtol=0.03).metadata["nodes"]
+    dearest = [row for row in rows if row.seconds is None]
+    assert [row.lines for row in dearest] == sorted((row.lines for row in dearest), reverse=True)
+    assert dearest[0].lines > 16
+    assert sum(row.lines for row in dearest) < sum(row.lines for row in steps)
+    places = [tuple(map(int, row.what.removeprefix("pixel ").split(", "))) for row in dearest]
+    assert all(12 <= x < 26 and 8 <= y < 18 for x, y in places)
+
+
 def test_findings_count_no_more_pixels_than_the_image_has():
     """Where the phantom extends beyond the image, pixels around it are evaluated too: silhouettes may cross them."""
     solution = solved(world_scene(ball(radius=60.0), sensor=lens(8, f_number=2.8)))
@@ -236,6 +252,12 @@ def test_explain_and_render_without_shortcuts_from_the_command_line(tmp_path, mo
     assert app.run(["explain", scene, *small, "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert {"what", "left_out", "why", "lines_saved", "time_saved", "time_spread"} == set(rows[0])
+    steps = {row["what"]: row for row in rows if "pixels" in row}
+    assert {"1 nodes", "12 nodes"} < steps.keys()
+    assert steps["12 nodes"]["lines"] == 12 * steps["12 nodes"]["pixels"]
+    assert steps["12 nodes"]["seconds"] > 0
+    assert sum(name.startswith("pixel ") for name in steps) == 10
+    assert all(what in table for what in steps)
     assert app.run(["render", scene, *small, "--no-shortcuts"]) == 0
     assert fspt.read("two_spheres.exr").metadata["shortcuts_off"] == ", ".join(sorted(SHORTCUTS))
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...camera.camera import Camera
 from ...camera.window import Window
@@ -138,10 +139,19 @@ class Draft:
         """Set the errors of given values; before, errors of the rules on these pixels count for their neighbours."""
         self.error = dr.select(self.computed, self.error, self.given_error)
 
-    def count(self, what: str, pixels_touched: int, rays: int) -> None:
-        """Record the name of a rule, the number of pixels it was applied to and their lines of sight."""
+    def count(self, what: str, pixels: mi.UInt32, rays: int) -> None:
+        """Record the name of a rule, the numbers of the pixels it was applied to, and their lines of sight."""
+        touched = dr.width(pixels)
         self.rays += rays
-        self.levels.append(f"{what}: {pixels_touched} pixels")
+        self.levels.append(f"{what}: {touched} pixels")
+        if log := self.progress.log:
+            others = self.view.specular is not None and self.view.specular.part == "others"
+            log.add(f"other courses, {what}" if others else what, touched, rays)
+            if touched and self.camera.pixel_pitch == log.pixel_pitch:
+                lines, plane = self.grid.full(mi.Float64, 0), np.zeros(self.window.shape)
+                dr.scatter(lines, mi.Float64(rays / touched), pixels)
+                self.grid.lay(lines, plane)
+                log.add_lines(self.window.crop_offset, self.window.expand(plane))
 
     # ------------------------------------------------------------------ edges between lines of sight
 

@@ -148,7 +148,8 @@ class Means:
                 dr.scatter_add(total, column, shift)
             dr.eval(sums)
         whole = done // (SHIFTS * runs)  # array entries of one pixel follow one another
-        draft.count(f"{SHIFTS} lattices of {more}", whole, done * FIRST)
+        touched = dr.gather(mi.UInt32, self.pixels, dr.arange(mi.UInt32, whole))
+        draft.count(f"{SHIFTS} lattices of {more}", touched, done * FIRST)
         old, new = (dr.opaque(mi.Float64, share) for share in (points / more, 1 / more))
         radiance, coverage = (
             old * before + new * total for before, total in zip((self.radiance, self.coverage), sums, strict=True)

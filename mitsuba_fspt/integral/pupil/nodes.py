@@ -166,6 +166,5 @@ def apply_nodes(draft: Draft, rule: node_rules.Rule, where: Mask | None = None, 
     found = Sums(**{name: images.get(name, mi.Float64(nothing)) for name, nothing in NOTHING_SEEN.items()})
     if not specular:
         found.front = found.nearest
-    count = dr.width(index)
-    draft.count(f"{len(rule)} nodes", count, count * len(rule))
+    draft.count(f"{len(rule)} nodes", index, dr.width(index) * len(rule))
     return found

@@ -157,6 +157,8 @@ class _Faces:
             return rough
         self.taken = True
         found = self.by_faces.run(wanted | forced, peak, Progress(deadline=draft.progress.deadline))
+        if draft.progress.log:
+            draft.progress.log.add("images of faces", int(np.count_nonzero(wanted | forced)), found.rays)
         return rough & ~self._give(found, grid.flat(wanted | forced), grid.flat(forced), peak)
 
     def _give(self, found: Solution, wanted: Mask, forced: Mask, peak: float) -> Mask:

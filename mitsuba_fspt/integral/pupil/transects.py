@@ -300,11 +300,12 @@ def apply_transects(
         dr.eval(found)
         rays += int(dr.sum(each.rays)[0])
         count += dr.width(part)
-    draft.count(f"{len(rule)} transects", count, rays)
+    touched = dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, count))
+    draft.count(f"{len(rule)} transects", touched, rays)
     done = None
     if count < dr.width(index):
         done = draft.grid.full(mi.Bool, False)
-        dr.scatter(done, mi.Bool(True), dr.gather(mi.UInt32, index, dr.arange(mi.UInt32, count)))
+        dr.scatter(done, mi.Bool(True), touched)
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = found.squares - found.value * found.value
     spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)

@@ -123,6 +123,8 @@ class _Refinement:
         power, error = (self.window.expand(image) * self.camera.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.coverage, 0, 1))
         complete = self.window.expand(where.astype(np.float64)) > 0
+        if progress.log:
+            progress.log.add("surface form", int(np.count_nonzero(where)), self.rays)
         progress(1.0)
         return Solution(power, error, coverage, self.rays, tuple(self.levels), complete, self._findings())
 
