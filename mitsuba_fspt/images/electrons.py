@@ -30,4 +30,4 @@ class Electrons:
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
         """The electrons, shape (h, w) [e-], for `np.asarray(exposure)`."""
-        return np.array(self.electrons, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
+        return np.array(self.electrons, dtype=dtype, copy=copy)  # None: if needed

@@ -122,7 +122,7 @@ class Image(ImageData):
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:
         """The power, shape (h, w) [W], for `np.asarray(image)`; read-only unless it is a copy."""
-        return np.array(self.power, dtype=dtype, copy=copy)  # type: ignore[arg-type]  # copy=None: if needed
+        return np.array(self.power, dtype=dtype, copy=copy)  # None: if needed
 
     def __getitem__(self, window: slice | tuple[slice, ...]) -> Image:
         """Part of the image, `image[top:bottom, left:right]`, with all its planes.
