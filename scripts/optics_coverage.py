@@ -1,30 +1,40 @@
-"""Coverage of the intervals of `locate` where optical coefficients are known to 10 %, from images of photons.
+"""Coverage of the intervals of `locate` where optical coefficients are known to 10 %.
 
-    python scripts/optics_coverage.py [--placements 40] [--three 40] [--photons 3e6] [-o docs/optics_coverage.csv]
+    python scripts/optics_coverage.py [--images series,photons] [--placements 40] [--three 40] [--photons 3e6] [-o CSV]
 
 A point source of 1 W at a random place of a cylinder of 16 by 16 mm, 3 to 7 mm below its side and 4 mm or more below
 its caps, in four views of 24² pixels from the side. The true µa and µs' of each band are the nominal ones times
-1 + 0.1 N(0, 1), n is 1.37. J_n of the images is that of photons one by one (`photon_walk`) in bins of 1 mm, and shares
-nothing with the solver; the images have 300 electrons on the brightest pixel of each band. `locate` has the nominal
-coefficients with `mua_sd` and `musp_sd` of 0.1, or without.
+1 + 0.1 N(0, 1), n is 1.37. The images have 300 electrons on the brightest pixel of each band. `locate` has the nominal
+coefficients with `mua_sd` and `musp_sd` of 0.1, or without. J_n of the images shares nothing with the solver:
 
-Columns: placements, and those that `locate` refused; shares of the 90 % intervals that contain x, y, z, and the power;
-rms error of the position over all directions [mm] and of the power [%]; rms of the errors over their stated sd, of
-positions and of powers; mean chi2; rms error of the coefficients before and after the fit [%]; median CPU seconds.
+*series* : of the diffusion equation, exact; `locate` solves the same equation, so that noise and coefficients alone are
+    unknown
+*photons* : one by one (`photon_walk`) in bins of 1 mm, with a noise of some 3 % a bin beside the bright ones; `locate`
+    solves SP3, whose own error counts, too
+
+Columns: images, placements, and those that `locate` refused; shares of the 90 % intervals that contain x, y, z, and the
+power; rms error of the position over all directions [mm] and of the power [%]; rms of the errors over their stated sd,
+of positions and of powers; mean chi2; rms error of the coefficients before and after the fit [%]; median CPU seconds.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import itertools
 import logging
 import math
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import tests_folder  # noqa: F401
 from csv_table import write_rows
+from cylinder_diffusion import Phantom, exitance
 from numpy.typing import NDArray
 
 import mitsuba_fspt as fspt
@@ -42,6 +52,8 @@ import mitsuba as mi  # noqa: E402
 from photon_walk import Body, Emitter, Optics, exit_power  # noqa: E402
 
 Array = NDArray[np.float64]
+Place = tuple[float, float, float]
+Truth = Callable[[Array, float, float, Place], Array]
 ROOT = Path(__file__).resolve().parent.parent
 RADIUS, HEIGHT, INDEX = 8.0, 16.0, 1.37
 VIEWS = [0, 90, 180, 270]
@@ -69,8 +81,8 @@ class Setup:
         return cls(matrix, Surface.of(matrix))
 
 
-def phantom(names: tuple[str, ...], spread: Spread = Spread()) -> PhantomFile:  # noqa: B008
-    """The cylinder with its nominal coefficients; `spread` of each band's."""
+def phantom(names: tuple[str, ...], spread: Spread = Spread(), model: str = "sp3") -> PhantomFile:  # noqa: B008
+    """The cylinder with its nominal coefficients; `spread` of each band's; `model` of its light."""
     bands = {name: Band(BANDS[name][0], (Medium(BANDS[name][1], BANDS[name][2], INDEX),), (spread,)) for name in names}
     return PhantomFile(
         CylinderGeometry(RADIUS, HEIGHT),
@@ -78,10 +90,11 @@ def phantom(names: tuple[str, ...], spread: Spread = Spread()) -> PhantomFile:  
         (Source(Sphere((0.0, 0.0, 0.0))),),
         edge=1.5,
         bands=bands,
+        model=model,
     )
 
 
-def place(rng: np.random.Generator) -> tuple[float, float, float]:
+def place(rng: np.random.Generator) -> Place:
     """Random place 3 to 7 mm below the side, and 4 mm or more below the caps."""
     while True:
         x, y, z = (float(value) for value in rng.uniform(-1, 1, 3) * (RADIUS, RADIUS, HEIGHT / 2 - 4))
@@ -99,7 +112,15 @@ def bin_of(p: mi.Point3f) -> mi.UInt32:
     return dr.select(on_cap, cap, row * TURNS + turn)
 
 
-def photon_exitance(points: Array, mua: float, musp: float, at: tuple[float, float, float], photons: int) -> Array:
+def series_exitance(points: Array, mua: float, musp: float, at: Place) -> Array:
+    """J_n [W/mm²] of 1 W at the points (V, 3) of the surface, of the diffusion equation."""
+    far, angle = math.hypot(*at[:2]), math.atan2(at[1], at[0])
+    turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+    body = Phantom(RADIUS, HEIGHT, mua, musp, INDEX, source_x=far, source_z=at[2], source_diameter=0.0)
+    return exitance(body, points @ turn.T)
+
+
+def photon_exitance(points: Array, mua: float, musp: float, at: Place, photons: int) -> Array:
     """J_n [W/mm²] of 1 W at the points (V, 3) of the surface, linear between the bins' centres."""
     count = (ROWS + 2 * RINGS) * TURNS
     power = exit_power(Body(RADIUS, HEIGHT), Optics(mua, musp, INDEX), Emitter(at), bin_of, count, photons).mean(axis=0)
@@ -126,8 +147,10 @@ def photon_exitance(points: Array, mua: float, musp: float, at: tuple[float, flo
     return np.maximum(result, 0)
 
 
-def replicate(setup: Setup, names: tuple[str, ...], fitted: bool, photons: int, seed: int) -> dict[str, Array] | None:
-    """Errors of one placement; None where `locate` refuses it."""
+def replicate(
+    setup: Setup, names: tuple[str, ...], fitted: bool, truth: Truth, model: str, seed: int
+) -> dict[str, Array] | None:
+    """Errors of one placement, by `model` from images of J_n of `truth`; None where `locate` refuses it."""
     rng = np.random.default_rng(seed)
     at, images, true = place(rng), {}, {}
     for name in names:
@@ -135,13 +158,13 @@ def replicate(setup: Setup, names: tuple[str, ...], fitted: bool, photons: int, 
         true[f"{name}.mua"], true[f"{name}.musp"] = np.array([mua, musp]) * (
             1 + SD * rng.standard_normal(2).clip(-3, 3)
         )
-        exitance = photon_exitance(setup.surface.vertices, true[f"{name}.mua"], true[f"{name}.musp"], at, photons)
-        power = share * setup.matrix.forward(exitance)
+        lit = truth(setup.surface.vertices, true[f"{name}.mua"], true[f"{name}.musp"], at)
+        power = share * setup.matrix.forward(lit)
         per_watt = ELECTRONS / power.max()
         counted = rng.poisson(power * per_watt) + READ_NOISE * rng.standard_normal(power.shape)
         metadata = {"electrons_per_watt": per_watt, "read_noise": READ_NOISE}
         images[name] = [fspt.Image(plane / per_watt, metadata=metadata) for plane in counted]
-    described = phantom(names, Spread(SD, SD) if fitted else Spread())
+    described = phantom(names, Spread(SD, SD) if fitted else Spread(), model)
     start = time.process_time()
     try:
         found = fspt.locate(described, dict.fromkeys(names, setup.matrix), images, scene=setup.surface)
@@ -167,9 +190,15 @@ def replicate(setup: Setup, names: tuple[str, ...], fitted: bool, photons: int, 
     }
 
 
-def row(setup: Setup, names: tuple[str, ...], fitted: bool, photons: int, placements: int) -> dict[str, object]:
+def row(
+    setup: Setup, names: tuple[str, ...], fitted: bool, images: str, photons: int, placements: int
+) -> dict[str, object]:
     """A line of the table."""
-    each = [replicate(setup, names, fitted, photons, seed) for seed in range(placements)]
+    truth, model = {
+        "series": (series_exitance, "diffusion"),
+        "photons": (partial(photon_exitance, photons=photons), "sp3"),
+    }[images]
+    each = [replicate(setup, names, fitted, truth, model, seed) for seed in range(placements)]
     kept = [one for one in each if one is not None]
     of = {key: np.array([one[key] for one in kept]) for key in kept[0]}
 
@@ -188,28 +217,36 @@ def row(setup: Setup, names: tuple[str, ...], fitted: bool, photons: int, placem
         "coefficients_after_percent": 100 * rms(of["after"]),
         "seconds": float(np.median(of["seconds"])),
     }
-    line: dict[str, object] = {"bands": len(names), "coefficients": "fitted along" if fitted else "taken as exact"}
+    line: dict[str, object] = {
+        "images": images,
+        "bands": len(names),
+        "coefficients": "fitted along" if fitted else "taken as exact",
+    }
     line |= {"placements": placements, "refused": placements - len(kept)}
     return line | {name: float(f"{value:.3g}") for name, value in numbers.items()}
 
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--images", default="series,photons", help="what J_n of the images is from; other rows stay")
     options.add_argument("--placements", type=int, default=40, help="with one band")
     options.add_argument("--three", type=int, default=40, help="placements with three bands")
     options.add_argument("--photons", type=float, default=3e6, help="of each image")
     options.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "optics_coverage.csv")
     given = options.parse_args()
     logging.getLogger("mitsuba_fspt").setLevel(logging.ERROR)
-    rows = []
+    kinds, rows = given.images.split(","), []
+    if given.output.exists():
+        with given.output.open(encoding="utf-8") as file:
+            rows = [dict(one) for one in csv.DictReader(file) if one["images"] not in kinds]
+    cases = [(names, fitted) for names in (("green",), tuple(BANDS)) for fitted in (True, False)]
     with tempfile.TemporaryDirectory() as folder:
         setup = Setup.of(Path(folder))
-        for names, placements in ((("green",), given.placements), (tuple(BANDS), given.three)):
-            for fitted in (True, False):
-                if placements:
-                    rows.append(row(setup, names, fitted, int(given.photons) // 32 * 32, placements))
-                    print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
-                    write_rows(given.output, rows)
+        for images, (names, fitted) in itertools.product(kinds, cases):
+            if placements := given.placements if len(names) == 1 else given.three:
+                rows.append(row(setup, names, fitted, images, int(given.photons) // 32 * 32, placements))
+                print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
+                write_rows(given.output, rows)
 
 
 if __name__ == "__main__":

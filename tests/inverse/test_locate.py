@@ -512,6 +512,27 @@ def test_uncertain_coefficients(case):
     assert fitted.summary()["optics"]["mua"] == {"value": mua.value, "sd": mua.sd}
 
 
+def test_stated_uncertainty_of_a_coefficient_is_a_prior(case):
+    """Rationale: data of information I and a prior of sd s about the file's value m₀ give m₀ + I (m − m₀)/(I + 1/s²).
+
+    I and m follow from the fit with s = 0.2; with s = 0.04 the data have less weight than the prior. Expected: that
+    value to a fifth of the pull, for what is not linear, and 1/√(I + 1/s²). Seen to fail where the prior is about the
+    coefficient of the round before.
+    """
+    wrong, images = replace(case.described, medium=Medium(0.06, 1.0)), case.images(SOURCE, seed=1)
+    wide, narrow = 0.06 * 0.2, 0.06 * 0.04
+    loose, tight = (
+        fspt.locate(replace(wrong, spread=Spread(mua=s)), case.matrix, images, scene=case.surface).optics["mua"]
+        for s in (0.2, 0.04)
+    )
+    information = loose.sd**-2 - wide**-2
+    alone = 0.06 + (loose.value - 0.06) / loose.sd**2 / information
+    pull = information * (alone - 0.06) / (information + narrow**-2)
+    assert 0.2 < pull / (alone - 0.06) < 0.8
+    assert tight.value - 0.06 == pytest.approx(pull, rel=0.2)
+    assert tight.sd == pytest.approx((information + narrow**-2) ** -0.5, rel=0.1)
+
+
 def test_names_of_uncertain_coefficients():
     """In a band, in a region, in a region of a band; only those with an sd > 0."""
     named = [SimpleNamespace(name=name) for name in (None, "red")]
