@@ -133,7 +133,7 @@ def source_figure() -> Figure:
         ax.set(xlim=(-16, 16), ylim=(-16, 16), aspect="equal", xlabel="x [mm]", ylabel=f"{'xyz'[across]} [mm]")
         half = found.position_interval[1] - found.position
         texts = (f"{'xyz'[k]} {found.position[k]:.2f} ± {half[k]:.2f}" for k in (0, across))
-        ax.set_title(f"{('from above', 'from the side')[across - 1]}: {', '.join(texts)} mm", fontsize="small")
+        ax.set_title(f"{('from above', 'from the side')[across - 1]}:\n{', '.join(texts)} mm", fontsize="small")
     return figure
 
 
