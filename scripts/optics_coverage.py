@@ -1,6 +1,6 @@
 """Coverage of the intervals of `locate` where optical coefficients are known to 10 %.
 
-    python scripts/optics_coverage.py [--images series,photons] [--placements 40] [--three 40] [--photons 3e6] [-o CSV]
+    python scripts/optics_coverage.py [--images series,photons] [--placements 40] [--three 40] [--photons 2e7] [-o CSV]
 
 A point source of 1 W at a random place of a cylinder of 16 by 16 mm, 3 to 7 mm below its side and 4 mm or more below
 its caps, in four views of 24² pixels from the side. The true µa and µs' of each band are the nominal ones times
@@ -9,8 +9,8 @@ coefficients with `mua_sd` and `musp_sd` of 0.1, or without. J_n of the images s
 
 *series* : of the diffusion equation, exact; `locate` solves the same equation, so that noise and coefficients alone are
     unknown
-*photons* : one by one (`photon_walk`) in bins of 1 mm, with a noise of some 3 % a bin beside the bright ones; `locate`
-    solves SP3, whose own error counts, too
+*photons* : one by one (`photon_walk`) in bins of 0.5 mm, between which J_n is linear; `locate` solves SP3, whose own
+    error counts, too. With bins of 1 mm the errors are two standard deviations (rms)
 
 Columns: images, placements, and those that `locate` refused; shares of the 90 % intervals that contain x, y, z, and the
 power; rms error of the position over all directions [mm] and of the power [%]; rms of the errors over their stated sd,
@@ -59,7 +59,7 @@ RADIUS, HEIGHT, INDEX = 8.0, 16.0, 1.37
 VIEWS = [0, 90, 180, 270]
 SD = 0.1
 ELECTRONS, READ_NOISE = 300, 3.5
-TURNS, ROWS, RINGS = 50, 16, 8  # bins: around, along the side, across a cap
+TURNS, ROWS, RINGS = 100, 32, 16  # bins: around, along the side, across a cap
 BANDS = {"red": (0.4, 0.02, 1.1), "green": (0.35, 0.05, 1.0), "blue": (0.25, 0.1, 0.9)}  # share, µa, µs' [1/mm]
 
 
@@ -231,7 +231,7 @@ def main() -> None:
     options.add_argument("--images", default="series,photons", help="what J_n of the images is from; other rows stay")
     options.add_argument("--placements", type=int, default=40, help="with one band")
     options.add_argument("--three", type=int, default=40, help="placements with three bands")
-    options.add_argument("--photons", type=float, default=3e6, help="of each image")
+    options.add_argument("--photons", type=float, default=2e7, help="of each image")
     options.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "optics_coverage.csv")
     given = options.parse_args()
     logging.getLogger("mitsuba_fspt").setLevel(logging.ERROR)
