@@ -27,13 +27,13 @@ Array = NDArray[np.float64]
 class OpticsSettings:
     """Accuracy of the fit of coefficients.
 
-    rounds : most tissues that are made;  settled : change of every x below which the fit ends
+    rounds : largest number of fits, each with the last coefficients;  change : of every x, at which they end
     step, step_n : relative change of µa and µs', and of n, for slopes by differences
     least : least factor of a coefficient, whatever the images ask for
     """
 
     rounds: int = 6
-    settled: float = 0.05
+    change: float = 0.05
     step: float = 0.05
     step_n: float = 0.01
     least: float = 0.1
@@ -93,7 +93,7 @@ class OpticsFit:
             self._fit.uncertain, self._fit.offset = changes, changes @ self.x
             found = self._fit.minimum(found.positions)
             before, self.x = self.x, self._fit.common(found)[-len(self.x) :]
-            if np.abs(self.x - before).max() < self._settings.settled:
+            if np.abs(self.x - before).max() < self._settings.change:
                 break
             self._fit.bands = self._bands(self.x)
             self._fit.offset = changes @ self.x

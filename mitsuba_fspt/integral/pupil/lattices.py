@@ -78,12 +78,17 @@ def refine_by_lattices(draft: Draft) -> None:
 
 
 def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]) -> Mask:
-    """The marked pixels, or as many of them as may take the first lattice: those of the largest errors."""
+    """The marked pixels, or as many of them as may take the first lattice: those of the largest errors.
+
+    Of equal errors, which neighbours may have, no more than that are taken.
+    """
     error = dr.select(above, draft.error, 0).numpy()
     count = int(np.count_nonzero(error))
     while most_points(count) < FIRST:
         count //= 2
-    return above & (draft.error >= dr.opaque(mi.Float64, np.partition(error, -count)[-count]))
+    taken = np.zeros(len(error), bool)
+    taken[np.argpartition(error, -count)[-count:]] = True
+    return above & mi.Bool(taken)
 
 
 def _most_points(quadrature: Quadrature, legs: int, pixels: int) -> int:

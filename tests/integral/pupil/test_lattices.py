@@ -128,7 +128,10 @@ def test_every_size_of_lattice_is_even():
 
 
 def test_where_all_pixels_would_take_too_many_lines_those_of_the_largest_errors_take_them(looked_at):
-    """Lines of sight by way of specular surfaces count as `LEGS`; seen to fail where all of the pixels take them."""
+    """Lines of sight by way of specular surfaces count as `LEGS`; seen to fail where all of the pixels take them.
+
+    No more of them where all errors are equal. Seen to fail there with a threshold for the error: all pixels took them.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -141,10 +144,13 @@ def test_where_all_pixels_would_take_too_many_lines_those_of_the_largest_errors_
         draft.error = mi.Float64(1 + np.random.default_rng(0).permutation(count))
         taken = _largest_errors(draft, draft.grid.full(mi.Bool, True), most_points)
         chosen = dr.select(taken, draft.error, 0).numpy()
+        draft.error = draft.grid.full(mi.Float64, 1.0)
+        alike = np.count_nonzero(_largest_errors(draft, draft.grid.full(mi.Bool, True), most_points).numpy())
     finally:
         draft.error = before
     number = np.count_nonzero(chosen)
     assert few / 2 < number <= few
+    assert alike == number
     assert chosen[chosen > 0].min() == count - number + 1
     # With `max_nodes` given, no line counts as more than one.
     assert _most_points(Quadrature(max_nodes=1 << 16), LEGS, 1) == _most_points(Quadrature(max_nodes=1 << 16), 1, 1)
