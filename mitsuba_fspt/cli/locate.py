@@ -18,6 +18,16 @@ if TYPE_CHECKING:
     from ..inverse.location import Location
 
 
+Shape = Annotated[
+    str,
+    typer.Option(metavar="point|sphere", help="sphere: fit a radius, too.", autocompletion=lambda: ["point", "sphere"]),
+]
+Bands = Annotated[list[str] | None, typer.Option(help="Name of [bands.NAME] in PHANTOM.toml; one for each T.npz.")]
+BandCorrelation = Annotated[
+    float, typer.Option(metavar="RHO", help="Of the bands' factors (gain_error), 0 to 1; 1: one common factor.")
+]
+
+
 def locate(
     phantom: Annotated[Path, typer.Argument(metavar="PHANTOM.toml", help="Geometry, optics and mesh.")],
     matrix: Annotated[Path, typer.Argument(metavar="T.npz", help="Transport matrix of 'fspt matrix'.")],
@@ -28,13 +38,13 @@ def locate(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Tetrahedra with the density to write, .vtu.")
     ] = None,
-    sources: Annotated[int, typer.Option(help="Number of point sources.")] = 1,
-    band: Annotated[
-        list[str] | None, typer.Option(help="Name of [bands.NAME] in PHANTOM.toml; one for each T.npz.")
-    ] = None,
+    sources: Annotated[int, typer.Option(help="Number of sources.")] = 1,
+    shape: Shape = "point",
+    band: Bands = None,
     confidence: Annotated[float, typer.Option(help="Of the intervals.")] = 0.9,
     gain_error: GainError = None,
     gain_per_view: GainPerView = 0.0,
+    band_correlation: BandCorrelation = 0.0,
     sampled: Sampled = False,
     scene: Annotated[Path | None, typer.Option(metavar="SCENE.xml", help="Scene of T.npz, where it has moved.")] = None,
     as_json: AsJson = False,
@@ -67,6 +77,8 @@ def locate(
             confidence=confidence,
             gain_error=gain_error,
             gain_per_view=gain_per_view,
+            band_correlation=band_correlation,
+            shape=shape,
             sampled=sampled,
             scene=scene,
             progress=progress,
@@ -102,6 +114,10 @@ def _text(found: Location, output: Path | None) -> str:
             for name, value, a, b in zip("xyz", source.position, low, high, strict=True)
         )
         lines.append(f"source {number}: {place} mm, {source.power:.5g} W ({least:.5g} to {most:.5g} W)")
+        if source.radius is not None and source.radius_interval:
+            inner, outer = source.radius_interval
+            text = f"{source.radius:.3g} mm ({inner:.3g} to {outer:.3g} mm)" if inner else f"at most {outer:.3g} mm"
+            lines[-1] += f", radius {text}"
     lines.append(f"{100 * found.confidence:g} % intervals; chi2 {found.chi2:.3g} over {found.pixels} pixels")
     if output:
         lines.append(f"{output}: source density and sources")

@@ -99,18 +99,32 @@ class BandImages:
         """(N,) number of the view of each pixel."""
         return self.rows // int(np.prod(self.matrix.image_shape[1:]))
 
-    def places(self) -> Array:
+    @cached_property
+    def points(self) -> Array:
         """(N, 3) mean point of the surface [mm] that each pixel sees."""
         seen = np.asarray(self.transport.sum(axis=1)).ravel()
         return np.asarray(self.transport @ self.surface.vertices) / seen[:, None]
 
-    def exitance(self, position: Array) -> Array:
-        """(V,) J_n [1/mm²] at the surface's vertices in this band, per watt of a point source over all bands.
+    def depth(self, position: Array) -> float:
+        """Distance of a position (3,) from the border [mm]."""
+        nearest = nearest_points(position[None], self._border)[0]
+        return float(np.linalg.norm(nearest - position))
+
+    @cached_property
+    def _border(self) -> Array:
+        """Corners of the triangles of the border (F, 3, 3) [mm]."""
+        mesh = self.tissue.mesh
+        return mesh.vertices[boundary(mesh.vertices, mesh.cells)[0]]
+
+    def exitance(self, position: Array, radius: float = 0.0) -> Array:
+        """(V,) J_n [1/mm²] at the surface's vertices in this band, per watt of a source over all bands.
+
+        radius : of a sphere that glows uniformly [mm]; 0: a point
 
         Raises FluxError where there is no tissue, or a source is too close to the border.
         """
         x, y, z = (float(value) for value in position)
-        solution = self.tissue.solve([Source(Sphere((x, y, z)))])
+        solution = self.tissue.solve([Source(Sphere((x, y, z), float(radius)))])
         return self.share * solution.exitance_at(self.surface.vertices, self._places)
 
     def image_of(self, sources: Sequence[Source], tissue: Tissue) -> Array:
@@ -118,16 +132,11 @@ class BandImages:
         solution = tissue.solve(sources)
         return np.asarray(self.share * (self.transport @ solution.exitance_at(self.surface.vertices, self._places)))
 
-    def slopes(self, positions: Array, powers: Array) -> dict[str, Array]:
+    def slopes(self, sources: Sequence[Source]) -> dict[str, Array]:
         """(N,) change of the power on the pixels [W] by relative changes of the tissue's coefficients.
 
-        'absorption': of all µa, 'scattering': of all µs', for point sources at `positions` (K, 3) [mm] with `powers`
-        (K,) [W]. By differences of solutions.
+        'absorption': of all µa, 'scattering': of all µs', for these sources. By differences of solutions.
         """
-        sources = [
-            Source(Sphere((float(x), float(y), float(z))), float(power))
-            for (x, y, z), power in zip(positions, powers, strict=True)
-        ]
         media = self.tissue.media
         changes = {
             "absorption": [replace(medium, mua=(1 + STEP) * medium.mua) for medium in media],
@@ -163,7 +172,7 @@ class BandImages:
     def _require_border(self) -> None:
         """Raise InversionError where the matrix's surface is not the border of the tissue."""
         mesh, points = self.tissue.mesh, self.surface.vertices
-        nearest = nearest_points(points, mesh.vertices[boundary(mesh.vertices, mesh.cells)[0]])
+        nearest = nearest_points(points, self._border)
         if mesh.snap is not None:
             nearest = mesh.snap(nearest)
         away = np.linalg.norm(points - nearest, axis=1).max()

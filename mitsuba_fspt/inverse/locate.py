@@ -13,7 +13,7 @@ from types import NoneType
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
 from ..images.exposure import Exposure
@@ -24,9 +24,10 @@ from ..runtime.progress_bar import Progress, reported
 from ..tissue.diffusion import Tissue
 from ..tissue.phantom_file import PhantomFile, Spread
 from .band_images import BandImages
-from .location import Location
+from .extent import SHAPES, Profile, with_radii
+from .location import Intervals, Location
 from .measurement import Measurement, tell_misfit, told
-from .optics_fit import Coefficient, OpticsFit, unknowns
+from .optics_fit import OpticsFit, unknowns
 from .source_fit import LocationSettings, SourceFit
 from .source_grid import SourceGrid
 from .surface import Surface
@@ -52,20 +53,21 @@ def locate(
     gain_error: float | None = None,
     gain_per_view: float = 0.0,
     band_correlation: float = 0.0,
+    shape: str = "point",
     sampled: bool = False,
     confidence: float = 0.9,
     scene: object = None,
     progress: Progress | None = None,
     settings: LocationSettings | None = None,
 ) -> Location:
-    """Positions and powers of point sources inside a phantom, and a source density, from images of its surface.
+    """Positions and powers of sources inside a phantom, and a source density, from images of its surface.
 
         S = fspt.locate("phantom.toml", T, images)
         S.sources[0].position, S.sources[0].position_interval  # mm, in the frame of phantom.toml
 
-    The intervals contain the noise of the images, the numerical error of the matrix, `gain_error`, and errors of
-    coefficients that the phantom file states (`mua_sd`, …), which are fitted along; not those of shape, inclusions left
-    out, pose, lens, or of SP3 or diffusion itself, of which `warnings` tell what the residuals show (M.34).
+    The intervals contain the noise of the images, errors of the matrix, `gain_error`, and errors of coefficients that
+    the phantom file states (`mua_sd`, …), which are fitted along; not those of shape, inclusions left out, pose, lens,
+    or of SP3 or diffusion itself, of which `warnings` tell what the residuals show (M.34).
 
     Parameters
     ----------
@@ -74,7 +76,9 @@ def locate(
         before `to_world`, is in the frame of the phantom file, as `fspt flux solve` writes it.
     images : one Image, Exposure or name of a file of either per view, in the order of the views; or an array of powers
         (views, h, w) [W] together with `error`
-    sources : number of point sources, 1 … 20
+    sources : number of sources, 1 … 20
+    shape : "point", or "sphere": they glow uniformly, with a fitted `radius`, whose interval starts at 0 where the
+        images show an upper limit only
     error, mask, gain_error, gain_per_view, sampled, scene : as in `invert`
     confidence, settings : of the intervals, in (0, 1); accuracy of the fit
     band_correlation : correlation of the bands' factors (`gain_error`), 0 … 1; 1: one factor common to all bands
@@ -88,18 +92,15 @@ def locate(
     InversionError : an option outside its range, bands that differ, images without light or error, a surface that is
         not the phantom's border, sources that the images do not determine, or one too close to the border for the mesh.
     TransportError, DetectorError, ImageError : as in `invert`.
-    FluxError : the phantom file cannot be used, or has no such band.
-    BackendError : scikit-fem, or the mesher that the phantom needs, is missing.
+    FluxError, BackendError : the phantom file cannot be used, or lacks the band; scikit-fem or the mesher is missing.
     """
-    count, confidence, accuracy = _checked(sources, confidence, settings)
-    gains = checked_factor("locate", gain_per_view), _checked_correlation(band_correlation)
+    options = _checked(sources, shape, confidence, settings, gain_per_view, band_correlation)
     given = _given(matrix, images, error, mask)
     described = _described(phantom)
     with reported(progress) as report:
         bands = _band_images(described, given, gain_error, sampled, scene, report)
-        return _located(
-            bands, [described.band(one.name).spreads for one in given], count, confidence, accuracy, gains, report
-        )
+        fit = SourceFit(bands, options.settings, report, *options.gains)
+        return _located(fit, [described.band(one.name).spreads for one in given], options, report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +119,38 @@ class _Given:
         return "locate" if self.name is None else f"locate, band '{self.name}'"
 
 
-def _checked(sources: int, confidence: float, settings: LocationSettings | None) -> tuple[int, float, LocationSettings]:
-    """Number of sources, confidence and accuracy; raises InversionError where one is outside its range."""
+@dataclass(frozen=True)
+class _Options:
+    """Number of sources, whether they are spheres, confidence, accuracy, `gain_per_view` and `band_correlation`."""
+
+    count: int
+    spheres: bool
+    confidence: float
+    settings: LocationSettings
+    gains: tuple[float, float]
+
+    @property
+    def numbers(self) -> int:
+        """Of a source."""
+        return 5 if self.spheres else 4
+
+
+def _checked(
+    sources: int,
+    shape: object,
+    confidence: float,
+    settings: LocationSettings | None,
+    gain_per_view: float,
+    band_correlation: float,
+) -> _Options:
+    """The options; raises InversionError where one is outside its range."""
     count = whole("locate: 'sources'", sources, InversionError, "1")
     if not 1 <= count <= MOST_SOURCES:
         raise InversionError(f"locate: 'sources' must be in 1 … {MOST_SOURCES}, got {count}. Give their number.")
+    if shape not in SHAPES:
+        raise InversionError(
+            f"locate: 'shape' must be one of {', '.join(SHAPES)}, got {shape!r}. Give \"sphere\" to fit a radius."
+        )
     confidence = number("locate: 'confidence'", confidence, InversionError, "0.9")
     if not 0 < confidence < 1:
         raise InversionError(f"locate: 'confidence' must be in (0, 1), got {confidence:g}. Give for example 0.9.")
@@ -131,7 +159,8 @@ def _checked(sources: int, confidence: float, settings: LocationSettings | None)
             f"locate: 'settings' must be LocationSettings, got {type(settings).__name__}. Leave it out for the usual "
             "accuracy."
         )
-    return count, confidence, settings or LocationSettings()
+    gains = checked_factor("locate", gain_per_view), _checked_correlation(band_correlation)
+    return _Options(count, shape == "sphere", confidence, settings or LocationSettings(), gains)
 
 
 def _checked_correlation(value: object) -> float:
@@ -175,38 +204,46 @@ def _given(matrix: TransportMatrix | Mapping[str, TransportMatrix], images: Any,
     return [_Given(name, one, *(value[name] for value in others.values())) for name, one in bands.items()]
 
 
-def _located(
-    bands: Sequence[BandImages],
-    spreads: Sequence[Sequence[Spread]],
-    count: int,
-    confidence: float,
-    settings: LocationSettings,
-    gains: tuple[float, float],
-    report: Progress,
-) -> Location:
-    """Sources and density that fit the images of all bands; `gains`: gain_per_view and band_correlation."""
-    fit = SourceFit(bands, settings, report, gains[0])
-    if len(fit.power) <= 4 * count:
+def _located(fit: SourceFit, spreads: Sequence[Sequence[Spread]], options: _Options, report: Progress) -> Location:
+    """Sources and density that fit the images of all bands."""
+    count, numbers = options.count, options.numbers
+    if len(fit.power) <= numbers * count:
         raise InversionError(
-            f"locate: {len(fit.power)} pixels do not determine the {4 * count} numbers of {count} sources. Give more "
-            "pixels, or fewer sources."
+            f"locate: {len(fit.power)} pixels do not determine the {numbers * count} numbers of {count} sources. Give "
+            "more pixels, or fewer sources."
         )
     report("first positions", 0.0)
-    grid = SourceGrid.of(bands)
-    found, optics = fit.best(grid, count), dict[str, Coefficient]()
-    if uncertain := unknowns(spreads):
-        own = OpticsFit(fit, uncertain, report)
-        found = own.refined(found)
-        optics = own.coefficients(found)
-    noise = fit.covariance(found)
-    covariance, z = noise + fit.by_factors(found, noise, gains[1]), float(norm.ppf((1 + confidence) / 2))
-    linear = fit.is_linear(found, noise, z)
+    grid = SourceGrid.of(fit.bands)
+    found, z = fit.best(grid, count), float(norm.ppf((1 + options.confidence) / 2))
+    own = OpticsFit(fit, uncertain, report) if (uncertain := unknowns(spreads)) else None
+    found = own.refined(found) if own else found
+    profiles = list[Profile]()
+    if options.spheres:
+        found, profiles = with_radii(fit, found, report)
+        if own:
+            found, profiles = with_radii(fit, own.refined(found), report)
+    order = np.argsort(-found.powers, kind="stable")
+    found, extents = found.sorted(), [profiles[k].extent(z) for k in order] if profiles else None
+    covariance = fit.covariance(found)
+    linear = fit.is_linear(found, covariance, z)
+    p_values = fit.p_values(found, len(grid.inner), numbers)
+    _tell(linear, p_values, count, options.settings)
+    power = fit.power / fit.factors(found)[fit.view]
+    density = replace(grid, sigma=found.sigma, power=power).density(report)
+    warnings = tell_misfit("locate", found.cost, len(fit.power), numbers * count, fit.noise(found))
+    warnings += told("locate", fit.structure(found).lines())
+    optics = own.coefficients(found) if own else {}
+    intervals = Intervals(covariance, z, options.confidence, linear, p_values, extents)
+    return Location.of(fit, found, intervals, density, warnings, optics)
+
+
+def _tell(linear: bool, p_values: NDArray[np.float64], count: int, settings: LocationSettings) -> None:
+    """Say in a line each where intervals may be too narrow, and which sources the images do not show."""
     if not linear:
         LOG.warning(
             "fspt: locate: the intervals are those of a linear approximation, which does not hold for changes as "
             "large; they may be too narrow. Give fewer sources, or images with less noise."
         )
-    p_values = fit.p_values(found, len(grid.inner))
     for k in np.flatnonzero(p_values > settings.chance):
         LOG.warning(
             "fspt: locate: the images do not show that source %d is there, noise alone may look like it (p = %.2g). "
@@ -215,11 +252,6 @@ def _located(
             p_values[k],
             "Give fewer sources, or" if count > 1 else "Give",
         )
-    power = fit.power / fit.factors(found)[fit.view]
-    density = replace(grid, sigma=found.sigma, power=power).density(report)
-    warnings = tell_misfit("locate", found.cost, len(fit.power), 4 * count, fit.noise(found))
-    warnings += told("locate", fit.structure(found).lines())
-    return Location.of(fit, found, covariance, z, p_values, linear, density, confidence, warnings, optics)
 
 
 def _described(phantom: object) -> PhantomFile:

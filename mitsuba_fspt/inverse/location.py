@@ -1,10 +1,10 @@
-"""Result of `locate`: point sources with their intervals, a density, and files of them."""
+"""Result of `locate`: sources with their intervals, a density, and files of them."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..runtime.atomic_files import atomic_path
 from ..runtime.errors import BackendError, InversionError
 from ..tissue.tetrahedra import Tetrahedra
+from .extent import Extent
 from .optics_fit import Coefficient
 from .source_fit import PointSources, SourceFit
 
@@ -22,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class LocatedSource:
-    """Point source that fits the images.
+    """Point source, or sphere, that fits the images.
 
     Attributes
     ----------
@@ -30,6 +31,12 @@ class LocatedSource:
     position_interval : (low, high), each (3,) [mm]
     power : [W];  power_sd : [W];  power_interval : (low, high) [W]
     p_value : probability, at most, that noise alone makes a source fit as well anywhere in the tissue
+    radius : [mm] of a sphere; None where points were asked for
+    radius_interval : (low, high) [mm]: low is 0 where the images show only the upper limit `high`, and `high` is the
+        distance of the centre from the border where they exclude no sphere
+
+    Intervals of a sphere contain all radii of the interval, and are not symmetric; the standard deviations are those of
+    normal intervals of the same width.
     """
 
     position: Array
@@ -39,17 +46,24 @@ class LocatedSource:
     power_sd: float
     power_interval: tuple[float, float]
     p_value: float
+    radius: float | None = None
+    radius_interval: tuple[float, float] | None = None
 
     @classmethod
-    def of(cls, values: Array, sd: Array, z: float, p_value: float) -> LocatedSource:
-        """Source of x, y, z and power (4,) and their sd (4,), with intervals of z sd to both sides."""
+    def of(cls, values: Array, sd: Array, z: float, p_value: float, extent: Extent | None = None) -> LocatedSource:
+        """Source of x, y, z and power (4,) and their sd (4,), with intervals of z sd to both sides, or of a sphere."""
         low, high = values - z * sd, values + z * sd
+        if extent:
+            low, high = np.minimum(low, extent.low), np.maximum(high, extent.high)
+            sd = (high - low) / (2 * z)
         interval = (max(float(low[3]), 0.0), float(high[3]))
-        return cls(values[:3], sd[:3], (low[:3], high[:3]), float(values[3]), float(sd[3]), interval, float(p_value))
+        found = cls(values[:3], sd[:3], (low[:3], high[:3]), float(values[3]), float(sd[3]), interval, float(p_value))
+        return replace(found, radius=extent.radius, radius_interval=extent.interval) if extent else found
 
     def summary(self) -> dict[str, Any]:
         """All numbers by name, ready for JSON."""
-        return {
+        extent = {"radius": self.radius, "radius_interval": self.radius_interval and list(self.radius_interval)}
+        return (extent if self.radius is not None else {}) | {
             "position": self.position.tolist(),
             "position_sd": self.position_sd.tolist(),
             "position_interval": [end.tolist() for end in self.position_interval],
@@ -61,16 +75,31 @@ class LocatedSource:
 
 
 @dataclass(frozen=True, eq=False)
+class Intervals:
+    """What intervals of sources follow from: covariance (4K, 4K), standard deviations z to both sides, and notes.
+
+    confidence, linear : as in `Location`;  p_values : (K,);  extents : of spheres, None of points
+    """
+
+    covariance: Array
+    z: float
+    confidence: float
+    linear: bool
+    p_values: Array
+    extents: Sequence[Extent] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Location:
     """Light sources inside a phantom, from images of its surface.
 
     Attributes
     ----------
-    sources : point sources, the one of the largest power first
-    covariance : (4K, 4K) of x, y, z [mm] and power [W] of the sources, in their order (Eq. M.26)
+    sources : point sources or spheres, the one of the largest power first
+    covariance : (4K, 4K) of x, y, z [mm] and power [W] of the sources, in their order, for their radii (Eq. M.26)
     density : (V,) source density >= 0 [W/mm³] at the vertices of `mesh`
     mesh : tetrahedra of the phantom
-    chi2 : Σ (residual/σ)² over the pixels less the 4K parameters: about 1 where model and noise are right
+    chi2 : Σ (residual/σ)² over the pixels less the parameters, 4 or 5 a source: about 1 where model and noise are right
     pixels : number of pixels fitted
     confidence : of the intervals
     linear : False where the intervals may be too narrow, since the images do not change linearly within them
@@ -107,26 +136,25 @@ class Location:
         cls,
         fit: SourceFit,
         found: PointSources,
-        covariance: Array,
-        z: float,
-        p_values: Array,
-        linear: bool,
+        intervals: Intervals,
         density: Array,
-        confidence: float,
         warnings: Sequence[str] = (),
         optics: Mapping[str, Coefficient] | None = None,
     ) -> Location:
-        """Result of a fit, with intervals of z standard deviations to both sides."""
-        each = zip(found.values.reshape(-1, 4), np.sqrt(np.diag(covariance)).reshape(-1, 4), p_values, strict=True)
+        """Result of a fit."""
+        sd = np.sqrt(np.diag(intervals.covariance)).reshape(-1, 4)
+        extents: Sequence[Extent | None] = intervals.extents or [None] * len(sd)
+        each = zip(found.values.reshape(-1, 4), sd, intervals.p_values, extents, strict=True)
+        numbers = found.values.size + (len(sd) if intervals.extents else 0)
         return cls(
-            sources=tuple(LocatedSource.of(values, sd, z, p_value) for values, sd, p_value in each),
-            covariance=covariance,
+            sources=tuple(LocatedSource.of(v, one, intervals.z, p, extent) for v, one, p, extent in each),
+            covariance=intervals.covariance,
             density=density,
             mesh=fit.bands[0].tissue.mesh,
-            chi2=found.cost / fit.free(found),
+            chi2=found.cost / max(len(fit.power) - numbers, 1),
             pixels=len(fit.power),
-            confidence=confidence,
-            linear=linear,
+            confidence=intervals.confidence,
+            linear=intervals.linear,
             gain_error=max(band.measurement.gain_error for band in fit.bands),
             measured=fit.images(fit.power),
             fitted=fit.images(fit.fitted(found)),
@@ -156,9 +184,10 @@ class Location:
         }
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the tetrahedra with `density` [W/mm³], and the point sources with their `power` [W], to a .vtu file.
+        """Write the tetrahedra with `density` [W/mm³], and the sources with their `power` [W], to a .vtu file.
 
-        A point source is a cell of one vertex. On vertices of the mesh `power` is 0, on point sources `density`.
+        A source is a cell of one vertex, its centre, with its `radius` [mm]. On vertices of the mesh `power` and
+        `radius` are 0, on sources `density`.
 
         Raises
         ------
@@ -180,6 +209,7 @@ class Location:
         values = {
             "density": np.concatenate([self.density, np.zeros(count)]),
             "power": np.concatenate([np.zeros(len(vertices)), [source.power for source in self.sources]]),
+            "radius": np.concatenate([np.zeros(len(vertices)), [source.radius or 0.0 for source in self.sources]]),
         }
         with atomic_path(path, InversionError) as temporary:
             meshio.Mesh(points, cells, point_data=values).write(temporary, "vtu")

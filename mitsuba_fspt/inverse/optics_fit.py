@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optics.media import Medium, Source
-from ..optics.shapes import Sphere
+from ..optics.media import Medium
 from ..runtime.progress_bar import Progress
 from ..tissue.phantom_file import COEFFICIENTS, Spread
 from .band_images import BandImages
@@ -91,19 +90,20 @@ class OpticsFit:
             self._report("optics", turn / self._settings.rounds)
             changes = self._changes(found)
             self._fit.uncertain, self._fit.offset = changes, changes @ self.x
-            found = self._fit.minimum(found.positions)
+            found = self._fit.minimum(found.positions, found.radii)
             before, self.x = self.x, self._fit.common(found)[-len(self.x) :]
             if np.abs(self.x - before).max() < self._settings.change:
                 break
             self._fit.bands = self._bands(self.x)
             self._fit.offset = changes @ self.x
-        return self._fit.minimum(found.positions).sorted()
+        return self._fit.minimum(found.positions, found.radii).sorted()
 
     def coefficients(self, found: PointSources) -> dict[str, Coefficient]:
         """The coefficients by their names, with standard deviations that contain those of the sources."""
-        sd = np.sqrt(np.diag(self._fit.joint_covariance(found))[-len(self.x) :])
+        count = len(self._uncertain)
+        sd = np.sqrt(np.diag(self._fit.joint_covariance(found))[-count:])
         result = {}
-        for one, x, s in zip(self._uncertain, self.x, sd, strict=True):
+        for one, x, s in zip(self._uncertain, self._fit.common(found)[-count:], sd, strict=True):
             nominal = self._of(one)
             result[one.name(self._fit.bands)] = Coefficient(nominal * self._factor(one, x), nominal * one.sd * float(s))
         return result
@@ -133,10 +133,7 @@ class OpticsFit:
 
     def _changes(self, found: PointSources) -> Array:
         """(N, P) change of the power on the pixels [W] with each x, for these sources: one more solution for each."""
-        sources = [
-            Source(Sphere((float(x), float(y), float(z))), float(power))
-            for (x, y, z), power in zip(found.positions, found.powers, strict=True)
-        ]
+        sources = found.sources
         changes = np.zeros((len(found.signal), len(self._uncertain)))
         present = [band.image_of(sources, band.tissue) for band in self._fit.bands]
         for column, one in enumerate(self._uncertain):

@@ -1,7 +1,8 @@
-"""Least squares over the positions and powers of point sources: Levenberg and Marquardt, with SP3 or diffusion.
+"""Least squares over the positions and powers of sources: Levenberg and Marquardt, with SP3 or diffusion.
 
-Positions and powers >= 0 minimise Σ (residual/σ)² with the variances of Eq. M.24; their covariance is that of
-Eq. M.26, J the slopes with positions and powers. The powers of given positions follow from linear least squares.
+Sources are points, or spheres of given radii (see `extent`). Positions and powers >= 0 minimise Σ (residual/σ)² with
+the variances of Eq. M.24; their covariance is that of Eq. M.26, J the slopes with positions and powers. The powers of
+given positions follow from linear least squares.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.sparse import block_diag, csr_array, hstack
+from scipy.sparse import block_diag, csr_array
 from scipy.stats import chi2
 
+from ..optics.media import Source
+from ..optics.shapes import Sphere
 from ..runtime.errors import FluxError, InversionError
 from ..runtime.progress_bar import Progress
 from .band_images import BandImages
@@ -59,7 +62,7 @@ class LocationSettings:
 
 @dataclass(frozen=True, eq=False)
 class PointSources:
-    """Point sources and their images: positions (K, 3) [mm] and powers (K,) [W].
+    """Sources and their images: positions (K, 3) [mm], powers (K,) [W] and radii (K,) [mm], 0 for points.
 
     exitance : of each band, (V, K) J_n per watt of each source [1/mm²]
     columns : (N, K) power on the pixels of all bands per watt;  gradients : (N, K, 3) its change per mm of x, y, z
@@ -68,6 +71,7 @@ class PointSources:
 
     positions: Array
     powers: Array
+    radii: Array
     exitance: tuple[Array, ...]
     columns: Array
     gradients: Array
@@ -109,6 +113,12 @@ class PointSources:
         """(N,) power − fitted power, over the noise, for the measured power (N,) [W]."""
         return self.noise.over(power - self.signal)
 
+    @property
+    def sources(self) -> list[Source]:
+        """The sources of the tissue; those without power are left out."""
+        each = zip(self.positions.tolist(), self.radii.tolist(), self.powers.tolist(), strict=True)
+        return [Source(Sphere((x, y, z), radius), power) for (x, y, z), radius, power in each if power > 0]
+
     def sorted(self) -> PointSources:
         """The same, the source of the largest power first."""
         order = np.argsort(-self.powers, kind="stable")
@@ -116,6 +126,7 @@ class PointSources:
             self,
             positions=self.positions[order],
             powers=self.powers[order],
+            radii=self.radii[order],
             exitance=tuple(values[:, order] for values in self.exitance),
             columns=self.columns[:, order],
             gradients=self.gradients[:, order],
@@ -126,9 +137,15 @@ class SourceFit:
     """Fit of point sources to the images of all bands, their pixels one after the other, (N,)."""
 
     def __init__(
-        self, bands: Sequence[BandImages], settings: LocationSettings, report: Progress, gain_per_view: float = 0.0
+        self,
+        bands: Sequence[BandImages],
+        settings: LocationSettings,
+        report: Progress,
+        gain_per_view: float = 0.0,
+        band_correlation: float = 0.0,
     ) -> None:
         self.bands, self.settings, self.gain_per_view = list(bands), settings, gain_per_view
+        self._correlation = band_correlation
         self._report, self._share = report, 0.0  # of the steps that are done
         self.power = np.concatenate([band.power for band in bands])
         ends = np.cumsum([0, *(len(band.rows) for band in bands)])
@@ -162,13 +179,10 @@ class SourceFit:
     def fitted(self, found: PointSources) -> Array:
         """(N,) fitted power [W], with the factors of the views and the coefficients as fitted."""
         fitted = found.signal * self.factors(found)[self.view] - self.offset
-        if self.uncertain.size:
-            fitted += self.uncertain @ self.common(found)[-self.uncertain.shape[1] :]
+        if found.noise.others is not None:
+            others = found.noise.others
+            fitted += found.sigma * (others @ self.common(found)[-others.shape[1] :])
         return np.asarray(fitted)
-
-    def free(self, found: PointSources) -> int:
-        """Number of pixels less that of the parameters, at least 1."""
-        return max(len(self.power) - 4 * len(found.powers), 1)
 
     def noise(self, found: PointSources) -> list[Chi2]:
         """Σ (noise/σ)² of each band as its stated noise makes it."""
@@ -184,15 +198,14 @@ class SourceFit:
             names = [label if band.name is None else f"{band.name}: {label}" for label in view_labels(band.matrix)]
             seen = views_of(names, fitted, band.rows, found.sigma[own])
             numerical = band.numerical(exitance @ found.powers) / found.sigma[own]
-            factor = band.measurement.gain_error * csr_array((found.signal[own] / found.sigma[own])[:, None])
-            known.append(hstack([common_errors(numerical, seen), factor]))
+            known.append(common_errors(numerical, seen))
             views += seen
             where = "the tissue" if band.name is None else f"band {band.name}"
-            for kind, change in band.slopes(found.positions, found.powers).items():
+            for kind, change in band.slopes(found.sources).items():
                 slope = np.zeros_like(found.signal)
                 slope[own] = change / found.sigma[own]
                 tissue.append((kind, where, slope))
-        places = np.concatenate([band.places() for band in self.bands])
+        places = np.concatenate([band.points for band in self.bands])
         rings = [(light[:, k], np.linalg.norm(places - at, axis=1)) for k, at in enumerate(found.positions)]
         slopes = np.column_stack([found.changes / found.sigma[:, None], found.noise.all_columns])
         inverse = self.joint_covariance(found)
@@ -234,11 +247,15 @@ class SourceFit:
             raise failed
         return min(found, key=lambda one: one.unlikelihood).sorted()
 
-    def minimum(self, positions: Array) -> PointSources:
-        """Sources of least Σ (residual/σ)² from these first positions; σ is that of the last step."""
+    def minimum(self, positions: Array, radii: Array | None = None) -> PointSources:
+        """Sources of least Σ (residual/σ)² from these first positions; σ is that of the last step.
+
+        radii : (K,) of spheres [mm]; points if not given
+        """
         settings, damping = self.settings, self.settings.damping
         even = np.concatenate([band.flat_sigma() for band in self.bands])
-        found, _ = self._tried(positions, PixelNoise(even, np.zeros_like(even), self.view), np.inf)
+        radii = np.zeros(len(positions)) if radii is None else radii
+        found, _ = self._tried(positions, radii, PixelNoise(even, np.zeros_like(even), self.view), np.inf)
         flat, border = 0, False
         for step in range(settings.steps):
             if found is None or (flat == settings.patience and border):
@@ -254,7 +271,7 @@ class SourceFit:
             tried, border = None, False
             while tried is None and damping < settings.stuck:
                 moved = np.linalg.solve(normal + damping * np.eye(len(normal)), right) / lengths
-                tried, inside = self._tried(positions + moved.reshape(-1, 4)[:, :3], found.noise, found.cost)
+                tried, inside = self._tried(positions + moved.reshape(-1, 4)[:, :3], radii, found.noise, found.cost)
                 border |= not inside
                 damping *= 10 if tried is None else 0.1
             flat = flat + 1 if tried is not None and found.cost - tried.cost < settings.flat else 0
@@ -267,7 +284,7 @@ class SourceFit:
         )
 
     def covariance(self, found: PointSources) -> Array:
-        """(4K, 4K) of the `values` without uncertain factors: inverse of JᵀJ (Eq. M.26).
+        """(4K, 4K) of the `values`, for the radii: inverse of JᵀJ, with what pixels have in common (Eq. M.26, M.49).
 
         Raises InversionError where the images do not determine the sources separately.
         """
@@ -281,33 +298,20 @@ class SourceFit:
             )
         return np.asarray(np.linalg.inv(slopes.T @ slopes))
 
-    def by_factors(self, found: PointSources, covariance: Array, correlation: float = 0.0) -> Array:
-        """(4K, 4K) covariance of the `values` by the uncertain factors of the bands, `gain_error` (Eq. M.26).
-
-        correlation : of the factors of any two bands
-        """
-        slopes, changes = found.slopes, list[Array]()
-        for band, own in zip(self.bands, self.parts, strict=True):
-            signal = np.zeros_like(found.signal)
-            signal[own] = found.signal[own]
-            change = covariance @ (slopes.T @ found.noise.over(signal))
-            changes.append(band.measurement.gain_error * change)
-        each, common = np.array(changes), np.sum(changes, axis=0)
-        return (1 - correlation) * each.T @ each + correlation * np.outer(common, common)
-
-    def p_values(self, found: PointSources, places: int) -> Array:
+    def p_values(self, found: PointSources, places: int, numbers: int = 4) -> Array:
         """(K,) probability, at most, that noise alone makes a source fit as well as each of these.
 
-        At each of `places` positions a source that is not there lowers Σ (residual/σ)² by chi-squared of 4 degrees of
-        freedom, position and power, with the other sources free; Bonferroni's bound over the positions.
+        At each of `places` positions a source that is not there lowers Σ (residual/σ)² by chi-squared of as many
+        degrees of freedom as it has `numbers`, with the other sources free; Bonferroni's bound over the positions.
         """
-        slopes, residual = found.slopes, found.residual(self._target)
+        # Factors and coefficients make no light: they are taken as fitted, and add nothing to the noise.
+        slopes, residual = found.changes / found.sigma[:, None], (self.power - self.fitted(found)) / found.sigma
         values = np.empty(len(found.powers))
         for k, power in enumerate(found.powers):
             others = np.linalg.qr(np.delete(slopes, np.s_[4 * k : 4 * k + 4], axis=1))[0]
-            without = residual + power * found.noise.over(found.columns[:, k])
+            without = residual + power * found.columns[:, k] / found.sigma
             without -= others @ (others.T @ without)
-            values[k] = places * chi2.sf(without @ without - residual @ residual, 4)
+            values[k] = places * chi2.sf(without @ without - residual @ residual, numbers)
         return values.clip(max=1.0)
 
     def is_linear(self, found: PointSources, covariance: Array, z: float) -> bool:
@@ -334,20 +338,22 @@ class SourceFit:
     def _residual_at(self, found: PointSources, values: Array) -> Array:
         """(N,) residual over the σ of `found` for other `values` (4K,); raises FluxError as `BandImages.exitance`."""
         positions, powers = values.reshape(-1, 4)[:, :3], values.reshape(-1, 4)[:, 3]
-        return found.noise.over(self._target - self._images(positions)[1] @ powers)
+        return found.noise.over(self._target - self._images(positions, found.radii)[1] @ powers)
 
-    def _tried(self, positions: Array, noise: PixelNoise, below: float) -> tuple[PointSources | None, bool]:
+    def _tried(
+        self, positions: Array, radii: Array, noise: PixelNoise, below: float
+    ) -> tuple[PointSources | None, bool]:
         """Sources at these positions with the powers > 0 that fit best; False where the tissue has no solution there.
 
         The sources are None then, and where one gets no power or Σ (residual/σ)² is not below `below`.
         """
         try:
-            exitance, columns = self._images(positions)
-            empty = PointSources(positions, np.zeros(len(positions)), exitance, columns, np.empty(0), noise, 0.0)
+            exitance, columns = self._images(positions, radii)
+            empty = PointSources(positions, np.zeros(len(positions)), radii, exitance, columns, np.empty(0), noise, 0.0)
             tried = self._weighted(empty, noise)
             if not ((tried.powers > 0).all() and tried.cost < below):
                 return None, True
-            return replace(tried, gradients=np.stack([*map(self._gradient, positions, columns.T)], axis=1)), True
+            return replace(tried, gradients=np.stack([*map(self._gradient, positions, radii, columns.T)], axis=1)), True
         except FluxError:
             return None, False
 
@@ -360,25 +366,39 @@ class SourceFit:
         """Noise of the pixels for the fitted signal, with the numerical error of the matrices (Eq. M.24)."""
         each = zip(self.bands, found.exitance, strict=True)
         sigma = np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each])
-        others = self.uncertain / sigma[:, None] if self.uncertain.size else None
-        return PixelNoise(sigma, self.gain_per_view * found.signal / sigma, self.view, others)
+        others = np.column_stack([self._by_factors(found), self.uncertain]) / sigma[:, None]
+        common = self.gain_per_view * found.signal / sigma
+        return PixelNoise(sigma, common, self.view, others if others.size else None)
 
-    def _gradient(self, position: Array, column: Array) -> Array:
+    def _by_factors(self, found: PointSources) -> Array:
+        """(N, E) change of the pixels [W] by one standard deviation of the factors of the bands, `gain_error`.
+
+        A factor is √ρ c + √(1 − ρ) e with the correlation ρ of the bands, c common to all and e of the band.
+        """
+        own = np.zeros((len(self.power), len(self.bands)))
+        for k, (band, part) in enumerate(zip(self.bands, self.parts, strict=True)):
+            own[part, k] = band.measurement.gain_error * found.signal[part]
+        if not own.any():
+            return own[:, :0]
+        return np.column_stack([(1 - self._correlation) ** 0.5 * own, self._correlation**0.5 * own.sum(axis=1)])
+
+    def _gradient(self, position: Array, radius: float, column: Array) -> Array:
         """(N, 3) change of a source's image, `column` (N,), per mm along x, y and z; raises FluxError at the border."""
         length = self.settings.step * self.bands[0].tissue.mesh.edge
-        return np.column_stack([self._change(position, length * axis, column) / length for axis in np.eye(3)])
+        return np.column_stack([self._change(position, radius, length * axis, column) / length for axis in np.eye(3)])
 
-    def _change(self, position: Array, way: Array, column: Array) -> Array:
+    def _change(self, position: Array, radius: float, way: Array, column: Array) -> Array:
         """Change (N,) of a source's image along a way, backwards where the tissue ends."""
+        radii = np.array([radius])
         try:
-            return self._images((position + way)[None])[1][:, 0] - column
+            return self._images((position + way)[None], radii)[1][:, 0] - column
         except FluxError:
-            return column - self._images((position - way)[None])[1][:, 0]
+            return column - self._images((position - way)[None], radii)[1][:, 0]
 
-    def _images(self, positions: Array) -> tuple[tuple[Array, ...], Array]:
+    def _images(self, positions: Array, radii: Array) -> tuple[tuple[Array, ...], Array]:
         """Of sources of 1 W at the positions (K, 3): J_n of each band (V, K) [1/mm²], and their columns (N, K)."""
         self._report("fit", self._share)
-        exitance = tuple(np.column_stack([band.exitance(position) for position in positions]) for band in self.bands)
+        exitance = tuple(np.column_stack([*map(band.exitance, positions, radii)]) for band in self.bands)
         return exitance, np.concatenate(
             [band.transport @ values for band, values in zip(self.bands, exitance, strict=True)]
         )

@@ -26,7 +26,10 @@ from .patterns import Pattern, Patterns, Seen
 Array = NDArray[np.float64]
 Columns: TypeAlias = csr_array | Array
 CHUNK = 1 << 16  # pixels at a time
-TISSUE = "optical coefficients, or a depth at which SP3 or diffusion does not hold"
+TISSUE = (
+    "optical coefficients (state mua_sd, musp_sd), an extended source (give shape sphere), or a depth at which SP3 or "
+    "diffusion does not hold"
+)
 HINTS = {
     "factor": "exposure and filter of the view, or give gain_per_view",
     "background": "background and read-out offset",

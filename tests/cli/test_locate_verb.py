@@ -41,6 +41,7 @@ def test_sources_in_one_band_and_in_two(run, folder, monkeypatch):
     monkeypatch.chdir(folder)
     red, green = (["T.npz", *names(band)] for band in ("red", "green"))
     arguments = ("locate", "cylinder.toml", *red, *green, "--band", "red", "--band", "green", "--confidence", 0.999)
+    arguments += ("--band-correlation", 1)
     code, out, err = run(*arguments, "-o", "source.vtu", "--json")
     assert (code, err) == (0, "")
     record = json.loads(out)
@@ -52,9 +53,10 @@ def test_sources_in_one_band_and_in_two(run, folder, monkeypatch):
     assert (high - low).max() < 1
     assert (folder / record["output"]).stat().st_size > 10_000
     (folder / "source.vtu").unlink()
-    code, out, err = run("locate", "cylinder.toml", *red, "--band", "red")
+    code, out, err = run("locate", "cylinder.toml", *red, "--band", "red", "--shape", "sphere")
     assert (code, err) == (0, "")
     assert out.startswith("source 1: x 2.")
+    assert ", radius at most 3." in out or ", radius at most 2." in out
     assert "90 % intervals; chi2" in out
     assert run("locate", "cylinder.toml", *red, "--band", "red", "--quiet") == (0, "", "")
 
@@ -96,6 +98,8 @@ def test_images_as_npz(run, folder, monkeypatch):
         (("cylinder.toml", "T.npz", *names("red"), "T.npz", *names("green")), "2 transport matrices"),
         (("cylinder.toml", "T.npz", *names("red"), "--band", "blue"), "band 'blue'"),
         (("cylinder.toml", "T.npz", *names("red"), "--sources", 0), "'sources'"),
+        (("cylinder.toml", "T.npz", *names("red"), "--shape", "cube"), "'shape' must be one of point, sphere"),
+        (("cylinder.toml", "T.npz", *names("red"), "--band-correlation", 2), "'band_correlation' must be in [0, 1]"),
         (("none.toml", "T.npz", *names("red")), "none.toml"),
         (("cylinder.toml", "none.npz", *names("red")), "does not exist"),
         (("cylinder.xml", "T.npz", *names("red")), "cylinder.xml"),
