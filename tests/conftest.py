@@ -11,6 +11,7 @@ import warnings
 import pytest
 
 import mitsuba_fspt  # noqa: F401  # before any test imports Mitsuba: it chooses the LLVM that Dr.Jit binds
+from mitsuba_fspt.runtime import backend
 
 pytest_plugins = ["cpu_seconds"]
 
@@ -18,13 +19,30 @@ pytest_plugins = ["cpu_seconds"]
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The option that chooses what the tests compute on."""
+    parser.addoption(
+        "--variant",
+        help="Mitsuba's variant in this process; without it cuda_ad_mono where a CUDA device works, else llvm_ad_mono",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Set the variant before a test module sets the default."""
+    if variant := config.getoption("--variant"):
+        import mitsuba as mi
+
+        mi.set_variant(variant)
+
+
 @pytest.fixture(scope="module")
-def mono():
-    """Mitsuba in the variant llvm_ad_mono, quiet but for errors."""
+def mono(request):
+    """Mitsuba in the variant of this run, of one wavelength by default, quiet but for errors."""
     import mitsuba as mi
 
-    if mi.variant() != "llvm_ad_mono":
-        mi.set_variant("llvm_ad_mono")
+    variant = request.config.getoption("--variant") or backend.choose_variant()
+    if mi.variant() != variant:
+        mi.set_variant(variant)
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     yield mi

@@ -2,7 +2,7 @@
 
 `camera_scene` puts the lens into the origin: +z to the object, +x to the left. All its films are of 40 × 32 pixels; a
 crop window is quicker. `world_scene` has its objects around the origin and the `lens` on the +x axis. Importing this
-module sets a variant of Mitsuba unless one is set; the fixture `mono` sets llvm_ad_mono.
+module sets a variant of Mitsuba unless one is set; the fixture `mono` sets the variant of the run.
 """
 
 from __future__ import annotations

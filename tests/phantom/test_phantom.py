@@ -1,6 +1,5 @@
 """The phantom: what its PLY holds, for Mitsuba and for reading again, and what a phantom cannot be."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
@@ -40,13 +39,12 @@ def test_ply_comes_back_bit_by_bit(tmp_path, per):
 
 
 @pytest.mark.parametrize("per", ["vertex", "face"])
-def test_mitsuba_finds_the_exitance(tmp_path, per):
+def test_mitsuba_finds_the_exitance(mono, tmp_path, per):
     """The attribute is there under its name and holds each value, rounded to single precision once."""
     written = phantom(per, provenance={"source": "Mäuse"})
     written.write(tmp_path / "p.ply")
-    mi.set_variant("llvm_ad_mono")
-    mesh = mi.load_dict({"type": "ply", "filename": str(tmp_path / "p.ply")})
-    parameters = mi.traverse(mesh)
+    mesh = mono.load_dict({"type": "ply", "filename": str(tmp_path / "p.ply")})
+    parameters = mono.traverse(mesh)
     assert np.array_equal(np.array(parameters[f"{per}_exitance"]), written.exitance.astype(np.float32))
     assert np.array_equal(np.array(parameters["faces"]).reshape(-1, 3), FACES)
     assert np.array_equal(np.array(parameters["vertex_positions"]).reshape(-1, 3), VERTICES.astype(np.float32))
@@ -54,15 +52,14 @@ def test_mitsuba_finds_the_exitance(tmp_path, per):
 
 @pytest.mark.parametrize(("name", "attribute"), [("jn_x", "jn"), ("Jn_0", "Jn"), ("my_jn_1", "my_jn")])
 @pytest.mark.parametrize("per", ["vertex", "face"])
-def test_other_names_that_mitsuba_reads(tmp_path, per, name, attribute):
+def test_other_names_that_mitsuba_reads(mono, tmp_path, per, name, attribute):
     """The attribute of that name is what Mitsuba finds in the same file."""
     written = phantom(per)
     write_ply(tmp_path / "p.ply", VERTICES, FACES, {name: written.exitance}, per, {})
     read = Phantom.read(tmp_path / "p.ply")
     assert (read.attribute, read.per) == (attribute, per)
     assert np.array_equal(read.exitance, written.exitance)
-    mi.set_variant("llvm_ad_mono")
-    parameters = mi.traverse(mi.load_dict({"type": "ply", "filename": str(tmp_path / "p.ply")}))
+    parameters = mono.traverse(mono.load_dict({"type": "ply", "filename": str(tmp_path / "p.ply")}))
     assert len(np.array(parameters[f"{per}_{attribute}"])) == len(written.exitance)
 
 

@@ -25,6 +25,7 @@ from small_scenes import attribute, ball, glow, lens, world_scene, write_ply  # 
 
 import mitsuba_fspt as fspt  # noqa: E402
 from mitsuba_fspt.emission.elements import UNIFORM_SHARE  # noqa: E402
+from mitsuba_fspt.emission.of_emitter import probe_beside  # noqa: E402
 from mitsuba_fspt.runtime.errors import SceneError  # noqa: E402
 
 COUNT = 1 << 16
@@ -363,6 +364,7 @@ def test_direction_density_weight_and_radiance_agree(case):
 def test_directions_follow_their_density(name, tmp_path):
     """Mitsuba's own χ² test over the sphere of directions."""
     case = CASES[name](tmp_path)
+    probe_beside(case.scene)
     it = mi.Interaction3f(0.0, 0.0, mi.Color0f(), mi.Transform4f(PLACE) @ mi.Point3f(0.5, 0.3, 2.5))
 
     def sample(sample):

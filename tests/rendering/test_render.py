@@ -265,9 +265,10 @@ def test_numbers_of_numpy_and_arrays_without_axes_are_numbers(scene, tmp_path):
 def test_a_scene_of_another_variant_has_a_message_of_its_own(scene):
     """Seen to fail: 'Broadcast from type mitsuba.Shape to type mitsuba.Shape failed'."""
     before = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
+    other = before.replace("rgb", "mono") if "rgb" in before else before.replace("mono", "rgb")
+    mi.set_variant(other)
     try:
-        with pytest.raises(SceneError, match=rf"in the variant {before}, .* the active one is llvm_ad_rgb\. Load"):
+        with pytest.raises(SceneError, match=rf"in the variant {before}, .* the active one is {other}\. Load"):
             fspt.render(scene)
     finally:
         mi.set_variant(before)
