@@ -1,6 +1,7 @@
 """Cost of the integral against the number of pixels and of triangles.
 
     python scripts/scaling.py [--out docs] [--rounds 5] [--rtol 1e-2] [--only all|integral|matrix]
+                              [--sides 128,256,…] [--triangles 10000,…]
 
 The object is a sphere with a smooth J_n, its front in focus, at f/2.8. First the same field is rendered on 128 x 128 to
 2048 x 2048 pixels. Then the sphere has 10 thousand to 3 million triangles, on 256 x 256 pixels, where with the most
@@ -70,6 +71,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--rtol", type=float, default=1e-2)
     parser.add_argument("--only", choices=("all", "integral", "matrix"), default="all")
+    parser.add_argument("--sides", type=numbers, default=SIDES, help="pixels a side, with commas")
+    parser.add_argument("--triangles", type=numbers, default=TRIANGLES, help="numbers of triangles, with commas")
     arguments = parser.parse_args()
     arguments.out.mkdir(exist_ok=True)
     if arguments.only != "integral":
@@ -78,10 +81,15 @@ def main() -> None:
         measure_integral(arguments)
 
 
+def numbers(text: str) -> tuple[int, ...]:
+    """Whole numbers of an option."""
+    return tuple(map(int, text.split(",")))
+
+
 def measure_integral(arguments: argparse.Namespace) -> None:
     """Measure the integral, write its files, print its tables."""
-    by_pixels = [Setting(side, TRIANGLES[1]) for side in SIDES]
-    by_triangles = [[Setting(side, triangles) for triangles in TRIANGLES] for side in FEW_AND_MANY]
+    by_pixels = [Setting(side, TRIANGLES[1]) for side in arguments.sides]
+    by_triangles = [[Setting(side, triangles) for triangles in arguments.triangles] for side in FEW_AND_MANY]
     with tempfile.TemporaryDirectory() as folder:
         for settings in (by_pixels, *by_triangles):
             measure(settings, Path(folder), arguments.rounds, arguments.rtol)
@@ -176,6 +184,7 @@ def measure(settings: list[Setting], folder: Path, rounds: int, rtol: float) -> 
             if k:
                 setting.seconds.append(seconds)
                 setting.bare_seconds.append(bare_seconds)
+        print(f"{setting.side}², {setting.triangles} triangles: {np.median(setting.seconds):.4f} s", flush=True)
         del of, lens, bare
 
 
@@ -226,9 +235,9 @@ def report(by_pixels: list[Setting], by_triangles: list[list[Setting]]) -> None:
         seconds = float(np.median(s.seconds))
         row = (f"{s.side}²", s.triangles, f"{seconds:.3g} s", f"{s.nanoseconds:.0f} ns", f"{s.rays / s.side**2:.2f}")
         print(f"| {' | '.join(map(str, row))} | {s.bare_nanoseconds:.0f} ns |")
-    logarithm = math.log(TRIANGLES[-1]) / math.log(TRIANGLES[0])
     for settings in by_triangles:
         few, many = settings[0], settings[-1]
+        logarithm = math.log(many.triangles) / math.log(few.triangles)
         growth, bare = many.nanoseconds / few.nanoseconds, many.bare_nanoseconds / few.bare_nanoseconds
         print(f"{few.side}² pixels, {few.triangles} to {many.triangles} triangles: x{growth:.2f}", end="")
         print(f" (tracing alone: x{bare:.2f}, the logarithm: x{logarithm:.2f})")

@@ -55,6 +55,7 @@ RIM_ORDER = 1.5  # power of the block's side by which the error falls at the rim
 # exceed it on one pixel of 600.
 TRIED_GAIN = 2.5
 STREAM = 0x9E3779B9  # seed of the random pixels that are compared
+AT_ONCE = 1 << 16  # blocks whose neighbours are gathered together: 26 MB
 
 Plane = NDArray[np.float64]
 Marks = NDArray[np.bool_]
@@ -185,7 +186,7 @@ class _BlockImage:
         """
         self.edge = _spread(self.edge, 1) | _small_bodies(self._seen(), self.blocks.window)
         pixel = self.quadrature.pixel
-        self.bent = BEND_GAIN[pixel] * _bend(self.value, self.blocks.side, pixel)
+        self.bent = BEND_GAIN[pixel] * _bend(self.value, self.blocks.side, pixel, self.own)
         self.passed_on = _propagated(self.error, self.blocks.side, pixel)
         # Near blurred edges four lines of sight are too few for a comparison.
         refined = np.zeros(self.own.shape, bool)
@@ -344,9 +345,9 @@ def means_of_parts(cells: Plane, weights: Plane) -> Plane:
     return cells
 
 
-def _around(cells: Plane, row: NDArray[np.int64], column: NDArray[np.int64]) -> Plane:
-    """The cells within `REACH` of each of n cells (row, column), (n, 2 REACH + 1, 2 REACH + 1)."""
-    return sliding_window_view(np.pad(cells, REACH, mode="edge"), (2 * REACH + 1,) * 2)[row, column]
+def _around(cells: Plane, row: NDArray[np.int64], column: NDArray[np.int64], reach: int = REACH) -> Plane:
+    """The cells within `reach` of each of n cells (row, column), (n, 2 reach + 1, 2 reach + 1)."""
+    return sliding_window_view(np.pad(cells, reach, mode="edge"), (2 * reach + 1,) * 2)[row, column]
 
 
 def _propagated(errors: Plane, side: int, pixel: str) -> Plane:
@@ -359,12 +360,22 @@ def _propagated(errors: Plane, side: int, pixel: str) -> Plane:
     return np.sqrt(square)
 
 
-def _bend(cells: Plane, side: int, pixel: str) -> Plane:
-    """Largest change of a part of each cell and its neighbours from polynomials over five cells to seven, (h, w)."""
+def _bend(cells: Plane, side: int, pixel: str, on: Marks) -> Plane:
+    """Largest change of a part of each cell and its neighbours from polynomials over five cells to seven, (h, w).
+
+    It is right `on` the marked cells; their neighbours are computed for it, and no others.
+    """
     parts = [0, side // 2, side - 1]  # corners, where it is largest, and the middle
-    seven, five = (means_of_parts(cells, part_weights(side, reach, pixel)[parts]) for reach in (REACH + 1, REACH))
-    change, count = np.abs(seven - five), len(parts)
-    return _spread(reduce(np.maximum, (change[i::count, j::count] for i, j in np.ndindex(count, count))), 1)
+    seven, five = (part_weights(side, reach, pixel)[parts] for reach in (REACH + 1, REACH))
+    five = np.pad(five, ((0, 0), (1, 1)))
+    weights = (np.kron(seven, seven) - np.kron(five, five)).T  # cells around, parts
+    row, column = np.nonzero(_spread(on, 1))
+    change = np.zeros(cells.shape)
+    for k in range(0, len(row), AT_ONCE):
+        some = row[k : k + AT_ONCE], column[k : k + AT_ONCE]
+        around = _around(cells, *some, REACH + 1).reshape(-1, len(weights))
+        change[some] = np.abs(around @ weights).max(axis=1)
+    return _spread(change, 1)
 
 
 def _spread(image: NDArray, reach: int) -> NDArray:
