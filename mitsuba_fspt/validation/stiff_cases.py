@@ -55,6 +55,9 @@ OTHER = "the other domain"
 REFUSAL = "a refusal"
 # Tolerances: of an image with edges, and of two images, each of which may be wrong by the default rtol of 1e-3.
 SHARP, AGREED = 5e-4, 2e-3
+# Of an ideal mirror: CUDA's square root is approximate, and Mitsuba's Fresnel formula subtracts equal numbers, which
+# gives 0.9995 at some angles; on LLVM it is 1.
+MIRROR = 5e-5
 ROUNDED = 1e-4  # at the default rtol: float32 rounding changes the position at which the bisection of an edge ends
 
 
@@ -212,7 +215,7 @@ def specular_cases() -> list[Case]:
             Case(f"plate of index 1, {thickness:g} mm thick", CONE, behind(plate(80, thickness, 1.0)), EXACT)
             for thickness in (1e-2, 10.0)
         ),
-        Case("mirror at 45°", CONE, lambda: cone_error(beside, pane(80, mirror, tilt=45)), EXACT),
+        Case("mirror at 45°", CONE, lambda: cone_error(beside, pane(80, mirror, tilt=45)), MIRROR),
         Case("lens inside a chamber of index 1", CONE, behind(plate(-50, 150, 1.0)), EXACT),
     ]
 
