@@ -17,6 +17,8 @@ LEAST_STATED, FLOAT32_FLOOR = 0.05, 2e-7
 # Lines of sight of a pixel at the most, from this rtol on; below it more: on a pixel with an edge the error of lattices
 # falls with their number to the power 3/4. No more than the limit in any case.
 MOST_NODES, WORTH_MORE, LINES_ORDER, LIMIT = 1 << 16, 1e-3, 4 / 3, 1 << 22
+# Lines of sight that all pixels together may take in any case unless `max_nodes` is given: few pixels cost little.
+TOGETHER = 1 << 24
 LEAST_WEIGHT = 0.1  # of rtol: smallest share that is followed through or off specular surfaces; less counts as error
 MOST_SPECULAR = 64  # specular surfaces one after the other
 

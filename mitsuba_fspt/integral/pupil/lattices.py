@@ -8,7 +8,6 @@ unbiased estimates, and their scatter gives the error for any integrand. The poi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -18,7 +17,7 @@ import numpy as np
 from ...jit.batches import batches
 from ...jit.loops import repeat
 from ..lines.eq9 import most_radiance
-from ..quadrature import Quadrature
+from ..quadrature import TOGETHER, Quadrature
 from .draft import Draft
 
 if TYPE_CHECKING:
@@ -32,9 +31,8 @@ if TYPE_CHECKING:
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
+ORDER = 3 / 4  # power with which the error is expected to fall with the number of points, as at a jump
 LEGS = 8  # lines of sight that one through or off specular surfaces counts as, unless `max_nodes` is given
-# Lines of sight that all pixels together may take in any case unless `max_nodes` is given: few pixels cost little.
-TOGETHER = 1 << 24
 
 
 def refine_by_lattices(draft: Draft) -> None:
@@ -45,7 +43,12 @@ def refine_by_lattices(draft: Draft) -> None:
     """
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
     deadline, tolerance = draft.progress.deadline, draft.tolerance
-    most_points = partial(_most_points, draft.quadrature, LEGS if draft.view.specular else 1)
+    before = draft.rays
+
+    def most_points(pixels: int) -> int:
+        """Points of the largest lattice that so many pixels may take next."""
+        return _most_points(draft.quadrature, LEGS if draft.view.specular else 1, pixels, draft.rays - before)
+
     if most_points(1) < FIRST or not dr.any(above):
         return
     above = _largest_errors(draft, above, most_points)
@@ -71,7 +74,10 @@ def refine_by_lattices(draft: Draft) -> None:
             dr.scatter(image, column, means.pixels, better)
         dr.eval(images)
         draft.value, draft.coverage, draft.error = images
-        left = error > tolerance
+        # Where another rule's error is smaller, lattices have to get below it.
+        most = max(most_points(dr.width(means.pixels)), points)
+        expected = error * dr.opaque(mi.Float64, (points / most) ** ORDER)
+        left = (error > tolerance) & (expected <= dr.gather(mi.Float64, draft.error, means.pixels))
         if not dr.any(left):
             break
         means = means.of(left)
@@ -91,11 +97,14 @@ def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]
     return above & mi.Bool(taken)
 
 
-def _most_points(quadrature: Quadrature, legs: int, pixels: int) -> int:
-    """Points of the largest lattice on so many pixels, a power of two, of lines of sight that count as so many."""
+def _most_points(quadrature: Quadrature, legs: int, pixels: int, taken: int = 0) -> int:
+    """Points of the largest lattice on so many pixels, a power of two, of lines of sight that count as so many.
+
+    taken : lines of sight of smaller lattices, on other pixels as well
+    """
     lines = quadrature.most_nodes
     if quadrature.max_nodes is None:
-        lines = max(lines, TOGETHER // pixels) // legs
+        lines = max(lines, (TOGETHER - legs * taken) // pixels) // legs
     return min(1 << (lines // SHIFTS).bit_length() >> 1, MOST)
 
 

@@ -38,7 +38,7 @@ from .transects import integrate_by_transects
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ...jit.pixel_grid import Mask
+    from ...jit.pixel_grid import Mask, PixelArray
 
 # Lines of sight of a pixel that twelve nodes leave above the tolerance, as of a straight silhouette; the same where the
 # faces are projected in any case, for narrow light.
@@ -103,6 +103,8 @@ def refine(
     elif dr.any(rough):
         integrate_by_transects(draft, rough, levels, faces=faces)
     draft.restore_given_errors()
+    if faces and levels:
+        faces.further()
     if levels:
         refine_by_lattices(draft)
     progress(1.0)
@@ -122,18 +124,24 @@ class ByFaces(Protocol):
         """The image, complete on the marked pixels."""
         ...
 
+    def further(self, marked: NDArray[np.bool_], peak: float, progress: Progress) -> Solution:
+        """The same of some of these pixels, refined further if lattices would take more time."""
+        ...
+
 
 @dataclass
 class _Faces:
     """Gives rough pixels of a draft their value `by_faces`, once; they count as given from then on.
 
     narrow : pixels (h, w) that get it in any case; set to False if the deadline leaves no time for them
+    found : the pixels, their values, errors and coverage
     """
 
     draft: Draft
     by_faces: ByFaces
     narrow: NDArray[np.bool_]
     taken: bool = False
+    found: tuple[Mask, PixelArray, PixelArray, PixelArray] | None = None
 
     def __call__(self, rough: Mask, lines: float) -> Mask:
         """The rough pixels without those that get their value from faces, if that takes less time than as many `lines`
@@ -157,29 +165,65 @@ class _Faces:
             return rough
         self.taken = True
         found = self.by_faces.run(wanted | forced, peak, Progress(deadline=draft.progress.deadline))
-        if draft.progress.log:
-            draft.progress.log.add("images of faces", int(np.count_nonzero(wanted | forced)), found.rays)
+        self._count(found)
         return rough & ~self._give(found, grid.flat(wanted | forced), grid.flat(forced), peak)
 
     def _give(self, found: Solution, wanted: Mask, forced: Mask, peak: float) -> Mask:
         """Set the values, errors and coverage that are better; returns the pixels that are not refined further."""
-        draft, grid, window = self.draft, self.draft.grid, self.draft.window
-        power, error = (grid.flat(window.cut(image) / draft.camera.etendue) for image in (found.power, found.error))
+        draft = self.draft
+        power, error, coverage = self._images(found)
         brightest = dr.maximum(dr.max(dr.select(wanted, power, 0)), dr.opaque(mi.Float64, peak))
         taken = wanted & ((error < draft.error) | forced)
         done = taken & ((error <= dr.opaque(mi.Float64, draft.quadrature.rtol) * brightest) | forced)
         same = dr.abs(power - draft.value) <= dr.opaque(mi.Float64, ROUNDING) * brightest
         power = dr.select(same, draft.value, power)
-        draft.value, draft.error = dr.select(taken, power, draft.value), dr.select(taken, error, draft.error)
-        draft.set_coverage(dr.select(taken, grid.flat(window.cut(found.coverage)), draft.coverage))
+        self.found = taken, power, error, coverage
+        self._set(taken)
         draft.given, draft.given_error = (
             dr.select(done, new, old) for new, old in ((power, draft.given), (error, draft.given_error))
         )
         draft.computed &= ~done
-        draft.rays += found.rays
-        draft.levels += found.levels
         dr.eval(draft.value, draft.error, draft.given, draft.given_error, draft.computed)
         return done
+
+    def further(self) -> None:
+        """Before lattices: the values of faces again where those of transects have larger errors, refined further."""
+        draft, grid = self.draft, self.draft.grid
+        if self.found is None:
+            return
+        taken, _, error, _ = self.found
+        self._set(taken & draft.computed & (error < draft.error))
+        left = grid.array(taken & draft.shown & (draft.error > draft.tolerance))
+        if not left.any() or draft.progress.deadline.passed():
+            return
+        peak = max(float(draft.at_least_peak(draft.peak)[0]), 0.0)
+        found = self.by_faces.further(left, peak, Progress(deadline=draft.progress.deadline))
+        self._count(found)
+        power, error, coverage = self._images(found)
+        self.found = grid.flat(left), power, error, coverage
+        self._set(grid.flat(left) & (error < draft.error))
+
+    def _count(self, found: Solution) -> None:
+        """Record the work on an image of faces."""
+        self.draft.rays += found.rays
+        self.draft.levels += found.levels
+        if self.draft.progress.log:
+            self.draft.progress.log.add("images of faces", int(np.count_nonzero(found.where)), found.rays)
+
+    def _images(self, found: Solution) -> list[PixelArray]:
+        """Mean radiance on film [W/mm²/sr], its error, and coverage on the grid."""
+        etendue = self.draft.camera.etendue
+        images = (found.power / etendue, found.error / etendue, found.coverage)
+        return [self.draft.grid.flat(self.draft.window.cut(image)) for image in images]
+
+    def _set(self, where: Mask) -> None:
+        """Set the values, errors and coverage of some of the pixels."""
+        draft = self.draft
+        if self.found is None:
+            raise TypeError("no image of faces")
+        _, power, error, coverage = self.found
+        draft.value, draft.error = dr.select(where, power, draft.value), dr.select(where, error, draft.error)
+        draft.set_coverage(dr.select(where, coverage, draft.coverage))
 
 
 def peak_of_few(view: View, window: Window, quadrature: Quadrature) -> float:

@@ -11,6 +11,7 @@ errors are of second order.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 
@@ -26,23 +27,22 @@ from ...emission.emitting_surface import EmittingSurface
 from ...emission.of_emitter import surfaces_of
 from ...jit.batches import batch_slices
 from ...jit.mesh_buffers import triangles
-from ...jit.pixel_grid import Grid
 from ...runtime.deadline import Deadline
 from ..lines.eq9 import most_radiance
 from ..lines.occlusion import hides_nothing
 from ..progress import SILENT, Progress
-from ..quadrature import Quadrature
+from ..quadrature import TOGETHER, Quadrature
 from ..solution import Solution
 from .column_canvas import ColumnCanvas, Windows
 from .column_form import FaceLines, falloff_on_pixels
 from .face_light import ColumnRule, FaceLight, Plan
 from .glow import touching
 
-# Error over the largest last change of a pixel and of its neighbours, over twice what is left of it. Two images with
-# few nodes may agree by chance: the least error of the second level over the tolerance, for which M is chosen there,
-# and its factor from level to level.
-SAFETY, EXPECTED, FALL = 0.75, 0.3, 0.25
-CARRIED = 0.4  # least error over that of the level before, as two levels may agree by chance
+# Error over the largest last change within `AROUND` pixels, where no surface hides another and where one may. Images
+# with few nodes may agree by chance: the least error of the third level over the tolerance, for which M is chosen
+# there, and its factor from level to level.
+SAFETY, SHADED, AROUND, EXPECTED, FALL = 0.35, 1.0, 2, 0.5, 0.25
+FINER = 1.25  # M over that at which an edge as bright as its face is wrong by the tolerance: pixels have several
 DISPLACED = 2e-4  # pixels by which float32 displaces the images of faces against lines of sight
 MOST_LEVELS, MOST_CELLS = 6, 512  # levels; largest M at the second level
 # Largest radiance over that of the brightest pixel that M is chosen for; brighter faces, of which the pixel or the lens
@@ -50,7 +50,8 @@ MOST_LEVELS, MOST_CELLS = 6, 512  # levels; largest M at the second level
 BRIGHTEST = 4.0
 # Lines of sight in whose time one image of a piece is laid, and one face of the scene is prepared; time of the first
 # levels over that of the third.
-LINES, PREPARED, FIRST_LEVELS = 3, 60, 4 / 3
+LINES, PREPARED, FIRST_LEVELS = 1.5, 60, 4 / 3
+OTHERS = 1 << 13  # lines of sight that other rules take on a pixel that two levels leave above the tolerance
 
 Plane = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -77,8 +78,9 @@ class FaceImage:
         self.most = max(s.brightest for s in self.surfaces) or 1.0  # J_n in units of which light is laid [W/mm²]
         self.value, self.error, self.coverage = (np.zeros(window.shape) for _ in range(3))
         self.least_peak = least_peak
-        self.rays = 0
+        self.rays = self.level = 0
         self.levels: list[str] = []
+        self.plans: list[Plan] = []
 
     @cached_property
     def alone(self) -> bool:
@@ -119,45 +121,64 @@ class FaceImage:
         least_peak : lower bound of the brightest pixel's mean radiance on film [W/mm²/sr]
 
         From the third level on, a level is entered only if its images take less time than the lines of sight that its
-        pixels may take otherwise.
+        pixels take otherwise.
         """
-        shown, mark = self.window.shown(), where
-        self.rays, self.levels = 0, []
         self.error = np.zeros(self.window.shape)
-        rule, grid = ColumnRule.of(self.quadrature.rtol), Grid(self.window.shape)
-        recent = None
-        plans = [plan.halved().halved() for plan in self._plans(rule, least_peak)]
-        if mark.any() and (first := self._level(plans, _wider(mark), None)):
+        rule, around = ColumnRule.of(self.quadrature.rtol), _wider(where)
+        self.level, self.plans = 0, [plan.halved().halved() for plan in self._plans(rule, least_peak)]
+        if where.any() and (first := self._level(self.plans, around, None)):
             self.value, self.coverage = first
-        for level in range(1, MOST_LEVELS):
-            if not mark.any() or progress.deadline.passed():
-                break
-            around = _wider(mark)
-            plans = self._finer(plans, rule, level, least_peak)
-            if level > 1 and LINES * self._cost(plans, around) > self._worth(mark):
+        lines = min(OTHERS, self.quadrature.most_nodes / 2)
+        self._refine(where, least_peak, lambda count: lines * count, progress)
+        if self.level == 0:
+            self.error = _largest(self.value)
+        return self._solution(where)
+
+    def further(self, where: NDArray[np.bool_], least_peak: float, progress: Progress = SILENT) -> Solution:
+        """The same after further levels on some of those pixels that other rules leave above the tolerance, too, if
+        these levels take less time than the lattices that would follow."""
+
+        def worth(count: int) -> float:
+            lines = self.quadrature.most_nodes * count / 2
+            return lines if self.quadrature.max_nodes is not None else max(lines, TOGETHER / 2)
+
+        self._refine(where, least_peak, worth, progress)
+        return self._solution(where)
+
+    def _refine(
+        self, where: NDArray[np.bool_], least_peak: float, worth: Callable[[int], float], progress: Progress
+    ) -> None:
+        """Further levels on the pixels `where` until their errors are below the tolerance; `worth`: of a number of
+        pixels, lines of sight in whose time the next level has to be computed."""
+        shown, mark = self.window.shown(), where
+        safety = np.where(self._shaded, SHADED, SAFETY)
+        while self.level < MOST_LEVELS - 1 and mark.any() and not progress.deadline.passed():
+            level, around = self.level + 1, _wider(mark)
+            plans = self._finer(self.plans, ColumnRule.of(self.quadrature.rtol), level, least_peak)
+            if level > 1 and LINES * self._cost(plans, around) > worth(np.count_nonzero(mark)):
                 break
             if (found := self._level(plans, around, progress.deadline)) is None:
                 break
-            value, coverage = found
+            self.plans, self.level, (value, coverage) = plans, level, found
             change = np.where(around, np.abs(value - self.value), 0)
-            recent, last = SAFETY * grid.array(grid.spread_max(grid.flat(change))), recent
-            estimate = recent if last is None else np.maximum(recent, CARRIED * last)
+            recent = safety * _largest(change)
             least = EXPECTED * FALL ** (level - 2) * self.quadrature.rtol * self._peak(least_peak)
-            estimate = np.maximum(estimate, least)
-            self.error[mark] = estimate[mark]
+            self.error[mark] = np.maximum(recent, least)[mark]
             self.value[around], self.coverage[around] = value[around], coverage[around]
             mark = shown & where & (self.error > self.quadrature.rtol * self._peak(least_peak))
             progress(level / MOST_LEVELS)
-        if recent is None:
-            self.error = grid.array(grid.spread_max(grid.flat(self.value)))
+        progress(1.0)
+
+    def _solution(self, where: NDArray[np.bool_]) -> Solution:
+        """The present image, complete on the pixels `where`, with the work since the last one."""
         error = np.maximum(self.error, self.quadrature.least_error * self.window.brightest(self.value))
         error += DISPLACED * _steepest(self.value)
         error[self.coverage == 0] = self.error[self.coverage == 0]
         power, error = (self.window.expand(image) * self.camera.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.coverage, 0, 1))
         complete = self.window.expand(where.astype(np.float64)) > 0
-        progress(1.0)
-        return Solution(power, error, coverage, self.rays, tuple(self.levels), complete)
+        rays, levels, self.rays, self.levels = self.rays, tuple(self.levels), 0, []
+        return Solution(power, error, coverage, rays, levels, complete)
 
     def _finer(self, plans: list[Plan], rule: ColumnRule, level: int, least_peak: float) -> list[Plan]:
         """The plans of the next level: at the second level with all cells that the accuracy requires, as the brightest
@@ -169,10 +190,6 @@ class FaceImage:
         if level == 1:
             wanted = [plan.halved() for plan in wanted]
         return [plan.at_least(least) for plan, least in zip(wanted, doubled, strict=True)]
-
-    def _worth(self, mark: NDArray[np.bool_]) -> float:
-        """Lines of sight that other rules may take on the marked pixels."""
-        return self.quadrature.most_nodes / 2 * np.count_nonzero(mark)
 
     def cost(self, mark: NDArray[np.bool_], least_peak: float, most: float = math.inf) -> float:
         """Lines of sight in whose time the first three levels are computed on the marked pixels.
@@ -192,13 +209,28 @@ class FaceImage:
 
     def _plans(self, rule: ColumnRule, least_peak: float) -> list[Plan]:
         peak = self._peak(least_peak) or most_radiance(self.scene) or 1.0
-        rule = replace(rule, most=MOST_CELLS)
+        rule = replace(rule, most=MOST_CELLS, step=rule.step / FINER**2)
         plans = []
         for faces, (most, change) in zip(self.faces, self.radiance, strict=True):
             # The blur evens out what perspective misplaces within a face.
             change = change * np.minimum(faces.sides / (1 + faces.blur), 1)
             plans.append(faces.image_plan(rule, *(np.minimum(one / peak, BRIGHTEST) for one in (most, change))))
         return plans
+
+    @cached_property
+    def _shaded(self) -> NDArray[np.bool_]:
+        """True (h, w) for pixels that light of faces in a shadow's edge may reach."""
+        steps = np.zeros(np.add(self.window.shape, 1), np.int64)
+        size = np.array(self.window.shape[::-1])
+        for faces in self.faces:
+            some = faces.mixed & faces.bright
+            low, high = faces.low[some], faces.high[some]
+            (left, top), (right, bottom) = (
+                np.clip(edge, 0, size).astype(np.int64).T for edge in (np.floor(low), np.floor(high) + 1)
+            )
+            for y, x, sign in ((top, left, 1), (bottom, left, -1), (top, right, -1), (bottom, right, 1)):
+                np.add.at(steps, (y, x), sign)
+        return np.asarray(steps.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0)
 
     def _touching(self, mark: NDArray[np.bool_]) -> list[Index]:
         """Faces of each mesh whose light may reach a marked pixel."""
@@ -243,8 +275,13 @@ def _steepest(image: Plane) -> Plane:
 
 
 def _wider(mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The marked pixels and their neighbours, whose changes count for the error."""
-    return np.asarray(maximum_filter(mark, 3))
+    """The marked pixels and those around, whose changes count for the error."""
+    return np.asarray(maximum_filter(mark, 2 * AROUND + 1))
+
+
+def _largest(image: Plane) -> Plane:
+    """Largest value (h, w) within `AROUND` pixels of each."""
+    return np.asarray(maximum_filter(image, 2 * AROUND + 1))
 
 
 def _over(unit: float, surface: EmittingSurface) -> tuple[mi.Float, ...]:
