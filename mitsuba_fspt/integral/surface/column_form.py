@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 from ...camera.camera import Camera
 from ...emission.elements import of_part
 from ...jit.batches import batch_slices, numbered
+from ...jit.loops import repeat
 from ..lines.eq9 import eq9, etendue_from_pixel, etendue_from_surface
 from ..lines.occlusion import hidden
 from . import pupil_cells
 from .column_canvas import ColumnCanvas, Plane, Windows
-from .face_light import CORNERS, ColumnRule, FaceLight, Plan
+from .face_light import CORNERS, INWARD, ColumnRule, FaceLight, Plan
 from .footprint import SPECK
 
 AROUND = ((0, 0), (1, 0), (1, 1), (0, 1))  # of a cell of the pupil
@@ -37,6 +38,7 @@ LEAST_AREA = 2.0**-20  # pixels²: a smaller image is replaced by the square of 
 LEAST_HEIGHT = 2.0**-5  # pixels: over a flatter image the density is taken as constant
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
+HALVINGS = 5  # of a side of a piece, for the edge of a shadow
 MOST_WORK = 1 << 23  # entries of windows that are accumulated at a time
 LEFT = 1 / 3  # error over the change by twice the cells and pieces, of second order
 MOST_CHANGE = 6e4  # relative, below the largest number of float16
@@ -204,7 +206,7 @@ class FaceLines:
     ) -> Laid:
         """The light of J_n with the values `exitance` at the three corners of each face, and the coverage, on a film
         whose first pixel has this `corner` (x, y)."""
-        image = self._image(scene, camera, faces, corner)
+        image = self._image(scene, camera, faces, corner, cut=True)
         levels = [mi.Float64(dr.gather(mi.Float, own, self.face)) for own in exitance]
         light = [
             sum((w[c] * level for w, level in zip(image.of_corners(), levels, strict=True)), mi.Float64(0))
@@ -212,8 +214,13 @@ class FaceLines:
         ]
         return image.laid([light, [image.cover] * 3])
 
-    def _image(self, scene: mi.Scene, camera: Camera, faces: FaceLight, corner: tuple[float, float]) -> _Image:
-        """The image of the lines' pieces through the nodes, or of the nodes' cells through the pieces."""
+    def _image(
+        self, scene: mi.Scene, camera: Camera, faces: FaceLight, corner: tuple[float, float], cut: bool = False
+    ) -> _Image:
+        """The image of the lines' pieces through the nodes, or of the nodes' cells through the pieces.
+
+        cut : pieces are cut along the edge of a shadow; otherwise each is lit or not
+        """
         m, elements, face = self.m, faces.elements, self.face
         part, i, j = self.number // (m * m), self.number % m, self.number // m % m
         node = pupil_cells.middle(i, j, m)
@@ -221,11 +228,15 @@ class FaceLines:
         _, lens_point, arrival, _ = camera.arrival(middle.p, node)
         cos_s = dr.dot(middle.n, dr.normalize(lens_point - middle.p))
         active = (cos_s > 0) & (arrival > 0)
+        lit_part = None
         if faces.shadows:
+            ends = [elements.place(face, mi.Point2f(*at), self.cut, part)[0].p for at in CORNERS]
+            mixed = active & dr.gather(mi.Bool, mi.Bool(faces.mixed), face)
+            lit_part = _LitPart.of(scene, camera, node, ends, middle.p, mixed) if cut else None
             within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
             spot, _ = elements.place(face, within, self.cut, part)
-            _, to, _, _ = camera.arrival(spot.p, aim)
-            active &= ~hidden(scene, spot.p, to, active)
+            asked = active & ~lit_part.some if lit_part else active
+            active &= ~hidden(scene, spot.p, camera.arrival(spot.p, aim)[1], asked)
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in corner))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)
         for at in CORNERS:
@@ -252,11 +263,97 @@ class FaceLines:
         turn = _cross(images[1] - images[0], images[2] - images[0])
         large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
+        if lit_part:
+            ring, count, etendue = lit_part.of_image(camera, origin, node, ring, count, etendue)
         # The falloff over the film, which is not linear over a large piece, is put back pixel by pixel.
         even = [falloff(camera, mi.Point2f(image) + origin) for image in images]
         cover = etendue / (light_area * mean)
         values = [cover / f * value for f, value in zip(even, values, strict=True)]
         return _Image(images, values, shares, depths, turn, self.points | flat, cover, ring, count, active)
+
+
+@dataclass(frozen=True)
+class _LitPart:
+    """The part of triangles that is lit, where the edge of a shadow cuts off one of their corners.
+
+    some : True where it does. first, second, third : the corners, that one first. lit : True where it is the lit one.
+    along : shares of the sides from it to the two others where the edge crosses them
+    """
+
+    some: mi.Bool
+    first: mi.Point3f
+    second: mi.Point3f
+    third: mi.Point3f
+    lit: mi.Bool
+    along: mi.Point2f
+
+    @classmethod
+    def of(
+        cls,
+        scene: mi.Scene,
+        camera: Camera,
+        node: mi.Point2f,
+        ends: list[mi.Point3f],
+        middle: mi.Point3f,
+        active: mi.Bool,
+    ) -> _LitPart:
+        """Of triangles with the corners `ends` as seen through a node of the pupil; found by bisection."""
+
+        def open_from(point: mi.Point3f, asked: mi.Bool) -> mi.Bool:
+            start = point + INWARD * (middle - point)
+            return asked & ~hidden(scene, start, camera.arrival(start, node)[1], asked)
+
+        seen = [open_from(end, active) for end in ends]
+        some = active & ((seen[0] != seen[1]) | (seen[0] != seen[2]))
+        odd = [seen[1] == seen[2], seen[0] == seen[2]]  # else the third
+
+        def turned(k: int) -> mi.Point3f:
+            return dr.select(odd[0], ends[k], dr.select(odd[1], ends[(k + 1) % 3], ends[(k + 2) % 3]))
+
+        first, second, third = (turned(k) for k in range(3))
+        lit = dr.select(odd[0], seen[0], dr.select(odd[1], seen[1], seen[2]))
+
+        def halve(k: mi.UInt32, along: mi.Point2f, width: mi.Float) -> tuple[mi.Point2f, mi.Float]:
+            side = k % 2 == 0
+            share = dr.select(side, along.x, along.y)
+            other = dr.select(side, second, third)
+            alike = open_from(first + share * (other - first), some) == lit
+            share += dr.select(alike, 1.0, -1.0) * width
+            along = mi.Point2f(dr.select(side, share, along.x), dr.select(side, along.y, share))
+            return along, dr.select(side, width, 0.5 * width)
+
+        count = dr.select(some, dr.opaque(mi.UInt32, 2 * HALVINGS), 0)
+        along, _ = repeat(count, halve, mi.Point2f(0.5), mi.Float(0.25))
+        return cls(some, first, second, third, lit, along)
+
+    def of_image(
+        self,
+        camera: Camera,
+        origin: mi.Vector2f,
+        node: mi.Point2f,
+        ring: list[mi.Point2d],
+        count: mi.UInt32,
+        etendue: mi.Float64,
+    ) -> tuple[list[mi.Point2d], mi.UInt32, mi.Float64]:
+        """Polygon, number of edges and étendue of images through a node of the pupil, without the dark parts.
+
+        Of an image that is no triangle, see `_polygon`, not the polygon but the étendue becomes smaller.
+        """
+        whole = count == 4
+        corner = mi.Float64(self.along.x * self.along.y)
+        etendue = dr.select(self.some & whole, etendue * dr.select(self.lit, corner, 1 - corner), etendue)
+        sides = (self.along.x, self.second), (self.along.y, self.third)
+        a, b = (self.first + share * (end - self.first) for share, end in sides)
+        corners = [
+            dr.select(self.lit, self.first, a),
+            dr.select(self.lit, a, self.second),
+            dr.select(self.lit, b, self.third),
+            dr.select(self.lit, self.first, b),
+        ]
+        cut = self.some & ~whole
+        images = [mi.Point2d(camera.arrival(corner, node)[0] - origin) for corner in corners]
+        ring = [dr.select(cut, new, old) for new, old in zip(images, ring, strict=True)]
+        return ring, dr.select(cut, dr.select(self.lit, mi.UInt32(3), 4), count), etendue
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ As for columns of the transport matrix, every face sends its light through M × 
 the images of all faces tile the film without a gap, and the light of each, linear over it, is distributed exactly over
 the pixels: each node gives the exact image of a pinhole. Only the pupil is sampled. So light that is narrower than a
 pixel, faces edge-on and many small faces cost no more than others, and lines of sight are needed only where one surface
-may hide another. M and the pieces of faces double from level to level; the error follows from the change, as both
-errors are of second order.
+may hide another; there the faces are cut along the edge of the shadow. M doubles from level to level; the error follows
+from the change.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from .glow import touching
 # Error over the largest last change within `AROUND` pixels, where no surface hides another and where one may. Images
 # with few nodes may agree by chance: the least error of the third level over the tolerance, for which M is chosen
 # there, and its factor from level to level.
-SAFETY, SHADED, AROUND, EXPECTED, FALL = 0.35, 1.0, 2, 0.5, 0.25
+SAFETY, SHADED, AROUND, EXPECTED, FALL = 0.35, 0.5, 2, 0.5, 0.25
 FINER = 1.25  # M over that at which an edge as bright as its face is wrong by the tolerance: pixels have several
 DISPLACED = 2e-4  # pixels by which float32 displaces the images of faces against lines of sight
 MOST_LEVELS, MOST_CELLS = 6, 512  # levels; largest M at the second level
@@ -140,7 +140,7 @@ class FaceImage:
 
         def worth(count: int) -> float:
             lines = self.quadrature.most_nodes * count / 2
-            return lines if self.quadrature.max_nodes is not None else max(lines, TOGETHER / 2)
+            return lines if self.quadrature.max_nodes is not None else max(lines, TOGETHER)
 
         self._refine(where, least_peak, worth, progress)
         return self._solution(where)
@@ -183,7 +183,7 @@ class FaceImage:
     def _finer(self, plans: list[Plan], rule: ColumnRule, level: int, least_peak: float) -> list[Plan]:
         """The plans of the next level: at the second level with all cells that the accuracy requires, as the brightest
         pixel is known from the first one; half of them before, twice as many after that."""
-        doubled = [plan.doubled(faces.mixed) for plan, faces in zip(plans, self.faces, strict=True)]
+        doubled = [plan.doubled(own.mixed & ~own.small) for plan, own in zip(plans, self.faces, strict=True)]
         if level > 2:
             return doubled
         wanted = self._plans(rule, least_peak)

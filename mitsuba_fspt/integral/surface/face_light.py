@@ -235,6 +235,11 @@ class FaceLight:
         """Faces that may send light."""
         return self.low[:, 0] <= self.high[:, 0]
 
+    @property
+    def small(self) -> Mask:
+        """Faces smaller than their blur disc."""
+        return np.minimum(self.sides, LONGEST) < 2 * self.blur + 1
+
     def behind(self, scene: mi.Scene, camera: Camera) -> FaceLight:
         """The same in a scene where one surface may hide another: faces of which all lines are blocked are dark."""
         bright = np.flatnonzero(self.bright)
@@ -294,22 +299,23 @@ class FaceLight:
         many = np.minimum(np.sqrt(rule.coarse_factor * error), rule.coarse * self.blur)
         nodes = np.maximum(np.sqrt(rule.edge_factor * error), many)
         cells = (2 * np.ceil(nodes / 2)).clip(self._fewest(rule), rule.most).astype(np.int64)
-        cuts = np.minimum(self._pieces(rule, contrast, cells).astype(np.int64), math.isqrt(BATCH) // cells)
+        cuts = np.minimum(self._pieces(rule, contrast).astype(np.int64), math.isqrt(BATCH) // cells)
         return Plan(cells[:, None], cuts[:, None], np.zeros((len(cells), 1), bool))
 
-    def _pieces(self, rule: ColumnRule, contrast: Array | float = 1.0, cells: Index | None = None) -> Array:
-        """Pieces along a side that are laid through nodes; `contrast`: largest change of the light along a face.
+    def _pieces(self, rule: ColumnRule, contrast: Array | None = None) -> Array:
+        """Pieces along a side that are laid through nodes.
 
-        cells : M, over which the shadows' errors of pieces are averaged, where these are taken for an image
+        contrast : largest change of the light along a face, for an image, whose faces smaller than their blur disc are
+            cut along the edges of shadows; None: all pieces of columns are lit or not
         """
         sides = np.minimum(self.sides, LONGEST)
-        larger = 1.0 if cells is None else np.maximum(cells / rule.mixed, 1)
-        shaded = np.where(self.mixed, np.maximum(sides / (rule.shadow * larger), FEWEST_SHADED), 0)
-        small = sides < 2 * self.blur + 1
-        shaded = np.where(small, np.minimum(shaded, np.sqrt(self.crossed * sides / rule.displaced)), shaded)
+        shaded = np.where(self.mixed, np.maximum(sides / rule.shadow, FEWEST_SHADED), 0)
+        displaced = self.crossed * sides / rule.displaced if contrast is None else 0
+        shaded = np.where(self.small, np.minimum(shaded, np.sqrt(displaced)), shaded)
         pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
         # Within a pixel perspective misplaces nothing.
-        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant * contrast / (8 * rule.perspective)), sides))
+        change = 1.0 if contrast is None else contrast
+        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant * change / (8 * rule.perspective)), sides))
         return np.maximum(np.ceil(pieces), 1)
 
     def _fewest(self, rule: ColumnRule) -> Index:
