@@ -1,4 +1,4 @@
-"""Plugin of pytest: CPU seconds of the tests, the dearest ten of them and the total of all processes, at the end.
+"""Plugin of pytest: CPU seconds of the tests, the dearest ten of them, ten files and all processes, at the end.
 
 Wall times on a busy machine say little, so that the budget of the suite is one of CPU time. The time of a test is that
 of this process with all its threads and of the child processes that have ended meanwhile.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -52,9 +53,16 @@ class Spent:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter, config) -> None:
-        terminalreporter.section(f"dearest {DEAREST} tests, CPU seconds")
-        for name, seconds in self.tests.most_common(DEAREST):
-            terminalreporter.write_line(f"{seconds:7.1f}  {name}")
+        files: Counter[str] = Counter()
+        for name, seconds in self.tests.items():
+            files[name.partition("::")[0]] += seconds
+        for what, spent in (("tests", self.tests), ("files", files)):
+            terminalreporter.section(f"dearest {DEAREST} {what}, CPU seconds")
+            for name, seconds in spent.most_common(DEAREST):
+                terminalreporter.write_line(f"{seconds:7.1f}  {name}")
+        if table := config.getoption("cpu_table"):
+            lines = [f"{seconds:.2f},{name!r}" for name, seconds in self.tests.most_common()]
+            Path(table).write_text("\n".join(["cpu_seconds,test", *lines, ""]), encoding="utf-8")
         limit = config.getoption("cpu_limit")
         verdict = "over" if self.total > (BUDGET if limit is None else limit) else "within"
         text = f"{self.total:7.1f}  in all, {verdict} the budget of {BUDGET if limit is None else limit:.0f}"
@@ -64,6 +72,7 @@ class Spent:
 def pytest_addoption(parser) -> None:
     text = "fail if the tests take more CPU seconds than this; without it, the summary tells it"
     parser.addoption("--cpu-limit", type=float, default=None, metavar="SECONDS", help=text)
+    parser.addoption("--cpu-table", metavar="FILE.csv", help="write the CPU seconds of every test")
 
 
 def pytest_configure(config) -> None:

@@ -33,7 +33,8 @@ def test_dearest_tests_and_the_limit(tmp_path):
     """0.6 s of a worker and of its child count, sleep does not; the total has all, and a limit below it fails."""
     (tmp_path / "test_busy.py").write_text(BUSY)
     plugins = ("-p", "no:cacheprovider", "-p", "xdist", "-p", "cpu_seconds")
-    command = [sys.executable, "-m", "pytest", "-q", *plugins, "-n", "2", "--cpu-limit", "1", "test_busy.py"]
+    command = [sys.executable, "-m", "pytest", "-q", *plugins, "-n", "2", "--cpu-limit", "1"]
+    command += ["--cpu-table", "spent.csv", "test_busy.py"]
     paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": paths, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
@@ -44,3 +45,8 @@ def test_dearest_tests_and_the_limit(tmp_path):
     assert found["in"] > here + child
     assert "in all, over the budget of 1" in done.stdout
     assert done.returncode == 1
+    head, *rows = (tmp_path / "spent.csv").read_text().splitlines()
+    assert head == "cpu_seconds,test"
+    assert sorted(row.partition(",")[2] for row in rows) == [
+        f"'test_busy.py::test_{name}'" for name in ("asleep", "here", "in_a_child")
+    ]
