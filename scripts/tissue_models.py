@@ -2,22 +2,27 @@
 
     python scripts/tissue_models.py [--photons 8e6] [--edge 1.5] [--page docs/emission.md] [-o docs/tissue_models.csv]
     python scripts/tissue_models.py --border [--photons 3e6]
+    python scripts/tissue_models.py --errors
 
 Lengths of the phantoms are in mean free paths of µs' = 1/mm. Each line is one phantom: body, depth of the source's
 surface, µa, n. Columns: standard error of the total by photons [%], and for both models deviation of the total, of the
 brightest bin, and largest deviation of a bin beyond twice its standard error, over the bins whose standard error is
-below 1 % [%]. Bins of a sphere are rings of 12° about the axis of the source; of a cylinder, seven sectors by three
-heights of its side, and two halves of its caps.
+below 1 % [%]; and least squares of the deviation of J_n by c0 + c1 (2µ - 1) + c2 (6µ² - 6µ + 1), Eq. M.51, weighted by
+the exit power, with the rms of the rest [%]. Bins of a sphere are rings of 12° about the axis of the source; of a
+cylinder, seven sectors by three heights of its side, and two halves of its caps.
 
-`--border` prints the two numbers of an index that Eq. M.48 takes from photons: β, the fall of the extrapolation length
-with the curvature of the border, from spheres with a source in the middle, as the length with which the SP3 equations
-give the photons' exit power; and δ, its fall with the wave number along the border, from a sphere of 15 mean free paths
-with a source 3 or 4 below the surface, by least squares of J_n.
+`--errors` fits the numbers of the stated error of each model, Eq. M.51, to these coefficients in the CSV file: least
+squares of the squares of c0 by t², and of c1 and c2 by s².
+
+`--border` prints β, the fall of the extrapolation length with the curvature of the border that Eq. M.48 takes from
+photons, of an index and an anisotropy g: from spheres with a source in the middle, as the length with which the SP3
+equations give the photons' exit power.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -31,11 +36,13 @@ from closed_forms import coupled_ball_exitance
 from csv_table import write_rows
 from numpy.typing import NDArray
 from paper_common import Table, fill
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq, nnls
 
+from mitsuba_fspt.inverse.model_error import MODEL_ERRORS, ModelError, shapes
+from mitsuba_fspt.optics.half_space import border
 from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Sphere
-from mitsuba_fspt.optics.sp3_boundary import extrapolation_length, sp3_boundary
+from mitsuba_fspt.optics.sp3_boundary import sp3_boundary
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import solve
@@ -95,7 +102,11 @@ CASES = (
     Case(LARGE, 6, 0.03, 1.37),
     Case(LARGE, 6, 0.1, 1.33),
     Case(LARGE, 3, 0.03, 1.37, ball=2),
+    Case(LARGE, 3, 0.03, 1.37, g=0.9),
     Case(LARGE, 4, 0.03, 1.37, g=0.9),
+    Case(LARGE, 6, 0.03, 1.37, g=0.9),
+    Case(LARGE, 3, 0.1, 1.37, g=0.9),
+    Case(LARGE, 6, 0.1, 1.37, g=0.9),
     Case(SMALL, 3, 0.03, 1.37),
     Case(SMALL, 5, 0.1, 1.5),
     Case(THIN, 3, 0.005, 1.37),
@@ -185,7 +196,7 @@ def solved(case: Case, model: str, edge: float, places: Sequence[tuple[Array, Ar
     """Exit power in all and by bins of 1 W under a model, and CPU seconds."""
     body, start = case.body, time.process_time()
     mesh = cylinder_tetrahedra(body.radius, body.height, edge) if body.height else ball(body.radius, edge)
-    medium = Medium(case.mua, 1.0, case.n)
+    medium = Medium(case.mua, 1.0, case.n, case.g)
     solution = solve(mesh, [medium], [Source(Sphere(case.centre, case.ball))], model=model)
     values = np.array([areas @ solution.exitance_at(points) for points, areas in places])
     return solution.solved.exited, values, time.process_time() - start
@@ -194,6 +205,7 @@ def solved(case: Case, model: str, edge: float, places: Sequence[tuple[Array, Ar
 def row(case: Case, photons: int, edge: float) -> dict[str, object]:
     """A line of the table."""
     bin_of, places = bins(case.body)
+    photons = photons // 64 * 32 if case.g else photons  # ten times as many flights
     optics = Optics(case.mua, 1.0, case.n, case.g)
     batches = exit_power(case.body, optics, Emitter(case.centre, case.ball), bin_of, len(places), photons)
     power, error = batches.mean(axis=0), batches.std(axis=0, ddof=1) / math.sqrt(BATCHES)
@@ -212,8 +224,44 @@ def row(case: Case, photons: int, edge: float) -> dict[str, object]:
         line[f"{model}_peak"] = 100 * deviation[brightest]
         line[f"{model}_bin"] = 100 * beyond[known[np.argmax(np.abs(beyond[known]))]]
         line[f"{model}_rms"] = 100 * math.sqrt(np.average(deviation[known] ** 2, weights=power[known]))
+        for k, value in enumerate(_polynomial(case, places, deviation, power, known)):
+            line[f"{model}_{('c0', 'c1', 'c2', 'rest')[k]}"] = 100 * value
         line[f"{model}_seconds"] = seconds
     return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in line.items()}
+
+
+def _polynomial(
+    case: Case, places: Sequence[tuple[Array, Array]], deviation: Array, power: Array, known: NDArray[np.int64]
+) -> list[float]:
+    """c0, c1, c2 of M.51 for the relative deviations of the bins, and the rms of what they leave."""
+    rows = []
+    for points, areas in places:
+        cosine = (case.depth + case.ball) / np.linalg.norm(points - np.array(case.centre), axis=1)
+        rows.append([areas @ one / areas.sum() for one in (np.ones_like(cosine), *shapes(cosine))])
+    design, weight = np.array(rows)[known], np.sqrt(power[known] / power[known].sum())
+    found = np.linalg.lstsq(design * weight[:, None], deviation[known] * weight)[0]
+    return [*found.tolist(), float(np.linalg.norm((deviation[known] - design @ found) * weight))]
+
+
+def print_errors(path: Path) -> None:
+    """Print the four numbers of each model's stated error, and rms over stated sd of c0, and of c1 and c2."""
+    with path.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    absorption = np.array([float(row["mua"]) for row in rows])
+    depth = np.array([float(row["depth"]) for row in rows]) * (1 + absorption)
+    for model in MODELS:
+        c0, c1, c2 = (np.array([float(row[f"{model}_c{k}"]) for row in rows]) / 100 for k in range(3))
+        t2, s2 = c0**2, (c1**2 + c2**2) / 2
+        basis = np.column_stack([np.ones_like(depth), (absorption * depth) ** 2])
+        total = np.sqrt(nnls(basis / t2.mean(), t2 / t2.mean())[0])
+        shape = np.sqrt(nnls(np.column_stack([depth**-2.0, absorption**2]) / s2.mean(), s2 / s2.mean())[0])
+        stated = ModelError(*total, *shape)
+        t, s = np.transpose([stated.deviations(d, a) for d, a in zip(depth, absorption, strict=True)])
+        used = np.transpose([MODEL_ERRORS[model].deviations(d, a) for d, a in zip(depth, absorption, strict=True)])
+        print(model, stated, f"rms over stated {np.sqrt(np.mean(t2 / t**2)):.2f} {np.sqrt(np.mean(s2 / s**2)):.2f};")
+        print(
+            "  as in the package", *(f"{np.sqrt(np.mean(a / b**2)):.2f}" for a, b in zip((t2, s2), used, strict=True))
+        )
 
 
 def page_table(rows: Sequence[dict[str, object]]) -> Table:
@@ -226,60 +274,32 @@ def page_table(rows: Sequence[dict[str, object]]) -> Table:
 
 
 def print_border(photons: int) -> None:
-    """Print β by n and radius with its standard error, and δ by n and depth with the rms of J_n without and with it."""
+    """Print β by n, g and radius with its standard error."""
     for n in (1.0, 1.1, 1.2, 1.33, 1.4, 1.5, 1.7):
-        for radius, mua in ((6.0, 0.02), (12.0, 0.02), (24.0, 0.006)):
-            value, error = curvature_of(n, radius, mua, photons)
-            print(f"n {n:g}  R {radius:g}  beta {value:.3f} ± {error:.3f}", flush=True)
-        for depth, mua in ((3.0, 0.03), (4.0, 0.005)):
-            value, before, after = lateral_of(n, depth, mua, photons)
-            print(f"n {n:g}  depth {depth:g}  delta {value:.3f}  rms {before:.4f} to {after:.4f}", flush=True)
+        for g in (0.0, 0.9):
+            for radius, mua in ((6.0, 0.02), (12.0, 0.02), (24.0, 0.006)):
+                value, error = curvature_of(n, g, radius, mua, photons if g == 0 else photons // 160 * 32)
+                print(f"n {n:g}  g {g:g}  R {radius:g}  beta {value:.3f} ± {error:.3f}", flush=True)
 
 
-def curvature_of(n: float, radius: float, mua: float, photons: int) -> tuple[float, float]:
+def curvature_of(n: float, g: float, radius: float, mua: float, photons: int) -> tuple[float, float]:
     """β by a sphere with a source in its middle, and its standard error."""
-    batches = exit_power(Body(radius), Optics(mua, 1.0, n), Emitter((0, 0, 0)), lambda p: mi.UInt32(0), 1, photons)
+    optics = Optics(mua, 1.0, n, g)
+    batches = exit_power(Body(radius), optics, Emitter((0, 0, 0)), lambda p: mi.UInt32(0), 1, photons)
     power, error = batches.mean(), batches.std(ddof=1) / math.sqrt(BATCHES)
-    flat, scale = extrapolation_length(n), radius * (1 + mua)
+    flat, scale = border(n, g).length, radius * (1 + mua)
+    found = equations("sp3", [Medium(mua, 1.0, n, g)])
 
     def exited(length: float) -> float:
-        border = sp3_boundary(n).copy()
-        border[0, 0] += (1 / length - 1 / flat) / 3
-        found = equations("sp3", [Medium(mua, 1.0, n)])
-        optics = found.diffusion[0], found.reaction[0], found.source
-        central = coupled_ball_exitance(radius, 0.0, *optics, border, 0.0, np.zeros(1), orders=1)[0]
+        matrix = sp3_boundary(n, g).copy()
+        matrix[0, 0] += (1 / length - 1 / flat) / 3
+        media = found.diffusion[0], found.reaction[0], found.source
+        central = coupled_ball_exitance(radius, 0.0, *media, matrix, 0.0, np.zeros(1), orders=1)[0]
         return float(4 * math.pi * radius**2 * central)
 
-    length = brentq(lambda z: exited(z) / power - 1, 0.2 * flat, 1.5 * flat)
+    length = brentq(lambda z: exited(z) / power - 1, 0.2 * flat, 2 * flat)
     slope = (exited(1.01 * flat) / exited(flat) - 1) / (0.01 * flat)
     return (flat - length) * scale, error / power / abs(slope) * scale
-
-
-def lateral_of(n: float, depth: float, mua: float, photons: int) -> tuple[float, float, float]:
-    """δ by a sphere with a source near the surface, and the rms of J_n over that of J_n, without it and with it."""
-    radius, count = 15.0, 180
-    batches = exit_power(
-        Body(radius),
-        Optics(mua, 1.0, n),
-        Emitter((0, 0, radius - depth)),
-        lambda p: dr.minimum(mi.UInt32(dr.acos(dr.clip(p.z / dr.norm(p), -1, 1)) * (count / math.pi)), count - 1),
-        count,
-        photons,
-    )
-    bounds = np.cos(np.linspace(0, math.pi, count + 1))
-    area, cosine = 2 * math.pi * radius**2 * (bounds[:-1] - bounds[1:]), (bounds[:-1] + bounds[1:]) / 2
-    exitance = batches.mean(axis=0) / area
-    found = equations("sp3", [Medium(mua, 1.0, n)])
-    border = found.border_at(np.zeros(1, dtype=np.int64), np.array([1 / radius]))[0]
-    optics = found.diffusion[0], found.reaction[0], found.source
-    unit = 1 / (3 * extrapolation_length(n) ** 2 * (1 + mua) ** 2)
-
-    def rms(value: float) -> float:
-        solved = coupled_ball_exitance(radius, radius - depth, *optics, border, value * unit, cosine, orders=50)
-        return math.sqrt((area @ (solved - exitance) ** 2) / (area @ exitance**2))
-
-    best = minimize_scalar(rms, bounds=(-0.5, 6), method="bounded")
-    return float(best.x), rms(0.0), float(best.fun)
 
 
 def main() -> None:
@@ -288,9 +308,13 @@ def main() -> None:
     options.add_argument("--edge", type=float, default=1.5, help="of the tetrahedra [mm]")
     options.add_argument("--page", type=Path, default=ROOT / "docs" / "emission.md", help="page with the table")
     options.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "tissue_models.csv")
-    options.add_argument("--border", action="store_true", help="print β and δ, and end")
+    options.add_argument("--border", action="store_true", help="print β, and end")
+    options.add_argument("--errors", action="store_true", help="print the numbers of the stated errors, and end")
     given = options.parse_args()
     photons = int(given.photons) // BATCHES * BATCHES
+    if given.errors:
+        print_errors(given.output)
+        return
     if given.border:
         print_border(photons)
         return

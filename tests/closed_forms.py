@@ -93,14 +93,19 @@ def coupled_ball_exitance(
     lateral: float,
     cosine: Array,
     orders: int = 40,
+    flow: tuple[float, float] = (0.0, 0.0),
 ) -> Array:
-    """As `ball_exitance` for -c ∇²φ + C φ = s q with c ∂φ/∂n = -(H φ) + τ ∇_t²φ_1 (in the first equation)."""
+    """As `ball_exitance` for -c ∇²φ + C φ = s q with c ∂φ/∂n = -(H φ) + τ ∇_t²φ_1 = -h_1 (in the first equation).
+
+    J_n = h_1 + f with f - b ∇_t² f = a ∇_t² h_1 and (a, b) = `flow`.
+    """
     squares, vectors = eigh(reaction, np.diag(diffusion))
     k, power = np.sqrt(squares), vectors.T @ source
     result = np.zeros_like(cosine)
     for order in range(orders):
         matrix = border.copy()
-        matrix[0, 0] += lateral * order * (order + 1) / radius**2
+        along = order * (order + 1) / radius**2
+        matrix[0, 0] += lateral * along
         # Both functions of each mode over their values on the border, which under- and overflow.
         decayed = spherical_kn(order, k * radius)
         decay = k * spherical_kn(order, k * radius, derivative=True)
@@ -109,5 +114,5 @@ def coupled_ball_exitance(
         right = -(diffusion * (vectors @ (own * decay)) + matrix @ (vectors @ (own * decayed)))
         mirror = np.linalg.solve(diffusion[:, None] * vectors * growth + matrix @ vectors, right)
         outward = matrix @ (vectors @ (own * decayed + mirror))
-        result += outward[0] * eval_legendre(order, cosine)
+        result += outward[0] * (1 - flow[0] * along / (1 + flow[1] * along)) * eval_legendre(order, cosine)
     return result

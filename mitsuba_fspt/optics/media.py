@@ -9,12 +9,16 @@ from ..runtime.errors import FluxError
 from .shapes import Shape
 
 LARGEST = 1e6  # 1/mm: a mean free path of 1 nm, far below a wavelength
+MOST_FORWARD = 0.99  # largest anisotropy
 LARGEST_POWER = 1e30  # W
 
 
 @dataclass(frozen=True)
 class Medium:
     """Absorption `mua` >= 0, reduced scattering `musp` > 0 [1/mm], both <= 1e6; relative refractive index `n` >= 1.
+
+    g : anisotropy of the scattering in [0, 0.99], of the phase function of Henyey and Greenstein; µs = µs'/(1 - g). SP3
+        depends on it, diffusion does not
 
     Raises
     ------
@@ -24,6 +28,7 @@ class Medium:
     mua: float
     musp: float
     n: float = 1.37
+    g: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.mua <= LARGEST:
@@ -35,6 +40,8 @@ class Medium:
             )
         if not (math.isfinite(self.n) and self.n >= 1):
             raise FluxError(f"medium: 'n' must be >= 1 and finite, got {self.n:g}. Give for example 1.37.")
+        if not 0 <= self.g <= MOST_FORWARD:
+            raise FluxError(f"medium: 'g' must be in [0, {MOST_FORWARD:g}], got {self.g:g}. Give for example 0.9.")
 
     @property
     def diffusion(self) -> float:

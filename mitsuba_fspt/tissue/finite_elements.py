@@ -43,7 +43,8 @@ BORDER_DEGREE = 8
 class Solved:
     """Rest w at the nodes, (m, N) [W/mm²], power absorbed inside and power leaving through the border [W].
 
-    lateral : -∇_t·(τ ∇_t φ_1) at the nodes of the border, (N,) [W/mm²], its part of J_n
+    lateral : at the nodes of the border, (N,) [W/mm²], what J_n has beyond H φ: -∇_t·(τ ∇_t φ_1), and the flow along
+        the border, f
     """
 
     rest: Array
@@ -78,6 +79,7 @@ class System:
         region = mesh.region[grid.f2t[0, self.border.find]]
         self.outward = self._outward(region, curvature)
         self.lateral = equations.lateral[region, None]  # τ of the facets
+        self._flows = equations.flow[region, None], equations.spread[region, None]  # a, b
 
     def _outward(self, region: Index, curvature: Array) -> Array:
         """H at the quadrature points of the boundary facets, (m, m, F, Q)."""
@@ -95,7 +97,7 @@ class System:
         FluxError : no convergence.
         """
         load, exited, absorbed = np.zeros((self.equations.components, self.basis.N)), 0.0, 0.0
-        lateral = np.zeros(self.basis.N)
+        lateral, through = np.zeros(self.basis.N), np.zeros(self.basis.N)
         for field in fields:
             values, flux, outflow, along = self._on_border(field)
             outward = np.einsum("ijfq,jfq->ifq", self.outward, values)
@@ -103,6 +105,7 @@ class System:
                 load[i] -= self._integrate(self.border, total)
             if self.lateral.any():
                 lateral += self._integrate(self.border, np.zeros_like(outflow), self.lateral * along)
+                through += self._integrate(self.border, outward[0])
             exited += (outward[0] * self.border.dx).sum()
             # Σ C_1j φ_fj is the divergence of c_1 ∇φ_f1 + P r/(4πr³), a field without singularity.
             absorbed += ((flux[0] + outflow) * self.border.dx).sum()
@@ -115,9 +118,12 @@ class System:
         for j, component in enumerate(rest):
             inside, outside = self.basis.interpolate(component), self.border.interpolate(component)
             absorbed += (self._reaction(0, j) * inside * self.basis.dx).sum()
-            exited += (self.outward[0, j] * outside * self.border.dx).sum()
+            flux = self.outward[0, j] * outside
+            exited += (flux * self.border.dx).sum()
+            if self.lateral.any():
+                through += self._integrate(self.border, flux)
         if self.lateral.any():
-            lateral = self._over_border(lateral + self._lateral_matrix @ rest[0])
+            lateral = self._flow(lateral + self._along(self.lateral) @ rest[0], through)
         return Solved(rest, lateral, float(absorbed), float(exited), iterations)
 
     def _reaction(self, i: int, j: int) -> Array:
@@ -252,33 +258,37 @@ class System:
         else:
             volume = skfem.BilinearForm(lambda u, v, w: reaction * u * v)
         matrix = volume.assemble(self.basis) + surface.assemble(self.border)
-        return matrix + self._lateral_matrix if i == j == 0 and self.lateral.any() else matrix
+        return matrix + self._along(self.lateral) if i == j == 0 and self.lateral.any() else matrix
 
-    @cached_property
-    def _lateral_matrix(self) -> Any:
-        """∮ τ ∇_t u·∇_t v dS, (N, N)."""
+    def _along(self, factor: Array) -> Any:
+        """∮ factor ∇_t u·∇_t v dS, (N, N)."""
         skfem = import_skfem()
 
         def form(u: Any, v: Any, w: Any) -> Any:
             across = (u.grad * w.n).sum(axis=0) * (v.grad * w.n).sum(axis=0)
-            return self.lateral * ((u.grad * v.grad).sum(axis=0) - across)
+            return factor * ((u.grad * v.grad).sum(axis=0) - across)
 
         return skfem.BilinearForm(form).assemble(self.border)
 
     @cached_property
-    def _over_border(self) -> Callable[[Array], Array]:
-        """From integrals ∮ f v dS of each test function, (N,), to f at the nodes of the border, (N,), 0 inside."""
+    def _flow(self) -> Callable[[Array, Array], Array]:
+        """From integrals of -∇_t·(τ ∇_t φ_1) v and of H φ v over the border, (N,) each, to `Solved.lateral`."""
         skfem = import_skfem()
         nodes = self.basis.get_dofs(self.basis.mesh.boundary_facets()).flatten()
-        mass = skfem.BilinearForm(lambda u, v, w: u * v).assemble(self.border)
-        solve = splu(csc_array(mass[nodes][:, nodes]), permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve
+        mass = skfem.BilinearForm(lambda u, v, w: u * v).assemble(self.border)[nodes][:, nodes]
+        along, spread = (self._along(factor)[nodes][:, nodes] for factor in self._flows)
+        plain, smooth = (
+            splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve
+            for matrix in (mass, mass + spread)
+        )
 
-        def divided(integrals: Array) -> Array:
-            values = np.zeros_like(integrals)
-            values[nodes] = solve(integrals[nodes])
+        def flow(lateral: Array, through: Array) -> Array:
+            values = np.zeros_like(lateral)
+            flux = plain((lateral + through)[nodes])
+            values[nodes] = plain(lateral[nodes]) - smooth(along @ flux)
             return values
 
-        return divided
+        return flow
 
     @staticmethod
     def _integrate(basis: Any, value: Array, gradient: Array | None = None) -> Array:

@@ -2,8 +2,8 @@
 
     -∇·(c_i ∇φ_i) + Σ_j C_ij φ_j = s_i q inside,   c_i ∂φ_i/∂n = -Σ_j H_ij φ_j + δ_i1 ∇_t·(τ ∇_t φ_1) on the border
 
-with the gradient ∇_t along the border; τ = 0 for diffusion. The fluence is Σ_i s_i φ_i, J_n = -c_1 ∂φ_1/∂n. C and H are
-symmetric.
+with the gradient ∇_t along the border. The fluence is Σ_i s_i φ_i, J_n = h + f with h = -c_1 ∂φ_1/∂n and the flow of
+light along the border, f - ∇_t·(b ∇_t f) = ∇_t·(a ∇_t h). τ = a = b = 0 for diffusion. C and H are symmetric.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..optics.boundary import boundary_a
+from ..optics.half_space import border
 from ..optics.media import Medium
-from ..optics.sp3_boundary import curvature_effect, extrapolation_length, lateral_effect, shortened, sp3_boundary
+from ..optics.sp3_boundary import curvature_effect, shortened, sp3_boundary
 from ..runtime.errors import FluxError
 
 Array = NDArray[np.float64]
@@ -33,7 +34,7 @@ class Equations:
     title : for provenance;  diffusion : c, (R, m) [mm];  reaction : C, (R, m, m) [1/mm];  source : s, (m,)
     border : H of a flat border, (R, m, m)
     length : extrapolation length in mean free paths that H_11 contains, (R,);  bend : its fall per curvature [mm], (R,)
-    lateral : τ, (R,) [mm²]
+    lateral : τ, (R,) [mm²];  flow, spread : a, b, (R,) [mm²]
     """
 
     title: str
@@ -44,6 +45,8 @@ class Equations:
     length: Array
     bend: Array
     lateral: Array
+    flow: Array
+    spread: Array
 
     @property
     def components(self) -> int:
@@ -105,24 +108,26 @@ def _diffusion(media: Sequence[Medium], a: str | float) -> Equations:
         np.ones(1),
         1 / (2 * factors[:, None, None]),
         2 / 3 * factors,
-        np.zeros(len(media)),
-        np.zeros(len(media)),
+        *np.zeros((4, len(media))),
     )
 
 
 def _sp3(media: Sequence[Medium]) -> Equations:
-    """Eq. M.47 with φ₁ = Φ₀ + 2 Φ₂ and φ₂ = 3 Φ₂, Φ_l the moments of the radiance, for isotropic scattering µs'."""
-    mua = np.array([medium.mua for medium in media])
-    total = mua + np.array([medium.musp for medium in media])
-    length = np.array([extrapolation_length(medium.n) for medium in media])
-    reaction = np.array([[mua, -2 / 3 * mua], [-2 / 3 * mua, 4 / 9 * mua + 5 / 9 * total]])
+    """Eq. M.47 with φ₁ = Φ₀ + 2 Φ₂ and φ₂ = 3 Φ₂, Φ_l the moments of the radiance."""
+    mua, musp, g = (np.array([getattr(medium, key) for medium in media]) for key in ("mua", "musp", "g"))
+    total, second, third = mua + musp, mua + musp * (1 + g), mua + musp * (1 + g + g**2)
+    borders = [border(medium.n, medium.g) for medium in media]
+    length = np.array([one.length for one in borders])
+    reaction = np.array([[mua, -2 / 3 * mua], [-2 / 3 * mua, 4 / 9 * mua + 5 / 9 * second]])
     return Equations(
         "SP3 equations",
-        np.column_stack([1 / (3 * total), 1 / (7 * total)]),
+        np.column_stack([1 / (3 * total), 1 / (7 * third)]),
         np.moveaxis(reaction, 2, 0),
         np.array([1, -2 / 3]),
-        np.array([sp3_boundary(medium.n) for medium in media]),
+        np.array([sp3_boundary(medium.n, medium.g) for medium in media]),
         length,
-        np.array([curvature_effect(medium.n) for medium in media]) / total,
-        np.array([lateral_effect(medium.n) for medium in media]) / (3 * length**2 * total**2),
+        np.array([curvature_effect(medium.n, medium.g) for medium in media]) / total,
+        np.array([one.lateral for one in borders]) / (3 * length**2 * total**2),
+        np.array([one.flow for one in borders]) / total**2,
+        np.array([one.spread for one in borders]) / total**2,
     )

@@ -136,8 +136,9 @@ class PhantomFile:
         file = Table.load(path)
         optical = file.table("optical")
         mesh, output = file.table("mesh", {}), file.table("output", {})
-        medium, spread = _medium(optical, 1.37), _spread(optical, Spread())
-        regions = tuple(_region(table, medium.n, spread) for table in file.tables("regions"))
+        base, spread = Medium(0.0, 1.0, 1.37, optical.number("g", 0.0)), _spread(optical, Spread())
+        medium = _medium(optical, base)
+        regions = tuple(_region(table, medium, spread) for table in file.tables("regions"))
         result = cls(
             _geometry(file.table("geometry"), path.parent),
             medium,
@@ -231,9 +232,9 @@ def _geometry(table: Table, folder: Path) -> CylinderGeometry | MeshGeometry:
     return result
 
 
-def _medium(table: Table, n: float) -> Medium:
-    """Medium of the keys mua, musp and n, with `n` as the default."""
-    return Medium(table.number("mua"), table.number("musp"), table.number("n", n))
+def _medium(table: Table, outer: Medium) -> Medium:
+    """Medium of the keys mua, musp and n, with the g, and by default the n, of an `outer` one."""
+    return Medium(table.number("mua"), table.number("musp"), table.number("n", outer.n), outer.g)
 
 
 def _spread(table: Table, default: Spread) -> Spread:
@@ -242,8 +243,11 @@ def _spread(table: Table, default: Spread) -> Spread:
         return Spread(*(table.number(f"{key}_sd", getattr(default, key)) for key in COEFFICIENTS))
 
 
-def _band_medium(table: Table, n: float, wavelength_nm: float | None) -> Medium:
-    """Medium of a table of [bands.NAME], by its coefficients or by its composition at the band's wavelength."""
+def _band_medium(table: Table, outer: Medium, wavelength_nm: float | None) -> Medium:
+    """Medium of a table of [bands.NAME], by its coefficients or by its composition at the band's wavelength.
+
+    Its g, and by default its n, are those of the `outer` one, without bands.
+    """
     composed = [key for key in ABSORBERS if key in table.left]
     scattered = [key for key in SCATTERING if key in table.left]
     for given, other in ((composed, "mua"), (scattered, "musp")):
@@ -262,13 +266,13 @@ def _band_medium(table: Table, n: float, wavelength_nm: float | None) -> Medium:
         musp = reduced_scattering(table.number("scattering"), table.number("scattering_power"), at)
     else:
         musp = table.number("musp")
-    return Medium(mua, musp, table.number("n", n))
+    return Medium(mua, musp, table.number("n", outer.n), outer.g)
 
 
-def _region(table: Table, n: float, spread: Spread) -> Region:
+def _region(table: Table, outer: Medium, spread: Spread) -> Region:
     """Region of a table of [[regions]]; its refractive index and spread are those of [optical] unless it names them."""
     where = table.whole("label") if "label" in table.left else _shape(table, ("sphere", "cylinder"))
-    result = Region(where, _medium(table, n), _spread(table, spread))
+    result = Region(where, _medium(table, outer), _spread(table, spread))
     table.done()
     return result
 
@@ -296,7 +300,7 @@ def _bands(table: Table, parts: tuple[Region, ...]) -> dict[str, Band]:
         media, spreads = list[Medium](), list[Spread]()
         for part, of in zip([own, *regions], parts, strict=True):
             with named(part.name):
-                media.append(_band_medium(part, of.medium.n, at))
+                media.append(_band_medium(part, of.medium, at))
             spreads.append(_spread(part, of.spread))
         bands[name] = Band(share, tuple(media), tuple(spreads))
         for part in (own, *regions):

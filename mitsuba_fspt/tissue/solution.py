@@ -119,7 +119,9 @@ class TissueSolution:
         provenance = {
             "source": f"{self.equations.title} by finite elements",
             "boundary": "; ".join(" ".join(f"{h:.6g}" for h in border[0]) for border in self.equations.border),
-            "media": "; ".join(f"mua {m.mua:g}/mm, musp {m.musp:g}/mm, n {m.n:g}" for m in self.media),
+            "media": "; ".join(
+                f"mua {m.mua:g}/mm, musp {m.musp:g}/mm, n {m.n:g}" + (f", g {m.g:g}" if m.g else "") for m in self.media
+            ),
             "source_power": f"{self.source_power!r} W",
             "scale": f"{scale!r}",
         }

@@ -82,6 +82,7 @@ def test_the_documented_example(tmp_path: Path) -> None:
     defaults = {name: value for name, value in re.findall(r"^\| `(.*?)` \|.* ([\d.]+) where left out", page, re.M)}
     assert defaults == {
         "n": f"{phantom.medium.n:g}",
+        "g": f"{phantom.medium.g:g}",
         "power": f"{phantom.sources[0].power:g}",
         **{name: f"{getattr(Absorbers(), name):g}" for name in ("blood", "water", "fat")},
         "[mesh] edge": f"{PhantomFile.edge:g}",
@@ -93,14 +94,14 @@ def test_the_documented_example(tmp_path: Path) -> None:
 
 def test_every_key_of_a_phantom_file(tmp_path: Path) -> None:
     """Every kind of source and region, and all that has a default."""
-    text = SMALL.replace("musp = 1", 'musp = 1\nn = 1.4\nmodel = "diffusion"\na = "haskell"') + (
+    text = SMALL.replace("musp = 1", 'musp = 1\nn = 1.4\ng = 0.9\nmodel = "diffusion"\na = "haskell"') + (
         '[[sources]]\nshape = "sphere"\ncentre = [0, 0.5, 1]\nradius = 0.5\n'
         '[[sources]]\nshape = "cylinder"\ncentre = [0, 0, 0]\nradius = 0\nlength = 2\naxis = [0, 1, 0]\npower = 3\n'
         '[[regions]]\nshape = "sphere"\ncentre = [-2, 0, 0]\nradius = 2\nmua = 0.1\nmusp = 2\n'
         '[[regions]]\nshape = "cylinder"\ncentre = [0, 0, 3]\nradius = 9\nlength = 2\nmua = 0.2\nmusp = 3\nn = 1.5\n'
     )
     phantom = described(tmp_path, text)
-    assert phantom.medium == Medium(0.05, 1, 1.4)
+    assert phantom.medium == Medium(0.05, 1, 1.4, 0.9)
     assert (phantom.model, phantom.a) == ("diffusion", "haskell")
     assert phantom.sources == (
         Source(Sphere((1, 0, -1)), 2.5),
@@ -108,8 +109,8 @@ def test_every_key_of_a_phantom_file(tmp_path: Path) -> None:
         Source(Cylinder((0, 0, 0), 2, 0, (0, 1, 0)), 3),
     )
     assert phantom.regions == (
-        Region(Sphere((-2, 0, 0), 2), Medium(0.1, 2, 1.4)),
-        Region(Cylinder((0, 0, 3), 2, 9), Medium(0.2, 3, 1.5)),
+        Region(Sphere((-2, 0, 0), 2), Medium(0.1, 2, 1.4, 0.9)),
+        Region(Cylinder((0, 0, 3), 2, 9), Medium(0.2, 3, 1.5, 0.9)),
     )
     assert (phantom.edge, phantom.order, phantom.surface_edge, phantom.voxel) == (2, 2, 1, 1)
     mesh = phantom.mesh()
@@ -138,6 +139,7 @@ def test_every_key_of_a_phantom_file(tmp_path: Path) -> None:
             r"\[optical\]: 'a' is of the diffusion equation, got 2.5 beside the model sp3",
         ),
         ("musp = 1", "musp = 1\nmua_sd = 1.5", r"\[optical\]: 'mua_sd' must be in \[0, 1\), got 1.5\. Give a relative"),
+        ("musp = 1", "musp = 1\ng = 1", r"'g' must be in \[0, 0.99\], got 1\. Give for example 0.9"),
         ("musp = 1", "musp = 1\nn_sd = -0.1", r"'n_sd' must be in \[0, 1\), got -0.1"),
         ("musp = 1", "musp = 1\nmodel = 'p3'", r"\[optical\]: 'model' must be one of sp3, diffusion, got 'p3'"),
         ("[mesh]", "[mesh]\norder = 2.0", "'order' must be a whole number"),
@@ -325,9 +327,9 @@ musp = 0.8
 
 def test_bands(tmp_path: Path) -> None:
     """A band has its own media, in the order of the regions, and its share of the sources' power."""
-    phantom = described(tmp_path, SMALL + BANDS)
-    assert phantom.band("red").media == (Medium(0.01, 0.9, 1.4), Medium(0.2, 0.8, 1.37))
-    assert phantom.band(None).media == (Medium(0.05, 1, 1.37), Medium(0.3, 1, 1.37))
+    phantom = described(tmp_path, SMALL.replace("musp = 1\n", "musp = 1\ng = 0.8\n", 1) + BANDS)
+    assert phantom.band("red").media == (Medium(0.01, 0.9, 1.4, 0.8), Medium(0.2, 0.8, 1.37, 0.8))
+    assert phantom.band(None).media == (Medium(0.05, 1, 1.37, 0.8), Medium(0.3, 1, 1.37, 0.8))
     assert phantom.solve(band="red").source_power == pytest.approx(0.25 * 2.5)
 
 

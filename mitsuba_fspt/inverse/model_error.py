@@ -1,0 +1,57 @@
+"""Stated error of the equation itself, SP3 or diffusion, in the J_n of a source (Eq. M.51).
+
+    δJ_n/J_n = t x₀ + s (x₁ (2µ − 1) + x₂ (6µ² − 6µ + 1)),   µ = d/r,   x ~ N(0, 1)
+
+with the distances d of the source and r of a point of the surface: a common factor, and what varies from the nearest
+point of the surface, µ = 1, to far ones, µ = 0. J_n of either equation differs from photons one by one by such
+polynomials but for 0.1 to 1 %. t grows with the absorption along the way; s falls with the depth in mean free paths,
+and grows with the absorption.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+LEAST_DEPTH = 1.0  # mean free paths: a source nearer to the border has the errors of this depth
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """t² = total² + (total_absorbed α D)² and s² = (shape/D)² + (shape_absorbed α)² of a source D mean free paths deep
+    in tissue of α = µa/µs'.
+    """
+
+    total: float
+    total_absorbed: float
+    shape: float
+    shape_absorbed: float
+
+    def deviations(self, depth: float, absorption: float) -> tuple[float, float]:
+        """t and s of a source `depth` mean free paths deep, in tissue of the ratio µa/µs' `absorption`."""
+        deep = max(depth, LEAST_DEPTH)
+        t = np.hypot(self.total, self.total_absorbed * absorption * deep)
+        return float(t), float(np.hypot(self.shape / deep, self.shape_absorbed * absorption))
+
+    def columns(self, cosine: Array, depth: float, absorption: float) -> Array:
+        """(n, 3) relative errors of J_n by one standard deviation of x₀, x₁, x₂ at points of µ = `cosine` (n,)."""
+        t, s = self.deviations(depth, absorption)
+        first, second = shapes(cosine)
+        return np.column_stack([np.full(len(cosine), t), s * first, s * second])
+
+
+def shapes(cosine: Array) -> tuple[Array, Array]:
+    """Legendre's polynomials of the degrees 1 and 2 over (0, 1)."""
+    return 2 * cosine - 1, 6 * cosine**2 - 6 * cosine + 1
+
+
+# Least squares over the phantoms of docs/tissue_models.csv, by `scripts/tissue_models.py --errors`, rounded up; `total`
+# of SP3, 0 there, is the rms deviation of the exit power.
+MODEL_ERRORS: Mapping[str, ModelError] = {
+    "sp3": ModelError(0.003, 0.03, 0.055, 0.26),
+    "diffusion": ModelError(0.0075, 0.26, 0.26, 1.4),
+}
