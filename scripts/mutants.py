@@ -574,6 +574,27 @@ MUTANTS = (
         (SP3,),
     ),
     Mutant(
+        "flow of light along the border",
+        "tissue/finite_elements.py",
+        "plain(lateral[nodes]) - smooth(along @ flux)",
+        "plain(lateral[nodes])",
+        (SP3,),
+    ),
+    Mutant(
+        "anisotropy in the equations of SP3",
+        "tissue/light_models.py",
+        "mua + musp * (1 + g), mua + musp * (1 + g + g**2)",
+        "mua + musp, mua + musp",
+        (SP3,),
+    ),
+    Mutant(
+        "stated error of the equation",
+        "inverse/source_fit.py",
+        "return np.asarray(change @ change.T)",
+        "return 0 * np.asarray(change @ change.T)",
+        ("tests/inverse/test_locate.py",),
+    ),
+    Mutant(
         "4 pi of the free field",
         "tissue/free_field.py",
         "inflation / (4 * np.pi * self.diffusion)",

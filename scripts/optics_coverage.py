@@ -7,10 +7,10 @@ its caps, in four views of 24² pixels from the side. The true µa and µs' of e
 1 + 0.1 N(0, 1), n is 1.37. The images have 300 electrons on the brightest pixel of each band. `locate` has the nominal
 coefficients with `mua_sd` and `musp_sd` of 0.1, or without. J_n of the images shares nothing with the solver:
 
-*series* : of the diffusion equation, exact; `locate` solves the same equation, so that noise and coefficients alone are
-    unknown
+*series* : of the diffusion equation, exact; `locate` solves the same equation, with `model_error=0`, so that noise and
+    coefficients alone are unknown
 *photons* : one by one (`photon_walk`) in bins of 0.5 mm, between which J_n is linear; `locate` solves SP3, whose own
-    error counts, too. With bins of 1 mm the errors are two standard deviations (rms)
+    error counts, too, and is in the intervals. With bins of 1 mm the errors are two standard deviations (rms)
 
 Columns: images, placements, and those that `locate` refused; shares of the 90 % intervals that contain x, y, z, and the
 power; rms error of the position over all directions [mm] and of the power [%]; rms of the errors over their stated sd,
@@ -38,6 +38,7 @@ from cylinder_diffusion import Phantom, exitance
 from numpy.typing import NDArray
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.inverse.source_fit import LocationSettings
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Sphere
@@ -166,8 +167,11 @@ def replicate(
         images[name] = [fspt.Image(plane / per_watt, metadata=metadata) for plane in counted]
     described = phantom(names, Spread(SD, SD) if fitted else Spread(), model)
     start = time.process_time()
+    settings = LocationSettings(model_error=0.0 if model == "diffusion" else 1.0)
     try:
-        found = fspt.locate(described, dict.fromkeys(names, setup.matrix), images, scene=setup.surface)
+        found = fspt.locate(
+            described, dict.fromkeys(names, setup.matrix), images, scene=setup.surface, settings=settings
+        )
     except FsptError as error:
         print(f"seed {seed}: {error}", flush=True)
         return None

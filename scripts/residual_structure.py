@@ -45,6 +45,7 @@ from mitsuba_fspt.tissue.phantom_file import PhantomFile
 ROOT = Path(__file__).resolve().parent.parent
 Array = NDArray[np.float64]
 Row = dict[str, object]
+EXACT = source_fit.LocationSettings(model_error=0.0)
 SOURCE = (2.5, 1.0, -1.0, 2.0)  # x, y, z [mm], power [W]
 INCLUSION = """[[regions]]
 shape = "sphere"
@@ -119,7 +120,9 @@ def nylon_case(cause: str) -> Callable[[float, int], Any]:
     phantom, power = replace(location_coverage.described(2.0), bands={}), location_coverage.power(lit, None)
     if cause == "absorption":
         phantom = replace(phantom, medium=replace(phantom.medium, mua=0.9 * phantom.medium.mua))
-    return lambda electrons, seed: fspt.locate(phantom, matrix, images(power, electrons, seed), scene=surface)
+    return lambda electrons, seed: fspt.locate(
+        phantom, matrix, images(power, electrons, seed), scene=surface, settings=EXACT
+    )
 
 
 def locate_case(truth: str, cause: str) -> Callable[[float, int], Any]:
@@ -136,7 +139,9 @@ def locate_case(truth: str, cause: str) -> Callable[[float, int], Any]:
     power = matrix.forward(exitance)
     if cause == "factor":
         power = power * np.array([1.0, 1.0, 1.0, 1.05])[:, None, None]
-    return lambda electrons, seed: fspt.locate(phantom, matrix, images(power, electrons, seed), scene=surface)
+    return lambda electrons, seed: fspt.locate(
+        phantom, matrix, images(power, electrons, seed), scene=surface, settings=EXACT
+    )
 
 
 def row(verb: str, truth: str, cause: str, electrons: float, seeds: int) -> Row:

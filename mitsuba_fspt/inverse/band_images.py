@@ -18,6 +18,7 @@ from ..runtime.errors import InversionError
 from ..tissue.border_surface import nearest_points
 from ..tissue.diffusion import Tissue
 from .measurement import Measurement
+from .model_error import MODEL_ERRORS
 from .surface import Surface
 from .transport_matrix import TransportMatrix
 
@@ -115,6 +116,16 @@ class BandImages:
         """Corners of the triangles of the border (F, 3, 3) [mm]."""
         mesh = self.tissue.mesh
         return mesh.vertices[boundary(mesh.vertices, mesh.cells)[0]]
+
+    def model_error(self, position: Array, radius: float = 0.0) -> Array:
+        """(N, 3) relative errors of a source's image by the equation itself, one standard deviation each (Eq. M.51)."""
+        mesh = self.tissue.mesh
+        distance = np.linalg.norm(self.points - position, axis=1)
+        depth = self.depth(position)
+        medium = self.tissue.media[int(mesh.region[mesh.locate(position[None])[0]][0])]
+        free = (depth - radius) * (medium.mua + medium.musp)
+        cosine = np.minimum(depth / distance, 1.0)
+        return MODEL_ERRORS[self.tissue.model].columns(cosine, free, medium.mua / medium.musp)
 
     def exitance(self, position: Array, radius: float = 0.0) -> Array:
         """(V,) J_n [1/mm²] at the surface's vertices in this band, per watt of a source over all bands.

@@ -76,15 +76,19 @@ class Profile:
         return self._known[self._least()][1]
 
     def extent(self, z: float) -> Extent:
-        """The radius, and intervals of all radii whose -2 ln L rises by at most z², with the values they give."""
-        low, high = self._end(z, -1), self._end(z, 1)
+        """The radius, and intervals of all radii whose -2 ln L rises by at most z², with the values they give.
+
+        z grows by the share of the errors of the equation itself in the variance of the squared radius.
+        """
+        wide = z * (1 + self._by_model()) ** 0.5
+        low, high = self._end(wide, -1), self._end(wide, 1)
         ends = [low or 0.0, self.limit**2 if high is None else high]
-        inside = [q for q, _ in self._known if self._rise_at(q) <= z**2]
+        inside = [q for q, _ in self._known if self._rise_at(q) <= wide**2]
         own = slice(4 * self._number, 4 * self._number + 4)
         below, above = [], []
         for square in sorted({*inside, *(q for q in ends if q <= self._known[-1][0])}):
             values, sd = self._values(square)
-            half = max(z**2 - self._rise_at(square), 0.0) ** 0.5 * sd[own]
+            half = z * max(1 - self._rise_at(square) / wide**2, 0.0) ** 0.5 * sd[own]
             below.append(values[own] - half)
             above.append(values[own] + half)
         radius = self._known[self._least()][0] ** 0.5
@@ -155,9 +159,24 @@ class Profile:
         at = min(max(int(np.searchsorted(squares, square)), 1), len(squares) - 1) if len(squares) > 1 else 0
         near = [self._known[k][1] for k in ((at - 1, at) if at else (0, 0))]
         share = (square - squares[at - 1]) / (squares[at] - squares[at - 1]) if at else 0.0
-        each = [(one.values, np.sqrt(np.diag(self._fit.covariance(one)))) for one in near]
-        values, sd = ((1 - share) * a + share * b for a, b in zip(*each, strict=True))
-        return values, sd
+        noise = [self._fit.covariance(one) for one in near]
+        sd = [np.sqrt(np.diag(a + self._fit.by_model(one, a))) for one, a in zip(near, noise, strict=True)]
+        each = [(one.values, b) for one, b in zip(near, sd, strict=True)]
+        values, deviations = ((1 - share) * a + share * b for a, b in zip(*each, strict=True))
+        return values, deviations
+
+    def _by_model(self) -> float:
+        """Variance of the squared radius by the errors of the equation itself, over that by the noise of the images."""
+        at = self._least()
+        other = at - 1 if at else min(at + 1, len(self._known) - 1)
+        (q, one), (p, two) = self._known[at], self._known[other]
+        errors = one.noise.over(self._fit.model_errors(one))
+        if p == q or not errors.size:
+            return 0.0
+        along = one.noise.over((two.signal - one.signal) / (p - q))
+        beside = np.linalg.qr(one.slopes)[0]
+        along -= beside @ (beside.T @ along)
+        return float(((along @ errors) ** 2).sum() / (along @ along))
 
 
 def with_radii(

@@ -65,9 +65,9 @@ def locate(
         S = fspt.locate("phantom.toml", T, images)
         S.sources[0].position, S.sources[0].position_interval  # mm, in the frame of phantom.toml
 
-    The intervals contain the noise of the images, errors of the matrix, `gain_error`, and errors of coefficients that
-    the phantom file states (`mua_sd`, …), which are fitted along; not those of shape, inclusions left out, pose, lens,
-    or of SP3 or diffusion itself, of which `warnings` tell what the residuals show (M.34).
+    The intervals contain the noise of the images, errors of the matrix and of SP3 or diffusion itself (M.51),
+    `gain_error`, and errors of coefficients that the phantom file states (`mua_sd`, …), which are fitted along; not
+    those of shape, inclusions left out, pose, lens, of which `warnings` tell what the residuals show (M.34).
 
     Parameters
     ----------
@@ -224,8 +224,8 @@ def _located(fit: SourceFit, spreads: Sequence[Sequence[Spread]], options: _Opti
             found, profiles = with_radii(fit, own.refined(found), report)
     order = np.argsort(-found.powers, kind="stable")
     found, extents = found.sorted(), [profiles[k].extent(z) for k in order] if profiles else None
-    covariance = fit.covariance(found)
-    linear = fit.is_linear(found, covariance, z)
+    noise = fit.covariance(found)
+    covariance, linear = noise + fit.by_model(found, noise), fit.is_linear(found, noise, z)
     p_values = fit.p_values(found, len(grid.inner), numbers)
     _tell(linear, p_values, count, options.settings)
     power = fit.power / fit.factors(found)[fit.view]

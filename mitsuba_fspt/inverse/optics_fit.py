@@ -101,7 +101,7 @@ class OpticsFit:
     def coefficients(self, found: PointSources) -> dict[str, Coefficient]:
         """The coefficients by their names, with standard deviations that contain those of the sources."""
         count = len(self._uncertain)
-        sd = np.sqrt(np.diag(self._fit.joint_covariance(found))[-count:])
+        sd = self._fit.joint_sd(found)[-count:]
         result = {}
         for one, x, s in zip(self._uncertain, self._fit.common(found)[-count:], sd, strict=True):
             nominal = self._of(one)

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import block_diag, csr_array, hstack
 from scipy.stats import chi2
 
 from ..optics.media import Source
@@ -42,6 +42,7 @@ class LocationSettings:
     flat, patience : fall of Σ (residual/σ)² below which a step counts as one along a valley, and steps in a row after
         which the fit ends there: the images do not determine the place along it, which the intervals and p-values say;
         steps that only the border of the tissue shortens lead to no minimum inside
+    model_error : factor of the stated error of SP3 or diffusion (Eq. M.51); 0: images made with the same equation
     chance : p-value of a source above which a warning says that noise alone may look like it
     stuck : factor of damping at which no step is left: the minimum is at the border, or beyond
     apart : least singular value of the slopes with columns of length 1, over the largest; below it sources count as not
@@ -55,6 +56,7 @@ class LocationSettings:
     least: float = 1e-9
     flat: float = 0.5
     patience: int = 3
+    model_error: float = 1.0
     chance: float = 1e-3
     stuck: float = 1e8
     apart: float = 1e-3
@@ -176,6 +178,13 @@ class SourceFit:
         prior = np.repeat([0.0, 1.0], [found.changes.shape[1], found.noise.all_columns.shape[1]])
         return np.asarray(np.linalg.inv(slopes.T @ slopes + np.diag(prior)))
 
+    def joint_sd(self, found: PointSources) -> Array:
+        """Standard deviations in the order of `joint_covariance`, with the errors of the equation itself (Eq. M.51)."""
+        covariance = self.joint_covariance(found)
+        slopes = np.column_stack([found.changes / found.sigma[:, None], found.noise.all_columns])
+        change = covariance @ (slopes.T @ (self.model_errors(found) / found.sigma[:, None]))
+        return np.sqrt(np.diag(covariance) + (change**2).sum(axis=1))
+
     def fitted(self, found: PointSources) -> Array:
         """(N,) fitted power [W], with the factors of the views and the coefficients as fitted."""
         fitted = found.signal * self.factors(found)[self.view] - self.offset
@@ -193,12 +202,13 @@ class SourceFit:
         """Test of the residuals for structure: over views, around sources, by coefficients of the tissue."""
         views, known, tissue = list[Seen](), [], list[tuple[str, str, Array]]()
         light = found.columns * found.powers / found.sigma[:, None]
+        by_model = self.model_errors(found) / found.sigma[:, None]
         for band, own, exitance in zip(self.bands, self.parts, found.exitance, strict=True):
             fitted = band.measurement.as_images(band.rows, found.signal[own])[0]
             names = [label if band.name is None else f"{band.name}: {label}" for label in view_labels(band.matrix)]
             seen = views_of(names, fitted, band.rows, found.sigma[own])
             numerical = band.numerical(exitance @ found.powers) / found.sigma[own]
-            known.append(common_errors(numerical, seen))
+            known.append(hstack([common_errors(numerical, seen), csr_array(by_model[own])]))
             views += seen
             where = "the tissue" if band.name is None else f"band {band.name}"
             for kind, change in band.slopes(found.sources).items():
@@ -284,7 +294,7 @@ class SourceFit:
         )
 
     def covariance(self, found: PointSources) -> Array:
-        """(4K, 4K) of the `values`, for the radii: inverse of JᵀJ, with what pixels have in common (Eq. M.26, M.49).
+        """(4K, 4K) of the `values` by the images, for the radii: inverse of JᵀJ (Eq. M.26), with common factors (M.49).
 
         Raises InversionError where the images do not determine the sources separately.
         """
@@ -297,6 +307,14 @@ class SourceFit:
                 f"{singular[0] / max(singular[-1], 1e-300):.3g}). Give fewer."
             )
         return np.asarray(np.linalg.inv(slopes.T @ slopes))
+
+    def by_model(self, found: PointSources, covariance: Array) -> Array:
+        """(4K, 4K) covariance of the `values` by the errors of the equation itself (Eq. M.51).
+
+        The fit does not weigh pixels by them: they are not known well enough to take the source from what they leave.
+        """
+        change = covariance @ (found.slopes.T @ found.noise.over(self.model_errors(found)))
+        return np.asarray(change @ change.T)
 
     def p_values(self, found: PointSources, places: int, numbers: int = 4) -> Array:
         """(K,) probability, at most, that noise alone makes a source fit as well as each of these.
@@ -381,6 +399,26 @@ class SourceFit:
         if not own.any():
             return own[:, :0]
         return np.column_stack([(1 - self._correlation) ** 0.5 * own, self._correlation**0.5 * own.sum(axis=1)])
+
+    def model_errors(self, found: PointSources) -> Array:
+        """(N, E) change of the pixels [W] by one standard deviation of the errors of the equation itself (Eq. M.51).
+
+        Half of their variance is common to all bands, half of each band.
+        """
+        if not self.settings.model_error:
+            return np.empty((len(self.power), 0))
+        columns, count = list[Array](), len(self.bands)
+        for k, power in enumerate(found.powers):
+            common = np.zeros((len(self.power), 3))
+            for band, part in zip(self.bands, self.parts, strict=True):
+                relative = band.model_error(found.positions[k], float(found.radii[k]))
+                common[part] = self.settings.model_error * power * found.columns[part, k, None] * relative
+                if count > 1:
+                    own = np.zeros_like(common)
+                    own[part] = 0.5**0.5 * common[part]
+                    columns.append(own)
+            columns.append(common if count == 1 else 0.5**0.5 * common)
+        return np.column_stack(columns)
 
     def _gradient(self, position: Array, radius: float, column: Array) -> Array:
         """(N, 3) change of a source's image, `column` (N,), per mm along x, y and z; raises FluxError at the border."""

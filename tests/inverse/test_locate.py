@@ -7,6 +7,7 @@ import logging
 import re
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,7 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.band_images import BandImages
 from mitsuba_fspt.inverse.measurement import Measurement
 from mitsuba_fspt.inverse.optics_fit import unknowns
+from mitsuba_fspt.inverse.source_fit import LocationSettings
 from mitsuba_fspt.inverse.source_grid import SourceGrid
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.optics.media import Medium, Source
@@ -30,6 +32,7 @@ from mitsuba_fspt.tissue.phantom_file import PhantomFile, Spread
 pytest.importorskip("skfem")
 SOURCE = (2.5, 1.0, -1.0, 2.0)  # x, y, z [mm], power [W]
 OTHER = (-2.0, -1.0, 1.5, 1.0)
+locate = partial(fspt.locate, settings=LocationSettings(model_error=0.0))  # the equation is exact in these images
 
 
 class Case:
@@ -49,7 +52,7 @@ class Case:
         return self.matrix.forward(exact(self.surface.vertices, sources, band))
 
     def locate(self, images, **options):
-        return fspt.locate(self.described, self.matrix, images, scene=self.surface, **options)
+        return locate(self.described, self.matrix, images, scene=self.surface, **options)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +79,7 @@ def test_a_source_from_images_without_noise(case):
     Seen to fail (power 2 %) with a boundary factor 2 % larger.
     """
     power = case.power(SOURCE)
-    found = fspt.locate(case.toml, case.matrix, power, error=np.full(power.shape, 1e-3 * power.max()))
+    found = locate(case.toml, case.matrix, power, error=np.full(power.shape, 1e-3 * power.max()))
     (source,) = found.sources
     np.testing.assert_allclose(source.position, SOURCE[:3], rtol=0, atol=2e-3)
     assert source.power == pytest.approx(SOURCE[3], rel=1e-3)
@@ -168,8 +171,8 @@ def test_bands(case):
     names = ("red", "green")
     images = {name: case.images(SOURCE, band=name, seed=k) for k, name in enumerate(names)}
     matrices = dict.fromkeys(names, case.matrix)
-    both = fspt.locate(case.toml, matrices, images, scene=case.surface)
-    one = fspt.locate(case.toml, {"red": case.matrix}, {"red": images["red"]}, scene=case.surface)
+    both = locate(case.toml, matrices, images, scene=case.surface)
+    one = locate(case.toml, {"red": case.matrix}, {"red": images["red"]}, scene=case.surface)
     for found in (both, one):
         assert np.abs(ratios(found, SOURCE)).max() < 3
     assert (both.sources[0].position_sd < one.sources[0].position_sd).all()
@@ -184,7 +187,7 @@ def test_a_band_that_is_not_given_is_named(case, caplog):
     """The phantom file has bands: images of one without its name would give the power in that band alone."""
     whole = replace(case.described, bands={})
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
-        fspt.locate(whole, case.matrix, case.images(SOURCE), scene=case.surface)
+        locate(whole, case.matrix, case.images(SOURCE), scene=case.surface)
         assert not caplog.text
         case.locate(case.images(SOURCE))
     assert "no band is given, of the phantom file's red, green" in caplog.text
@@ -193,7 +196,7 @@ def test_a_band_that_is_not_given_is_named(case, caplog):
 def test_a_matrix_of_faces(case, tmp_path):
     """J_n of a face is the mean of its corners: the same source as from vertices."""
     matrix = cylinder_views(tmp_path, on="face")
-    found = fspt.locate(case.described, matrix, case.images(SOURCE))
+    found = locate(case.described, matrix, case.images(SOURCE))
     whole = case.locate(case.images(SOURCE))
     np.testing.assert_allclose(found.sources[0].position, whole.sources[0].position, atol=0.02)
     assert found.sources[0].power == pytest.approx(whole.sources[0].power, rel=5e-3)
@@ -217,7 +220,7 @@ def test_the_pose_in_the_scene_does_not_matter(case, tmp_path, pose):
     surface = Surface.of(matrix)
     np.testing.assert_allclose(surface.vertices, case.surface.vertices, atol=1e-5)
     images = noisy(matrix, exact(case.surface.vertices, [SOURCE]), 1000, 0)
-    assert np.abs(ratios(fspt.locate(case.described, matrix, images), SOURCE)).max() < 3
+    assert np.abs(ratios(locate(case.described, matrix, images), SOURCE)).max() < 3
 
 
 def test_the_grid_has_the_images_of_sources_at_its_vertices(case):
@@ -318,7 +321,7 @@ def test_wrong_coefficients_are_told(case):
     lines = []
     for name, factor in (("musp", 1.1), ("mua", 1.3)):
         wrong = replace(case.described, medium=replace(medium, **{name: getattr(medium, name) / factor}))
-        found = fspt.locate(wrong, case.matrix, images, scene=case.surface)
+        found = locate(wrong, case.matrix, images, scene=case.surface)
         lines.append(next(one for one in found.warnings if "structure" in one))
     size = re.search(r"other coefficients of the tissue, as scattering ([\d.]+) ± ([\d.]+) times as large", lines[0])
     assert float(size[1]) == pytest.approx(1.1, abs=4 * float(size[2]))
@@ -399,9 +402,9 @@ def test_bad_images(case):
         case.locate(images, mask=mask)
     for phantom in (None, 3):
         with pytest.raises(InversionError, match="name of a TOML file or a PhantomFile"):
-            fspt.locate(phantom, case.matrix, images)
+            locate(phantom, case.matrix, images)
     with pytest.raises(InversionError, match="locate: 'scene' must be a scene"):
-        fspt.locate(case.described, case.matrix, images, scene=3)
+        locate(case.described, case.matrix, images, scene=3)
 
 
 def test_bad_bands(case):
@@ -414,30 +417,30 @@ def test_bad_bands(case):
         ((images, images), "must be a transport matrix, got list"),
     ):
         with pytest.raises(InversionError, match=words):
-            fspt.locate(case.described, *given)
+            locate(case.described, *given)
     with pytest.raises(FluxError, match=r"band 'blue' is not in the phantom file\. The bands are red, green"):
-        fspt.locate(case.described, {"blue": case.matrix}, {"blue": images}, scene=case.surface)
+        locate(case.described, {"blue": case.matrix}, {"blue": images}, scene=case.surface)
     with pytest.raises(TransportError, match=r"locate, band 'red'|3 images"):
-        fspt.locate(case.described, matrices, {"red": images[:3]}, scene=case.surface)
+        locate(case.described, matrices, {"red": images[:3]}, scene=case.surface)
 
 
 def test_a_surface_that_is_not_the_phantoms(case, tmp_path_factory):
     matrix = sphere_views(tmp_path_factory.mktemp("sphere"))
     with pytest.raises(InversionError, match="mm away from the phantom's border"):
-        fspt.locate(case.described, matrix, noisy(matrix, np.ones(matrix.shape[1]), 1000, 0))
+        locate(case.described, matrix, noisy(matrix, np.ones(matrix.shape[1]), 1000, 0))
 
 
 def test_a_surface_near_the_border_is_reported(case, caplog):
     """A mesh displaced by 0.1 mm is used, and one line says that the intervals do not contain it."""
     moved = replace(case.surface, vertices=case.surface.vertices + np.array([0.1, 0, 0]))
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
-        fspt.locate(case.described, case.matrix, case.images(SOURCE), scene=moved)
+        locate(case.described, case.matrix, case.images(SOURCE), scene=moved)
     assert "up to 0.101 mm away from the phantom's border" in caplog.text
 
 
 def test_a_mesh_without_vertices_inside(case):
     with pytest.raises(InversionError, match="all vertices of the tetrahedra are on the border"):
-        fspt.locate(replace(case.described, edge=6.0), case.matrix, case.images(SOURCE), scene=case.surface)
+        locate(replace(case.described, edge=6.0), case.matrix, case.images(SOURCE), scene=case.surface)
 
 
 @pytest.mark.parametrize("seed", [0, 3, 5, 8])
@@ -475,19 +478,24 @@ def test_a_source_at_the_border(case):
 
 
 def test_sp3(case):
-    """Images of SP3 on a finer mesh: SP3 finds the source in its intervals, diffusion 6 sd beside it, with χ² 2.7.
+    """Images of SP3 on a finer mesh: SP3 finds the source in its intervals, diffusion 6 sd beside it, with χ² 2.0.
 
-    Seen to fail with the model left out of the tissue.
+    With its stated error the source is in the intervals of diffusion, too. Seen to fail with the model left out of the
+    tissue.
     """
     sp3 = replace(case.described, model="sp3", edge=0.9)
     own = (replace(sp3.sources[0], shape=Sphere(SOURCE[:3]), power=SOURCE[3]),)
     solution = replace(sp3, sources=own).solve()
     images = noisy(case.matrix, solution.exitance_at(case.surface.vertices), 3000, 0)
-    found = fspt.locate(replace(sp3, edge=1.5), case.matrix, images, scene=case.surface)
+    found = locate(replace(sp3, edge=1.5), case.matrix, images, scene=case.surface)
     assert np.abs(ratios(found, SOURCE)).max() < 3.5
     other = case.locate(images)
     assert np.abs(ratios(other, SOURCE)).max() > 5
-    assert other.chi2 > 2 > 1.1 > found.chi2
+    assert other.chi2 > 1.7 > 1.1 > found.chi2
+    stated = fspt.locate(case.described, case.matrix, images, scene=case.surface)
+    assert np.abs(ratios(stated, SOURCE)).max() < 2.5
+    np.testing.assert_allclose(stated.sources[0].position, other.sources[0].position, rtol=1e-3)
+    assert stated.sources[0].power_sd > 0.0075 * SOURCE[3] > other.sources[0].power_sd
 
 
 # --- uncertain coefficients ---
@@ -501,7 +509,7 @@ def test_uncertain_coefficients(case):
     wrong = replace(case.described, medium=Medium(0.055, 0.92))
     images = case.images(SOURCE, seed=1)
     exact, fitted = (
-        fspt.locate(replace(wrong, spread=spread), case.matrix, images, scene=case.surface)
+        locate(replace(wrong, spread=spread), case.matrix, images, scene=case.surface)
         for spread in (Spread(), Spread(0.1, 0.1))
     )
     assert exact.optics == {}
@@ -525,7 +533,7 @@ def test_stated_uncertainty_of_a_coefficient_is_a_prior(case):
     wrong, images = replace(case.described, medium=Medium(0.06, 1.0)), case.images(SOURCE, seed=1)
     wide, narrow = 0.06 * 0.2, 0.06 * 0.04
     loose, tight = (
-        fspt.locate(replace(wrong, spread=Spread(mua=s)), case.matrix, images, scene=case.surface).optics["mua"]
+        locate(replace(wrong, spread=Spread(mua=s)), case.matrix, images, scene=case.surface).optics["mua"]
         for s in (0.2, 0.04)
     )
     information = loose.sd**-2 - wide**-2
@@ -552,12 +560,12 @@ def test_band_correlation(case):
     described = replace(case.described, bands=band)
     images = dict.fromkeys(band, case.images(SOURCE, electrons=3000, gain_error=0.1))
     sd = [
-        fspt.locate(described, dict.fromkeys(band, case.matrix), images, scene=case.surface, band_correlation=rho)
+        locate(described, dict.fromkeys(band, case.matrix), images, scene=case.surface, band_correlation=rho)
         .sources[0]
         .power_sd
         for rho in (0.0, 1.0)
     ]
-    noise = fspt.locate(described, dict.fromkeys(band, case.matrix), images, scene=case.surface, gain_error=0.0)
+    noise = locate(described, dict.fromkeys(band, case.matrix), images, scene=case.surface, gain_error=0.0)
     by_gain = np.sqrt(np.square(sd) - noise.sources[0].power_sd ** 2) / noise.sources[0].power
     np.testing.assert_allclose(by_gain, [0.1 / np.sqrt(2), 0.1], rtol=0.02)
 
