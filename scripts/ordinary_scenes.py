@@ -36,7 +36,9 @@ VECTOR = (1, 949661, 683229, 634757)  # rank-1 lattice whose first 2^m points ar
 HEAD = (
     *("body", "view", "f_number", "seconds", "cpu_seconds", "lines", "stated", "largest_stated"),
     *("compared", "beyond_rtol", "beyond_2_rtol", "beyond_error", "largest_error", "reference_error"),
+    *("path_cpu_seconds", "path_rms", "path"),
 )
+SPP, GOAL = 256, 1e-4  # samples a pixel of `path`; its RMS error
 
 
 def bodies() -> Iterator[tuple[str, Body]]:
@@ -103,6 +105,19 @@ def row_of(scene: object, image: fspt.Image, seconds: float, cpu: float, count: 
     return [f"{seconds:.2f}", f"{cpu:.2f}", f"{lines:.2f}", far, f"{stated.max() / peak:.2e}", *beyond]
 
 
+def path_of(scene: object, image: fspt.Image, cpu: float) -> list[str]:
+    """CPU seconds of `path`, its RMS error over the brightest pixel, and the ratio of times to `GOAL`."""
+    import mitsuba as mi
+
+    path = mi.load_dict({"type": "path", "max_depth": 1})
+    for seed in (1, 2):  # the first one compiles
+        start = time.process_time()
+        power = np.array(mi.render(scene, integrator=path, spp=SPP, seed=seed)).reshape(image.power.shape)
+        spent = time.process_time() - start
+    rms = float(np.sqrt(np.mean((power - image.power) ** 2)) / image.power.max())
+    return [f"{spent:.2f}", f"{rms:.2e}", f"{spent * (rms / GOAL) ** 2 / cpu:.0f}"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--body", default="")
@@ -130,7 +145,8 @@ def main() -> None:
                 start, cpu = time.perf_counter(), time.process_time()
                 image = fspt.render(scene, **settings)
                 spent = time.perf_counter() - start, time.process_time() - cpu
-                rows.append([name, view, f_number, *row_of(scene, image, *spent, options.pixels)])
+                row = row_of(scene, image, *spent, options.pixels)
+                rows.append([name, view, f_number, *row, *path_of(scene, image, spent[1])])
                 print(*rows[-1], sep="\t", flush=True)
     if options.output:
         with atomic_path(options.output) as part, part.open("w", newline="") as file:
