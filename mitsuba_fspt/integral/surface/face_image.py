@@ -41,7 +41,7 @@ from .glow import touching
 # Error over the largest last change within `AROUND` pixels, where no surface hides another and where one may. Images
 # with few nodes may agree by chance: the least error of the third level over the tolerance, for which M is chosen
 # there, and its factor from level to level.
-SAFETY, SHADED, AROUND, EXPECTED, FALL = 0.35, 0.5, 2, 0.5, 0.25
+SAFETY, SHADED, AROUND, EXPECTED, FALL = 0.35, 1.0, 2, 0.5, 0.25
 FINER = 1.25  # M over that at which an edge as bright as its face is wrong by the tolerance: pixels have several
 DISPLACED = 2e-4  # pixels by which float32 displaces the images of faces against lines of sight
 MOST_LEVELS, MOST_CELLS = 6, 512  # levels; largest M at the second level

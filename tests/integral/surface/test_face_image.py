@@ -79,10 +79,10 @@ def test_few_pixels_take_a_fourth_level(tmp_path):
 def test_shadows_converge(tmp_path):
     """A torus that hides a part of itself, of 2,304 faces smaller than their blur discs.
 
-    Expected: after three levels no stated error above 5e-3 (3.4e-3). Seen to fail where each face is lit as a whole or
-    not at all: 9.5e-3.
+    Expected: after three levels no stated error above 1e-2 (6.8e-3), the largest change of the third. Seen to fail
+    where each face is lit as a whole or not at all: 1.9e-2.
     """
     torus = trimesh.creation.torus(major_radius=12, minor_radius=4, major_sections=48, minor_sections=24)
     image = by_faces(seen_from_the_side(tmp_path, torus), 1e-3, 1 << 10)
     assert len(image.levels) == 3
-    assert image.beyond(1e-3)[1] < 5e-3
+    assert image.beyond(1e-3)[1] < 1e-2
