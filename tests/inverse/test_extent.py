@@ -166,8 +166,8 @@ def test_an_uncertain_ratio_of_the_bands_widens_the_radius(case, sphere):
 def test_factors_of_bands_are_fitted(case, caplog):
     """One band is 10 % too bright, with a stated factor of 10 %: the position stays, chi2 is 1, and nothing is told.
 
-    A factor of 50 % is no reason to doubt the source. Seen to fail (0.04 mm = 8 sd and chi2 3) with the factors only
-    propagated, and (p = 0.4) with the factors as noise in the p-value.
+    A factor of 50 % is no reason to doubt the source. Seen to fail (0.04 mm = 9 sd) without the factors in the noise of
+    the fit, and (p = 1) with the factors as noise in the p-value.
     """
     images = case.images(0.0, 3000, gain_error=0.1)
     images["green"] = [
