@@ -17,6 +17,7 @@ import logging
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.phantom.formats.ply import write_ply
 from mitsuba_fspt.runtime.errors import InversionError
+from mitsuba_fspt.tissue.phantom_file import PhantomFile, Spread
 
 Array = NDArray[np.float64]
 Row = dict[str, object]
@@ -106,9 +108,19 @@ def locate_rows() -> Iterator[Row]:
     yield timed("locate, 1 source", 15, lambda: fspt.locate(coarse, matrix, given, scene=surface))
     yield timed("locate, noise only", 30, lambda: fspt.locate(coarse, matrix, none, scene=surface))
     yield timed("locate, 3 bands", 60, lambda: fspt.locate(coarse, matrices, several, scene=surface))
+    known = Spread(0.1, 0.1)
+    bands = {name: replace(band, spreads=(known,)) for name, band in coarse.bands.items()}
+    finest = replace(coarse, edge=0.77, bands=bands)
+    name = f"locate, 3 bands, coefficients known to 10 %, {nodes_of(finest)} nodes"
+    yield timed(name, 180, lambda: fspt.locate(finest, matrices, several, scene=surface))
     for name, mesh in (("edge 3 mm", coarse), ("edge 1.5 mm", fine)):
         name = f"locate, 2 sources on 1, {name}"
         yield timed(name, 60, lambda mesh=mesh: fspt.locate(mesh, matrix, given, sources=2, scene=surface))
+
+
+def nodes_of(described: PhantomFile) -> int:
+    """Number of the nodes of its tetrahedra."""
+    return len(described.mesh().vertices)
 
 
 def timed(name: str, asked: float, work: Callable[[], Any]) -> Row:

@@ -1,11 +1,11 @@
 """Kernel launches and time of a picture, on whatever Dr.Jit computes: is it bound by launches, by the host, by rays?
 
-    python scripts/launches.py [--rounds 7] [--sides 256,2048] [--rtols 1e-2,1e-3] [-o launches.csv]
+    python scripts/launches.py [--rounds 7] [--sides 256,2048] [--rtols 1e-2,1e-3] [--machine NAME] [-o FILE.csv]
 
 The nylon cylinder at f/2.8 and the two spheres. Each row has the number of launches and the lines of sight of one warm
-rendering, the time that kernels ran, the time of the whole rendering (median), and the time of tracing alone as many
-rays as four a pixel, from which follows the share of the bare rate of rays. The variant is that which
-`fspt doctor` would choose; CUDA_VISIBLE_DEVICES="" hides the CUDA devices.
+rendering, the time that kernels ran, the time of the whole rendering (median), and the time to trace four rays a pixel
+and nothing else; from it follows the share of the bare rate of rays. The variant is that which `fspt doctor` would
+choose; CUDA_VISIBLE_DEVICES="" hides the CUDA devices.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--sides", default="256,2048")
     parser.add_argument("--rtols", default="1e-2,1e-3")
+    parser.add_argument("--machine", default="", help="first column of the table")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
     print(backend.ensure_variant())
@@ -37,7 +38,7 @@ def main() -> None:
     for name in FIELD:
         for side in map(int, options.sides.split(",")):
             for rtol in map(float, options.rtols.split(",")):
-                rows.append(measured(name, side, rtol, options.rounds))
+                rows.append({"machine": options.machine} | measured(name, side, rtol, options.rounds))
                 print(*(f"{key} {value}" for key, value in rows[-1].items()), sep="  ", flush=True)
     if options.output:
         import csv_table

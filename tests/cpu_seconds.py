@@ -6,6 +6,7 @@ of this process with all its threads and of the child processes that have ended 
 
 from __future__ import annotations
 
+import csv
 import os
 from collections import Counter
 from pathlib import Path
@@ -61,8 +62,9 @@ class Spent:
             for name, seconds in spent.most_common(DEAREST):
                 terminalreporter.write_line(f"{seconds:7.1f}  {name}")
         if table := config.getoption("cpu_table"):
-            lines = [f"{seconds:.2f},{name!r}" for name, seconds in self.tests.most_common()]
-            Path(table).write_text("\n".join(["cpu_seconds,test", *lines, ""]), encoding="utf-8")
+            with Path(table).open("w", newline="", encoding="utf-8") as file:
+                rows = [(f"{seconds:.2f}", name) for name, seconds in self.tests.most_common()]
+                csv.writer(file).writerows([("cpu_seconds", "test"), *rows])
         limit = config.getoption("cpu_limit")
         verdict = "over" if self.total > (BUDGET if limit is None else limit) else "within"
         text = f"{self.total:7.1f}  in all, {verdict} the budget of {BUDGET if limit is None else limit:.0f}"

@@ -28,7 +28,9 @@ class ExtentSettings:
     ladder : radii that are tried first, over the distance of the centre from the border, up to one that is too large
     beyond : rise of -2 ln L above its least value at which the ladder ends
     even : of -2 ln L, the fall that counts: below it the smaller radius stays, and the search for the least value ends
-    steps : most radii that are tried in a search;  rounds : of the radii, where there are several sources
+    steps : most radii that are tried in a search
+    rounds : of the radii, where there are several sources, and of the ends of an interval, where a likelier radius is
+        found on the way
     close : of the root of the rise of -2 ln L at an end of the interval, the relative distance to interpolate over
     """
 
@@ -60,29 +62,27 @@ class Profile:
     -2 ln L is smooth in the squared radius, about a parabola, and has a slope at 0.
     """
 
-    def __init__(self, fit: SourceFit, found: PointSources, number: int, settings: ExtentSettings) -> None:
-        self._fit, self._found, self._number, self._settings = fit, found, number, settings
+    def __init__(self, fit: SourceFit, found: PointSources, number: int, z: float, settings: ExtentSettings) -> None:
+        self._fit, self._found, self._number, self._z, self._settings = fit, found, number, z, settings
         self.limit = fit.bands[0].depth(found.positions[number])
         self._known: list[tuple[float, PointSources]] = []  # by the squared radius
-        for share in settings.ladder:
-            reached = self._try((share * self.limit) ** 2)
-            if not reached or self._rise(-1) > settings.beyond:
-                break
+        self._top = False  # True where no larger radius lies inside the tissue
+        while self._climb() and self._rise(-1) <= settings.beyond:
+            pass
         self._search()
+        self._wide, self._ends = self._interval()
 
     @property
     def best(self) -> PointSources:
         """Sources of the likeliest radius."""
         return self._known[self._least()][1]
 
-    def extent(self, z: float) -> Extent:
+    def extent(self) -> Extent:
         """The radius, and intervals of all radii whose -2 ln L rises by at most z², with the values they give.
 
         z grows by the share of the errors of the equation itself in the variance of the squared radius.
         """
-        wide = z * (1 + self._by_model()) ** 0.5
-        low, high = self._end(wide, -1), self._end(wide, 1)
-        ends = [low or 0.0, self.limit**2 if high is None else high]
+        z, wide, ends = self._z, self._wide, self._ends
         inside = [q for q, _ in self._known if self._rise_at(q) <= wide**2]
         own = slice(4 * self._number, 4 * self._number + 4)
         below, above = [], []
@@ -93,6 +93,23 @@ class Profile:
             above.append(values[own] + half)
         radius = self._known[self._least()][0] ** 0.5
         return Extent(radius, (ends[0] ** 0.5, ends[1] ** 0.5), np.min(below, axis=0), np.max(above, axis=0))
+
+    def _interval(self) -> tuple[float, tuple[float, float]]:
+        """Rise at the ends, as its root, and the ends [mm²]; again where one was found that is likelier."""
+        for _ in range(self._settings.rounds):
+            least, wide = self.best, self._z * (1 + self._by_model()) ** 0.5
+            low, high = self._end(wide, -1), self._end(wide, 1)
+            if self.best is least:
+                break
+            self._search()
+        return wide, (low or 0.0, self.limit**2 if high is None else high)
+
+    def _climb(self) -> bool:
+        """Try the next radius of the ladder; False where there is none inside the tissue."""
+        squares = [(share * self.limit) ** 2 for share in self._settings.ladder]
+        larger = [q for q in squares if not self._known or q > self._known[-1][0]]
+        self._top = self._top or not (larger and self._try(larger[0]))
+        return not self._top
 
     def _try(self, square: float) -> bool:
         """Fit with this squared radius; False where there is none inside the tissue."""
@@ -124,6 +141,8 @@ class Profile:
 
     def _search(self) -> None:
         """Try radii at the vertex of the parabola through the three about the least -2 ln L, while it falls."""
+        if len(self._known) == 2:  # half the radius
+            self._try(self._known[1][0] / 4)
         for _ in range(self._settings.steps):
             middle = min(max(int(np.argmin([one.unlikelihood for _, one in self._known])), 1), len(self._known) - 2)
             if middle < 1:
@@ -142,7 +161,7 @@ class Profile:
         outer = inner
         while self._rise(outer) < z**2:
             outer += way
-            if not 0 <= outer < len(self._known):
+            if outer < 0 or (outer == len(self._known) and not self._climb()):
                 return None
         a, b = self._known[outer - way][0], self._known[outer][0]
         for _ in range(self._settings.steps):
@@ -180,16 +199,19 @@ class Profile:
 
 
 def with_radii(
-    fit: SourceFit, found: PointSources, report: Progress, settings: ExtentSettings | None = None
+    fit: SourceFit, found: PointSources, z: float, report: Progress, settings: ExtentSettings | None = None
 ) -> tuple[PointSources, list[Profile]]:
-    """The sources as spheres with the likeliest radii, and the profile of each, in the order of `found`."""
+    """The sources as spheres with the likeliest radii, and the profile of each, in the order of `found`.
+
+    Intervals are those of `z` standard deviations.
+    """
     settings = settings or ExtentSettings()
     count, profiles = len(found.powers), list[Profile]()
     for turn in range(settings.rounds if count > 1 else 1):
         before, profiles = found.radii, []
         for k in range(count):
             report("radius", (turn + k / count) / settings.rounds)
-            profiles.append(Profile(fit, found, k, settings))
+            profiles.append(Profile(fit, found, k, z, settings))
             found = profiles[-1].best
         if np.allclose(found.radii, before):
             break

@@ -219,11 +219,11 @@ def _located(fit: SourceFit, spreads: Sequence[Sequence[Spread]], options: _Opti
     found = own.refined(found) if own else found
     profiles = list[Profile]()
     if options.spheres:
-        found, profiles = with_radii(fit, found, report)
+        found, profiles = with_radii(fit, found, z, report)
         if own:
-            found, profiles = with_radii(fit, own.refined(found), report)
+            found, profiles = with_radii(fit, own.refined(found), z, report)
     order = np.argsort(-found.powers, kind="stable")
-    found, extents = found.sorted(), [profiles[k].extent(z) for k in order] if profiles else None
+    found, extents = found.sorted(), [profiles[k].extent() for k in order] if profiles else None
     noise = fit.covariance(found)
     covariance, linear = noise + fit.by_model(found, noise), fit.is_linear(found, noise, z)
     p_values = fit.p_values(found, len(grid.inner), numbers)

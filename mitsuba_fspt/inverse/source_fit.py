@@ -20,6 +20,7 @@ from scipy.stats import chi2
 from ..optics.media import Source
 from ..optics.shapes import Sphere
 from ..runtime.errors import FluxError, InversionError
+from ..runtime.numbers import number
 from ..runtime.progress_bar import Progress
 from .band_images import BandImages
 from .measurement import Chi2
@@ -60,6 +61,14 @@ class LocationSettings:
     chance: float = 1e-3
     stuck: float = 1e8
     apart: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """InversionError where `model_error` is no factor."""
+        factor = number("locate: 'model_error'", self.model_error, InversionError, "1")
+        if not 0 <= factor < np.inf:
+            raise InversionError(
+                f"locate: 'model_error' must be >= 0 and finite, got {factor:g}. Give 1, or 0 for none."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,16 +329,18 @@ class SourceFit:
         """(K,) probability, at most, that noise alone makes a source fit as well as each of these.
 
         At each of `places` positions a source that is not there lowers Σ (residual/σ)² by chi-squared of as many
-        degrees of freedom as it has `numbers`, with the other sources free; Bonferroni's bound over the positions.
+        degrees of freedom as it has `numbers`, with the other sources free, and the factors of their light and the
+        coefficients with their prior; Bonferroni's bound over the positions.
         """
-        # Factors and coefficients make no light: they are taken as fitted, and add nothing to the noise.
-        slopes, residual = found.changes / found.sigma[:, None], (self.power - self.fitted(found)) / found.sigma
         values = np.empty(len(found.powers))
-        for k, power in enumerate(found.powers):
-            others = np.linalg.qr(np.delete(slopes, np.s_[4 * k : 4 * k + 4], axis=1))[0]
-            without = residual + power * found.columns[:, k] / found.sigma
-            without -= others @ (others.T @ without)
-            values[k] = places * chi2.sf(without @ without - residual @ residual, numbers)
+        for k in range(len(values)):
+            others = replace(found, powers=np.where(np.arange(len(values)) == k, 0.0, found.powers))
+            noise = self._noise_of(others, found.sigma)  # factors and coefficients alone make no light
+            own = slice(4 * k, 4 * k + 4)
+            changes = np.column_stack([np.delete(found.changes, own, axis=1), found.changes[:, own]])
+            directions = np.linalg.qr(noise.over(changes))[0][:, -4:]  # what this source adds to the others
+            without = noise.over(self._target - others.signal)
+            values[k] = places * chi2.sf(((directions.T @ without) ** 2).sum(), numbers)
         return values.clip(max=1.0)
 
     def is_linear(self, found: PointSources, covariance: Array, z: float) -> bool:
@@ -383,10 +394,13 @@ class SourceFit:
     def _noise(self, found: PointSources) -> PixelNoise:
         """Noise of the pixels for the fitted signal, with the numerical error of the matrices (Eq. M.24)."""
         each = zip(self.bands, found.exitance, strict=True)
-        sigma = np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each])
-        others = np.column_stack([self._by_factors(found), self.uncertain]) / sigma[:, None]
-        common = self.gain_per_view * found.signal / sigma
-        return PixelNoise(sigma, common, self.view, others if others.size else None)
+        return self._noise_of(found, np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each]))
+
+    def _noise_of(self, found: PointSources, sigma: Array) -> PixelNoise:
+        """Noise with this σ and what factors and coefficients change of the light of `found`; of no light, nothing."""
+        uncertain = self.uncertain if found.powers.any() else self.uncertain[:, :0]
+        others = np.column_stack([self._by_factors(found), uncertain]) / sigma[:, None]
+        return PixelNoise(sigma, self.gain_per_view * found.signal / sigma, self.view, others if others.size else None)
 
     def _by_factors(self, found: PointSources) -> Array:
         """(N, E) change of the pixels [W] by one standard deviation of the factors of the bands, `gain_error`.

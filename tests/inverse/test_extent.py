@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from cylinder_views import COEFFICIENTS, HEIGHT, cylinder_views, exact
 from sphere_views import noisy
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.inverse.extent import ExtentSettings, Profile
 from mitsuba_fspt.inverse.source_fit import LocationSettings
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.optics.media import Source
@@ -76,6 +78,41 @@ def inside(found, *, z=1.0):
     ends = np.array([[*end, power] for end, power in zip(source.position_interval, source.power_interval, strict=True)])
     middle, half = ends.mean(axis=0), np.ptp(ends, axis=0) / 2
     return bool((np.abs(middle - SOURCE) < z * half).all())
+
+
+@pytest.mark.parametrize(
+    ("height", "square", "by_model"),
+    [(24 / 0.49**2, 0.49, 0.0), (20.0, 0.49, 0.0), (1.0, 2.25, 0.0), (1.0, 2.25, 12.0), (0.01, 0.0, 0.0)],
+    ids=["below the first rung", "near the first rung", "wide", "errors of the equation", "no radius"],
+)
+def test_ends_of_a_parabola(height, square, by_model):
+    """Rationale: -2 ln L = c (a² − q)² has its least value at q and rises by z² (1 + v) at q ± z √((1 + v)/c).
+
+    The centre is 7 mm deep. Seen to fail: a radius of 0 for the first, no upper limit with v = 12.
+    """
+
+    class Known(Profile):
+        def _by_model(self):
+            return by_model
+
+    def minimum(positions, radii):
+        cost = height * (radii[0] ** 2 - square) ** 2
+        return SimpleNamespace(unlikelihood=cost, positions=positions, values=np.array([0, 0, 0, radii[0] ** 2]))
+
+    fit = SimpleNamespace(
+        bands=[SimpleNamespace(depth=lambda _: 7.0)],
+        minimum=minimum,
+        covariance=lambda _: np.eye(4),
+        by_model=lambda *_: np.zeros((4, 4)),
+    )
+    found = SimpleNamespace(positions=np.zeros((1, 3)), radii=np.zeros(1))
+    profile = Known(fit, found, 0, 1.645, ExtentSettings())
+    extent, half = profile.extent(), 1.645 * np.sqrt((1 + by_model) / height)
+    low, high = np.sqrt(max(square - half, 0.0)), min(np.sqrt(square + half), 7.0)
+    assert extent.radius == pytest.approx(np.sqrt(square), abs=0.02)
+    assert extent.interval == (pytest.approx(low, abs=0.03), pytest.approx(high, rel=0.03))
+    assert profile.best.values[3] == pytest.approx(square, abs=0.03)
+    assert extent.low[3] < square < extent.high[3]
 
 
 def test_a_sphere_comes_back(case, sphere):

@@ -456,6 +456,18 @@ def test_more_sources_than_the_images_determine(case, seed, caplog):
         assert "the images do not show that source 2 is there" in caplog.text
 
 
+def test_a_second_source_that_imitates_a_coefficient(case):
+    """Two sources for the light of one, with a µa 25 % above the true one, known to 10 %: the second is not proven.
+
+    Another µa fits as well without it. Seen to fail (p = 3e-7) where coefficients stay as fitted beside both sources.
+    """
+    wrong = replace(case.described, medium=Medium(0.0625, 1.0), spread=Spread(0.1))
+    images = case.images(SOURCE, electrons=3000, seed=1)
+    first, second = locate(wrong, case.matrix, images, scene=case.surface, sources=2).sources
+    assert first.p_value < 1e-50
+    assert second.p_value > 0.1
+
+
 def test_images_of_noise_alone_are_reported(case, caplog):
     """A fit to noise has a large p-value and one line; that to a source's own light a small one and none."""
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):

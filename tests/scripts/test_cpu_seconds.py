@@ -48,5 +48,5 @@ def test_dearest_tests_and_the_limit(tmp_path):
     head, *rows = (tmp_path / "spent.csv").read_text().splitlines()
     assert head == "cpu_seconds,test"
     assert sorted(row.partition(",")[2] for row in rows) == [
-        f"'test_busy.py::test_{name}'" for name in ("asleep", "here", "in_a_child")
+        f"test_busy.py::test_{name}" for name in ("asleep", "here", "in_a_child")
     ]
