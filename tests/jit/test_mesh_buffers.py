@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import mitsuba_fspt  # noqa: F401  # before Mitsuba: it selects the LLVM
+import mitsuba_fspt  # before Mitsuba: it selects the LLVM
 
 ROOT = Path(__file__).resolve().parents[2]
 POSITIONS = np.float32([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 2, 0]])
@@ -76,6 +76,6 @@ def test_a_mesh_of_3_10_is_made_from_tensors_and_read_by_its_geometric_faces(new
 def test_only_one_file_uses_these_names():
     """Of the package, and no script; `vertex_exitance` is a name of this package."""
     names = r"vertex_positions|vertex_normals|positions_buffer|faces_buffer|\bmi\.Mesh\(|\.add_attribute\("
-    files = [*(ROOT / "mitsuba_fspt").rglob("*.py"), *(ROOT / "scripts").glob("*.py")]
+    files = [*Path(mitsuba_fspt.__file__).parent.rglob("*.py"), *(ROOT / "scripts").glob("*.py")]
     using = {path.name for path in files if re.search(names, path.read_text(encoding="utf-8"))}
     assert using == {"mesh_buffers.py"}

@@ -17,6 +17,7 @@ from mitsuba_fspt.runtime import backend, libllvm
 from mitsuba_fspt.runtime.errors import BackendError
 
 REPOSITORY = Path(backend.__file__).resolve().parents[2]
+SCENE = Path(__file__).resolve().parents[2] / "scenes" / "textured_sphere.exr"  # beside the tests, not in a wheel
 LLVM_15 = next(iter(glob.glob("/usr/lib/*-linux-gnu/libLLVM-15.so*")), None)
 WORKING = libllvm.select({})
 
@@ -282,6 +283,6 @@ backend.ensure_variant()
 if {cores == "all"}:
     backend.set_threads(1)
 import mitsuba
-print(json.dumps(list(mitsuba.Bitmap({str(REPOSITORY / "scenes/textured_sphere.exr")!r}).size())))
+print(json.dumps(list(mitsuba.Bitmap({str(SCENE)!r}).size())))
 """
     assert run_script(script) == [512, 256]
