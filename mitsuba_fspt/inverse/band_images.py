@@ -13,10 +13,10 @@ from scipy.sparse import csr_array
 
 from ..optics.media import Source
 from ..optics.shapes import Sphere
-from ..phantom.surface_mesh import boundary
-from ..runtime.errors import InversionError
+from ..runtime.errors import FluxError, InversionError
 from ..tissue.border_surface import nearest_points
 from ..tissue.diffusion import Tissue
+from ..tissue.solution import TissueSolution
 from .measurement import Measurement
 from .model_error import MODEL_ERRORS
 from .surface import Surface
@@ -29,7 +29,8 @@ LOG = logging.getLogger("mitsuba_fspt")
 # from which on a line reports it. The sources are wrong by about that distance, which intervals do not contain.
 OFF_BORDER = 0.25
 REPORTED = 0.02
-STEP = 0.05  # relative change of optical coefficients, for slopes
+STEP = 1e-4  # relative change of optical coefficients, for slopes
+KEPT = 20_000_000  # values of solutions that are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ class BandImages:
     def _border(self) -> Array:
         """Corners of the triangles of the border (F, 3, 3) [mm]."""
         mesh = self.tissue.mesh
-        return mesh.vertices[boundary(mesh.vertices, mesh.cells)[0]]
+        return mesh.vertices[mesh.border]
 
     def model_error(self, position: Array, radius: float = 0.0) -> Array:
         """(N, 3) relative errors of a source's image by the equation itself, one standard deviation each (Eq. M.51)."""
@@ -134,29 +135,71 @@ class BandImages:
 
         Raises FluxError where there is no tissue, or a source is too close to the border.
         """
-        x, y, z = (float(value) for value in position)
-        solution = self.tissue.solve([Source(Sphere((x, y, z), float(radius)))])
+        return self._exitance(self._solution(position, radius))
+
+    def gradient(self, position: Array, radius: float, step: float) -> Array:
+        """(V, 3) change of `exitance` [1/mm³] along x, y and z, by steps [mm], backwards where the tissue ends.
+
+        Raises FluxError where there is none behind either.
+        """
+        present = self._solution(position, radius)
+
+        def changes(ways: Array) -> Array:
+            others = [(self.tissue, [_sphere(position + way, radius)]) for way in ways]
+            near = self.tissue.near(present, others)
+            return np.column_stack([self._exitance(one) for one in near]) - self._exitance(present)[:, None]
+
+        try:
+            return changes(step * np.eye(3)) / step
+        except FluxError:
+            columns = []
+        for way in step * np.eye(3):
+            try:
+                columns.append(changes(way[None]))
+            except FluxError:
+                columns.append(-changes(-way[None]))
+        return np.column_stack(columns) / step
+
+    def _solution(self, position: Array, radius: float) -> TissueSolution:
+        """Solution for a source of 1 W; the last ones are kept, since fits begin anew from the same positions."""
+        key = (*position.tolist(), float(radius))
+        if key not in self._solutions:
+            found = self.tissue.solve([_sphere(position, radius)])
+            self._solutions[key] = found
+            while len(self._solutions) > max(2, KEPT // found.solved.rest.size):
+                del self._solutions[next(iter(self._solutions))]
+        return self._solutions[key]
+
+    @cached_property
+    def _solutions(self) -> dict[tuple[float, ...], TissueSolution]:
+        return {}
+
+    def _exitance(self, solution: TissueSolution) -> Array:
+        """(V,) J_n at the surface's vertices [W/mm²] in this band."""
         return self.share * solution.exitance_at(self.surface.vertices, self._places)
 
-    def image_of(self, sources: Sequence[Source], tissue: Tissue) -> Array:
-        """(N,) power on the pixels [W] of sources, with their power over all bands, in a tissue on the same mesh."""
-        solution = tissue.solve(sources)
-        return np.asarray(self.share * (self.transport @ solution.exitance_at(self.surface.vertices, self._places)))
+    def changes(self, sources: Sequence[Source], tissues: Sequence[Tissue]) -> Array:
+        """(N, P) change of the power on the pixels [W] where other `tissues`, slightly different, take its place.
+
+        The sources have their power over all bands. One more solution for each, by the factors at hand (Eq. M.52).
+        """
+        present = self.tissue.solve(sources)
+        near = self.tissue.near(present, [(tissue, sources) for tissue in tissues])
+        change = np.column_stack([self._exitance(one) for one in near]) - self._exitance(present)[:, None]
+        return np.asarray(self.transport @ change)
 
     def slopes(self, sources: Sequence[Source]) -> dict[str, Array]:
         """(N,) change of the power on the pixels [W] by relative changes of the tissue's coefficients.
 
-        'absorption': of all µa, 'scattering': of all µs', for these sources. By differences of solutions.
+        'absorption': of all µa, 'scattering': of all µs', for these sources.
         """
         media = self.tissue.media
-        changes = {
+        others = {
             "absorption": [replace(medium, mua=(1 + STEP) * medium.mua) for medium in media],
             "scattering": [replace(medium, musp=(1 + STEP) * medium.musp) for medium in media],
         }
-        tissues = [self.tissue, *map(self.tissue.of_media, changes.values())]
-        fields = [one.solve(sources).exitance_at(self.surface.vertices, self._places) for one in tissues]
-        change = self.share / STEP * (np.column_stack(fields[1:]) - fields[0][:, None])
-        return dict(zip(changes, (self.transport @ change).T, strict=True))
+        changes = self.changes(sources, [self.tissue.of_media(one) for one in others.values()])
+        return dict(zip(others, changes.T / STEP, strict=True))
 
     @cached_property
     def _places(self) -> tuple[Index, Array]:
@@ -198,3 +241,9 @@ class BandImages:
                 "stated errors do not contain.",
                 away,
             )
+
+
+def _sphere(position: Array, radius: float) -> Source:
+    """Source of 1 W that glows uniformly over a sphere, a point for the radius 0."""
+    x, y, z = (float(value) for value in position)
+    return Source(Sphere((x, y, z), float(radius)))

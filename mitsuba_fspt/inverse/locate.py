@@ -22,6 +22,7 @@ from ..runtime.errors import InversionError, renamed
 from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
 from ..tissue.diffusion import Tissue
+from ..tissue.elements import Elements
 from ..tissue.phantom_file import PhantomFile, Spread
 from .band_images import BandImages
 from .extent import SHAPES, Profile, with_radii
@@ -290,9 +291,17 @@ def _band_images(
             "coefficients of [optical]. Give the band, where images are of one.",
             ", ".join(described.bands),
         )
-    bands = []
+    bands, elements = [], Elements(mesh, described.order)
     for one, (surface, measurement, optics) in zip(given, read, strict=True):
-        tissue = Tissue(mesh, optics.media, model=described.model, a=described.a, order=described.order, repeated=True)
+        tissue = Tissue(
+            mesh,
+            optics.media,
+            model=described.model,
+            a=described.a,
+            order=described.order,
+            repeated=True,
+            elements=elements,
+        )
         with renamed("locate", one.label):
             bands.append(BandImages.of(one.name, measurement.matrix, surface, measurement, tissue, optics.share))
     return bands

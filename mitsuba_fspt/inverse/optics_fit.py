@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..optics.media import Medium
 from ..runtime.progress_bar import Progress
+from ..tissue.diffusion import Tissue
 from ..tissue.phantom_file import COEFFICIENTS, Spread
 from .band_images import BandImages
 from .source_fit import PointSources, SourceFit
@@ -27,14 +28,13 @@ class OpticsSettings:
     """Accuracy of the fit of coefficients.
 
     rounds : largest number of fits, each with the last coefficients;  change : of every x, at which they end
-    step, step_n : relative change of µa and µs', and of n, for slopes by differences
+    step : relative change of a coefficient, for slopes
     least : least factor of a coefficient, whatever the images ask for
     """
 
     rounds: int = 6
     change: float = 0.05
-    step: float = 0.05
-    step_n: float = 0.01
+    step: float = 1e-4
     least: float = 0.1
 
 
@@ -126,23 +126,23 @@ class OpticsFit:
 
     def _bands(self, x: Array) -> list[BandImages]:
         """The bands with tissues for these x."""
-        return [
-            replace(band, tissue=band.tissue.of_media(media, repeated=True))
-            for band, media in zip(self._fit.bands, self._media(x), strict=True)
-        ]
+        each = zip(self._fit.bands, self._media(x), strict=True)
+        return [replace(band, tissue=band.tissue.of_media(media)) for band, media in each]
 
     def _changes(self, found: PointSources) -> Array:
         """(N, P) change of the power on the pixels [W] with each x, for these sources: one more solution for each."""
-        sources = found.sources
         changes = np.zeros((len(found.signal), len(self._uncertain)))
-        present = [band.image_of(sources, band.tissue) for band in self._fit.bands]
-        for column, one in enumerate(self._uncertain):
-            step = self._settings.step_n if one.key == "n" else self._settings.step
-            band, own = self._fit.bands[one.band], self._fit.parts[one.band]
-            media = list(band.tissue.media)
-            medium = media[one.region]
-            change = step * self._of(one)
-            media[one.region] = replace(medium, **{one.key: getattr(medium, one.key) + change})
-            other = band.tissue.of_media(media)
-            changes[own, column] = (band.image_of(sources, other) - present[one.band]) / step * one.sd
+        for k, (band, own) in enumerate(zip(self._fit.bands, self._fit.parts, strict=True)):
+            if columns := [column for column, one in enumerate(self._uncertain) if one.band == k]:
+                tissues = [self._other(band, self._uncertain[column]) for column in columns]
+                sd = [self._uncertain[column].sd for column in columns]
+                changes[own, columns] = band.changes(found.sources, tissues) * sd / self._settings.step
         return changes
+
+    def _other(self, band: BandImages, one: Unknown) -> Tissue:
+        """Tissue of a band with one coefficient changed by `step` of its nominal value."""
+        media = list(band.tissue.media)
+        medium = media[one.region]
+        value = getattr(medium, one.key) + self._settings.step * self._of(one)
+        media[one.region] = replace(medium, **{one.key: value})
+        return band.tissue.of_media(media)

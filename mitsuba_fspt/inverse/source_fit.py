@@ -382,7 +382,7 @@ class SourceFit:
             tried = self._weighted(empty, noise)
             if not ((tried.powers > 0).all() and tried.cost < below):
                 return None, True
-            return replace(tried, gradients=np.stack([*map(self._gradient, positions, radii, columns.T)], axis=1)), True
+            return replace(tried, gradients=np.stack([*map(self._gradient, positions, radii)], axis=1)), True
         except FluxError:
             return None, False
 
@@ -434,18 +434,10 @@ class SourceFit:
             columns.append(common if count == 1 else 0.5**0.5 * common)
         return np.column_stack(columns)
 
-    def _gradient(self, position: Array, radius: float, column: Array) -> Array:
-        """(N, 3) change of a source's image, `column` (N,), per mm along x, y and z; raises FluxError at the border."""
-        length = self.settings.step * self.bands[0].tissue.mesh.edge
-        return np.column_stack([self._change(position, radius, length * axis, column) / length for axis in np.eye(3)])
-
-    def _change(self, position: Array, radius: float, way: Array, column: Array) -> Array:
-        """Change (N,) of a source's image along a way, backwards where the tissue ends."""
-        radii = np.array([radius])
-        try:
-            return self._images((position + way)[None], radii)[1][:, 0] - column
-        except FluxError:
-            return column - self._images((position - way)[None], radii)[1][:, 0]
+    def _gradient(self, position: Array, radius: float) -> Array:
+        """(N, 3) change of a source's image per mm along x, y and z; raises FluxError at the border."""
+        step = self.settings.step * self.bands[0].tissue.mesh.edge
+        return np.concatenate([band.transport @ band.gradient(position, radius, step) for band in self.bands])
 
     def _images(self, positions: Array, radii: Array) -> tuple[tuple[Array, ...], Array]:
         """Of sources of 1 W at the positions (K, 3): J_n of each band (V, K) [1/mm²], and their columns (N, K)."""

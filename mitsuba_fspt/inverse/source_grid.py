@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, minimize, nnls
 from scipy.sparse import csr_array
 
-from ..phantom.surface_mesh import boundary
 from ..runtime.errors import InversionError
 from ..runtime.progress_bar import Progress
+from ..tissue.sparse_factor import Solve
 from ..tissue.tetrahedra import Tetrahedra
 from .band_images import BandImages
-from .nonnegative import Solve, factor
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -69,7 +68,7 @@ class SourceGrid:
     def of(cls, bands: Sequence[BandImages]) -> SourceGrid:
         """Grid of the bands, with the noise of flat images; raises InversionError where no vertex is inside."""
         mesh = bands[0].tissue.mesh
-        inner = np.setdiff1d(np.unique(mesh.cells), boundary(mesh.vertices, mesh.cells)[0])
+        inner = np.setdiff1d(np.unique(mesh.cells), mesh.border)
         if not inner.size:
             raise InversionError(
                 "locate: all vertices of the tetrahedra are on the border. Give a shorter 'edge' in [mesh] of the "
@@ -78,7 +77,7 @@ class SourceGrid:
         return cls(
             mesh,
             inner,
-            tuple(factor(csr_array(band.tissue.linear.system.matrix)) for band in bands),
+            tuple(band.tissue.linear.system.factors[0] for band in bands),
             tuple(csr_array(band.share * band.from_fluence()) for band in bands),
             np.concatenate([band.power for band in bands]),
             np.concatenate([band.flat_sigma() for band in bands]),
@@ -140,7 +139,9 @@ class SourceGrid:
         basis = np.linalg.qr(columns)[0]
         gain = np.maximum(self.backward(residual), 0) / self.lengths
         best = np.argsort(gain)[-self.settings.tried :]
-        tried = self.forward(np.eye(len(self.inner))[:, best])
+        ones = np.zeros((len(self.inner), len(best)))
+        ones[best, np.arange(len(best))] = 1
+        tried = self.forward(ones)
         beside = tried - basis @ (basis.T @ tried)
         fit = residual @ beside / np.linalg.norm(beside, axis=0).clip(LEAST_LENGTH * self.lengths.max())
         if not fit.max() > 0:

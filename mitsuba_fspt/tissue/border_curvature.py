@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import spsolve
 
-from ..phantom.surface_mesh import boundary
 from .tetrahedra import Tetrahedra
 
 Array = NDArray[np.float64]
@@ -25,7 +24,7 @@ def mean_curvature(mesh: Tetrahedra, length: float) -> Array:
 
     length : of the smoothing [mm]
     """
-    faces = np.asarray(boundary(mesh.vertices, mesh.cells)[0], dtype=np.int64)
+    faces = mesh.border
     points, count = mesh.vertices, len(mesh.vertices)
     corners = points[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

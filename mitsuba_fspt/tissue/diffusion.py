@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ..optics.media import Medium, Source
 from ..runtime.errors import FluxError
 from .border_curvature import mean_curvature
+from .elements import Elements
 from .finite_elements import Solved, System
 from .free_field import SourceField
 from .light_models import DEFAULT, Equations, equations
@@ -76,7 +77,8 @@ def solve(
 class Tissue:
     """Tissue without sources: mesh, media, equations and the finite elements, which serve any sources.
 
-    Arguments as of `solve`; `repeated`: it will be solved for many sources, see `System`.
+    Arguments as of `solve`; `repeated`: it will be solved for many sources; `elements`: of the mesh, where they are
+    known; `coarse`: as of `System`, where not `repeated`.
 
     Raises
     ------
@@ -93,6 +95,8 @@ class Tissue:
         a: str | float = "robin",
         order: int = 2,
         repeated: bool = False,
+        elements: Elements | None = None,
+        coarse: System | None = None,
     ) -> None:
         if order not in (1, 2):
             raise FluxError(f"solve: 'order' must be 1 or 2, got {order}.")
@@ -103,30 +107,59 @@ class Tissue:
             )
         self.mesh, self.media, self.model, self._a, self._order = mesh, tuple(media), model, a, order
         self.equations = equations(model, self.media, a)
+        self.elements = elements or Elements(mesh, order)
         self.curvature = np.zeros(len(mesh.vertices))
         if self.equations.bend.any():
             self.curvature = mean_curvature(mesh, SMOOTHED * max(1 / (m.mua + m.musp) for m in media))
-        self.system = System(mesh, order, self.equations, self.curvature, repeated)
+        self._coarse = coarse
+        if repeated:
+            self._coarse = (self.linear if model == "diffusion" else self._of_order_1(model)).system
+        self.system: System = System(self.elements, self.equations, self.curvature, self._coarse)
 
     @cached_property
     def linear(self) -> Tissue:
         """The same tissue with finite elements of order 1 under the diffusion equation: coarse, and fast."""
-        return Tissue(self.mesh, self.media, model="diffusion", a=self._a, order=1)
+        return self._of_order_1("diffusion")
 
-    def of_media(self, media: Sequence[Medium], repeated: bool = False) -> Tissue:
-        """The same tissue and elements with other media."""
-        return Tissue(self.mesh, media, model=self.model, a=self._a, order=self._order, repeated=repeated)
+    def _of_order_1(self, model: str) -> Tissue:
+        return Tissue(self.mesh, self.media, model=model, a=self._a, order=1, elements=self.elements.linear)
+
+    def of_media(self, media: Sequence[Medium]) -> Tissue:
+        """The same tissue and elements with other media; the coarse solution, if there is one, stays."""
+        return Tissue(
+            self.mesh,
+            media,
+            model=self.model,
+            a=self._a,
+            order=self._order,
+            elements=self.elements,
+            coarse=self._coarse,
+        )
 
     def places(self, points: Array) -> tuple[Index, Array]:
         """Cells (N,) and local coordinates (N, 3) of `points` (N, 3) [mm], for `exitance_at` of any solution."""
-        count = self.system.basis.N
+        count = self.elements.nodes
         nothing = Solved(np.zeros((self.equations.components, count)), np.zeros(count), 0.0, 0.0, 0)
         return self._solution((), 0.0, nothing).places(points)
 
     def solve(self, sources: Sequence[Source]) -> TissueSolution:
         """Solution for these sources; raises FluxError as `solve`."""
         fields = _free_fields(self.mesh, self.equations, sources)
-        solution = self._solution(fields, math.fsum(source.power for source in sources), self.system.solve(fields))
+        return self._balanced(fields, sources, self.system.solve(fields))
+
+    def near(self, solution: TissueSolution, others: Sequence[tuple[Tissue, Sequence[Source]]]) -> list[TissueSolution]:
+        """Solutions for slightly other media and sources, from one of this tissue, to the first order in the media.
+
+        Raises FluxError as `solve`.
+        """
+        fields = [_free_fields(self.mesh, tissue.equations, sources) for tissue, sources in others]
+        systems = [(tissue.system, own) for (tissue, _), own in zip(others, fields, strict=True)]
+        each = zip(others, fields, self.system.near(solution.solved, systems), strict=True)
+        return [tissue._balanced(own, sources, solved) for (tissue, sources), own, solved in each]
+
+    def _balanced(self, fields: tuple[SourceField, ...], sources: Sequence[Source], solved: Solved) -> TissueSolution:
+        """The solution; FluxError where its powers are not in balance."""
+        solution = self._solution(fields, math.fsum(source.power for source in sources), solved)
         if abs(solution.balance) > LARGEST_IMBALANCE:
             raise FluxError(
                 f"solve: absorbed + exited power is {1 + solution.balance:.6g} of the source's. A source is too close "
@@ -135,7 +168,7 @@ class Tissue:
         return solution
 
     def _solution(self, fields: tuple[SourceField, ...], power: float, solved: Solved) -> TissueSolution:
-        basis = self.system.basis
+        basis = self.elements.basis
         return TissueSolution(self.mesh, basis, self.media, self.equations, self.curvature, fields, power, solved)
 
 

@@ -22,21 +22,19 @@ from numpy.typing import NDArray
 from scipy.sparse import block_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-from ..runtime.errors import BackendError, FluxError
+from ..runtime.errors import FluxError
+from .elements import SYMMETRIC, Elements, import_skfem
 from .free_field import SourceField
 from .light_models import Equations
-from .tetrahedra import Tetrahedra
+from .sparse_factor import Solve, factor
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 # Relative residual of the linear system: far from the sources φ is nine decades below its peak and must keep digits.
 TOLERANCE = 1e-13
+CHANGE_TOLERANCE = 1e-7  # of the system for a small change of the solution, which needs fewer digits
 MOST_ITERATIONS = 5000
-SYMMETRIC = {"SymmetricMode": True}  # of SuperLU, for a matrix that is symmetric and positive definite
-# Degree of the quadrature on the border, where φ_f is no polynomial. Its error is that of the power balance of shallow
-# sources (see `balance`).
-BORDER_DEGREE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,37 +52,40 @@ class Solved:
     iterations: int
 
 
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Right side (m N,) of the module's equation, and what the free fields have of the numbers of `Solved`.
+
+    lateral, through : ∮ τ ∇_t φ_f1·∇_t v dS and ∮ H_1j φ_fj v dS, (N,) [W]
+    """
+
+    right: Array
+    lateral: Array
+    through: Array
+    absorbed: float
+    exited: float
+
+
 class System:
-    """Discrete problem on one mesh: `basis` of the cells, `border` basis of the boundary facets.
+    """Discrete problem of the `equations` of the mesh's regions on its `elements`.
 
-    `equations` of the mesh's regions; `curvature` of the border at the vertices [1/mm]; `order` is 1 or 2. Elements of
-    order 2 have a curved border if the mesh has a `snap`. `repeated`: many sources will be solved for, so that factors
-    of the matrix of linear elements, once, take less time than iterations without them.
-
-    Raises
-    ------
-    BackendError : scikit-fem or SciPy is missing.
+    curvature : of the border at the vertices [1/mm]
+    coarse : system of linear elements of these equations or similar ones, whose solutions make iterations fewer: for
+        many sources, since its factors take longer than the solution for a few; None without
     """
 
     def __init__(
-        self, mesh: Tetrahedra, order: int, equations: Equations, curvature: Array, repeated: bool = False
+        self, elements: Elements, equations: Equations, curvature: Array, coarse: System | None = None
     ) -> None:
-        skfem = import_skfem()
-        self.element = skfem.ElementTetP2() if order == 2 else skfem.ElementTetP1()
-        self.equations, self.repeated = equations, repeated
-        grid = _grid(skfem, mesh, order)
-        self.basis = skfem.Basis(grid, self.element, intorder=2 * order)
-        self.border = _border_basis(skfem, grid, self.element)
-        self.region = mesh.region  # of each cell
-        region = mesh.region[grid.f2t[0, self.border.find]]
-        self.outward = self._outward(region, curvature)
-        self.lateral = equations.lateral[region, None]  # τ of the facets
-        self._flows = equations.flow[region, None], equations.spread[region, None]  # a, b
+        self.elements, self.equations = elements, equations
+        self._coarse = coarse
+        self.outward = self._outward(elements.facet_region, curvature)
 
     def _outward(self, region: Index, curvature: Array) -> Array:
         """H at the quadrature points of the boundary facets, (m, m, F, Q)."""
-        x, y = self.border.X
-        corners = curvature[self.border.mesh.facets[:, self.border.find]]
+        border = self.elements.border
+        x, y = border.X
+        corners = curvature[border.mesh.facets[:, border.find]]
         values = np.einsum("kf,kq->fq", corners, np.stack([1 - x - y, x, y]))
         matrix = self.equations.border_at(np.repeat(region, len(x)), values.ravel())
         return np.asarray(np.moveaxis(matrix, 0, 2).reshape(*matrix.shape[1:], *values.shape))
@@ -96,76 +97,99 @@ class System:
         ------
         FluxError : no convergence.
         """
-        load, exited, absorbed = np.zeros((self.equations.components, self.basis.N)), 0.0, 0.0
-        lateral, through = np.zeros(self.basis.N), np.zeros(self.basis.N)
+        load = self._load(fields)
+        rest, iterations = self._conjugate_gradients(load.right[:, None], TOLERANCE)
+        return self._solved(load, rest[:, 0], iterations)
+
+    def near(self, solved: Solved, others: Sequence[tuple[System, Sequence[SourceField]]]) -> list[Solved]:
+        """Solutions of other systems, of about these equations, for other fields, from the solution `solved` of this.
+
+        To the first order in the change of the equations (M.52): K δw = f' − K' w. K' is not inverted.
+        """
+        before = solved.rest.ravel()
+        loads = [system._load(fields) for system, fields in others]
+        right = np.column_stack(
+            [load.right - system.image(before) for (system, _), load in zip(others, loads, strict=True)]
+        )
+        change, iterations = self._conjugate_gradients(right, CHANGE_TOLERANCE)
+        each = zip(others, loads, change.T, strict=True)
+        return [system._solved(load, before + one, iterations) for (system, _), load, one in each]
+
+    def _load(self, fields: Sequence[SourceField]) -> _Load:
+        """Right side for these fields."""
+        elements = self.elements
+        border, count = elements.border, elements.nodes
+        load, exited, absorbed = np.zeros((self.equations.components, count)), 0.0, 0.0
+        lateral, through = np.zeros(count), np.zeros(count)
         for field in fields:
             values, flux, outflow, along = self._on_border(field)
             outward = np.einsum("ijfq,jfq->ifq", self.outward, values)
             for i, total in enumerate(outward + flux):
-                load[i] -= self._integrate(self.border, total)
-            if self.lateral.any():
-                lateral += self._integrate(self.border, np.zeros_like(outflow), self.lateral * along)
-                through += self._integrate(self.border, outward[0])
-            exited += (outward[0] * self.border.dx).sum()
+                load[i] -= elements.integrate(border, total)
+            if self._has_lateral:
+                factor = self.equations.lateral[elements.facet_region, None]
+                lateral += elements.integrate(border, np.zeros_like(outflow), factor * along)
+                through += elements.integrate(border, outward[0])
+            exited += (outward[0] * border.dx).sum()
             # Σ C_1j φ_fj is the divergence of c_1 ∇φ_f1 + P r/(4πr³), a field without singularity.
-            absorbed += ((flux[0] + outflow) * self.border.dx).sum()
+            absorbed += ((flux[0] + outflow) * border.dx).sum()
             other, difference = self._in_other_regions(field)
             load -= other
             absorbed += difference
         load[0] -= lateral
-        rest, iterations = self._conjugate_gradients(load.ravel())
-        rest = rest.reshape(load.shape)
-        for j, component in enumerate(rest):
-            inside, outside = self.basis.interpolate(component), self.border.interpolate(component)
-            absorbed += (self._reaction(0, j) * inside * self.basis.dx).sum()
-            flux = self.outward[0, j] * outside
-            exited += (flux * self.border.dx).sum()
-            if self.lateral.any():
-                through += self._integrate(self.border, flux)
-        if self.lateral.any():
-            lateral = self._flow(lateral + self._along(self.lateral) @ rest[0], through)
-        return Solved(rest, lateral, float(absorbed), float(exited), iterations)
+        return _Load(load.ravel(), lateral, through, absorbed, exited)
 
-    def _reaction(self, i: int, j: int) -> Array:
-        """C_ij [1/mm] of each cell, (T, 1), to broadcast over its quadrature points."""
-        return np.asarray(self.equations.reaction[self.region, i, j, None])
+    def _solved(self, load: _Load, rest: Array, iterations: int) -> Solved:
+        """Solution with the rest w (m N,)."""
+        rest = rest.reshape(self.equations.components, -1)
+        absorbed, through = load.absorbed, np.zeros(self.elements.nodes)
+        for j, component in enumerate(rest):
+            absorbed += float(self._of_regions(self.equations.reaction[:, 0, j]) @ (self.elements.volumes @ component))
+            through += self._border[0][j] @ component
+        lateral = load.lateral
+        if self._has_lateral:
+            lateral = self._flow(lateral + self._along(self.equations.lateral) @ rest[0], load.through + through)
+        return Solved(rest, lateral, float(absorbed), float(load.exited + through.sum()), iterations)
+
+    @property
+    def _has_lateral(self) -> bool:
+        return bool(self.equations.lateral.any())
+
+    def _of_regions(self, values: Array) -> Array:
+        """Of the regions that the mesh has, (R,)."""
+        return values[: self.elements.regions]
 
     def _on_border(self, field: SourceField) -> tuple[Array, Array, Array, Array]:
         """φ_f and c_f ∂φ_f/∂n (m, F, Q), P n·r/(4πr³) (F, Q) [W/mm²], ∇_t φ_f1 (3, F, Q) at the facets' nodes."""
-        points = np.asarray(self.border.global_coordinates())
-        normals = np.asarray(self.border.normals).reshape(3, -1).T
-        values, gradient, outflow = field.with_gradient(points.reshape(3, -1).T)
+        normals, shape = self.elements.normals, self.elements.border.dx.shape
+        values, gradient, outflow = field.with_gradient(self.elements.points)
         slope = np.einsum("ind,nd->in", gradient, normals)
         flux = field.diffusion[:, None] * slope
         through = (outflow * normals).sum(axis=1)
         along = (gradient[0] - slope[0][:, None] * normals).T
-        shape = points.shape[1:]
         return values.reshape(-1, *shape), flux.reshape(-1, *shape), through.reshape(shape), along.reshape(3, *shape)
 
     def _in_other_regions(self, field: SourceField) -> tuple[Array, float]:
         """∫ [(c - c_f) ∇φ_f·∇v + (C - C_f) φ_f v] dV of each test function (m, N), ∫ Σ (C - C_f)_1j φ_fj dV [W]."""
-        equations = self.equations
+        equations, elements = self.equations, self.elements
         differs = np.array([not equations.same(region, field.region) for region in range(len(equations.diffusion))])
-        other = np.flatnonzero(differs[self.region])
-        load, power = np.zeros((equations.components, self.basis.N)), 0.0
+        other = np.flatnonzero(differs[elements.region])
+        load, power = np.zeros((equations.components, elements.nodes)), 0.0
         # ∇φ_f is steep near a source: cells there are integrated by a rule on many small tetrahedra.
         near = self._near(other, field.centres)
-        skfem = import_skfem()
-        degree = 2 * self.element.maxdeg
-        for cells, rule in (
-            (other[~near], skfem.quadrature.get_quadrature(self.element, degree)),
-            (other[near], _split_rule(degree)),
-        ):
+        degree = 2 * elements.element.maxdeg
+        for cells, rule in ((other[~near], {"intorder": degree}), (other[near], {"quadrature": _split_rule(degree)})):
             if len(cells) == 0:
                 continue
-            basis = skfem.Basis(self.basis.mesh, self.element, quadrature=rule, elements=cells)
+            basis = elements.on_cells(cells, **rule)
             points = np.asarray(basis.global_coordinates())
             values, gradient, _ = field.with_gradient(points.reshape(3, -1).T)
-            reaction = (equations.reaction - equations.reaction[field.region])[self.region[cells]]
+            region = elements.region[cells]
+            reaction = (equations.reaction - equations.reaction[field.region])[region]
             values = np.einsum("tij,jtq->itq", reaction, values.reshape(-1, *points.shape[1:]))
-            diffusion = (equations.diffusion - equations.diffusion[field.region])[self.region[cells]]
+            diffusion = (equations.diffusion - equations.diffusion[field.region])[region]
             for i, (value, slope) in enumerate(zip(values, gradient, strict=True)):
-                load[i] += self._integrate(basis, value, diffusion[:, i, None] * slope.T.reshape(points.shape))
+                load[i] += elements.integrate(basis, value, diffusion[:, i, None] * slope.T.reshape(points.shape))
             power += float((values[0] * basis.dx).sum())
         return load, power
 
@@ -173,30 +197,35 @@ class System:
         """True for each of the cells with one of the `centres` within two cell radii of its centroid."""
         from scipy.spatial import cKDTree
 
-        corners = self.basis.mesh.p[:, self.basis.mesh.t[:, cells]]
+        mesh = self.elements.basis.mesh
+        corners = mesh.p[:, mesh.t[:, cells]]
         middle = corners.mean(axis=1)
         size = np.linalg.norm(corners - middle[:, None], axis=0).max(axis=0)
         return np.asarray(cKDTree(centres).query(middle.T)[0] < 2 * size)
 
-    def _conjugate_gradients(self, load: Array) -> tuple[Array, int]:
-        """Solution of the linear system, shape (m N,), with `_preconditioner`, and the number of iterations.
+    def _conjugate_gradients(self, load: Array, tolerance: float) -> tuple[Array, int]:
+        """Solutions of the linear system for each column, shape (m N, k), with `_preconditioner`, and the iterations.
 
         SciPy's conjugate gradients take dot products by threaded BLAS, whose threads wait for each other on a busy
         machine: five times the time.
         """
-        matrix, precondition = self.matrix, self._preconditioner
+        precondition, active = self._preconditioner, np.arange(load.shape[1])
         rest, residual = np.zeros_like(load), load.copy()
         direction = precondition(residual)
-        product, goal = _dot(residual, direction), TOLERANCE**2 * _dot(load, load)
+        product, goal = _dots(residual, direction), tolerance**2 * _dots(load, load)
         for iteration in range(MOST_ITERATIONS):
-            if _dot(residual, residual) <= goal:
+            going = _dots(residual, residual) > goal[active]
+            if not going.all():
+                active = active[going]
+                residual, direction, product = residual[:, going], direction[:, going], product[going]
+            if not active.size:
                 return rest, iteration
-            image = matrix @ direction
-            step = product / _dot(direction, image)
-            rest += step * direction
+            image = self._applied(direction)
+            step = product / _dots(direction, image)
+            rest[:, active] += step * direction
             residual -= step * image
             scaled = precondition(residual)
-            product, before = _dot(residual, scaled), product
+            product, before = _dots(residual, scaled), product
             direction = scaled + product / before * direction
         raise FluxError(
             f"solve: conjugate gradients did not converge in {MOST_ITERATIONS} iterations. The mesh has very "
@@ -205,82 +234,102 @@ class System:
 
     @cached_property
     def _preconditioner(self) -> Callable[[Array], Array]:
-        """Inverse of the diagonal; for `repeated`, and the solution by linear elements added to it.
+        """Inverse of the diagonal; where there is a `coarse` system, the solution of each component by it is added.
 
         A function that is linear in the cells has the mean of its ends at the middles of edges. With P that map,
-        P K₁⁻¹ Pᵀ, K₁ = PᵀKP, solves for all that is smooth, and the diagonal for the rest. Only φ₁ has such a part:
-        φ₂ decays within a mean free path, and its matrix is close to one of masses.
+        P K₁⁻¹ Pᵀ solves for all that is smooth, and the diagonal for the rest.
         """
-        jacobi = 1 / self.matrix.diagonal()
-        if not self.repeated:
+        jacobi = 1 / np.concatenate([row[i].diagonal() for i, row in enumerate(self._blocks)])[:, None]
+        if self._coarse is None:
             return lambda residual: jacobi * residual
-        linear, count = self._from_linear(), self.basis.N
-        first = linear.T @ self.matrix[:count, :count] @ linear
-        solve = splu(csc_array(first), permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve
+        linear, factors, count = self.elements.from_linear, self._coarse.factors, self.elements.nodes
+        transposed = csr_array(linear.T)
 
         def precondition(residual: Array) -> Array:
             result = jacobi * residual
-            result[:count] += linear @ solve(linear.T @ residual[:count])
-            return result
+            for i, solve in enumerate(factors):
+                own = slice(i * count, (i + 1) * count)
+                result[own] += linear @ solve(transposed @ residual[own])
+            return np.asarray(result)
 
         return precondition
-
-    def _from_linear(self) -> Any:
-        """(N, V) values at the nodes of functions that are linear in each cell, from those at its vertices."""
-        count, basis, mesh = self.basis.mesh.nvertices, self.basis, self.basis.mesh
-        rows, columns, values = [basis.nodal_dofs[0]], [np.arange(count)], [np.ones(count)]
-        if self.element.maxdeg == 2:
-            ends = np.asarray(mesh.edges)
-            rows += [basis.edge_dofs[0], basis.edge_dofs[0]]
-            columns += [ends[0], ends[1]]
-            values += [np.full(ends.shape[1], 0.5)] * 2
-        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-        return csr_array(entries, shape=(basis.N, count))
 
     @cached_property
     def matrix(self) -> Any:
         """Sparse matrix (m N, m N) of the left side of the module's equation [mm], component after component."""
+        return csr_array(block_array(self._blocks, format="csr"))
+
+    @cached_property
+    def factors(self) -> tuple[Solve, ...]:
+        """Solution for each component alone, of linear elements, by factors of its matrix."""
+        points = self.elements.basis.mesh.p.T
+        return tuple(factor(row[i], points) for i, row in enumerate(self._blocks))
+
+    @cached_property
+    def _blocks(self) -> list[list[csr_array]]:
+        """Parts (N, N) of the matrix that take component j to equation i; they are symmetric."""
         count = self.equations.components
-        blocks = [[None] * count for _ in range(count)]
-        for i in range(count):
-            for j in range(i, count):
-                blocks[i][j] = blocks[j][i] = self._block(i, j)
-        return csr_array(block_array(blocks, format="csr"))
+        half = {(i, j): self._block(i, j) for i in range(count) for j in range(i, count)}
+        return [[half[min(i, j), max(i, j)] for j in range(count)] for i in range(count)]
 
-    def _block(self, i: int, j: int) -> Any:
-        """Part (N, N) of the matrix that takes component j to equation i; it is symmetric."""
-        skfem = import_skfem()
-        reaction, diffusion = self._reaction(i, j), self.equations.diffusion[self.region, i, None]
-        border = self.outward[i, j]
-        surface = skfem.BilinearForm(lambda u, v, w: border * u * v)
+    def _block(self, i: int, j: int) -> csr_array:
+        matrix = self._border[i][j]
+        for region, mass in enumerate(self.elements.mass):
+            matrix = matrix + self.equations.reaction[region, i, j] * mass
         if i == j:
-            volume = skfem.BilinearForm(lambda u, v, w: diffusion * (u.grad * v.grad).sum(axis=0) + reaction * u * v)
-        else:
-            volume = skfem.BilinearForm(lambda u, v, w: reaction * u * v)
-        matrix = volume.assemble(self.basis) + surface.assemble(self.border)
-        return matrix + self._along(self.lateral) if i == j == 0 and self.lateral.any() else matrix
+            for region, stiffness in enumerate(self.elements.stiffness):
+                matrix = matrix + self.equations.diffusion[region, i] * stiffness
+        if i == j == 0 and self._has_lateral:
+            matrix = matrix + self._along(self.equations.lateral)
+        return csr_array(matrix)
 
-    def _along(self, factor: Array) -> Any:
-        """∮ factor ∇_t u·∇_t v dS, (N, N)."""
-        skfem = import_skfem()
+    @cached_property
+    def _border(self) -> list[list[csr_array]]:
+        """∮ H_ij u v dS, (N, N), of the components."""
+        of, components = self.equations.border, range(self.equations.components)
+        blocks = [[self._sum(of[:, i, j], self.elements.border_mass) for j in components] for i in components]
+        if self.equations.bend.any():  # H_11 depends on the place
+            blocks[0][0] = self.elements.on_border(self.outward[0, 0])
+        return blocks
 
-        def form(u: Any, v: Any, w: Any) -> Any:
-            across = (u.grad * w.n).sum(axis=0) * (v.grad * w.n).sum(axis=0)
-            return factor * ((u.grad * v.grad).sum(axis=0) - across)
+    def _along(self, factor: Array) -> csr_array:
+        """∮ factor ∇_t u·∇_t v dS, (N, N), for a factor of each region."""
+        return self._sum(factor, self.elements.border_stiffness)
 
-        return skfem.BilinearForm(form).assemble(self.border)
+    def _sum(self, factors: Array, matrices: Sequence[csr_array]) -> csr_array:
+        """Σ over the regions."""
+        each = [factor * one for factor, one in zip(self._of_regions(factors), matrices, strict=True)]
+        return csr_array(sum(each[1:], each[0]))
+
+    def _applied(self, values: Array) -> Array:
+        """The matrix times values (m N, k)."""
+        parts = np.split(values, self.equations.components)
+        return np.concatenate(
+            [sum(block @ part for block, part in zip(row, parts, strict=True)) for row in self._blocks]
+        )
+
+    def image(self, values: Array) -> Array:
+        """The matrix times values (m N,), without the matrix."""
+        elements, equations = self.elements, self.equations
+        parts = np.split(values, equations.components)
+        result = [sum(self._border[i][j] @ part for j, part in enumerate(parts)) for i in range(len(parts))]
+        if self._has_lateral:
+            result[0] = result[0] + self._along(equations.lateral) @ parts[0]
+        for region, (stiffness, mass) in enumerate(zip(elements.stiffness, elements.mass, strict=True)):
+            masses = [mass @ part for part in parts]
+            for i, part in enumerate(parts):
+                result[i] = result[i] + equations.diffusion[region, i] * (stiffness @ part)
+                result[i] += sum(equations.reaction[region, i, j] * one for j, one in enumerate(masses))
+        return np.concatenate(result)
 
     @cached_property
     def _flow(self) -> Callable[[Array, Array], Array]:
         """From integrals of -∇_t·(τ ∇_t φ_1) v and of H φ v over the border, (N,) each, to `Solved.lateral`."""
-        skfem = import_skfem()
-        nodes = self.basis.get_dofs(self.basis.mesh.boundary_facets()).flatten()
-        mass = skfem.BilinearForm(lambda u, v, w: u * v).assemble(self.border)[nodes][:, nodes]
-        along, spread = (self._along(factor)[nodes][:, nodes] for factor in self._flows)
-        plain, smooth = (
-            splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve
-            for matrix in (mass, mass + spread)
-        )
+        elements, nodes = self.elements, self.elements.border_nodes
+        mass = self._sum(np.ones(elements.regions), elements.border_mass)
+        plain, along = elements.border_values, self._along(self.equations.flow)[nodes][:, nodes]
+        spread = (mass + self._along(self.equations.spread))[nodes][:, nodes]
+        smooth = splu(csc_array(spread), permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve
 
         def flow(lateral: Array, through: Array) -> Array:
             values = np.zeros_like(lateral)
@@ -290,35 +339,10 @@ class System:
 
         return flow
 
-    @staticmethod
-    def _integrate(basis: Any, value: Array, gradient: Array | None = None) -> Array:
-        """∫ (value · v + gradient · ∇v) for every test function v; `value` and `gradient` at the quadrature points."""
-        skfem = import_skfem()
-        if gradient is None:
-            form = skfem.LinearForm(lambda v, w: value * v)
-        else:
-            form = skfem.LinearForm(lambda v, w: value * v + (gradient * v.grad).sum(axis=0))
-        return np.asarray(form.assemble(basis))
 
-
-def _dot(a: Array, b: Array) -> float:
-    return float(np.einsum("i,i->", a, b))
-
-
-def import_skfem() -> Any:
-    """The module skfem.
-
-    Raises
-    ------
-    BackendError : it is not installed.
-    """
-    try:
-        import skfem
-    except ImportError as cause:
-        raise BackendError(
-            f"flux solve: scikit-fem cannot be imported ({cause}). pip install 'mitsuba-fspt[tissue]'."
-        ) from cause
-    return skfem
+def _dots(a: Array, b: Array) -> Array:
+    """(k,) dot products of the columns."""
+    return np.asarray(np.einsum("nk,nk->k", a, b))
 
 
 def _split_rule(degree: int) -> tuple[Array, Array]:
@@ -326,42 +350,3 @@ def _split_rule(degree: int) -> tuple[Array, Array]:
     skfem = import_skfem()
     parts = skfem.Basis(skfem.MeshTet1.init_refdom().refined(2), skfem.ElementTetP1(), intorder=degree)
     return np.asarray(parts.global_coordinates()).reshape(3, -1), parts.dx.ravel()
-
-
-def _grid(skfem: Any, mesh: Tetrahedra, order: int) -> Any:
-    """Mesh of scikit-fem; for order 2 and a curved border, with the midpoints of border edges on the true border."""
-    straight = skfem.MeshTet1(np.ascontiguousarray(mesh.vertices.T), np.ascontiguousarray(mesh.cells.T))
-    if order == 1 or mesh.snap is None:
-        return straight
-    curved = skfem.MeshTet2.from_mesh(straight)
-    middle = curved.dofs.edge_dofs[0, np.unique(curved.f2e[:, curved.boundary_facets()])]
-    before = curved.doflocs[:, middle]
-    curved.doflocs[:, middle] = mesh.snap(before.T).T
-    # A flat cell can be inverted, or nearly; all its edges stay straight.
-    points = skfem.ElementTetP2.doflocs.T
-    bent = skfem.MappingIsoparametric(curved, skfem.ElementTetP2()).detDF(points)
-    turned = (bent / straight.mapping().detDF(points)).min(axis=1) < 0.5
-    back = np.isin(middle, curved.dofs.element_dofs[:, turned])
-    curved.doflocs[:, middle[back]] = before[:, back]
-    return curved
-
-
-def _border_basis(skfem: Any, grid: Any, element: Any) -> Any:
-    """Basis of the boundary facets, with exact local coordinates of their quadrature points in the cells.
-
-    scikit-fem computes those of curved cells by Newton's method, which fails for flat cells and, by round-off, far
-    from the origin.
-    """
-    if grid.affine:
-        return skfem.FacetBasis(grid, element, intorder=BORDER_DEGREE)
-    points, weights = skfem.quadrature.get_quadrature(skfem.ElementTriP1(), BORDER_DEGREE)
-    facets = grid.boundary_facets()
-    mapping = grid.mapping()
-
-    def local_coordinates(_: Array, tind: Index) -> Array:
-        corners = np.argmax(grid.t[:, None, tind] == grid.facets[:, facets], axis=0)
-        reference = skfem.refdom.RefTet.p[:, corners]
-        return np.einsum("dkf,kq->dfq", reference, np.stack([1 - points[0] - points[1], *points]))
-
-    mapping.invF = local_coordinates
-    return skfem.FacetBasis(grid, element, mapping, quadrature=(points, weights), facets=facets)

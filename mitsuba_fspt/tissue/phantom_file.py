@@ -18,7 +18,7 @@ from ..runtime.wavelength import wavelength
 from .composition import Absorbers, reduced_scattering
 from .cylinder_mesh import cylinder_tetrahedra
 from .diffusion import Progress, solve
-from .finite_elements import import_skfem
+from .elements import import_skfem
 from .light_models import DEFAULT, check_model
 from .mesher import read_tetrahedra
 from .solution import TissueSolution

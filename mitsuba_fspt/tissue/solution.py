@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..optics.media import Medium
 from ..phantom.phantom import Phantom
-from ..phantom.surface_mesh import boundary, face_areas
+from ..phantom.surface_mesh import face_areas
 from ..runtime.errors import FluxError
 from .border_surface import nearest_points, refined_border
 from .finite_elements import Solved
@@ -169,15 +168,10 @@ class TissueSolution:
     def _outward(self, cells: Index, local: Array, components: Array) -> Array:
         """H φ [W/mm²], the outward flux of each component, (m, N), from the components on the border."""
         corners = self.mesh.cells[cells]
-        weights = np.column_stack([1 - local.sum(axis=1), local]) * self._on_border[corners]
+        weights = np.column_stack([1 - local.sum(axis=1), local]) * self.mesh.on_border[corners]
         weights /= weights.sum(axis=1, keepdims=True).clip(1e-300)
         curvature = (weights * self.curvature[corners]).sum(axis=1)
         return np.einsum("nij,jn->in", self.equations.border_at(self.mesh.region[cells], curvature), components)
-
-    @cached_property
-    def _on_border(self) -> NDArray[np.bool_]:
-        """True for the vertices of the mesh on its border, (V,)."""
-        return np.isin(np.arange(len(self.mesh.vertices)), boundary(self.mesh.vertices, self.mesh.cells)[0])
 
     def _border(self, edge: float) -> tuple[Array, Index]:
         """Vertices and faces of the border, with edges of about `edge` [mm] or less, on the true surface."""

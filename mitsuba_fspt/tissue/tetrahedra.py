@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..optics.shapes import Shape
+from ..phantom.surface_mesh import boundary
 from ..runtime.errors import FluxError
 
 Array = NDArray[np.float64]
@@ -102,12 +104,12 @@ class Tetrahedra:
         corners = self.vertices[self.cells]
         return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
 
-    @property
+    @cached_property
     def volumes(self) -> Array:
         """Volume of each cell, shape (T,) [mm³]."""
         return np.asarray(np.abs(np.linalg.det(self.edges)) / 6)
 
-    @property
+    @cached_property
     def edge(self) -> float:
         """Edge of the regular tetrahedron of mean volume [mm]."""
         return float((6 * np.sqrt(2) * self.volumes.mean()) ** (1 / 3))
@@ -122,10 +124,7 @@ class Tetrahedra:
         Returns the cells (N,) and the points' local coordinates (N, 3), the barycentric coordinates of the cell's
         second to fourth vertex. If the point is inside, they and their complement to 1 are >= 0 (see `depth`).
         """
-        from scipy.spatial import cKDTree
-
-        tree = cKDTree(self.vertices[self.cells].mean(axis=1))
-        starts = tree.query(points, k=min(STARTS, len(self.cells)))[1].reshape(len(points), -1)
+        starts = self._centroids.query(points, k=min(STARTS, len(self.cells)))[1].reshape(len(points), -1)
         cells, local = self._walk(points, starts[:, 0])
         for start in starts.T[1:]:
             # The search ended at the border: the point is outside, or behind a concave part. Try another start cell.
@@ -165,6 +164,23 @@ class Tetrahedra:
         through = np.argmin(weights, axis=1)
         row = np.arange(len(cells))
         return np.where(weights[row, through] < -ROUND_OFF, self.neighbours[cells, through], -1)
+
+    @cached_property
+    def _centroids(self) -> Any:
+        """Tree of the cells' centroids."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.vertices[self.cells].mean(axis=1))
+
+    @cached_property
+    def border(self) -> Index:
+        """Faces of the border, outward, (F, 3)."""
+        return np.asarray(boundary(self.vertices, self.cells)[0])
+
+    @cached_property
+    def on_border(self) -> NDArray[np.bool_]:
+        """True for the vertices on the border, (V,)."""
+        return np.isin(np.arange(len(self.vertices)), self.border)
 
     @cached_property
     def inverse(self) -> Array:
