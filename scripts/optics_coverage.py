@@ -1,6 +1,7 @@
 """Coverage of the intervals of `locate` where optical coefficients are known to 10 %.
 
-    python scripts/optics_coverage.py [--images series,photons] [--placements 40] [--three 40] [--photons 2e7] [-o CSV]
+    python scripts/optics_coverage.py [--images series,photons] [--coefficients fitted,exact] [--placements 40]
+        [--three 40] [--photons 2e7] [-o CSV]
 
 A point source of 1 W at a random place of a cylinder of 16 by 16 mm, 3 to 7 mm below its side and 4 mm or more below
 its caps, in four views of 24² pixels from the side. The true µa and µs' of each band are the nominal ones times
@@ -26,7 +27,7 @@ import logging
 import math
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -54,6 +55,7 @@ from photon_walk import Body, Emitter, Optics, exit_power  # noqa: E402
 
 Array = NDArray[np.float64]
 Place = tuple[float, float, float]
+Key = tuple[str, int, str]
 Truth = Callable[[Array, float, float, Place], Array]
 ROOT = Path(__file__).resolve().parent.parent
 RADIUS, HEIGHT, INDEX = 8.0, 16.0, 1.37
@@ -61,6 +63,7 @@ VIEWS = [0, 90, 180, 270]
 SD = 0.1
 ELECTRONS, READ_NOISE = 300, 3.5
 TURNS, ROWS, RINGS = 100, 32, 16  # bins: around, along the side, across a cap
+COEFFICIENTS = {True: "fitted along", False: "taken as exact"}
 BANDS = {"red": (0.4, 0.02, 1.1), "green": (0.35, 0.05, 1.0), "blue": (0.25, 0.1, 0.9)}  # share, µa, µs' [1/mm]
 
 
@@ -194,16 +197,26 @@ def replicate(
     }
 
 
-def row(
+def rows_of(
     setup: Setup, names: tuple[str, ...], fitted: bool, images: str, photons: int, placements: int
-) -> dict[str, object]:
-    """A line of the table."""
+) -> Iterator[dict[str, object]]:
+    """A line of the table, after each placement anew."""
     truth, model = {
         "series": (series_exitance, "diffusion"),
         "photons": (partial(photon_exitance, photons=photons), "sp3"),
     }[images]
-    each = [replicate(setup, names, fitted, truth, model, seed) for seed in range(placements)]
-    kept = [one for one in each if one is not None]
+    kept = list[dict[str, Array]]()
+    for seed in range(placements):
+        one = replicate(setup, names, fitted, truth, model, seed)
+        kept += [one] if one is not None else []
+        if kept:
+            yield row(names, fitted, images, seed + 1, kept)
+
+
+def row(
+    names: tuple[str, ...], fitted: bool, images: str, placements: int, kept: Sequence[dict[str, Array]]
+) -> dict[str, object]:
+    """A line of the table."""
     of = {key: np.array([one[key] for one in kept]) for key in kept[0]}
 
     def rms(values: Array) -> float:
@@ -221,36 +234,35 @@ def row(
         "coefficients_after_percent": 100 * rms(of["after"]),
         "seconds": float(np.median(of["seconds"])),
     }
-    line: dict[str, object] = {
-        "images": images,
-        "bands": len(names),
-        "coefficients": "fitted along" if fitted else "taken as exact",
-    }
+    line: dict[str, object] = {"images": images, "bands": len(names), "coefficients": COEFFICIENTS[fitted]}
     line |= {"placements": placements, "refused": placements - len(kept)}
     return line | {name: float(f"{value:.3g}") for name, value in numbers.items()}
 
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--images", default="series,photons", help="what J_n of the images is from; other rows stay")
+    options.add_argument("--images", default="series,photons", help="what J_n of the images is from")
+    options.add_argument("--coefficients", default="fitted,exact", help="how locate takes them; other rows stay")
     options.add_argument("--placements", type=int, default=40, help="with one band")
     options.add_argument("--three", type=int, default=40, help="placements with three bands")
     options.add_argument("--photons", type=float, default=2e7, help="of each image")
     options.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "optics_coverage.csv")
     given = options.parse_args()
     logging.getLogger("mitsuba_fspt").setLevel(logging.ERROR)
-    kinds, rows = given.images.split(","), []
+    rows: dict[Key, dict[str, object]] = {}
     if given.output.exists():
         with given.output.open(encoding="utf-8") as file:
-            rows = [dict(one) for one in csv.DictReader(file) if one["images"] not in kinds]
-    cases = [(names, fitted) for names in (("green",), tuple(BANDS)) for fitted in (True, False)]
+            rows = {(one["images"], int(one["bands"]), one["coefficients"]): dict(one) for one in csv.DictReader(file)}
+    fits = [fitted for fitted, name in ((True, "fitted"), (False, "exact")) if name in given.coefficients.split(",")]
+    cases = [(names, fitted) for names in (("green",), tuple(BANDS)) for fitted in fits]
     with tempfile.TemporaryDirectory() as folder:
         setup = Setup.of(Path(folder))
-        for images, (names, fitted) in itertools.product(kinds, cases):
-            if placements := given.placements if len(names) == 1 else given.three:
-                rows.append(row(setup, names, fitted, images, int(given.photons) // 32 * 32, placements))
-                print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
-                write_rows(given.output, rows)
+        for images, (names, fitted) in itertools.product(given.images.split(","), cases):
+            placements = given.placements if len(names) == 1 else given.three
+            for line in rows_of(setup, names, fitted, images, int(given.photons) // 32 * 32, placements):
+                rows[images, len(names), COEFFICIENTS[fitted]] = line
+                print("  ".join(f"{name}={value}" for name, value in line.items()), flush=True)
+                write_rows(given.output, rows.values())
 
 
 if __name__ == "__main__":

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +27,7 @@ from .transport_matrix import TransportMatrix
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Result = TypeVar("Result")
 LOG = logging.getLogger("mitsuba_fspt")
 # Distance of the matrix's surface from the tissue's border, over the edge of the tetrahedra: the largest one, and that
 # from which on a line reports it. The sources are wrong by about that distance, which intervals do not contain.
@@ -241,6 +245,12 @@ class BandImages:
                 "stated errors do not contain.",
                 away,
             )
+
+
+def of_each(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
+    """`work` of the arguments of each band, the bands in threads: NumPy and SciPy let others run while they compute."""
+    with ThreadPoolExecutor(min(len(arguments[0]), os.cpu_count() or 1)) as pool:
+        return list(pool.map(work, *arguments))
 
 
 def _sphere(position: Array, radius: float) -> Source:

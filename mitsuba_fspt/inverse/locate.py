@@ -291,7 +291,7 @@ def _band_images(
             "coefficients of [optical]. Give the band, where images are of one.",
             ", ".join(described.bands),
         )
-    bands, elements = [], Elements(mesh, described.order)
+    bands, elements = [], Elements(mesh, described.order).assembled()
     for one, (surface, measurement, optics) in zip(given, read, strict=True):
         tissue = Tissue(
             mesh,

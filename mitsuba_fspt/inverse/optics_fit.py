@@ -17,7 +17,7 @@ from ..optics.media import Medium
 from ..runtime.progress_bar import Progress
 from ..tissue.diffusion import Tissue
 from ..tissue.phantom_file import COEFFICIENTS, Spread
-from .band_images import BandImages
+from .band_images import BandImages, of_each
 from .source_fit import PointSources, SourceFit
 
 Array = NDArray[np.float64]
@@ -132,11 +132,18 @@ class OpticsFit:
     def _changes(self, found: PointSources) -> Array:
         """(N, P) change of the power on the pixels [W] with each x, for these sources: one more solution for each."""
         changes = np.zeros((len(found.signal), len(self._uncertain)))
-        for k, (band, own) in enumerate(zip(self._fit.bands, self._fit.parts, strict=True)):
-            if columns := [column for column, one in enumerate(self._uncertain) if one.band == k]:
-                tissues = [self._other(band, self._uncertain[column]) for column in columns]
-                sd = [self._uncertain[column].sd for column in columns]
-                changes[own, columns] = band.changes(found.sources, tissues) * sd / self._settings.step
+        bands = self._fit.bands
+        columns = [[column for column, one in enumerate(self._uncertain) if one.band == k] for k in range(len(bands))]
+
+        def of_band(band: BandImages, own: list[int]) -> Array:
+            uncertain = [self._uncertain[column] for column in own]
+            if not uncertain:
+                return np.empty((len(band.rows), 0))
+            change = band.changes(found.sources, [self._other(band, one) for one in uncertain])
+            return change * [one.sd for one in uncertain] / self._settings.step
+
+        for own, part, change in zip(columns, self._fit.parts, of_each(of_band, bands, columns), strict=True):
+            changes[part, own] = change
         return changes
 
     def _other(self, band: BandImages, one: Unknown) -> Tissue:

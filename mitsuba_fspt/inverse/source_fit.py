@@ -22,7 +22,7 @@ from ..optics.shapes import Sphere
 from ..runtime.errors import FluxError, InversionError
 from ..runtime.numbers import number
 from ..runtime.progress_bar import Progress
-from .band_images import BandImages
+from .band_images import BandImages, of_each
 from .measurement import Chi2
 from .patterns import Patterns, Seen, views_of
 from .sensitivity_picture import view_labels
@@ -212,7 +212,8 @@ class SourceFit:
         views, known, tissue = list[Seen](), [], list[tuple[str, str, Array]]()
         light = found.columns * found.powers / found.sigma[:, None]
         by_model = self.model_errors(found) / found.sigma[:, None]
-        for band, own, exitance in zip(self.bands, self.parts, found.exitance, strict=True):
+        by_bands = of_each(lambda band: band.slopes(found.sources), self.bands)
+        for band, own, exitance, by_tissue in zip(self.bands, self.parts, found.exitance, by_bands, strict=True):
             fitted = band.measurement.as_images(band.rows, found.signal[own])[0]
             names = [label if band.name is None else f"{band.name}: {label}" for label in view_labels(band.matrix)]
             seen = views_of(names, fitted, band.rows, found.sigma[own])
@@ -220,7 +221,7 @@ class SourceFit:
             known.append(hstack([common_errors(numerical, seen), csr_array(by_model[own])]))
             views += seen
             where = "the tissue" if band.name is None else f"band {band.name}"
-            for kind, change in band.slopes(found.sources).items():
+            for kind, change in by_tissue.items():
                 slope = np.zeros_like(found.signal)
                 slope[own] = change / found.sigma[own]
                 tissue.append((kind, where, slope))
@@ -437,12 +438,12 @@ class SourceFit:
     def _gradient(self, position: Array, radius: float) -> Array:
         """(N, 3) change of a source's image per mm along x, y and z; raises FluxError at the border."""
         step = self.settings.step * self.bands[0].tissue.mesh.edge
-        return np.concatenate([band.transport @ band.gradient(position, radius, step) for band in self.bands])
+        return np.concatenate(of_each(lambda band: band.transport @ band.gradient(position, radius, step), self.bands))
 
     def _images(self, positions: Array, radii: Array) -> tuple[tuple[Array, ...], Array]:
         """Of sources of 1 W at the positions (K, 3): J_n of each band (V, K) [1/mm²], and their columns (N, K)."""
         self._report("fit", self._share)
-        exitance = tuple(np.column_stack([*map(band.exitance, positions, radii)]) for band in self.bands)
+        exitance = tuple(of_each(lambda band: np.column_stack([*map(band.exitance, positions, radii)]), self.bands))
         return exitance, np.concatenate(
             [band.transport @ values for band, values in zip(self.bands, exitance, strict=True)]
         )

@@ -23,7 +23,7 @@ from ..runtime.errors import InversionError
 from ..runtime.progress_bar import Progress
 from ..tissue.sparse_factor import Solve
 from ..tissue.tetrahedra import Tetrahedra
-from .band_images import BandImages
+from .band_images import BandImages, of_each
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -100,17 +100,14 @@ class SourceGrid:
         """(k, …) transpose of `forward` applied to `values` (N, …)."""
         ends = np.cumsum([pixels.shape[0] for pixels in self.pixels])[:-1]
         parts = np.split((values.T / self.sigma).T, ends)
-        fields = (
-            solve(np.asarray(pixels.T @ part))
-            for solve, pixels, part in zip(self.solve, self.pixels, parts, strict=True)
-        )
+        fields = of_each(lambda solve, pixels, part: solve(np.asarray(pixels.T @ part)), self.solve, self.pixels, parts)
         return np.asarray(sum(fields))[self.inner]
 
     def forward(self, power: Array) -> Array:
         """(N, …) image over the noise of `power` (k, …) [W] of the inner vertices."""
         load = np.zeros((len(self.mesh.vertices), *power.shape[1:]))
         load[self.inner] = power
-        image = np.concatenate([pixels @ solve(load) for solve, pixels in zip(self.solve, self.pixels, strict=True)])
+        image = np.concatenate(of_each(lambda solve, pixels: pixels @ solve(load), self.solve, self.pixels))
         return np.asarray((image.T / self.sigma).T)
 
     def positions(self, count: int) -> list[Array]:

@@ -97,6 +97,11 @@ class Elements:
             self.basis.mesh, self.element, elements=cells, dofs=self.basis.dofs, disable_doflocs=True, **quadrature
         )
 
+    def assembled(self) -> Elements:
+        """The same, once the integrals over its cells are there, which threads would each make."""
+        self._integrals  # noqa: B018
+        return self
+
     @property
     def stiffness(self) -> tuple[csr_array, ...]:
         """∫ ∇u·∇v dV [mm] over each region, (N, N)."""

@@ -175,6 +175,8 @@ class System:
         differs = np.array([not equations.same(region, field.region) for region in range(len(equations.diffusion))])
         other = np.flatnonzero(differs[elements.region])
         load, power = np.zeros((equations.components, elements.nodes)), 0.0
+        if not other.size:
+            return load, power
         # ∇φ_f is steep near a source: cells there are integrated by a rule on many small tetrahedra.
         near = self._near(other, field.centres)
         degree = 2 * elements.element.maxdeg
