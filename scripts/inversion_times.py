@@ -1,12 +1,14 @@
 """CPU seconds of `invert` and `locate` on bodies of many vertices, the transport matrix made before.
 
-    python scripts/inversion_times.py [--phantom FILE.ply] [--only invert,locate] [-o docs/inversion_times.csv]
+    python scripts/inversion_times.py [--phantom FILE.ply] [--only invert,locate] [--cases WORDS]
+        [-o docs/inversion_times.csv]
 
 *invert*: an ellipsoid of the size of a mouse, 10,242 vertices with J_n of a source 3.5 mm deep, or the PLY given with
 J_n as its first vertex attribute; 96 x 96 pixels a view. *locate*: the phantom of scenes/nylon_cylinder.toml, point
 source at (8, 0, -1) mm, 4 views of 64 x 64 pixels, see location_coverage.py. 1000 electrons on the brightest pixel and
 3.5 electrons of read noise; "noise only" has the read noise alone. Columns: CPU seconds of all threads, elapsed
-seconds, those asked for on two idle cores, chi2, and what `locate` says where it refuses the images.
+seconds, those asked for on two idle cores, chi2, and what `locate` says where it refuses the images; largest memory of
+the process until then [GB]. Coefficients known to 10 % are fitted along; nodes are those of the finite elements.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
+import resource
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -36,6 +39,7 @@ from mitsuba_fspt.tissue.phantom_file import PhantomFile, Spread
 
 Array = NDArray[np.float64]
 Row = dict[str, object]
+Case = tuple[str, float, Callable[[], Any]]
 ROOT = Path(__file__).resolve().parent.parent
 READ_NOISE, ELECTRONS = 3.5, 1000.0
 AXES = np.array([11.0, 11.0, 40.0])  # mm, of the ellipsoid
@@ -85,16 +89,16 @@ def lit(band: str | None) -> Array:
     return phantom.power(phantom.Case("", (phantom.NEAR,), phantom.ALL_ROUND, ELECTRONS), band)
 
 
-def invert_rows(ply: Path | None) -> Iterator[Row]:
+def invert_rows(ply: Path | None) -> Iterator[Case]:
     """Two views without draws, four with 100."""
     for views, samples, asked in (([0, 90], 0, 20), ([0, 90, 180, 270], 100, 60)):
         matrix, surface, power = inverted(ply, views)
         given = images(power, ELECTRONS / power.max())
         name = f"invert, {len(surface.vertices)} vertices, {len(views)} views, {samples} draws"
-        yield timed(name, asked, lambda m=matrix, g=given, s=surface, n=samples: fspt.invert(m, g, scene=s, samples=n))
+        yield name, asked, lambda m=matrix, g=given, s=surface, n=samples: fspt.invert(m, g, scene=s, samples=n)
 
 
-def locate_rows() -> Iterator[Row]:
+def locate_rows() -> Iterator[Case]:
     """One source, noise only, three bands, two sources where there is one."""
     matrix, surface = located()
     power = lit(None)
@@ -105,22 +109,26 @@ def locate_rows() -> Iterator[Row]:
     brightest = max(lit(band).max() for band in BANDS)
     several = {band: images(lit(band), ELECTRONS / brightest, k) for k, band in enumerate(BANDS)}
     matrices = dict.fromkeys(BANDS, matrix)
-    yield timed("locate, 1 source", 15, lambda: fspt.locate(coarse, matrix, given, scene=surface))
-    yield timed("locate, noise only", 30, lambda: fspt.locate(coarse, matrix, none, scene=surface))
-    yield timed("locate, 3 bands", 60, lambda: fspt.locate(coarse, matrices, several, scene=surface))
-    known = Spread(0.1, 0.1)
-    bands = {name: replace(band, spreads=(known,)) for name, band in coarse.bands.items()}
-    finest = replace(coarse, edge=0.77, bands=bands)
-    name = f"locate, 3 bands, coefficients known to 10 %, {nodes_of(finest)} nodes"
-    yield timed(name, 180, lambda: fspt.locate(finest, matrices, several, scene=surface))
+    yield "locate, 1 source", 15, lambda: fspt.locate(coarse, matrix, given, scene=surface)
+    yield "locate, noise only", 30, lambda: fspt.locate(coarse, matrix, none, scene=surface)
+    yield "locate, 3 bands", 60, lambda: fspt.locate(coarse, matrices, several, scene=surface)
     for name, mesh in (("edge 3 mm", coarse), ("edge 1.5 mm", fine)):
         name = f"locate, 2 sources on 1, {name}"
-        yield timed(name, 60, lambda mesh=mesh: fspt.locate(mesh, matrix, given, sources=2, scene=surface))
+        yield name, 60, lambda mesh=mesh: fspt.locate(mesh, matrix, given, sources=2, scene=surface)
+    known = Spread(0.1, 0.1)
+    bands = {name: replace(band, spreads=(known,)) for name, band in coarse.bands.items()}
+    for edge, model in ((1.5, "diffusion"), (1.5, "sp3"), (0.77, "diffusion")):
+        mesh = replace(coarse, edge=edge, bands=bands, model=model)
+        name = f"locate, 3 bands, coefficients known to 10 %, {model}, {nodes_of(mesh)} nodes"
+        yield name, 180, lambda mesh=mesh: fspt.locate(mesh, matrices, several, scene=surface)
 
 
 def nodes_of(described: PhantomFile) -> int:
-    """Number of the nodes of its tetrahedra."""
-    return len(described.mesh().vertices)
+    """Number of the nodes of its finite elements: vertices and middles of edges of the tetrahedra."""
+    cells = np.sort(described.mesh().cells, axis=1)
+    edges = np.concatenate([cells[:, [i, j]] for i in range(4) for j in range(i + 1, 4)])
+    count = int(cells.max()) + 1
+    return count + (len(np.unique(edges @ [count, 1])) if described.order == 2 else 0)
 
 
 def timed(name: str, asked: float, work: Callable[[], Any]) -> Row:
@@ -137,6 +145,7 @@ def timed(name: str, asked: float, work: Callable[[], Any]) -> Row:
         "asked_seconds": asked,
         "chi2": chi2,
         "refused": refused,
+        "memory_gigabytes": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6, 2),
     }
     print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
     return row
@@ -147,6 +156,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--phantom", type=Path, help="PLY with J_n on its vertices, in place of the ellipsoid.")
     parser.add_argument("--only", default="invert,locate", help="Verbs; rows of the others are kept.")
+    parser.add_argument("--cases", default="", help="Text that the names of the cases contain; other rows are kept.")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "inversion_times.csv")
     arguments = parser.parse_args()
     logging.getLogger("mitsuba_fspt").setLevel(logging.ERROR)
@@ -154,9 +164,13 @@ def main() -> None:
     rows: dict[str, Row] = {}
     if arguments.output.exists():
         with arguments.output.open(encoding="utf-8") as file:
-            rows = {row["case"]: dict(row) for row in csv.DictReader(file)}
+            rows = {
+                row["case"]: {**row, "memory_gigabytes": row.get("memory_gigabytes", "")}
+                for row in csv.DictReader(file)
+            }
     made = {"invert": lambda: invert_rows(arguments.phantom), "locate": locate_rows}
-    for row in (row for verb in verbs for row in made[verb]()):
+    chosen = (case for verb in verbs for case in made[verb]() if arguments.cases in case[0])
+    for row in (timed(*case) for case in chosen):
         rows[str(row["case"])] = row
         write_rows(arguments.output, rows.values())
 

@@ -581,6 +581,13 @@ MUTANTS = (
         (SP3,),
     ),
     Mutant(
+        "change of the matrix in slopes",
+        "tissue/finite_elements.py",
+        "load.right - system.image(before)",
+        "load.right - self.image(before)",
+        ("tests/tissue/test_near.py",),
+    ),
+    Mutant(
         "anisotropy in the equations of SP3",
         "tissue/light_models.py",
         "mua + musp * (1 + g), mua + musp * (1 + g + g**2)",

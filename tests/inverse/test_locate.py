@@ -207,12 +207,11 @@ def test_the_pose_in_the_scene_does_not_matter(case, tmp_path, pose):
     """Positions are in the frame of the phantom file, whatever pose the scene's default values give, and in mm
     where the mesh is in cm. Seen to fail (turned by 50 degrees, without a word) in the frame of the scene.
     """
-    cylinder_views(tmp_path)
-    phantom = Phantom.read(tmp_path / "cylinder.ply")
+    phantom = Phantom.read(case.toml.with_suffix(".ply"))
     if "scale" in pose:
         phantom = replace(phantom, vertices=phantom.vertices / 10)
-        phantom.write(tmp_path / "cylinder.ply")
-    xml = (tmp_path / "cylinder.xml").read_text()
+    phantom.write(tmp_path / "cylinder.ply")
+    xml = case.toml.with_suffix(".xml").read_text()
     turned = xml.replace('<rotate z="1"', pose + '<rotate z="1"')
     assert turned != xml
     (tmp_path / "turned.xml").write_text(turned)
@@ -618,7 +617,7 @@ def test_two_sources_for_one_end_soon(case, monkeypatch):
 
     count_solutions("exitance", 1)
     count_solutions("gradient", 3)
-    for seed in (0, 1, 2):
+    for seed in (1, 2):
         with suppress(InversionError):
             case.locate(case.images(SOURCE, seed=seed), sources=2)
-    assert count < 3 * 160
+    assert count < 2 * 160
