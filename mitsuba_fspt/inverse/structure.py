@@ -33,10 +33,10 @@ TISSUE = (
 HINTS = {
     "factor": "exposure and filter of the view, or give gain_per_view",
     "background": "background and read-out offset",
-    "gradient": "flat field and vignetting",
+    "gradient": "flat field, vignetting and exit law",
     "shift": "pose",
     "scale": "distance, magnification and focus",
-    "smooth": "shape, absorbers and light that the model leaves out",
+    "smooth": "shape, exit law, absorbers and light that the model leaves out",
     "ring": TISSUE,
     "absorption": TISSUE,
     "scattering": TISSUE,

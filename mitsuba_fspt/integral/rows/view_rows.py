@@ -214,14 +214,14 @@ def _by_faces(
     entries = _Entries.of(columns, math.prod(camera.film.shape))
     del columns
     laid.clear()  # the work that follows needs the memory
-    rough, cut, outside = _rough(scene, camera, entries, image, rtol)
+    rough, cut, outside, off = _rough(scene, camera, entries, image, rtol)
     sums = np.where(exact, entries.column_sums(), np.nan)
     if outside.any() or cut.any():
         sizes = np.diff(entries.starts)
         sums[entries.columns[np.repeat(outside | cut, sizes)]] = np.nan  # the stop takes some of their light
         entries = entries.where(~np.repeat(outside, sizes))
     if rough.any():
-        entries = _refined(scene, camera, entries, on, rough, cut, rtol)
+        entries = _refined(scene, camera, entries, on, rough, np.where(cut, np.inf, off), rtol)
     return entries, sums
 
 
@@ -240,13 +240,17 @@ def _by_lines(
 
 
 def _refined(
-    scene: mi.Scene, camera: Camera, entries: _Entries, on: Sequence[str], rough: Mask, cut: Mask, rtol: float
+    scene: mi.Scene, camera: Camera, entries: _Entries, on: Sequence[str], rough: Mask, off: Array, rtol: float
 ) -> _Entries:
     """The entries, on rough pixels those by lines of sight where they are bright.
 
-    An entry is bright if the surface form or the lines of sight put it above a threshold; so each entry comes from
-    one of the two, also where one puts it just above and the other just below. In pixels in `cut` all entries are
-    bright: the border of a stop crosses these pixels, and the surface form counts them whole.
+    off : (h · w) error of the rows by the surface form; inf where the border of a stop crosses the pixel, which the
+        surface form counts whole
+
+    A row by lines of sight is taken if its error for any J_n, √Σ (error of an entry)², is smaller than `off`. An
+    entry of it is bright if the surface form or the lines of sight put it above a threshold; so each entry comes from
+    one of the two, also where one puts it just above and the other just below. Across the border of a stop all
+    entries are bright.
     """
     pixels = np.flatnonzero(rough)
     lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
@@ -254,9 +258,11 @@ def _refined(
     kept, found = np.ones(len(entries.light), bool), []
     for some in places:
         rows = _rows(scene, camera, some, on, lines)
-        threshold = np.where(cut[some], 0, FEWEST_HITS / (math.pi * lines))
         sizes = np.diff(entries.starts)[some]
         row, met = (np.repeat(np.arange(len(some)), counts) for counts in (sizes, np.diff(rows.starts)))
+        error = np.sqrt(np.bincount(met, (rows.light * rows.change.astype(np.float64)) ** 2, len(some)))
+        threshold = np.where(error < off[some], FEWEST_HITS / (math.pi * lines), np.inf)
+        threshold[np.isinf(off[some])] = 0
         here = np.repeat(entries.starts[some] - np.cumsum(sizes) + sizes, sizes) + np.arange(len(row))
         bright, bright_met = entries.light[here] >= threshold[row], rows.light >= threshold[met]
         number_here = row * entries.count + entries.columns[here]
@@ -268,8 +274,8 @@ def _refined(
 
 def _rough(
     scene: mi.Scene, camera: Camera, entries: _Entries, solution: Solution, rtol: float
-) -> tuple[Mask, Mask, Mask]:
-    """Pixels (h · w) on which the surface form is wrong, those that the stop cuts, and those beyond it.
+) -> tuple[Mask, Mask, Mask, Array]:
+    """Pixels (h · w) on which the surface form is wrong, those that the stop cuts, those beyond it, and their error.
 
     The first include the second, rows whose sum is far from the image, and rows that differ from an uncertain image.
     """
@@ -282,7 +288,7 @@ def _rough(
     unit = rtol * float(solution.power.max(initial=0.0)) / etendue
     far = inside & ((off > ROUGH * unit) | (off > UNREACHED * unit) & (uncertain > unit))
     cut &= ~inside
-    return far | (cut & (power > 0)), cut, ~(inside | cut)
+    return far | (cut & (power > 0)), cut, ~(inside | cut), off
 
 
 def _rows(
