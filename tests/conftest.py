@@ -13,7 +13,7 @@ import pytest
 import mitsuba_fspt  # noqa: F401  # before any test imports Mitsuba: it chooses the LLVM that Dr.Jit binds
 from mitsuba_fspt.runtime import backend
 
-pytest_plugins = ["cpu_seconds"]
+pytest_plugins = ["cpu_seconds", "plain_kernels"]
 
 # A shell's background jobs inherit that Ctrl-C is ignored, and so would all that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
