@@ -216,8 +216,7 @@ def test_uncertain_absorption_widens_the_radius(case, sphere):
     """µa of both bands known to 10 %, in the file 8 % below the true one: k and the ratio of the bands are uncertain.
 
     Expected: the radius with exact coefficients lies off its interval, that with fitted ones inside, in an interval
-    that is twice as wide; the coefficients come nearer to the true ones. Seen to fail with the tissue of the first
-    round.
+    that is twice as wide; the coefficients come nearer to the true ones.
     """
     images = case.images(1.5, 3000)
     found = {}
