@@ -40,6 +40,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 STEPS = ("build", "extras", "readme", "suite", "lowest", "pythons")
 PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
+LONGEST, LONGEST_SUITE = 1800.0, 4 * 3600.0  # seconds of a command, and of the whole suite on a busy machine
 COPIED = ("tests", "scenes", "examples", "scripts", "docs", "pyproject.toml", "README.md", "CONTRIBUTING.md")
 SHORT = ("tests/phantom/test_phantom.py", "tests/phantom/test_framed_scene.py", "tests/optics/test_thin_lens.py")
 # Tests of the checkout itself: its pages, its scripts, its git.
@@ -100,7 +101,7 @@ def clean_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in left_out}
 
 
-def call(command: Sequence[object], cwd: Path, timeout: float = 1800, **more: str) -> str:
+def call(command: Sequence[object], cwd: Path, timeout: float = LONGEST, **more: str) -> str:
     """Output of a command; Failed with the last lines of what it printed if it does not end with 0."""
     words = [str(word) for word in command]
     done = subprocess.run(
@@ -151,9 +152,9 @@ class Release:
         call([uv, "pip", "check", "-q", "--python", interpreter], self.work)
         return interpreter
 
-    def run(self, interpreter: Path, *words: object, cwd: Path | None = None) -> str:
+    def run(self, interpreter: Path, *words: object, cwd: Path | None = None, timeout: float = LONGEST) -> str:
         """Output of this environment's Python."""
-        return call([interpreter, *words], cwd or self.empty(), DRJIT_CACHE_DIR=str(self.kernels))
+        return call([interpreter, *words], cwd or self.empty(), timeout, DRJIT_CACHE_DIR=str(self.kernels))
 
     def empty(self) -> Path:
         return Path(tempfile.mkdtemp(dir=self.work))
@@ -182,7 +183,7 @@ class Release:
                 shutil.copy(source, folder / name)
         ignored = [f"--ignore={name}" for name in OF_CHECKOUT]
         words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", *ignored, *tests]
-        said = self.run(interpreter, *words, cwd=folder).strip().splitlines()
+        said = self.run(interpreter, *words, cwd=folder, timeout=LONGEST_SUITE).strip().splitlines()
         return next((line for line in reversed(said) if re.search(r"\d+ passed", line)), said[-1])
 
 
