@@ -145,7 +145,7 @@ def timed(name: str, asked: float, work: Callable[[], Any]) -> Row:
         "asked_seconds": asked,
         "chi2": chi2,
         "refused": refused,
-        "memory_gigabytes": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6, 2),
+        "memory_gigabytes": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9, 2),
     }
     print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
     return row

@@ -34,7 +34,7 @@ LOG = logging.getLogger("mitsuba_fspt")
 OFF_BORDER = 0.25
 REPORTED = 0.02
 STEP = 1e-4  # relative change of optical coefficients, for slopes
-KEPT = 20_000_000  # values of solutions that are kept
+KEPT = 30_000_000  # values of the solutions that a band keeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +167,11 @@ class BandImages:
     def _solution(self, position: Array, radius: float) -> TissueSolution:
         """Solution for a source of 1 W; the last ones are kept, since fits begin anew from the same positions."""
         key = (*position.tolist(), float(radius))
-        if key not in self._solutions:
-            found = self.tissue.solve([_sphere(position, radius)])
-            self._solutions[key] = found
-            while len(self._solutions) > max(2, KEPT // found.solved.rest.size):
-                del self._solutions[next(iter(self._solutions))]
-        return self._solutions[key]
+        found = self._solutions.pop(key, None) or self.tissue.solve([_sphere(position, radius)])
+        self._solutions[key] = found
+        while len(self._solutions) > max(2, KEPT // (found.solved.rest.size + found.solved.lateral.size)):
+            del self._solutions[next(iter(self._solutions))]
+        return found
 
     @cached_property
     def _solutions(self) -> dict[tuple[float, ...], TissueSolution]:
@@ -248,7 +247,12 @@ class BandImages:
 
 
 def of_each(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
-    """`work` of the arguments of each band, the bands in threads: NumPy and SciPy let others run while they compute."""
+    """`work` of the arguments of each band, the bands in threads: NumPy and SciPy let others run while they compute.
+
+    After Ctrl-C the threads end the work of their present band first.
+    """
+    if len(arguments[0]) == 1:
+        return [work(*(one[0] for one in arguments))]
     with ThreadPoolExecutor(min(len(arguments[0]), os.cpu_count() or 1)) as pool:
         return list(pool.map(work, *arguments))
 

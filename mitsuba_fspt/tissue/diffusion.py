@@ -108,6 +108,10 @@ class Tissue:
         self.mesh, self.media, self.model, self._a, self._order = mesh, tuple(media), model, a, order
         self.equations = equations(model, self.media, a)
         self.elements = elements or Elements(mesh, order)
+        if not self.elements.are_of(mesh, order):
+            raise FluxError(
+                "solve: 'elements' are of another mesh or order. Leave them out, or give those of this mesh."
+            )
         self.curvature = np.zeros(len(mesh.vertices))
         if self.equations.bend.any():
             self.curvature = mean_curvature(mesh, SMOOTHED * max(1 / (m.mua + m.musp) for m in media))
@@ -152,6 +156,8 @@ class Tissue:
 
         Raises FluxError as `solve`.
         """
+        if any(tissue.elements is not self.elements or tissue.model != self.model for tissue, _ in others):
+            raise FluxError("solve: a tissue near this one has other elements or another model. Make it by 'of_media'.")
         fields = [_free_fields(self.mesh, tissue.equations, sources) for tissue, sources in others]
         systems = [(tissue.system, own) for (tissue, _), own in zip(others, fields, strict=True)]
         each = zip(others, fields, self.system.near(solution.solved, systems), strict=True)
@@ -160,7 +166,7 @@ class Tissue:
     def _balanced(self, fields: tuple[SourceField, ...], sources: Sequence[Source], solved: Solved) -> TissueSolution:
         """The solution; FluxError where its powers are not in balance."""
         solution = self._solution(fields, math.fsum(source.power for source in sources), solved)
-        if abs(solution.balance) > LARGEST_IMBALANCE:
+        if not abs(solution.balance) <= LARGEST_IMBALANCE:
             raise FluxError(
                 f"solve: absorbed + exited power is {1 + solution.balance:.6g} of the source's. A source is too close "
                 f"to the border for mesh edges of {self.mesh.edge:.3g} mm; make them shorter than its depth."

@@ -98,9 +98,15 @@ class Elements:
         )
 
     def assembled(self) -> Elements:
-        """The same, once the integrals over its cells are there, which threads would each make."""
-        self._integrals  # noqa: B018
+        """The same, once all is there that threads with the same elements would each make."""
+        for one in (self, self.linear):
+            one._integrals, one.border_mass, one.border_values  # noqa: B018
+        self.from_linear  # noqa: B018
         return self
+
+    def are_of(self, mesh: Tetrahedra, order: int) -> bool:
+        """Whether these are the elements of this order on this mesh."""
+        return self._mesh is mesh and self.element.maxdeg == order
 
     @property
     def stiffness(self) -> tuple[csr_array, ...]:

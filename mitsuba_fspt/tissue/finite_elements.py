@@ -216,7 +216,7 @@ class System:
         direction = precondition(residual)
         product, goal = _dots(residual, direction), tolerance**2 * _dots(load, load)
         for iteration in range(MOST_ITERATIONS):
-            going = _dots(residual, residual) > goal[active]
+            going = ~(_dots(residual, residual) <= goal[active])  # also where it is no number
             if not going.all():
                 active = active[going]
                 residual, direction, product = residual[:, going], direction[:, going], product[going]

@@ -1,8 +1,9 @@
 """Sparse factor of the matrix of linear elements, by nested dissection.
 
-The vertices are divided in two parts at the median of the longest side of their box, again and again; those of one part
-that have neighbours in the other come last (A. George, SIAM J. Numer. Anal. 10, 345, 1973). With 46,000 vertices the
-factor has two thirds of the entries of one in the order of minimum degree, and takes a third of the time.
+The vertices are divided in two halves across x, y or z, again and again; those of one half that have neighbours in the
+other come last (A. George, SIAM J. Numer. Anal. 10, 345, 1973). Of the three ways the one with the fewest of these is
+taken. With 46,000 vertices the factor has two thirds of the entries of one in the order of minimum degree, and takes a
+third of the time.
 """
 
 from __future__ import annotations
@@ -40,21 +41,22 @@ def factor(matrix: csr_array, points: Array) -> Solve:
 
 def dissection(matrix: csr_array, points: Array) -> Index:
     """Order (V,) of the points (V, 3) for elimination, where entries of `matrix` (V, V) join neighbours."""
-    side = np.zeros(len(points), np.int8)
+    in_second = np.zeros(len(points), bool)
+
+    def halves(part: Index, axis: int) -> tuple[Index, Index, NDArray[np.bool_]]:
+        """The two halves of a part along an axis, and which points of the first have neighbours in the second."""
+        along = part[np.argsort(points[part, axis], kind="stable")]
+        first, second = along[: len(along) // 2], along[len(along) // 2 :]
+        in_second[second] = True
+        rows = matrix[first]
+        ends = np.repeat(np.arange(len(first)), np.diff(rows.indptr))[in_second[rows.indices]]
+        in_second[second] = False
+        return first, second, np.bincount(ends, minlength=len(first)) > 0
 
     def ordered(part: Index) -> list[Index]:
-        own = points[part]
-        axis = int(np.argmax(np.ptp(own, axis=0)))
-        low = own[:, axis] < np.median(own[:, axis])
-        if len(part) <= SMALL or not low.any():
+        if len(part) <= SMALL:
             return [part]
-        first, second = part[low], part[~low]
-        side[first], side[second] = 1, 2
-        rows = matrix[first]
-        joined = (
-            np.bincount(np.repeat(np.arange(len(first)), np.diff(rows.indptr)), side[rows.indices] == 2, len(first)) > 0
-        )
-        side[part] = 0
+        first, second, joined = min((halves(part, axis) for axis in range(3)), key=lambda one: int(one[2].sum()))
         return [*ordered(first[~joined]), *ordered(second), first[joined]]
 
     return np.concatenate(ordered(np.arange(len(points))))

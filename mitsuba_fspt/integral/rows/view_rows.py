@@ -247,10 +247,10 @@ def _refined(
     off : (h · w) error of the rows by the surface form; inf where the border of a stop crosses the pixel, which the
         surface form counts whole
 
-    A row by lines of sight is taken if its error for any J_n, √Σ (error of an entry)², is smaller than `off`. An
-    entry of it is bright if the surface form or the lines of sight put it above a threshold; so each entry comes from
-    one of the two, also where one puts it just above and the other just below. Across the border of a stop all
-    entries are bright.
+    A row by lines of sight is taken if √Σ (error of an entry)², its error for J_n = 1 where errors of entries are
+    independent, is smaller than `off`. An entry of it is bright if the surface form or the lines of sight put it above
+    a threshold; so each entry comes from one of the two, also where one puts it just above and the other just below.
+    Across the border of a stop all entries are bright.
     """
     pixels = np.flatnonzero(rough)
     lines = int(np.clip(BATCH / len(pixels), ROW_LINES * (1e-3 / rtol) ** 0.5, 1 << 16)) // 2 * 2
