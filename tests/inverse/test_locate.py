@@ -446,12 +446,13 @@ def test_a_mesh_without_vertices_inside(case):
 def test_more_sources_than_the_images_determine(case, seed, caplog):
     """Two sources for the light of one: refused, or one line says that the second may be noise.
 
-    Seen to fail without the change of the other source in the p-value.
+    Noise makes p < 0.01 in 1 % of the cases at the most. Seen to fail (p < 3e-4 on each seed) without the change of the
+    other source in the p-value.
     """
     with suppress(InversionError), caplog.at_level(logging.WARNING, "mitsuba_fspt"):
         found = case.locate(case.images(SOURCE, electrons=300, seed=seed), sources=2)
         assert not found.linear or min(source.power - 2 * source.power_sd for source in found.sources) < 0
-        assert found.sources[1].p_value > 0.1
+        assert found.sources[1].p_value > 0.01
         assert "the images do not show that source 2 is there" in caplog.text
 
 
