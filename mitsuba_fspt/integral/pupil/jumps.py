@@ -28,6 +28,7 @@ def integrate_transect(
     phase: mi.Float,
     along: AlongTransect,
     outline: mi.Float,
+    least: mi.Float,
     steep: float,
 ) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
     """Means of integrand and coverage along a transect, number of jumps, depth of the edge at the largest jump [mm],
@@ -37,6 +38,7 @@ def integrate_transect(
     jumps; `along.bisections` halve each of them towards the larger difference. Every piece between jumps that is not
     dark has `along.nodes` nodes at even distances, the first at the share `phase` of a distance.
     outline : size that an outline counts as, in units of the radiance [W/mm²/sr]
+    least : smallest jump of the radiance on one body [W/mm²/sr]
     steep : a jump on one body is larger than so many times the mean of the other steps of the scan
     """
     together = view.detail <= TRANSECTS_TOGETHER
@@ -48,7 +50,7 @@ def integrate_transect(
             return mi.Vector4f(sight.radiance, sight.body, sight.depth, sight.front)
         return mi.Point3f(sight.radiance, sight.body, sight.depth)
 
-    found = _search(trace, phase, along, outline, steep, mi.Vector4f(0) if view.specular else mi.Point3f(0))
+    found = _search(trace, phase, along, outline, least, steep, mi.Vector4f(0) if view.specular else mi.Point3f(0))
     jumps, places = found.jumps, found.places()
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
@@ -164,6 +166,7 @@ def _search(
     phase: mi.Float,
     along: AlongTransect,
     outline: mi.Float,
+    least: mi.Float,
     steep: float,
     nothing: Seen,
 ) -> _Search:
@@ -190,7 +193,7 @@ def _search(
             rest = rest - most  # not `-=`, which would change the total with it
             jump = most >= outline
             if k < MOST_STEPS:
-                jump = jump | (most > steep * rest / (number - (k + 1)))
+                jump = jump | (most > dr.maximum(steep * rest / (number - (k + 1)), least))
             large &= jump
             jumps += dr.select(large, mi.UInt32(1), 0)
         lit = dr.select(_met(seen), mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)

@@ -7,14 +7,12 @@ unbiased estimates, and their scatter gives the error for any integrand. The poi
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.special import stdtrit
 
 from ...jit.batches import batches
 from ...jit.loops import repeat
@@ -40,8 +38,8 @@ LEGS = 8  # lines of sight that one through or off specular surfaces counts as, 
 def refine_by_lattices(draft: Draft) -> None:
     """Value and error of the pixels above the tolerance by lattices of more and more points, until they are below it.
 
-    The error of a pixel is at least the largest share of pixel × pupil that all points may miss, times the brightest
-    value around; on pixels that another solution gives, times the brightest surface.
+    The error of a pixel is at least `missed_share` over the number of points times the brightest value around; on
+    pixels that another solution gives, times the brightest surface.
     """
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
     deadline, tolerance = draft.progress.deadline, draft.tolerance
@@ -57,7 +55,6 @@ def refine_by_lattices(draft: Draft) -> None:
     brightest = dr.select(
         draft.computed, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
     )
-    student_t, missed = (dr.opaque(mi.Float64, n) for n in _exceeded_with(draft.estimator.chance))
     means, points = Means.none(draft.grid.pixels(above)), 0
     while not deadline.passed():
         more = min(GROWTH * points or FIRST, most_points(dr.width(means.pixels)))
@@ -66,8 +63,11 @@ def refine_by_lattices(draft: Draft) -> None:
         means, points = means.refined(draft, points, more), more
         if not dr.width(means.pixels):  # the deadline left no time for the first of them
             break
-        unmet = missed / (points * SHIFTS) * dr.gather(mi.Float64, brightest, means.pixels)
-        error = dr.maximum(student_t * means.standard_error, unmet)
+        unmet = dr.opaque(mi.Float64, draft.estimator.missed_share / (points * SHIFTS)) * dr.gather(
+            mi.Float64, brightest, means.pixels
+        )
+        scatter = draft.estimator.student_t * means.standard_error
+        error = dr.maximum(scatter, unmet)
         better = error < dr.gather(mi.Float64, draft.error, means.pixels)
         images = mi.Float64(draft.value), mi.Float64(draft.coverage), mi.Float64(draft.error)
         for image, column in zip(images, (means.value, means.share, error), strict=True):
@@ -81,12 +81,6 @@ def refine_by_lattices(draft: Draft) -> None:
         if not dr.any(left):
             break
         means = means.of(left)
-
-
-def _exceeded_with(chance: float) -> tuple[float, float]:
-    """Error over the standard error of the mean of all shifts that is exceeded with this `chance`, by Student's t; and
-    share of pixel × pupil, times the number of points, that all points miss with it."""
-    return float(stdtrit(SHIFTS - 1, 1 - chance / 2)), -math.log(chance)
 
 
 def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]) -> Mask:

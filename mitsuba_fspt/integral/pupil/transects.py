@@ -14,7 +14,7 @@ from ...jit.batches import batches
 from ...jit.loops import repeat
 from ...jit.pixel_grid import COVERAGE_ROUNDING, parted
 from ...jit.tables import Table
-from ..quadrature import FLOAT32_FLOOR
+from ..estimator import Estimator
 from . import node_rules
 from .draft import Draft
 from .jumps import integrate_transect
@@ -27,10 +27,6 @@ if TYPE_CHECKING:
 # Lines of sight that pixels which take these levels are expected to take, but no more than a quarter of the most.
 HARD = {1: 600, 3: 1 << 14}
 DARK_LEVELS = 3  # levels of transects that are taken while no line of sight of the image has met light
-# Where at least this share of the transects across a sharp edge crosses several edges, as at corners and on texels, a
-# corner may lie between two transects, and their order is lower by this factor. Where fewer do, as where a smooth
-# outline touches a transect, that adds less than an eighth to the error.
-SEVERAL_SHARE, SEVERAL_ORDER = 1 / 16, 2 / 3
 FAR = 1e30  # depth [mm] at which larger ones are clipped; the blur of an edge is finite there
 
 
@@ -102,20 +98,17 @@ class _Refinement:
             if level == 0:
                 draft.spread_error(where & ~means.done)
             self.where = where = where & means.done
-        # The outline of a dark body counts only where lines of sight meet light, by more than float32 rounds.
-        lit = means.value > dr.opaque(mi.Float64, FLOAT32_FLOOR) * draft.peak
+        # The outline of a dark body counts only where some lines of sight meet light.
+        lit = means.value > dr.opaque(mi.Float64, self.estimator.faint) * draft.peak
         first_met = where & means.jumps & lit & ~self.has_jump
         self.has_jump |= first_met
         self.smooth = self.smooth & where & ~self.has_jump
         value, coverage = self._smooth_by_nodes(level)
         change = dr.abs(value - self.value)
         if level == 0:
-            remaining = self._after_first(first_met, change, parted(coverage))
-            # Pixels that another solution gives take no transects; their outlines count as jumps here.
-            around = draft.missed_edge_error(first_met | (draft.outline & ~draft.computed))
+            remaining, around = self._after_first(first_met, change, parted(coverage))
         else:
-            remaining = self._after_later(level, first_met, change, len(rule))
-            around = draft.near_edge(dr.select(first_met, change, 0))
+            remaining, around = self._after_later(level, first_met, change, len(rule))
             self.smooth = self.smooth & (value > 0)  # where all is dark, only transects detect a small body
         # An edge may reach into pixels around whose transects have crossed no jump.
         around = dr.select((self.has_jump & where) | ~draft.computed, 0, around)
@@ -169,34 +162,45 @@ class _Refinement:
         blurred = dr.maximum(share * near, dr.select(met_before, 0, with_jump))
         return dr.select(self.edges.sharp, near, blurred)
 
-    def _after_first(self, first_met: Mask, change: PixelArray, silhouette: Mask) -> PixelArray:
-        """Error that remains after the first transects.
+    def _after_first(self, first_met: Mask, change: PixelArray, silhouette: Mask) -> tuple[PixelArray, PixelArray]:
+        """Error that remains after the first transects, and error of pixels around a jump, which may have missed it.
 
-        Two transects that agree suffice on a silhouette, which coverage shows too, but not on a step of J_n. Without a
-        jump there may be a dim spot far below a pixel, or the edges of a coarse mesh.
+        Two transects that agree with the nodes suffice on a silhouette, which coverage shows too, but not on a step of
+        J_n.
         """
-        at_jump = self.means.scatter
+        draft, estimator = self.draft, self.estimator
+        at_jump = dr.maximum(estimator.first_ratio * change, self.means.scatter)
         at_jump = dr.select(silhouette, at_jump, self._above_tolerance(at_jump))
-        elsewhere = dr.select(parted(self.draft.coverage), self.draft.error, self.draft.roughness)
-        return dr.select(first_met, at_jump, dr.maximum(self.estimator.nodes_ratio * change, elsewhere))
+        elsewhere = dr.select(parted(draft.coverage), draft.error, draft.roughness)
+        elsewhere = dr.maximum(estimator.nodes_ratio * change, elsewhere)
+        # Pixels that another solution gives take no transects; their outlines count as jumps here.
+        jumps = first_met | (draft.outline & ~draft.computed)
+        return dr.select(first_met, at_jump, elsewhere), draft.missed_edge_error(jumps)
 
-    def _after_later(self, level: int, first_met: Mask, change: PixelArray, count: int) -> PixelArray:
-        """Error that remains after a later level.
+    def _after_later(
+        self, level: int, first_met: Mask, change: PixelArray, count: int
+    ) -> tuple[PixelArray, PixelArray]:
+        """Error that remains after a later level, and error around pixels that this level changed beyond their error.
 
         The smaller the change of the value relative to the error before, the smaller the error that remains; but the
         change counts as no smaller than the order of convergence predicts, as two wrong values may agree by chance.
         Where a jump is crossed for the first time another level follows, as earlier changes do not bound its error.
         """
         before, estimator = self.remaining, self.estimator
-        fewer, order, most = self.count / count, estimator.order, estimator.ratio
-        one, several = (dr.opaque(mi.Float64, fewer**own) for own in (order, SEVERAL_ORDER * order))
-        assumed = dr.maximum(change, before * dr.select(self.edges.sharp & self.means.several, several, one))
-        ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), 1, most)
+        least, most = estimator.least_ratio, estimator.most_ratio
+        fewer = self.count / count
+        one, several = (dr.opaque(mi.Float64, fewer**order) for order in (estimator.order, estimator.several_order))
+        least_change = before * dr.select(self.edges.sharp & self.means.several, several, one)
+        assumed = dr.maximum(change, least_change)
+        ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), least, most)
         remaining = dr.maximum(assumed * ratio, self.means.scatter)
         if level <= node_rules.SMOOTH_LEVELS:
             # On smooth pixels the next node rule changes the value by less than this one did.
             remaining = dr.select(self.smooth, estimator.step_ratio * change, remaining)
-        return dr.select(first_met, self._above_tolerance(remaining), remaining)
+        remaining = dr.select(first_met, self._above_tolerance(remaining), remaining)
+        expected = dr.maximum(dr.opaque(mi.Float64, estimator.unexpected) * before, self.draft.tolerance)
+        unexpected = self.where & (change > expected)
+        return remaining, self.draft.near_edge(dr.select(first_met | unexpected, change, 0))
 
 
 # ---------------------------------------------------------------------- direction and blur of edges
@@ -264,7 +268,7 @@ class Means:
 
     value, coverage : mean radiance on film [W/mm²/sr], share of lines of sight that meet a glowing surface
     jumps : True where a transect crosses a jump
-    several : True where a share of the transects, `SEVERAL_SHARE`, crosses more than one
+    several : True where a share of the transects, `several_share`, crosses more than one
     scatter : error of the value that follows from the differences between transects [W/mm²/sr]
     blur : signed radius of the most blurred edge that a transect crosses, 0 without one [pixels]
     done : False on pixels that the deadline left out; None if there are none
@@ -290,7 +294,7 @@ def apply_transects(
         if count and draft.progress.deadline.passed():
             break
         each = _along_transects(draft, part, edges, rule, table, along)
-        of_part = _over_transects(part, edges, rule, table, each)
+        of_part = _over_transects(part, edges, rule, table, each, draft.estimator)
         for field in fields(_OfPixels):
             dr.scatter(getattr(found, field.name), getattr(of_part, field.name), part)
         dr.eval(found)
@@ -304,7 +308,8 @@ def apply_transects(
         dr.scatter(done, mi.Bool(True), touched)
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = found.squares - found.value * found.value
-    blurred = estimator.scatter * dr.safe_sqrt(variance - found.trend) / number
+    spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
+    blurred = spread * dr.safe_sqrt(variance - found.trend) / number
     # A sharp edge slants: each transect crosses a part of its own. A second edge may lie between two of them.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, found.between)
@@ -312,7 +317,7 @@ def apply_transects(
         found.value,
         found.coverage,
         jumps=found.split > 0,
-        several=found.several >= SEVERAL_SHARE * number,
+        several=found.several >= estimator.several_share * number,
         scatter=dr.select(edges.sharp, sharp, blurred),
         blur=found.blur,
         done=done,
@@ -373,8 +378,8 @@ def _along_transects(
     phase = table.gather("phase", number)
     curve = transect(draft.centres(pixel), angle, blur, place, dr.opaque(mi.Float, float(draft.area)))
     outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
-    steep = draft.estimator.steep
-    value, coverage, jumps, depth, rays = integrate_transect(draft.view, curve, phase, along, outline, steep)
+    least, steep = mi.Float(draft.estimator.least_jump * draft.tolerance), draft.estimator.steep
+    value, coverage, jumps, depth, rays = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
     # The edge of a weak reflection beside nothing has no depth.
     has_depth = (jumps > 0) & dr.isfinite(depth)
     blur = mi.Float(dr.select(has_depth, draft.camera.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
@@ -389,6 +394,7 @@ def _over_transects(
     rule: node_rules.Transects,
     table: Table,
     found: _OfTransects,
+    estimator: Estimator,
 ) -> _OfPixels:
     """Results over the transects of each pixel of `part`, from those of all its transects."""
     count = dr.opaque(mi.UInt32, len(rule))
@@ -417,17 +423,17 @@ def _over_transects(
         **sums,
         trend=sum(map(dr.square, trends)),
         blur=mi.Float64(_most_blurred(*blurs)),
-        between=_second_edge(dr.width(part), rule, found.value),
+        between=_second_edge(dr.width(part), rule, found.value, estimator),
     )
 
 
-def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float) -> PixelArray:
+def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float, estimator: Estimator) -> PixelArray:
     """Error of a second edge between two transects of each pixel, from the `value` of all transects, pixel by pixel.
 
     In the order of transects across a sharp edge, their position along it increases, so that a second edge gives two
-    second differences d that are much larger than the others. √(Σd² − 2 (Σ|d|)²/n) is then √2 times the jump, of which
-    half is the error at most; it is 0 where all differences vary alike. On a net, where the edge is nearly along many
-    transects, it cuts all but one of them evenly: the error is at most the largest |d| over n.
+    second differences d that are much larger than the others. √(Σd² − 2 (Σ|d|)²/n) is then √2 times the jump; it is 0
+    where all differences vary alike. On a net, where the edge is nearly along many transects, it cuts all but one of
+    them evenly: the error is at most the largest |d| over n.
     """
     count = len(rule)
     first = dr.arange(mi.UInt32, pixels) * dr.opaque(mi.UInt32, count)
@@ -439,5 +445,5 @@ def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float) -> Pi
 
     zero = mi.Float64(0)
     squares, sizes, most = repeat(dr.opaque(mi.UInt32, count - 2), add, zero, zero, zero)
-    jumps = 0.5 * dr.safe_sqrt(squares - dr.opaque(mi.Float64, 2 / count) * sizes * sizes)
+    jumps = estimator.second_edge * dr.safe_sqrt(squares - dr.opaque(mi.Float64, 2 / count) * sizes * sizes)
     return (dr.minimum(jumps, most) if rule.is_net else jumps) / dr.opaque(mi.Float64, count)
