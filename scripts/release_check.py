@@ -44,7 +44,7 @@ LONGEST, LONGEST_SUITE = 1800.0, 4 * 3600.0  # seconds of a command, and of the 
 COPIED = ("tests", "scenes", "examples", "scripts", "docs", "pyproject.toml", "README.md", "CONTRIBUTING.md")
 SHORT = ("tests/phantom/test_phantom.py", "tests/phantom/test_framed_scene.py", "tests/optics/test_thin_lens.py")
 # Tests of the checkout itself: its pages, its scripts, its git.
-OF_CHECKOUT = ("tests/test_docs.py", "tests/scripts", "tests/cli/test_verbs.py")
+OF_CHECKOUT = ("tests/test_docs.py", "tests/test_release.py", "tests/scripts", "tests/cli/test_verbs.py")
 IN_WHEEL = (
     "mitsuba_fspt/py.typed",
     "mitsuba_fspt/__init__.pyi",

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from references.random_scenes import random_scene
 from small_scenes import (
     FOCUS,
     RADIUS,
     SCENES,
     SIDE,
+    attribute,
     camera_scene,
     disk,
+    glow,
     lens,
     load_scene,
     look_at_crop,
     mi,
     power,
     world_scene,
+    write_ply,
 )
 
 import mitsuba_fspt as fspt
@@ -32,6 +36,23 @@ def solid_angle(x, y, z, radius=RADIUS):
     rho, turn = radius * np.sqrt((node[:, None] + 1) / 2), 2 * np.pi * np.arange(64) / 64
     d2 = (rho * np.cos(turn) - x) ** 2 + (rho * np.sin(turn) - y) ** 2 + z**2
     return np.pi * radius**2 * (weight / 2) @ (z / d2**1.5).mean(axis=1)
+
+
+def test_the_flat_end_of_a_cylinder_along_a_row_of_pixels(tmp_path):
+    """An end that the lens sees edge-on: the sharp edge of the side, and nothing but the curve of the rim behind it.
+
+    Expected: the pupil form and the surface form, which share no samples, agree within both errors. Seen to fail, with
+    2 % of the brightest pixel missing at 0.1 % stated, where estimates of transects at a sharp edge were left out.
+    """
+    body = trimesh.creation.cylinder(radius=6, height=8, sections=48)
+    path = write_ply(tmp_path / "cylinder.ply", body.vertices, body.faces, vertex=np.ones(len(body.vertices)))
+    shape = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute())}
+    scene = world_scene(shape, sensor=lens((16, 16), 0.5, FOCUS, f_number=2.8))
+    look_at_crop(scene, 0, 2, 16, 3)
+    images = [fspt.render(scene, rtol=1e-3, domain=domain) for domain in ("pupil", "surface")]
+    off = np.abs(images[0].power - images[1].power)
+    assert (off <= images[0].error + images[1].error).all()
+    assert images[0].error.max() < 2e-3 * images[0].power.max()
 
 
 @pytest.mark.parametrize("seed", range(6))
