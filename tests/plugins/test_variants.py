@@ -58,12 +58,13 @@ print(json.dumps(all_pictures()))
 
 def start(script, *arguments, environ=None):
     """A fresh process that runs `script` with the tests' folder on its path."""
+    paths = os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))
     return subprocess.Popen(
         [sys.executable, "-c", PRELUDE + script, *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": str(TESTS), **(environ or {})},
+        env={**os.environ, "PYTHONPATH": paths, **(environ or {})},
     )
 
 
