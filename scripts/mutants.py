@@ -565,6 +565,9 @@ MUTANTS = (
         "np.array([1, 0])",
         (SP3,),
     ),
+    Mutant(
+        "flow that ends at a crease", "tissue/border_curvature.py", "1 - border.near", "1 - 0 * border.near", (SP3,)
+    ),
     Mutant("curvature of the border", "tissue/light_models.py", "* curvature, self", "* 0 * curvature, self", (SP3,)),
     Mutant(
         "light along the border in J_n",

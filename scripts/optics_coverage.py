@@ -1,7 +1,7 @@
 """Coverage of the intervals of `locate` where optical coefficients are known to 10 %.
 
     python scripts/optics_coverage.py [--images series,photons] [--coefficients fitted,exact] [--placements 40]
-        [--three 40] [--photons 2e7] [-o CSV]
+        [--three 40] [--photons 2e7] [--keep FOLDER] [-o CSV]
 
 A point source of 1 W at a random place of a cylinder of 16 by 16 mm, 3 to 7 mm below its side and 4 mm or more below
 its caps, in four views of 24² pixels from the side. The true µa and µs' of each band are the nominal ones times
@@ -11,7 +11,7 @@ coefficients with `mua_sd` and `musp_sd` of 0.1, or without. J_n of the images s
 *series* : of the diffusion equation, exact; `locate` solves the same equation, with `model_error=0`, so that noise and
     coefficients alone are unknown
 *photons* : one by one (`photon_walk`) in bins of 0.5 mm, between which J_n is linear; `locate` solves SP3, whose own
-    error counts, too, and is in the intervals. With bins of 1 mm the errors are two standard deviations (rms)
+    error counts, too, and is in the intervals. `--keep` keeps the exit power by bins, for another run
 
 Columns: images, placements, and those that `locate` refused; shares of the 90 % intervals that contain x, y, z, and the
 power; rms error of the position over all directions [mm] and of the power [%]; rms of the errors over their stated sd,
@@ -56,7 +56,7 @@ from photon_walk import Body, Emitter, Optics, exit_power  # noqa: E402
 Array = NDArray[np.float64]
 Place = tuple[float, float, float]
 Key = tuple[str, int, str]
-Truth = Callable[[Array, float, float, Place], Array]
+Truth = Callable[[Array, float, float, Place, int], Array]
 ROOT = Path(__file__).resolve().parent.parent
 RADIUS, HEIGHT, INDEX = 8.0, 16.0, 1.37
 VIEWS = [0, 90, 180, 270]
@@ -116,18 +116,31 @@ def bin_of(p: mi.Point3f) -> mi.UInt32:
     return dr.select(on_cap, cap, row * TURNS + turn)
 
 
-def series_exitance(points: Array, mua: float, musp: float, at: Place) -> Array:
-    """J_n [W/mm²] of 1 W at the points (V, 3) of the surface, of the diffusion equation."""
+def series_exitance(points: Array, mua: float, musp: float, at: Place, seed: int = 0) -> Array:
+    """J_n [W/mm²] of 1 W at the points (V, 3) of the surface, of the diffusion equation; of any seed."""
     far, angle = math.hypot(*at[:2]), math.atan2(at[1], at[0])
     turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     body = Phantom(RADIUS, HEIGHT, mua, musp, INDEX, source_x=far, source_z=at[2], source_diameter=0.0)
     return exitance(body, points @ turn.T)
 
 
-def photon_exitance(points: Array, mua: float, musp: float, at: Place, photons: int) -> Array:
+def photon_power(mua: float, musp: float, at: Place, seed: int, photons: int, keep: Path | None) -> Array:
+    """Exit power [W] of 1 W by bins; kept as a file in the folder `keep`."""
+    file = keep / f"{photons}_{seed}_{mua:.9g}_{musp:.9g}.npy" if keep else None
+    if file and file.exists():
+        return np.asarray(np.load(file), np.float64)
+    optics, count = Optics(mua, musp, INDEX), (ROWS + 2 * RINGS) * TURNS
+    power = exit_power(Body(RADIUS, HEIGHT), optics, Emitter(at), bin_of, count, photons, seed).mean(axis=0)
+    if file:
+        np.save(file, power)
+    return np.asarray(power)
+
+
+def photon_exitance(
+    points: Array, mua: float, musp: float, at: Place, seed: int, photons: int, keep: Path | None
+) -> Array:
     """J_n [W/mm²] of 1 W at the points (V, 3) of the surface, linear between the bins' centres."""
-    count = (ROWS + 2 * RINGS) * TURNS
-    power = exit_power(Body(RADIUS, HEIGHT), Optics(mua, musp, INDEX), Emitter(at), bin_of, count, photons).mean(axis=0)
+    power = photon_power(mua, musp, at, seed, photons, keep)
     ring = np.pi * RADIUS**2 / RINGS**2 * (2 * np.arange(RINGS) + 1) / TURNS
     area = np.concatenate([np.full(ROWS, 2 * np.pi * RADIUS * HEIGHT / ROWS / TURNS), ring, ring])
     exitance = power.reshape(-1, TURNS) / area[:, None]
@@ -156,14 +169,13 @@ def replicate(
 ) -> dict[str, Array] | None:
     """Errors of one placement, by `model` from images of J_n of `truth`; None where `locate` refuses it."""
     rng = np.random.default_rng(seed)
-    at, images, true = place(rng), {}, {}
+    at, images, true = place(rng), {}, dict[str, float]()
     for name in names:
-        share, mua, musp = BANDS[name]
-        true[f"{name}.mua"], true[f"{name}.musp"] = np.array([mua, musp]) * (
-            1 + SD * rng.standard_normal(2).clip(-3, 3)
-        )
-        lit = truth(setup.surface.vertices, true[f"{name}.mua"], true[f"{name}.musp"], at)
-        power = share * setup.matrix.forward(lit)
+        factors = 1 + SD * rng.standard_normal(2).clip(-3, 3)
+        true[f"{name}.mua"], true[f"{name}.musp"] = (float(value) for value in factors * BANDS[name][1:])
+    for number, name in enumerate(names):
+        lit = truth(setup.surface.vertices, true[f"{name}.mua"], true[f"{name}.musp"], at, 1000 * seed + number)
+        power = BANDS[name][0] * setup.matrix.forward(lit)
         per_watt = ELECTRONS / power.max()
         counted = rng.poisson(power * per_watt) + READ_NOISE * rng.standard_normal(power.shape)
         metadata = {"electrons_per_watt": per_watt, "read_noise": READ_NOISE}
@@ -198,13 +210,10 @@ def replicate(
 
 
 def rows_of(
-    setup: Setup, names: tuple[str, ...], fitted: bool, images: str, photons: int, placements: int
+    setup: Setup, names: tuple[str, ...], fitted: bool, images: str, truth: Truth, placements: int
 ) -> Iterator[dict[str, object]]:
     """A line of the table, after each placement anew."""
-    truth, model = {
-        "series": (series_exitance, "diffusion"),
-        "photons": (partial(photon_exitance, photons=photons), "sp3"),
-    }[images]
+    model = {"series": "diffusion", "photons": "sp3"}[images]
     kept = list[dict[str, Array]]()
     for seed in range(placements):
         one = replicate(setup, names, fitted, truth, model, seed)
@@ -246,6 +255,7 @@ def main() -> None:
     options.add_argument("--placements", type=int, default=40, help="with one band")
     options.add_argument("--three", type=int, default=40, help="placements with three bands")
     options.add_argument("--photons", type=float, default=2e7, help="of each image")
+    options.add_argument("--keep", type=Path, help="folder in which exit powers of photons are kept")
     options.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "optics_coverage.csv")
     given = options.parse_args()
     logging.getLogger("mitsuba_fspt").setLevel(logging.ERROR)
@@ -255,11 +265,13 @@ def main() -> None:
             rows = {(one["images"], int(one["bands"]), one["coefficients"]): dict(one) for one in csv.DictReader(file)}
     fits = [fitted for fitted, name in ((True, "fitted"), (False, "exact")) if name in given.coefficients.split(",")]
     cases = [(names, fitted) for names in (("green",), tuple(BANDS)) for fitted in fits]
+    walk = partial(photon_exitance, photons=int(given.photons) // 32 * 32, keep=given.keep)
+    truths: dict[str, Truth] = {"series": series_exitance, "photons": walk}
     with tempfile.TemporaryDirectory() as folder:
         setup = Setup.of(Path(folder))
         for images, (names, fitted) in itertools.product(given.images.split(","), cases):
             placements = given.placements if len(names) == 1 else given.three
-            for line in rows_of(setup, names, fitted, images, int(given.photons) // 32 * 32, placements):
+            for line in rows_of(setup, names, fitted, images, truths[images], placements):
                 rows[images, len(names), COEFFICIENTS[fitted]] = line
                 print("  ".join(f"{name}={value}" for name, value in line.items()), flush=True)
                 write_rows(given.output, rows.values())

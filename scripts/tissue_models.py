@@ -2,6 +2,7 @@
 
     python scripts/tissue_models.py [--photons 8e6] [--edge 1.5] [--page docs/emission.md] [-o docs/tissue_models.csv]
     python scripts/tissue_models.py --border [--photons 3e6]
+    python scripts/tissue_models.py --creases [--photons 4e6]
     python scripts/tissue_models.py --errors
 
 Lengths of the phantoms are in mean free paths of µs' = 1/mm. Each line is one phantom: body, depth of the source's
@@ -17,6 +18,10 @@ squares of the squares of c0 by t², and of c1 and c2 by s².
 `--border` prints β, the fall of the extrapolation length with the curvature of the border that Eq. M.48 takes from
 photons, of an index and an anisotropy g: from spheres with a source in the middle, as the length with which the SP3
 equations give the photons' exit power.
+
+`--creases` prints the deviation of J_n of both models from photons in strips of a quarter of a mean free path from the
+rim of a cylinder of 8 by 16, on its side and on its cap, a source 4 below both; and the least squares of e in e exp(-d)
+for the mean deviation of strips of two mean free paths, Eq. M.51.
 """
 
 from __future__ import annotations
@@ -255,7 +260,7 @@ def print_errors(path: Path) -> None:
         basis = np.column_stack([np.ones_like(depth), (absorption * depth) ** 2])
         total = np.sqrt(nnls(basis / t2.mean(), t2 / t2.mean())[0])
         shape = np.sqrt(nnls(np.column_stack([depth**-2.0, absorption**2]) / s2.mean(), s2 / s2.mean())[0])
-        stated = ModelError(*total, *shape)
+        stated = ModelError(*total, *shape, MODEL_ERRORS[model].crease)
         t, s = np.transpose([stated.deviations(d, a) for d, a in zip(depth, absorption, strict=True)])
         used = np.transpose([MODEL_ERRORS[model].deviations(d, a) for d, a in zip(depth, absorption, strict=True)])
         print(model, stated, f"rms over stated {np.sqrt(np.mean(t2 / t**2)):.2f} {np.sqrt(np.mean(s2 / s**2)):.2f};")
@@ -280,6 +285,39 @@ def print_border(photons: int) -> None:
             for radius, mua in ((6.0, 0.02), (12.0, 0.02), (24.0, 0.006)):
                 value, error = curvature_of(n, g, radius, mua, photons if g == 0 else photons // 160 * 32)
                 print(f"n {n:g}  g {g:g}  R {radius:g}  beta {value:.3f} ± {error:.3f}", flush=True)
+
+
+def print_creases(photons: int) -> None:
+    """Print the deviation of J_n near the rim of a cylinder [%], and e of Eq. M.51."""
+    body, at, strips = Body(8, 16), (4.0, 0.0, 4.0), 8
+    distance = (np.arange(strips) + 0.5) / 4
+
+    def bin_of(p: mi.Point3f) -> mi.UInt32:
+        below, inner = body.height / 2 - p.z, body.radius - dr.sqrt(p.x * p.x + p.y * p.y)
+        on_cap = below < 1e-4
+        depth = mi.UInt32(dr.select(on_cap, inner, below) * 4)
+        return dr.select(depth < strips, depth + dr.select(on_cap, mi.UInt32(strips), mi.UInt32(0)), 2 * strips)
+
+    turn, wt = (np.arange(96) + 0.5) * math.pi / 48, math.pi / 48
+    for n in (1.0, 1.37, 1.5):
+        batches = exit_power(body, Optics(0.05, 1.0, n), Emitter(at), bin_of, 2 * strips + 1, photons)
+        power = batches.mean(axis=0)[:-1].reshape(2, strips)
+        error = batches.std(axis=0, ddof=1)[:-1].reshape(2, strips) / math.sqrt(BATCHES)
+        print(f"n {n:g}: standard error of the photons", np.round(100 * error / power, 1).tolist())
+        for model in MODELS:
+            for edge in (1.5, 0.75):
+                mesh = cylinder_tetrahedra(body.radius, body.height, edge)
+                solution = solve(mesh, [Medium(0.05, 1.0, n)], [Source(Sphere(at))], model=model)
+                found = np.zeros((2, strips))
+                for strip in range(strips):
+                    for d, wd in zip(*_nodes(strip / 4, (strip + 1) / 4), strict=True):
+                        for cap in (0, 1):
+                            radius, up = body.radius - cap * d, body.height / 2 - (1 - cap) * d
+                            ring = [radius * np.cos(turn), radius * np.sin(turn), np.full(len(turn), up)]
+                            found[cap, strip] += wd * wt * radius * solution.exitance_at(np.column_stack(ring)).sum()
+                deviation, profile = found / power - 1, np.exp(-distance)
+                least = math.sqrt((deviation**2).mean(axis=0) @ profile**2 / (profile**2 @ profile**2))
+                print(f"  {model}, edge {edge:g}: e {least:.3f};", np.round(100 * deviation, 1).tolist(), flush=True)
 
 
 def curvature_of(n: float, g: float, radius: float, mua: float, photons: int) -> tuple[float, float]:
@@ -309,11 +347,15 @@ def main() -> None:
     options.add_argument("--page", type=Path, default=ROOT / "docs" / "emission.md", help="page with the table")
     options.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "tissue_models.csv")
     options.add_argument("--border", action="store_true", help="print β, and end")
+    options.add_argument("--creases", action="store_true", help="print J_n near the rim of a cylinder, and end")
     options.add_argument("--errors", action="store_true", help="print the numbers of the stated errors, and end")
     given = options.parse_args()
     photons = int(given.photons) // BATCHES * BATCHES
     if given.errors:
         print_errors(given.output)
+        return
+    if given.creases:
+        print_creases(photons)
         return
     if given.border:
         print_border(photons)

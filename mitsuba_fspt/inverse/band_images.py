@@ -108,8 +108,12 @@ class BandImages:
     @cached_property
     def points(self) -> Array:
         """(N, 3) mean point of the surface [mm] that each pixel sees."""
-        seen = np.asarray(self.transport.sum(axis=1)).ravel()
-        return np.asarray(self.transport @ self.surface.vertices) / seen[:, None]
+        return np.asarray(self.transport @ self.surface.vertices) / self._seen[:, None]
+
+    @cached_property
+    def _seen(self) -> Array:
+        """(N,) power on the pixels from J_n = 1 [mm²]."""
+        return np.asarray(self.transport.sum(axis=1)).ravel()
 
     def depth(self, position: Array) -> float:
         """Distance of a position (3,) from the border [mm]."""
@@ -122,15 +126,26 @@ class BandImages:
         mesh = self.tissue.mesh
         return mesh.vertices[mesh.border]
 
+    @cached_property
+    def crease_error(self) -> Array:
+        """(N,) relative error of J_n near creases by the equation itself, e η of Eq. M.51, a mean over each pixel."""
+        return MODEL_ERRORS[self.tissue.model].crease * self._near_creases
+
+    @cached_property
+    def _near_creases(self) -> Array:
+        """(N,) η: 1 on creases of the border, 0 far away."""
+        near = 1 - self.tissue.mesh.on_border_at(self.tissue.border_shape.along, *self._places)
+        return np.asarray(self.transport @ near) / self._seen
+
     def model_error(self, position: Array, radius: float = 0.0) -> Array:
-        """(N, 3) relative errors of a source's image by the equation itself, one standard deviation each (Eq. M.51)."""
+        """(N, 4) relative errors of a source's image by the equation itself, one standard deviation each (Eq. M.51)."""
         mesh = self.tissue.mesh
         distance = np.linalg.norm(self.points - position, axis=1)
         depth = self.depth(position)
         medium = self.tissue.media[int(mesh.region[mesh.locate(position[None])[0]][0])]
         free = (depth - radius) * (medium.mua + medium.musp)
         cosine = np.minimum(depth / distance, 1.0)
-        return MODEL_ERRORS[self.tissue.model].columns(cosine, free, medium.mua / medium.musp)
+        return MODEL_ERRORS[self.tissue.model].columns(cosine, free, medium.mua / medium.musp, self._near_creases)
 
     def exitance(self, position: Array, radius: float = 0.0) -> Array:
         """(V,) J_n [1/mm²] at the surface's vertices in this band, per watt of a source over all bands.

@@ -321,7 +321,8 @@ class SourceFit:
     def by_model(self, found: PointSources, covariance: Array) -> Array:
         """(4K, 4K) covariance of the `values` by the errors of the equation itself (Eq. M.51).
 
-        The fit does not weigh pixels by them: they are not known well enough to take the source from what they leave.
+        But for what is near creases, the fit does not weigh pixels by them: they are not known well enough to take the
+        source from what they leave.
         """
         change = covariance @ (found.slopes.T @ found.noise.over(self.model_errors(found)))
         return np.asarray(change @ change.T)
@@ -393,9 +394,15 @@ class SourceFit:
         return replace(found, powers=powers, noise=noise, cost=length**2)
 
     def _noise(self, found: PointSources) -> PixelNoise:
-        """Noise of the pixels for the fitted signal, with the numerical error of the matrices (Eq. M.24)."""
+        """Noise of the pixels for the fitted signal, with the numerical error of the matrices (Eq. M.24) and the error
+        of the equation near creases (Eq. M.51).
+        """
         each = zip(self.bands, found.exitance, strict=True)
-        return self._noise_of(found, np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each]))
+        sigma = np.concatenate([band.sigma(exitance @ found.powers) for band, exitance in each])
+        if self.settings.model_error:
+            crease = np.concatenate([band.crease_error for band in self.bands])
+            sigma = np.hypot(sigma, self.settings.model_error * crease * found.signal)
+        return self._noise_of(found, sigma)
 
     def _noise_of(self, found: PointSources, sigma: Array) -> PixelNoise:
         """Noise with this σ and what factors and coefficients change of the light of `found`; of no light, nothing."""
@@ -424,9 +431,9 @@ class SourceFit:
             return np.empty((len(self.power), 0))
         columns, count = list[Array](), len(self.bands)
         for k, power in enumerate(found.powers):
-            common = np.zeros((len(self.power), 3))
-            for band, part in zip(self.bands, self.parts, strict=True):
-                relative = band.model_error(found.positions[k], float(found.radii[k]))
+            errors = [band.model_error(found.positions[k], float(found.radii[k])) for band in self.bands]
+            common = np.zeros((len(self.power), errors[0].shape[1]))
+            for relative, part in zip(errors, self.parts, strict=True):
                 common[part] = self.settings.model_error * power * found.columns[part, k, None] * relative
                 if count > 1:
                     own = np.zeros_like(common)

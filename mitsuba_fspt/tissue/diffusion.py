@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..optics.media import Medium, Source
 from ..runtime.errors import FluxError
-from .border_curvature import mean_curvature
+from .border_curvature import BorderShape
 from .elements import Elements
 from .finite_elements import Solved, System
 from .free_field import SourceField
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 LARGEST_IMBALANCE = 1e-5
-SMOOTHED = 1.0  # mean free paths over which the border's curvature is smoothed, as the radiance there follows it
+SMOOTHED = 1.0  # mean free paths over which the radiance at the border follows its curvature and creases
 
 
 def solve(
@@ -112,13 +112,16 @@ class Tissue:
             raise FluxError(
                 "solve: 'elements' are of another mesh or order. Leave them out, or give those of this mesh."
             )
-        self.curvature = np.zeros(len(mesh.vertices))
-        if self.equations.bend.any():
-            self.curvature = mean_curvature(mesh, SMOOTHED * max(1 / (m.mua + m.musp) for m in media))
+        self._shape = self.border_shape if self.equations.bend.any() else BorderShape.flat(mesh)
         self._coarse = coarse
         if repeated:
             self._coarse = (self.linear if model == "diffusion" else self._of_order_1(model)).system
-        self.system: System = System(self.elements, self.equations, self.curvature, self._coarse)
+        self.system: System = System(self.elements, self.equations, self._shape, self._coarse)
+
+    @cached_property
+    def border_shape(self) -> BorderShape:
+        """Curvature and creases of the border, over the longest mean free path."""
+        return BorderShape.of(self.mesh, SMOOTHED * max(1 / (medium.mua + medium.musp) for medium in self.media))
 
     @cached_property
     def linear(self) -> Tissue:
@@ -175,7 +178,7 @@ class Tissue:
 
     def _solution(self, fields: tuple[SourceField, ...], power: float, solved: Solved) -> TissueSolution:
         basis = self.elements.basis
-        return TissueSolution(self.mesh, basis, self.media, self.equations, self.curvature, fields, power, solved)
+        return TissueSolution(self.mesh, basis, self.media, self.equations, self._shape, fields, power, solved)
 
 
 def _free_fields(mesh: Tetrahedra, equations: Equations, sources: Sequence[Source]) -> tuple[SourceField, ...]:

@@ -130,25 +130,24 @@ class Elements:
 
     def along_border(self, factor: Array) -> csr_array:
         """∮ factor ∇_t u·∇_t v dS, (N, N), with the gradient ∇_t along the border; `factor` as for `on_border`."""
-        skfem = import_skfem()
+        border, normals = self.border, np.asarray(self.border.normals)
+        along = np.array([one[0].grad - (one[0].grad * normals).sum(axis=0) * normals for one in border.basis])
+        first, second = (np.moveaxis(each, 2, 0) for each in (along * (factor * border.dx), along))
+        shape = len(first), len(along), -1
+        return self._from_cells(border.element_dofs, first.reshape(shape) @ second.reshape(shape).swapaxes(1, 2))
 
-        def form(u: Any, v: Any, w: Any) -> Any:
-            across = (u.grad * w.n).sum(axis=0) * (v.grad * w.n).sum(axis=0)
-            return factor * ((u.grad * v.grad).sum(axis=0) - across)
-
-        return csr_array(skfem.BilinearForm(form).assemble(self.border))
+    def on_facets(self, values: Array) -> Array:
+        """(F, Q) at the quadrature points of the border's facets, linear between `values` (V,) at the vertices."""
+        x, y = self.border.X
+        corners = values[self.border.mesh.facets[:, self.border.find]]
+        return np.einsum("kf,kq->fq", corners, np.stack([1 - x - y, x, y]))
 
     @cached_property
     def border_mass(self) -> tuple[csr_array, ...]:
         """∮ u v dS [mm²] over the border of each region, (N, N)."""
-        return tuple(self.on_border(self._of_region(region)) for region in range(self.regions))
+        return tuple(self.on_border(self.of_region(region)) for region in range(self.regions))
 
-    @cached_property
-    def border_stiffness(self) -> tuple[csr_array, ...]:
-        """∮ ∇_t u·∇_t v dS [no unit] over the border of each region, (N, N)."""
-        return tuple(self.along_border(self._of_region(region)) for region in range(self.regions))
-
-    def _of_region(self, region: int) -> Array:
+    def of_region(self, region: int) -> Array:
         """1 on the facets of a region, (F, 1)."""
         return (self.facet_region == region).astype(np.float64)[:, None]
 

@@ -7,7 +7,8 @@ and each component i, where repeated j are summed over,
         = -∮ (H_ij φ_fj + c_fi ∂φ_fi/∂n) v dS - ∫ [(c_i - c_fi) ∇φ_fi·∇v + (C_ij - C_fij) φ_fj v] dV,
 
 where the last integral runs over the regions whose optics differ from the source's. For i = 1 the border has also
-∮ τ ∇_t w_1·∇_t v dS on the left and -∮ τ ∇_t φ_f1·∇_t v dS on the right.
+∮ τ ∇_t w_1·∇_t v dS on the left and -∮ τ ∇_t φ_f1·∇_t v dS on the right. τ, a and b are those of `light_models` times
+the share of `border_curvature` that is left near creases.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from scipy.sparse import block_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from ..runtime.errors import FluxError
+from .border_curvature import BorderShape
 from .elements import SYMMETRIC, Elements, import_skfem
 from .free_field import SourceField
 from .light_models import Equations
@@ -69,25 +71,23 @@ class _Load:
 class System:
     """Discrete problem of the `equations` of the mesh's regions on its `elements`.
 
-    curvature : of the border at the vertices [1/mm]
+    shape : of the border
     coarse : system of linear elements of these equations or similar ones, whose solutions make iterations fewer: for
         many sources, since its factors take longer than the solution for a few; None without
     """
 
     def __init__(
-        self, elements: Elements, equations: Equations, curvature: Array, coarse: System | None = None
+        self, elements: Elements, equations: Equations, shape: BorderShape, coarse: System | None = None
     ) -> None:
         self.elements, self.equations = elements, equations
         self._coarse = coarse
-        self.outward = self._outward(elements.facet_region, curvature)
+        self._shape = shape
+        self.outward = self._outward(elements.facet_region)
 
-    def _outward(self, region: Index, curvature: Array) -> Array:
+    def _outward(self, region: Index) -> Array:
         """H at the quadrature points of the boundary facets, (m, m, F, Q)."""
-        border = self.elements.border
-        x, y = border.X
-        corners = curvature[border.mesh.facets[:, border.find]]
-        values = np.einsum("kf,kq->fq", corners, np.stack([1 - x - y, x, y]))
-        matrix = self.equations.border_at(np.repeat(region, len(x)), values.ravel())
+        values = self.elements.on_facets(self._shape.curvature)
+        matrix = self.equations.border_at(np.repeat(region, values.shape[1]), values.ravel())
         return np.asarray(np.moveaxis(matrix, 0, 2).reshape(*matrix.shape[1:], *values.shape))
 
     def solve(self, fields: Sequence[SourceField]) -> Solved:
@@ -127,7 +127,7 @@ class System:
             for i, total in enumerate(outward + flux):
                 load[i] -= elements.integrate(border, total)
             if self._has_lateral:
-                factor = self.equations.lateral[elements.facet_region, None]
+                factor = self.equations.lateral[elements.facet_region, None] * self._share
                 lateral += elements.integrate(border, np.zeros_like(outflow), factor * along)
                 through += elements.integrate(border, outward[0])
             exited += (outward[0] * border.dx).sum()
@@ -295,8 +295,19 @@ class System:
         return blocks
 
     def _along(self, factor: Array) -> csr_array:
-        """∮ factor ∇_t u·∇_t v dS, (N, N), for a factor of each region."""
-        return self._sum(factor, self.elements.border_stiffness)
+        """∮ factor s ∇_t u·∇_t v dS, (N, N), for a factor of each region, s the share that is left near creases."""
+        return self._sum(factor, self._border_stiffness)
+
+    @cached_property
+    def _border_stiffness(self) -> tuple[csr_array, ...]:
+        elements = self.elements
+        own = (elements.of_region(region) * self._share for region in range(elements.regions))
+        return tuple(elements.along_border(factor) for factor in own)
+
+    @property
+    def _share(self) -> Array:
+        """(F, Q) at the nodes of the facets."""
+        return self.elements.on_facets(self._shape.along)
 
     def _sum(self, factors: Array, matrices: Sequence[csr_array]) -> csr_array:
         """Σ over the regions."""

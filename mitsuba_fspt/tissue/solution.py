@@ -12,6 +12,7 @@ from ..optics.media import Medium
 from ..phantom.phantom import Phantom
 from ..phantom.surface_mesh import face_areas
 from ..runtime.errors import FluxError
+from .border_curvature import BorderShape
 from .border_surface import nearest_points, refined_border
 from .finite_elements import Solved
 from .fluence_volume import Volume, voxel_box
@@ -33,14 +34,14 @@ NEARBY = 0.5  # barycentric distance from a cell beyond which straight edges are
 class TissueSolution:
     """Solution φ: sum of the free `fields` of the sources and the rest `solved.rest` in the `basis` on `mesh`.
 
-    `media` and `equations` of the regions of the mesh; `curvature` of its border at the vertices; `source_power` [W].
+    `media` and `equations` of the regions of the mesh; `shape` of its border; `source_power` [W].
     """
 
     mesh: Tetrahedra
     basis: Any
     media: tuple[Medium, ...]
     equations: Equations
-    curvature: Array
+    shape: BorderShape
     fields: tuple[SourceField, ...]
     source_power: float
     solved: Solved
@@ -167,10 +168,7 @@ class TissueSolution:
 
     def _outward(self, cells: Index, local: Array, components: Array) -> Array:
         """H φ [W/mm²], the outward flux of each component, (m, N), from the components on the border."""
-        corners = self.mesh.cells[cells]
-        weights = np.column_stack([1 - local.sum(axis=1), local]) * self.mesh.on_border[corners]
-        weights /= weights.sum(axis=1, keepdims=True).clip(1e-300)
-        curvature = (weights * self.curvature[corners]).sum(axis=1)
+        curvature = self.mesh.on_border_at(self.shape.curvature, cells, local)
         return np.einsum("nij,jn->in", self.equations.border_at(self.mesh.region[cells], curvature), components)
 
     def _border(self, edge: float) -> tuple[Array, Index]:

@@ -165,6 +165,13 @@ class Tetrahedra:
         row = np.arange(len(cells))
         return np.where(weights[row, through] < -ROUND_OFF, self.neighbours[cells, through], -1)
 
+    def on_border_at(self, values: Array, cells: Index, local: Array) -> Array:
+        """Values (N,) at points of the border with these cells and local coordinates, from those at vertices (V,)."""
+        corners = self.cells[cells]
+        weights = np.column_stack([1 - local.sum(axis=1), local]) * self.on_border[corners]
+        weights /= weights.sum(axis=1, keepdims=True).clip(1e-300)
+        return np.asarray((weights * values[corners]).sum(axis=1))
+
     @cached_property
     def _centroids(self) -> Any:
         """Tree of the cells' centroids."""

@@ -490,10 +490,10 @@ def test_a_source_at_the_border(case):
 
 
 def test_sp3(case):
-    """Images of SP3 on a finer mesh: SP3 finds the source in its intervals, diffusion 6 sd beside it, with χ² 2.0.
+    """Images of SP3 on a finer mesh: SP3 finds the source in its intervals, diffusion 6 sd beside it, with χ² 1.4.
 
-    With its stated error the source is in the intervals of diffusion, too. Seen to fail with the model left out of the
-    tissue.
+    With its stated error the source is in the intervals of diffusion, too; pixels that see a rim then have a larger σ.
+    Seen to fail with the model left out of the tissue, and with σ of the noise alone.
     """
     sp3 = replace(case.described, model="sp3", edge=0.9)
     own = (replace(sp3.sources[0], shape=Sphere(SOURCE[:3]), power=SOURCE[3]),)
@@ -503,10 +503,11 @@ def test_sp3(case):
     assert np.abs(ratios(found, SOURCE)).max() < 3.5
     other = case.locate(images)
     assert np.abs(ratios(other, SOURCE)).max() > 5
-    assert other.chi2 > 1.7 > 1.1 > found.chi2
+    assert other.chi2 > 1.3 > 1.1 > found.chi2
     stated = fspt.locate(case.described, case.matrix, images, scene=case.surface)
     assert np.abs(ratios(stated, SOURCE)).max() < 2.5
-    np.testing.assert_allclose(stated.sources[0].position, other.sources[0].position, rtol=1e-3)
+    more = stated.sigma / other.sigma  # of pixels near the rims of the cylinder
+    assert np.nanmin(more) < 1.001 < 3 < np.nanmax(more)
     assert stated.sources[0].power_sd > 0.0075 * SOURCE[3] > other.sources[0].power_sd
 
 

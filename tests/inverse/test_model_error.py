@@ -13,16 +13,22 @@ from mitsuba_fspt.inverse.source_fit import LocationSettings, SourceFit
 
 def test_deviations():
     """By hand: t² = 0.03² + (0.5 · 0.1 · 4)², s² = (0.4/4)² + (2.5 · 0.1)²; above a depth of 1, those of 1."""
-    error = ModelError(0.03, 0.5, 0.4, 2.5)
+    error = ModelError(0.03, 0.5, 0.4, 2.5, 0.1)
     assert error.deviations(4.0, 0.1) == pytest.approx((np.hypot(0.03, 0.2), np.hypot(0.1, 0.25)))
     assert error.deviations(0.2, 0.1) == error.deviations(1.0, 0.1)
 
 
 def test_columns():
-    """A common factor, and Legendre's polynomials over (0, 1), which are orthogonal; 1 at the nearest point."""
+    """A common factor, and Legendre's polynomials over (0, 1), which are orthogonal; 1 at the nearest point.
+
+    What is near creases is an error of its own.
+    """
     x, weight = np.polynomial.legendre.leggauss(8)
     cosine = (x + 1) / 2
-    columns = ModelError(0.03, 0.0, 0.4, 0.0).columns(cosine, 4.0, 0.1)
+    near = np.linspace(0, 1, 8)
+    columns = ModelError(0.03, 0.0, 0.4, 0.0, 0.2).columns(cosine, 4.0, 0.1, near)
+    np.testing.assert_allclose(columns[:, 3], 0.2 * near)
+    columns = columns[:, :3]
     np.testing.assert_allclose(columns[:, 0], 0.03)
     np.testing.assert_allclose(
         (columns.T * weight / 2) @ columns, np.diag([0.03**2, 0.1**2 / 3, 0.1**2 / 5]), atol=1e-17

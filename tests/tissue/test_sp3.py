@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 
@@ -27,7 +28,7 @@ from mitsuba_fspt.optics.sp3_boundary import (
 )
 from mitsuba_fspt.runtime.errors import FluxError
 from mitsuba_fspt.tissue import diffusion
-from mitsuba_fspt.tissue.border_curvature import mean_curvature
+from mitsuba_fspt.tissue.border_curvature import BorderShape
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.free_field import FreeField, SourceField
 from mitsuba_fspt.tissue.light_models import equations
@@ -281,16 +282,57 @@ def test_a_ball_of_many_decay_lengths() -> None:
 
 def test_curvature_of_a_border() -> None:
     """Rationale: 1/R of a sphere, half of it of a cylinder's side, 0 of its caps; ∫ κ dS by Steiner's formula."""
-    ball = mean_curvature(ball_mesh(10, 3), 1.0)
+    ball = BorderShape.of(ball_mesh(10, 3), 1.0).curvature
     np.testing.assert_allclose(ball[ball != 0], 0.1, rtol=0.25)
     assert ball[ball != 0].mean() == pytest.approx(0.1, rel=0.02)
     mesh = cylinder_tetrahedra(15, 30, 1.5)
     across, height = np.hypot(*mesh.vertices[:, :2].T), np.abs(mesh.vertices[:, 2])
-    curvature = mean_curvature(mesh, 1.0)
+    curvature = BorderShape.of(mesh, 1.0).curvature
     np.testing.assert_allclose(curvature[(across > 14.9) & (height < 6)], 1 / 30, rtol=5e-3)
     np.testing.assert_allclose(curvature[(across < 8) & (height > 14.9)], 0, atol=1e-3)
     assert curvature[(across > 14.9) & (height > 14.9)].min() > 0.2
     assert curvature[(across < 14) & (height < 14)].max() == 0
+
+
+def test_creases_of_a_border() -> None:
+    """Rationale: along flat faces (M + ℓ² L) η = 0 is η'' = η/ℓ², so η = exp(-d/ℓ) off a crease, and s = 1 - η.
+
+    A sphere has no creases. Seen to fail with M left out.
+    """
+    mesh = cylinder_tetrahedra(15, 30, 0.75)
+    across, height = np.hypot(*mesh.vertices[:, :2].T), np.abs(mesh.vertices[:, 2])
+    share = BorderShape.of(mesh, 2.0).along
+    side = (across > 14.9) & (height > 8)
+    np.testing.assert_allclose(share[side], 1 - np.exp((height[side] - 15) / 2), atol=0.02)
+    assert share[(across > 14.9) & (height > 14.9)].max() == 0
+    assert share[(across < 14) & (height < 14)].min() == 1
+    assert (BorderShape.of(ball_mesh(10, 2), 2.0).along == 1).all()
+
+
+def test_rim_of_a_cylinder() -> None:
+    """Rationale: exit power of 1.6e7 photons in strips of 0.5 mm on both sides of a cylinder's rim, within 0.3 %.
+
+    Expected behaviour: SP3 is 9 % too low on the strip of the side at the rim, within 5 % on the others. With the flow
+    along the border as on a flat one, which takes light away from the rim on both sides, the strips at the rim are 26 %
+    too low, the next ones 9 and 10 % too high, and the exit power is 0.3 % too high: seen to fail.
+    """
+    side_photons, cap_photons = np.array([5.4589, 6.3114, 7.5261, 8.9792]), np.array([4.9785, 5.5380, 6.3539, 7.3259])
+    source = Source(Sphere((4.0, 0.0, 4.0)))
+    solution = solve(cylinder_tetrahedra(8, 16, 1.5), [Medium(0.05, 1.0, 1.37)], [source])
+    x, weight = np.polynomial.legendre.leggauss(3)
+    turn, depth = (np.arange(96) + 0.5) * np.pi / 48, 0.5 * np.arange(4)[:, None] + 0.25 * (1 + x)
+
+    def power(points: Callable[[Array, Array], list[Array]], radius: Array | float) -> Array:
+        d, angle = np.meshgrid(depth.ravel(), turn, indexing="ij")
+        values = solution.exitance_at(np.stack(points(d, angle), axis=-1).reshape(-1, 3)).reshape(4, 3, -1)
+        return np.einsum("skt,k,sk->s", values, weight / 4, np.broadcast_to(radius, depth.shape)) * np.pi / 48
+
+    side = 1e3 * power(lambda d, angle: [8 * np.cos(angle), 8 * np.sin(angle), 8 - d], 8.0)
+    cap = 1e3 * power(lambda d, angle: [(8 - d) * np.cos(angle), (8 - d) * np.sin(angle), 8 + 0 * d], 8 - depth)
+    np.testing.assert_allclose(side, side_photons, rtol=0.1)
+    np.testing.assert_allclose(cap, cap_photons, rtol=0.05)
+    np.testing.assert_allclose(side[1:], side_photons[1:], rtol=0.05)
+    assert solution.solved.exited == pytest.approx(0.27930, rel=2e-3)
 
 
 def test_shortened_length() -> None:
