@@ -34,7 +34,12 @@ def refined_border(grid: Any, cuts: int) -> tuple[Array, Index]:
 
 
 def nearest_points(points: Array, triangles: Array) -> Array:
-    """Nearest point on `triangles` (F, 3 corners, 3) to each of `points` (N, 3), shape (N, 3), all [mm].
+    """Nearest point on `triangles` (F, 3 corners, 3) to each of `points` (N, 3), shape (N, 3), all [mm]."""
+    return nearest_triangles(points, triangles)[0]
+
+
+def nearest_triangles(points: Array, triangles: Array) -> tuple[Array, Index]:
+    """Nearest point (N, 3) on `triangles` (F, 3, 3) [mm] to each of `points` (N, 3) [mm], and its triangle (N,).
 
     The result is exact if the nearest triangle is among the eight with the nearest centroids, as is the case for
     triangles of similar size.
@@ -45,8 +50,8 @@ def nearest_points(points: Array, triangles: Array) -> Array:
     candidates = cKDTree(triangles.mean(axis=1)).query(points, k=min(8, len(triangles)))[1].reshape(len(points), -1)
     each = np.repeat(points, candidates.shape[1], axis=0)
     found = closest_point(triangles[candidates.ravel()], each).reshape(*candidates.shape, 3)
-    best = np.argmin(np.linalg.norm(found - points[:, None], axis=2), axis=1)
-    return found[np.arange(len(points)), best]
+    best, row = np.argmin(np.linalg.norm(found - points[:, None], axis=2), axis=1), np.arange(len(points))
+    return found[row, best], candidates[row, best]
 
 
 def _lattice_numbers(grid: Any, facets: Index, lattice: Index, cuts: int) -> Index:

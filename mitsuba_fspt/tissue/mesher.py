@@ -10,13 +10,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.remesh import subdivide_to_size
 
 from ..phantom.formats import read_mesh
 from ..phantom.length_unit import millimetres
 from ..phantom.surface_mesh import boundary, closure
 from ..runtime.errors import BackendError, FluxError
-from .border_surface import nearest_points
+from .smooth_surface import SmoothSurface
 from .tetrahedra import Tetrahedra, require_few
 
 ENVELOPE = 20  # edge over the largest distance between mesher's border and surface; later the border is moved onto it
@@ -65,7 +64,8 @@ def read_tetrahedra(
 def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:
     """Tetrahedra with edges of about `edge` [mm] in a closed surface, `vertices` (V, 3) [mm], `faces` (F, 3).
 
-    Meshed by fTetWild; the border's vertices are moved onto the surface. The mesh differs a little from run to run.
+    Meshed by fTetWild; the border's vertices are moved onto the smooth surface through `vertices` (`smooth_surface`).
+    The mesh differs a little from run to run.
 
     Raises
     ------
@@ -116,13 +116,7 @@ def _in_temporary_folder() -> Iterator[None]:
 
 def _on_surface(mesh: Tetrahedra, vertices: Array, faces: Index) -> Tetrahedra:
     """Mesh with its border vertices moved onto the surface; `snap` of the result moves other points there."""
-    # Triangles of similar size, so that the nearest one is among the few with the nearest centroids.
-    fine, parts = subdivide_to_size(vertices, faces, mesh.edge / 2, max_iter=20)
-    surface = fine[parts]
-
-    def snap(points: Array) -> Array:
-        return nearest_points(points, surface)
-
+    snap = SmoothSurface(vertices, faces, mesh.edge / 2).nearest
     border = np.unique(boundary(mesh.vertices, mesh.cells)[0])
     moved = mesh.vertices.copy()
     moved[border] = snap(moved[border])
