@@ -1,7 +1,7 @@
 """Errors of the integral on random scenes, against an independent float64 reference.
 
     python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
-    python scripts/audit.py --ablate all|kink,slant [--scenes 3] [--seed 0] [--family spheres,plates] [--rtol 1e-3]
+    python scripts/audit.py --ablate all|order,slant [--matrix] [--scenes 3] [--seed 0] [--family …] [--rtol 1e-3]
     python scripts/audit.py --matrix [--scenes 10] [--seed 0] [--family boxes,meshes] [--rtol 1e-3] [--out docs]
 
 Scenes of every family of tests/references/random_scenes.py are rendered by `fspt_integral`. tests/references/fans.py
@@ -9,8 +9,9 @@ computes the power, with an error of its own, on 24 pixels of each: 16 where err
 edges, strong curvature of the image) and 8 random ones. A pixel counts as beyond a limit only if it exceeds the limit
 by more than the reference's error. Writes audit.csv, one row per scene, and prints the table by family.
 
-With `--ablate` the same pixels are evaluated without each threshold of `integral/estimator.py` in turn: how many are
-beyond `rtol` and beyond the stated error, and what it costs. Writes ablation.csv.
+With `--ablate` scenes are computed without each threshold of `integral/estimator.py` in turn, with `--matrix` without
+each of `ColumnRule`: how many of all pixels are beyond `rtol` and beyond the stated error, and what it costs. The image
+for a tenth of `rtol` takes the place of the reference here. Writes ablation.csv or ablation_matrix.csv.
 
 With `--matrix` the product of the transport matrix and J_n takes the place of the image, and `T.error(J)` that of its
 error, in scenes of `MESH_FAMILIES`. J_n is random on every vertex or face, or has one bright spot (`_exitance`). Writes
@@ -25,6 +26,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from unittest import mock
 
 import markdown_tables
 import numpy as np
@@ -40,6 +42,7 @@ from mitsuba_fspt.runtime.atomic_files import atomic_path
 
 LIKELY, RANDOM = 16, 8  # pixels of each scene
 SLOW = 2.0  # s: rendered once more, as kernels may have been compiled
+FINER_NODES = 1 << 14  # lines of sight a pixel of images that take the place of the reference
 GOAL, LEAST_GOAL = 0.15, 1e-5  # error of the reference: over the stated error, and over the brightest pixel
 MATRIX_GOAL = 0.05  # likewise over rtol, for products of the matrix: in its scenes lines of sight cross many faces
 LEAST_TRUE = 1e-7  # of the brightest pixel: smaller errors are rounding
@@ -110,10 +113,12 @@ def main() -> None:
     names = arguments.family.split(",") if arguments.family else list(MESH_FAMILIES if arguments.matrix else FAMILIES)
     arguments.out.mkdir(exist_ok=True)
     if arguments.ablate:
-        wanted = (
-            [field.name for field in fields(Estimator)] if arguments.ablate == "all" else arguments.ablate.split(",")
-        )
-        ablate([(family, seed) for family in names for seed in seeds], wanted, arguments.rtol, arguments.out)
+        from mitsuba_fspt.integral.surface.face_light import ColumnRule
+
+        every = [field.name for field in fields(ColumnRule if arguments.matrix else Estimator)]
+        wanted = every if arguments.ablate == "all" else arguments.ablate.split(",")
+        path = arguments.out / f"ablation{'_matrix' * arguments.matrix}.csv"
+        ablate([(one, seed) for one in names for seed in seeds], wanted, arguments.rtol, arguments.matrix, path)
         return
     audits = []
     for family in names:
@@ -272,64 +277,82 @@ def _likely(image: fspt.Image, count: int, generator: np.random.Generator) -> np
 
 @dataclass(frozen=True)
 class Ablation:
-    """Result for a number of scenes with the threshold `without` removed; '' removes none.
+    """Result for a number of scenes with the threshold `without` removed; 'nothing' removes none.
 
-    checked : number of checked pixels
+    scenes, pixels : number of scenes, and of all their pixels
     beyond, beyond_error, silent : of these beyond rtol; beyond the stated error; beyond both with less than rtol stated
-    scenes, pixels : number of scenes and of all pixels with a stated error above rtol
-    lines : number of lines of sight [million]
+    stated : pixels with a stated error above rtol
+    work : lines of sight, or images of faces for a matrix [million]
     """
 
     without: str
-    checked: int
+    scenes: int
+    pixels: int
     beyond: int
     beyond_error: int
     silent: int
-    scenes: int
-    pixels: int
-    lines: float
+    stated: int
+    work: float
 
 
-def ablate(scenes: Sequence[tuple[str, int]], names: Sequence[str], rtol: float, out: Path) -> None:
-    """Compute the pixels of scenes, given by family and seed, with one of these thresholds removed at a time."""
+Computed = tuple[np.ndarray, np.ndarray, float]  # power and error [W], work
+
+
+def ablate(scenes: Sequence[tuple[str, int]], names: Sequence[str], rtol: float, matrix: bool, path: Path) -> None:
+    """Compute scenes, given by family and seed, with one of these thresholds removed at a time; writes a table."""
     backend.ensure_variant()
     import mitsuba as mi
 
     mi.set_log_level(mi.LogLevel.Error)
-    integrator = mi.load_dict({"type": "fspt_integral"})
-    cases = []
+    compute = _product_without if matrix else _image_without
+    found: dict[str, list[tuple[float, ...]]] = {name: [] for name in ("nothing", *names)}
     for family, seed in scenes:
-        made = random_scene(family, seed)
-        image = fspt.render(made.scene(), method="integral", rtol=rtol, pixel=made.reference.pixel)
-        picked = _picked(image, LIKELY, RANDOM)
-        cases.append(
-            (
-                made,
-                made.scene(),
-                picked,
-                *_reference(made, picked, GOAL * rtol * np.full(len(picked), image.power.max())),
-            )
-        )
-    found = []
-    for name in ("nothing", *names):
-        estimator = Estimator() if name == "nothing" else Estimator().without(name)
-        rows = []
-        for made, scene, picked, power, error in cases:
-            quadrature = Quadrature(rtol=rtol, pixel=made.reference.pixel, estimator=estimator)
-            solution = integrator.solve(scene, scene.sensors()[0], quadrature)
-            off = np.abs(solution.power.ravel()[picked] - power) - error
-            stated, most = solution.error.ravel()[picked], rtol * solution.power.max()
-            silent = (off > stated) & (off > most) & (stated <= most)
-            above = int((solution.error > most).sum())
-            lines = solution.rays / 1e6
-            rows.append((len(off), (off > most).sum(), (off > stated).sum(), silent.sum(), above > 0, above, lines))
-        *counts, lines = np.sum(rows, axis=0)
-        found.append(Ablation(name, *(int(count) for count in counts), round(float(lines), 1)))
-        print(found[-1], flush=True)
-    with atomic_path(out / "ablation.csv") as temporary, open(temporary, "w", newline="") as file:
-        sheet = csv.DictWriter(file, list(asdict(found[0])))
+        finer, uncertain, _ = compute(family, seed, rtol / 10, "nothing", FINER_NODES)
+        most = rtol * finer.max()
+        for name, rows in found.items():
+            power, error, work = compute(family, seed, rtol, name, None)
+            off = np.abs(power - finer) - uncertain
+            beyond, missed = off > most, off > error
+            flags = beyond, missed, missed & beyond & (error <= most), error > most
+            rows.append((power.size, *(float(flag.sum()) for flag in flags), work))
+        print(family, seed, flush=True)
+    table = []
+    for name, rows in found.items():
+        *counts, work = np.sum(rows, axis=0)
+        table.append(Ablation(name, len(rows), *(int(count) for count in counts), round(float(work) / 1e6, 2)))
+        print(table[-1], flush=True)
+    with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
+        sheet = csv.DictWriter(file, list(asdict(table[0])))
         sheet.writeheader()
-        sheet.writerows(asdict(one) for one in found)
+        sheet.writerows(asdict(one) for one in table)
+
+
+def _image_without(family: str, seed: int, rtol: float, name: str, most_nodes: int | None) -> Computed:
+    """The image without one threshold."""
+    import mitsuba as mi
+
+    made, estimator = random_scene(family, seed), Estimator() if name == "nothing" else Estimator().without(name)
+    quadrature = Quadrature(rtol=rtol, pixel=made.reference.pixel, max_nodes=most_nodes, estimator=estimator)
+    scene = made.scene()
+    solution = mi.load_dict({"type": "fspt_integral"}).solve(scene, scene.sensors()[0], quadrature)
+    return solution.power, solution.error, float(solution.rays)
+
+
+def _product_without(family: str, seed: int, rtol: float, name: str, most_nodes: int | None) -> Computed:
+    """The product of the matrix and J_n without one threshold of its columns."""
+    from mitsuba_fspt.integral.surface.column_form import FaceLines
+    from mitsuba_fspt.integral.surface.face_light import ColumnRule
+
+    rule, numbered, work = ColumnRule.of, FaceLines.numbered, [0.0]
+
+    def counted(items: np.ndarray) -> FaceLines:
+        work[0] += float(((items[1] * items[2]) ** 2).sum())
+        return numbered(items)
+
+    wanted = (lambda rtol: rule(rtol).without(name)) if name != "nothing" else rule
+    with mock.patch.object(ColumnRule, "of", wanted), mock.patch.object(FaceLines, "numbered", counted):
+        _, image, _ = _multiplied(random_scene(family, seed), seed, rtol)
+    return image.power, image.error, work[0]
 
 
 def table(audits: Sequence[Audit], rtol: float) -> str:

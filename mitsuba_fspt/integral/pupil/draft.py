@@ -27,6 +27,7 @@ FULL = 1e-6  # rounding of the coverage, a sum of float32 weights
 # between the nodes, and where it lies in the gap between the nodes and the rim of the pupil.
 PARTED = {1: (0.5, 0.5), 4: (0.35, 0.35), 12: (0.3, 0.21)}
 MISSED = {1: (0.5, 0.5), 4: (0.21, 0.2), 12: (0.15, 0.07)}
+MISSED_BY_TRANSECTS = 0.0125  # likewise of the first transects, in the gap between these and the rim of the pupil
 IN_FOCUS = 0.3  # blur radius [pixels] below which an edge counts as sharp in these tables
 
 
@@ -210,9 +211,8 @@ class Draft:
     def missed_edge_error(self, split: Mask) -> PixelArray:
         """Error of the first transects that cross no jump, near pixels on which they do (`split`)."""
         reach, most = self.reach("transects")
-        return dr.select(
-            self.grid.grow(split, reach, most), dr.opaque(mi.Float64, self.estimator.missed_edge) * self._whole(most), 0
-        )
+        whole = dr.opaque(mi.Float64, MISSED_BY_TRANSECTS) * self._whole(most)
+        return dr.select(self.grid.grow(split, reach, most), whole, 0)
 
     def wanted(self) -> Mask:
         """Pixels of the crop window, and those of the rim whose edges may reach into it."""

@@ -7,12 +7,14 @@ unbiased estimates, and their scatter gives the error for any integrand. The poi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.special import stdtrit
 
 from ...jit.batches import batches
 from ...jit.loops import repeat
@@ -32,14 +34,15 @@ VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
 ORDER = 3 / 4  # power with which the error is expected to fall with the number of points, as at a jump
+CHANCE = 1e-3  # with which the stated error is exceeded, by Student's t, and as all points may miss light
 LEGS = 8  # lines of sight that one through or off specular surfaces counts as, unless `max_nodes` is given
 
 
 def refine_by_lattices(draft: Draft) -> None:
     """Value and error of the pixels above the tolerance by lattices of more and more points, until they are below it.
 
-    The error of a pixel is at least `missed_share` over the number of points times the brightest value around; on
-    pixels that another solution gives, times the brightest surface.
+    The error of a pixel is at least the largest share of pixel × pupil that all points may miss, times the brightest
+    value around; on pixels that another solution gives, times the brightest surface.
     """
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
     deadline, tolerance = draft.progress.deadline, draft.tolerance
@@ -55,6 +58,7 @@ def refine_by_lattices(draft: Draft) -> None:
     brightest = dr.select(
         draft.computed, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
     )
+    student_t, missed = (dr.opaque(mi.Float64, n) for n in _exceeded_with(CHANCE))
     means, points = Means.none(draft.grid.pixels(above)), 0
     while not deadline.passed():
         more = min(GROWTH * points or FIRST, most_points(dr.width(means.pixels)))
@@ -63,11 +67,8 @@ def refine_by_lattices(draft: Draft) -> None:
         means, points = means.refined(draft, points, more), more
         if not dr.width(means.pixels):  # the deadline left no time for the first of them
             break
-        unmet = dr.opaque(mi.Float64, draft.estimator.missed_share / (points * SHIFTS)) * dr.gather(
-            mi.Float64, brightest, means.pixels
-        )
-        scatter = draft.estimator.student_t * means.standard_error
-        error = dr.maximum(scatter, unmet)
+        unmet = missed / (points * SHIFTS) * dr.gather(mi.Float64, brightest, means.pixels)
+        error = dr.maximum(student_t * means.standard_error, unmet)
         better = error < dr.gather(mi.Float64, draft.error, means.pixels)
         images = mi.Float64(draft.value), mi.Float64(draft.coverage), mi.Float64(draft.error)
         for image, column in zip(images, (means.value, means.share, error), strict=True):
@@ -81,6 +82,12 @@ def refine_by_lattices(draft: Draft) -> None:
         if not dr.any(left):
             break
         means = means.of(left)
+
+
+def _exceeded_with(chance: float) -> tuple[float, float]:
+    """Error over the standard error of the mean of all shifts that is exceeded with this `chance`, by Student's t; and
+    share of pixel × pupil, times the number of points, that all points miss with it."""
+    return float(stdtrit(SHIFTS - 1, 1 - chance / 2)), -math.log(chance)
 
 
 def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]) -> Mask:

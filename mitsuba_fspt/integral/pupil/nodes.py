@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 BY_SPECULAR_SURFACES = ("lost", "front")  # sums that only specular surfaces change
 REFINED = ("value", "coverage", "nearest", "lost")  # sums of twelve nodes that are used
 BOTH = 4 + 12  # lines of sight a pixel of both rules; with fewer allowed only four are taken
+# One line of sight a pixel suffices where cos⁴θ varies by less than this share of rtol over the pupil and the blur disc
+# lies in the pixel: the image's curvature, from which the error follows, is that over a pixel.
+FALLOFF, IN_PIXEL = 0.1, 0.5
+LIGHT_KNOWN = 2.0  # factor to which the light that surfaces send to a pixel is known
 TURN_REACH = 2  # pixels around over which the correction `four_turn` is averaged, to leave out the roughness of J_n
 
 
@@ -108,7 +112,7 @@ def _missed(draft: Draft, light: PixelArray) -> Mask:
 
     A body up to √2 pixels wide may lie between single lines of sight.
     """
-    least = dr.maximum(draft.estimator.missed_body * draft.grid.spread_max(draft.value), draft.tolerance)
+    least = dr.maximum(LIGHT_KNOWN * draft.grid.spread_max(draft.value), draft.tolerance)
     return draft.computed & ~draft.outside & (light > least)
 
 
@@ -116,8 +120,8 @@ def _one_suffices(draft: Draft) -> bool:
     """True if one line of sight a pixel suffices: the radiance varies no more over the pupil than over a pixel."""
     lens, blur = draft.camera.lens, draft.window.blur
     curvature = 2 * (lens.pupil_radius / lens.focus_distance) ** 2
-    estimator, rtol = draft.estimator, draft.quadrature.rtol
-    suffices = curvature <= estimator.falloff * rtol and blur <= estimator.in_pixel and len(lens.discs) == 1
+    rtol = draft.quadrature.rtol
+    suffices = curvature <= FALLOFF * rtol and blur <= IN_PIXEL and len(lens.discs) == 1
     bends = bool(draft.view.specular and draft.view.specular.bending)
     lambert = all((own := surface_of(emitter)) and own.is_isotropic() for emitter in draft.view.scene.emitters())
     taken = suffices and lambert and not bends and draft.quadrature.takes("one line")
@@ -139,8 +143,7 @@ def _refine(draft: Draft, where: Mask) -> PixelArray:
     rough = dr.select(parted(seen.coverage), 0, difference)
     rough, left = draft.grid.spread_all((rough, difference))
     draft.roughness = dr.maximum(draft.roughness, rough)
-    error = dr.maximum(left, draft.error / draft.estimator.largest_gain)
-    draft.error = dr.select(where, dr.maximum(error, draft.edge_error()), draft.error)
+    draft.error = dr.select(where, dr.maximum(left, draft.edge_error()), draft.error)
     dr.eval(draft.value, draft.error, draft.roughness, draft.nearest, draft.lost, difference)
     return difference
 

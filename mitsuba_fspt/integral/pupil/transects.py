@@ -14,7 +14,7 @@ from ...jit.batches import batches
 from ...jit.loops import repeat
 from ...jit.pixel_grid import COVERAGE_ROUNDING, parted
 from ...jit.tables import Table
-from ..estimator import Estimator
+from ..quadrature import FLOAT32_FLOOR
 from . import node_rules
 from .draft import Draft
 from .jumps import integrate_transect
@@ -26,7 +26,13 @@ if TYPE_CHECKING:
 
 # Lines of sight that pixels which take these levels are expected to take, but no more than a quarter of the most.
 HARD = {1: 600, 3: 1 << 14}
+UNKNOWN = 1.5  # error over the tolerance where a jump is crossed for the first time, so that another level follows
+LEAST_JUMP = 0.1  # of the tolerance: a smaller step along a transect is no jump, as its error is below that
 DARK_LEVELS = 3  # levels of transects that are taken while no line of sight of the image has met light
+# Where at least this share of the transects across a sharp edge crosses several edges, as at corners and on texels, a
+# corner may lie between two transects, and their order is lower by this factor. Where fewer do, as where a smooth
+# outline touches a transect, that adds less than an eighth to the error.
+SEVERAL_SHARE, SEVERAL_ORDER = 1 / 16, 2 / 3
 FAR = 1e30  # depth [mm] at which larger ones are clipped; the blur of an edge is finite there
 
 
@@ -98,8 +104,8 @@ class _Refinement:
             if level == 0:
                 draft.spread_error(where & ~means.done)
             self.where = where = where & means.done
-        # The outline of a dark body counts only where some lines of sight meet light.
-        lit = means.value > dr.opaque(mi.Float64, self.estimator.faint) * draft.peak
+        # The outline of a dark body counts only where lines of sight meet light, by more than float32 rounds.
+        lit = means.value > dr.opaque(mi.Float64, FLOAT32_FLOOR) * draft.peak
         first_met = where & means.jumps & lit & ~self.has_jump
         self.has_jump |= first_met
         self.smooth = self.smooth & where & ~self.has_jump
@@ -149,7 +155,7 @@ class _Refinement:
 
     def _above_tolerance(self, remaining: PixelArray) -> PixelArray:
         """The error that remains, or one above the tolerance, so that another level follows."""
-        return dr.maximum(remaining, self.estimator.new_jump * self.draft.tolerance)
+        return dr.maximum(remaining, UNKNOWN * self.draft.tolerance)
 
     def _by_neighbours(self, met_before: Mask) -> PixelArray:
         """Error of each pixel that follows from the errors of its neighbours, as their edges may reach into it.
@@ -165,17 +171,17 @@ class _Refinement:
     def _after_first(self, first_met: Mask, change: PixelArray, silhouette: Mask) -> tuple[PixelArray, PixelArray]:
         """Error that remains after the first transects, and error of pixels around a jump, which may have missed it.
 
-        Two transects that agree with the nodes suffice on a silhouette, which coverage shows too, but not on a step of
-        J_n.
+        Two transects that agree suffice on a silhouette, which coverage shows too, but not on a step of J_n. Without a
+        jump there may be a dim spot far below a pixel, or the edges of a coarse mesh.
         """
-        draft, estimator = self.draft, self.estimator
+        estimator = self.estimator
         at_jump = dr.maximum(estimator.first_ratio * change, self.means.scatter)
         at_jump = dr.select(silhouette, at_jump, self._above_tolerance(at_jump))
-        elsewhere = dr.select(parted(draft.coverage), draft.error, draft.roughness)
+        elsewhere = dr.select(parted(self.draft.coverage), self.draft.error, self.draft.roughness)
         elsewhere = dr.maximum(estimator.nodes_ratio * change, elsewhere)
         # Pixels that another solution gives take no transects; their outlines count as jumps here.
-        jumps = first_met | (draft.outline & ~draft.computed)
-        return dr.select(first_met, at_jump, elsewhere), draft.missed_edge_error(jumps)
+        jumps = first_met | (self.draft.outline & ~self.draft.computed)
+        return dr.select(first_met, at_jump, elsewhere), self.draft.missed_edge_error(jumps)
 
     def _after_later(
         self, level: int, first_met: Mask, change: PixelArray, count: int
@@ -187,16 +193,14 @@ class _Refinement:
         Where a jump is crossed for the first time another level follows, as earlier changes do not bound its error.
         """
         before, estimator = self.remaining, self.estimator
-        least, most = estimator.least_ratio, estimator.most_ratio
-        fewer = self.count / count
-        one, several = (dr.opaque(mi.Float64, fewer**order) for order in (estimator.order, estimator.several_order))
-        least_change = before * dr.select(self.edges.sharp & self.means.several, several, one)
-        assumed = dr.maximum(change, least_change)
-        ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), least, most)
+        fewer, order, most = self.count / count, estimator.order, estimator.ratio
+        one, several = (dr.opaque(mi.Float64, fewer**own) for own in (order, SEVERAL_ORDER * order))
+        assumed = dr.maximum(change, before * dr.select(self.edges.sharp & self.means.several, several, one))
+        ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), 1, most)
         remaining = dr.maximum(assumed * ratio, self.means.scatter)
         if level <= node_rules.SMOOTH_LEVELS:
             # On smooth pixels the next node rule changes the value by less than this one did.
-            remaining = dr.select(self.smooth, estimator.step_ratio * change, remaining)
+            remaining = dr.select(self.smooth, change, remaining)
         remaining = dr.select(first_met, self._above_tolerance(remaining), remaining)
         expected = dr.maximum(dr.opaque(mi.Float64, estimator.unexpected) * before, self.draft.tolerance)
         unexpected = self.where & (change > expected)
@@ -268,7 +272,7 @@ class Means:
 
     value, coverage : mean radiance on film [W/mm²/sr], share of lines of sight that meet a glowing surface
     jumps : True where a transect crosses a jump
-    several : True where a share of the transects, `several_share`, crosses more than one
+    several : True where a share of the transects, `SEVERAL_SHARE`, crosses more than one
     scatter : error of the value that follows from the differences between transects [W/mm²/sr]
     blur : signed radius of the most blurred edge that a transect crosses, 0 without one [pixels]
     done : False on pixels that the deadline left out; None if there are none
@@ -294,7 +298,7 @@ def apply_transects(
         if count and draft.progress.deadline.passed():
             break
         each = _along_transects(draft, part, edges, rule, table, along)
-        of_part = _over_transects(part, edges, rule, table, each, draft.estimator)
+        of_part = _over_transects(part, edges, rule, table, each)
         for field in fields(_OfPixels):
             dr.scatter(getattr(found, field.name), getattr(of_part, field.name), part)
         dr.eval(found)
@@ -308,8 +312,8 @@ def apply_transects(
         dr.scatter(done, mi.Bool(True), touched)
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = found.squares - found.value * found.value
-    spread = dr.opaque(mi.Float64, estimator.kink if len(rule) > 2 else estimator.spread)
-    blurred = spread * dr.safe_sqrt(variance - found.trend) / number
+    scatter = estimator.scatter if len(rule) > 2 else estimator.scatter / 3
+    blurred = dr.opaque(mi.Float64, scatter) * dr.safe_sqrt(variance - found.trend) / number
     # A sharp edge slants: each transect crosses a part of its own. A second edge may lie between two of them.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, found.between)
@@ -317,7 +321,7 @@ def apply_transects(
         found.value,
         found.coverage,
         jumps=found.split > 0,
-        several=found.several >= estimator.several_share * number,
+        several=found.several >= SEVERAL_SHARE * number,
         scatter=dr.select(edges.sharp, sharp, blurred),
         blur=found.blur,
         done=done,
@@ -378,7 +382,7 @@ def _along_transects(
     phase = table.gather("phase", number)
     curve = transect(draft.centres(pixel), angle, blur, place, dr.opaque(mi.Float, float(draft.area)))
     outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
-    least, steep = mi.Float(draft.estimator.least_jump * draft.tolerance), draft.estimator.steep
+    least, steep = mi.Float(LEAST_JUMP * draft.tolerance), draft.estimator.steep
     value, coverage, jumps, depth, rays = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
     # The edge of a weak reflection beside nothing has no depth.
     has_depth = (jumps > 0) & dr.isfinite(depth)
@@ -394,7 +398,6 @@ def _over_transects(
     rule: node_rules.Transects,
     table: Table,
     found: _OfTransects,
-    estimator: Estimator,
 ) -> _OfPixels:
     """Results over the transects of each pixel of `part`, from those of all its transects."""
     count = dr.opaque(mi.UInt32, len(rule))
@@ -423,17 +426,17 @@ def _over_transects(
         **sums,
         trend=sum(map(dr.square, trends)),
         blur=mi.Float64(_most_blurred(*blurs)),
-        between=_second_edge(dr.width(part), rule, found.value, estimator),
+        between=_second_edge(dr.width(part), rule, found.value),
     )
 
 
-def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float, estimator: Estimator) -> PixelArray:
+def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float) -> PixelArray:
     """Error of a second edge between two transects of each pixel, from the `value` of all transects, pixel by pixel.
 
     In the order of transects across a sharp edge, their position along it increases, so that a second edge gives two
-    second differences d that are much larger than the others. √(Σd² − 2 (Σ|d|)²/n) is then √2 times the jump; it is 0
-    where all differences vary alike. On a net, where the edge is nearly along many transects, it cuts all but one of
-    them evenly: the error is at most the largest |d| over n.
+    second differences d that are much larger than the others. √(Σd² − 2 (Σ|d|)²/n) is then √2 times the jump, of which
+    half is the error at most; it is 0 where all differences vary alike. On a net, where the edge is nearly along many
+    transects, it cuts all but one of them evenly: the error is at most the largest |d| over n.
     """
     count = len(rule)
     first = dr.arange(mi.UInt32, pixels) * dr.opaque(mi.UInt32, count)
@@ -445,5 +448,5 @@ def _second_edge(pixels: int, rule: node_rules.Transects, value: mi.Float, estim
 
     zero = mi.Float64(0)
     squares, sizes, most = repeat(dr.opaque(mi.UInt32, count - 2), add, zero, zero, zero)
-    jumps = estimator.second_edge * dr.safe_sqrt(squares - dr.opaque(mi.Float64, 2 / count) * sizes * sizes)
+    jumps = 0.5 * dr.safe_sqrt(squares - dr.opaque(mi.Float64, 2 / count) * sizes * sizes)
     return (dr.minimum(jumps, most) if rule.is_net else jumps) / dr.opaque(mi.Float64, count)

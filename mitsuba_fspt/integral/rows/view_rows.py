@@ -33,7 +33,7 @@ from ..quadrature import Quadrature
 from ..solution import Solution
 from ..surface.column_canvas import Windows
 from ..surface.column_form import MOST_CHANGE, Columns, column_windows, columns_of
-from ..surface.face_light import ColumnRule, FaceLight
+from ..surface.face_light import FaceLight
 from .row_form import rows_of
 from .sparse_rows import SparseRows
 
@@ -209,7 +209,7 @@ def _by_faces(
             def report(share: float, first: float = number / len(on)) -> None:
                 progress(first + share / len(on))
 
-        columns.append(columns_of(scene, camera, faces, windows, kind, ColumnRule.of(rtol), report))
+        columns.append(columns_of(scene, camera, faces, windows, kind, rtol, report))
     exact = np.concatenate([part.exact for part in columns])
     entries = _Entries.of(columns, math.prod(camera.film.shape))
     del columns

@@ -30,7 +30,7 @@ from ..lines.eq9 import eq9, etendue_from_pixel, etendue_from_surface
 from ..lines.occlusion import hidden
 from . import pupil_cells
 from .column_canvas import ColumnCanvas, Plane, Windows
-from .face_light import CORNERS, INWARD, ColumnRule, FaceLight, Plan
+from .face_light import CORNERS, DROP, INWARD, ColumnRule, FaceLight, Plan
 from .footprint import SPECK
 
 AROUND = ((0, 0), (1, 0), (1, 1), (0, 1))  # of a cell of the pupil
@@ -85,12 +85,12 @@ def columns_of(
     faces: FaceLight,
     windows: Windows,
     on: str,
-    rule: ColumnRule,
+    rtol: float,
     progress: Callable[[float], None] | None = None,
 ) -> Columns:
-    """Columns of one mesh, accumulated on some windows at a time; `progress` is called with the share done."""
+    """Columns of one mesh by `ColumnRule`, some windows at a time; `progress` is called with the share done."""
     shape = camera.film.shape
-    plan = faces.plan(rule, on)
+    plan = faces.plan(ColumnRule.of(rtol), on)
     parts = []
     groups = list(_groups(windows))
     for number, group in enumerate(groups):
@@ -100,7 +100,7 @@ def columns_of(
         inside = group if on == "face" else group[faces.corners].any(axis=1)
         index = np.flatnonzero(faces.bright & inside)
         fine, coarse = (_laid(scene, camera, faces, index, p, some, on, shape) for p in (plan, plan.halved()))
-        parts.append(_kept(some, fine, coarse, rule, camera, shape))
+        parts.append(_kept(some, fine, coarse, DROP * rtol, camera, shape))
     exact = ~faces.mixed
     if on == "vertex":
         exact = np.ones(len(windows.left), bool)
@@ -125,9 +125,9 @@ def _groups(windows: Windows) -> Iterator[Mask]:
 
 
 def _kept(
-    windows: Windows, fine: Array, coarse: Array, rule: ColumnRule, camera: Camera, shape: tuple[int, int]
+    windows: Windows, fine: Array, coarse: Array, least: float, camera: Camera, shape: tuple[int, int]
 ) -> tuple[NDArray[Any], ...]:
-    """Column, pixel, light and relative change of the entries that count."""
+    """Column, pixel, light and relative change of the entries above the `least` share of a column's brightest."""
     column = windows.columns()
     some = np.flatnonzero((fine > 0) & windows.inside())
     starts = np.cumsum(windows.areas) - windows.areas
@@ -135,7 +135,7 @@ def _kept(
     filled = windows.areas > 0
     if filled.any():
         brightest[filled] = np.maximum.reduceat(fine, starts[filled])
-    some = some[fine[some] > rule.drop * brightest[column[some]]]
+    some = some[fine[some] > least * brightest[column[some]]]
     column, fine, coarse = column[some].astype(np.int32), fine[some], coarse[some]
     y, x = windows.rows_of_film()[some], windows.columns_of_film()[some]
     even = falloff_on_pixels(camera, x, y, camera.film.crop_offset)

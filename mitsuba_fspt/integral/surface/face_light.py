@@ -20,6 +20,7 @@ from ...emission.elements import Elements, elements_of
 from ...emission.emitting_surface import EmittingSurface
 from ...jit.batches import BATCH
 from ...jit.mesh_buffers import triangles
+from ..estimator import Thresholds, bound
 from ..lines.occlusion import hidden
 from . import pupil_cells
 
@@ -28,6 +29,15 @@ MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for flo
 RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
 INWARD = 0.05  # of a face: distance from its sides at which rays start that search for the edge of a shadow
 FEWEST_SHADED = 2  # pieces along a side where one surface may hide another: with half of them the light differs
+# What middles of M × M cells leave of a half plane averaged over pixels, times r/M² of its step for a blur disc of r
+# pixels: the most of all directions and offsets for r = 0.5 … 32, M = 4 … 32 and M > 1.25 r, below which it is 0.18.
+# Likewise of a slope that begins at a straight line, times r/M² of the slope per pixel, for r = 1 … 64.
+EDGE_LEFT, KINK_LEFT = 0.12, 0.13
+# Points in place of pieces of s pixels leave s³/r^1.5 of the standard deviation of a J_n that is random from face to
+# face, root mean square over the pixels: the most on equilateral triangles, r = 0.1 … 3, s = 0.05 … 0.4.
+SPECKLE_LEFT = 0.04
+FEWEST, MOST = 4, 64  # least and largest M of columns
+DROP = 0.01  # of rtol and of a column's brightest entry: entries below are left out
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
 # M of columns of several faces: neighbours mostly take the same.
 LEVELS = (4, 6, 8, 10, 12, 16, 20, 24, 28, 32, 36, 40, 44, 50, 56, 64)
@@ -38,76 +48,49 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class ColumnRule:
-    """Numbers of cells and pieces, each with the error it bounds.
+class ColumnRule(Thresholds):
+    """Numbers of cells and pieces, each with the error it bounds; `audit.py --matrix --ablate` measures their effects.
 
-    edge : error at an edge of J_n, over its step: cells M along the pupil are √(edge_factor · r/edge) for a blur
-        radius r [pixels], or √(coarse_factor · r/edge) where that is below `coarse` · r
-    step : likewise at the sides of faces, at which J_n on faces steps
+    step : error at an edge or side at which the light of faces steps, over its step: cells M along the pupil are
+        √(EDGE_LEFT · r/step) for a blur radius r [pixels]
     kink : error at a face's side where J_n is continuous, over its change along the face: of columns that are
-        continuous and nowhere cut off M is √(kink_factor · r/(h · kink)), with h [pixels] the height of a face's image
-    edge_factor, coarse_factor : by what middles of cells leave of a half plane averaged over pixels, the most of all
-        directions and offsets for r = 0.5 … 32, M = 4 … 32, with more and with less than `coarse` · r cells
-    kink_factor : likewise for a slope that begins at a straight line; fitted for r = 1 … 64, M = 4 … 32
-    fewest, most : least and largest M
-    partial : least M where a face turns away from part of the pupil, or a second border cuts the pupil
-    mixed : least M where one surface may hide another
-    cells : M where the cells are laid; their étendue is constant in each
-    point : largest piece [pixels] that may be taken as a point then
-    speckle : error where J_n varies at random from face to face, over its standard deviation, and pieces are points:
-        for pieces of s pixels speckle_factor · s³/r^1.5, root mean square over the pixels
-    speckle_factor : the most of random J_n on equilateral triangles, r = 0.1 … 3, s = 0.05 … 0.4
+        continuous and nowhere cut off M is √(KINK_LEFT · r/(h · kink)), with h [pixels] the height of a face's image
+    partial : least M where only a part of the pupil takes light of a face: it turns away from the rest, a second border
+        cuts the pupil, or one surface may hide another
+    cells : M where the cells are laid and pieces are points; their étendue is constant in each
+    speckle : error of these points where J_n varies at random from face to face, over its standard deviation: for
+        pieces of s pixels SPECKLE_LEFT · s³/r^1.5, root mean square over the pixels
     piece : largest piece over the distance in focus, over which étendue and exit law are linear but for some of its
         square
     perspective : J_n that perspective, corrected on average, misplaces within a piece, over its change along the face:
         pieces along a side of a face of relative depth δ are √(δ/(8 · perspective))
-    shadow : largest piece [pixels] where one surface may hide another: each piece is lit or not on a line of sight
-    displaced : light of a column that is displaced so, over all of it, times the distance [pixels], on faces smaller
-        than their blur disc: w · s²/a for pieces of s on a face of a pixels, with w the share of the lines of sight of
-        which the edge of a shadow crosses it
-    drop : entries below this share of a column's brightest are left out
+    shadow : largest piece s [pixels] where one surface may hide another: each is lit or not on a line of sight. On
+        faces of a pixels, smaller than their blur disc, the light displaced so over that of the column, times the
+        distance [pixels], is w · s²/a, with w the share of the lines of sight of which the edge of a shadow crosses
+        them; it is at most the mean of s² over pieces of any size up to the largest, a third of its square
     """
 
-    edge: float
-    step: float
-    kink: float
-    speckle: float
-    edge_factor: float = 0.12
-    coarse_factor: float = 0.18
-    coarse: float = 1.25
-    kink_factor: float = 0.13
-    speckle_factor: float = 0.04
-    fewest: int = 4
-    most: int = 64
-    partial: int = 12
-    mixed: int = 16
-    cells: int = 6
-    point: float = 0.5
-    piece: float = 0.03
-    perspective: float = 2e-3
-    shadow: float = 0.7
-    displaced: float = 0.16
-    drop: float = 1e-5
+    step: float = bound(1e-3, 1e30)
+    kink: float = bound(3e-3, 1e30)
+    partial: int = bound(16, FEWEST)
+    cells: int = bound(6, FEWEST)
+    speckle: float = bound(2.5e-4, 1e30)
+    piece: float = bound(0.03, 1e30)
+    perspective: float = bound(5e-4, 1e30)
+    shadow: float = bound(0.7, 1e30)
 
     @classmethod
     def of(cls, rtol: float) -> ColumnRule:
         """The rule for a tolerance relative to the brightest pixel: columns are right to some ten times that."""
         finer = math.sqrt(min(rtol / 1e-3, 1))
-        cells = 2 * math.ceil(3 / math.sqrt(finer))
-        partial = 2 * math.ceil(6 / math.sqrt(finer))
         return cls(
-            edge=2 * rtol,
             step=rtol,
             kink=3 * rtol,
+            partial=2 * math.ceil(8 / math.sqrt(finer)),
+            cells=2 * math.ceil(3 / math.sqrt(finer)),
             speckle=0.25 * rtol,
-            cells=cells,
-            partial=partial,
-            mixed=2 * math.ceil(8 / math.sqrt(finer)),
-            point=0.5 * finer,
+            perspective=0.5 * rtol,
             shadow=0.7 * finer,
-            displaced=0.16 * finer**2,
-            perspective=2 * rtol,
-            drop=1e-2 * rtol,
         )
 
 
@@ -272,12 +255,12 @@ class FaceLight:
         nodes = self._nodes(rule, sides, on)
         pieces = self._pieces(rule)
         cells = np.where(self.partial, rule.partial, rule.cells)
-        largest = np.minimum(rule.point, np.cbrt(rule.speckle / rule.speckle_factor) * np.sqrt(self.blur))
+        largest = np.cbrt(rule.speckle / SPECKLE_LEFT) * np.sqrt(self.blur)
         smaller = np.maximum(np.ceil(sides / np.maximum(largest, 1 / LONGEST)), pieces)
         by_nodes = (nodes * pieces) ** 2 * (1 + sides / pieces)
         by_cells = (cells * smaller) ** 2 * (1 + 2 * self.blur / cells)
         points = by_cells < by_nodes
-        nodes = np.minimum(nodes, rule.most)
+        nodes = np.minimum(nodes, MOST)
         if on == "face":
             of_columns = np.where(points, cells, nodes)[:, None]
             points = points[:, None]
@@ -288,17 +271,15 @@ class FaceLight:
         cuts = np.where(points, smaller[:, None], pieces[:, None]).astype(np.int64)
         return Plan(of_columns, np.minimum(cuts, math.isqrt(BATCH) // of_columns), points)
 
-    def image_plan(self, rule: ColumnRule, brightness: Array, contrast: Array) -> Plan:
+    def image_plan(self, rule: ColumnRule, brightness: Array, contrast: Array, most: int) -> Plan:
         """How the faces are divided for an image, given the `brightness` (F,) of each and its change along the face,
-        both over the brightness of the image.
+        both over the brightness of the image, and the largest M.
 
         M is that of the error at an edge, which grows with the brightness; so each face is as accurate as if it glowed
         alone, and neighbours may differ in M.
         """
-        error = self.blur * brightness / rule.step
-        many = np.minimum(np.sqrt(rule.coarse_factor * error), rule.coarse * self.blur)
-        nodes = np.maximum(np.sqrt(rule.edge_factor * error), many)
-        cells = (2 * np.ceil(nodes / 2)).clip(self._fewest(rule), rule.most).astype(np.int64)
+        nodes = np.sqrt(EDGE_LEFT * self.blur * brightness / rule.step)
+        cells = (2 * np.ceil(nodes / 2)).clip(self._fewest(rule), most).astype(np.int64)
         cuts = np.minimum(self._pieces(rule, contrast).astype(np.int64), math.isqrt(BATCH) // cells)
         return Plan(cells[:, None], cuts[:, None], np.zeros((len(cells), 1), bool))
 
@@ -310,7 +291,7 @@ class FaceLight:
         """
         sides = np.minimum(self.sides, LONGEST)
         shaded = np.where(self.mixed, np.maximum(sides / rule.shadow, FEWEST_SHADED), 0)
-        displaced = self.crossed * sides / rule.displaced if contrast is None else 0
+        displaced = 3 * self.crossed * sides / rule.shadow**2 if contrast is None else 0
         shaded = np.where(self.small, np.minimum(shaded, np.sqrt(displaced)), shaded)
         pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
         # Within a pixel perspective misplaces nothing.
@@ -320,16 +301,14 @@ class FaceLight:
 
     def _fewest(self, rule: ColumnRule) -> Index:
         """Least M of each face."""
-        return np.where(self.partial, rule.partial, np.where(self.mixed, rule.mixed, rule.fewest))
+        return np.where(self.partial | self.mixed, rule.partial, FEWEST)
 
     def _nodes(self, rule: ColumnRule, sides: Array, on: str) -> Array:
         """M of the nodes that the accuracy of each face requires."""
         fewest = self._fewest(rule)
-        error = self.blur / (rule.step if on == "face" else rule.edge)
-        many = np.minimum(np.sqrt(rule.coarse_factor * error), rule.coarse * self.blur)
-        nodes = np.maximum(np.sqrt(rule.edge_factor * error), many)
+        nodes = np.sqrt(EDGE_LEFT * self.blur / rule.step)
         if on == "vertex":
-            kinks = np.sqrt(rule.kink_factor * self.blur / (rule.kink * np.maximum(self.heights, 1e-3)))
+            kinks = np.sqrt(KINK_LEFT * self.blur / (rule.kink * np.maximum(self.heights, 1e-3)))
             nodes = np.where(self.cut[self.corners].any(axis=1), nodes, np.minimum(nodes, kinks))
         nodes = np.maximum(nodes, 2 * self.blur / np.maximum(sides, 1e-3))  # their images overlap
         if on == "face":
