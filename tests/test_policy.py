@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -102,11 +103,9 @@ PUBLIC = [
 ]
 
 
+@cache
 def tree_of(name):
     return ast.parse((PACKAGE / name).read_text())
-
-
-TREES = {name: tree_of(name) for name in NAMES}
 
 
 def room_of(name):
@@ -138,7 +137,7 @@ def imported(nodes):
 def imported_rooms(name):
     """Rooms that a file imports from, those for types alone included."""
     folder = name.split("/")[:-1]
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.ImportFrom) and node.level:
             home = folder[: len(folder) - node.level + 1] + (node.module.split(".") if node.module else [])
             if home:
@@ -166,7 +165,7 @@ def test_arrows_between_rooms_run_one_way():
 def imported_files(name):
     """Files of the package that a file imports from, inside functions and for types alone included."""
     folder = name.split("/")[:-1]
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.ImportFrom) and node.level:
             home = folder[: len(folder) - node.level + 1] + (node.module.split(".") if node.module else [])
             for alias in node.names:
@@ -175,7 +174,7 @@ def imported_files(name):
                     "/".join(home) + ".py",
                     "/".join([*home, "__init__.py"]),
                 ]
-                yield from [file for file in tried if file in TREES][:1]
+                yield from [file for file in tried if file in NAMES][:1]
 
 
 def test_no_files_import_each_other():
@@ -202,11 +201,11 @@ def test_every_listed_arrow_exists():
 def files_imported(name):
     """Files of the package that a file imports from, as paths without suffix, those for types alone included."""
     folder = name.split("/")[:-1]
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.ImportFrom) and node.level:
             home = [*folder[: len(folder) - node.level + 1], *(node.module.split(".") if node.module else [])]
             found = ["/".join(home), *("/".join([*home, alias.name]) for alias in node.names)]
-            yield from (file for file in found if f"{file}.py" in TREES)
+            yield from (file for file in found if f"{file}.py" in NAMES)
 
 
 def test_arrows_between_the_rooms_of_the_integral_run_one_way():
@@ -249,7 +248,7 @@ def members_of_plugins():
     """Public names of the lens's and the surface's class that are not Mitsuba's: methods and attributes of `self`."""
     found = set()
     for name, base in (("plugins/lens.py", "Sensor"), ("plugins/surface.py", "Emitter")):
-        body = next(node for node in TREES[name].body if isinstance(node, ast.ClassDef))
+        body = next(node for node in tree_of(name).body if isinstance(node, ast.ClassDef))
         found |= {node.name for node in body.body if isinstance(node, ast.FunctionDef)} - MITSUBAS[base]
         for node in ast.walk(body):
             if (
@@ -283,7 +282,7 @@ def test_lens_and_surface_are_shells_whose_members_nobody_uses_below():
     members = members_of_plugins()
     assert members == {"camera", "prepare_model", "surface"}
     for name in (name for name in NAMES if room_of(name) in WITHOUT_PLUGINS):
-        for node in ast.walk(TREES[name]):
+        for node in ast.walk(tree_of(name)):
             if isinstance(node, ast.Attribute) and node.attr in members:
                 holder = ast.unparse(node.value).rpartition(".")[2]
                 plugin = holder in ("sensor", "lens", "emitter") or holder.endswith("()")
@@ -306,7 +305,7 @@ def test_no_star_imports():
     assert not faults(
         lambda name: (
             f"line {node.lineno}"
-            for node in ast.walk(TREES[name])
+            for node in ast.walk(tree_of(name))
             if isinstance(node, ast.ImportFrom) and any(alias.name == "*" for alias in node.names)
         )
     )
@@ -315,7 +314,7 @@ def test_no_star_imports():
 def test_only_some_rooms_import_the_renderer():
     """Under TYPE_CHECKING anyone may name its types."""
     for name in NAMES:
-        if {"mitsuba", "drjit"} & set(imported(at_run_time(TREES[name]))):
+        if {"mitsuba", "drjit"} & set(imported(at_run_time(tree_of(name)))):
             assert room_of(name) in DRJIT_ROOMS | IMPORTS_MITSUBA, name
 
 
@@ -324,7 +323,7 @@ def test_nobody_imports_the_renderer_at_module_level():
     functions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
     # The sum over surface points is Dr.Jit code too, and is imported where it is needed.
     for name in (name for name in NAMES if room_of(name) not in DRJIT_ROOMS and "direct_summation" not in name):
-        module = TREES[name]
+        module = tree_of(name)
         inside = {id(n) for f in ast.walk(module) if isinstance(f, functions) for n in ast.walk(f)}
         outer = [node for node in at_run_time(module) if id(node) not in inside]
         assert not {"mitsuba", "drjit"} & set(imported(outer)), name
@@ -332,7 +331,7 @@ def test_nobody_imports_the_renderer_at_module_level():
 
 def test_only_the_command_line_prints():
     for name in (name for name in NAMES if room_of(name) != "cli"):
-        for node in ast.walk(TREES[name]):
+        for node in ast.walk(tree_of(name)):
             if isinstance(node, ast.Call):
                 printer = ast.unparse(node.func)
                 assert printer not in ("print", "typer.echo", "sys.stdout.write", "sys.stderr.write"), name
@@ -340,7 +339,7 @@ def test_only_the_command_line_prints():
 
 def test_input_is_not_checked_by_assert_nor_refused_by_a_bare_exception():
     for name in NAMES:
-        for node in ast.walk(TREES[name]):
+        for node in ast.walk(tree_of(name)):
             assert not isinstance(node, ast.Assert), f"{name}, line {node.lineno}"
             if isinstance(node, ast.Raise) and node.exc is not None:
                 raised = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
@@ -351,7 +350,7 @@ def test_nobody_uses_the_private_names_of_another_file():
     """Neither `from .other import _name` nor `other._name` of a module imported from the package."""
     stems = {Path(other).stem for other in NAMES}
     for name in NAMES:
-        nodes = list(ast.walk(TREES[name]))
+        nodes = list(ast.walk(tree_of(name)))
         taken = [alias for node in nodes if isinstance(node, ast.ImportFrom) and node.level for alias in node.names]
         modules = {alias.asname or alias.name for alias in taken} & stems
         assert not [alias.name for alias in taken if alias.name.startswith("_")], name
@@ -363,7 +362,7 @@ def test_nobody_uses_the_private_names_of_another_file():
 def test_plugins_load_nothing_in_their_constructors():
     """`mi.load_dict` there races with the other threads of Mitsuba's loader: see the tests of scenes."""
     for name in (name for name in NAMES if room_of(name) in DRJIT_ROOMS):
-        for node in ast.walk(TREES[name]):
+        for node in ast.walk(tree_of(name)):
             if isinstance(node, ast.Call):
                 assert ast.unparse(node.func) not in ("mi.load_dict", "mi.load_file", "mi.load_string"), name
 
@@ -372,7 +371,7 @@ def test_files_and_functions_stay_short():
     """A file is one noun of up to some 500 lines."""
     for name in NAMES:
         assert len((PACKAGE / name).read_text().splitlines()) <= 520, name
-        for node in ast.walk(TREES[name]):
+        for node in ast.walk(tree_of(name)):
             if isinstance(node, ast.FunctionDef):
                 assert node.end_lineno - node.lineno < 60, f"{name}: {node.name}, line {node.lineno}"
 

@@ -30,15 +30,14 @@ def noisy(scene, seed, share=0.01, rtol=1e-4, **parameters):
 
 
 def test_parameters_come_back_within_their_sd(scene):
-    """Distance and f-number of a sphere, started 1 % and 3 % off; 2 seeds: no z beyond 4, χ² is 1."""
-    scores, chi2 = [], []
-    for seed in range(2):
-        found = fspt.calibrate(scene, noisy(scene, seed, distance=163.5, f_number=7.8), free=["distance", "f_number"])
-        scores += [(found.values["distance"] - 163.5) / found.sd["distance"]]
-        scores += [(found.values["f_number"] - 7.8) / found.sd["f_number"]]
-        chi2.append(found.chi2)
-    assert np.abs(scores).max() < 4
-    assert np.mean(chi2) == pytest.approx(1, abs=0.6)
+    """Distance and f-number of a sphere, started 1 % and 3 % off: no z beyond 4, χ² is 1.
+
+    The scatter over many seeds is in docs/calibrate_coverage.csv.
+    """
+    found = fspt.calibrate(scene, noisy(scene, 0, distance=163.5, f_number=7.8), free=["distance", "f_number"])
+    assert abs(found.values["distance"] - 163.5) < 4 * found.sd["distance"]
+    assert abs(found.values["f_number"] - 7.8) < 4 * found.sd["f_number"]
+    assert found.chi2 == pytest.approx(1, abs=0.6)
     assert 0 < found.sd["f_number"] < 0.1
 
 
@@ -278,11 +277,11 @@ def test_variance_of_monte_carlo_follows_the_signal():
 
 @pytest.mark.slow
 def test_intervals_contain_the_reference_on_a_fine_film(mono):
-    """256 samples on 72² pixels: magnification and distance within 3 sd, of at most 3e-5 and 4 µm.
+    """256 samples on 72 × 16 pixels: magnification and distance within 3 sd, of at most 3e-5 and 4 µm.
 
-    Seen to fail (5 sd) where the edges' standard errors were taken as smaller than they are.
+    Seen to fail (5 sd and more) where the edges' standard errors were taken as smaller than they are.
     """
-    camera = {"width": 72, "height": 72, "pixel_pitch": 0.216, "f_number": 2.8, "view": 90}
+    camera = {"width": 72, "height": 16, "pixel_pitch": 0.216, "f_number": 2.8, "view": 90}
     image = fspt.render(fspt.load(SCENES / "nylon_cylinder.xml", **camera), method="path", spp=256, seed=2)
     found = fspt.calibrate(SCENES / "nylon_cylinder.xml", image, free=["magnification", "distance"], **camera)
     for name, true, bound in (("magnification", 0.5, 3e-5), ("distance", 180.0, 4e-3)):
