@@ -191,7 +191,7 @@ def main() -> None:
         with arguments.output.open(encoding="utf-8") as file:
             rows = [dict(one) for one in csv.DictReader(file) if one["verb"] not in verbs]
     for one in cases(arguments.seeds, arguments.wrong):
-        if one[0] in verbs:
+        if one[0] in verbs and one[-1] > 0:
             rows.append(row(*one))
             print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
     rows.sort(key=lambda one: str(one["verb"]))
