@@ -304,7 +304,7 @@ class System:
         own = (elements.of_region(region) * self._share for region in range(elements.regions))
         return tuple(elements.along_border(factor) for factor in own)
 
-    @property
+    @cached_property
     def _share(self) -> Array:
         """(F, Q) at the nodes of the facets."""
         return self.elements.on_facets(self._shape.along)
