@@ -209,8 +209,9 @@ def _causes(
         best_log.append(float(min(likely, 0.0)))
         taken = _span(np.concatenate([effects[k] for k in found], axis=1))
     joint = np.concatenate([effects[k] for k in found], axis=1) if found else np.empty((len(score), 0))
-    size, inverse = np.linalg.pinv(joint) @ score, np.linalg.pinv(joint.T @ joint)
-    sd, causes, first = np.sqrt(np.diag(inverse)), list[Cause](), 0
+    fitted = np.linalg.pinv(joint)
+    # Not from the inverse of the normal equations, whose diagonal rounding makes negative where effects nearly depend.
+    size, sd, causes, first = fitted @ score, np.linalg.norm(fitted, axis=1), list[Cause](), 0
     for k, log in zip(found, best_log, strict=True):
         own = slice(first, first := first + effects[k].shape[1])
         causes.append(Cause(patterns[k].kind, patterns[k].where, tuple(size[own]), tuple(sd[own]), log))
