@@ -11,7 +11,8 @@ So `prepare` puts an `ImportWatch` before Python's import finders. It finds no m
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -150,9 +151,7 @@ def ensure_variant() -> str:
             " Call mi.set_variant('llvm_ad_mono') or 'cuda_ad_mono' first, or set none."
         )
     require_working_llvm(active)
-    import drjit
-
-    if drjit.thread_count() < 2:  # on one core
+    if _cores() < 2:  # Mitsuba's own loading of EXR files, see `threads_for_files`
         set_threads(2)
     return active
 
@@ -165,14 +164,36 @@ def refusal(variant: str) -> str:
 
 
 def set_threads(count: int) -> None:
-    """Set the number of Dr.Jit's threads, at least two.
+    """Set the number of Dr.Jit's threads, this one among them, >= 1.
+
+    The others search for work in a loop for 20 ms after each kernel, so that more threads than cores slow all down.
+    """
+    import drjit
+
+    if drjit.thread_count() != count:
+        drjit.set_thread_count(count)
+
+
+@contextmanager
+def threads_for_files() -> Iterator[None]:
+    """Context manager in which Dr.Jit has two threads at least.
 
     With one there is no worker thread, and Mitsuba's reader of EXR bitmaps, which gives its lines to worker threads,
     never returns.
     """
     import drjit
 
-    drjit.set_thread_count(max(count, 2))
+    before = drjit.thread_count()
+    set_threads(max(before, 2))
+    try:
+        yield
+    finally:
+        set_threads(before)
+
+
+def _cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def quiet_mitsuba() -> None:
