@@ -591,6 +591,20 @@ MUTANTS = (
         ("tests/tissue/test_near.py",),
     ),
     Mutant(
+        "steps of a source stay in its medium",
+        "inverse/band_images.py",
+        "lengths[same.argmax(axis=0)]",
+        "lengths[0 * same.argmax(axis=0)]",
+        ("tests/inverse/test_inner_border.py",),
+    ),
+    Mutant(
+        "parts of cells at a source close to another medium",
+        "tissue/graded_rule.py",
+        "length > WIDE * distance",
+        "length > 1e9 * distance",
+        ("tests/inverse/test_inner_border.py",),
+    ),
+    Mutant(
         "anisotropy in the equations of SP3",
         "tissue/light_models.py",
         "mua + musp * (1 + g), mua + musp * (1 + g + g**2)",

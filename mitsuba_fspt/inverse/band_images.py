@@ -34,6 +34,7 @@ LOG = logging.getLogger("mitsuba_fspt")
 OFF_BORDER = 0.25
 REPORTED = 0.02
 STEP = 1e-4  # relative change of optical coefficients, for slopes
+STEPS = 1, -1, 0.1, -0.1, 0.01, -0.01  # of a source's position, over the usual one, by preference
 KEPT = 30_000_000  # values of the solutions that a band keeps
 
 
@@ -159,9 +160,12 @@ class BandImages:
     def gradient(self, position: Array, radius: float, step: float) -> Array:
         """(V, 3) change of `exitance` [1/mm³] along x, y and z, by steps [mm], backwards where the tissue ends.
 
-        Raises FluxError where there is none behind either.
+        J_n has a kink where the source passes from one medium to another, and that of the finite elements a small jump:
+        steps stay in the medium of the source, whose side of the kink they give.
+
+        Raises FluxError where there is no tissue on either side.
         """
-        present = self._solution(position, radius)
+        present, steps = self._solution(position, radius), self._steps(position, step)
 
         def changes(ways: Array) -> Array:
             others = [(self.tissue, [_sphere(position + way, radius)]) for way in ways]
@@ -169,15 +173,23 @@ class BandImages:
             return np.column_stack([self._exitance(one) for one in near]) - self._exitance(present)[:, None]
 
         try:
-            return changes(step * np.eye(3)) / step
+            return changes(np.diag(steps)) / steps
         except FluxError:
             columns = []
-        for way in step * np.eye(3):
+        for way in np.diag(steps):
             try:
                 columns.append(changes(way[None]))
             except FluxError:
                 columns.append(-changes(-way[None]))
-        return np.column_stack(columns) / step
+        return np.column_stack(columns) / steps
+
+    def _steps(self, position: Array, step: float) -> Array:
+        """(3,) steps along x, y and z to points in the medium of `position`: ± `step`, or the longest that is there."""
+        lengths = step * np.array(STEPS)
+        ends = position + lengths[:, None, None] * np.eye(3)
+        medium = self.tissue.medium_at(np.vstack([position, *ends]))
+        same = (medium[1:] == medium[0]).reshape(-1, 3)
+        return np.asarray(lengths[same.argmax(axis=0)])  # the first where there is none
 
     def _solution(self, position: Array, radius: float) -> TissueSolution:
         """Solution for a source of 1 W; the last ones are kept, since fits begin anew from the same positions."""

@@ -149,6 +149,13 @@ class Tissue:
         nothing = Solved(np.zeros((self.equations.components, count)), np.zeros(count), 0.0, 0.0, 0)
         return self._solution((), 0.0, nothing).places(points)
 
+    def medium_at(self, points: Array) -> Index:
+        """(N,) number of the first region with the equations of the tissue at `points` (N, 3) [mm]; -1 outside."""
+        count = len(self.media)
+        first = [next(k for k in range(count) if self.equations.same(k, label)) for label in range(count)]
+        cells, local = self.mesh.locate(points)
+        return np.where(depth(local) < -OUTSIDE, -1, np.array(first)[self.mesh.region[cells]])
+
     def solve(self, sources: Sequence[Source]) -> TissueSolution:
         """Solution for these sources; raises FluxError as `solve`."""
         fields = _free_fields(self.mesh, self.equations, sources)

@@ -25,8 +25,9 @@ from scipy.sparse.linalg import splu
 
 from ..runtime.errors import FluxError
 from .border_curvature import BorderShape
-from .elements import SYMMETRIC, Elements, import_skfem
+from .elements import SYMMETRIC, Elements
 from .free_field import SourceField
+from .graded_rule import even_rule, graded_rule, is_wide
 from .light_models import Equations
 from .sparse_factor import Solve, factor
 
@@ -177,10 +178,7 @@ class System:
         load, power = np.zeros((equations.components, elements.nodes)), 0.0
         if not other.size:
             return load, power
-        # ∇φ_f is steep near a source: cells there are integrated by a rule on many small tetrahedra.
-        near = self._near(other, field.centres)
-        degree = 2 * elements.element.maxdeg
-        for cells, rule in ((other[~near], {"intorder": degree}), (other[near], {"quadrature": _split_rule(degree)})):
+        for cells, rule in self._rules(other, field):
             if len(cells) == 0:
                 continue
             basis = elements.on_cells(cells, **rule)
@@ -194,6 +192,20 @@ class System:
                 load[i] += elements.integrate(basis, value, diffusion[:, i, None] * slope.T.reshape(points.shape))
             power += float((values[0] * basis.dx).sum())
         return load, power
+
+    def _rules(self, cells: Index, field: SourceField) -> list[tuple[Index, dict[str, Any]]]:
+        """The cells in groups, each with its quadrature: ∇φ_f is steep near a source, and about 1/r² at it."""
+        degree = 2 * self.elements.element.maxdeg
+        near = self._near(cells, field.centres)
+        mesh, radii = self.elements.basis.mesh, field.modes[0].radii
+        corners = mesh.p.T[mesh.t.T[cells[near]]]
+        wide = is_wide(corners, field.centres, radii)
+        graded = [graded_rule(one, field.centres, radii, degree) for one in corners[wide]]
+        return [
+            (cells[~near], {"intorder": degree}),
+            (cells[near][~wide], {"quadrature": even_rule(degree)}),
+            *((one, {"quadrature": rule}) for one, rule in zip(cells[near][wide][:, None], graded, strict=True)),
+        ]
 
     def _near(self, cells: Index, centres: Array) -> NDArray[np.bool_]:
         """True for each of the cells with one of the `centres` within two cell radii of its centroid."""
@@ -356,10 +368,3 @@ class System:
 def _dots(a: Array, b: Array) -> Array:
     """(k,) dot products of the columns."""
     return np.asarray(np.einsum("nk,nk->k", a, b))
-
-
-def _split_rule(degree: int) -> tuple[Array, Array]:
-    """Points (3, Q) and weights (Q,) on the reference tetrahedron: a rule of `degree` on each of its 64 equal parts."""
-    skfem = import_skfem()
-    parts = skfem.Basis(skfem.MeshTet1.init_refdom().refined(2), skfem.ElementTetP1(), intorder=degree)
-    return np.asarray(parts.global_coordinates()).reshape(3, -1), parts.dx.ravel()
