@@ -35,7 +35,9 @@ from .footprint import SPECK
 
 AROUND = ((0, 0), (1, 0), (1, 1), (0, 1))  # of a cell of the pupil
 LEAST_AREA = 2.0**-20  # pixels²: a smaller image is replaced by the square of half a side `SPECK`
-LEAST_HEIGHT = 2.0**-5  # pixels: over a flatter image the density is taken as constant
+# Pixels a pixel of the film's longer side: over a flatter image the density varies along its longest edge alone, as its
+# slope, of a density below 1/16, times that side is to be a tenth of the largest number of quanta of `ColumnCanvas`.
+LEAST_HEIGHT = 2.0**-18
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
 HALVINGS = 5  # of a side of a piece, for the edge of a shadow
@@ -259,7 +261,8 @@ class FaceLines:
         own = dr.select(self.points, pupil_cells.area(cell), dr.pi / mi.Float(m * m))
         virtual_pixel = dr.opaque(mi.Float, camera.virtual_pitch**2)
         etendue = mi.Float64(etendue_from_surface(cos_s, area, arrival, own, virtual_pixel))
-        ring, count, light_area, flat = _polygon(images, tile, self.points)
+        least_height = dr.opaque(mi.Float64, LEAST_HEIGHT * max(camera.film.shape))
+        ring, count, light_area, flat, constant = _polygon(images, tile, self.points, least_height)
         turn = _cross(images[1] - images[0], images[2] - images[0])
         large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
@@ -269,7 +272,7 @@ class FaceLines:
         even = [falloff(camera, mi.Point2f(image) + origin) for image in images]
         cover = etendue / (light_area * mean)
         values = [cover / f * value for f, value in zip(even, values, strict=True)]
-        return _Image(images, values, shares, depths, turn, self.points | flat, cover, ring, count, active)
+        return _Image(images, values, shares, depths, turn, flat, constant, cover, ring, count, active)
 
 
 @dataclass(frozen=True)
@@ -359,14 +362,16 @@ class _LitPart:
 @dataclass(frozen=True)
 class _Image:
     """Images of pieces of faces: the three corners, the density of the light of J_n = 1 there, over the falloff of the
-    film, the share of each corner of the face there, the depth up to a factor; twice the signed area, and whether the
-    density is constant; the density of the coverage; and the polygon that the light fills, see `Laid`."""
+    film, the share of each corner of the face there, the depth up to a factor; twice the signed area; whether the
+    density varies along the longest edge alone, and whether it is constant; the density of the coverage; and the
+    polygon that the light fills, see `Laid`."""
 
     corners: list[mi.Point2d]
     values: list[mi.Float64]
     shares: list[list[mi.Float64]]
     depths: list[mi.Float64]
     turn: mi.Float64
+    flat: mi.Bool
     constant: mi.Bool
     cover: mi.Float64
     ring: list[mi.Point2d]
@@ -379,7 +384,7 @@ class _Image:
 
     def laid(self, densities: list[list[mi.Float64]]) -> Laid:
         """The image with these densities at its corners."""
-        planes = [_plane(self.corners, values, self.turn, self.constant) for values in densities]
+        planes = [_plane(self.corners, values, self.turn, self.flat, self.constant) for values in densities]
         return planes, self.ring, self.count, self.active
 
 
@@ -421,34 +426,46 @@ def _weights(
 
 
 def _polygon(
-    images: list[mi.Point2d], tile: list[mi.Point2d], points: mi.Bool
-) -> tuple[list[mi.Point2d], mi.UInt32, mi.Float64, mi.Bool]:
+    images: list[mi.Point2d], tile: list[mi.Point2d], points: mi.Bool, least_height: mi.Float64
+) -> tuple[list[mi.Point2d], mi.UInt32, mi.Float64, mi.Bool, mi.Bool]:
     """Polygon that the light fills: the image of a piece or of a cell, or a small square where that has no size.
 
-    Beside it the number of its edges, its area [pixels²], and True where the density over it is taken as constant.
+    Beside it the number of its edges, its area [pixels²], True where it is flatter than `least_height` [pixels], and
+    True where the density over it is constant: of cells and of squares.
     """
     ring = [dr.select(points, t, c) for t, c in zip(tile, (*images, images[0]), strict=True)]
     area = 0.5 * dr.abs(_cross(ring[2] - ring[0], ring[3] - ring[1]))
     longest = mi.Float64(0)
     for k in range(4):
         longest = dr.maximum(longest, dr.squared_norm(ring[k] - ring[k - 1]))
-    flat = 2 * area < LEAST_HEIGHT * dr.sqrt(longest)
+    flat = 2 * area < least_height * dr.sqrt(longest)
     none = ~(area > LEAST_AREA)
     count = dr.select(points | none, mi.UInt32(4), 3)
     middle = 0.25 * (ring[0] + ring[1] + ring[2] + ring[3])
     speck = [middle + SPECK * mi.Vector2d(x, y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     ring = [dr.select(none, s, own) for s, own in zip(speck, ring, strict=True)]
-    return ring, count, dr.select(none, 4 * SPECK**2, area), flat | none
+    return ring, count, dr.select(none, 4 * SPECK**2, area), flat | none, points | none
 
 
-def _plane(images: list[mi.Point2d], values: list[mi.Float64], turn: mi.Float64, constant: mi.Bool) -> Plane:
-    """The linear density with these values at three corners, `turn` twice their signed area; or their mean."""
+def _plane(
+    images: list[mi.Point2d], values: list[mi.Float64], turn: mi.Float64, flat: mi.Bool, constant: mi.Bool
+) -> Plane:
+    """The linear density with these values at three corners, `turn` twice their signed area.
+
+    Where they are `flat`, that along their longest edge of the same light and first moment; or their mean.
+    """
     a, b = images[1] - images[0], images[2] - images[0]
     u, v = values[1] - values[0], values[2] - values[0]
-    x, y = (u * b.y - v * a.y) / turn, (v * a.x - u * b.x) / turn
-    at = values[0] - x * images[0].x - y * images[0].y
-    mean = (values[0] + values[1] + values[2]) / 3
-    return Plane(dr.select(constant, mean, at), dr.select(constant, 0, x), dr.select(constant, 0, y))
+    middle, mean = (1 / 3) * (images[0] + images[1] + images[2]), (1 / 3) * (values[0] + values[1] + values[2])
+    edge = dr.select(dr.squared_norm(a) > dr.squared_norm(b), a, b)
+    edge = dr.select(dr.squared_norm(b - a) > dr.squared_norm(edge), b - a, edge)
+    places = [dr.dot(image - middle, edge) for image in images]
+    moment = sum((place * value for place, value in zip(places, values, strict=True)), mi.Float64(0))
+    along = moment / sum(map(dr.square, places), mi.Float64(0)) * edge
+    x = dr.select(flat, along.x, (u * b.y - v * a.y) / turn)
+    y = dr.select(flat, along.y, (v * a.x - u * b.x) / turn)
+    x, y = dr.select(constant, 0, x), dr.select(constant, 0, y)
+    return Plane(mean - x * middle.x - y * middle.y, x, y)
 
 
 def _cross(a: mi.Vector2d, b: mi.Vector2d) -> mi.Float64:

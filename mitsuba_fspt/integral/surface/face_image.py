@@ -42,6 +42,7 @@ from .glow import touching
 # with few nodes may agree by chance: the least error of the third level over the tolerance, for which M is chosen
 # there, and its factor from level to level.
 SAFETY, SHADED, AROUND, EXPECTED, FALL = 0.35, 1.0, 2, 0.5, 0.25
+PERSPECTIVE = 0.25  # of the tolerance: error by perspective, which no change shows where a face stays one piece
 FINER = 1.25  # M over that at which an edge as bright as its face is wrong by the tolerance: pixels have several
 DISPLACED = 2e-4  # pixels by which float32 displaces the images of faces against lines of sight
 MOST_LEVELS, MOST_CELLS = 6, 512  # levels; largest M at the second level
@@ -162,7 +163,7 @@ class FaceImage:
             self.plans, self.level, (value, coverage) = plans, level, found
             change = np.where(around, np.abs(value - self.value), 0)
             recent = safety * _largest(change)
-            least = EXPECTED * FALL ** (level - 2) * self.quadrature.rtol * self._peak(least_peak)
+            least = max(EXPECTED * FALL ** (level - 2), PERSPECTIVE) * self.quadrature.rtol * self._peak(least_peak)
             self.error[mark] = np.maximum(recent, least)[mark]
             self.value[around], self.coverage[around] = value[around], coverage[around]
             mark = shown & where & (self.error > self.quadrature.rtol * self._peak(least_peak))
@@ -209,14 +210,10 @@ class FaceImage:
 
     def _plans(self, rule: ColumnRule, least_peak: float) -> list[Plan]:
         peak = self._peak(least_peak) or most_radiance(self.scene) or 1.0
-        # A bound of 0.25 rtol on what perspective misplaces takes up to six times as many images of faces.
-        rule = replace(rule, step=rule.step / FINER**2, perspective=2 * rule.step)
+        rule = replace(rule, step=rule.step / FINER**2, perspective=PERSPECTIVE * rule.step)
         plans = []
         for faces, (most, change) in zip(self.faces, self.radiance, strict=True):
-            # The blur evens out what perspective misplaces within a face.
-            change = change * np.minimum(faces.sides / (1 + faces.blur), 1)
-            relative = (np.minimum(one / peak, BRIGHTEST) for one in (most, change))
-            plans.append(faces.image_plan(rule, *relative, MOST_CELLS))
+            plans.append(faces.image_plan(rule, np.minimum(most / peak, BRIGHTEST), change / peak, MOST_CELLS))
         return plans
 
     @cached_property

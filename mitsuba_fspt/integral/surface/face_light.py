@@ -36,6 +36,10 @@ EDGE_LEFT, KINK_LEFT = 0.12, 0.13
 # Points in place of pieces of s pixels leave s³/r^1.5 of the standard deviation of a J_n that is random from face to
 # face, root mean square over the pixels: the most on equilateral triangles, r = 0.1 … 3, s = 0.05 … 0.4.
 SPECKLE_LEFT = 0.04
+# What perspective, corrected on average, misplaces at the most within a triangle of the relative depth δ, over δ times
+# the change of J_n along it. A blur disc evens it out: over triangles of s pixels, whatever the directions of J_n and of
+# the depth on each, r pixels leave (s/(4 r))^1.5 of it at the most, for r = s/4 … 4 s.
+PERSPECTIVE_LEFT, EVENED = 0.16, 4.0
 FEWEST, MOST = 4, 64  # least and largest M of columns
 DROP = 0.01  # of rtol and of a column's brightest entry: entries below are left out
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
@@ -63,7 +67,8 @@ class ColumnRule(Thresholds):
     piece : largest piece over the distance in focus, over which étendue and exit law are linear but for some of its
         square
     perspective : J_n that perspective, corrected on average, misplaces within a piece, over its change along the face:
-        pieces along a side of a face of relative depth δ are √(δ/(8 · perspective))
+        pieces along a side of a face of relative depth δ are √(PERSPECTIVE_LEFT · δ/perspective), fewer where the blur
+        disc evens it out
     shadow : largest piece s [pixels] where one surface may hide another: each is lit or not on a line of sight. On
         faces of a pixels, smaller than their blur disc, the light displaced so over that of the column, times the
         distance [pixels], is w · s²/a, with w the share of the lines of sight of which the edge of a shadow crosses
@@ -294,10 +299,14 @@ class FaceLight:
         displaced = 3 * self.crossed * sides / rule.shadow**2 if contrast is None else 0
         shaded = np.where(self.small, np.minimum(shaded, np.sqrt(displaced)), shaded)
         pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
-        # Within a pixel perspective misplaces nothing.
-        change = 1.0 if contrast is None else contrast
-        pieces = np.maximum(pieces, np.minimum(np.sqrt(self.slant * change / (8 * rule.perspective)), sides))
+        pieces = np.maximum(pieces, np.minimum(self._flat_pieces(rule, 1.0 if contrast is None else contrast), sides))
         return np.maximum(np.ceil(pieces), 1)
+
+    def _flat_pieces(self, rule: ColumnRule, contrast: Array | float) -> Array:
+        """Pieces along a side for `perspective`, of a J_n with this change along the face."""
+        misplaced = PERSPECTIVE_LEFT * self.slant * contrast / rule.perspective
+        left = (np.minimum(self.sides, LONGEST) / (EVENED * np.maximum(self.blur, 1 / LONGEST))) ** 1.5
+        return np.minimum(np.sqrt(misplaced), (misplaced * left) ** (2 / 7))
 
     def _fewest(self, rule: ColumnRule) -> Index:
         """Least M of each face."""

@@ -48,6 +48,24 @@ def test_power_is_within_its_error(seed):
     assert off.max() < RTOL * peak
 
 
+def test_large_and_thin_faces_are_within_the_error():
+    """An ellipsoid of large faces, some edge-on, J_n over two decades from vertex to vertex, against the reference.
+
+    Expected: the stated error on pixels inside large faces, and where faces edge-on have an image of 0.1 pixels.
+    Seen to fail on the last three pixels where perspective may misplace 2 rtol of the change of J_n, which no level
+    shows where a face is one piece, and on the second where the density over pieces below 1/32 pixel is constant.
+    """
+    made = random_scene("cropped ellipsoids", 0)
+    image = by_faces(made.scene(), 1e-3)
+    pixels = np.array([[20, 40], [36, 28], [29, 30], [34, 22], [34, 23]])
+    left, top = made.crop[:2]
+    least = np.full(len(pixels), 1e-4 * image.power.max())
+    true, uncertain = made.reference.power(pixels + np.array([top, left]), least, most=2048)
+    off = np.abs(image.power[tuple(pixels.T)] - true)
+    assert (off <= image.error[tuple(pixels.T)] + uncertain).all()
+    assert uncertain.max() < 0.3 * image.error.max()
+
+
 def test_lines_of_sight_a_pixel_follow_rtol():
     """65,536 from 1e-3 on; below, with the power 4/3 of 1/rtol, as errors of lattices fall with the power -3/4."""
     assert Quadrature(rtol=1e-2).most_nodes == Quadrature().most_nodes == 65536
