@@ -37,8 +37,8 @@ EDGE_LEFT, KINK_LEFT = 0.12, 0.13
 # face, root mean square over the pixels: the most on equilateral triangles, r = 0.1 … 3, s = 0.05 … 0.4.
 SPECKLE_LEFT = 0.04
 # What perspective, corrected on average, misplaces at the most within a triangle of the relative depth δ, over δ times
-# the change of J_n along it. A blur disc evens it out: over triangles of s pixels, whatever the directions of J_n and of
-# the depth on each, r pixels leave (s/(4 r))^1.5 of it at the most, for r = s/4 … 4 s.
+# the change of J_n along it. A blur disc evens it out: over triangles of s pixels, whatever the directions of J_n and
+# of the depth on each, r pixels leave (s/(4 r))^1.5 of it at the most, for r = s/4 … 4 s.
 PERSPECTIVE_LEFT, EVENED = 0.16, 4.0
 FEWEST, MOST = 4, 64  # least and largest M of columns
 DROP = 0.01  # of rtol and of a column's brightest entry: entries below are left out
