@@ -13,6 +13,7 @@ project = "mitsuba_fspt"
 author = "The mitsuba_fspt developers"
 version = release = installed("mitsuba-fspt")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_gallery.gen_gallery", "fspt_pages"]
+html_show_copyright = False
 html_theme = "furo"
 html_title = f"{project} {version}"
 default_role = "code"  # `name` in docstrings
