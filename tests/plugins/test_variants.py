@@ -40,7 +40,8 @@ import numpy as np
 def pictures():
     from small_scenes import attribute, ball, glow, lens, world_scene
     mesh = {"type": "ply", "filename": sys.argv[1], "face_normals": True, "emitter": glow(attribute())}
-    scene = world_scene(mesh, ball(700.0, radius=1.5, center=(9, 1, 1)), sensor=lens(size=8, pitch=1.0))
+    coarse = {"type": "fspt_integral", "rtol": 1e-2}
+    scene = world_scene(mesh, ball(700.0, radius=1.5, center=(9, 1, 1)), sensor=lens(8, 1.0), integrator=coarse)
     integral = fspt.render(scene)
     plain = np.array(mi.render(scene)).mean(-1)
     tracers = [fspt.render(scene, method=method, spp=256) for method in ("path", "ptracer")]

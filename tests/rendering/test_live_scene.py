@@ -30,16 +30,13 @@ SCENE = """<scene version="3.0.0">
         <emitter type="fspt_surface"><float name="exitance" value="1"/></emitter>
     </shape>
 </scene>"""
+SMALL = SCENE.replace('"32"', '"16"').replace('"24"', '"12"').replace('value="0.5"', 'value="1"')  # the same field
 # For comparisons to the bit, which any accuracy serves.
-COARSE = SCENE.replace('"fspt_integral"/>', '"fspt_integral"><float name="rtol" value="0.01"/></integrator>')
+AT_1_PERCENT = '"fspt_integral"><float name="rtol" value="0.01"/></integrator>'
+COARSE = SMALL.replace('"fspt_integral"/>', AT_1_PERCENT)
 
 
 LENS = {"focal_length": 50.0, "f_number": 4.0, "focus_distance": 150.0, "pixel_pitch": 0.5}
-
-
-@pytest.fixture(scope="module")
-def live(mono):
-    return LiveScene(SCENE, {})
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +57,15 @@ def test_lens_numbers_and_placement_change_in_place_to_the_bit(coarse):
     assert coarse.loads == loads
 
 
-def test_a_draft_of_a_turned_phantom_loads_nothing_and_the_image_is_that_of_the_loaded_scene(live):
+def test_a_draft_of_a_turned_phantom_loads_nothing_and_the_image_is_that_of_the_loaded_scene(coarse):
     """The lens that turns the other way sees the same; a turn the same way would be off by half the peak."""
-    live.image({})
-    loads, wanted = live.loads, fspt.render(fspt.load(SCENE, turn=25))
-    draft = live.draft({"turn": 25}, rtol=1e-3, max_nodes=200_000)
-    assert live.loads == loads
-    assert np.abs(draft.power - wanted.power).max() <= 2e-3 * wanted.power.max()
-    assert np.array_equal(live.image({"turn": 25}).power, wanted.power)
-    assert live.loads == loads + 1
+    coarse.image({})
+    loads, wanted = coarse.loads, fspt.render(fspt.load(COARSE, turn=25))
+    draft = coarse.draft({"turn": 25}, rtol=1e-2, max_nodes=200_000)
+    assert coarse.loads == loads
+    assert np.abs(draft.power - wanted.power).max() <= 2e-2 * wanted.power.max()
+    assert np.array_equal(coarse.image({"turn": 25}).power, wanted.power)
+    assert coarse.loads == loads + 1
 
 
 def test_the_draft_of_a_monte_carlo_is_one_of_few_samples(mono):
@@ -79,16 +76,16 @@ def test_the_draft_of_a_monte_carlo_is_one_of_few_samples(mono):
     assert draft.power.sum() == pytest.approx(image.power.sum(), rel=0.05)
 
 
-def test_shapes_that_move_alone_are_moved_in_place_and_the_image_is_that_of_the_loaded_scene(live):
+def test_shapes_that_move_alone_are_moved_in_place_and_the_image_is_that_of_the_loaded_scene(coarse):
     """Mesh and sphere, one after the other and back; a shape left where it was would be off by its own radiance."""
-    live.image({})
-    loads = live.loads
+    coarse.image({})
+    loads = coarse.loads
     for values in ({"aside": 3}, {"lift": 1.5, "aside": -2}, {"lift": 1.5, "turn": 20}, {}):
-        draft = live.draft(values, rtol=1e-3, max_nodes=200_000)
-        wanted = fspt.render(fspt.load(SCENE, **values))
-        assert np.abs(draft.power - wanted.power).max() <= 2e-3 * wanted.power.max()
-    assert live.loads == loads
-    assert np.array_equal(live.image(values).power, wanted.power)
+        draft = coarse.draft(values, rtol=1e-2, max_nodes=200_000)
+        wanted = fspt.render(fspt.load(COARSE, **values))
+        assert np.abs(draft.power - wanted.power).max() <= 2e-2 * wanted.power.max()
+    assert coarse.loads == loads
+    assert np.array_equal(coarse.image(values).power, wanted.power)
 
 
 def test_a_mesh_file_that_changed_is_loaded_again(mono, tmp_path):
@@ -132,8 +129,9 @@ def test_another_model_of_the_lens(coarse):
     assert not np.array_equal(coarse.image({}).power, wanted)
 
 
-def test_the_surface_point_of_a_pixel(live):
+def test_the_surface_point_of_a_pixel(mono):
     """The line of sight on the axis meets the box at x = 4, 156 mm from the lens; focused there the disc is a point."""
+    live = LiveScene(SCENE, {})
     place = live.surface_point({}, None, 16, 12)
     assert place.shape == "box"
     assert place.exitance == pytest.approx(2)
@@ -168,9 +166,10 @@ def test_the_surface_point_behind_a_mirror_and_a_pane(mono):
 
 def test_the_second_of_two_lenses(mono):
     """Each lens changes in place, as if it were the only one."""
-    first = COARSE[COARSE.index("    <sensor") : COARSE.index("    <shape")]
+    one = SCENE.replace('"fspt_integral"/>', AT_1_PERCENT)
+    first = one[one.index("    <sensor") : one.index("    <shape")]
     other = first.replace('"50"', '"35"').replace("$distance, 0, 0", "0, $distance, 0").replace('"32"', '"20"')
-    two = COARSE.replace(first, first + other)
+    two = one.replace(first, first + other)
     live = LiveScene(two, sensor=1)
     for values in ({}, {"f_number": 8, "distance": 170}):
         wanted = fspt.render(fspt.load(two, **values), sensor=1)

@@ -16,6 +16,7 @@ from small_scenes import (
     camera_scene,
     disk,
     glow,
+    look_at_crop,
     mi,
     power,
     sphere,
@@ -62,7 +63,7 @@ def mirrored(point, z, tilt):
 
 def agrees_with_path(scene, spp=1024, seed=3, **settings):
     """True where the image of the integral, which is not dark, is that of Mitsuba's path tracer: p > 1e-3."""
-    image = fspt.render(scene, method="integral", rtol=1e-3, **settings)
+    image = fspt.render(scene, method="integral", rtol=3e-3, **settings)
     p = fspt.compare(image, fspt.render(scene, method="path", spp=spp, seed=seed)).z_test.p_value
     return image.power.max() > 0 and p > 1e-3
 
@@ -144,7 +145,7 @@ def test_two_mirrors_in_turn():
 
 def test_a_mask_of_even_opacity_scales_the_image():
     far, mask = sphere(150, 9), pane(80, {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}})
-    seen, bare = (fspt.render(camera_scene(far, bodies=b), rtol=1e-3) for b in ((mask,), ()))
+    seen, bare = (fspt.render(camera_scene(far, bodies=b, crop=QUARTER), rtol=1e-3) for b in ((mask,), ()))
     assert abs(seen.power - 0.7 * bare.power).max() < 1e-3 * bare.power.max()
     assert seen.coverage == pytest.approx(bare.coverage, abs=1e-3)
 
@@ -186,7 +187,7 @@ def test_a_mirror_in_another_bsdf_reflects_its_share():
             {"type": "twosided", "nested": half},
         ]
         bare += [PERFECT | {"specular_reflectance": r} for r in (share, share, share + 0.2 * (1 - share))]
-    scenes = (camera_scene(sphere(80, 5, x=70), bodies=strips(bsdfs), crop=(16, 9, 4, 7)) for bsdfs in (inside, bare))
+    scenes = (camera_scene(sphere(80, 5, x=70), bodies=strips(bsdfs), crop=(17, 9, 2, 7)) for bsdfs in (inside, bare))
     seen, due = (power(scene, rtol=4e-3) for scene in scenes)
     assert due.max() > 0
     assert abs(seen - due).max() < 4e-3 * due.max()
@@ -299,7 +300,7 @@ def test_narrow_light_behind_a_window():
     tiny = sphere(150, 0.05, x=3.1, y=1.3)
     around = (11, 10, 10, 9)
     scenes = (camera_scene(tiny, bodies=bodies, crop=around) for bodies in ((), (pane(80, PANE),)))
-    bare, seen = (fspt.render(scene, rtol=1e-3) for scene in scenes)
+    bare, seen = (fspt.render(scene, rtol=3e-3) for scene in scenes)
     assert seen.power.sum() / bare.power.sum() == pytest.approx(THROUGH, rel=2e-3)
 
 
@@ -333,11 +334,13 @@ def test_a_scene_without_specular_shapes_ends_lines_of_sight_at_the_first_surfac
 def test_panes_merged_by_mitsuba_are_not_passed_by():
     """Merged rectangles have no bounding box; lines of sight began behind them, and the phantom shone through."""
     plates = {f"p{k}": pane(100 + k, {"type": "diffuse", "reflectance": 0.0}, size=5.0, x=7.0 * k) for k in range(2)}
-    scene = camera_scene(sphere(150, 9), bodies=tuple(plates.values()))
+    crop = (10, 13, 14, 4)  # from limb to limb, with both plates
+    scene = camera_scene(sphere(150, 9), bodies=tuple(plates.values()), crop=crop)
     parts = {"type": "scene", "s": sphere(150, 9) | {"emitter": glow(1.0)}, **plates}
     film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "luminance"}
     lens = {"type": "fspt_lens", "focal_length": 55.0, "f_number": 2.8, "pixel_pitch": 0.4, "magnification": 0.5}
     merged = mi.load_dict(parts | {"sensor": lens | {"film": film}})
+    look_at_crop(merged, *crop)
     assert len(merged.shapes()) < len(scene.shapes())
     seen, due = power(merged, rtol=5e-3), power(scene, rtol=5e-3)
     assert abs(seen - due).max() < 1e-2 * due.max()
