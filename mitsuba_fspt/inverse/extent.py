@@ -25,8 +25,8 @@ SHAPES = ("point", "sphere")
 class ExtentSettings:
     """Accuracy of the radii.
 
-    ladder : radii that are tried first, over the distance of the centre from the border, up to one that is too large
-    beyond : rise of -2 ln L above its least value at which the ladder ends
+    radii : those that are tried first, over the distance of the centre from the border, up to one that is too large
+    beyond : rise of -2 ln L above its least value at which the search over radii ends
     even : of -2 ln L, the fall that counts: below it the smaller radius stays, and the search for the least value ends
     steps : most radii that are tried in a search
     rounds : of the radii, where there are several sources, and of the ends of an interval, where a likelier radius is
@@ -34,7 +34,7 @@ class ExtentSettings:
     close : of the root of the rise of -2 ln L at an end of the interval, the relative distance to interpolate over
     """
 
-    ladder: tuple[float, ...] = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95)
+    radii: tuple[float, ...] = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95)
     beyond: float = 25.0
     even: float = 0.05
     steps: int = 8
@@ -105,8 +105,8 @@ class Profile:
         return wide, (low or 0.0, self.limit**2 if high is None else high)
 
     def _climb(self) -> bool:
-        """Try the next radius of the ladder; False where there is none inside the tissue."""
-        squares = [(share * self.limit) ** 2 for share in self._settings.ladder]
+        """Try the next of the radii; False where there is none inside the tissue."""
+        squares = [(share * self.limit) ** 2 for share in self._settings.radii]
         larger = [q for q in squares if not self._known or q > self._known[-1][0]]
         self._top = self._top or not (larger and self._try(larger[0]))
         return not self._top

@@ -30,12 +30,12 @@ FLOAT32 = 2e-7
 RULES, TRANSECTS = (4, 16, 1000, 4000), (4, 16, 800, 3500, 13000)
 
 
-def measured(scene, truth, domain, **ladder):
+def measured(scene, truth, domain, **knobs):
     """Lines of sight and RMS errors for every value of one knob of the quadrature, `rtol` or `max_nodes`."""
     import mitsuba as mi
 
     integrator, sensor = mi.load_dict({"type": "fspt_integral"}), scene.sensors()[0]
-    ((knob, values),) = ladder.items()
+    ((knob, values),) = knobs.items()
     settings = [{"rtol": 1e-6, "domain": domain} | {knob: value} for value in values]
     solutions = [integrator.solve(scene, sensor, Quadrature(**setting)) for setting in settings]
     errors = [np.sqrt(np.mean((solution.power - truth) ** 2)) / truth.max() for solution in solutions]

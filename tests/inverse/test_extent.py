@@ -82,7 +82,7 @@ def inside(source, true=SOURCE, *, z=1.0):
 @pytest.mark.parametrize(
     ("height", "square", "by_model"),
     [(24 / 0.49**2, 0.49, 0.0), (20.0, 0.49, 0.0), (1.0, 2.25, 0.0), (1.0, 2.25, 12.0), (0.01, 0.0, 0.0)],
-    ids=["below the first rung", "near the first rung", "wide", "errors of the equation", "no radius"],
+    ids=["below the first radius", "near the first radius", "wide", "errors of the equation", "no radius"],
 )
 def test_ends_of_a_parabola(height, square, by_model):
     """Rationale: -2 ln L = c (a² − q)² has its least value at q and rises by z² (1 + v) at q ± z √((1 + v)/c).
@@ -189,12 +189,12 @@ def test_a_sphere_under_sp3(case):
 
 
 def test_two_sources_of_different_extent(case, monkeypatch):
-    """A sphere of 1.8 mm and a point 5 mm from it, on a coarse ladder of radii: each has the radius of its own.
+    """A sphere of 1.8 mm and a point 5 mm from it, on few radii: each has the radius of its own.
 
     Expected: 1.8 mm in 1.5 times the interval, of 0.4 mm or less, as positions and powers are in theirs; an upper limit
     below 1.5 mm for the point. Seen to fail with the profile of the second source made with the radius of the first.
     """
-    few = partial(ExtentSettings, ladder=(0.0, 0.6, 0.95), rounds=1, steps=3)
+    few = partial(ExtentSettings, radii=(0.0, 0.6, 0.95), rounds=1, steps=3)
     monkeypatch.setattr("mitsuba_fspt.inverse.extent.ExtentSettings", few)
     other, images = (-2.0, -1.0, 1.5, 1.5), {}
     for k, name in enumerate(BANDS):

@@ -159,8 +159,8 @@ class Means:
         """
         sums = [dr.zeros(mi.Float64, dr.width(self.pixels) * SHIFTS) for _ in range(2)]
         runs, done = (more - points) // FIRST, 0
-        lanes = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS * runs)
-        for part in batches(lanes, FIRST, draft.progress.batch):
+        entries = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS * runs)
+        for part in batches(entries, FIRST, draft.progress.batch):
             if done and draft.progress.deadline.passed():
                 break
             done += dr.width(part)

@@ -76,9 +76,9 @@ def rows_of(
         else:
             pi = scene.ray_intersect_preliminary(ray, active=passes)
             hits.note(pi, ray, mi.Float(1), pi.is_valid())
-        for k, (lane, face, weights, radiance) in enumerate(hits.stored()):
-            own = (dr.gather(mi.UInt32, column, lane) for column in (place, line))
-            light = eq9(radiance, dr.gather(mi.Float, etendue, lane))
+        for k, (entry, face, weights, radiance) in enumerate(hits.stored()):
+            own = (dr.gather(mi.UInt32, column, entry) for column in (place, line))
+            light = eq9(radiance, dr.gather(mi.Float, etendue, entry))
             found[k].append(tuple(column.numpy() for column in (*own, face, *weights, light)))
     rows = []
     for some in found:
@@ -90,15 +90,15 @@ def rows_of(
 
 
 class _Hits:
-    """Hits of a number of lines of sight, `lanes`, on emitting meshes; one line may meet several."""
+    """Hits of a number of lines of sight on emitting meshes; one line may meet several."""
 
     def __init__(
-        self, surfaces: Sequence[EmittingSurface], elements: Sequence[Elements], lanes: int, most: int
+        self, surfaces: Sequence[EmittingSurface], elements: Sequence[Elements], count: int, most: int
     ) -> None:
         self._meshes = list(zip(surfaces, elements, strict=True))
-        self._lane, self._most = dr.arange(mi.UInt32, lanes), most * lanes
+        self._entry, self._most = dr.arange(mi.UInt32, count), most * count
         self._counts = [dr.zeros(mi.UInt32) for _ in surfaces]
-        kinds = {"lane": mi.UInt32, "face": mi.UInt32} | dict.fromkeys(("a", "b", "c", "radiance"), mi.Float)
+        kinds = {"entry": mi.UInt32, "face": mi.UInt32} | dict.fromkeys(("a", "b", "c", "radiance"), mi.Float)
         self._stored = [{name: dr.zeros(kind, self._most) for name, kind in kinds.items()} for _ in surfaces]
 
     def note(self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, weight: mi.Float, met: mi.Bool) -> None:
@@ -112,7 +112,7 @@ class _Hits:
             face, (a, b, c) = own.weigh(si)
             kept = mine & (radiance > 0)
             slot = dr.scatter_inc(count, mi.UInt32(0), kept)
-            hits = {"lane": self._lane, "face": face, "a": a, "b": b, "c": c, "radiance": radiance}
+            hits = {"entry": self._entry, "face": face, "a": a, "b": b, "c": c, "radiance": radiance}
             for name, array in stored.items():
                 dr.scatter(array, hits[name], slot, kept & (slot < self._most))
 
@@ -126,13 +126,13 @@ class _Hits:
             number = int(count[0])
             if number > self._most:
                 raise SceneError(
-                    f"transport: {dr.width(self._lane)} lines of sight meet glowing surfaces {number} times by way of "
+                    f"transport: {dr.width(self._entry)} lines of sight meet glowing surfaces {number} times by way of "
                     f"specular shapes, at most {MOST_HITS} each are kept. Give a larger rtol."
                 )
-            keys = [stored[name].numpy()[:number] for name in ("radiance", "face", "lane")]
+            keys = [stored[name].numpy()[:number] for name in ("radiance", "face", "entry")]
             order = mi.UInt32(np.lexsort(keys).astype(np.uint32))
             hits = {name: dr.gather(type(array), array, order) for name, array in stored.items()}
-            yield hits["lane"], hits["face"], [hits[corner] for corner in "abc"], hits["radiance"]
+            yield hits["entry"], hits["face"], [hits[corner] for corner in "abc"], hits["radiance"]
 
 
 def _nothing(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Float:
