@@ -13,9 +13,10 @@ coefficients with `mua_sd` and `musp_sd` of 0.1, or without. J_n of the images s
 *photons* : one by one (`photon_walk`) in bins of 0.5 mm, between which J_n is linear; `locate` solves SP3, whose own
     error counts, too, and is in the intervals. `--keep` keeps the exit power by bins, for another run
 
-Columns: images, placements, and those that `locate` refused; shares of the 90 % intervals that contain x, y, z, and the
-power; rms error of the position over all directions [mm] and of the power [%]; rms of the errors over their stated sd,
-of positions and of powers; mean chi2; rms error of the coefficients before and after the fit [%]; median CPU seconds.
+Columns: images, placements, and those that `locate` refused; shares of the 90 % intervals that contain x, y, z, the
+power, and the coefficients; rms error of the position over all directions [mm] and of the power [%]; rms of the errors
+over their stated sd, of positions, of powers and of coefficients; mean chi2; rms error of the coefficients before and
+after the fit [%]; median CPU seconds. What is of fitted coefficients is empty where they are taken as exact.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ ROOT = Path(__file__).resolve().parent.parent
 RADIUS, HEIGHT, INDEX = 8.0, 16.0, 1.37
 VIEWS = [0, 90, 180, 270]
 SD = 0.1
+NORMAL_90 = 1.645  # standard deviations from the middle to the ends of a 90 % interval
 ELECTRONS, READ_NOISE = 300, 3.5
 TURNS, ROWS, RINGS = 100, 32, 16  # bins: around, along the side, across a cap
 COEFFICIENTS = {True: "fitted along", False: "taken as exact"}
@@ -195,6 +197,7 @@ def replicate(
     coefficients = np.array([[BANDS[n][k] for k in (1, 2)] for n in names]).ravel()
     actual = np.array([true[f"{n}.{key}"] for n in names for key in ("mua", "musp")])
     best = np.array([found.optics[name].value for name in true]) if fitted else coefficients
+    sd = np.array([found.optics[name].sd for name in true]) if fitted else np.full(len(actual), np.nan)
     return {
         "inside": ((low <= at) & (at <= high)).astype(float),
         "power_inside": np.array([float(source.power_interval[0] <= 1 <= source.power_interval[1])]),
@@ -202,6 +205,7 @@ def replicate(
         "power": np.array([source.power - 1]),
         "position_z": (source.position - at) / source.position_sd,
         "power_z": np.array([(source.power - 1) / source.power_sd]),
+        "coefficients_z": (best - actual) / sd,
         "chi2": np.array([found.chi2]),
         "before": coefficients / actual - 1,
         "after": best / actual - 1,
@@ -234,10 +238,12 @@ def row(
     numbers = {
         "holds_position": of["inside"].mean(),
         "holds_power": of["power_inside"].mean(),
+        "holds_coefficients": (np.abs(of["coefficients_z"]) <= NORMAL_90).mean() if fitted else np.nan,
         "position_mm": math.sqrt(3) * rms(of["position"]),
         "power_percent": 100 * rms(of["power"]),
         "position_over_sd": rms(of["position_z"]),
         "power_over_sd": rms(of["power_z"]),
+        "coefficients_over_sd": rms(of["coefficients_z"]),
         "chi2": of["chi2"].mean(),
         "coefficients_before_percent": 100 * rms(of["before"]),
         "coefficients_after_percent": 100 * rms(of["after"]),
@@ -245,7 +251,7 @@ def row(
     }
     line: dict[str, object] = {"images": images, "bands": len(names), "coefficients": COEFFICIENTS[fitted]}
     line |= {"placements": placements, "refused": placements - len(kept)}
-    return line | {name: float(f"{value:.3g}") for name, value in numbers.items()}
+    return line | {name: "" if math.isnan(value) else float(f"{value:.3g}") for name, value in numbers.items()}
 
 
 def main() -> None:

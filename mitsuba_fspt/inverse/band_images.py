@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -17,6 +15,7 @@ from scipy.sparse import csr_array
 from ..optics.media import Source
 from ..optics.shapes import Sphere
 from ..runtime.errors import FluxError, InversionError
+from ..runtime.interrupt import in_threads
 from ..tissue.border_surface import nearest_points
 from ..tissue.diffusion import Tissue
 from ..tissue.solution import TissueSolution
@@ -274,14 +273,10 @@ class BandImages:
 
 
 def of_each(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
-    """`work` of the arguments of each band, the bands in threads: NumPy and SciPy let others run while they compute.
-
-    After Ctrl-C the threads end the work of their present band first.
-    """
+    """`work` of the arguments of each band, the bands in threads: NumPy and SciPy let others run while they compute."""
     if len(arguments[0]) == 1:
         return [work(*(one[0] for one in arguments))]
-    with ThreadPoolExecutor(min(len(arguments[0]), os.cpu_count() or 1)) as pool:
-        return list(pool.map(work, *arguments))
+    return in_threads(work, *arguments)
 
 
 def _sphere(position: Array, radius: float) -> Source:

@@ -4,14 +4,21 @@ another exception, on its way through C++. SIGTERM is handled alike if the proce
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from contextvars import ContextVar
 from types import FrameType
+from typing import Any, TypeVar
 
 from .errors import FsptError
+
+Result = TypeVar("Result")
+ENDED: ContextVar[threading.Event | None] = ContextVar("ended", default=None)  # of a thread of `in_threads`
 
 
 @contextmanager
@@ -83,6 +90,37 @@ def ctrl_c_held() -> Iterator[None]:
 def terminated_as_by_ctrl_c() -> None:
     """Make SIGTERM raise KeyboardInterrupt from now on, so that files, folders and processes are cleaned up."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+def in_threads(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
+    """`work` of the first, second, … of each of the `arguments`, in as many threads as there are processors.
+
+    After Ctrl-C, or where one raises, the others end at their next `end_if_asked`.
+    """
+    ended = threading.Event()
+
+    def one(*given: Any) -> Result:
+        ENDED.set(ended)
+        end_if_asked()
+        return work(*given)
+
+    with ThreadPoolExecutor(min(len(arguments[0]), os.cpu_count() or 1)) as pool:
+        futures = [pool.submit(one, *given) for given in zip(*arguments, strict=True)]
+        try:
+            done = wait(futures, return_when=FIRST_EXCEPTION).done
+            for future in filter(done.__contains__, futures):
+                future.result()
+            return [future.result() for future in futures]
+        except BaseException:
+            ended.set()
+            raise
+
+
+def end_if_asked() -> None:
+    """Raise KeyboardInterrupt in a thread of `in_threads` that has to end."""
+    ended = ENDED.get()
+    if ended is not None and ended.is_set():
+        raise KeyboardInterrupt
 
 
 def _handlers() -> dict[int, Callable[[int, FrameType | None], object]]:

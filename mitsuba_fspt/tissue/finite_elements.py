@@ -24,6 +24,7 @@ from scipy.sparse import block_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from ..runtime.errors import FluxError
+from ..runtime.interrupt import end_if_asked
 from .border_curvature import BorderShape
 from .elements import SYMMETRIC, Elements
 from .free_field import SourceField
@@ -228,6 +229,7 @@ class System:
         direction = precondition(residual)
         product, goal = _dots(residual, direction), tolerance**2 * _dots(load, load)
         for iteration in range(MOST_ITERATIONS):
+            end_if_asked()
             going = ~(_dots(residual, residual) <= goal[active])  # also where it is no number
             if not going.all():
                 active = active[going]

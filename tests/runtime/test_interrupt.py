@@ -6,11 +6,12 @@ import os
 import signal
 import sys
 import threading
+import time
 
 import pytest
 
 from mitsuba_fspt.runtime.errors import SceneError
-from mitsuba_fspt.runtime.interrupt import ctrl_c_held, ctrl_c_noted, terminated_as_by_ctrl_c
+from mitsuba_fspt.runtime.interrupt import ctrl_c_held, ctrl_c_noted, end_if_asked, in_threads, terminated_as_by_ctrl_c
 
 
 def press():
@@ -149,3 +150,29 @@ def test_other_threads_hear_of_no_signal():
     thread.start()
     thread.join()
     assert seen
+
+
+def test_threads_end_after_ctrl_c():
+    """Two threads that would work for ten seconds end at their next check. Seen to fail without the checks."""
+    threading.Timer(0.2, press).start()
+    start = time.monotonic()
+
+    def work(_):
+        while time.monotonic() < start + 10:
+            time.sleep(0.01)
+            end_if_asked()
+
+    with pytest.raises(KeyboardInterrupt):
+        in_threads(work, range(2))
+    assert time.monotonic() < start + 3
+
+
+def test_threads_give_results_in_order_and_their_error():
+    end_if_asked()  # outside of such threads it does nothing
+    assert in_threads(lambda a, b: a - b, [3, 2, 1], [1, 1, 1]) == [2, 1, 0]
+    with pytest.raises(SceneError, match="no"):
+        in_threads(lambda a: wrong() if a else None, [0, 1])
+
+
+def wrong():
+    raise SceneError("no")

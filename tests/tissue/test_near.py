@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ from closed_forms import ball_exitance
 from mitsuba_fspt.optics.boundary import robin_a
 from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Sphere
+from mitsuba_fspt.runtime.errors import FluxError
+from mitsuba_fspt.runtime.interrupt import in_threads
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import Tissue
 from mitsuba_fspt.tissue.elements import Elements
@@ -86,3 +89,23 @@ def test_slopes_are_those_of_whole_solutions(model):
         up, down = (changed(*case, s * STEP).solve([SOURCE]).exitance_at(points, places) for s in (10, -10))
         other = (up - down) / (20 * STEP)
         np.testing.assert_allclose(one, other, rtol=0, atol=2e-3 * np.abs(other).max())
+
+
+def test_solutions_in_a_thread_end_where_another_fails():
+    """Iterations ask whether they have to end: of 400 solutions, some seconds, few are left. Seen to fail without."""
+    tissue = Tissue(cylinder_tetrahedra(5, 8, 2.0), MEDIA[:1], model="diffusion")
+    begun, count = threading.Event(), 0
+
+    def work(fails):
+        nonlocal count
+        if fails:
+            begun.wait(10)
+            raise FluxError("solve: no.")
+        for _ in range(400):
+            begun.set()
+            tissue.solve([SOURCE])
+            count += 1
+
+    with pytest.raises(FluxError):
+        in_threads(work, [False, True])
+    assert count < 50
