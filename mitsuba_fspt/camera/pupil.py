@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 
@@ -19,6 +21,12 @@ class Pupil:
     def __init__(self, optics: Lens) -> None:
         self.shift, self.radius = (dr.opaque(mi.Float, n) for n in (optics.discs[0].shift, optics.pupil_radius))
         self._borders = [tuple(dr.opaque(mi.Float, n) for n in (d.shift, d.radius)) for d in optics.discs[1:]]
+
+    def without_borders(self) -> Pupil:
+        """The first disc alone."""
+        whole = copy(self)
+        whole._borders = []
+        return whole
 
     def on_lens(self, x: mi.Point2f, pupil: mi.Point2f) -> mi.Point2f:
         """Point a = shift·x + radius·pupil [mm] of the lens plane, for virtual point x [mm]."""

@@ -198,6 +198,7 @@ class Solver:
         by_faces = None
         if not (everywhere or specular) and face_image.applies(scene, quadrature):
             by_faces = face_image.FaceImage(scene, camera, window, quadrature, peak)
+            where &= window.fully_open(camera)
         light, form = narrow.in_focus, partial(pupil_form.solve, view, window, quadrature)
         if progress.deadline.passed():
             where = np.zeros(window.shape, bool)

@@ -147,7 +147,8 @@ class _Faces:
         """The rough pixels without those that get their value from faces, if that takes less time than as many `lines`
         of sight for each of them."""
         draft, grid = self.draft, self.draft.grid
-        allowed = grid.array(draft.shown & draft.computed & ~(draft.clipped | draft.outside))
+        visible = grid.array(draft.shown & draft.computed & ~(draft.clipped | draft.outside))
+        allowed = visible & draft.window.fully_open(draft.camera)
         wanted, forced = grid.array(rough) & allowed, self.narrow & allowed
         if not self.taken and draft.progress.deadline.passed():
             self.narrow[:] = False
