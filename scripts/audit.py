@@ -110,7 +110,11 @@ def main() -> None:
     parser.add_argument("--readme", type=Path, help="file whose table 'audit', or 'audit_matrix', is replaced")
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.scenes)
-    names = arguments.family.split(",") if arguments.family else list(MESH_FAMILIES if arguments.matrix else FAMILIES | MESH_FAMILIES)
+    names = (
+        arguments.family.split(",")
+        if arguments.family
+        else list(MESH_FAMILIES if arguments.matrix else FAMILIES | MESH_FAMILIES)
+    )
     arguments.out.mkdir(exist_ok=True)
     if arguments.ablate:
         from mitsuba_fspt.integral.surface.face_light import ColumnRule
