@@ -118,7 +118,8 @@ class _Refinement:
             mark = shown & (mark | where & (self.coverage == 0) & (lines < DARK_LINES))
         if recent is None and mark.any():  # no time for a second level: the change from nothing
             self.error = SAFETY * grid.array(grid.spread_max(grid.flat(self.value)))
-        error = np.maximum(self.error, self.quadrature.least_error * self.window.brightest(self.value))
+        least = max([self.quadrature.least_error, *(glow.unseen for glow in self.glows)])
+        error = np.maximum(self.error, least * self.window.brightest(self.value))
         error[self.coverage == 0] = self.error[self.coverage == 0]
         power, error = (self.window.expand(image) * self.camera.etendue for image in (self.value, error))
         coverage = self.window.expand(np.clip(self.coverage, 0, 1))

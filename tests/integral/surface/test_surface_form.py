@@ -48,6 +48,19 @@ def both(of, rtol=RTOL, **accuracy):
     return fspt.render(of, domain="surface", rtol=rtol, **accuracy), fspt.render(of, rtol=rtol / 10, **accuracy)
 
 
+def test_the_centre_of_a_disk_is_within_the_error():
+    """A disk in focus, whose innermost elements are triangles that the midpoint rule does not hit in their centroids.
+
+    Expected: the pupil form within both errors. Seen to fail on 12 pixels, 0.7 rtol off at 0.2 stated, with as many
+    elements as a rectangle takes, and on 4 where their error is not stated.
+    """
+    scene = camera_scene(disk(FOCUS, 5.0, x=8.0))
+    image = fspt.render(scene, method="integral", rtol=3e-3, domain="surface")
+    truth = fspt.render(scene, method="integral", rtol=1e-4)
+    assert (np.abs(image.power - truth.power) <= image.error + truth.error).all()
+    assert image.error.max() < 3e-3 * image.power.max()
+
+
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_both_forms_are_one_integral(case):
     """Expected: the accuracy asked for at every pixel, a bound on 99 of 100.
