@@ -195,20 +195,21 @@ class Solver:
             peak = max(narrow.brightest / 2, least_peak)
         if specular and specular.bending:  # the surface form contains only light that goes straight to the lens
             where = np.zeros(window.shape, bool)
-        by_faces = None
-        if not (everywhere or specular) and face_image.applies(scene, quadrature):
-            by_faces = face_image.FaceImage(scene, camera, window, quadrature, peak)
-            where &= window.fully_open(camera)
         light, form = narrow.in_focus, partial(pupil_form.solve, view, window, quadrature)
         if progress.deadline.passed():
             where = np.zeros(window.shape, bool)
-        if by_faces:
-            solution = form(light, None, least_peak, progress, by_faces, where)
-        elif where.any():
-            part = progress.part(0, 2)
-            known = surface_form.solve(scene, camera, window, quadrature, where, peak, part, specular)
+        by_faces, by_elements, on_faces = None, where, np.zeros(window.shape, bool)
+        if not (everywhere or specular) and face_image.applies(scene, quadrature):
+            by_faces = face_image.FaceImage(scene, camera, window, quadrature, peak)
+            on_faces = where & window.fully_open(camera)
+            by_elements = where & ~on_faces
+        if by_elements.any():
+            part, rest = progress.part(0, 2), progress.part(1, 2)
+            known = surface_form.solve(scene, camera, window, quadrature, by_elements, peak, part, specular)
             known = _with_dark_coverage(known, view, window)
-            solution = known.completed_by(form(light, known, least_peak, progress.part(1, 2)))
+            solution = known.completed_by(form(light, known, least_peak, rest, by_faces, on_faces))
+        elif by_faces:
+            solution = form(light, None, least_peak, progress, by_faces, on_faces)
         elif specular and specular.bending and specular.branching:
             solution = _by_courses(view, window, quadrature, light, least_peak, progress)
         else:
@@ -216,7 +217,7 @@ class Solver:
         findings = (Finding("smooth blocks", False, why), *solution.findings)
         if not narrow.on_pixels.any():
             return replace(solution, findings=findings)
-        missed = _missed(narrow, where, cut, window, camera, solution)
+        missed = _missed(narrow, on_faces | by_elements | ~(inside | cut), cut, window, camera, solution)
         if specular and specular.bending:
             # The positions at which a mirror or glass shows a narrow spot are not known.
             there = window.seen_in(specular.bending, camera)
@@ -296,7 +297,7 @@ def _missed(
 ) -> NDArray[np.float64]:
     """Light of narrow spots that lines of sight may miss [W], shape (h, w), on pixels without the surface form.
 
-    where : pixels of the window that took the surface form
+    where : pixels of the window that took faces or the surface form, and dark ones beyond the image-plane stop
     cut : pixels that the border of the image-plane stop crosses, which always take lines of sight
     """
     light = np.where(where, 0, UNCERTAINTY * narrow.on_pixels)

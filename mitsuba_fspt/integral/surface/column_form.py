@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...camera.camera import Camera
+from ...camera.window import MOST_RIM
 from ...emission.elements import of_part
 from ...jit.batches import batch_slices, numbered
 from ...jit.loops import repeat
@@ -35,8 +36,9 @@ from .footprint import SPECK
 
 AROUND = ((0, 0), (1, 0), (1, 1), (0, 1))  # of a cell of the pupil
 LEAST_AREA = 2.0**-20  # pixels²: a smaller image is replaced by the square of half a side `SPECK`
-# Pixels a pixel of the film's longer side: over a flatter image the density varies along its longest edge alone, as its
-# slope, of a density below 1/16, times that side is to be a tenth of the largest number of quanta of `ColumnCanvas`.
+# Over the farthest coordinate of an image and the film's longer side: over a flatter image the density varies along its
+# longest edge alone, as its slope, of a density below 1/4π, times these is to be a sixth of the largest number of
+# quanta of `ColumnCanvas`.
 LEAST_HEIGHT = 2.0**-18
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
@@ -261,8 +263,8 @@ class FaceLines:
         own = dr.select(self.points, pupil_cells.area(cell), dr.pi / mi.Float(m * m))
         virtual_pixel = dr.opaque(mi.Float, camera.virtual_pitch**2)
         etendue = mi.Float64(etendue_from_surface(cos_s, area, arrival, own, virtual_pixel))
-        least_height = dr.opaque(mi.Float64, LEAST_HEIGHT * max(camera.film.shape))
-        ring, count, light_area, flat, constant = _polygon(images, tile, self.points, least_height)
+        side = dr.opaque(mi.Float64, max(camera.film.shape) + 2 * MOST_RIM)
+        ring, count, light_area, flat, constant = _polygon(images, tile, self.points, side)
         turn = _cross(images[1] - images[0], images[2] - images[0])
         large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
@@ -426,19 +428,20 @@ def _weights(
 
 
 def _polygon(
-    images: list[mi.Point2d], tile: list[mi.Point2d], points: mi.Bool, least_height: mi.Float64
+    images: list[mi.Point2d], tile: list[mi.Point2d], points: mi.Bool, side: mi.Float64
 ) -> tuple[list[mi.Point2d], mi.UInt32, mi.Float64, mi.Bool, mi.Bool]:
     """Polygon that the light fills: the image of a piece or of a cell, or a small square where that has no size.
 
-    Beside it the number of its edges, its area [pixels²], True where it is flatter than `least_height` [pixels], and
-    True where the density over it is constant: of cells and of squares.
+    Beside it the number of its edges, its area [pixels²], True where it is too flat for a density that is linear in two
+    coordinates on a film of this `side` [pixels], and True where the density is constant: of cells and of squares.
     """
     ring = [dr.select(points, t, c) for t, c in zip(tile, (*images, images[0]), strict=True)]
     area = 0.5 * dr.abs(_cross(ring[2] - ring[0], ring[3] - ring[1]))
-    longest = mi.Float64(0)
+    longest, reach = mi.Float64(0), mi.Float64(side)
     for k in range(4):
         longest = dr.maximum(longest, dr.squared_norm(ring[k] - ring[k - 1]))
-    flat = 2 * area < least_height * dr.sqrt(longest)
+        reach = dr.maximum(reach, dr.maximum(dr.abs(ring[k].x), dr.abs(ring[k].y)))
+    flat = 2 * area < LEAST_HEIGHT * reach * dr.sqrt(longest)
     none = ~(area > LEAST_AREA)
     count = dr.select(points | none, mi.UInt32(4), 3)
     middle = 0.25 * (ring[0] + ring[1] + ring[2] + ring[3])
