@@ -214,15 +214,8 @@ class Solver:
             solution = _by_courses(view, window, quadrature, light, least_peak, progress)
         else:
             solution = form(light, None, least_peak, progress)
-        findings = (Finding("smooth blocks", False, why), *solution.findings)
-        if not narrow.on_pixels.any():
-            return replace(solution, findings=findings)
-        missed = _missed(narrow, on_faces | by_elements | ~(inside | cut), cut, window, camera, solution)
-        if specular and specular.bending:
-            # The positions at which a mirror or glass shows a narrow spot are not known.
-            there = window.seen_in(specular.bending, camera)
-            missed = np.maximum(missed, window.expand(there * UNCERTAINTY * narrow.on_pixels.max() * camera.etendue))
-        return replace(solution, error=np.maximum(solution.error, missed), findings=findings)
+        solution = replace(solution, findings=(Finding("smooth blocks", False, why), *solution.findings))
+        return _with_missed(solution, narrow, on_faces | by_elements | ~(inside | cut), cut, window, view)
 
     def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[tuple[Blocks, ...], str]:
         """Blocks of pixels between which the image may be interpolated; the reason if there are none."""
@@ -290,6 +283,26 @@ def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solut
         return solution
     met = np.where(solution.where, pupil_form.coverage_of(view, window), 0)
     return replace(solution, coverage=np.maximum(solution.coverage, met))
+
+
+def _with_missed(
+    solution: Solution,
+    narrow: NarrowLight,
+    where: NDArray[np.bool_],
+    cut: NDArray[np.bool_],
+    window: Window,
+    view: View,
+) -> Solution:
+    """The solution with the light of narrow spots that lines of sight may miss in its error; masks as of `_missed`."""
+    if not narrow.on_pixels.any():
+        return solution
+    missed = _missed(narrow, where, cut, window, view.camera, solution)
+    if view.specular and view.specular.bending:
+        # The positions at which a mirror or glass shows a narrow spot are not known.
+        there = window.seen_in(view.specular.bending, view.camera)
+        most = UNCERTAINTY * narrow.on_pixels.max() * view.camera.etendue
+        missed = np.maximum(missed, window.expand(there * most))
+    return replace(solution, error=np.maximum(solution.error, missed))
 
 
 def _missed(
