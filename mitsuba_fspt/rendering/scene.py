@@ -6,7 +6,7 @@ import itertools
 import os
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,6 @@ from .scene_source import SceneSource
 from .scene_xml import TEXT
 
 COLOUR_FORMATS = ("rgb", "rgba", "xyz", "xyza")
-MESHES = ("ply", "obj", "serialized")  # plugins
 COLOURS = {  # plugins of colours and of spectra
     **dict.fromkeys(("d65", "srgb"), "colour"),
     **dict.fromkeys(("blackbody", "regular", "irregular"), "spectrum"),
@@ -68,8 +67,7 @@ def load_source(source: SceneSource) -> mi.Scene:
         _set_up(state, source)
         placements = _placements(state)
         mi.parser.transform_all(config, state)
-        with backend.threads_for_files() if _names_bitmaps(state) else nullcontext():
-            loaded: Any = mi.parser.instantiate(config, state)
+        loaded: Any = mi.parser.instantiate(config, state)
     loaded = loaded[0] if isinstance(loaded, list) else loaded
     probe_beside(loaded)
     remember_defaults(loaded, source.values)
@@ -135,11 +133,6 @@ def _set_up(state: mi.parser.ParserState, source: SceneSource) -> None:
     _require_whole_meshes(state)
     _name_children(state)
     _set_film_formats(state)
-
-
-def _names_bitmaps(state: mi.parser.ParserState) -> bool:
-    """Whether an element other than a mesh names a file: it may be a bitmap."""
-    return any("filename" in node.props and node.props.plugin_name() not in MESHES for node in state.nodes)
 
 
 def _require_whole_meshes(state: mi.parser.ParserState) -> None:

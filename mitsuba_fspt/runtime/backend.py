@@ -11,8 +11,7 @@ So `prepare` puts an `ImportWatch` before Python's import finders. It finds no m
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -151,7 +150,9 @@ def ensure_variant() -> str:
             " Call mi.set_variant('llvm_ad_mono') or 'cuda_ad_mono' first, or set none."
         )
     require_working_llvm(active)
-    if _cores() < 2:  # Mitsuba's own loading of EXR files, see `threads_for_files`
+    import drjit
+
+    if drjit.thread_count() < 2:  # on one core
         set_threads(2)
     return active
 
@@ -164,36 +165,14 @@ def refusal(variant: str) -> str:
 
 
 def set_threads(count: int) -> None:
-    """Set the number of Dr.Jit's threads, this one among them, >= 1.
-
-    The others search for work in a loop for 20 ms after each kernel, so that more threads than cores slow all down.
-    """
-    import drjit
-
-    if drjit.thread_count() != count:
-        drjit.set_thread_count(count)
-
-
-@contextmanager
-def threads_for_files() -> Iterator[None]:
-    """Context manager in which Dr.Jit has two threads at least.
+    """Set the number of Dr.Jit's threads, at least two.
 
     With one there is no worker thread, and Mitsuba's reader of EXR bitmaps, which gives its lines to worker threads,
     never returns.
     """
     import drjit
 
-    before = drjit.thread_count()
-    set_threads(max(before, 2))
-    try:
-        yield
-    finally:
-        set_threads(before)
-
-
-def _cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    drjit.set_thread_count(max(count, 2))
 
 
 def quiet_mitsuba() -> None:

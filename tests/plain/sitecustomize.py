@@ -1,10 +1,9 @@
-"""Kernels that are compiled quickly: vectors of four numbers, and without LLVM's optional passes. One thread.
+"""Kernels that are compiled quickly: vectors of four numbers, and without LLVM's optional passes.
 
 Python imports this module in every process that tests start with `--plain-kernels`, which puts its folder on PYTHONPATH
 (tests/plain_kernels.py). The settings change no result but for the order of sums: Dr.Jit permits no pass that rounds
 differently. Vectors of four in place of eight halve the time of the code generator. Dr.Jit has no public name for their
-width; where its library lacks the function, the width stays as it is. Further threads of Dr.Jit would search for work
-in a loop for 20 ms after each kernel, on cores that other tests use.
+width; where its library lacks the function, the width stays as it is.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ def compile_quickly():
 
     if not drjit.has_backend(drjit.JitBackend.LLVM):
         return
-    drjit.set_thread_count(1)
     if llvm := os.environ.get("DRJIT_LIBLLVM_PATH"):
         library, major = ctypes.CDLL(llvm), ctypes.c_uint()
         library.LLVMGetVersion(ctypes.byref(major), None, None)

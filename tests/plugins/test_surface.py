@@ -128,7 +128,8 @@ def bitmap(folder):
     Powers of two, so that no element of the surface lies on two texels.
     """
     texels = np.array([[5, 1, 0, 2], [40, 3, 7, 1], [2, 2, 0.5, 9], [1, 2, 3, 4]], np.float32)
-    picture = {"type": "bitmap", "bitmap": mi.Bitmap(texels[..., None]), "raw": True, "filter_type": "nearest"}
+    mi.Bitmap(texels[..., None]).write(str(folder / "texels.exr"))
+    picture = {"type": "bitmap", "filename": str(folder / "texels.exr"), "raw": True, "filter_type": "nearest"}
     scene = plastic("sphere", picture, radius=3.0)
     rows = 2 * np.pi * 9 * -np.diff(np.cos(np.linspace(0, np.pi, 5)))
     area = np.repeat(rows / 4, 4)

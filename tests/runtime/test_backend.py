@@ -270,30 +270,19 @@ def test_a_missing_libatomic_is_named_when_drjit_is_asked_for(monkeypatch: pytes
         watch.find_spec("drjit")
 
 
-def test_an_exr_is_read_on_one_core() -> None:
+@pytest.mark.parametrize("cores", ["one", "all"])
+def test_an_exr_is_read_with_one_core_or_thread(cores: str) -> None:
     """Seen to hang, in Mitsuba's reader, where Dr.Jit has no worker thread beside the main one."""
-    if not hasattr(os, "sched_setaffinity"):
+    if cores == "one" and not hasattr(os, "sched_setaffinity"):
         pytest.skip("this system binds no process to a core")
     script = f"""
-os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])
+if {cores == "one"}:
+    os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])
 from mitsuba_fspt.runtime import backend
 backend.ensure_variant()
+if {cores == "all"}:
+    backend.set_threads(1)
 import mitsuba
 print(json.dumps(list(mitsuba.Bitmap({str(SCENE)!r}).size())))
 """
     assert run_script(script) == [512, 256]
-
-
-def test_a_scene_with_an_exr_loads_with_one_thread() -> None:
-    """And the one thread remains. Seen to hang without `threads_for_files`."""
-    script = f"""
-import json, mitsuba_fspt
-from mitsuba_fspt.runtime import backend
-backend.ensure_variant()
-backend.set_threads(1)
-scene = mitsuba_fspt.load({str(SCENE.with_suffix(".xml"))!r})
-import drjit
-print(json.dumps([len(scene.shapes()), drjit.thread_count()]))
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
-    assert json.loads(done.stdout) == [1, 1]
