@@ -25,7 +25,7 @@ def is_hopeless(problem: Problem, levels: list[Surface], bounds: Hopeless, repor
     if chi2 < bounds.chi2:
         return False
     if count := _alone(part, residual, bounds):
-        cause = f"{count} pixels differ from all around them and hold most of it: mask cosmic rays and hot pixels"
+        cause = f"about {count} pixels differ from all around them and hold most of it: mask cosmic rays and hot pixels"
     else:
         if _share(part, fit, residual) < bounds.share:
             return False
@@ -39,7 +39,10 @@ def is_hopeless(problem: Problem, levels: list[Surface], bounds: Hopeless, repor
 
 
 def _alone(problem: Problem, residual: Array, bounds: Hopeless) -> int:
-    """Number of pixels that are brighter than all around them, where they are few and hold most of Σ (residual/σ)²."""
+    """Number of pixels that are brighter than all around them, where they are few and hold most of Σ (residual/σ)².
+
+    The fit bends towards them, so that a pixel beside one may count, too, and one of little light may not.
+    """
     views, height, width = problem.matrix.image_shape
     image = np.zeros(views * height * width)
     image[problem.rows] = residual

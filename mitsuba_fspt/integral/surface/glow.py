@@ -23,8 +23,8 @@ CELLS = 2.5  # cells along the pupil over ⁴√lines: errors of cells and of pi
 PIXELS_PER_ELEMENT, FEWEST_ELEMENTS, MOST_ELEMENTS = 4, 1 << 10, 1 << 20
 # Over rtol: elements of a shape that is no mesh. Below a pixel none is cut, so that no level shows the error of the
 # midpoint rule on n elements, times n in MIDPOINT: on a disk around its centre, where elements are triangles.
-FLAT, CURVED = 8.0, {"Sphere": 24.0, "Cylinder": 24.0, "Disk": 40.0}
-MIDPOINT = {"Sphere": 0.8, "Cylinder": 0.8, "Disk": 7.0}
+FLAT, CURVED = 8.0, 24.0
+MIDPOINT = {"Sphere": 0.8, "Cylinder": 0.8, "Disk": 6.0}
 BULGE = 0.1  # how far a curved element may reach beyond its corners, in units of their distance
 MISPLACED = 1 / 8  # of a step in J_n along an element, times its side squared [pixels], it misplaces
 UNBOUNDED = 4.0  # side [pixels] counted for an element that reaches through the lens plane and has no image
@@ -196,7 +196,8 @@ def _elements(shape: mi.Shape, camera: Camera, rtol: float) -> Elements:
     """Elements of a few pixels each, so that the refinement of one pixel affects few others."""
     pixel = float(camera.blur_disc(mi.Point3f(shape.bbox().center()))[2][0])
     ideal = float(shape.surface_area()[0]) / (PIXELS_PER_ELEMENT * pixel**2)
-    fewest = FEWEST_ELEMENTS if shape.is_mesh() else max(FEWEST_ELEMENTS, CURVED.get(shape.class_name(), FLAT) / rtol)
+    curved = shape.class_name() in ("Sphere", "Cylinder")
+    fewest = FEWEST_ELEMENTS if shape.is_mesh() else max(FEWEST_ELEMENTS, (CURVED if curved else FLAT) / rtol)
     return elements_of(shape, int(min(max(ideal, fewest), MOST_ELEMENTS)))
 
 

@@ -51,8 +51,8 @@ def both(of, rtol=RTOL, **accuracy):
 def test_the_centre_of_a_disk_is_within_the_error():
     """A disk in focus, whose innermost elements are triangles that the midpoint rule does not hit in their centroids.
 
-    Expected: the pupil form within both errors. Seen to fail on 12 pixels, 0.7 rtol off at 0.2 stated, with as many
-    elements as a rectangle takes, and on 4 where their error is not stated.
+    Expected: the pupil form within both errors. Seen to fail on 12 pixels, 0.7 rtol off at 0.2 stated, where the error
+    that the number of elements leaves is not stated.
     """
     scene = camera_scene(disk(FOCUS, 5.0, x=8.0))
     image = fspt.render(scene, method="integral", rtol=3e-3, domain="surface")
