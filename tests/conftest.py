@@ -85,13 +85,21 @@ def loaded():
                 importlib.import_module(name)
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 1_000, 10)  # no object of a test becomes old while the test runs
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_scene_of_another_module(loaded):
+    """Delete the scenes of the fixtures of earlier modules, which reference cycles keep alive."""
+    gc.collect()
 
 
 @pytest.fixture(autouse=True)
-def no_scene_of_another_test(loaded):
+def no_scene_of_another_test(no_scene_of_another_module):
     """Delete the scenes of earlier tests, which reference cycles keep alive.
 
     Kernels record the class of every living emitter and shape: one of a scene that was meant to be bad refuses, and
-    with others alive a kernel is compiled anew that the cache would have.
+    with others alive a kernel is compiled anew that the cache would have. The objects of the test before are young; a
+    search of all objects takes ten times as long.
     """
-    gc.collect()
+    gc.collect(1)
