@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from io import TextIOWrapper
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer.exceptions import TyperException
@@ -73,11 +75,17 @@ def main() -> None:
     sys.exit(code)
 
 
+@cache
+def _command() -> Callable[..., Any]:
+    """The verbs of `app` with their options, read from the signatures once in a process."""
+    return typer.main.get_command(app)
+
+
 def run(arguments: list[str]) -> int:
     """Exit code of `fspt` with these arguments; an error is printed as one line on stderr."""
     try:
         with ctrl_c_noted():
-            code = app(args=arguments, prog_name="fspt", standalone_mode=False)
+            code = _command()(args=arguments, prog_name="fspt", standalone_mode=False)
         if code == INTERRUPTED:  # typer returns this after a KeyboardInterrupt
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
