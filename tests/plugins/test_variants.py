@@ -1,6 +1,6 @@
 """Every LLVM variant of the wheel computes the same watts; switching between them and to scalar ones breaks nothing.
 
-What happens at import happens once in a process, so these run small scripts in processes of their own, side by side.
+What happens at import happens once in a process, so these run small scripts in processes of their own.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from mitsuba_fspt.runtime import backend, libllvm
 
 TESTS = Path(__file__).resolve().parents[1]
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral", "llvm_ad_spectral_polarized")
-# One process each; the first switches there and back.
-RUNS = (("llvm_ad_mono", "llvm_ad_spectral_polarized", "llvm_ad_mono"), *((name,) for name in VARIANTS[1:4]))
+SWITCHES = (*VARIANTS, VARIANTS[0])
 SCALAR_FIRST = "import mitsuba; mitsuba.set_variant('scalar_rgb'); import mitsuba_fspt"
 
 PRELUDE = """
@@ -77,23 +76,22 @@ def answer(process):
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """What `all_pictures` says in every run: power by integral and plain mi.render, power and error by path and by
-    ptracer, the variant.
+    """What `all_pictures` says of each of `SWITCHES`: power by integral and plain mi.render, power and error by path
+    and by ptracer, the variant.
     """
     from small_scenes import write_ply
 
     vertices = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
     path = tmp_path_factory.mktemp("variants") / "sheet.ply"
     write_ply(path, vertices, [(0, 1, 2), (0, 2, 3)], vertex=[100, 900, 500, 300])
-    processes = [start(PICTURES, path, *variants) for variants in RUNS]
-    return [[[*map(np.array, parts), tag] for *parts, tag in answer(process)] for process in processes]
+    return [[*map(np.array, parts), tag] for *parts, tag in answer(start(PICTURES, path, *SWITCHES))]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_computes_the_same_watts(pictures, variant):
     """The integral and plain `mi.render` to 1e-5 of the peak, `path` and `ptracer` within their noise."""
-    integral, plain, *noisy, _ = next(row for rows in pictures for row in rows if row[-1] == variant)
-    truth, _, *references, _ = pictures[0][0]
+    integral, plain, *noisy, _ = next(row for row in pictures if row[-1] == variant)
+    truth, _, *references, _ = pictures[0]
     peak = truth.max()
     assert peak > 0
     np.testing.assert_allclose(integral, truth, rtol=0, atol=1e-5 * peak)
@@ -122,7 +120,7 @@ print(json.dumps(path.power.sum() / integral.power.sum() - 1))
 
 
 def test_switching_there_and_back_changes_nothing(pictures):
-    first, _, again = pictures[0]
+    first, *_, again = pictures
     assert first[-1] == again[-1] == "llvm_ad_mono"
     # Not ptracer's last bits: its threads add to pixels in any order.
     for before, after in zip(first[:4], again[:4], strict=True):

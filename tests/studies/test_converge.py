@@ -133,13 +133,14 @@ def test_a_picture_of_few_settings_or_without_an_error_of_the_reference(tmp_path
 
 @pytest.fixture
 def short(monkeypatch):
-    """Two settings a method and a coarse reference, whatever the machine's speed."""
+    """Two settings a method, timed by a single run, and a coarse reference, whatever the machine's speed."""
     monkeypatch.setattr(converge_methods, "RTOL", (0.5, 0.02))
     monkeypatch.setattr(converge_methods, "RTOL_SURFACE", (0.5, 0.03))
     for name in ("SIDES", "POWERS_OF_TWO"):
         monkeypatch.setattr(converge_methods, name, (2, 16))
     monkeypatch.setattr(converge_methods, "PRIMES", (2, 17))
     monkeypatch.setattr(converge_methods, "MOST_POINTS", 1 << 16)
+    monkeypatch.setattr(converge, "BURST", 0.01)
     monkeypatch.setattr(converge, "REFERENCE_RTOL", {"pupil": (1e-4,), "surface": (0.1,)})
 
 
@@ -149,11 +150,13 @@ def test_every_method_comes_nearer_with_its_knob(tmp_path):
 
     A sphere behind the virtual detector plane, as blurred as the sum over points needs it.
     """
-    scene = small_scenes.camera_scene(small_scenes.sphere(220.0, 6.0), exitance=1e-3)
+    across, down = 20, 16
+    crop = ((WIDTH - across) // 2, (HEIGHT - down) // 2, across, down)
+    scene = small_scenes.camera_scene(small_scenes.sphere(220.0, 6.0), exitance=1e-3, crop=crop)
     told = fspt.converge(scene, rounds=1, budget=100.0)
     assert told.methods == ALL
     assert told.skipped == {}
-    assert 0 < told.full < WIDTH * HEIGHT
+    assert 0 < told.full < across * down
     assert told.stated < 1e-3
     assert told.raw_rate > 0
     for method in ALL:
@@ -165,7 +168,7 @@ def test_every_method_comes_nearer_with_its_knob(tmp_path):
         assert all(0 < r.memory < 1000 for r in rows)
     assert told.order("path, independent") == pytest.approx(0.5, abs=0.1)
     assert told.order("path, multijitter") > 0.55
-    assert [r.rays for r in told.of("path, stratified")] == [4 * WIDTH * HEIGHT, 256 * WIDTH * HEIGHT]
+    assert [r.rays for r in told.of("path, stratified")] == [4 * across * down, 256 * across * down]
     write_csv(told, tmp_path / "c.csv")
     with png_file(told, tmp_path / "c.png"):
         pass
