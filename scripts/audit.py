@@ -124,23 +124,26 @@ def main() -> None:
         path = arguments.out / f"ablation{'_matrix' * arguments.matrix}.csv"
         ablate([(one, seed) for one in names for seed in seeds], wanted, arguments.rtol, arguments.matrix, path)
         return
-    audits = []
-    for family in names:
-        pixels = arguments.likely, arguments.random
-        audits += [
-            audited(family, seed, arguments.rtol, *pixels, finer=arguments.finer, matrix=arguments.matrix)
-            for seed in seeds
-        ]
-        print(_row(family, [audit for audit in audits if audit.family == family], arguments.rtol), flush=True)
+    audits: list[Audit] = []
     name = "audit_matrix" if arguments.matrix else "audit"
-    with atomic_path(arguments.out / f"{name}.csv") as temporary, open(temporary, "w", newline="") as file:
-        sheet = csv.DictWriter(file, list(asdict(audits[0])))
-        sheet.writeheader()
-        sheet.writerows({name: _text(value) for name, value in asdict(audit).items()} for audit in audits)
+    for family in names:
+        for seed in seeds:
+            pixels = arguments.likely, arguments.random
+            audits.append(audited(family, seed, arguments.rtol, *pixels, arguments.finer, arguments.matrix))
+            _write(arguments.out / f"{name}.csv", audits)
+        print(_row(family, [audit for audit in audits if audit.family == family], arguments.rtol), flush=True)
     text = table(audits, arguments.rtol)
     print(f"\n{text}")
     if arguments.readme:
         markdown_tables.write(arguments.readme, name, text)
+
+
+def _write(path: Path, audits: Sequence[Audit]) -> None:
+    """All rows so far: a run that is ended early leaves them."""
+    with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
+        sheet = csv.DictWriter(file, list(asdict(audits[0])))
+        sheet.writeheader()
+        sheet.writerows({name: _text(value) for name, value in asdict(audit).items()} for audit in audits)
 
 
 def audited(

@@ -6,8 +6,6 @@ image. A line of sight runs from a point a of the lens plane through a point r_v
 
 from __future__ import annotations
 
-from copy import copy
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -144,12 +142,6 @@ class Camera:
         film = Film.whole(*(-(-n // side) for n in self.film.size))
         return Camera(self.lens, self.pixel_pitch * side, film, self.to_world)
 
-    def without_borders(self) -> Camera:
-        """The same camera with a lens of one border; right where a second one covers nothing of the pupil."""
-        whole = copy(self)
-        whole.pupil = self.pupil.without_borders()
-        return whole
-
     # ------------------------------------------------------------------ lines of sight
 
     def line_of_sight(
@@ -232,6 +224,37 @@ class Camera:
            not affect it.
         4. cosθ of the line of sight to the optical axis.
         """
+        position, x, lens_point, weight, cos_theta = self._arrival(point, pupil)
+        passes = self.pupil.passes(x, self.pupil.on_lens(x, pupil))
+        return position, lens_point, dr.select(passes, weight, 0), cos_theta
+
+    def open_arrival(
+        self, point: mi.Point3f, pupil: mi.Point2f
+    ) -> tuple[mi.Point2f, mi.Point3f, mi.Float, mi.Float, mi.Float]:
+        """As `arrival`, towards the point of the open part of the pupil that `opening` maps `pupil` [unit disc] to.
+
+        Fifth the share of the pupil that is open: the mean of share · weight over the unit disc is that of the weight
+        in `arrival`.
+        """
+        opened, share = self.opening(point, pupil)
+        position, _, lens_point, weight, cos_theta = self._arrival(point, opened)
+        return position, lens_point, weight, cos_theta, share
+
+    def opening(self, point: mi.Point3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
+        """Point of the part of the pupil that is open to the light of a world point, and the share of the pupil's area.
+
+        As `open_pupil`, at a fixed point of the object instead of a fixed film position (Eq. M.13).
+        """
+        return self.pupil.opened_to(self._in_camera(point), pupil)
+
+    def closed_to(self, corners: list[mi.Point3f], middle: mi.Point3f) -> mi.Bool:
+        """True for triangles of which a second border hides all; False for some of them, too."""
+        return self.pupil.closed_to([self._in_camera(corner) for corner in corners], self._in_camera(middle))
+
+    def _arrival(
+        self, point: mi.Point3f, pupil: mi.Point2f
+    ) -> tuple[mi.Point2f, mi.Point2f, mi.Point3f, mi.Float, mi.Float]:
+        """As `arrival`, with the virtual point second and without second borders."""
         centre, radius, _ = self.blur_disc(point)
         ideal, shift = mi.Point2f(centre + radius * pupil), self.pupil.shift
         x = self.film_map.ideal_to_plane(ideal)
@@ -244,8 +267,8 @@ class Camera:
         back, scale = defocus(depth, self._u, shift)
         growth = 1 - shift * back / scale
         weight = dr.square(growth * self._u / distance) * cos_theta
-        passes = (depth > 0) & dr.isfinite(weight) & self.pupil.passes(x, a)
-        return self.film_map.from_ideal(ideal), lens_point, dr.select(passes, weight, 0), cos_theta
+        weight = dr.select((depth > 0) & dr.isfinite(weight), weight, 0)
+        return self.film_map.from_ideal(ideal), x, lens_point, weight, cos_theta
 
     def _in_camera(self, point: mi.Point3f) -> mi.Vector3f:
         """World point in the camera frame [mm]; subtracted before it is rotated, which is exact far from the origin."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 import drjit as dr
 import mitsuba as mi
 
 from ..jit.disc_segments import segment, segment_height
+from ..optics.discs import defocus
 from ..optics.thin_lens import Lens
+
+LEAST_SCALE = 1e-6  # m' of Eq. M.7; a point with a smaller one lies before the border, where none has an image
 
 
 class Pupil:
@@ -21,12 +22,12 @@ class Pupil:
     def __init__(self, optics: Lens) -> None:
         self.shift, self.radius = (dr.opaque(mi.Float, n) for n in (optics.discs[0].shift, optics.pupil_radius))
         self._borders = [tuple(dr.opaque(mi.Float, n) for n in (d.shift, d.radius)) for d in optics.discs[1:]]
+        self._u = dr.opaque(mi.Float, optics.focus_distance)
 
-    def without_borders(self) -> Pupil:
-        """The first disc alone."""
-        whole = copy(self)
-        whole._borders = []
-        return whole
+    @property
+    def bordered(self) -> bool:
+        """True if a second border may cover a part of the pupil."""
+        return bool(self._borders)
 
     def on_lens(self, x: mi.Point2f, pupil: mi.Point2f) -> mi.Point2f:
         """Point a = shift·x + radius·pupil [mm] of the lens plane, for virtual point x [mm]."""
@@ -49,6 +50,42 @@ class Pupil:
             centre = (shift - self.shift) / self.radius * mi.Vector2f(x)
             pupil, share = onto_overlap(pupil, centre, radius / self.radius)
         return pupil, share
+
+    def opened_to(self, point: mi.Vector3f, pupil: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
+        """As `opened`, in the part of the pupil that is open to an object `point` [mm], in the camera frame."""
+        share = mi.Float(1)
+        for across, radius in self._seen_from(point):
+            pupil, share = onto_overlap(pupil, across, radius)
+        return pupil, share
+
+    def closed_to(self, corners: list[mi.Vector3f], middle: mi.Vector3f) -> mi.Bool:
+        """True for triangles with these `corners` and `middle` [mm], in the camera frame, to which nothing is open.
+
+        False for some of them, too: a line between a triangle and all points with an open part is searched for in one
+        direction alone.
+        """
+        closed = mi.Bool(False)
+        for k, (across, _) in enumerate(self._seen_from(middle)):
+            beyond, away = mi.Bool(True), across / dr.norm(across)
+            for corner in corners:
+                there, radius = self._seen_from(corner)[k]
+                beyond &= dr.dot(away, there) > 1 + radius
+            closed |= beyond
+        return closed
+
+    def _seen_from(self, point: mi.Vector3f) -> list[tuple[mi.Vector2f, mi.Float]]:
+        """Centre and radius of each second border on the unit disc, as seen from a point in the camera frame.
+
+        The lens point a = κx + ρ of light towards ρ passes a border of κ' and R' where |a - κ'x| <= R'. With
+        x = r/m - ρ b/m (Eq. M.7) that is |ρ m'/m - (κ' - κ) r/m| <= R', with m' the scale m for κ'.
+        """
+        _, scale = defocus(point.z, self._u, self.shift)
+        found = []
+        for shift, radius in self._borders:
+            _, other = defocus(point.z, self._u, shift)
+            side = self.radius * dr.maximum(other, LEAST_SCALE)
+            found.append(((shift - self.shift) / side * mi.Vector2f(point.x, point.y), radius * scale / side))
+        return found
 
 
 def onto_overlap(point: mi.Point2f, centre: mi.Vector2f, radius: mi.Float) -> tuple[mi.Point2f, mi.Float]:

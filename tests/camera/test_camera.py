@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from small_scenes import even_disc
 
 from mitsuba_fspt.runtime import backend
 
@@ -80,6 +81,26 @@ def test_weights_of_arrival_are_the_solid_angle_of_the_pupil():
     weight = own.arrival(mi.Point3f(0, 0, z), pupil)[2].numpy().astype(np.float64)
     solid_angle = np.pi * radius**2 / U**2 * weight.mean()
     assert solid_angle == pytest.approx(2 * np.pi * (1 - z / np.hypot(z, radius)), rel=1e-5)
+
+
+@pytest.mark.parametrize("depth", [60.0, 400.0])
+def test_light_through_the_open_part_of_the_pupil_is_all_that_passes(depth):
+    """Points of the object see the same light through the map of M.13 as through those points of the pupil that pass.
+
+    Law: sums of the weights, and of these times the place of arrival, from points for which much, little and nothing of
+    the pupil is open; `closed_to` finds only the last. Seen to fail with the border as the film sees it.
+    """
+    own, even = camera(lens_diameter=16.0, diaphragm_distance=15.0), even_disc(20_000)
+    pupil = mi.Point2f(*even.astype(np.float32))
+    for x in (2.0, 12.0, 24.0, 60.0):
+        point = mi.Point3f(x * depth / U, -0.3 * x, depth)
+        position, _, weight, _ = own.arrival(point, pupil)
+        opened, _, through, _, share = own.open_arrival(point, pupil)
+        expected, found = weight.numpy(), np.broadcast_to((share * through).numpy(), even.shape[1])
+        assert found.mean() == pytest.approx(expected.mean(), abs=3e-3)
+        moments = [(w * np.array(at)).mean(axis=1) for w, at in ((expected, position), (found, opened))]
+        np.testing.assert_allclose(moments[1], moments[0], rtol=2e-3, atol=3e-2)
+        assert bool(own.closed_to([point] * 3, point)[0]) == (expected.max() == 0)
 
 
 def test_etendue_of_a_pixel_and_its_filters():

@@ -42,6 +42,7 @@ LEAST_AREA = 2.0**-20  # pixels²: a smaller image is replaced by the square of 
 LEAST_HEIGHT = 2.0**-18
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
+WHOLE = 1e-6  # by which float32 changes the share of the pupil that is open
 HALVINGS = 5  # of a side of a piece, for the edge of a shadow
 MOST_WORK = 1 << 23  # entries of windows that are accumulated at a time
 LEFT = 1 / 3  # error over the change by twice the cells and pieces, of second order
@@ -229,7 +230,7 @@ class FaceLines:
         part, i, j = self.number // (m * m), self.number % m, self.number // m % m
         node = pupil_cells.middle(i, j, m)
         middle, area = elements.place(face, mi.Point2f(*elements.middle), self.cut, part)
-        _, lens_point, arrival, _ = camera.arrival(middle.p, node)
+        _, lens_point, arrival, _, open_share = camera.open_arrival(middle.p, node)
         cos_s = dr.dot(middle.n, dr.normalize(lens_point - middle.p))
         active = (cos_s > 0) & (arrival > 0)
         lit_part = None
@@ -240,17 +241,19 @@ class FaceLines:
             within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
             spot, _ = elements.place(face, within, self.cut, part)
             asked = active & ~lit_part.some if lit_part else active
-            active &= ~hidden(scene, spot.p, camera.arrival(spot.p, aim)[1], asked)
+            active &= ~hidden(scene, spot.p, camera.open_arrival(spot.p, aim)[1], asked)
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in corner))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)
+        open_mean = 0.75 * open_share
         for at in CORNERS:
             end, _ = elements.place(face, mi.Point2f(*at), self.cut, part)
-            position, to, _, cos_theta = camera.arrival(end.p, node)
+            position, to, _, cos_theta, share = camera.open_arrival(end.p, node)
             profile = faces.surface.law.profile(middle, dr.normalize(to - end.p), active)
             cos4 = mi.Float64(etendue_from_pixel(cos_theta, True, camera.film_map.area_share(position)))
             images.append(mi.Point2d(position - origin))
             values.append(eq9(mi.Float64(profile), cos4))
             mean += cos4 / 3
+            open_mean += share / 12  # exact where the share is a quadratic function of the place
             b = of_part(part, self.cut, mi.warp.square_to_uniform_triangle(mi.Point2f(*at)))
             shares.append([mi.Float64(1 - b.x - b.y), mi.Float64(b.x), mi.Float64(b.y)])
             depths.append(mi.Float64(camera.blur_disc(end.p)[2]))
@@ -259,14 +262,15 @@ class FaceLines:
         active &= side > 0
         cell = [pupil_cells.corner(i + x, j + y, m) for x, y in AROUND]
         film = camera.film_map.from_ideal
-        tile = [mi.Point2d(film(mi.Point2f(centre + radius * c)) - origin) for c in cell]
+        tiles = [centre + radius * camera.opening(middle.p, c)[0] for c in cell]
+        tile = [mi.Point2d(film(mi.Point2f(corner)) - origin) for corner in tiles]
         own = dr.select(self.points, pupil_cells.area(cell), dr.pi / mi.Float(m * m))
         virtual_pixel = dr.opaque(mi.Float, camera.virtual_pitch**2)
-        etendue = mi.Float64(etendue_from_surface(cos_s, area, arrival, own, virtual_pixel))
+        etendue = mi.Float64(etendue_from_surface(cos_s, area, open_mean * arrival, own, virtual_pixel))
         side = dr.opaque(mi.Float64, max(camera.film.shape) + 2 * MOST_RIM)
         ring, count, light_area, flat, constant = _polygon(images, tile, self.points, side)
         turn = _cross(images[1] - images[0], images[2] - images[0])
-        large = ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
+        large = (open_mean > 1 - WHOLE) & ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
         if lit_part:
             ring, count, etendue = lit_part.of_image(camera, origin, node, ring, count, etendue)
@@ -306,7 +310,7 @@ class _LitPart:
 
         def open_from(point: mi.Point3f, asked: mi.Bool) -> mi.Bool:
             start = point + INWARD * (middle - point)
-            return asked & ~hidden(scene, start, camera.arrival(start, node)[1], asked)
+            return asked & ~hidden(scene, start, camera.open_arrival(start, node)[1], asked)
 
         seen = [open_from(end, active) for end in ends]
         some = active & ((seen[0] != seen[1]) | (seen[0] != seen[2]))
@@ -356,7 +360,7 @@ class _LitPart:
             dr.select(self.lit, self.first, b),
         ]
         cut = self.some & ~whole
-        images = [mi.Point2d(camera.arrival(corner, node)[0] - origin) for corner in corners]
+        images = [mi.Point2d(camera.open_arrival(corner, node)[0] - origin) for corner in corners]
         ring = [dr.select(cut, new, old) for new, old in zip(images, ring, strict=True)]
         return ring, dr.select(cut, dr.select(self.lit, mi.UInt32(3), 4), count), etendue
 

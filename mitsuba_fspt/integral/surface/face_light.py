@@ -26,7 +26,6 @@ from . import pupil_cells
 
 CORNERS = ((0, 0), (1, 0), (0, 1))  # of a face, in the square that `Elements.place` maps to it
 MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for float32, and of the blur radius, for cells
-RIM_POINTS = 8  # of the pupil, by which a second border is found to cut it
 INWARD = 0.05  # of a face: distance from its sides at which rays start that search for the edge of a shadow
 FEWEST_SHADED = 2  # pieces along a side where one surface may hide another: with half of them the light differs
 # What middles of M × M cells leave of a half plane averaged over pixels, times r/M² of its step for a blur disc of r
@@ -40,6 +39,9 @@ SPECKLE_LEFT = 0.04
 # the change of J_n along it. A blur disc evens it out: over triangles of s pixels, whatever the directions of J_n and
 # of the depth on each, r pixels leave (s/(4 r))^1.5 of it at the most, for r = s/4 … 4 s.
 PERSPECTIVE_LEFT, EVENED = 0.16, 4.0
+# Where the open part of the pupil moves by δ [unit disc] along a triangle, its images through nodes are bent and their
+# density is not linear: at the most so much of its light, times δ², is misplaced, whatever its blur.
+BENT_LEFT = 0.4
 FEWEST, MOST = 4, 64  # least and largest M of columns
 DROP = 0.01  # of rtol and of a column's brightest entry: entries below are left out
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
@@ -59,8 +61,8 @@ class ColumnRule(Thresholds):
         √(EDGE_LEFT · r/step) for a blur radius r [pixels]
     kink : error at a face's side where J_n is continuous, over its change along the face: of columns that are
         continuous and nowhere cut off M is √(KINK_LEFT · r/(h · kink)), with h [pixels] the height of a face's image
-    partial : least M where only a part of the pupil takes light of a face: it turns away from the rest, a second border
-        cuts the pupil, or one surface may hide another
+    partial : least M where only a part of the pupil takes light of a face: it turns away from the rest, or one surface
+        may hide another
     cells : M where the cells are laid and pieces are points; their étendue is constant in each
     speckle : error of these points where J_n varies at random from face to face, over its standard deviation: for
         pieces of s pixels SPECKLE_LEFT · s³/r^1.5, root mean square over the pixels
@@ -141,11 +143,12 @@ class FaceLight:
 
     corners (F, 3): numbers of their vertices. low, high (F, 2): bounds of their light [pixels of the crop window],
     empty for a face that sends none. sides, heights, blur (F,): longest edge, height over it and blur radius of the
-    image [pixels]. slant (F,): depth of the face over its distance. partial (F,): only part of the pupil takes light of
-    the face. cut (V,): vertices at which the light of the surface ends for part of the pupil, at silhouettes and
-    borders. mixed (F,): one surface hides part of another here. edges (F, 3): of the image, from each corner to the
-    next [pixels]. crossed (F,): share of the lines of sight of which the edge of a shadow lies on the face, along its
-    longest edge. distance: in focus [virtual pixels].
+    image [pixels]. slant (F,): depth of the face over its distance. shift (F,): distance by which the open part of the
+    pupil moves along the face, where a second border covers the rest [unit disc]. partial (F,): the face turns away
+    from part of the pupil. cut (V,): vertices at which the light of the surface ends for part of the pupil, at
+    silhouettes and borders. mixed (F,): one surface hides part of another here. edges (F, 3): of the image, from each
+    corner to the next [pixels]. crossed (F,): share of the lines of sight of which the edge of a shadow lies on the
+    face, along its longest edge. distance: in focus [virtual pixels].
     """
 
     surface: EmittingSurface
@@ -157,6 +160,7 @@ class FaceLight:
     heights: Array
     blur: Array
     slant: Array
+    shift: Array
     partial: Mask
     cut: Mask
     mixed: Mask
@@ -185,15 +189,16 @@ class FaceLight:
         turn = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
         heights = np.divide(turn, sides, out=np.zeros(len(sides)), where=(sides > 0) & np.isfinite(turn))
         elements = elements_of(mesh, minimum=1)
-        most, least, rim = _facing(elements, camera)
+        most, least = _facing(elements, camera)
+        shift, closed = _opening(elements, camera)
         size = np.array(shape[::-1])
         beside = ((high <= 0) | (low >= size)).any(axis=1)
         area = np.isfinite(most)  # a face without area has no normal
-        dark = beside | (most <= 0) | (rim == 0) | ~area
+        dark = beside | (most <= 0) | closed | ~area
         low[dark], high[dark] = np.inf, -np.inf
-        partial = ~dark & ((least < 0) | (rim < 1))
+        partial = ~dark & (least < 0)
         cut = _border(corners, len(vertices))
-        cut[corners[~(least >= 0) | (rim < 1)].ravel()] = True
+        cut[corners[~(least >= 0)].ravel()] = True
         none = np.zeros(len(corners), bool)
         depth = _scales(mesh, camera)[corners]
         slant = np.ptp(depth, axis=1) / np.maximum(np.abs(depth).min(axis=1), 1e-3 * np.abs(depth).max(axis=1))
@@ -209,6 +214,7 @@ class FaceLight:
             heights=heights,
             blur=blur,
             slant=slant,
+            shift=shift,
             partial=partial,
             cut=cut,
             mixed=none,
@@ -285,12 +291,13 @@ class FaceLight:
         """
         nodes = np.sqrt(EDGE_LEFT * self.blur * brightness / rule.step)
         cells = (2 * np.ceil(nodes / 2)).clip(self._fewest(rule), most).astype(np.int64)
-        cuts = np.minimum(self._pieces(rule, contrast).astype(np.int64), math.isqrt(BATCH) // cells)
+        cuts = np.minimum(self._pieces(rule, contrast, brightness).astype(np.int64), math.isqrt(BATCH) // cells)
         return Plan(cells[:, None], cuts[:, None], np.zeros((len(cells), 1), bool))
 
-    def _pieces(self, rule: ColumnRule, contrast: Array | None = None) -> Array:
+    def _pieces(self, rule: ColumnRule, contrast: Array | None = None, brightness: Array | float = 1.0) -> Array:
         """Pieces along a side that are laid through nodes.
 
+        brightness : of the light of a face; 1 for columns
         contrast : largest change of the light along a face, for an image, whose faces smaller than their blur disc are
             cut along the edges of shadows; None: all pieces of columns are lit or not
         """
@@ -300,6 +307,8 @@ class FaceLight:
         shaded = np.where(self.small, np.minimum(shaded, np.sqrt(displaced)), shaded)
         pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
         pieces = np.maximum(pieces, np.minimum(self._flat_pieces(rule, 1.0 if contrast is None else contrast), sides))
+        if self.shift.any():
+            pieces = np.maximum(pieces, self.shift * np.sqrt(BENT_LEFT * brightness / rule.perspective))
         return np.maximum(np.ceil(pieces), 1)
 
     def _flat_pieces(self, rule: ColumnRule, contrast: Array | float) -> Array:
@@ -349,10 +358,10 @@ def _scales(mesh: mi.Shape, camera: Camera) -> Array:
     return camera.blur_disc(dr.unravel(mi.Point3f, positions))[2].numpy().astype(np.float64)
 
 
-def _facing(elements: Elements, camera: Camera) -> tuple[Array, Array, Array]:
-    """n·(a − r) of faces at the most and at the least [mm], and the share of the pupil's rim that is open to them.
+def _facing(elements: Elements, camera: Camera) -> tuple[Array, Array]:
+    """n·(a − r) of faces at the most and at the least [mm], over their corners r and the points a of the whole pupil.
 
-    Over the corners r of a face and the points a of the pupil; NaN where a face has no normal.
+    NaN where a face has no normal.
     """
     index = dr.arange(mi.UInt32, elements.count)
     axis = dr.normalize(camera.axis)
@@ -365,18 +374,21 @@ def _facing(elements: Elements, camera: Camera) -> tuple[Array, Array, Array]:
         spread = dr.norm(rim - middle) * dr.safe_sqrt(1 - dr.square(dr.dot(si.n, axis)))
         most = np.maximum(most, (towards + spread).numpy())
         least = np.minimum(least, (towards - spread).numpy())
-    open_rim = mi.Float(0)
-    si, _ = elements.place(index, mi.Point2f(*elements.middle))
-    turns = dr.two_pi * np.arange(RIM_POINTS) / RIM_POINTS
-    for turn in turns:
-        _, _, weight, _ = camera.arrival(
-            si.p, mi.Point2f(*(dr.opaque(mi.Float, f(turn)) for f in (math.cos, math.sin)))
-        )
-        open_rim += dr.select(weight > 0, 1 / RIM_POINTS, 0)
-    if len(camera.lens.discs) > 1:  # the middle of the pupil may be open where its rim is not
-        _, _, weight, _ = camera.arrival(si.p, mi.Point2f(0))
-        open_rim = dr.select(weight > 0, dr.maximum(open_rim, 0.5 / RIM_POINTS), open_rim)
-    return most, least, np.broadcast_to(open_rim.numpy(), elements.count)
+    return most, least
+
+
+def _opening(elements: Elements, camera: Camera) -> tuple[Array, Mask]:
+    """By how much the open part of the pupil moves along each face [unit disc], and True for faces of which a second
+    border hides all."""
+    if not camera.pupil.bordered:
+        return np.zeros(elements.count), np.zeros(elements.count, bool)
+    index = dr.arange(mi.UInt32, elements.count)
+    corners = [elements.place(index, mi.Point2f(*at))[0].p for at in CORNERS]
+    middles = [camera.opening(corner, mi.Point2f(0))[0] for corner in corners]
+    moved = dr.maximum(dr.norm(middles[1] - middles[0]), dr.norm(middles[2] - middles[1]))
+    closed = camera.closed_to(corners, elements.place(index, mi.Point2f(*elements.middle))[0].p)
+    moved = 2 * dr.maximum(moved, dr.norm(middles[0] - middles[2]))
+    return moved.numpy().astype(np.float64), np.broadcast_to(closed.numpy(), elements.count)
 
 
 def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
@@ -386,8 +398,8 @@ def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Inde
     m = mi.UInt32(cells)
     within, aim = pupil_cells.strata(number % m, number // m, m, index * pupil_cells.STRIDE)
     spot, _ = elements.place(index, within)
-    _, lens_point, arrival, _ = camera.arrival(spot.p, aim)
-    reaches = (arrival > 0) & (dr.dot(spot.n, lens_point - spot.p) > 0)
+    _, lens_point, arrival, _, share = camera.open_arrival(spot.p, aim)
+    reaches = (share * arrival > 0) & (dr.dot(spot.n, lens_point - spot.p) > 0)
     blocked = reaches & hidden(scene, spot.p, lens_point, reaches)
     counted = [np.asarray(flag.numpy()).reshape(-1, cells**2).sum(axis=1) for flag in (reaches, blocked)]
     return 1 - counted[1] / np.maximum(counted[0], 1)
@@ -407,8 +419,8 @@ def _crossed_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: I
     seen = []
     for k in range(6):
         point = 0.5 * (corners[k // 2] + corners[(k + 1) // 2 % 3])
-        _, lens_point, arrival, _ = camera.arrival(point, node)
-        open_to = (arrival > 0) & (dr.dot(middle.n, lens_point - point) > 0)
+        _, lens_point, arrival, _, share = camera.open_arrival(point, node)
+        open_to = (share * arrival > 0) & (dr.dot(middle.n, lens_point - point) > 0)
         seen.append((open_to & ~hidden(scene, point, lens_point, open_to)).numpy().reshape(-1, cells**2))
     lit = np.stack(seen, axis=-1)
     some = np.maximum(lit.any(axis=-1).sum(axis=1), 1)

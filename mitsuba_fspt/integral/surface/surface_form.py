@@ -183,9 +183,10 @@ class _Refinement:
         # a round shape noisy. J_n and occlusion, which may jump within a piece, are sampled all over it.
         middle, area = elements.place(index, mi.Point2f(*elements.middle), cut, part)
         spot, _ = elements.place(index, within, cut, part)
-        _, lens_point, arrival, cos_theta = camera.arrival(middle.p, aim)
+        _, lens_point, arrival, cos_theta, open_share = camera.open_arrival(middle.p, aim)
         to_lens = dr.normalize(lens_point - middle.p)
         cos_s = dr.dot(middle.n, to_lens)
+        arrival *= open_share
         active = (cos_s > 0) & (arrival > 0)
         through = mi.Float(1)
         if self.hidden:
@@ -201,11 +202,15 @@ class _Refinement:
             active, etendue_from_surface(cos_s, area, arrival, pupil_cells.area(cell), virtual_pixel), 0
         )
 
-        discs = {at: camera.blur_disc(elements.place(index, mi.Point2f(*at), cut, part)[0].p) for at in CORNERS}
+        places = {at: elements.place(index, mi.Point2f(*at), cut, part)[0].p for at in CORNERS}
+        discs = {at: camera.blur_disc(place) for at, place in places.items()}
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.window.corner))
-        middle = pupil_cells.middle(i, j, m)
+        node = pupil_cells.middle(i, j, m)
         film = camera.film_map.from_ideal
-        images = [film(mi.Point2f(centre + radius * middle)) - origin for centre, radius, _ in discs.values()]
+        images = [
+            film(mi.Point2f(centre + radius * camera.opening(place, node)[0])) - origin
+            for place, (centre, radius, _) in zip(places.values(), discs.values(), strict=True)
+        ]
         # The image of a piece through the cell's middle; or, where that is smaller than a cell's image or the blur disc
         # covers the whole shape, of the cell through the piece's middle. Either way neighbours on the surface or on the
         # pupil are neighbours on the film.
@@ -214,7 +219,7 @@ class _Refinement:
         radius = sum((discs[at][1] for at in elements.corners), mi.Float(0)) * share
         least = dr.opaque(mi.Float, BLURRED**2 if batch.glow.small else 0)
         blurred = _size(images) < dr.square(radius) * dr.maximum(dr.two_pi / dr.square(mi.Float(m)), least)
-        tiles = [film(mi.Point2f(centre + radius * own)) - origin for own in cell]
+        tiles = [film(mi.Point2f(centre + radius * camera.opening(middle.p, own)[0])) - origin for own in cell]
         polygon = [dr.select(blurred, own, other) for own, other in zip(tiles, images, strict=True)]
         for _, _, scale in discs.values():  # no image where a piece reaches through the lens plane
             active &= scale * discs[CORNERS[0]][2] > 0
