@@ -22,6 +22,7 @@ NEEDS = {
     "source_in_a_cylinder": ["skfem"],
     "sweep_on_dask": ["distributed"],
 }
+SMALL = {"recover_bitmap": ["12"]}  # arguments: fewer pixels
 # Which third: FSPT_EXAMPLES=0, 1, 2 or all; else by the day. In a third the examples stand by their names.
 THIRD = os.environ.get("FSPT_EXAMPLES") or str(datetime.date.today().toordinal() % 3)
 CHOSEN = NAMES if THIRD == "all" else NAMES[int(THIRD) :: 3]
@@ -36,7 +37,7 @@ def test_an_example_runs_and_finds_its_number(name, tmp_path):
     for module in ["matplotlib", *NEEDS.get(name, [])]:
         pytest.importorskip(module)
     environment = os.environ | {"MPLBACKEND": "agg", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    call = [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py")]
+    call = [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py"), *SMALL.get(name, [])]
     done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()

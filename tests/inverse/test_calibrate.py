@@ -22,7 +22,7 @@ def scene(tmp_path_factory, mono):
     return write_scene(tmp_path_factory.mktemp("calibrate") / "ball.xml")
 
 
-def noisy(scene, seed, share=0.01, rtol=1e-4, **parameters):
+def noisy(scene, seed, share=0.01, rtol=1e-3, **parameters):
     """Image of the scene with independent normal noise of 1 % of its brightest pixel."""
     power = fspt.render(fspt.load(scene, **parameters), rtol=rtol).power.astype(float)
     sigma = np.full(power.shape, share * power.max())
@@ -57,7 +57,7 @@ def test_warnings_about_the_scene_are_told_once(scene, monkeypatch, caplog):
 def test_monte_carlo_gives_the_parameters_of_its_scene(scene):
     """An image by `path` with its own standard error; gain beside the distance."""
     image = fspt.render(fspt.load(scene, distance=164), method="path", spp=512, seed=4)
-    found = fspt.calibrate(scene, image, free=["distance", "gain"])
+    found = fspt.calibrate(scene, image, free=["distance", "gain"], settings=CalibrationSettings(rtol=1e-3))
     assert found.values["gain"] == pytest.approx(1, abs=4 * found.sd["gain"])
     assert found.values["distance"] == pytest.approx(164, abs=4 * found.sd["distance"])
     assert found.covariance.shape == (2, 2)
@@ -79,7 +79,7 @@ def test_electrons_of_another_source_give_the_parameters(scene, tmp_path):
 
 def test_a_gain_of_images_with_stray_light(scene):
     """5 % of glare over the film is in the images, too: the gain is 1. Seen to fail (0.95, 30 sd) without it."""
-    image = noisy(scene, 3, share=0.002)
+    image = noisy(scene, 3, share=0.002, rtol=1e-4)
     power = image.power.astype(float)
     power = 0.95 * power + 0.05 * power.mean()
     known = {"veiling_glare": 0.05, "veiling_glare_film": f"{image.shape[1]} x {image.shape[0]}"}
@@ -98,7 +98,7 @@ def test_a_number_of_the_distortion_comes_back(tmp_path, mono):
     shapes = "".join(ball.format(y, z) for y in (-8, 8) for z in (-5, 5))
     wide = write_scene(tmp_path / "wide.xml", sensor=sensor, shapes=shapes)
     wide.write_text(wide.read_text().replace('value="165"', 'value="26"'))
-    found = fspt.calibrate(wide, noisy(wide, 1, rtol=5e-4, k1=-0.08), free=["k1"])
+    found = fspt.calibrate(wide, noisy(wide, 1, k1=-0.08), free=["k1"])
     assert abs(found.values["k1"] + 0.08) < 4 * found.sd["k1"]
     assert 0 < found.sd["k1"] < 0.02
 
@@ -279,11 +279,14 @@ def test_variance_of_monte_carlo_follows_the_signal():
 def test_intervals_contain_the_reference_on_a_fine_film(mono):
     """256 samples on 72 × 16 pixels: magnification and distance within 3 sd, of at most 3e-5 and 4 µm.
 
-    Seen to fail (5 sd and more) where the edges' standard errors were taken as smaller than they are.
+    Seen to fail (5 sd and more, 87 with a variance in proportion to the square of the power) where the edges' standard
+    errors were taken as smaller than they are.
     """
     camera = {"width": 72, "height": 16, "pixel_pitch": 0.216, "f_number": 2.8, "view": 90}
     image = fspt.render(fspt.load(SCENES / "nylon_cylinder.xml", **camera), method="path", spp=256, seed=2)
-    found = fspt.calibrate(SCENES / "nylon_cylinder.xml", image, free=["magnification", "distance"], **camera)
+    settings = CalibrationSettings(rtol=3e-4)
+    names = ["magnification", "distance"]
+    found = fspt.calibrate(SCENES / "nylon_cylinder.xml", image, free=names, settings=settings, **camera)
     for name, true, bound in (("magnification", 0.5, 3e-5), ("distance", 180.0, 4e-3)):
         assert abs(found.values[name] - true) < 3 * found.sd[name]
         assert 0 < found.sd[name] < bound
@@ -298,7 +301,8 @@ def test_pose_of_the_nylon_cylinder(mono):
     camera = {"width": 32, "height": 32, "pixel_pitch": 0.864, "f_number": 2.8}
     true = {"view": 0.7, "distance": 180.4, "magnification": 0.5013}
     image = fspt.render(fspt.load(SCENES / "nylon_cylinder.xml", **camera, **true), method="path", spp=256, seed=3)
-    found = fspt.calibrate(SCENES / "nylon_cylinder.xml", image, free=list(true), **camera)
+    settings = CalibrationSettings(rtol=5e-4)
+    found = fspt.calibrate(SCENES / "nylon_cylinder.xml", image, free=list(true), settings=settings, **camera)
     for name, bound in (("view", 0.1), ("distance", 0.02), ("magnification", 5e-4)):
         off = abs(found.values[name] - true[name])
         assert 0 < found.sd[name] < bound / 2

@@ -107,9 +107,9 @@ def collected_by_vertices(vertices, faces, cut=4):
     return total
 
 
-@pytest.mark.parametrize(("rtol", "depth"), [(1e-3, 185.0), (1e-4, 150.0)])
+@pytest.mark.parametrize(("rtol", "depth"), [(1e-3, 185.0), (3e-4, 150.0)])
 def test_sums_of_columns_are_form_factors_whatever_the_focus(tmp_path, rtol, depth):
-    """Expected: ∫ φ_j f_S→pupil dS, to 3e-3 at rtol 1e-3 and 1e-3 at 1e-4 of each column that sends light.
+    """Expected: ∫ φ_j f_S→pupil dS, to 3e-3 at rtol 1e-3 and 1e-3 at 3e-4 of each column that sends light.
 
     A column seen by a rim of the pupil alone has so little light that it is compared with a percent of the largest.
     Seen to fail with cos⁴θ or cosθ_s dropped from the columns, 1/π twice, and u² replaced by a constant.
@@ -258,11 +258,11 @@ def test_perspective_within_large_faces_is_in_the_error():
     assert (off <= matrix.error(exitance) + finer.error(exitance)).all()
 
 
-@pytest.mark.parametrize(("depth", "rtol", "bound"), [(200.0, 1e-3, 0.1), (165.0, 1e-4, 0.01)])
+@pytest.mark.parametrize(("depth", "rtol", "bound"), [(200.0, 1e-3, 0.1), (165.0, 3e-4, 0.03)])
 def test_a_column_alone_is_the_image_of_one_vertex(tmp_path, depth, rtol, bound):
     """Vertices in the middle, at the limb and of faces far below a pixel, each rendered alone.
 
-    Expected: 10 % of the column's own brightest entry at rtol 1e-3, 1 % at 1e-4.
+    Expected: 10 % of the column's own brightest entry at rtol 1e-3, 3 % at 3e-4.
     """
     small = trimesh.creation.icosphere(1, radius=0.2)
     fine = np.concatenate([BODY.vertices @ TURN.T, small.vertices + np.array([9.0, 0.0, 0.0])])
