@@ -105,7 +105,7 @@ def test_narrow_light_before_a_dark_plate_that_hides_a_wide_body():
     parameters = mi.traverse(scene)
     parameters["shape_0.to_world"] = mi.Transform4f(np.array((at([0, 0, 190]) @ turned.scale(40)).matrix))
     parameters.update()
-    assert fspt.render(scene).power.sum() == pytest.approx(light, rel=1e-2)
+    assert fspt.render(scene, rtol=3e-3).power.sum() == pytest.approx(light, rel=1e-2)
 
 
 def test_light_beside_a_dark_cylinder_is_found_along_its_outline_too():

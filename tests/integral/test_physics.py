@@ -233,7 +233,7 @@ def test_diaphragm_tends_to_the_pinhole_through_five_decades_without_a_jump():
     """
     pinhole = over_etendue(13.75, model="pinhole")
     assert pinhole.max() > 1.5 / np.pi
-    for decade in (0, 1, 3, 5):
+    for decade in (0, 2, 5):
         diameter = 13.75 / 10**decade
         first, second = over_etendue(diameter), over_etendue(diameter * 0.9999)
         assert np.abs(first - second).max() < 1e-4 * pinhole.max(), diameter

@@ -37,7 +37,7 @@ def both(scene, monkeypatch, side=SIDE, **accuracy):
     [
         ("two_spheres", {"rtol": 1e-3}),
         ("nylon_cylinder", {"rtol": 1e-3, "pixel": "centre"}),
-        ("nylon_cylinder", {"rtol": 3e-2, "domain": "surface"}),
+        ("nylon_cylinder", {"rtol": 0.1, "domain": "surface"}),
     ],
 )
 def test_tiles_and_one_piece_agree_within_the_errors_of_both(name, accuracy, monkeypatch):

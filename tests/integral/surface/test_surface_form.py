@@ -304,19 +304,19 @@ def test_light_from_beyond_all_surfaces_is_refused(domain):
 def test_a_small_sphere_far_out_of_focus():
     """Rationale: the radiance on film is J_n/π times the mean of cos⁴θ over the lines of sight that meet the sphere.
 
-    Expected: rtol on every pixel, and no more claimed. Fails (5e-3) where cosines are those of spots that differ from
+    Expected: rtol on every pixel, and no more claimed. Fails (5e-3 at rtol 1e-3) where cosines are those of spots that differ from
     line to line, instead of those of a piece's middle.
     """
     depth, radius, x, y = 120.0, 0.4, 1.0, -2.0
     quarter = (0, 0, WIDTH // 2, HEIGHT // 2)
-    picture = fspt.render(camera_scene(sphere(depth, radius, x, y), crop=quarter), domain="surface", rtol=1e-3)
+    picture = fspt.render(camera_scene(sphere(depth, radius, x, y), crop=quarter), domain="surface", rtol=2e-3)
     rows, columns = np.nonzero(picture.power > 0)
     pick = slice(None, None, 3)
     expected = [
         power_of_ball(row, column, depth, radius, x, y) for row, column in zip(rows[pick], columns[pick], strict=True)
     ]
-    np.testing.assert_allclose(picture.power[rows, columns][pick], expected, atol=1e-3 * picture.power.max())
-    assert picture.error.max() <= 1e-3 * picture.power.max()
+    np.testing.assert_allclose(picture.power[rows, columns][pick], expected, atol=2e-3 * picture.power.max())
+    assert picture.error.max() <= 2e-3 * picture.power.max()
 
 
 def power_of_ball(row, column, depth, radius, x, y, sub=12, points=3000):
@@ -393,8 +393,8 @@ def test_a_spot_on_a_wall_of_two_faces_adds_its_light(domain):
     expected = fspt.render(bare, domain="pupil", rtol=3e-4).power.copy()
     for x, y in spots:
         expected[int(5 - y / pitch), int(6 - x / pitch)] *= 1 + 2 * np.pi * 0.1**2
-    image = fspt.render(of, domain=domain)
-    assert np.abs(image.power - expected).max() < 1.5e-3 * expected.max()
+    image = fspt.render(of, domain=domain, rtol=2e-3)
+    assert np.abs(image.power - expected).max() < 2e-3 * expected.max()
 
 
 @pytest.mark.parametrize("domain", ["pupil", "surface"])
