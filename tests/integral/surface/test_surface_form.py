@@ -304,8 +304,8 @@ def test_light_from_beyond_all_surfaces_is_refused(domain):
 def test_a_small_sphere_far_out_of_focus():
     """Rationale: the radiance on film is J_n/π times the mean of cos⁴θ over the lines of sight that meet the sphere.
 
-    Expected: rtol on every pixel, and no more claimed. Fails (5e-3 at rtol 1e-3) where cosines are those of spots that differ from
-    line to line, instead of those of a piece's middle.
+    Expected: rtol on every pixel, and no more claimed. Fails (5e-3 at rtol 1e-3) where cosines are those of spots that
+    differ from line to line, instead of those of a piece's middle.
     """
     depth, radius, x, y = 120.0, 0.4, 1.0, -2.0
     quarter = (0, 0, WIDTH // 2, HEIGHT // 2)
