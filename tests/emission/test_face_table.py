@@ -43,7 +43,7 @@ MESHES = {
     "number": lambda path: world_scene(ply(path, exitance=2e-3), sensor=lens(8, 1.6)),
     "inside out": lambda path: world_scene(wall(), ply(path, per="vertex", flip_normals=True), sensor=lens(8, 1.6)),
     "rectangle": lambda path: world_scene(rectangle(), sensor=lens(8, 1.6)),
-    "several": lambda path: world_scene(wall(), ply(path, per="face"), rectangle(), sensor=lens(8, 1.6)),
+    "several": lambda path: world_scene(wall(), ply(path, per="face"), rectangle(), sensor=lens(4, 3.2)),
 }
 
 
@@ -66,7 +66,7 @@ def test_packets_of_lines_of_sight_meet_the_same_surfaces_as_single_ones(build, 
     for most in (-1.0, np.inf):
         monkeypatch.setattr("mitsuba_fspt.integral.pupil.node_sums.NODES_TOGETHER", most)
         monkeypatch.setattr("mitsuba_fspt.integral.pupil.jumps.TRANSECTS_TOGETHER", most)
-        found.append(solved(scene))
+        found.append(solved(scene, rtol=3e-3))
     singly, together = found
     np.testing.assert_allclose(together.power, singly.power, rtol=0, atol=10 * FLOAT32 * singly.power.max())
     np.testing.assert_allclose(together.coverage, singly.coverage, atol=10 * FLOAT32)
@@ -80,7 +80,7 @@ def by_table(solution):
 def test_the_same_light_as_by_surface_records(build, tmp_path):
     """Seen to fail without the normals, with corners in another order, and with all meshes' faces from number 0."""
     scene = build(tmp_path / "body.ply")
-    table, record = solved(scene), solved(scene, "record")
+    table, record = solved(scene, rtol=3e-3), solved(scene, "record", rtol=3e-3)
     assert (by_table(table), by_table(record)) == (True, False)
     np.testing.assert_allclose(table.power, record.power, rtol=0, atol=1e-4 * record.power.max())
     assert np.median(np.abs(table.power - record.power)) <= FLOAT32 * record.power.max()

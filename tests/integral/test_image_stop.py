@@ -105,22 +105,22 @@ def test_pixels_beside_the_stop_are_dark_and_not_computed():
     assert four.metadata["nodes"] <= 4 * (2.0 / PITCH + 4) ** 2
 
 
-@pytest.mark.parametrize("method", ["path", "ptracer"])
 @pytest.mark.parametrize("borders", [{}, {"f_number": 11.0, "lens_diameter": 6.0, "diaphragm_distance": 30.0}])
-def test_monte_carlo_agrees_where_silhouettes_cross_the_border(method, borders):
+def test_monte_carlo_agrees_where_silhouettes_cross_the_border(borders):
     """A blurred sphere beside the axis, partly behind the stop. Seen to fail with the stop left out of ptracer."""
     body = sphere(150.0, 6.0, 7.0, -3.0)
     view = camera_scene(body, image_stop_diameter=STOP, **borders)
     inside, beside = pixels(STOP)
     cut = ~inside & ~beside
     image = fspt.render(view)
-    truth = fspt.render(view, method=method, spp=2000, seed=4)
     assert (image.power[cut] > 0.05 * image.power.max()).sum() > 10
-    lit = truth.power > 0.02 * truth.power.max()
-    z = (truth.power - image.power)[lit] / np.hypot(truth.error, image.error)[lit]
-    assert np.abs(z).max() < 4.5
-    assert image.power.sum() == pytest.approx(truth.power.sum(), rel=5e-3)
-    whole = power(camera_scene(body, **borders))
+    for method in ("path", "ptracer"):
+        truth = fspt.render(view, method=method, spp=2000, seed=4)
+        lit = truth.power > 0.02 * truth.power.max()
+        z = (truth.power - image.power)[lit] / np.hypot(truth.error, image.error)[lit]
+        assert np.abs(z).max() < 4.5, method
+        assert image.power.sum() == pytest.approx(truth.power.sum(), rel=5e-3), method
+    whole = power(camera_scene(body, **borders), rtol=1e-2)
     assert image.power.sum() < 0.95 * whole.sum()
 
 
