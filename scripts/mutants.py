@@ -606,9 +606,23 @@ MUTANTS = (
     ),
     Mutant(
         "anisotropy in the equations of SP3",
-        "tissue/light_models.py",
+        "optics/sp3_boundary.py",
         "mua + musp * (1 + g), mua + musp * (1 + g + g**2)",
         "mua + musp, mua + musp",
+        (SP3,),
+    ),
+    Mutant(
+        "absorption in the numbers of the border",
+        "optics/absorbing_border.py",
+        "min(absorption, LARGEST) / STRONG",
+        "0 * min(absorption, LARGEST) / STRONG",
+        (SP3,),
+    ),
+    Mutant(
+        "absorption in the curvature's effect",
+        "optics/sp3_boundary.py",
+        "min(absorption, LARGEST) * np",
+        "0 * np",
         (SP3,),
     ),
     Mutant(

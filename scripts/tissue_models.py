@@ -44,14 +44,12 @@ from paper_common import Table, fill
 from scipy.optimize import brentq, nnls
 
 from mitsuba_fspt.inverse.model_error import MODEL_ERRORS, ModelError, shapes
-from mitsuba_fspt.optics.half_space import border
 from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Sphere
-from mitsuba_fspt.optics.sp3_boundary import sp3_boundary
 from mitsuba_fspt.runtime import backend
 from mitsuba_fspt.tissue.cylinder_mesh import cylinder_tetrahedra
 from mitsuba_fspt.tissue.diffusion import solve
-from mitsuba_fspt.tissue.finite_elements import import_skfem
+from mitsuba_fspt.tissue.elements import import_skfem
 from mitsuba_fspt.tissue.light_models import MODELS, equations
 from mitsuba_fspt.tissue.tetrahedra import Tetrahedra
 
@@ -279,12 +277,12 @@ def page_table(rows: Sequence[dict[str, object]]) -> Table:
 
 
 def print_border(photons: int) -> None:
-    """Print β by n, g and radius with its standard error."""
+    """Print β by n, g, radius and µa with its standard error."""
     for n in (1.0, 1.1, 1.2, 1.33, 1.4, 1.5, 1.7):
         for g in (0.0, 0.9):
-            for radius, mua in ((6.0, 0.02), (12.0, 0.02), (24.0, 0.006)):
+            for radius, mua in ((6.0, 0.02), (12.0, 0.02), (24.0, 0.006), (6.0, 0.1)):
                 value, error = curvature_of(n, g, radius, mua, photons if g == 0 else photons // 160 * 32)
-                print(f"n {n:g}  g {g:g}  R {radius:g}  beta {value:.3f} ± {error:.3f}", flush=True)
+                print(f"n {n:g}  g {g:g}  R {radius:g}  mua {mua:g}  beta {value:.3f} ± {error:.3f}", flush=True)
 
 
 def print_creases(photons: int) -> None:
@@ -325,11 +323,11 @@ def curvature_of(n: float, g: float, radius: float, mua: float, photons: int) ->
     optics = Optics(mua, 1.0, n, g)
     batches = exit_power(Body(radius), optics, Emitter((0, 0, 0)), lambda p: mi.UInt32(0), 1, photons)
     power, error = batches.mean(), batches.std(ddof=1) / math.sqrt(BATCHES)
-    flat, scale = border(n, g).length, radius * (1 + mua)
     found = equations("sp3", [Medium(mua, 1.0, n, g)])
+    flat, scale = float(found.length[0]), radius * (1 + mua)
 
     def exited(length: float) -> float:
-        matrix = sp3_boundary(n, g).copy()
+        matrix = found.border[0].copy()
         matrix[0, 0] += (1 / length - 1 / flat) / 3
         media = found.diffusion[0], found.reaction[0], found.source
         central = coupled_ball_exitance(radius, 0.0, *media, matrix, 0.0, np.zeros(1), orders=1)[0]

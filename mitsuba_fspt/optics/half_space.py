@@ -1,10 +1,11 @@
 """Light at the border of scattering tissue by the transport equation, for the boundary condition of SP3 (Eq. M.48).
 
-A half space without absorption, in which light varies as exp(ikx) along the border; lengths in mean free paths 1/µs'.
-Discrete ordinates in the polar cosine, modes cos(mφ) of the azimuth, phase function of Henyey and Greenstein. Two of
-the solutions vary as exp(±kz), the diffusing light; the others decay within a mean free path. On the border the
-diffusing light has the extrapolation length z(k), φ = z ∂φ/∂z, and a flux; the flux that leaves is another one for
-k > 0, since the light that does not diffuse flows along the border.
+A half space, in which light varies as exp(ikx) along the border; lengths in mean free paths 1/(µa + µs'). `border` is
+of tissue without absorption, `absorbing_border` has what absorption changes. Discrete ordinates in the polar cosine,
+modes cos(mφ) of the azimuth, phase function of Henyey and Greenstein. Two of the solutions, the diffusing light, vary
+as exp(±κz); the others decay within a mean free path. On the border the diffusing light has the extrapolation length
+z(k), φ = z ∂φ/∂z, and a flux; the flux that leaves is another one for k > 0, since the light that does not diffuse
+flows along the border.
 """
 
 from __future__ import annotations
@@ -55,11 +56,33 @@ def border(n: float, g: float) -> Border:
     return Border(length, lateral, low / LOW**2 + spread * low, spread)
 
 
+@dataclass(frozen=True)
+class Light:
+    """The diffusing light exp(±κz) of a half space, of the fluence 1 on its way to the border.
+
+    rate : κ;  back : fluence of what the border reflects;  flux : that leaves;  own : of the diffusing light there
+    """
+
+    rate: float
+    back: float
+    flux: float
+    own: float
+
+
 def diffusing(n: float, g: float, k: float) -> tuple[float, float]:
     """z(k), and the flux that leaves over that of the diffusing light."""
+    light = half_space(n, g, k)
+    return (1 + light.back) / (light.rate * (1 - light.back)), light.flux / light.own
+
+
+@cache
+def half_space(n: float, g: float, k: float, absorption: float = 0.0) -> Light:
+    """Diffusing light at the border, lengths in 1/(µa + µs') where µa/µs' is `absorption`; k > 0 without it."""
     cosine, weight, reflectance = hemisphere(n, NODES)
     both, weights, count = np.concatenate([cosine, -cosine]), np.tile(weight, 2), len(cosine)
-    rates, modes = np.linalg.eig(-operator(both, weights, g, k) / np.tile(both, AZIMUTH + 1)[:, None])
+    matrix = operator(both, weights, g, k * (1 + absorption))
+    matrix = (matrix + absorption * np.eye(len(matrix))) / (1 + absorption)
+    rates, modes = np.linalg.eig(-matrix / np.tile(both, AZIMUTH + 1)[:, None])
     order = np.argsort(np.abs(rates))
     falls, rises = sorted(order[:2], key=lambda one: rates[one].real)
     modes = modes / np.where(np.isin(np.arange(len(rates)), [falls, rises]), weights @ modes[: 2 * count], 1.0)
@@ -70,9 +93,9 @@ def diffusing(n: float, g: float, k: float) -> tuple[float, float]:
     amplitude = np.linalg.lstsq(enters[:, decays], -enters[:, rises], rcond=None)[0]
     back = float(amplitude[0].real)
     outflow = (weights * both) @ modes[: 2 * count]
-    flux = outflow[rises] + outflow[decays] @ amplitude
-    share = float((flux / (outflow[rises] + back * outflow[falls])).real)
-    return (1 + back) / (float(rates[rises].real) * (1 - back)), share
+    flux = -(outflow[rises] + outflow[decays] @ amplitude).real
+    own = -(outflow[rises] + back * outflow[falls]).real
+    return Light(float(rates[rises].real), back, float(flux), float(own))
 
 
 def operator(cosine: Array, weight: Array, g: float, k: float) -> Array:

@@ -31,18 +31,20 @@ Array = NDArray[np.float64]
 # without absorption. H + diag(0, LAYER) is positive definite, and so is the whole problem, though for n > 1.7 H alone
 # is not.
 LAYER = math.sqrt(35 / 9) / 7
-# n, β at g = 0, β at g = 0.9: from photons in spheres with a source in the middle (scripts/tissue_models.py --border).
-# The extrapolation length is linear in the curvature there, for radii of 6 to 24 mean free paths.
+# n, β at g = 0 and 0.9 without absorption, and their rise per µa/µs': from photons in spheres with a source in the
+# middle (scripts/tissue_models.py --border). The extrapolation length is linear in the curvature there, for radii of
+# 6 to 24 mean free paths.
 CURVATURE_EFFECT = (
-    (1.0, 0.44, 0.27),
-    (1.1, 0.84, 0.47),
-    (1.2, 1.24, 0.67),
-    (1.33, 1.73, 0.87),
-    (1.4, 1.97, 0.97),
-    (1.5, 2.3, 1.11),
-    (1.7, 2.9, 1.34),
+    (1.0, 0.44, 0.27, 0.0, 0.0),
+    (1.1, 0.84, 0.47, 0.0, 0.4),
+    (1.2, 1.24, 0.67, 0.5, 0.9),
+    (1.33, 1.73, 0.87, 1.8, 1.6),
+    (1.4, 1.97, 0.97, 3.0, 2.0),
+    (1.5, 2.3, 1.11, 5.2, 2.7),
+    (1.7, 2.9, 1.34, 11.0, 4.0),
 )
-FORWARD = 0.9  # g of the last column
+FORWARD = 0.9  # g of the second and the last column
+LARGEST = 0.15  # µa/µs' from which the numbers of the border stay the same
 
 
 @cache
@@ -63,6 +65,13 @@ def sp3_boundary(n: float, g: float = 0.0) -> Array:
     return matrix
 
 
+def sp3_coefficients(mua: Array, musp: Array, g: Array) -> tuple[Array, Array]:
+    """c (R, 2) [mm] and C (R, 2, 2) [1/mm] of Eq. M.47 in media of µa, µs' [1/mm] and g, (R,) each."""
+    total, second, third = mua + musp, mua + musp * (1 + g), mua + musp * (1 + g + g**2)
+    reaction = np.array([[mua, -2 / 3 * mua], [-2 / 3 * mua, 4 / 9 * mua + 5 / 9 * second]])
+    return np.column_stack([1 / (3 * total), 1 / (7 * third)]), np.moveaxis(reaction, 2, 0)
+
+
 def marshak_boundary(n: float) -> Array:
     """H of Marshak's condition, shape (2, 2), no unit, as Klose and Larsen give it; raises FluxError as above."""
     cosine, weight, reflectance = hemisphere(n)
@@ -72,12 +81,14 @@ def marshak_boundary(n: float) -> Array:
     return np.asarray(np.linalg.solve(odd * [3, 7], even))
 
 
-def curvature_effect(n: float, g: float = 0.0) -> float:
+def curvature_effect(n: float, g: float = 0.0, absorption: float = 0.0) -> float:
     """β: fall of the extrapolation length per mean curvature of the border, both in mean free paths.
 
-    Linear in n between the table's, and in g/(1 + g): at n = 1.37 photons of g = 0.5 and 0.8 agree to 2 %.
+    Linear in n between the table's, in g/(1 + g): at n = 1.37 photons of g = 0.5 and 0.8 agree to 2 %, and in
+    µa/µs' = `absorption` up to `LARGEST`.
     """
-    index, isotropic, forward = np.transpose(CURVATURE_EFFECT)
+    index, *columns = np.transpose(CURVATURE_EFFECT)
+    isotropic, forward = np.array(columns[:2]) + min(absorption, LARGEST) * np.array(columns[2:])
     share = g / (1 + g) / (FORWARD / (1 + FORWARD))
     return float(np.interp(index_of(n), index, (1 - share) * isotropic + share * forward))
 

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..optics.absorbing_border import absorbing
 from ..optics.boundary import boundary_a
 from ..optics.half_space import border
 from ..optics.media import Medium
-from ..optics.sp3_boundary import curvature_effect, shortened, sp3_boundary
+from ..optics.sp3_boundary import curvature_effect, shortened, sp3_boundary, sp3_coefficients
 from ..runtime.errors import FluxError
 
 Array = NDArray[np.float64]
@@ -115,19 +116,24 @@ def _diffusion(media: Sequence[Medium], a: str | float) -> Equations:
 def _sp3(media: Sequence[Medium]) -> Equations:
     """Eq. M.47 with φ₁ = Φ₀ + 2 Φ₂ and φ₂ = 3 Φ₂, Φ_l the moments of the radiance."""
     mua, musp, g = (np.array([getattr(medium, key) for medium in media]) for key in ("mua", "musp", "g"))
-    total, second, third = mua + musp, mua + musp * (1 + g), mua + musp * (1 + g + g**2)
+    total = mua + musp
+    diffusion, reaction = sp3_coefficients(mua, musp, g)
     borders = [border(medium.n, medium.g) for medium in media]
-    length = np.array([one.length for one in borders])
-    reaction = np.array([[mua, -2 / 3 * mua], [-2 / 3 * mua, 4 / 9 * mua + 5 / 9 * second]])
+    changes = [absorbing(one.n, one.g).at(one.mua / one.musp) for one in media]
+    shift, lateral, flow, spread = np.transpose(changes)
+    matrices = np.array([sp3_boundary(medium.n, medium.g) for medium in media])
+    matrices[:, 0, 0] += shift
+    flat = np.array([one.length for one in borders])
+    bend = np.array([curvature_effect(one.n, one.g, one.mua / one.musp) for one in media])
     return Equations(
         "SP3 equations",
-        np.column_stack([1 / (3 * total), 1 / (7 * third)]),
-        np.moveaxis(reaction, 2, 0),
+        diffusion,
+        reaction,
         np.array([1, -2 / 3]),
-        np.array([sp3_boundary(medium.n, medium.g) for medium in media]),
-        length,
-        np.array([curvature_effect(medium.n, medium.g) for medium in media]) / total,
-        np.array([one.lateral for one in borders]) / (3 * length**2 * total**2),
-        np.array([one.flow for one in borders]) / total**2,
-        np.array([one.spread for one in borders]) / total**2,
+        matrices,
+        1 / (1 / flat + 3 * shift),
+        bend / total,
+        lateral * [one.lateral for one in borders] / (3 * flat**2 * total**2),
+        flow * [one.flow for one in borders] / total**2,
+        spread * [one.spread for one in borders] / total**2,
     )
