@@ -6,6 +6,8 @@ image. A line of sight runs from a point a of the lens plane through a point r_v
 
 from __future__ import annotations
 
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -141,6 +143,12 @@ class Camera:
         """The same camera without filters and vignetting, on whose film a pixel is `side` times as wide."""
         film = Film.whole(*(-(-n // side) for n in self.film.size))
         return Camera(self.lens, self.pixel_pitch * side, film, self.to_world)
+
+    def without_borders(self) -> Camera:
+        """The same camera with a lens of one border; right where a second one covers nothing of the pupil."""
+        whole = copy(self)
+        whole.pupil = self.pupil.without_borders()
+        return whole
 
     # ------------------------------------------------------------------ lines of sight
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 
@@ -23,6 +25,12 @@ class Pupil:
         self.shift, self.radius = (dr.opaque(mi.Float, n) for n in (optics.discs[0].shift, optics.pupil_radius))
         self._borders = [tuple(dr.opaque(mi.Float, n) for n in (d.shift, d.radius)) for d in optics.discs[1:]]
         self._u = dr.opaque(mi.Float, optics.focus_distance)
+
+    def without_borders(self) -> Pupil:
+        """The first disc alone."""
+        whole = copy(self)
+        whole._borders = []
+        return whole
 
     @property
     def bordered(self) -> bool:
@@ -107,7 +115,8 @@ def onto_overlap(point: mi.Point2f, centre: mi.Vector2f, radius: mi.Float) -> tu
     height, across = dr.dot(point, up), dr.dot(point, turned(up))
     below = segment(height) * area
     low, high = segment_height(below / dr.square(radius)), -segment_height(area - below)
-    bounded = below < lower
+    # Beyond a disc that lies inside the unit disc there is nothing, also for points that rounding puts on its rim.
+    bounded = (below < lower) | (distance <= 1 - radius)
     half_chord = dr.select(bounded, radius * _half_chord(low), _half_chord(high))
     across = dr.select(dr.abs(height) < 1, across / _half_chord(height), 0) * half_chord
     return mi.Point2f(dr.select(bounded, distance + radius * low, high) * up + across * turned(up)), area

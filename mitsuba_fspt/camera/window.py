@@ -22,6 +22,7 @@ SEARCHED_RIM, MOST_RIM = 0.6, 16
 # Of a rectangle whose distorted image is bounded: points along each side, share of its size that is added, and the
 # largest rectangle, in sizes of the film beyond it.
 SIDE_POINTS, DISTORTED_MARGIN, FAR = 65, 1e-3, 1.0
+OPEN = 1e-6  # rounding of the share of the pupil that is open
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,18 @@ class Window:
         radius = camera.lens.seen_field / camera.virtual_pitch
         inside = np.hypot(x + 0.5, y + 0.5) <= radius
         return inside, ~inside & (np.hypot(np.maximum(x - 0.5, 0), np.maximum(y - 0.5, 0)) < radius)
+
+    def fully_open(self, camera: Camera) -> NDArray[np.bool_]:
+        """Pixels (h, w) to which a second border of the lens leaves the whole pupil open."""
+        if len(camera.lens.discs) == 1:
+            return np.ones(self.shape, bool)
+        left, top = self.corner
+        y, x = np.divmod(np.arange((self.shape[0] + 1) * (self.shape[1] + 1)), self.shape[1] + 1)
+        corners = mi.Point2f(mi.Float(x + float(left)), mi.Float(y + float(top)))
+        share = camera.open_pupil(corners, mi.Point2f(0))[1].numpy().reshape(self.shape[0] + 1, -1)
+        # The positions with the whole pupil are those of a disc, so that the corners of a pixel suffice.
+        whole = share > 1 - OPEN
+        return whole[:-1, :-1] & whole[:-1, 1:] & whole[1:, :-1] & whole[1:, 1:]
 
     def seen_in(self, boxes: Boxes, camera: Camera) -> NDArray[np.bool_]:
         """Pixels (h, w) of this window with a line of sight into one of these boxes, and some around."""

@@ -33,8 +33,6 @@ class Estimator(Thresholds):
     first_ratio : remaining error over the change from nodes to the first transects, where these cross a jump
     nodes_ratio : the same, where they cross none, as of a dim spot far below a pixel, or of the edges of a coarse mesh;
         below 1, as they contradict the nodes
-    ratio : remaining error over the change by later transects if the change is as large as the error before; less, down
-        to 1, if it is smaller
     order : least power by which the error of transects falls with their number; two thirds of it at corners
     scatter : remaining error of transects across a blurred edge over the deviation between them, without its trend, and
         their number: J_n may have a kink between two. A third of it for two transects, which have no trend
@@ -48,7 +46,6 @@ class Estimator(Thresholds):
 
     first_ratio: float = bound(0.2, 0.0)
     nodes_ratio: float = bound(0.9, 0.0)
-    ratio: float = bound(3.0, 1.0)
     order: float = bound(1.5, 100.0)
     scatter: float = bound(6.0, 0.0)
     slant: float = bound(2.0, 0.0)

@@ -198,20 +198,24 @@ class Solver:
         light, form = narrow.in_focus, partial(pupil_form.solve, view, window, quadrature)
         if progress.deadline.passed():
             where = np.zeros(window.shape, bool)
+        by_faces, by_elements, on_faces = None, where, np.zeros(window.shape, bool)
         if not (everywhere or specular) and face_image.applies(scene, quadrature):
             by_faces = face_image.FaceImage(scene, camera, window, quadrature, peak)
-            solution = form(light, None, least_peak, progress, by_faces, where)
-        elif where.any():
+            on_faces = where & window.fully_open(camera)
+            by_elements = where & ~on_faces
+        if by_elements.any():
             part, rest = progress.part(0, 2), progress.part(1, 2)
-            known = surface_form.solve(scene, camera, window, quadrature, where, peak, part, specular)
+            known = surface_form.solve(scene, camera, window, quadrature, by_elements, peak, part, specular)
             known = _with_dark_coverage(known, view, window)
-            solution = known.completed_by(form(light, known, least_peak, rest))
+            solution = known.completed_by(form(light, known, least_peak, rest, by_faces, on_faces))
+        elif by_faces:
+            solution = form(light, None, least_peak, progress, by_faces, on_faces)
         elif specular and specular.bending and specular.branching:
             solution = _by_courses(view, window, quadrature, light, least_peak, progress)
         else:
             solution = form(light, None, least_peak, progress)
         solution = replace(solution, findings=(Finding("smooth blocks", False, why), *solution.findings))
-        return _with_missed(solution, narrow, where | ~(inside | cut), cut, window, view)
+        return _with_missed(solution, narrow, on_faces | by_elements | ~(inside | cut), cut, window, view)
 
     def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[tuple[Blocks, ...], str]:
         """Blocks of pixels between which the image may be interpolated; the reason if there are none."""

@@ -49,6 +49,18 @@ def test_share_of_one_disc_in_the_other(distance, radius):
     np.testing.assert_allclose(overlap, expected, atol=2e-6)
 
 
+def test_rim_of_the_pupil_goes_to_the_rim_of_a_disc_inside():
+    """Points on the unit disc's rim, and corners of cells a little beyond it, all around.
+
+    Seen to fail where the point of the rim along the line of centres stays on the unit disc.
+    """
+    turns = np.linspace(0, 2 * np.pi, 257)[:-1] + np.arctan2(AXIS[1], AXIS[0])
+    for reach in (1.0, 1.005):
+        points = reach * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+        overlap, _ = mapped(points, 0.1, 0.3)
+        assert np.hypot(*(overlap - 0.1 * AXIS).T).max() < 0.302
+
+
 def test_nothing_is_open_between_discs_apart():
     assert mapped(even_disc(1).T, 2.0, 0.9)[1] == 0
 

@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 FIRST_LINES, BESIDE_NARROW = 70, 600
 # Rounding of sums of faces' light along a row of pixels, over the brightest pixel. A value of lines of sight from which
 # they differ by less is kept: beside a far brighter surface it is more exact.
-LEAST_OPEN = 1e-6  # share of the pupil below which coverage is not divided by it
 ROUNDING = 1e-12
 
 FEW = 1 << 18  # pixels of the coarse lattice for a lower bound of the brightest pixel
@@ -148,7 +147,8 @@ class _Faces:
         """The rough pixels without those that get their value from faces, if that takes less time than as many `lines`
         of sight for each of them."""
         draft, grid = self.draft, self.draft.grid
-        allowed = grid.array(draft.shown & draft.computed & ~(draft.clipped | draft.outside))
+        visible = grid.array(draft.shown & draft.computed & ~(draft.clipped | draft.outside))
+        allowed = visible & draft.window.fully_open(draft.camera)
         wanted, forced = grid.array(rough) & allowed, self.narrow & allowed
         if not self.taken and draft.progress.deadline.passed():
             self.narrow[:] = False
@@ -213,12 +213,9 @@ class _Faces:
 
     def _images(self, found: Solution) -> list[PixelArray]:
         """Mean radiance on film [W/mm²/sr], its error, and coverage on the grid."""
-        camera, window, grid = self.draft.camera, self.draft.window, self.draft.grid
-        images = (found.power / camera.etendue, found.error / camera.etendue, found.coverage)
-        power, error, coverage = (grid.flat(window.cut(image)) for image in images)
-        if camera.pupil.bordered:  # of a draft it is that of the open part of the pupil
-            coverage = dr.minimum(coverage / dr.maximum(open_share(camera, window, grid), LEAST_OPEN), 1)
-        return [power, error, coverage]
+        etendue = self.draft.camera.etendue
+        images = (found.power / etendue, found.error / etendue, found.coverage)
+        return [self.draft.grid.flat(self.draft.window.cut(image)) for image in images]
 
     def _set(self, where: Mask) -> None:
         """Set the values, errors and coverage of some of the pixels."""

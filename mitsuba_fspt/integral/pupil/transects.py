@@ -188,16 +188,15 @@ class _Refinement:
     ) -> tuple[PixelArray, PixelArray]:
         """Error that remains after a later level, and error around pixels that this level changed beyond their error.
 
-        The smaller the change of the value relative to the error before, the smaller the error that remains; but the
-        change counts as no smaller than the order of convergence predicts, as two wrong values may agree by chance.
+        It is the change of the value, which counts as no smaller than the order of convergence predicts, as two wrong
+        values may agree by chance.
         Where a jump is crossed for the first time another level follows, as earlier changes do not bound its error.
         """
         before, estimator = self.remaining, self.estimator
-        fewer, order, most = self.count / count, estimator.order, estimator.ratio
+        fewer, order = self.count / count, estimator.order
         one, several = (dr.opaque(mi.Float64, fewer**own) for own in (order, SEVERAL_ORDER * order))
         assumed = dr.maximum(change, before * dr.select(self.edges.sharp & self.means.several, several, one))
-        ratio = dr.clip(dr.select(before > 0, most * assumed / before, most), 1, most)
-        remaining = dr.maximum(assumed * ratio, self.means.scatter)
+        remaining = dr.maximum(assumed, self.means.scatter)
         if level <= node_rules.SMOOTH_LEVELS:
             # On smooth pixels the next node rule changes the value by less than this one did.
             remaining = dr.select(self.smooth, change, remaining)

@@ -69,12 +69,16 @@ def applies(scene: mi.Scene, quadrature: Quadrature) -> bool:
 
 
 class FaceImage:
-    """The pixels of a `window` by faces, for scenes to which this `applies`."""
+    """The pixels of a `window` by faces, for scenes to which this `applies`.
+
+    A second border of the lens is ignored: only pixels that are `Window.fully_open` are right.
+    """
 
     def __init__(
         self, scene: mi.Scene, camera: Camera, window: Window, quadrature: Quadrature, least_peak: float = 0.0
     ) -> None:
-        self.scene, self.camera, self.window, self.quadrature = scene, camera, window, quadrature
+        self.scene, self.window, self.quadrature = scene, window, quadrature
+        self.camera = camera.without_borders()
         self.surfaces = surfaces_of(scene)
         self.most = max(s.brightest for s in self.surfaces) or 1.0  # J_n in units of which light is laid [W/mm²]
         self.value, self.error, self.coverage = (np.zeros(window.shape) for _ in range(3))

@@ -39,9 +39,10 @@ SPECKLE_LEFT = 0.04
 # the change of J_n along it. A blur disc evens it out: over triangles of s pixels, whatever the directions of J_n and
 # of the depth on each, r pixels leave (s/(4 r))^1.5 of it at the most, for r = s/4 … 4 s.
 PERSPECTIVE_LEFT, EVENED = 0.16, 4.0
-# Where the open part of the pupil moves by δ [unit disc] along a triangle, its images through nodes are bent and their
-# density is not linear: at the most so much of its light, times δ², is misplaced, whatever its blur.
-BENT_LEFT = 0.4
+# Where points of the open part of the pupil move by δ along a triangle, over the radius of that part, its images
+# through nodes are bent and their density is not even: so much of its light, times δ², is misplaced.
+BENT_LEFT, MOST_SHIFT = 1.6, 8.0
+OPEN_POINTS = ((0, 0), (0.7, 0), (-0.7, 0), (0, 0.7), (0, -0.7))  # of the unit disc, whose images are compared
 FEWEST, MOST = 4, 64  # least and largest M of columns
 DROP = 0.01  # of rtol and of a column's brightest entry: entries below are left out
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
@@ -143,12 +144,12 @@ class FaceLight:
 
     corners (F, 3): numbers of their vertices. low, high (F, 2): bounds of their light [pixels of the crop window],
     empty for a face that sends none. sides, heights, blur (F,): longest edge, height over it and blur radius of the
-    image [pixels]. slant (F,): depth of the face over its distance. shift (F,): distance by which the open part of the
-    pupil moves along the face, where a second border covers the rest [unit disc]. partial (F,): the face turns away
-    from part of the pupil. cut (V,): vertices at which the light of the surface ends for part of the pupil, at
-    silhouettes and borders. mixed (F,): one surface hides part of another here. edges (F, 3): of the image, from each
-    corner to the next [pixels]. crossed (F,): share of the lines of sight of which the edge of a shadow lies on the
-    face, along its longest edge. distance: in focus [virtual pixels].
+    image [pixels]. slant (F,): depth of the face over its distance. shift (F,): distance by which points of the part
+    of the pupil that a second border leaves open move along the face, over the radius of that part. partial (F,): the
+    face turns away from part of the pupil. cut (V,): vertices at which the light of the surface ends for part of the
+    pupil, at silhouettes and borders. mixed (F,): one surface hides part of another here. edges (F, 3): of the image,
+    from each corner to the next [pixels]. crossed (F,): share of the lines of sight of which the edge of a shadow lies
+    on the face, along its longest edge. distance: in focus [virtual pixels].
     """
 
     surface: EmittingSurface
@@ -291,13 +292,12 @@ class FaceLight:
         """
         nodes = np.sqrt(EDGE_LEFT * self.blur * brightness / rule.step)
         cells = (2 * np.ceil(nodes / 2)).clip(self._fewest(rule), most).astype(np.int64)
-        cuts = np.minimum(self._pieces(rule, contrast, brightness).astype(np.int64), math.isqrt(BATCH) // cells)
+        cuts = np.minimum(self._pieces(rule, contrast).astype(np.int64), math.isqrt(BATCH) // cells)
         return Plan(cells[:, None], cuts[:, None], np.zeros((len(cells), 1), bool))
 
-    def _pieces(self, rule: ColumnRule, contrast: Array | None = None, brightness: Array | float = 1.0) -> Array:
+    def _pieces(self, rule: ColumnRule, contrast: Array | None = None) -> Array:
         """Pieces along a side that are laid through nodes.
 
-        brightness : of the light of a face; 1 for columns
         contrast : largest change of the light along a face, for an image, whose faces smaller than their blur disc are
             cut along the edges of shadows; None: all pieces of columns are lit or not
         """
@@ -308,7 +308,7 @@ class FaceLight:
         pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
         pieces = np.maximum(pieces, np.minimum(self._flat_pieces(rule, 1.0 if contrast is None else contrast), sides))
         if self.shift.any():
-            pieces = np.maximum(pieces, self.shift * np.sqrt(BENT_LEFT * brightness / rule.perspective))
+            pieces = np.maximum(pieces, self.shift * math.sqrt(BENT_LEFT / rule.perspective))
         return np.maximum(np.ceil(pieces), 1)
 
     def _flat_pieces(self, rule: ColumnRule, contrast: Array | float) -> Array:
@@ -378,17 +378,21 @@ def _facing(elements: Elements, camera: Camera) -> tuple[Array, Array]:
 
 
 def _opening(elements: Elements, camera: Camera) -> tuple[Array, Mask]:
-    """By how much the open part of the pupil moves along each face [unit disc], and True for faces of which a second
-    border hides all."""
+    """By how much points of the open part of the pupil move along each face, over the radius of the part, and True for
+    faces of which a second border hides all."""
     if not camera.pupil.bordered:
         return np.zeros(elements.count), np.zeros(elements.count, bool)
     index = dr.arange(mi.UInt32, elements.count)
     corners = [elements.place(index, mi.Point2f(*at))[0].p for at in CORNERS]
-    middles = [camera.opening(corner, mi.Point2f(0))[0] for corner in corners]
-    moved = dr.maximum(dr.norm(middles[1] - middles[0]), dr.norm(middles[2] - middles[1]))
+    moved, most = mi.Float(0), mi.Float(0)
+    for node in OPEN_POINTS:
+        places, shares = zip(*(camera.opening(corner, mi.Point2f(*node)) for corner in corners), strict=True)
+        for k in range(3):
+            moved = dr.maximum(moved, dr.norm(places[k] - places[k - 1]))
+            most = dr.maximum(most, shares[k])
     closed = camera.closed_to(corners, elements.place(index, mi.Point2f(*elements.middle))[0].p)
-    moved = 2 * dr.maximum(moved, dr.norm(middles[0] - middles[2]))
-    return moved.numpy().astype(np.float64), np.broadcast_to(closed.numpy(), elements.count)
+    shift = dr.minimum(moved * dr.rsqrt(dr.maximum(most, 1e-6)), MOST_SHIFT)
+    return shift.numpy().astype(np.float64), np.broadcast_to(closed.numpy(), elements.count)
 
 
 def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
