@@ -17,7 +17,8 @@ import numpy as np
 
 from mitsuba_fspt.phantom.shipped_scenes import FOLDER
 
-size, steps = (int(n) for n in (*sys.argv[1:], 16, 25)[:2])
+given = [int(word) for word in sys.argv[1:]]
+size, steps = given + [16, 25][len(given) :]
 scene = fspt.load(FOLDER / "textured_sphere.xml", width=size, height=size, pixel_pitch=256 * 0.108 / size)
 picture = mi.render(scene)
 unit = float(np.max(picture))
