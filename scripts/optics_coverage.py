@@ -134,6 +134,7 @@ def photon_power(mua: float, musp: float, at: Place, seed: int, photons: int, ke
     optics, count = Optics(mua, musp, INDEX), (ROWS + 2 * RINGS) * TURNS
     power = exit_power(Body(RADIUS, HEIGHT), optics, Emitter(at), bin_of, count, photons, seed).mean(axis=0)
     if file:
+        file.parent.mkdir(parents=True, exist_ok=True)
         np.save(file, power)
     return np.asarray(power)
 

@@ -379,11 +379,14 @@ def _facing(elements: Elements, camera: Camera) -> tuple[Array, Array]:
 
 def _opening(elements: Elements, camera: Camera) -> tuple[Array, Mask]:
     """By how much points of the open part of the pupil move along each face, over the radius of the part, and True for
-    faces of which a second border hides all."""
-    if not camera.pupil.bordered:
-        return np.zeros(elements.count), np.zeros(elements.count, bool)
+    faces behind the lens plane or of which a second border hides all."""
     index = dr.arange(mi.UInt32, elements.count)
     corners = [elements.place(index, mi.Point2f(*at))[0].p for at in CORNERS]
+    weights = [camera.open_arrival(corner, mi.Point2f(0))[2] for corner in corners]
+    behind = dr.maximum(dr.maximum(weights[0], weights[1]), weights[2]).numpy() <= 0
+    behind = np.broadcast_to(behind, elements.count)
+    if not camera.pupil.bordered:
+        return np.zeros(elements.count), behind
     moved, most = mi.Float(0), mi.Float(0)
     for node in OPEN_POINTS:
         places, shares = zip(*(camera.opening(corner, mi.Point2f(*node)) for corner in corners), strict=True)
@@ -392,7 +395,7 @@ def _opening(elements: Elements, camera: Camera) -> tuple[Array, Mask]:
             most = dr.maximum(most, shares[k])
     closed = camera.closed_to(corners, elements.place(index, mi.Point2f(*elements.middle))[0].p)
     shift = dr.minimum(moved * dr.rsqrt(dr.maximum(most, 1e-6)), MOST_SHIFT)
-    return shift.numpy().astype(np.float64), np.broadcast_to(closed.numpy(), elements.count)
+    return shift.numpy().astype(np.float64), behind | np.broadcast_to(closed.numpy(), elements.count)
 
 
 def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:

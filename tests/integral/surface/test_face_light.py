@@ -56,3 +56,28 @@ def test_faces_larger_than_their_blur_are_cut_wherever_a_shadow_may_be(tmp_path)
     free = light.mixed & (light.crossed == 0)
     assert free.any()
     assert (light.plan(rule, "vertex").cuts[free].min(axis=1) < light.sides[free] / rule.shadow).all()
+
+
+def test_faces_behind_the_lens_and_in_its_borders_shadow_are_dark(tmp_path):
+    """A sheet behind the lens plane, and one aside that a second border hides from all of the pupil.
+
+    Expected: no bright face, which would be cut into pieces without end. Seen to fail without the depth of the faces,
+    and without `closed_to`.
+    """
+    import mitsuba as mi
+
+    vertices, faces = sheet()
+    path = write_ply(tmp_path / "sheet.ply", vertices, faces, vertex=np.ones(len(vertices)))
+    mesh = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute())}
+
+    def bright(**optics):
+        scene = world_scene(mesh, sensor=lens(24, pitch=6.0, **optics))
+        surface, camera = scene.emitters()[0].surface, scene.sensors()[0].camera
+        return FaceLight.seen(surface, camera, (0, 0), (24, 24)).bright
+
+    aside = mi.ScalarTransform4f().look_at([165, 0, 90], [0, 0, 90], [0, 0, 1])
+    away = mi.ScalarTransform4f().look_at([30, 0, 0], [300, 0, 0], [0, 0, 1])
+    border = {"lens_diameter": 14.0, "diaphragm_distance": 60.0}
+    assert bright(to_world=aside).all()
+    assert not bright(to_world=aside, **border).any()
+    assert not bright(to_world=away).any()
