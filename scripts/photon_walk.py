@@ -1,4 +1,4 @@
-"""Photons in tissue, one by one: exit power of a cylinder or a sphere by bins of its surface, for the scripts here.
+"""Photons in tissue, one by one: exit power of a cylinder, a sphere or a mesh by bins of its surface, for the scripts.
 
 Absorption and scattering happen at the ends of exponential flights of the mean 1/(µa + µs); a photon's weight falls by
 the albedo at each, and photons of small weight end by Russian roulette. At the surface Fresnel's reflectance decides
@@ -29,6 +29,23 @@ class Body:
     height: float = 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """What a closed surface contains; `scene` has its mesh, with outward normals [mm]."""
+
+    scene: mi.Scene
+
+    @classmethod
+    def of(cls, vertices: Array, faces: NDArray[np.int64]) -> Filled:
+        """Of the vertices (V, 3) [mm] and the faces (F, 3)."""
+        mesh = mi.Mesh("surface", len(vertices), len(faces))
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = np.asarray(vertices, np.float32).ravel()
+        parameters["faces"] = np.asarray(faces, np.uint32).ravel()
+        parameters.update()
+        return cls(mi.load_dict({"type": "scene", "mesh": mesh}))
+
+
 @dataclass(frozen=True)
 class Optics:
     """µa, µs' [1/mm], index n, and g of the phase function of Henyey and Greenstein; µs = µs'/(1 - g)."""
@@ -48,7 +65,7 @@ class Emitter:
 
 
 def exit_power(
-    body: Body,
+    body: Body | Filled,
     optics: Optics,
     emitter: Emitter,
     bin_of: Callable[[mi.Point3f], mi.UInt32],
@@ -100,8 +117,12 @@ def _transmittance(cosine: mi.Float, n: float) -> mi.Float:
     return dr.select(outer > 0, 1 - (s * s + p * p) / 2, 0)
 
 
-def _way_out(body: Body, p: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
+def _way_out(body: Body | Filled, p: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
     """Distance to the surface along d, and the outward normal with its sign turned: inward there."""
+    if isinstance(body, Filled):
+        hit = body.scene.ray_intersect_preliminary(mi.Ray3f(p, d))
+        normal = hit.compute_surface_interaction(mi.Ray3f(p, d), mi.RayFlags.Minimal).n
+        return hit.t, dr.mulsign(mi.Vector3f(normal), -dr.dot(d, normal))
     if not body.height:
         b = dr.dot(p, d)
         reach = dr.sqrt(dr.maximum(b * b - dr.dot(p, p) + body.radius**2, 0)) - b
