@@ -15,6 +15,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsuba_fspt.jit.mesh_buffers import new_mesh
+
 Array = NDArray[np.float64]
 SMALL, SURVIVAL = 0.05, 0.2  # weight below which a photon goes on only with this probability
 CLEARANCE = 1e-5  # mm, off the surface after a reflection: a chord along it has a length
@@ -38,11 +40,7 @@ class Filled:
     @classmethod
     def of(cls, vertices: Array, faces: NDArray[np.int64]) -> Filled:
         """Of the vertices (V, 3) [mm] and the faces (F, 3)."""
-        mesh = mi.Mesh("surface", len(vertices), len(faces))
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = np.asarray(vertices, np.float32).ravel()
-        parameters["faces"] = np.asarray(faces, np.uint32).ravel()
-        parameters.update()
+        mesh = new_mesh("surface", np.float32(vertices).ravel(), np.uint32(faces).ravel())
         return cls(mi.load_dict({"type": "scene", "mesh": mesh}))
 
 
