@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cylinder_views import COEFFICIENTS, HEIGHT, cylinder_views, exact
+from cylinder_views import COEFFICIENTS, HEIGHT, cylinder_views, exact, tetrahedra_made_once
 from sphere_views import noisy
 
 import mitsuba_fspt as fspt
@@ -63,13 +63,21 @@ class Case:
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory, mono):
-    return Case(tmp_path_factory.mktemp("cylinder"))
+    with tetrahedra_made_once():
+        yield Case(tmp_path_factory.mktemp("cylinder"))
 
 
 @pytest.fixture(scope="module")
 def sphere(case):
     """Result for images of a sphere of 1.5 mm, 3000 electrons."""
     return case.locate(case.images(1.5, 3000))
+
+
+@pytest.fixture
+def few_radii(monkeypatch):
+    """Searches over radii that are shorter than by default."""
+    few = partial(ExtentSettings, radii=(0.0, 0.6, 0.95), rounds=1, steps=3)
+    monkeypatch.setattr("mitsuba_fspt.inverse.extent.ExtentSettings", few)
 
 
 def inside(source, true=SOURCE, *, z=1.0):
@@ -138,7 +146,7 @@ def test_a_sphere_comes_back(case, sphere):
     assert any("shape" in line for line in point.warnings)
 
 
-def test_a_point_has_an_upper_limit(case):
+def test_a_point_has_an_upper_limit(case, few_radii):
     """Rationale: 300 electrons determine the ratio of the bands, ∝ 1 + Δk² a²/10, to about 1 %: a < 0.4 … 1 mm.
 
     The power's interval contains smaller powers for larger radii, and the true one.
@@ -154,7 +162,7 @@ def test_a_point_has_an_upper_limit(case):
     assert source.power_interval[1] == pytest.approx(point.power_interval[1], rel=2e-3)
 
 
-def test_one_band_shows_no_radius(case):
+def test_one_band_shows_no_radius(case, few_radii):
     """Rationale: under diffusion a sphere looks like a point in one band exactly.
 
     Expected: the upper limit is the distance of the centre from the cap, 3 mm; the power is between that of the point
@@ -170,7 +178,7 @@ def test_one_band_shows_no_radius(case):
     assert source.power_interval[0] < SOURCE[3] < source.power_interval[1]
 
 
-def test_a_sphere_under_sp3(case):
+def test_a_sphere_under_sp3(case, few_radii):
     """Images of SP3 on a finer mesh, a sphere of 1.8 mm: radius in its interval of 0.3 mm or less, power within 2 %.
 
     chi2 of 800 pixels is 1 ± 0.05.
@@ -188,22 +196,18 @@ def test_a_sphere_under_sp3(case):
     assert 0.85 < found.chi2 < 1.15
 
 
-def test_two_sources_of_different_extent(case, monkeypatch):
+def test_two_sources_of_different_extent(case, few_radii):
     """A sphere of 1.8 mm and a point 5 mm from it, on few radii: each has the radius of its own.
 
     Expected: 1.8 mm in 1.5 times the interval, of 0.4 mm or less, as positions and powers are in theirs; an upper limit
     below 1.5 mm for the point. Seen to fail with the profile of the second source made with the radius of the first.
     """
-    few = partial(ExtentSettings, radii=(0.0, 0.6, 0.95), rounds=1, steps=3)
-    monkeypatch.setattr("mitsuba_fspt.inverse.extent.ExtentSettings", few)
     other, images = (-2.0, -1.0, 1.5, 1.5), {}
     for k, name in enumerate(BANDS):
         points = case.surface.vertices
         lit = apparent(1.8, name) * exact(points, [SOURCE], name) + exact(points, [other], name)
         images[name] = noisy(case.matrix, lit, 10_000, k)
-    coarse = replace(case.described, edge=2.4)
-    matrices = dict.fromkeys(BANDS, case.matrix)
-    sphere, point = locate(coarse, matrices, images, scene=case.surface, shape="sphere", sources=2).sources
+    sphere, point = case.locate(images, sources=2).sources
     low, high = sphere.radius_interval
     assert abs(1.8 - (low + high) / 2) < 1.5 * (high - low) / 2 < 1.5 * 0.2
     assert point.radius_interval[0] == 0
@@ -212,7 +216,7 @@ def test_two_sources_of_different_extent(case, monkeypatch):
     assert inside(point, other, z=1.5)
 
 
-def test_uncertain_absorption_widens_the_radius(case, sphere):
+def test_uncertain_absorption_widens_the_radius(case, sphere, few_radii):
     """µa of both bands known to 10 %, in the file 8 % below the true one: k and the ratio of the bands are uncertain.
 
     Expected: the radius with exact coefficients lies off its interval, that with fitted ones inside, in an interval
@@ -238,7 +242,7 @@ def test_uncertain_absorption_widens_the_radius(case, sphere):
     assert inside(fitted, z=1.5)
 
 
-def test_an_uncertain_ratio_of_the_bands_widens_the_radius(case, sphere):
+def test_an_uncertain_ratio_of_the_bands_widens_the_radius(case, sphere, few_radii):
     """Rationale: factors of the bands of 5 % make the ratio uncertain by 7 %, as much as a sphere of 1.3 mm; a common
     factor of 5 % does not change the ratio. Seen to fail with the factors left out of the noise."""
     images = case.images(1.5, 3000, gain_error=0.05)

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cylinder_views import cylinder_views, exact
-from sphere_views import noisy, passes_of, sphere_views
+from cylinder_views import cylinder_views, exact, tetrahedra_made_once
+from sphere_views import VIEWS, noisy, passes_of, sphere_views
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.band_images import BandImages
@@ -57,7 +57,8 @@ class Case:
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory, mono):
-    return Case(tmp_path_factory.mktemp("cylinder"))
+    with tetrahedra_made_once():
+        yield Case(tmp_path_factory.mktemp("cylinder"))
 
 
 def ratios(found, *sources):
@@ -79,7 +80,9 @@ def test_a_source_from_images_without_noise(case):
     Seen to fail (power 2 %) with a boundary factor 2 % larger.
     """
     power = case.power(SOURCE)
-    found = locate(case.toml, case.matrix, power, error=np.full(power.shape, 1e-3 * power.max()))
+    found = locate(
+        replace(case.described, edge=1.5), case.matrix, power, error=np.full(power.shape, 1e-3 * power.max())
+    )
     (source,) = found.sources
     np.testing.assert_allclose(source.position, SOURCE[:3], rtol=0, atol=2e-3)
     assert source.power == pytest.approx(SOURCE[3], rel=1e-3)
@@ -87,14 +90,14 @@ def test_a_source_from_images_without_noise(case):
 
 
 def test_intervals_contain_the_reference_as_often_as_stated(case):
-    """Σ z²/n of 32 values of 8 images is 1 ± 0.25. Seen to fail (8) with a hundredth of the shot noise in σ, and (0.16)
+    """Σ z²/n of 16 values of 4 images is 1 ± 0.35. Seen to fail (8) with a hundredth of the shot noise in σ, and (0.16)
     with four times the covariance.
 
     The script location_coverage.py counts intervals over hundreds of images.
     """
-    z = np.array([ratios(case.locate(case.images(SOURCE, electrons=300, seed=seed)), SOURCE) for seed in range(8)])
-    assert 0.45 < (z**2).mean() < 1.6
-    assert np.abs(z.mean(axis=0)).max() < 3 / 8**0.5
+    z = np.array([ratios(case.locate(case.images(SOURCE, electrons=300, seed=seed)), SOURCE) for seed in range(4)])
+    assert 0.3 < (z**2).mean() < 2.1
+    assert np.abs(z.mean(axis=0)).max() < 3 / 4**0.5
 
 
 def test_images_with_stray_light(case):
@@ -193,9 +196,9 @@ def test_a_band_that_is_not_given_is_named(case, caplog):
     assert "no band is given, of the phantom file's red, green" in caplog.text
 
 
-def test_a_matrix_of_faces(case, tmp_path):
+def test_a_matrix_of_faces(case):
     """J_n of a face is the mean of its corners: the same source as from vertices."""
-    matrix = cylinder_views(tmp_path, on="face")
+    matrix = fspt.transport(case.toml.with_suffix(".xml"), view=VIEWS, on="face", rtol=3e-3)
     found = locate(case.described, matrix, case.images(SOURCE))
     whole = case.locate(case.images(SOURCE))
     np.testing.assert_allclose(found.sources[0].position, whole.sources[0].position, atol=0.02)
@@ -215,7 +218,7 @@ def test_the_pose_in_the_scene_does_not_matter(case, tmp_path, pose):
     turned = xml.replace('<rotate z="1"', pose + '<rotate z="1"')
     assert turned != xml
     (tmp_path / "turned.xml").write_text(turned)
-    matrix = fspt.transport(tmp_path / "turned.xml", view=[0, 90, 180, 270], rtol=1e-3)
+    matrix = fspt.transport(tmp_path / "turned.xml", view=VIEWS, rtol=3e-3)
     surface = Surface.of(matrix)
     np.testing.assert_allclose(surface.vertices, case.surface.vertices, atol=1e-5)
     images = noisy(matrix, exact(case.surface.vertices, [SOURCE]), 1000, 0)
@@ -289,7 +292,7 @@ def test_masked_pixels_do_not_count(case):
 def test_a_misfit_is_reported(case, caplog):
     """Images that no single source explains: one line, and chi2 far above 1."""
     with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
-        found = case.locate(case.images(SOURCE, OTHER))
+        found = locate(replace(case.described, edge=1.5), case.matrix, case.images(SOURCE, OTHER), scene=case.surface)
     assert found.chi2 > 2
     assert "locate: chi2 is" in caplog.text
 
@@ -442,7 +445,7 @@ def test_a_mesh_without_vertices_inside(case):
         locate(replace(case.described, edge=6.0), case.matrix, case.images(SOURCE), scene=case.surface)
 
 
-@pytest.mark.parametrize("seed", [0, 3, 5, 8])
+@pytest.mark.parametrize("seed", [0, 5])
 def test_more_sources_than_the_images_determine(case, seed, caplog):
     """Two sources for the light of one: refused, or one line says that the second may be noise.
 
@@ -495,11 +498,11 @@ def test_sp3(case):
     With its stated error the source is in the intervals of diffusion, too; pixels that see a rim then have a larger σ.
     Seen to fail with the model left out of the tissue, and with σ of the noise alone.
     """
-    sp3 = replace(case.described, model="sp3", edge=0.9)
+    sp3 = replace(case.described, model="sp3", edge=1.2)
     own = (replace(sp3.sources[0], shape=Sphere(SOURCE[:3]), power=SOURCE[3]),)
     solution = replace(sp3, sources=own).solve()
     images = noisy(case.matrix, solution.exitance_at(case.surface.vertices), 3000, 0)
-    found = locate(replace(sp3, edge=1.5), case.matrix, images, scene=case.surface)
+    found = locate(replace(sp3, edge=2.0), case.matrix, images, scene=case.surface)
     assert np.abs(ratios(found, SOURCE)).max() < 3.5
     other = case.locate(images)
     assert np.abs(ratios(other, SOURCE)).max() > 5
@@ -603,7 +606,7 @@ def test_solutions_by_factors_are_those_by_iterations(case, model):
 def test_two_sources_for_one_end_soon(case, monkeypatch):
     """A second source that is not there follows a valley of χ²: it ends after some ten steps of nine solutions each.
 
-    Seen to fail (405 solutions with seed 1, 262 with seed 2) without the end in a valley.
+    Seen to fail (405 solutions) without the end in a valley.
     """
     count = 0
 
@@ -619,7 +622,6 @@ def test_two_sources_for_one_end_soon(case, monkeypatch):
 
     count_solutions("exitance", 1)
     count_solutions("gradient", 3)
-    for seed in (1, 2):
-        with suppress(InversionError):
-            case.locate(case.images(SOURCE, seed=seed), sources=2)
-    assert count < 2 * 160
+    with suppress(InversionError):
+        case.locate(case.images(SOURCE, seed=1), sources=2)
+    assert 0 < count < 160
