@@ -16,9 +16,9 @@ from ..detector.reduction import measured
 from ..detector.stray_light import StrayLight
 from ..images.exposure import Exposure
 from ..images.image import Image
+from ..rendering.live_scene import LiveScene
 from ..rendering.parameters import texts_of
 from ..rendering.render import render
-from ..rendering.scene import load
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, named, renamed
@@ -198,6 +198,8 @@ def _noise(images: Sequence[Image]) -> float:
 class _Renderings:
     """Power and numerical error [W] of all views, (views, h, w), as a function of the values of the free parameters.
 
+    The scene is loaded again only where more than numbers and pose of the lens differ from the image before.
+
     powers : of the light source [W] by which the image of each view was scaled, and its rendering is, or None
     strays : stray light that the image of each view has, and its rendering gets (Eq. M.38)
     first : the renderings of the first call
@@ -214,7 +216,8 @@ class _Renderings:
         rtol: float,
         report: Progress,
     ) -> None:
-        self.scene, self.names, self.views, self.powers, self.sensor = scene, names, views, powers, sensor
+        self._live = LiveScene(scene, sensor=sensor, any_sensor=True)
+        self.names, self.views, self.powers, self.sensor = names, views, powers, sensor
         self.strays, self.rtol, self.report = strays, rtol, report
         self.first: list[Image] = []
         self._known: dict[tuple[float, ...], tuple[Array, Array]] = {}
@@ -237,7 +240,7 @@ class _Renderings:
         self.report("calibrating", 1 - 1 / (1 + self._count / 20))  # how many it will be is not known
         with named(f"calibrate, at {', '.join(f'{name} = {value:.6g}' for name, value in found.items())}"):
             images = [
-                render(load(self.scene, **{**view, **found}), method="integral", sensor=self.sensor, rtol=self.rtol)
+                render(self._live.scene({**view, **found}), method="integral", sensor=self.sensor, rtol=self.rtol)
                 for view in self.views
             ]
             images = [i if watt is None else i.scaled(watt) for i, watt in zip(images, self.powers, strict=True)]

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.image import Image
+from ..rendering.live_scene import LiveScene
 from ..rendering.provenance import source_of
 from ..rendering.render import render
-from ..rendering.scene import load
 from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import SceneXml, is_text, read_text, read_xml
 from ..runtime.errors import FsptError, InversionError
@@ -92,9 +92,10 @@ def derivatives(
     xml = scene_text(file, parameters)
     values = {name: varied_value(xml, name) for name in _listed(names)}
     accuracy = steps.rtol if rtol is None else rtol
+    live = LiveScene(file, parameters, sensor, any_sensor=True)
 
     def image(change: Mapping[str, float]) -> Image:
-        return render(load(file, **{**parameters, **change}), method="integral", sensor=sensor, rtol=accuracy)
+        return render(live.scene(change), method="integral", sensor=sensor, rtol=accuracy)
 
     return {name: _Differences(name, value, image, steps).best() for name, value in values.items()}
 

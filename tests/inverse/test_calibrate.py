@@ -14,7 +14,10 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse import calibrate
 from mitsuba_fspt.inverse.calibration_fit import CalibrationFit, CalibrationSettings, Measured, UndeterminedError
 from mitsuba_fspt.inverse.measurement import Noise, sampling_variance
+from mitsuba_fspt.rendering import live_scene
 from mitsuba_fspt.runtime.errors import InversionError
+
+COARSE = CalibrationSettings(rtol=3e-3)  # a third of the noise of `noisy`: half the time, and slopes right to 5 %
 
 
 @pytest.fixture(scope="module")
@@ -29,16 +32,22 @@ def noisy(scene, seed, share=0.01, rtol=1e-3, **parameters):
     return fspt.Image(power + sigma * np.random.default_rng(seed).standard_normal(power.shape), sigma)
 
 
-def test_parameters_come_back_within_their_sd(scene):
+def test_parameters_come_back_within_their_sd(scene, monkeypatch):
     """Distance and f-number of a sphere, started 1 % and 3 % off: no z beyond 4, χ² is 1.
 
-    The scatter over many seeds is in docs/calibrate_coverage.csv.
+    Only the lens changes, so that the scene is loaded once. The scatter over many seeds is in
+    docs/calibrate_coverage.csv.
     """
-    found = fspt.calibrate(scene, noisy(scene, 0, distance=163.5, f_number=7.8), free=["distance", "f_number"])
+    loaded, load = [], live_scene.load_source
+    monkeypatch.setattr(live_scene, "load_source", lambda source: loaded.append(source.given) or load(source))
+    found = fspt.calibrate(
+        scene, noisy(scene, 0, distance=163.5, f_number=7.8), free=["distance", "f_number"], settings=COARSE
+    )
     assert abs(found.values["distance"] - 163.5) < 4 * found.sd["distance"]
     assert abs(found.values["f_number"] - 7.8) < 4 * found.sd["f_number"]
     assert found.chi2 == pytest.approx(1, abs=0.6)
     assert 0 < found.sd["f_number"] < 0.1
+    assert loaded == [{"distance": "165.0", "f_number": "8.0"}]
 
 
 def test_warnings_about_the_scene_are_told_once(scene, monkeypatch, caplog):
@@ -57,7 +66,7 @@ def test_warnings_about_the_scene_are_told_once(scene, monkeypatch, caplog):
 def test_monte_carlo_gives_the_parameters_of_its_scene(scene):
     """An image by `path` with its own standard error; gain beside the distance."""
     image = fspt.render(fspt.load(scene, distance=164), method="path", spp=512, seed=4)
-    found = fspt.calibrate(scene, image, free=["distance", "gain"], settings=CalibrationSettings(rtol=1e-3))
+    found = fspt.calibrate(scene, image, free=["distance", "gain"], settings=COARSE)
     assert found.values["gain"] == pytest.approx(1, abs=4 * found.sd["gain"])
     assert found.values["distance"] == pytest.approx(164, abs=4 * found.sd["distance"])
     assert found.covariance.shape == (2, 2)
@@ -89,16 +98,16 @@ def test_a_gain_of_images_with_stray_light(scene):
 
 
 def test_a_number_of_the_distortion_comes_back(tmp_path, mono):
-    """k1 as a `<default>` inside the string, of an 8 mm lens with a wide film before four spheres, within 4 sd."""
+    """k1 as a `<default>` inside the string, of an 8 mm lens with a wide film before two spheres, within 4 sd."""
     text = '<string name="distortion" value="$k1, 0.01, 0, 0"/><transform name="to_world">'
     sensor = LENS_XML.replace('<transform name="to_world">', text).replace('value="55"', 'value="8"')
     sensor = '<default name="k1" value="-0.1"/>' + sensor.replace('value="0.8"', 'value="1.6"')
     ball = """<shape type="sphere"><point name="center" x="0" y="{}" z="{}"/><float name="radius" value="2"/>
         <emitter type="fspt_surface"><float name="exitance" value="1e-3"/></emitter></shape>"""
-    shapes = "".join(ball.format(y, z) for y in (-8, 8) for z in (-5, 5))
+    shapes = "".join(ball.format(y, z) for y, z in ((-8, -5), (8, 5)))
     wide = write_scene(tmp_path / "wide.xml", sensor=sensor, shapes=shapes)
     wide.write_text(wide.read_text().replace('value="165"', 'value="26"'))
-    found = fspt.calibrate(wide, noisy(wide, 1, k1=-0.08), free=["k1"])
+    found = fspt.calibrate(wide, noisy(wide, 1, k1=-0.08), free=["k1"], settings=COARSE)
     assert abs(found.values["k1"] + 0.08) < 4 * found.sd["k1"]
     assert 0 < found.sd["k1"] < 0.02
 
@@ -120,10 +129,11 @@ def test_a_flat_view_does_not_determine_focus_magnification_and_gain(tmp_path, m
     first = '<default name="magnification" value="0.5"/><integrator type="fspt_integral"/>'
     flat = write_scene(tmp_path / "flat.xml", sensor=sensor, shapes=disk, integrator=first)
     image = noisy(flat, 1, f_number=22)
-    two = fspt.calibrate(flat, image, free=["distance", "magnification"], f_number=22)
+    options = {"settings": COARSE, "f_number": 22}
+    two = fspt.calibrate(flat, image, free=["distance", "magnification"], **options)
     assert two.condition < 100
     with pytest.raises(UndeterminedError, match="separately") as caught:
-        fspt.calibrate(flat, image, free=["distance", "magnification", "gain"], f_number=22)
+        fspt.calibrate(flat, image, free=["distance", "magnification", "gain"], **options)
     assert caught.value.condition > 10
     assert min(map(abs, caught.value.combinations[0].values())) > 0.1
 
@@ -215,7 +225,7 @@ def test_covariance_by_hand(scene):
     gain = wide.values["gain"]
     assert wide.sd["gain"] ** 2 == pytest.approx(expected + (0.05 * gain) ** 2, rel=0.01)
     distance = fspt.calibrate(scene, image, free=["distance"])
-    slope = [fspt.render(fspt.load(scene, distance=165 + d), rtol=1e-4).power.astype(float) for d in (1.0, -1.0)]
+    slope = [fspt.render(fspt.load(scene, distance=165 + d), rtol=1e-3).power.astype(float) for d in (1.0, -1.0)]
     slope = (slope[0] - slope[1]) / 2 / image.error
     assert distance.sd["distance"] == pytest.approx(1 / np.sqrt((slope**2).sum()), rel=0.03)
 
@@ -277,33 +287,33 @@ def test_variance_of_monte_carlo_follows_the_signal():
 
 @pytest.mark.slow
 def test_intervals_contain_the_reference_on_a_fine_film(mono):
-    """256 samples on 72 × 16 pixels: magnification and distance within 3 sd, of at most 3e-5 and 4 µm.
+    """256 samples on 72 × 8 pixels: magnification and distance within 3 sd, of at most 5e-5 and 6 µm.
 
     Seen to fail (5 sd and more, 87 with a variance in proportion to the square of the power) where the edges' standard
     errors were taken as smaller than they are.
     """
-    camera = {"width": 72, "height": 16, "pixel_pitch": 0.216, "f_number": 2.8, "view": 90}
+    camera = {"width": 72, "height": 8, "pixel_pitch": 0.216, "f_number": 2.8, "view": 90}
     image = fspt.render(fspt.load(SCENES / "nylon_cylinder.xml", **camera), method="path", spp=256, seed=2)
     settings = CalibrationSettings(rtol=3e-4)
     names = ["magnification", "distance"]
     found = fspt.calibrate(SCENES / "nylon_cylinder.xml", image, free=names, settings=settings, **camera)
-    for name, true, bound in (("magnification", 0.5, 3e-5), ("distance", 180.0, 4e-3)):
+    for name, true, bound in (("magnification", 0.5, 5e-5), ("distance", 180.0, 6e-3)):
         assert abs(found.values[name] - true) < 3 * found.sd[name]
         assert 0 < found.sd[name] < bound
 
 
 @pytest.mark.slow
 def test_pose_of_the_nylon_cylinder(mono):
-    """One image by `path`, 256 samples: view to 0.1 degrees, distance to 0.02 mm, magnification to 5e-4, within 4 sd.
+    """One image by `path`, 256 samples: view to 0.2 degrees, distance to 0.08 mm, magnification to 1e-3, within 4 sd.
 
     The start is 0.7 degrees, 0.4 mm and 1.3e-3 away.
     """
-    camera = {"width": 32, "height": 32, "pixel_pitch": 0.864, "f_number": 2.8}
+    camera = {"width": 16, "height": 16, "pixel_pitch": 1.728, "f_number": 2.8}
     true = {"view": 0.7, "distance": 180.4, "magnification": 0.5013}
     image = fspt.render(fspt.load(SCENES / "nylon_cylinder.xml", **camera, **true), method="path", spp=256, seed=3)
-    settings = CalibrationSettings(rtol=5e-4)
+    settings = CalibrationSettings(rtol=1e-3)
     found = fspt.calibrate(SCENES / "nylon_cylinder.xml", image, free=list(true), settings=settings, **camera)
-    for name, bound in (("view", 0.1), ("distance", 0.02), ("magnification", 5e-4)):
+    for name, bound in (("view", 0.2), ("distance", 0.08), ("magnification", 1e-3)):
         off = abs(found.values[name] - true[name])
         assert 0 < found.sd[name] < bound / 2
         assert off < bound
