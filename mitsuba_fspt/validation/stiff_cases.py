@@ -58,6 +58,7 @@ SHARP, AGREED = 5e-4, 2e-3
 # Of an ideal mirror: CUDA's square root is approximate, and Mitsuba's Fresnel formula subtracts equal numbers, which
 # gives 0.9995 at some angles; on LLVM it is 1.
 MIRROR = 5e-5
+QUARTER = (0, 0, WIDTH // 2, HEIGHT // 2)  # crop window that holds the middle of the ball and a part of its limb
 ROUNDED = 1e-4  # at the default rtol: float32 rounding changes the position at which the bisection of an edge ends
 
 
@@ -89,9 +90,9 @@ def focus_cases() -> list[Case]:
     rows += [
         Case(tilted, CONE, lambda: cone_error(disk(FOCUS, 600, tilt=80)), EXACT),
         Case(
-            "edge in the plane z = u, surface form", BALANCE, partial(balance_error, FOCUS, 4.0, "surface", 1e-3), SHARP
+            "edge in the plane z = u, surface form", BALANCE, partial(balance_error, FOCUS, 4.0, "surface", 4e-3), SHARP
         ),
-        Case("sphere through the plane z = u", OTHER, lambda: domain_error(ball()), AGREED),
+        Case("sphere through the plane z = u", OTHER, lambda: domain_error(ball(), crop=QUARTER), AGREED),
     ]
     for share, tolerance in ((1e-6, None), (1e-5, EXACT), (1e-4, EXACT), (1e-2, EXACT)):
         run = partial(lambda u: cone_error(disk(u, 60), focus_distance=u, pixel_pitch=10), FOCAL * (1 + share))
@@ -118,7 +119,7 @@ def lens_cases() -> list[Case]:
         ]
     rows += [
         Case("f/1e6 against the pinhole model", SAME, pinhole_limit_error, 1e-3),
-        Case("f/1e6", OTHER, lambda: domain_error(ball(), f_number=1e6), AGREED),
+        Case("f/1e6", OTHER, lambda: domain_error(ball(), crop=QUARTER, f_number=1e6), AGREED),
         Case("lens 0.1 mm off the surface", CONE, lambda: cone_error(disk(0.1, 200)), EXACT),
         Case("lens 0.1 mm off the surface, f/0.5", CONE, lambda: cone_error(disk(0.1, 200), f_number=0.5), EXACT),
     ]

@@ -297,9 +297,9 @@ def invariance_error(
     return peak_error(power(of) / factor, standard_image(*objects))
 
 
-def domain_error(*objects: SceneObject, **lens: Any) -> float:
-    """Peak error between the pupil form and the surface form of the integral."""
-    of = scene(*objects, **lens)
+def domain_error(*objects: SceneObject, **changed: Any) -> float:
+    """Peak error between the pupil form and the surface form of the integral; `changed`: arguments of `scene`."""
+    of = scene(*objects, **changed)
     return peak_error(power(of, domain="pupil"), power(of, domain="surface"))
 
 
