@@ -137,16 +137,16 @@ def test_sums_of_rows_are_the_image_of_one_in_closed_form(tmp_path):
 
 @pytest.mark.parametrize(("on", "depth"), [("face", 165.0), ("vertex", 205.0)])
 def test_products_are_rendered_images(tmp_path, on, depth):
-    """Expected: rtol of the brightest pixel beside the error of a render four times finer; within `error` on 99 %.
+    """Expected: rtol of the brightest pixel beside the error of a render twice as fine; within `error` on 99 %.
 
     Seen to fail with two columns swapped, and with cosθ_s dropped.
     """
     scene = body_scene(tmp_path, on, depth)
-    look_at_crop(scene, 9, 2, 6, 6)  # a quarter of the body, with the limb and the middle
+    look_at_crop(scene, 9, 2, 4, 6)  # an eighth of the body, with the limb and the middle
     matrix = fspt.transport(scene, on=on, rtol=RTOL)
     for name, exitance in exitances(on).items():
         shine(scene, on, exitance)
-        image = fspt.render(scene, method="integral", rtol=RTOL / 4)
+        image = fspt.render(scene, method="integral", rtol=RTOL / 2)
         off = np.abs(matrix.forward(exitance)[0] - image.power)
         beyond = off - image.error
         assert beyond.max() <= RTOL * image.power.max(), name
@@ -164,7 +164,7 @@ def test_faces_of_many_pixels_far_out_of_focus(tmp_path, on):
     ball = trimesh.creation.icosphere(1, radius=3.0)
     mesh = ball.vertices @ TURN.T, ball.faces
     scene = body_scene(tmp_path, on, 200.0, mesh=mesh, size=(48, 48), pitch=0.1)
-    look_at_crop(scene, 24, 6, 14, 18)  # a quarter of the ball, with the limb and the middle
+    look_at_crop(scene, 24, 6, 7, 18)  # an eighth of the ball, with the limb and the middle
     matrix = fspt.transport(scene, on=on, rtol=RTOL)
     exitance = 0.1 + np.random.default_rng(3).random(matrix.shape[1])
     shine(scene, on, exitance)
@@ -276,7 +276,7 @@ def test_a_column_alone_is_the_image_of_one_vertex(tmp_path, depth, rtol, bound)
         exitance = np.zeros(len(fine))
         exitance[vertex] = 1
         shine(scene, "vertex", exitance)
-        image = fspt.render(scene, method="integral", rtol=3e-3, domain="surface", max_nodes=1 << 16)
+        image = fspt.render(scene, method="integral", rtol=1e-2, domain="surface", max_nodes=1 << 14)
         column = matrix.forward(exitance)[0]
         peak = image.power.max()
         assert peak > 0
@@ -298,10 +298,10 @@ def test_a_column_alone_is_the_image_of_one_vertex(tmp_path, depth, rtol, bound)
 def test_every_lens_and_exit_law(tmp_path, optics):
     """Expected: as of a render. Seen to fail, by 4e-2, with rows of the image-plane stop's border scaled only."""
     scene = body_scene(tmp_path, **optics)
-    look_at_crop(scene, 9, 2, 6, 6)  # with the limb, the middle and the border of the stop
+    look_at_crop(scene, 10, 2, 3, 6)  # with the limb, the middle and the border of the stop
     matrix, exitance = fspt.transport(scene, rtol=RTOL), exitances("vertex")["decades"]
     shine(scene, "vertex", exitance)
-    image = fspt.render(scene, method="integral", rtol=RTOL / 4)
+    image = fspt.render(scene, method="integral", rtol=RTOL / 2)
     off = np.abs(matrix.forward(exitance)[0] - image.power)
     assert (off - image.error).max() <= RTOL * image.power.max()
 
