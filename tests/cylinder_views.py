@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,13 +49,27 @@ edge = 0.8
 """
 
 
-def cylinder_views(folder, **options):
-    """Transport matrix of the cylinder; its scene `cylinder.xml` and phantom file `cylinder.toml` are in the folder."""
+FOLDER = tempfile.TemporaryDirectory(prefix="fspt-cylinder-views-")  # of the scene that the matrix names
+
+
+def cylinder_views(folder):
+    """Transport matrix of the cylinder; its scene `cylinder.xml` and phantom file `cylinder.toml` are in the folder.
+
+    Made once in a process; no test changes it.
+    """
+    matrix = _made()
+    shutil.copytree(FOLDER.name, folder, dirs_exist_ok=True)
+    return matrix
+
+
+@cache
+def _made():
+    folder = Path(FOLDER.name)
     (folder / "cylinder.toml").write_text(TOML)
     described = PhantomFile.read(folder / "cylinder.toml")
     replace(described, edge=2.5, order=1).solve().phantom(described.surface_edge).write(folder / "cylinder.ply")
     (folder / "cylinder.xml").write_text(sphere_views.SCENE.replace("sphere.ply", "cylinder.ply"))
-    return fspt.transport(folder / "cylinder.xml", view=sphere_views.VIEWS, **{"rtol": 1e-3} | options)
+    return fspt.transport(folder / "cylinder.xml", view=sphere_views.VIEWS, rtol=1e-3)
 
 
 @contextmanager

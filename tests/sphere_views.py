@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import trimesh
 
@@ -27,11 +31,26 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 
 
-def sphere_views(folder, subdivisions=2, **options):
-    """Transport matrix of the sphere, 162 vertices by default; its scene `sphere.xml` is written into the folder."""
+FOLDER = tempfile.TemporaryDirectory(prefix="fspt-sphere-views-")  # of the scenes that the matrices name
+
+
+def write_sphere(folder, subdivisions=2):
+    """Name of the scene `sphere.xml`, written into the folder with its mesh, 162 vertices by default."""
     trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS).export(folder / "sphere.ply")
     (folder / "sphere.xml").write_text(SCENE)
-    return fspt.transport(folder / "sphere.xml", view=VIEWS, **{"rtol": 1e-3} | options)
+    return folder / "sphere.xml"
+
+
+def sphere_views(subdivisions=2, **options):
+    """Transport matrix of the sphere, 162 vertices by default; made once in a process, no test changes it."""
+    return _made(subdivisions, **options)
+
+
+@cache
+def _made(subdivisions, **options):
+    folder = Path(FOLDER.name, str(_made.cache_info().misses))
+    folder.mkdir()
+    return fspt.transport(write_sphere(folder, subdivisions), view=VIEWS, **{"rtol": 1e-3} | options)
 
 
 def noisy(matrix, exitance, electrons, seed, read_noise=3.5, **metadata):

@@ -8,7 +8,7 @@ import signal
 
 import numpy as np
 import pytest
-from sphere_views import sphere_views
+from sphere_views import sphere_views, write_sphere
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.invert import Problem
@@ -35,7 +35,8 @@ SETTINGS = ("--wavelength-nm", 650, "--exposure-time", 600, "--pixel-pitch", 0.5
 def folder(tmp_path_factory, mono):
     """Matrix T.npz, the camera, counts of four views as NPY, and the total power of the surface [W]."""
     folder = tmp_path_factory.mktemp("counts")
-    matrix = sphere_views(folder)
+    matrix = sphere_views()
+    write_sphere(folder)
     matrix.save(folder / "T.npz")
     (folder / "camera.toml").write_text(CAMERA)
     detector = fspt.Detector.from_toml(folder / "camera.toml")

@@ -56,9 +56,9 @@ def test_smooth_functions_on_a_sphere(on):
 
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory, mono):
+def case(mono):
     """Matrix of a sphere of 642 vertices, and noisy images of 300 electrons."""
-    matrix = sphere_views(tmp_path_factory.mktemp("sphere"), subdivisions=3, rtol=3e-3)
+    matrix = sphere_views(subdivisions=3, rtol=3e-3)
     exitance = 1e-3 * (1 + 0.5 * Surface.of(matrix).vertices[:, 2] / RADIUS)
     return matrix, noisy(matrix, exitance, 300, 3)
 

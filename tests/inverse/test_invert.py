@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from scipy.optimize import lsq_linear, minimize, nnls
 from scipy.sparse import csr_array
-from sphere_views import RADIUS, noisy, passes_of, sphere_views
+from sphere_views import RADIUS, VIEWS, noisy, passes_of, sphere_views, write_sphere
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse import multipliers
@@ -23,9 +23,9 @@ from mitsuba_fspt.runtime.errors import DetectorError, InversionError, Transport
 
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory, mono):
+def case(mono):
     """Matrix of a sphere in four views, and a smooth J_n on it [W/mm²]."""
-    matrix = sphere_views(tmp_path_factory.mktemp("sphere"))
+    matrix = sphere_views()
     return matrix, 1e-3 * (1 + 0.5 * Surface.of(matrix).vertices[:, 2] / RADIUS)
 
 
@@ -302,7 +302,7 @@ def test_mlem_weighs_by_the_error_of_the_response(case):
 
 
 def test_intervals_contain_the_reference_as_often_as_stated(case):
-    """Truths of the penalty's own prior, 60 replicates: 90 % of the intervals of vertices hold, and of totals.
+    """Truths of the penalty's own prior, 30 replicates: 90 % of the intervals of vertices hold, and of totals.
 
     The script interval_calibration.py makes the table with 400. Seen to fail (vertices 79 %) with half of the noise in
     the draws, and (72 %) without the share of the prior.
@@ -313,7 +313,7 @@ def test_intervals_contain_the_reference_as_often_as_stated(case):
     smooth = Smoothness.of(surface, length)
     solve = factor(smooth.root)
     inside, totals = [], []
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         exitance = mean * (1 + solve(rng.standard_normal(surface.unknowns)) / np.sqrt(weight))[surface.number]
         images = noisy(matrix, exitance, 300, seed)
@@ -322,8 +322,8 @@ def test_intervals_contain_the_reference_as_often_as_stated(case):
         inside.append(np.mean((r.lower <= exitance) & (exitance <= r.upper)))
         low, high = r.total_interval
         totals.append(low <= matrix.areas @ exitance <= high)
-    assert np.mean(inside) == pytest.approx(0.9, abs=0.03)
-    assert np.mean(totals) > 0.78  # 90 % less three standard deviations of 60 replicates
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.04)
+    assert np.mean(totals) > 0.73  # 90 % less three standard deviations of 30 replicates
 
 
 def test_gain_error_widens_the_total(case):
@@ -430,15 +430,13 @@ def test_files(case, tmp_path):
     assert (tmp_path / "report.png").stat().st_size > 10_000
 
 
-def test_a_scale_in_the_scene_is_reported(tmp_path, mono, caplog):
+def test_a_scale_in_the_scene_is_reported(case, tmp_path, caplog):
     """A mesh in cm with a scale of 10: the PLY is in mm, and one line says to leave the scale out; else none."""
-    for scale in (1, 10):
-        sphere_views(tmp_path)
-        mesh = trimesh.load(tmp_path / "sphere.ply", process=False)
-        trimesh.Trimesh(mesh.vertices / scale, mesh.faces, process=False).export(tmp_path / "sphere.ply")
-        xml = (tmp_path / "sphere.xml").read_text()
-        (tmp_path / "sphere.xml").write_text(xml.replace('<rotate z="1"', f'<scale value="{scale}"/><rotate z="1"'))
-        matrix = fspt.transport(tmp_path / "sphere.xml", view=[0, 90, 180, 270], rtol=1e-3)
+    scene = write_sphere(tmp_path)
+    mesh = trimesh.load(tmp_path / "sphere.ply", process=False)
+    trimesh.Trimesh(mesh.vertices / 10, mesh.faces, process=False).export(tmp_path / "sphere.ply")
+    scene.write_text(scene.read_text().replace('<rotate z="1"', '<scale value="10"/><rotate z="1"'))
+    for scale, matrix in ((1, case[0]), (10, fspt.transport(scene, view=VIEWS, rtol=1e-2))):
         found = fspt.invert(matrix, noisy(matrix, np.ones(matrix.shape[1]), 1000, 1))
         caplog.clear()
         with caplog.at_level(logging.WARNING, "mitsuba_fspt"):

@@ -426,8 +426,8 @@ def test_bad_bands(case):
         locate(case.described, matrices, {"red": images[:3]}, scene=case.surface)
 
 
-def test_a_surface_that_is_not_the_phantoms(case, tmp_path_factory):
-    matrix = sphere_views(tmp_path_factory.mktemp("sphere"))
+def test_a_surface_that_is_not_the_phantoms(case):
+    matrix = sphere_views()
     with pytest.raises(InversionError, match="mm away from the phantom's border"):
         locate(case.described, matrix, noisy(matrix, np.ones(matrix.shape[1]), 1000, 0))
 

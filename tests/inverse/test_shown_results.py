@@ -16,8 +16,8 @@ from mitsuba_fspt.runtime.errors import BackendError
 
 
 @pytest.fixture(scope="module")
-def matrix(tmp_path_factory, mono):
-    return sphere_views(tmp_path_factory.mktemp("sphere"))
+def matrix(mono):
+    return sphere_views()
 
 
 @pytest.fixture(scope="module")

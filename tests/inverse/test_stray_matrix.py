@@ -25,7 +25,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def matrix(folder):
-    return sphere_views(folder)
+    return sphere_views()
 
 
 @pytest.fixture(scope="module")

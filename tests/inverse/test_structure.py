@@ -48,16 +48,16 @@ class Linear:
 
 @pytest.mark.parametrize("prior", [1.0, 0.003])
 def test_noise_without_structure_gives_no_warning(prior):
-    """Σ z² of 300 fits has mean and variance of chi-squared to 4 %, 25 %, and no line is reported.
+    """Σ z² of 150 fits has mean and variance of chi-squared to 8 %, 40 %, three of its errors, and no line is reported.
 
     Also where the prior holds most unknowns. Seen to fail (mean 0.8) with the identity in place of I − K.
     """
     model, rng = Linear(prior), np.random.default_rng(1)
-    found = [model.found(model.residual(rng), rougher=1.0) for _ in range(300)]
+    found = [model.found(model.residual(rng), rougher=1.0) for _ in range(150)]
     sums, directions = np.array([one.chi2_sum for one in found]), found[0].directions
     assert 15 < directions < 30
-    assert sums.mean() == pytest.approx(directions, rel=0.04)
-    assert sums.var() == pytest.approx(2 * directions, rel=0.25)
+    assert sums.mean() == pytest.approx(directions, rel=0.08)
+    assert sums.var() == pytest.approx(2 * directions, rel=0.4)
     assert not any(one.lines() for one in found)
 
 
@@ -131,9 +131,9 @@ def test_errors_in_common_are_no_structure():
 
 
 @pytest.fixture(scope="module")
-def sphere(tmp_path_factory, mono):
+def sphere(mono):
     """Matrix of a sphere in four views, its surface, and a smooth J_n."""
-    matrix = sphere_views(tmp_path_factory.mktemp("sphere"))
+    matrix = sphere_views()
     surface = Surface.of(matrix)
     return matrix, surface, 1e-3 * (1 + 0.5 * surface.vertices[:, 2] / RADIUS)
 
