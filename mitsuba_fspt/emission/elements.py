@@ -150,6 +150,8 @@ class ParameterElements(Elements):
         super().__init__(shape)
         self.side = math.ceil(math.sqrt(minimum))
         self.count = self.side**2
+        # Opaque: one kernel for elements of any size.
+        self._across, self._columns = dr.opaque(mi.Float, self.side), dr.opaque(mi.UInt32, self.side)
         self._unit_shape = _UNIT_SHAPES.get(shape.class_name())
         if self._unit_shape:
             self._to_world = mi.Transform4f(mi.traverse(shape)["to_world"])
@@ -159,23 +161,24 @@ class ParameterElements(Elements):
     def place(
         self, index: mi.UInt32, sample: mi.Point2f, cut: int | mi.UInt32 = 1, part: int | mi.UInt32 = 0
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        cell = mi.Point2f(mi.Point2u(index % self.side, index // self.side))
+        row = index // dr.maximum(self._columns, 1)  # 0 where a recorded call is masked, and the CPU would refuse
+        cell = mi.Point2f(mi.Point2u(index - row * self._columns, row))
         number, cut = mi.UInt32(part), mi.UInt32(cut)
         within = (mi.Point2f(mi.Point2u(number % cut, number // cut)) + sample) / mi.Float(cut)
         # Slightly inside: at the ends of their parameters some shapes do not find their own points.
-        uv = dr.clip((cell + within) / self.side, 2.0**-21, 1 - 2.0**-21)
+        uv = dr.clip((cell + within) / self._across, 2.0**-21, 1 - 2.0**-21)
         si = self.at(uv)
         return si, self._area(si) / dr.square(mi.Float(cut))
 
     def locate(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, mi.Float]:
         cell = self._cell(si)
-        return cell.x + cell.y * self.side, self._area(si)
+        return cell.x + cell.y * self._columns, self._area(si)
 
     def weigh(self, si: mi.SurfaceInteraction3f) -> tuple[mi.UInt32, tuple[mi.Float, ...]]:
         cell = self._cell(si)
-        x = si.uv * self.side - mi.Point2f(cell)
+        x = si.uv * self._across - mi.Point2f(cell)
         weights = ((1 - x.x) * (1 - x.y), x.x * (1 - x.y), (1 - x.x) * x.y, x.x * x.y)
-        return cell.x + cell.y * self.side, weights
+        return cell.x + cell.y * self._columns, weights
 
     def at(self, uv: mi.Point2f) -> mi.SurfaceInteraction3f:
         """Surface interaction at (u, v) in [0, 1]².
@@ -199,13 +202,13 @@ class ParameterElements(Elements):
 
     def _cell(self, si: mi.SurfaceInteraction3f) -> mi.Point2u:
         """Column and row of the cell that contains `si`."""
-        return mi.Point2u(dr.clip(si.uv * self.side, 0, self.side - 1))
+        return mi.Point2u(dr.clip(si.uv * self._across, 0, self._across - 1))
 
     def _area(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         """dA/d(sample) of the cell at `si` [mm²]: in closed form for round shapes, whose derivatives Mitsuba rounds."""
         if self._unit_shape:
-            return self._unit_shape.area(si.uv, *self._scales) / self.count
-        return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / self.count
+            return self._unit_shape.area(si.uv, *self._scales) / dr.square(self._across)
+        return dr.norm(dr.cross(si.dp_du, si.dp_dv)) / dr.square(self._across)
 
 
 def _on_sphere(uv: mi.Point2f) -> tuple[mi.Point3f, mi.Normal3f]:

@@ -157,17 +157,22 @@ class Means:
 
         After the deadline only those of the pixels for which there was time.
         """
-        sums = [dr.zeros(mi.Float64, dr.width(self.pixels) * SHIFTS) for _ in range(2)]
         runs, done = (more - points) // FIRST, 0
         entries = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS * runs)
+        columns = [dr.zeros(mi.Float64, dr.width(entries)) for _ in range(2)]
+        # One kernel for lattices of all sizes: it contains neither numbers of points nor the sums over runs.
+        of_shift, start = dr.opaque(mi.UInt32, runs), dr.opaque(mi.UInt32, points)
         for part in batches(entries, FIRST, draft.progress.batch):
             if done and draft.progress.deadline.passed():
                 break
             done += dr.width(part)
-            shift, run = part // runs, part % runs
-            for total, column in zip(sums, _run(draft, self.pixels, shift, points + run * FIRST), strict=True):
-                dr.scatter_add(total, column, shift)
-            dr.eval(sums)
+            dr.eval(part)
+            shift = part // of_shift
+            first = start + (part - shift * of_shift) * dr.opaque(mi.UInt32, FIRST)
+            for column, sums in zip(columns, _run(draft, self.pixels, shift, first), strict=True):
+                dr.scatter(column, sums, part)
+            dr.eval(columns)
+        sums = [dr.block_sum(column, runs) for column in columns]
         whole = done // (SHIFTS * runs)  # array entries of one pixel follow one another
         touched = dr.gather(mi.UInt32, self.pixels, dr.arange(mi.UInt32, whole))
         draft.count(f"{SHIFTS} lattices of {more}", touched, done * FIRST)

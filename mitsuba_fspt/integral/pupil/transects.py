@@ -382,6 +382,7 @@ def _along_transects(
     curve = transect(draft.centres(pixel), angle, blur, place, dr.opaque(mi.Float, float(draft.area)))
     outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
     least, steep = mi.Float(LEAST_JUMP * draft.tolerance), draft.estimator.steep
+    dr.eval(outline, least)  # what they are computed from would tell the kernels of two levels apart
     value, coverage, jumps, depth, rays = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
     # The edge of a weak reflection beside nothing has no depth.
     has_depth = (jumps > 0) & dr.isfinite(depth)

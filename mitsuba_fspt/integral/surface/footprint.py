@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 GRID = 2.0**-20  # corners lie on a grid this fine [pixels], where differences of coordinates are exact
 SPECK = 2.0**-4  # half the side [pixels] of the square that stands for a polygon folded over
+LEAST_LAYER = 1 << 12  # pixels for which a layer has room
 DENSEST = 2.0**57  # largest density of a polygon [quanta a pixel]
 
 
@@ -29,14 +30,16 @@ class Canvas:
 
     def __init__(self, shape: tuple[int, int], quanta: Sequence[float], centres: bool) -> None:
         self.shape, self.quanta, self.centres = shape, quanta, centres
-        self.layers = [dr.zeros(mi.UInt64, shape[0] * shape[1]) for _ in quanta]
-        # Opaque: another film is the same kernel.
+        # Of a power of two and with opaque numbers: another film is the same kernel.
+        size = max(LEAST_LAYER, 1 << (shape[0] * shape[1] - 1).bit_length())
+        self.layers = [dr.zeros(mi.UInt64, size) for _ in quanta]
         self._scales = [dr.opaque(mi.Float64, 1 / quantum) for quantum in quanta]
         self._height, self._width = (dr.opaque(mi.Float64, side) for side in shape)
 
     def images(self) -> list[NDArray[np.float64]]:
         """Each quantity accumulated so far, shape (h, w)."""
-        steps = [mi.Int64(layer).numpy().reshape(self.shape) for layer in self.layers]
+        height, width = self.shape
+        steps = [mi.Int64(layer).numpy()[: height * width].reshape(self.shape) for layer in self.layers]
         return [np.cumsum(step, axis=1) * quantum for step, quantum in zip(steps, self.quanta, strict=True)]
 
     def lay(self, lights: Sequence[mi.Float64], polygon: Sequence[mi.Point2f], active: mi.Bool) -> None:

@@ -117,7 +117,8 @@ class Glow:
         centres, levels = [], []
         exitance = _exitance(emitter)
         for corner in CORNERS:
-            si, _ = elements.place(dr.arange(mi.UInt32, count), mi.Point2f(*corner))
+            # Opaque: one kernel for all corners.
+            si, _ = elements.place(dr.arange(mi.UInt32, count), mi.Point2f(*(dr.opaque(mi.Float, n) for n in corner)))
             front = _front(si, camera)
             level = exitance(si) / dr.pi
             dr.eval(si.p, front, level)
