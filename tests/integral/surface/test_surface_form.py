@@ -23,6 +23,7 @@ from small_scenes import (
     glow,
     lens,
     load_scene,
+    look_at_crop,
     sphere,
     world_scene,
     write_ply,
@@ -38,14 +39,14 @@ QUARTER = (6, 8, 11, 10)  # crop window: the upper left quarter of a sphere of 8
 CASES = [
     ("nylon_cylinder", 2.8, None),
     ("two_spheres", 2.8, (14, 8, 12, 8)),
-    ("textured_sphere", 8.0, (14, 6, 14, 14)),  # the letter, bands, the limb above and to the right
+    ("textured_sphere", 8.0, (19, 6, 9, 7)),  # bands, the limb above and to the right
     ("l_shape", 2.8, (14, 6, 8, 12)),
 ]
 
 
 def both(of, rtol=RTOL, **accuracy):
-    """Images by the surface form, at `rtol`, and by the pupil form, ten times finer."""
-    return fspt.render(of, domain="surface", rtol=rtol, **accuracy), fspt.render(of, rtol=rtol / 10, **accuracy)
+    """Images by the surface form, at `rtol`, and by the pupil form, four times finer."""
+    return fspt.render(of, domain="surface", rtol=rtol, **accuracy), fspt.render(of, rtol=rtol / 4, **accuracy)
 
 
 def test_the_centre_of_a_disk_is_within_the_error():
@@ -54,7 +55,7 @@ def test_the_centre_of_a_disk_is_within_the_error():
     Expected: the pupil form within both errors. Seen to fail on 12 pixels, 0.7 rtol off at 0.2 stated, where the error
     that the number of elements leaves is not stated.
     """
-    scene = camera_scene(disk(FOCUS, 5.0, x=8.0))
+    scene = camera_scene(disk(FOCUS, 5.0, x=8.0), crop=(7, 13, 6, 6))
     image = fspt.render(scene, method="integral", rtol=3e-3, domain="surface")
     truth = fspt.render(scene, method="integral", rtol=1e-4)
     assert (np.abs(image.power - truth.power) <= image.error + truth.error).all()
@@ -105,9 +106,9 @@ def test_a_shadows_border_lies_where_lines_of_sight_find_it():
     far = 2000.0
     ball = sphere(150.0, 4.0, far + 3) | {"emitter": glow(0.01)}
     place = mi.ScalarTransform4f().translate([far, 0, 0])
-    crop = (10, 6, 12, 8)  # of the disk's upper half, and the border on it
-    surface, pupil = both(camera_scene(disk(175.0, 9.0, far, tilt=30), ball, to_world=place, crop=crop))
-    np.testing.assert_allclose(surface.power, pupil.power, atol=RTOL * pupil.power.max())
+    crop = (12, 9, 7, 5)  # of the disk's upper half, and the border on it
+    surface, pupil = both(camera_scene(disk(175.0, 9.0, far, tilt=30), ball, to_world=place, crop=crop), rtol=2e-2)
+    np.testing.assert_allclose(surface.power, pupil.power, atol=2e-2 * pupil.power.max())
     np.testing.assert_allclose(surface.power.sum(), pupil.power.sum(), rtol=1e-3)
 
 
@@ -117,8 +118,8 @@ def test_all_power_arrives_at_every_focus(focus):
 
     Seen to fail with the cosine at the surface dropped.
     """
-    pitch = 0.8 * 55 / (focus - 55)
-    sharp = camera_scene(sphere(180.0, 8.0), focus_distance=focus, pixel_pitch=pitch)
+    pitch = 1.6 * 55 / (focus - 55)
+    sharp = camera_scene(sphere(180.0, 8.0), focus_distance=focus, pixel_pitch=pitch, crop=(10, 6, 20, 20))
     power = fspt.render(sharp, domain="surface", rtol=0.1).power
     assert power[[0, -1]].max() == power[:, [0, -1]].max() == 0
     assert power.sum() == pytest.approx(collected(8.0, 180.0), rel=2e-3)
@@ -135,7 +136,7 @@ def test_no_pixel_is_left_out_in_focus_nor_stopped_down(f_number):
 
 
 def test_same_bits_in_every_run():
-    body = camera_scene(sphere(180.0, 8.0, 3.0), sphere(150.0, 3.0))
+    body = camera_scene(sphere(180.0, 8.0, 3.0), sphere(150.0, 3.0), crop=(10, 8, 12, 8))
     first, second = (fspt.render(body, domain="surface", rtol=0.1) for _ in range(2))
     for plane in ("power", "error", "coverage"):
         np.testing.assert_array_equal(getattr(first, plane), getattr(second, plane))
@@ -166,10 +167,10 @@ def test_crop_window_is_a_part_of_the_whole_image():
     """Expected: the accuracy asked for, the brightest pixel of either image in the part."""
     x, y, width, height = crop = (15, 9, 12, 10)
     whole, part = (
-        fspt.render(camera_scene(sphere(180.0, 8.0), crop=c), domain="surface", rtol=RTOL) for c in (None, crop)
+        fspt.render(camera_scene(sphere(180.0, 8.0), crop=c), domain="surface", rtol=3e-2) for c in (None, crop)
     )
     inside = whole.power[y : y + height, x : x + width]
-    np.testing.assert_allclose(part.power, inside, atol=RTOL * whole.power.max())
+    np.testing.assert_allclose(part.power, inside, atol=3e-2 * whole.power.max())
     assert part.coverage.shape == (height, width)
 
 
@@ -207,7 +208,7 @@ def test_a_bar_thinner_than_a_pixel_or_than_its_blur_is_seen_all_along(bar):
     depth = FOCUS * RADIUS / (RADIUS + blur * SIDE)
     size = np.array([length, width]) * SIDE * depth / FOCUS
     picture = fspt.render(camera_scene(rectangle(depth, *size, angle=27.0)), rtol=RTOL)
-    expected = summed_points(depth, *size, angle=27.0, n=1 << (22 if blur > 4 else 20))
+    expected = summed_points(depth, *size, angle=27.0, n=1 << (21 if blur > 4 else 20))
     off = np.abs(picture.power - expected) / expected.max()
     assert off.max() < RTOL
     assert np.mean(off <= picture.error / expected.max() + 5e-3) >= 0.99
@@ -222,8 +223,8 @@ def test_light_that_only_grazes_the_pupil_is_seen():
     depth, radius, off_axis = 180.0, 3.0, 1.0
     ends = {"p0": [off_axis, off_axis, depth], "p1": [off_axis, off_axis, depth + 1]}
     picture = fspt.render(camera_scene({"type": "cylinder", **ends, "radius": radius}), rtol=0.05)
-    turn = np.linspace(0, 2 * np.pi, 360, endpoint=False)[:, None]
-    ax, ay = RADIUS * even_disc(10000)
+    turn = np.linspace(0, 2 * np.pi, 180, endpoint=False)[:, None]
+    ax, ay = RADIUS * even_disc(3000)
     dx, dy = ax - off_axis - radius * np.cos(turn), ay - off_axis - radius * np.sin(turn)
     z = depth + 0.5
     seen = np.maximum(dx * np.cos(turn) + dy * np.sin(turn), 0) * z / (dx**2 + dy**2 + z**2) ** 2
@@ -308,12 +309,13 @@ def test_a_small_sphere_far_out_of_focus():
     differ from line to line, instead of those of a piece's middle.
     """
     depth, radius, x, y = 120.0, 0.4, 1.0, -2.0
-    quarter = (0, 0, WIDTH // 2, HEIGHT // 2)
+    quarter = (12, 13, 8, 6)
     picture = fspt.render(camera_scene(sphere(depth, radius, x, y), crop=quarter), domain="surface", rtol=2e-3)
     rows, columns = np.nonzero(picture.power > 0)
     pick = slice(None, None, 3)
     expected = [
-        power_of_ball(row, column, depth, radius, x, y) for row, column in zip(rows[pick], columns[pick], strict=True)
+        power_of_ball(quarter[1] + row, quarter[0] + column, depth, radius, x, y)
+        for row, column in zip(rows[pick], columns[pick], strict=True)
     ]
     np.testing.assert_allclose(picture.power[rows, columns][pick], expected, atol=2e-3 * picture.power.max())
     assert picture.error.max() <= 2e-3 * picture.power.max()
@@ -343,9 +345,9 @@ def test_a_thin_tube_far_away():
 
     place = mi.ScalarTransform4f().translate([-4, 0, FOCUS])
     tube = {"type": "cylinder", "p0": [0, -3, 0], "p1": [0, 3, 0], "radius": 0.2, "to_world": place}
-    of = camera_scene(tube, f_number=8.0, pixel_pitch=0.2)
-    surface, pupil = (fspt.render(of, domain=domain, rtol=1e-3).power for domain in ("surface", "pupil"))
-    np.testing.assert_allclose(surface, pupil, atol=1e-3 * surface.max())
+    of = camera_scene(tube, f_number=8.0, pixel_pitch=0.2, crop=(26, 6, 8, 10))
+    surface, pupil = (fspt.render(of, domain=domain, rtol=2e-3).power for domain in ("surface", "pupil"))
+    np.testing.assert_allclose(surface, pupil, atol=2e-3 * surface.max())
 
 
 def test_no_pixel_is_dark_because_the_first_lines_of_sight_pass_it_by(tmp_path):
@@ -369,10 +371,11 @@ def test_no_pixel_is_dark_because_the_first_lines_of_sight_pass_it_by(tmp_path):
     squared = (1.5**2 + 0.5**2) * side**2
     z = u**2 + radius**2 + squared
     expected = side**2 * 0.5 * (1 - (z - 2 * radius**2) / np.sqrt(z**2 - 4 * radius**2 * squared))
+    look_at_crop(of, 6, 3, 4, 4)
     for domain in ("surface", "pupil"):
         image = fspt.render(of, domain=domain, pixel="centre", rtol=1e-3, max_nodes=20000)
-        assert image.power[5, 7] > 0
-        assert abs(image.power[5, 7] - expected) <= image.error[5, 7] + 1e-3 * image.power.max()
+        assert image.power[2, 1] > 0
+        assert abs(image.power[2, 1] - expected) <= image.error[2, 1] + 1e-3 * image.power.max()
 
 
 @pytest.mark.parametrize("domain", ["pupil", "surface"])
@@ -388,11 +391,10 @@ def test_a_spot_on_a_wall_of_two_faces_adds_its_light(domain):
     disks = [{"type": "disk", "to_world": mi_turned(x, y, 179.99, 0.1 * pitch)} for x, y in spots]
     shapes = [wall | {"emitter": glow(1.0)}, *(disk | {"emitter": glow(3.0)} for disk in disks)]
     optics = {"f_number": 4.0, "magnification": None, "focus_distance": 180.0, "to_world": None}
-    of = world_scene(*shapes, sensor=lens(size=(12, 10), pitch=pitch * 55 / 125, **optics))
-    bare = world_scene(shapes[0], sensor=lens(size=(12, 10), pitch=pitch * 55 / 125, **optics))
-    expected = fspt.render(bare, domain="pupil", rtol=3e-4).power.copy()
+    of = world_scene(*shapes, sensor=lens(size=(8, 6), pitch=pitch * 55 / 125, **optics))
+    expected = filled(side=pitch, nodes=2, radius=55 / 8, distance=180.0)[13:19, 16:24]
     for x, y in spots:
-        expected[int(5 - y / pitch), int(6 - x / pitch)] *= 1 + 2 * np.pi * 0.1**2
+        expected[int(3 - y / pitch), int(4 - x / pitch)] *= 1 + 2 * np.pi * 0.1**2
     image = fspt.render(of, domain=domain, rtol=2e-3)
     assert np.abs(image.power - expected).max() < 2e-3 * expected.max()
 
@@ -417,8 +419,8 @@ def test_a_bright_vertex_of_small_faces_lies_where_it_is(tmp_path, domain):
     camera = lens(size=(12, 10), pitch=side * 55 / 125, **optics)
     of = world_scene({"type": "ply", "filename": str(path), "face_normals": True, "emitter": glowing}, sensor=camera)
     image = fspt.render(of, domain=domain, rtol=1e-2)
-    u, v = (c.ravel() for c in np.meshgrid(*2 * [(np.arange(2000) + 0.5) / 1000 - 1]))
-    cone = (1 - np.maximum(np.maximum(np.abs(u), np.abs(v)), np.abs(u - v))).clip(0) * (steps / 1000 / side) ** 2
+    u, v = (c.ravel() for c in np.meshgrid(*2 * [(np.arange(800) + 0.5) / 400 - 1]))
+    cone = (1 - np.maximum(np.maximum(np.abs(u), np.abs(v)), np.abs(u - v))).clip(0) * (steps / 400 / side) ** 2
     column, row = (size / 2 - (n * steps + o) / side for n, o, size in ((u, off[0], 12), (v, off[1], 10)))
     expected = np.full((10, 12), 1e-3)
     np.add.at(expected, (row.astype(int), column.astype(int)), 0.999 * cone)
