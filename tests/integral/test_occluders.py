@@ -60,7 +60,7 @@ def test_light_past_a_dark_disk_arrives(disks, dim, max_nodes):
     changes nothing: it settles no pixel either.
     """
     scene, expected = seen_past(*disks, dim), power_past(*disks)
-    image = fspt.render(scene, rtol=1e-2, max_nodes=max_nodes)
+    image = fspt.render(scene, rtol=2e-2, max_nodes=max_nodes)
     off = np.abs(image.power - expected)
     assert image.error.max() < 0.03 * expected.max()
     assert (off <= image.error + COUNTED * expected.max()).mean() > 0.99
@@ -101,11 +101,11 @@ def test_narrow_light_before_a_dark_plate_that_hides_a_wide_body():
     scene = world_scene(*shapes, sensor=lens(size=(16, 12), pitch=0.22, **optics))
     camera = scene.sensors()[0].camera
     light = 3 * camera.etendue * 0.08**2 / camera.virtual_pitch**2
-    assert fspt.render(scene, rtol=1e-2).power.sum() > 10 * light
+    assert fspt.render(scene, rtol=0.1).power.sum() > 10 * light
     parameters = mi.traverse(scene)
     parameters["shape_0.to_world"] = mi.Transform4f(np.array((at([0, 0, 190]) @ turned.scale(40)).matrix))
     parameters.update()
-    assert fspt.render(scene, rtol=3e-3).power.sum() == pytest.approx(light, rel=1e-2)
+    assert fspt.render(scene, rtol=5e-3).power.sum() == pytest.approx(light, rel=1e-2)
 
 
 def test_light_beside_a_dark_cylinder_is_found_along_its_outline_too():

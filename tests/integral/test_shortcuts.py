@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def soft_spot(path):
 
 CASES = {
     "outside": (lambda path: world_scene(ball(), sensor=lens(40)), "pupil"),
-    "smooth blocks": (lambda path: world_scene(ball(radius=14.0), sensor=lens(640, 0.03, f_number=2.8)), "pupil"),
+    "smooth blocks": (lambda path: world_scene(ball(radius=14.0), sensor=lens(256, 0.075, f_number=2.8)), "pupil"),
     "one line": (soft_spot, "pupil"),
     "smooth": (lambda path: world_scene(ball(radius=12.0), sensor=lens(24, f_number=2.8)), "pupil"),
     "specular": (lambda path: world_scene(ball(), sensor=lens(24)), "pupil"),
@@ -67,8 +68,12 @@ def found(solution, name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_shortcut_changes_no_pixel_by_a_tenth_of_rtol(name, tmp_path):
-    """Seen to fail with `one_spread` left out, and with all but the brightest elements taken for dark."""
+def test_a_shortcut_changes_no_pixel_by_a_tenth_of_rtol(name, tmp_path, monkeypatch):
+    """Seen to fail with `one_spread` left out, and with all but the brightest elements taken for dark.
+
+    Blocks are allowed on a smaller film than by default.
+    """
+    monkeypatch.setattr("mitsuba_fspt.integral.pupil.interpolated.FEWEST", 32)
     build, domain = CASES[name]
     scene = build(tmp_path / "body.ply")
     rtol = RTOL if domain == "surface" or name == "smooth blocks" else 1e-3
@@ -143,7 +148,7 @@ def test_faces_that_float32_gives_no_direction_have_no_say(tmp_path):
 
 def dented(path):
     """A sphere with a shallow dent around its waist, in a mesh so fine that no single edge shows it."""
-    body = trimesh.creation.uv_sphere(radius=5, count=[800, 60])
+    body = trimesh.creation.uv_sphere(radius=5, count=[800, 16])
     body.vertices *= (1 - 0.1 * np.exp(-((body.vertices[:, 2] / 1.5) ** 2)))[:, None]
     return world_scene(mesh_of(body, path))
 
@@ -173,11 +178,11 @@ def test_a_body_thinner_than_a_pixel_between_two_rows_is_found():
     crop = {"crop_offset_x": 2, "crop_offset_y": 10, "crop_width": 12, "crop_height": 8}  # all rows with light
     film = {"type": "hdrfilm", "width": 28, "height": 28, "pixel_format": "luminance", **crop}
     scene = world_scene(plate, sensor=lens(pitch=0.216, film=film))
-    by_light = fspt.render(scene, method="ptracer", spp=1024, seed=1)
+    by_light = fspt.render(scene, method="ptracer", spp=512, seed=1)
     noise = np.sqrt((by_light.error**2).sum())
     assert noise < 0.05 * by_light.power.sum()
     assert solved(scene, rtol=3e-2).power.sum() == pytest.approx(by_light.power.sum(), abs=4 * noise)
-    random = fspt.render(scene, method="path", spp=16384, seed=1).power
+    random = fspt.render(scene, method="path", spp=8192, seed=1).power
     np.testing.assert_allclose(solved(scene, rtol=1e-2).power, random, atol=0.03 * random.max())
 
 
@@ -207,7 +212,7 @@ def test_an_unknown_shortcut_is_refused():
 
 
 def test_explain_measures_what_each_shortcut_saves():
-    rows = fspt.explain(world_scene(ball(), sensor=lens(40, f_number=2.8)), rtol=RTOL)
+    rows = fspt.explain(world_scene(ball(), sensor=lens(20, 1.6, f_number=2.8)), rtol=RTOL)
     by_what = {row.what: row for row in rows}
     outside, one = by_what[SHORTCUTS["outside"]], by_what[SHORTCUTS["one line"]]
     assert outside.left_out
@@ -242,8 +247,24 @@ def test_findings_count_no_more_pixels_than_the_image_has():
     assert (outside.taken, outside.why) == (False, "64 of 64 pixels can see what glows")
 
 
+def once(function):
+    """The function, whose first result is that of all later calls."""
+    kept = []
+
+    def call(*arguments, **named):
+        if not kept:
+            kept.append(function(*arguments, **named))
+        return kept[0]
+
+    return call
+
+
 def test_explain_and_render_without_shortcuts_from_the_command_line(tmp_path, monkeypatch, capsys):
+    """The table and the JSON of one measurement."""
     monkeypatch.chdir(tmp_path)
+    for name in ("explain", "work"):
+        path = f"mitsuba_fspt.studies.explain.{name}"
+        monkeypatch.setattr(path, once(pkgutil.resolve_name(path)))
     small = ["-D", "width=12", "-D", "height=10", "-D", "pixel_pitch=2.304", "--rtol", "0.1"]
     scene = str(SCENES / "two_spheres.xml")
     assert app.run(["explain", scene, *small]) == 0
