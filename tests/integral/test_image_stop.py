@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from small_scenes import (
@@ -48,12 +50,14 @@ def inside_stop(stop, function, strips=2000):
     return means
 
 
+@cache
 def pixels(stop):
     """Pixels wholly inside the stop, and wholly beside it."""
     share = inside_stop(stop, np.ones_like)
     return share > 1 - 1e-9, share < 1e-9
 
 
+@cache
 def truth(stop):
     """Power [W] before a uniform disk of 1 W/mm²: A_vd times the mean configuration factor inside the stop."""
     return SIDE**2 * inside_stop(stop, lambda r: configuration_factor(RADIUS, FOCUS, r))
@@ -115,7 +119,7 @@ def test_monte_carlo_agrees_where_silhouettes_cross_the_border(borders):
     image = fspt.render(view)
     assert (image.power[cut] > 0.05 * image.power.max()).sum() > 10
     for method in ("path", "ptracer"):
-        truth = fspt.render(view, method=method, spp=2000, seed=4)
+        truth = fspt.render(view, method=method, spp=800, seed=4)
         lit = truth.power > 0.02 * truth.power.max()
         z = (truth.power - image.power)[lit] / np.hypot(truth.error, image.error)[lit]
         assert np.abs(z).max() < 4.5, method
@@ -128,8 +132,8 @@ def test_monte_carlo_agrees_where_silhouettes_cross_the_border(borders):
 def test_both_domains_agree():
     body = sphere(158.0, 3.0, 8.5, -3.0)
     view = camera_scene(body, image_stop_diameter=STOP)
-    pupil, surface = (fspt.render(view, domain=domain, rtol=2e-3) for domain in ("pupil", "surface"))
-    np.testing.assert_allclose(pupil.power, surface.power, atol=2e-3 * pupil.power.max())
+    pupil, surface = (fspt.render(view, domain=domain, rtol=5e-3) for domain in ("pupil", "surface"))
+    np.testing.assert_allclose(pupil.power, surface.power, atol=5e-3 * pupil.power.max())
     assert (np.abs(pupil.power - surface.power) <= pupil.error + surface.error).all()
     assert np.any(pupil.power != surface.power)
 
@@ -148,7 +152,7 @@ def test_a_stop_wider_than_the_film_changes_no_bit():
     body = sphere(150.0, 6.0)
     for domain in ("pupil", "surface"):
         free, wide = (
-            power(camera_scene(body, **s), domain=domain, rtol=3e-2) for s in ({}, {"image_stop_diameter": 100.0})
+            power(camera_scene(body, **s), domain=domain, rtol=0.1) for s in ({}, {"image_stop_diameter": 100.0})
         )
         np.testing.assert_array_equal(free, wide)
 

@@ -35,8 +35,8 @@ def both(scene, monkeypatch, side=SIDE, **accuracy):
 @pytest.mark.parametrize(
     ("name", "accuracy"),
     [
-        ("two_spheres", {"rtol": 1e-3}),
-        ("nylon_cylinder", {"rtol": 1e-3, "pixel": "centre"}),
+        ("two_spheres", {"rtol": 3e-3}),
+        ("nylon_cylinder", {"rtol": 3e-3, "pixel": "centre"}),
         ("nylon_cylinder", {"rtol": 0.1, "domain": "surface"}),
     ],
 )
@@ -58,8 +58,8 @@ def test_tiles_and_one_piece_agree_within_the_errors_of_both(name, accuracy, mon
 
 def test_there_are_no_seams(monkeypatch):
     """Pixels along the borders of tiles differ from those of one piece by a hundredth of rtol on average."""
-    scene = scene_of("two_spheres")
-    whole, tiled = both(scene, monkeypatch, rtol=1e-3)
+    scene = scene_of("two_spheres", 160)
+    whole, tiled = both(scene, monkeypatch, 68, rtol=1e-3)
     apart = np.abs(tiled.power - whole.power) / whole.power.max()
     seam = np.zeros(apart.shape, bool)
     for tile in tiles_of(visible_window(scene, scene.sensors()[0].camera)):

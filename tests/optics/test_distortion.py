@@ -106,12 +106,12 @@ def test_uniform_plane_in_closed_form(domain):
 
 
 def test_total_of_an_isolated_body_does_not_change():
-    """With and without, to 2e-4: light moves between pixels and is neither made nor lost."""
+    """With and without, to 5e-4: light moves between pixels and is neither made nor lost."""
     body = sphere(230.0, 4.0, x=30.0, y=20.0)
     with_it, without = (
-        fspt.render(scene(body, **more), method="integral", rtol=1e-4) for more in ({}, {"distortion": "0, 0"})
+        fspt.render(scene(body, **more), method="integral", rtol=5e-4) for more in ({}, {"distortion": "0, 0"})
     )
-    assert with_it.power.sum() == pytest.approx(without.power.sum(), rel=2e-4)
+    assert with_it.power.sum() == pytest.approx(without.power.sum(), rel=5e-4)
     assert np.abs(with_it.power - without.power).max() > 0.1 * without.power.max()
     assert with_it.metadata["distortion"] == "-1.5, 4, 0.02, -0.03, 6"
     assert "distortion" not in without.metadata

@@ -198,7 +198,7 @@ def test_derivatives_have_it(curve):
         f'<integrator type="fspt_integral"/>{text}{BALL_XML}</scene>'
         for text in (LENS_XML.replace('<transform name="to_world">', more), LENS_XML)
     )
-    one, other = (fspt.derivatives(text, ["f_number"], rtol=1e-4)["f_number"] for text in (dim, clear))
+    one, other = (fspt.derivatives(text, ["f_number"], rtol=5e-4)["f_number"] for text in (dim, clear))
     x, y = (np.arange(8) - 3.5) * 0.8, (np.arange(6) - 2.5)[:, None] * 0.8
     shares = np.interp(np.hypot(x, y), HEIGHTS, SHARES)
     assert np.abs(other.value).max() > 0

@@ -39,7 +39,7 @@ def power(*bodies, camera=CAMERA, stops=None, pixel="area", goal=1e-6):
 def test_it_is_the_lattice_reference(shape, pixel):
     """Both state their errors. Seen to fail with cos³θ, and without the edges of the shapes."""
     found, error = power(uniform(shape), pixel=pixel, goal=1e-5)
-    other, others = pupil_form(CAMERA, [shape], lambda points, k: np.ones(len(points)), 1 << 14, "lattice", pixel)
+    other, others = pupil_form(CAMERA, [shape], lambda points, k: np.ones(len(points)), 1 << 13, "lattice", pixel)
     row, column = PIXELS.T
     peak = other.max()
     assert other[row, column].max() > 0.3 * peak

@@ -56,7 +56,7 @@ def test_rows_agree_with_samples_of_all_coordinates(name):
         value = objects[number][3]
         return value(lens.from_world(points)) if callable(value) else np.full(len(points), value)
 
-    sampled, doubt = pupil_form(lens, shapes, exitance, 1 << 14, "lattice")
+    sampled, doubt = pupil_form(lens, shapes, exitance, 1 << 13, "lattice")
     power, error = truth(lens, *own, nodes=1 << 12)
     assert np.count_nonzero(sampled) > 30
     assert rms(error) < 0.5 * rms(doubt)

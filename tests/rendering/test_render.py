@@ -94,7 +94,7 @@ def test_monte_carlo_repeats_by_its_seed(scene, method):
 @pytest.mark.parametrize("method", ["path", "ptracer"])
 def test_the_standard_error_of_monte_carlo_is_its_scatter(scene, method):
     """Mean z² between independent images is near 1 (1.07 for errors from 32 passes)."""
-    images = [fspt.render(scene, method=method, spp=64, seed=seed) for seed in range(8)]
+    images = [fspt.render(scene, method=method, spp=64, seed=seed) for seed in range(5)]
     power = np.array([image.power for image in images])
     error = np.array([image.error for image in images])
     lit = (power.min(axis=0) > 0) & (error.min(axis=0) > 1e-3 * power.max())  # leaves out what does not scatter
@@ -107,7 +107,7 @@ def test_the_standard_error_of_monte_carlo_is_its_scatter(scene, method):
 def test_pixels_that_no_sample_met_have_the_error_of_a_single_one(method):
     """Expected: the light that few samples miss on the pixels of the rim is within some errors. Fails with none (0)."""
     scene = world_scene(ball(radius=3.0), sensor=lens(size=48, pixel_pitch=0.1, f_number=2.8))
-    exact = fspt.render(scene, rtol=1e-3).power
+    exact = fspt.render(scene, rtol=1e-2).power
     missed, error = [], []
     for seed in range(4):
         image = fspt.render(scene, method=method, spp=4, seed=seed)
@@ -125,7 +125,7 @@ def test_pixels_at_a_border_that_no_sample_missed_have_the_error_of_a_single_mis
     Fails for one in twelve of these pixels, by 26 errors, with their scatter alone.
     """
     scene = world_scene(ball(radius=3.0), sensor=lens(size=48, pixel_pitch=0.1, f_number=2.8))
-    exact = fspt.render(scene, rtol=1e-3)
+    exact = fspt.render(scene, rtol=3e-3)
     rim = (exact.coverage > 0.9) & (exact.coverage < 0.999)
     off, error = [], []
     for seed in range(4):

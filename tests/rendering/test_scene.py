@@ -362,7 +362,7 @@ def graded(tmp_path):
 def test_updating_vertex_values_changes_every_method(graded):
     """All three, of which the particle tracer also has to sample anew."""
     scene, parameters = graded
-    methods = ({}, {"method": "path", "spp": 400}, {"method": "ptracer", "spp": 4000})
+    methods = ({}, {"method": "path", "spp": 128}, {"method": "ptracer", "spp": 1024})
     before = [fspt.render(scene, **options) for options in methods]
     key = "shape_0.vertex_exitance"
     parameters[key] = mi.Float(np.where(np.array(parameters[key]) > 5e-3, 5.0, 1.0) * np.array(parameters[key]))

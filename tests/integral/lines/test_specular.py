@@ -80,9 +80,9 @@ def test_a_plate_of_glass_moves_the_focus():
     """What lies z behind a plate is seen at z - d (1 - 1/n); without the shift the blurred edge is off by 3 %."""
     depth, nearer = 190.0, THICK * (1 - 1 / N)
     rim = {"f_number": 4, "crop": (12, 12, 4, 4)}
-    behind = power(camera_scene(disk(depth, radius=6.0), bodies=(slab(80),), **rim), rtol=3e-4)
-    in_air = power(camera_scene(disk(depth - nearer, radius=6.0), **rim), rtol=3e-4)
-    unmoved = power(camera_scene(disk(depth, radius=6.0), **rim), rtol=3e-4)
+    behind = power(camera_scene(disk(depth, radius=6.0), bodies=(slab(80),), **rim), rtol=6e-4)
+    in_air = power(camera_scene(disk(depth - nearer, radius=6.0), **rim), rtol=6e-4)
+    unmoved = power(camera_scene(disk(depth, radius=6.0), **rim), rtol=6e-4)
     assert abs(behind - THROUGH * in_air).max() < PEAK_MISS * behind.max()
     assert abs(behind - THROUGH * unmoved).max() > 5 * PEAK_MISS * behind.max()
 
@@ -112,10 +112,13 @@ def test_a_mirror_shows_the_mirrored_phantom(bsdf, depth):
     share, seen = 0.9, [(np.array([0.0, 3.0, depth]), 5.0), (np.array([7.0, -2.0, depth - 4]), 2.0)]
     mirror = pane(80, bsdf | {"specular_reflectance": share}, tilt=45)
     real = [{"type": "sphere", "center": mirrored(p, 80, 45).tolist(), "radius": r} for p, r in seen]
-    image = fspt.render(camera_scene(*real, bodies=(mirror,)), rtol=1e-3)
-    direct = fspt.render(camera_scene(*({"type": "sphere", "center": p.tolist(), "radius": r} for p, r in seen)))
+    straight = ({"type": "sphere", "center": p.tolist(), "radius": r} for p, r in seen)
+    image, direct = (
+        fspt.render(camera_scene(*shapes, bodies=bodies), rtol=3e-3)
+        for shapes, bodies in ((real, (mirror,)), (straight, ()))
+    )
     assert (abs(image.power - share * direct.power) <= image.error + direct.error).mean() > 0.995
-    assert abs(image.power - share * direct.power).max() < 2e-3 * direct.power.max()
+    assert abs(image.power - share * direct.power).max() < 6e-3 * direct.power.max()
     assert image.coverage == pytest.approx(direct.coverage, abs=2e-2)
 
 
@@ -138,9 +141,9 @@ def test_two_mirrors_in_turn():
     """A periscope: two parallel mirrors at 45° shift the line of sight sideways by 40 mm."""
     mirrors = (pane(70, PERFECT, size=[18, 18, 1], tilt=45), pane(70, PERFECT, size=[25, 25, 1], x=40, tilt=225))
     quarter = (10, 7, 10, 9)
-    shifted = fspt.render(camera_scene(sphere(125, 6, x=40), bodies=mirrors, crop=quarter), rtol=1e-3)
-    direct = fspt.render(camera_scene(sphere(FOCUS, 6), crop=quarter), rtol=1e-3)
-    assert abs(shifted.power - direct.power).max() < 2e-3 * direct.power.max()
+    shifted = fspt.render(camera_scene(sphere(125, 6, x=40), bodies=mirrors, crop=quarter), rtol=2e-3)
+    direct = fspt.render(camera_scene(sphere(FOCUS, 6), crop=quarter), rtol=2e-3)
+    assert abs(shifted.power - direct.power).max() < 4e-3 * direct.power.max()
 
 
 def test_a_mask_of_even_opacity_scales_the_image():
@@ -188,9 +191,9 @@ def test_a_mirror_in_another_bsdf_reflects_its_share():
         ]
         bare += [PERFECT | {"specular_reflectance": r} for r in (share, share, share + 0.2 * (1 - share))]
     scenes = (camera_scene(sphere(80, 5, x=70), bodies=strips(bsdfs), crop=(17, 9, 2, 7)) for bsdfs in (inside, bare))
-    seen, due = (power(scene, rtol=4e-3) for scene in scenes)
+    seen, due = (power(scene, rtol=6e-3) for scene in scenes)
     assert due.max() > 0
-    assert abs(seen - due).max() < 4e-3 * due.max()
+    assert abs(seen - due).max() < 6e-3 * due.max()
 
 
 @pytest.mark.parametrize(
@@ -309,14 +312,14 @@ def test_narrow_light_in_a_mirror_is_in_the_error():
     tiny = {"type": "sphere", "center": where.tolist(), "radius": 0.05}
     around = (14, 9, 12, 12)
     scene = camera_scene(tiny, disk(300, 3.0, x=60), bodies=(pane(80, PERFECT, tilt=45),), crop=around)
-    direct = fspt.render(camera_scene(sphere(160, 0.05, y=1.0), crop=around), rtol=1e-3)
+    direct = fspt.render(camera_scene(sphere(160, 0.05, y=1.0), crop=around), rtol=3e-3)
     assert direct.power.max() > 0
     image = fspt.render(scene, rtol=4e-3)
     assert (abs(image.power - direct.power) <= image.error + direct.error).all()
 
 
 def test_the_surface_form_goes_through_panes_alone():
-    scene = camera_scene(sphere(150, 9), bodies=(pane(80, PANE),), crop=(4, 4, 12, 12))
+    scene = camera_scene(sphere(150, 9), bodies=(pane(80, PANE),), crop=(7, 6, 8, 8))
     pupil, surface = (fspt.render(scene, rtol=1e-2, domain=domain) for domain in ("pupil", "surface"))
     assert abs(pupil.power - surface.power).max() <= 2e-2 * pupil.power.max()
     assert pupil.power.sum() == pytest.approx(surface.power.sum(), rel=2e-3)
@@ -326,9 +329,9 @@ def test_the_surface_form_goes_through_panes_alone():
 
 def test_a_scene_without_specular_shapes_ends_lines_of_sight_at_the_first_surface():
     scene = camera_scene(sphere(150, 9), bodies=(pane(80, {"type": "diffuse"}, size=3.0),), crop=(8, 14, 6, 3))
-    image, other = (fspt.render(scene, shortcuts=shortcuts) for shortcuts in (True, False))
+    image, other = (fspt.render(scene, shortcuts=shortcuts, rtol=3e-3) for shortcuts in (True, False))
     assert "lines of sight beyond the first surface: left out" in image.metadata["left_out"]
-    assert abs(image.power - other.power).max() <= 2e-3 * image.power.max()
+    assert abs(image.power - other.power).max() <= 6e-3 * image.power.max()
 
 
 def test_panes_merged_by_mitsuba_are_not_passed_by():
@@ -342,8 +345,8 @@ def test_panes_merged_by_mitsuba_are_not_passed_by():
     merged = mi.load_dict(parts | {"sensor": lens | {"film": film}})
     look_at_crop(merged, *crop)
     assert len(merged.shapes()) < len(scene.shapes())
-    seen, due = power(merged, rtol=5e-3), power(scene, rtol=5e-3)
-    assert abs(seen - due).max() < 1e-2 * due.max()
+    seen, due = power(merged, rtol=1e-2), power(scene, rtol=1e-2)
+    assert abs(seen - due).max() < 2e-2 * due.max()
 
 
 def test_a_lens_in_a_glass_chamber_is_not_inside_the_phantom():
