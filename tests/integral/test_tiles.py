@@ -41,7 +41,7 @@ def both(scene, monkeypatch, side=SIDE, **accuracy):
     ],
 )
 def test_tiles_and_one_piece_agree_within_the_errors_of_both(name, accuracy, monkeypatch):
-    """Seen to fail with tiles without a rim."""
+    """Seams that are smaller: `test_there_are_no_seams`."""
     scene = scene_of(name, 160)
     whole, tiled = both(scene, monkeypatch, 68, **accuracy)
     assert len(tiles_of(visible_window(scene, scene.sensors()[0].camera))) > 3
@@ -57,7 +57,10 @@ def test_tiles_and_one_piece_agree_within_the_errors_of_both(name, accuracy, mon
 
 
 def test_there_are_no_seams(monkeypatch):
-    """Pixels along the borders of tiles differ from those of one piece by a hundredth of rtol on average."""
+    """Pixels along the borders of tiles differ from those of one piece by a hundredth of rtol on average.
+
+    Seen to fail with tiles without a rim.
+    """
     scene = scene_of("two_spheres", 160)
     whole, tiled = both(scene, monkeypatch, 68, rtol=1e-3)
     apart = np.abs(tiled.power - whole.power) / whole.power.max()
