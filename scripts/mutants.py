@@ -711,6 +711,13 @@ MUTANTS = (
         ("tests/inverse/test_calibrate.py",),
     ),
     Mutant(
+        "correction along transects",
+        "integral/pupil/transects.py",
+        "if count >= MANY:",
+        "if count >= 1 << 20:",
+        ("tests/integral/test_honest_error.py",),
+    ),
+    Mutant(
         "y axis of an image",
         "images/pixel_axes.py",
         "return cls(x, -y, side",

@@ -30,9 +30,9 @@ def integrate_transect(
     outline: mi.Float,
     least: mi.Float,
     steep: float,
-) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
-    """Means of integrand and coverage along a transect, number of jumps, depth of the edge at the largest jump [mm],
-    number of lines of sight.
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.UInt32, mi.Float, mi.UInt32]:
+    """Means along a transect of the integrand, the same without correction of the nodes' weights, of the coverage;
+    number of jumps, depth of the edge at the largest jump [mm], number of lines of sight.
 
     The transect is split at its `MOST_JUMPS` largest jumps. A scan of `along.scan` + 1 points finds the intervals with
     jumps; `along.bisections` halve each of them towards the larger difference. Every piece between jumps that is not
@@ -55,9 +55,7 @@ def integrate_transect(
     nodes = dr.opaque(mi.UInt32, along.nodes)
 
     # Pieces 0 … jumps between -1, the jumps and 1; an outer one is dark if all its lines of sight miss the phantom.
-    def integrate(
-        piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, value: mi.Float, coverage: mi.Float, rays: mi.UInt32
-    ) -> tuple:
+    def integrate(piece: mi.UInt32, low: mi.Float, since: mi.Vector2d, means: mi.Point3f, rays: mi.UInt32) -> tuple:
         at_start, at_end = piece > 0, piece < jumps
         high = mi.Float(1)
         for k, place in enumerate(places):
@@ -75,13 +73,14 @@ def integrate_transect(
 
         (sums,) = repeat(count, add, _Sums(mi.Vector3f(0), mi.Vector2f(0), mi.Float(0)))
         until = dr.select(at_end, transect.moments(high), mi.Vector2d(1, 0))  # the density is even
-        more_value, more_coverage = sums.corrected(_about(until - since, middle, half))
-        return high, until, value + more_value, coverage + more_coverage, rays + count
+        value, covered = sums.corrected(_about(until - since, middle, half))
+        plain = 2 * half / mi.Float(nodes) * sums.f.x
+        return high, until, means + mi.Point3f(value, plain, covered), rays + count
 
-    start = (mi.Float(-1), mi.Vector2d(0), mi.Float(0), mi.Float(0), found.rays)
-    _, _, value, coverage, rays = repeat(jumps + 1, integrate, *start)
+    start = (mi.Float(-1), mi.Vector2d(0), mi.Point3f(0), found.rays)
+    _, _, means, rays = repeat(jumps + 1, integrate, *start)
     depth = dr.select(jumps > 0, found.largest[0].depth(), 0)
-    return value, coverage, jumps, depth, rays
+    return means.x, means.y, means.z, jumps, depth, rays
 
 
 # ---------------------------------------------------------------------- search for jumps

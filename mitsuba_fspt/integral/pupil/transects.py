@@ -33,6 +33,10 @@ DARK_LEVELS = 3  # levels of transects that are taken while no line of sight of 
 # corner may lie between two transects, and their order is lower by this factor. Where fewer do, as where a smooth
 # outline touches a transect, that adds less than an eighth to the error.
 SEVERAL_SHARE, SEVERAL_ORDER = 1 / 16, 2 / 3
+# Number of transects from which their mean with uncorrected weights of the nodes is accurate, as phases are even: from
+# there on the change by the correction counts as an error. Where there are many steps along a transect, the correction
+# makes the values of all transects wrong in the same way, and no level tells.
+MANY = 72
 FAR = 1e30  # depth [mm] at which larger ones are clipped; the blur of an edge is finite there
 
 
@@ -197,6 +201,8 @@ class _Refinement:
         one, several = (dr.opaque(mi.Float64, fewer**own) for own in (order, SEVERAL_ORDER * order))
         assumed = dr.maximum(change, before * dr.select(self.edges.sharp & self.means.several, several, one))
         remaining = dr.maximum(assumed, self.means.scatter)
+        if count >= MANY:
+            remaining = dr.maximum(remaining, dr.abs(self.means.value - self.means.plain))
         if level <= node_rules.SMOOTH_LEVELS:
             # On smooth pixels the next node rule changes the value by less than this one did.
             remaining = dr.select(self.smooth, change, remaining)
@@ -270,6 +276,7 @@ class Means:
     """Means over the transects of each marked pixel.
 
     value, coverage : mean radiance on film [W/mm²/sr], share of lines of sight that meet a glowing surface
+    plain : `value` without correction of the weights of the nodes along the transects
     jumps : True where a transect crosses a jump
     several : True where a share of the transects, `SEVERAL_SHARE`, crosses more than one
     scatter : error of the value that follows from the differences between transects [W/mm²/sr]
@@ -278,6 +285,7 @@ class Means:
     """
 
     value: PixelArray
+    plain: PixelArray
     coverage: PixelArray
     jumps: Mask
     several: Mask
@@ -318,6 +326,7 @@ def apply_transects(
     sharp = dr.maximum(slant, found.between)
     return Means(
         found.value,
+        found.plain,
         found.coverage,
         jumps=found.split > 0,
         several=found.several >= SEVERAL_SHARE * number,
@@ -331,11 +340,13 @@ def apply_transects(
 class _OfTransects:
     """Results of each transect of some pixels, those of a pixel one after the other.
 
-    value, coverage : means along the transect;  jumps : their number;  rays : number of lines of sight
+    value, coverage : means along the transect;  plain : that of the value without correction of the nodes' weights
+    jumps : their number;  rays : number of lines of sight
     blur : signed blur radius of the edge at the largest jump, 0 without one [pixels]
     """
 
     value: mi.Float
+    plain: mi.Float
     coverage: mi.Float
     jumps: mi.UInt32
     blur: mi.Float
@@ -346,7 +357,7 @@ class _OfTransects:
 class _OfPixels:
     """Results over the transects of each pixel.
 
-    value, coverage, squares : means of the value, the coverage and the squared value
+    value, plain, coverage, squares : means of the value, of the plain one, of the coverage and of the squared value
     trend : sum of the squared trends of the value
     split, several : number of transects with a jump, and with more than one
     blur : signed radius of the most blurred edge [pixels]
@@ -354,6 +365,7 @@ class _OfPixels:
     """
 
     value: mi.Float64
+    plain: mi.Float64
     coverage: mi.Float64
     squares: mi.Float64
     trend: mi.Float64
@@ -383,11 +395,12 @@ def _along_transects(
     outline = mi.Float(2 * draft.at_least_peak(dr.max(draft.value)))
     least, steep = mi.Float(LEAST_JUMP * draft.tolerance), draft.estimator.steep
     dr.eval(outline, least)  # what they are computed from would tell the kernels of two levels apart
-    value, coverage, jumps, depth, rays = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
+    seen = integrate_transect(draft.view, curve, phase, along, outline, least, steep)
+    value, plain, coverage, jumps, depth, rays = seen
     # The edge of a weak reflection beside nothing has no depth.
     has_depth = (jumps > 0) & dr.isfinite(depth)
     blur = mi.Float(dr.select(has_depth, draft.camera.blur_radius(mi.Float64(dr.minimum(depth, FAR))), 0))
-    found = _OfTransects(value, coverage, jumps, blur, rays)
+    found = _OfTransects(value, plain, coverage, jumps, blur, rays)
     dr.eval(found)  # together, as a later reduction of one of them would trace every ray again
     return found
 
@@ -405,11 +418,14 @@ def _over_transects(
     sharp, even = dr.gather(mi.Bool, edges.sharp, part), dr.opaque(mi.Float, 1 / len(rule))
 
     def add(k: mi.UInt32, sums: dict[str, PixelArray], trends: list[PixelArray], blurs: tuple) -> tuple:
-        value, coverage, blur = (dr.gather(mi.Float, of, first + k) for of in (found.value, found.coverage, found.blur))
+        value, plain, coverage, blur = (
+            dr.gather(mi.Float, of, first + k) for of in (found.value, found.plain, found.coverage, found.blur)
+        )
         weight = mi.Float64(dr.select(sharp, even, table.gather("weight", k)))
         share, jumps = weight * mi.Float64(value), dr.gather(mi.UInt32, found.jumps, first + k)
         terms = {
             "value": share,
+            "plain": weight * mi.Float64(plain),
             "coverage": weight * mi.Float64(coverage),
             "squares": share * mi.Float64(value),
             "split": dr.select(jumps > 0, mi.Float64(1), 0),
@@ -419,7 +435,7 @@ def _over_transects(
         trends = [total + share * mi.Float64(table.gather(f"trend{n}", k)) for n, total in enumerate(trends)]
         return sums, trends, (dr.maximum(blurs[0], blur), dr.minimum(blurs[1], blur))
 
-    sums = {name: mi.Float64(0) for name in ("value", "coverage", "squares", "split", "several")}
+    sums = {name: mi.Float64(0) for name in ("value", "plain", "coverage", "squares", "split", "several")}
     trends = [mi.Float64(0) for _ in range(node_rules.TRENDS)]
     sums, trends, blurs = repeat(count, add, sums, trends, (mi.Float(-dr.inf), mi.Float(dr.inf)))
     return _OfPixels(

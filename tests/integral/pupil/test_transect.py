@@ -212,6 +212,6 @@ def test_a_transect_is_split_where_it_enters_one_body_leaves_it_for_another_and_
     expected = 2 * light.reshape(number, points).mean(axis=1)
     along = node_rules.AlongTransect(scan=24, bisections=16, nodes=6)
     phase = mi.Float(node_rules.transects(24).phase[:number])
-    value, _, jumps, *_ = integrate_transect(view, curves(1), phase, along, mi.Float(1e-2), mi.Float(1e-9), 4.0)
+    value, _, _, jumps, *_ = integrate_transect(view, curves(1), phase, along, mi.Float(1e-2), mi.Float(1e-9), 4.0)
     assert np.all(np.array(jumps) == 3)
     np.testing.assert_allclose(value, expected, atol=1e-3 * expected.max())
