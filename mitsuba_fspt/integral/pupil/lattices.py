@@ -158,24 +158,26 @@ class Means:
         After the deadline only those of the pixels for which there was time.
         """
         runs, done = (more - points) // FIRST, 0
-        entries = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS * runs)
-        columns = [dr.zeros(mi.Float64, dr.width(entries)) for _ in range(2)]
+        shifts = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS)
+        sums = [dr.zeros(mi.Float64, dr.width(shifts)) for _ in range(2)]
         # One kernel for lattices of all sizes: it contains neither numbers of points nor the sums over runs.
         of_shift, start = dr.opaque(mi.UInt32, runs), dr.opaque(mi.UInt32, points)
-        for part in batches(entries, FIRST, draft.progress.batch):
+        for part in batches(shifts, FIRST * runs, draft.progress.batch):
             if done and draft.progress.deadline.passed():
                 break
             done += dr.width(part)
-            dr.eval(part)
-            shift = part // of_shift
-            first = start + (part - shift * of_shift) * dr.opaque(mi.UInt32, FIRST)
-            for column, sums in zip(columns, _run(draft, self.pixels, shift, first), strict=True):
-                dr.scatter(column, sums, part)
+            entry = dr.arange(mi.UInt32, dr.width(part) * runs)
+            shift = dr.gather(mi.UInt32, part, entry // of_shift)
+            first = start + entry % of_shift * dr.opaque(mi.UInt32, FIRST)
+            dr.eval(shift, first)
+            columns = _run(draft, self.pixels, shift, first)
             dr.eval(columns)
-        sums = [dr.block_sum(column, runs) for column in columns]
-        whole = done // (SHIFTS * runs)  # array entries of one pixel follow one another
+            for total, column in zip(sums, columns, strict=True):
+                dr.scatter(total, dr.block_sum(column, runs), part)
+            dr.eval(sums)
+        whole = done // SHIFTS  # array entries of one pixel follow one another
         touched = dr.gather(mi.UInt32, self.pixels, dr.arange(mi.UInt32, whole))
-        draft.count(f"{SHIFTS} lattices of {more}", touched, done * FIRST)
+        draft.count(f"{SHIFTS} lattices of {more}", touched, done * runs * FIRST)
         old, new = (dr.opaque(mi.Float64, share) for share in (points / more, 1 / more))
         radiance, coverage = (
             old * before + new * total for before, total in zip((self.radiance, self.coverage), sums, strict=True)
