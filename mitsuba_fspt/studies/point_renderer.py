@@ -19,7 +19,7 @@ from .sweep_point import SweepPoint
 class PointRenderer:
     """Renders the points of a sweep one at a time and keeps the last scene.
 
-    The images are equal to the bit to those of a scene that is loaded for each point.
+    The images are those of a scene that is loaded for each point, as of `LiveScene.image`.
     """
 
     def __init__(self, *, threads: int | None = None, quiet: bool = False) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.rendering.live_scene import LiveScene
+from mitsuba_fspt.runtime.errors import SceneError
 
 SCENE = """<scene version="3.0.0">
     <default name="f_number" value="4"/> <default name="distance" value="160"/> <default name="turn" value="0"/>
@@ -120,6 +121,20 @@ def test_a_lens_that_cannot_be_leaves_a_usable_scene(coarse):
         with pytest.raises(fspt.FsptError, match=word):
             coarse.image(values, model)
         assert np.array_equal(coarse.image({}).power, good)
+
+
+def test_a_lens_with_times_of_a_shutter(mono):
+    """Mitsuba's sensors have them; they are no numbers of the lens. Seen to fail with a KeyError."""
+    text = SMALL.replace("<film", '<float name="shutter_open" value="0"/> <film')
+    live = LiveScene(text)
+    for distance in (160, 170):
+        assert live.scene({"distance": distance}).sensors()[0].camera.centre[0] == distance
+    assert live.loads == 1
+
+
+def test_a_sensor_that_is_no_whole_number_is_refused():
+    with pytest.raises(SceneError, match=r"scene: 'sensor' must be a whole number, got 0\.5\b"):
+        LiveScene(SMALL, sensor=0.5)
 
 
 def test_another_model_of_the_lens(coarse):
