@@ -134,7 +134,7 @@ def turned(at: Place) -> Array:
 
 def photon_power(mua: float, musp: float, at: Place, seed: int, photons: int, keep: Path | None) -> Array:
     """Exit power [W] of 1 W by bins, of both sides together; kept as a file in the folder `keep`."""
-    file = keep / f"{photons}_{seed}_{mua:.9g}_{musp:.9g}.npy" if keep else None
+    file = keep / f"half_{photons}_{seed}_{mua:.9g}_{musp:.9g}.npy" if keep else None
     if file and file.exists():
         return np.asarray(np.load(file), np.float64)
     optics, count = Optics(mua, musp, INDEX), (ROWS + 2 * RINGS) * TURNS

@@ -78,13 +78,15 @@ def tetrahedra_made_once() -> Iterator[None]:
 
     They depend on nothing else that the tests change, and are a third of the time of a fit of one source.
     """
-    plain, meshes, elements = PhantomFile.checked_mesh, dict[float, Tetrahedra](), dict[tuple[float, int], Elements]()
+    plain, meshes = PhantomFile.checked_mesh, dict[tuple[object, float], Tetrahedra]()
+    elements = dict[tuple[float, int], Elements]()
 
     def mesh_of(described: PhantomFile) -> Tetrahedra:
         assert not described.regions
-        if described.edge not in meshes:
-            meshes[described.edge] = plain(described)
-        return meshes[described.edge]
+        key = described.geometry, described.edge
+        if key not in meshes:
+            meshes[key] = plain(described)
+        return meshes[key]
 
     def elements_of(mesh: Tetrahedra, order: int) -> Elements:
         key = mesh.edge, order
