@@ -29,7 +29,7 @@ from .lines.visible_window import glowing_boxes
 from .progress import Progress
 from .pupil import interpolated, pupil_form
 from .pupil.interpolated import Blocks, blocks_of
-from .pupil.narrow import NarrowLight, narrow_light, peak_of_points, points_on_surfaces
+from .pupil.narrow import NarrowLight, edge_on_light, narrow_light, peak_of_points, points_on_surfaces
 from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
@@ -195,7 +195,7 @@ class Solver:
             peak = max(narrow.brightest / 2, least_peak)
         if specular and specular.bending:  # the surface form contains only light that goes straight to the lens
             where = np.zeros(window.shape, bool)
-        light, form = narrow.in_focus, partial(pupil_form.solve, view, window, quadrature)
+        light, form = narrow.in_focus, partial(pupil_form.solve, view, window, quadrature, edge_on=narrow.edge_on)
         if progress.deadline.passed():
             where = np.zeros(window.shape, bool)
         by_faces, by_elements, on_faces = None, where, np.zeros(window.shape, bool)
@@ -238,7 +238,13 @@ class Solver:
         narrow = self._narrow_light(replace(view, camera=largest.camera), largest.window)
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
-        return interpolated.solve(view, blocks, quadrature, least_peak, progress)
+        edge_on = partial(_edge_on, view)
+        return interpolated.solve(view, blocks, quadrature, edge_on, least_peak, progress)
+
+
+def _edge_on(view: View, window: Window) -> NDArray[np.float64]:
+    """`NarrowLight.edge_on` on the pixels of a window."""
+    return edge_on_light(points_on_surfaces(view.scene, view.camera, view.specular), window)
 
 
 def _refuse_bending(specular: Specular | None, quadrature: Quadrature) -> None:

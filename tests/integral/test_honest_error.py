@@ -38,21 +38,42 @@ def solid_angle(x, y, z, radius=RADIUS):
     return np.pi * radius**2 * (weight / 2) @ (z / d2**1.5).mean(axis=1)
 
 
-def test_the_flat_end_of_a_cylinder_along_a_row_of_pixels(tmp_path):
-    """An end that the lens sees edge-on: the sharp edge of the side, and nothing but the curve of the rim behind it.
-
-    Expected: the pupil form and the surface form, which share no samples, agree within both errors. Seen to fail, with
-    2 % of the brightest pixel missing at 0.1 % stated, where estimates of transects at a sharp edge were left out.
-    """
-    body = trimesh.creation.cylinder(radius=6, height=8, sections=48)
+def cylinder_end_on(tmp_path, height, size, distance=FOCUS, **optics):
+    """A cylinder of radius 6 mm upright before the lens, which sees its upper end edge-on."""
+    body = trimesh.creation.cylinder(radius=6, height=height, sections=48)
     path = write_ply(tmp_path / "cylinder.ply", body.vertices, body.faces, vertex=np.ones(len(body.vertices)))
     shape = {"type": "ply", "filename": str(path), "face_normals": True, "emitter": glow(attribute())}
-    scene = world_scene(shape, sensor=lens((16, 16), 0.5, FOCUS, f_number=2.8))
+    return world_scene(shape, sensor=lens(size, 0.5, distance, **optics))
+
+
+@pytest.mark.parametrize("rtol", [1e-3, 1e-2])
+def test_the_flat_end_of_a_cylinder_along_a_row_of_pixels(tmp_path, rtol):
+    """An end that the lens sees edge-on: the sharp edge of the side, and nothing but the curve of the rim behind it.
+    The rim before the virtual detector plane and that behind it are edges of opposite blur.
+
+    Expected: the pupil form and the surface form, which share no samples, agree within both errors. Seen to fail, with
+    2 % of the brightest pixel missing at 0.1 % stated, where estimates of transects at a sharp edge were left out; at
+    `rtol` 0.01, 2.2 % at 0.2 %, without the light of surfaces edge-on in the error of few transects.
+    """
+    scene = cylinder_end_on(tmp_path, 8, (16, 16), f_number=2.8)
     look_at_crop(scene, 0, 2, 16, 3)
-    images = [fspt.render(scene, rtol=1e-3, domain=domain) for domain in ("pupil", "surface")]
+    images = [fspt.render(scene, rtol=r, domain=domain) for r, domain in ((rtol, "pupil"), (1e-3, "surface"))]
     off = np.abs(images[0].power - images[1].power)
     assert (off <= images[0].error + images[1].error).all()
-    assert images[0].error.max() < 2e-3 * images[0].power.max()
+    assert images[0].error.max() < 2 * rtol * images[0].power.max()
+
+
+def test_an_outline_behind_the_virtual_detector_plane_of_a_body_before_it(tmp_path):
+    """The limb of a cylinder whose front alone is before the virtual detector plane cuts 1.4 % off a pixel at f/2.8,
+    where all nodes and the transects for the blur of the front see the cylinder.
+
+    Expected: the surface form, which takes no outline from lines of sight, within both errors. Seen to fail (1.4 % off
+    at 5e-5 stated) where the blur of an outline that no transect has crossed keeps its sign.
+    """
+    scene = cylinder_end_on(tmp_path, 8.461, (16, 16), 165.418, f_number=2.8)
+    look_at_crop(scene, 0, 2, 16, 4)
+    image, truth = (fspt.render(scene, rtol=1e-3, domain=domain) for domain in ("pupil", "surface"))
+    assert (np.abs(image.power - truth.power) <= image.error + truth.error).all()
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -41,6 +41,7 @@ class Draft:
     blur, most_blur : largest blur radius of surfaces on a pixel and its neighbours; of all pixels [pixels]
     least_blur : smallest blur radius between the nearest and the farthest surface, inf without one [pixels]
     sharp : True where least_blur is below `IN_FOCUS` on the pixel or a neighbour
+    edge_on : light of surfaces edge-on as of `NarrowLight`, 0 unless it is set [W/mm²/sr]
     outline : True within a pixel of lines of sight that meet a glowing surface and of others that do not
     shown : False on the rim of the window; one entry if there is none
     clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
@@ -69,7 +70,7 @@ class Draft:
         self.least_blur = grid.full(mi.Float64, dr.inf)
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
-        self.roughness, self.lost = (grid.full(mi.Float64, 0) for _ in range(2))
+        self.roughness, self.lost, self.edge_on = (grid.full(mi.Float64, 0) for _ in range(3))
         self.shown = grid.flat(window.shown()) if window.count < math.prod(window.shape) else mi.Bool(True)
         self.clipped, self.outside = (grid.full(mi.Bool, False) for _ in range(2))
         if math.isfinite(view.camera.lens.seen_field):

@@ -9,6 +9,7 @@ or the difference to a single pixel exceeds the tolerance, are divided into smal
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, reduce
 
@@ -103,11 +104,15 @@ def solve(
     view: View,
     blocks: tuple[Blocks, ...],
     quadrature: Quadrature,
+    edge_on: Callable[[Window], Plane],
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
-    """As `pupil_form.solve`, with values between blocks interpolated; None if most blocks are divided into pixels."""
-    image = _BlockImage(view, blocks, quadrature, least_peak)
+    """As `pupil_form.solve`, with values between blocks interpolated; None if most blocks are divided into pixels.
+
+    edge_on : gives `NarrowLight.edge_on` on the pixels of a window
+    """
+    image = _BlockImage(view, blocks, quadrature, edge_on, least_peak)
     while image.own.any():
         image.compute(progress)
         if image.blocks.side == 1:
@@ -134,7 +139,15 @@ class _BlockImage:
     tolerance : rtol times `peak` [W/mm²/sr]
     """
 
-    def __init__(self, view: View, sizes: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float) -> None:
+    def __init__(
+        self,
+        view: View,
+        sizes: tuple[Blocks, ...],
+        quadrature: Quadrature,
+        edge_on: Callable[[Window], Plane],
+        least_peak: float,
+    ) -> None:
+        self.edge_on_pixels = edge_on
         self.view, self.sizes, self.quadrature, self.peak = view, sizes, quadrature, least_peak
         self.blocks, shape = sizes[0], sizes[0].window.shape
         self.grid, self.own = Grid(shape), np.ones(shape, bool)
@@ -154,6 +167,7 @@ class _BlockImage:
             grid.lay((blur < BLURRED) & (draft.outline | parted(draft.coverage)), self.edge)
             grid.lay(blur * blocks.side, self.blur)
         else:
+            draft.edge_on = grid.flat(self.edge_on_pixels(blocks.window))
             refine(draft, np.broadcast_to(0.0, grid.shape))
         power, error, coverage = draft.images()
         images = (power / blocks.camera.etendue, error / blocks.camera.etendue, coverage)

@@ -1,8 +1,11 @@
-"""Narrow light: bodies and spots much smaller than a pixel and brighter than everything around them.
+"""What points all over the surfaces tell of light that lines of sight may miss: narrow light, surfaces edge-on.
 
 Four nodes of Eq. M.5 a pixel detect light from a region as large as a pixel at the phantom, or as its blur disc where
 that is larger. They may miss smaller bodies and spots, and error estimates from the nodes do not show that. Such light
 is detected from points all over the surfaces; the pixels that it reaches take the surface form (M.9).
+
+A surface whose tangent plane crosses the pupil shines on a part of it. Where it is deep, as the flat end of a cylinder,
+its nearer and its farther rim are edges of different blur on one pixel, of which few transects may miss one.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from ...camera.camera import Camera
 from ...camera.window import Window
@@ -44,7 +48,8 @@ PixelArray = NDArray[np.float64]
 @dataclass(frozen=True)
 class NarrowLight:
     """Light on each pixel of the window (h, w) of narrow spots; on the brightest pixel that is shown of all surfaces;
-    and of these on each pixel as if they were in focus.
+    of these on each pixel as if they were in focus; and of surfaces edge-on, times the difference of their blur radii
+    [pixels], at most 1.
 
     Mean radiance on film [W/mm²/sr], to a factor of two.
     """
@@ -52,6 +57,12 @@ class NarrowLight:
     on_pixels: PixelArray
     brightest: float
     in_focus: PixelArray
+    edge_on: PixelArray
+
+    @classmethod
+    def none(cls, shape: tuple[int, int]) -> NarrowLight:
+        """Of a window on which no surface shines."""
+        return cls(np.zeros(shape), 0.0, np.zeros(shape), np.zeros(shape))
 
 
 def points_on_surfaces(scene: mi.Scene, camera: Camera, specular: Specular | None = None) -> Points | None:
@@ -65,12 +76,11 @@ def points_on_surfaces(scene: mi.Scene, camera: Camera, specular: Specular | Non
 
 def narrow_light(points: Points | None, window: Window) -> NarrowLight:
     """The part of the light of points all over the surfaces that comes from narrow spots; 0 without points."""
-    on_pixels = np.zeros(window.shape)
-    if points is None or not on_pixels.size:
-        return NarrowLight(on_pixels, 0.0, on_pixels)
-    points = points.seen_in(window)
+    if points is None or not math.prod(window.shape):
+        return NarrowLight.none(window.shape)
+    on_pixels, points = np.zeros(window.shape), points.seen_in(window)
     if not (points.radiance > 0).any():
-        return NarrowLight(on_pixels, 0.0, on_pixels)
+        return NarrowLight.none(window.shape)
     light, level = points.light(), points.level()
     shown = points.shown_in(window)
     if not (light[shown] > 0).any():
@@ -85,7 +95,16 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
         here &= there & (points.apart < 1)
         if here.any():
             on_pixels += _spread(light[here], points[here], reach, window.shape)
-    return NarrowLight(on_pixels, float(brightest), points.on_pixels(light, window.shape))
+    in_focus = points.on_pixels(light, window.shape)
+    return NarrowLight(on_pixels, float(brightest), in_focus, _edge_on(points, light, window.shape))
+
+
+def edge_on_light(points: Points | None, window: Window) -> PixelArray:
+    """`NarrowLight.edge_on` alone."""
+    if points is None or not math.prod(window.shape):
+        return np.zeros(window.shape)
+    points = points.seen_in(window)
+    return _edge_on(points, points.light(), window.shape)
 
 
 def peak_of_points(points: Points | None, window: Window) -> float:
@@ -113,18 +132,25 @@ class Points:
     radiance : to the lens; 0 where a point has no image, or another body hides it
     area : of the sharp image that it stands for [pixels²]
     cosine, front : the largest cosine of the normal to a point of the pupil; > 0 if the pupil's middle sees the point
+    edge_on : 1 if the tangent plane crosses the pupil, so that a part of it does not see the point; 0 if not
     apart : distance from the next point; in pixels, or in blur radii where these are larger
-    blur, x, y : on film [pixels]
+    signed_blur, x, y : on film [pixels]
     """
 
     radiance: Column
     area: Column
     cosine: Column
     front: Column
+    edge_on: Column
     apart: Column
-    blur: Column
+    signed_blur: Column
     x: Column
     y: Column
+
+    @property
+    def blur(self) -> Column:
+        """Blur radius on film [pixels]."""
+        return np.abs(self.signed_blur)
 
     @classmethod
     def joined(cls, parts: list[Points]) -> Points:
@@ -176,6 +202,26 @@ class Points:
         )
         width = int(column.max()) + 1
         return _Cells((int(row.max()) + 1, width), row * width + column)
+
+
+def _edge_on(points: Points, light: Column, shape: tuple[int, int]) -> PixelArray:
+    """`NarrowLight.edge_on` from the `light` of points."""
+    found, level = np.zeros(shape), points.level()
+    least, most = np.full(shape, np.inf), np.full(shape, -np.inf)
+    for k in np.unique(level[points.edge_on > 0]):
+        reach = min(math.ceil(2 ** (k + 0.5)), sum(shape))
+        here = (level == k) & (points.edge_on > 0) & points.near(reach, shape)
+        if not here.any():
+            continue
+        found += _spread(light[here], points[here], reach, shape)
+        row, column = (np.floor(c[here]).astype(np.int64) + reach for c in (points.y, points.x))
+        low, high = (np.full([n + 2 * reach for n in shape], end) for end in (np.inf, -np.inf))
+        np.minimum.at(low, (row, column), points.signed_blur[here])
+        np.maximum.at(high, (row, column), points.signed_blur[here])
+        inner = tuple(slice(reach, reach + n) for n in shape)
+        least = np.minimum(least, minimum_filter(low, 2 * reach + 1, mode="constant", cval=np.inf)[inner])
+        most = np.maximum(most, maximum_filter(high, 2 * reach + 1, mode="constant", cval=-np.inf)[inner])
+    return found * np.clip(np.where(found > 0, most - least, 0), 0, 1)
 
 
 def _hidden(points: Points, side: float) -> NDArray[np.bool_]:
@@ -232,34 +278,38 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
         elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
     counts = np.ones(elements.count, np.int64)
     middles = _on_elements(surface, elements, camera, counts)
-    area, unit = middles.image.numpy(), np.maximum(middles.blur.numpy(), 1)
+    area, unit = middles.image.numpy(), np.maximum(np.abs(middles.blur.numpy()), 1)
     reach = _reach(elements, camera) / unit
     # A long and thin element is represented by many points, a quarter of a unit apart, any other by one.
     long = np.isfinite(reach) & (reach > MOST_POINTS)  # `MOST_POINTS` points would be too far apart
-    thin = np.isfinite(reach) & (area < WIDE * unit**2 * reach) & ~long
+    crossed = middles.edge_on.numpy() > 0
+    thin = np.isfinite(reach) & ((area < WIDE * unit**2 * reach) | crossed) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     at = _on_elements(surface, elements, camera, counts)
     if len(scene.shapes()) > 1:
         at.radiance = dr.select(_in_sight(scene, camera, at.place, specular), at.radiance, 0)
-    columns = (at.radiance, at.image, at.cosine, at.front, at.blur, at.centre.x, at.centre.y)
+    columns = (at.radiance, at.image, at.cosine, at.front, at.edge_on, at.blur, at.centre.x, at.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
-    radiance, image, cosine, front, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    radiance, image, cosine, front, edge_on, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
     # An element half as thick as a unit covers half of some square: its points are not narrow.
     apart = np.repeat(np.where(area < unit**2 * reach, reach / counts, np.inf), counts)
-    return Points(np.where(unseen, 0, radiance), image / np.repeat(counts, counts), cosine, front, apart, blur, x, y)
+    image = image / np.repeat(counts, counts)
+    return Points(np.where(unseen, 0, radiance), image, cosine, front, edge_on, apart, blur, x, y)
 
 
 @dataclass
 class _OnElements:
     """Values at points of elements: `radiance` towards the point of the pupil highest above them, area of the element's
-    `image` from there [pixels²]; cosine, front, blur, `centre` on film as in `Points`; `place` in the world.
+    `image` from there [pixels²]; cosine, front, edge_on, signed `blur`, `centre` on film as in `Points`; `place` in the
+    world.
     """
 
     radiance: mi.Float
     image: mi.Float
     cosine: mi.Float
     front: mi.Float
+    edge_on: mi.Float
     blur: mi.Float
     centre: mi.Point2f
     place: mi.Point3f
@@ -270,14 +320,17 @@ def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, c
     index, number = numbered(counts)
     sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
     si, area = elements.place(mi.UInt32(index), sample)
-    to_lens = dr.normalize(_rim_above(si, camera) - si.p)
+    to_rim = _rim_above(si, camera) - si.p
+    to_lens = dr.normalize(to_rim)
     at_one_wavelength(si)
     centre, blur, scale = camera.blur_disc(si.p)
     cosine = dr.dot(si.n, to_lens)
     image = area * dr.abs(cosine / (dr.dot(camera.axis, to_lens) * dr.square(scale)))
     front = dr.dot(si.n, camera.to_world @ mi.Point3f(0) - si.p)
     radiance, place = scalar(surface.radiance(si, to_lens, mi.Bool(True))), camera.film_map.from_ideal(centre)
-    at = _OnElements(radiance, image, cosine, front, dr.abs(blur), place, si.p)
+    # The rim below lies as far under the middle of the pupil as the rim above lies over it.
+    edge_on = dr.select((cosine > 0) & (2 * front <= dr.dot(si.n, to_rim)), mi.Float(1), 0)
+    at = _OnElements(radiance, image, cosine, front, edge_on, blur, place, si.p)
     dr.eval(at)
     return at
 

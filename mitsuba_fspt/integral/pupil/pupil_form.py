@@ -61,15 +61,18 @@ def solve(
     progress: Progress = SILENT,
     by_faces: ByFaces | None = None,
     narrow: NDArray[np.bool_] | None = None,
+    edge_on: NDArray[np.float64] | None = None,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window, to the accuracy of `quadrature`.
 
     Only pixels of the `window` are computed, the others are dark. `light`: of surfaces as if in focus, see
     `NarrowLight`. Pixels that the partial solution `given` has are not refined. `least_peak`: lower bound of the
     brightest pixel's mean radiance on film [W/mm²/sr]. `progress` is called after every level. `by_faces`,
-    `narrow` as of `refine`.
+    `narrow` as of `refine`, `edge_on` as of `NarrowLight`.
     """
     draft = Draft(view, window, quadrature, given, least_peak, progress)
+    if edge_on is not None:
+        draft.edge_on = draft.grid.flat(edge_on)
     refine(draft, light, by_faces, narrow)
     return draft.solution()
 

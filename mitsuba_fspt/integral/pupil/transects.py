@@ -37,6 +37,9 @@ SEVERAL_SHARE, SEVERAL_ORDER = 1 / 16, 2 / 3
 # there on the change by the correction counts as an error. Where there are many steps along a transect, the correction
 # makes the values of all transects wrong in the same way, and no level tells.
 MANY = 72
+# Number of transects from which their scatter shows edges of different blur; the share of the light of surfaces edge-on
+# that fewer may miss.
+SEVERAL_BLURS, MISSED_EDGE_ON = 24, 0.1
 FAR = 1e30  # depth [mm] at which larger ones are clipped; the blur of an edge is finite there
 
 
@@ -120,12 +123,19 @@ class _Refinement:
         else:
             remaining, around = self._after_later(level, first_met, change, len(rule))
             self.smooth = self.smooth & (value > 0)  # where all is dark, only transects detect a small body
+        if len(rule) < SEVERAL_BLURS:
+            unseen = dr.opaque(mi.Float64, MISSED_EDGE_ON) * draft.edge_on
+            remaining = dr.select(self.has_jump, dr.maximum(remaining, unseen), remaining)
+            # Between pixels that see all and nothing of a body there is an outline, though no transect has crossed it.
+            uncrossed = draft.outline & ~draft.grid.dilate(self.has_jump, 1)
+            around = dr.maximum(around, draft.missed_edge_error(uncrossed))
         # An edge may reach into pixels around whose transects have crossed no jump.
         around = dr.select((self.has_jump & where) | ~draft.computed, 0, around)
         replaced = where if level else first_met  # without a jump, nodes are more accurate than two transects
         self.value = dr.select(replaced, value, self.value)
         self.remaining = dr.select(where, remaining, self.remaining)
-        kept = self._earlier_is_better(remaining, first_met) if level > 1 else mi.Bool(False)
+        many = len(rule) >= MANY
+        kept = self._earlier_is_better(remaining, first_met, many) if level > 1 else mi.Bool(False)
         self.own = dr.select(where & ~kept, remaining, self.own)
         draft.value = dr.select(replaced & ~kept, value, draft.value)
         draft.set_coverage(dr.select(replaced & ~kept, coverage, draft.coverage))
@@ -138,7 +148,7 @@ class _Refinement:
         dr.eval(draft.value, draft.error, self.has_jump, self.smooth, self.where)
         dr.eval(self.value, self.remaining, self.own)
 
-    def _earlier_is_better(self, remaining: PixelArray, first_met: Mask) -> Mask:
+    def _earlier_is_better(self, remaining: PixelArray, first_met: Mask, many: bool) -> Mask:
         """Pixels whose value in the draft has a smaller error than that of this level, which lies within that error.
 
         A value beyond it contradicts the earlier error, which was too small, and so does a jump that is new. Without an
@@ -146,6 +156,8 @@ class _Refinement:
         and a node rule alone.
         """
         agrees = dr.abs(self.value - self.draft.value) <= self.own
+        if many:  # the correction may make the values of both levels wrong in the same way
+            agrees &= self.smooth | (dr.abs(self.means.plain - self.draft.value) <= self.own)
         return agrees & (self.own > 0) & (self.own < remaining) & ~first_met
 
     def _smooth_by_nodes(self, level: int) -> tuple[PixelArray, PixelArray]:
@@ -228,13 +240,14 @@ class Edges:
 
         Where no transect has crossed a jump, the end of a neighbour's edge may lie on the pixel: the next transects go
         along the gradient of the coverage, at every other level `across` it, as light beside a dark body may lie
-        between all those along it.
+        between all those along it. Where none around has crossed one either, the blur changes its sign: an outline may
+        lie on the other side of the virtual detector plane than the nearest surface.
         """
         grid, jumps = draft.grid, means.jumps
         around = (means.blur, -means.blur, jumps, has_jump | draft.outline)
         ahead, behind, known, near = grid.spread_all(around)
         blur = dr.select(jumps, means.blur, _most_blurred(ahead, -behind))
-        self.blur = dr.select(known & ~draft.clipped, blur, self.blur)
+        self.blur = dr.select(known & ~draft.clipped, blur, -self.blur)
         self.sharp = (dr.abs(self.blur) < draft.estimator.sharp) & near
         x, y = grid.gradient(grid.box_sum(draft.coverage, _around(draft)))
         alike = dr.abs(x) + dr.abs(y) < COVERAGE_ROUNDING
