@@ -718,6 +718,20 @@ MUTANTS = (
         ("tests/integral/test_honest_error.py",),
     ),
     Mutant(
+        "light of surfaces edge-on",
+        "integral/pupil/transects.py",
+        "MISSED_EDGE_ON = 24, 0.1",
+        "MISSED_EDGE_ON = 24, 0.0",
+        ("tests/integral/test_honest_error.py",),
+    ),
+    Mutant(
+        "sign of the blur of an outline",
+        "integral/pupil/transects.py",
+        "blur, -self.blur)",
+        "blur, self.blur)",
+        ("tests/integral/test_honest_error.py",),
+    ),
+    Mutant(
         "y axis of an image",
         "images/pixel_axes.py",
         "return cls(x, -y, side",

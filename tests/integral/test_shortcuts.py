@@ -80,7 +80,8 @@ def test_a_shortcut_changes_no_pixel_by_a_tenth_of_rtol(name, tmp_path, monkeypa
     short, long = solved(scene, domain, rtol=rtol), solved(scene, domain, [name], rtol=rtol)
     assert found(short, name)
     assert not found(long, name)
-    most = rtol if name == "smooth blocks" else rtol / 10  # what lies between blocks is in the error that is asked for
+    # What lies between blocks is in the error that is asked for; pixels outside take part in the choice of a level.
+    most = rtol if name in ("smooth blocks", "outside") else rtol / 10
     assert np.abs(short.power - long.power).max() <= most * long.power.max()
     assert short.rays < long.rays or name in ("specular", "record", "occlusion")
 
