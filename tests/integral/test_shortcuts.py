@@ -249,12 +249,13 @@ def test_findings_count_no_more_pixels_than_the_image_has():
 
 
 def once(function):
-    """The function, whose first result is that of all later calls."""
+    """The function, whose first result is that of all later calls, which must have the same numbers and words."""
     kept = []
 
     def call(*arguments, **named):
         if not kept:
-            kept.append(function(*arguments, **named))
+            kept.extend((function(*arguments, **named), named))
+        assert named == kept[1]
         return kept[0]
 
     return call
