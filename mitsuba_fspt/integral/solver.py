@@ -29,7 +29,7 @@ from .lines.visible_window import glowing_boxes
 from .progress import Progress
 from .pupil import interpolated, pupil_form
 from .pupil.interpolated import Blocks, blocks_of
-from .pupil.narrow import NarrowLight, edge_on_light, narrow_light, peak_of_points, points_on_surfaces
+from .pupil.narrow import NarrowLight, Points, edge_on_light, narrow_light, peak_of_points, points_on_surfaces
 from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
@@ -51,7 +51,7 @@ class Solver:
     def __init__(self) -> None:
         # A reference to the scene itself would be a cycle: the integrator that holds this solver is its child.
         self._traced = TracedScene()
-        self._window, self._narrow, self._faces, self._grid_of_blocks = (CachedValue() for _ in range(4))
+        self._window, self._narrow, self._edge_on, self._faces, self._grid_of_blocks = (CachedValue() for _ in range(5))
 
     def solve(
         self,
@@ -135,11 +135,11 @@ class Solver:
 
     def _narrow_light(self, view: View, window: Window) -> NarrowLight:
         """Light of bodies and spots that lines of sight may miss; cached."""
-        scene, camera, specular = view.scene, view.camera, view.specular
-        editions = [edition_of(emitter) for emitter in scene.emitters()]
-        through = specular.state() if specular else ()
-        state = (editions, glowing_boxes(scene), poses_of(scene.shapes()), through, camera.state, window)
-        return self._narrow.recall(state, lambda: narrow_light(points_on_surfaces(scene, camera, specular), window))
+        return self._narrow.recall(_seen_state(view, window), lambda: narrow_light(_points(view), window))
+
+    def _light_edge_on(self, view: View, window: Window) -> NDArray[np.float64]:
+        """`NarrowLight.edge_on` on the pixels of a window; cached."""
+        return self._edge_on.recall(_seen_state(view, window), lambda: edge_on_light(_points(view), window))
 
     def _fill(
         self,
@@ -154,7 +154,7 @@ class Solver:
         least_peak, points = 0.0, None
         progress(0.0)
         if len(tiles) > 1 and narrow:
-            points = points_on_surfaces(view.scene, view.camera, view.specular)
+            points = _points(view)
             least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points, window))
         for k, tile in enumerate(tiles):
             light = partial(self._narrow_light, view, tile)
@@ -211,7 +211,7 @@ class Solver:
         elif by_faces:
             solution = form(light, None, least_peak, progress, by_faces, on_faces)
         elif specular and specular.bending and specular.branching:
-            solution = _by_courses(view, window, quadrature, light, least_peak, progress)
+            solution = _by_courses(view, window, quadrature, narrow, least_peak, progress)
         else:
             solution = form(light, None, least_peak, progress)
         solution = replace(solution, findings=(Finding("smooth blocks", False, why), *solution.findings))
@@ -238,13 +238,21 @@ class Solver:
         narrow = self._narrow_light(replace(view, camera=largest.camera), largest.window)
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
-        edge_on = partial(_edge_on, view)
+        edge_on = partial(self._light_edge_on, view)
         return interpolated.solve(view, blocks, quadrature, edge_on, least_peak, progress)
 
 
-def _edge_on(view: View, window: Window) -> NDArray[np.float64]:
-    """`NarrowLight.edge_on` on the pixels of a window."""
-    return edge_on_light(points_on_surfaces(view.scene, view.camera, view.specular), window)
+def _points(view: View) -> Points | None:
+    """Points all over the surfaces of a view's scene."""
+    return points_on_surfaces(view.scene, view.camera, view.specular)
+
+
+def _seen_state(view: View, window: Window) -> tuple[object, ...]:
+    """What the light of surfaces on the pixels of a window depends on."""
+    scene, specular = view.scene, view.specular
+    editions = [edition_of(emitter) for emitter in scene.emitters()]
+    through = specular.state() if specular else ()
+    return editions, glowing_boxes(scene), poses_of(scene.shapes()), through, view.camera.state, window
 
 
 def _refuse_bending(specular: Specular | None, quadrature: Quadrature) -> None:
@@ -260,7 +268,7 @@ def _by_courses(
     view: View,
     window: Window,
     quadrature: Quadrature,
-    light: NDArray[np.float64],
+    narrow: NarrowLight,
     least_peak: float,
     progress: Progress,
 ) -> Solution:
@@ -278,9 +286,11 @@ def _by_courses(
     if quadrature.max_nodes is not None:
         shares[0] = replace(shares[0], max_nodes=max(quadrature.max_nodes - few, 1))
     shares[1] = replace(shares[1], max_nodes=few)
-    image = pupil_form.solve(views[0], window, shares[0], light, None, least_peak, progress.part(0, 2))
+    first, rest = progress.part(0, 2), progress.part(1, 2)
+    light, edge_on = narrow.in_focus, narrow.edge_on  # the latter of straight lines: reflected edges lie elsewhere
+    image = pupil_form.solve(views[0], window, shares[0], light, None, least_peak, first, edge_on=edge_on)
     peak = max(float((image.power - image.error).max(initial=0.0)) / view.camera.etendue, least_peak)
-    return image.plus(pupil_form.solve(views[1], window, shares[1], light, None, peak, progress.part(1, 2)))
+    return image.plus(pupil_form.solve(views[1], window, shares[1], light, None, peak, rest))
 
 
 def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solution:
