@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .footprint import along_edges
+from .footprint import PACKET, add_packet, along_edges
 
 PLACE = 8  # numbers of a `_Place` in the table, a power of two
 QUANTUM = 2.0**-46  # of the light on a pixel, over that of a pixel filled by 1 W/mm²/sr
@@ -105,26 +105,30 @@ class ColumnCanvas:
         self.shape, self.windows = shape, windows
         self._starts = np.concatenate([[0], np.cumsum(windows.areas)])
         total = max(int(self._starts[-1]), 1)
-        # Light that is added to a pixel and all to its right, and its increase from pixel to pixel.
-        self._level, self._slope = (dr.zeros(mi.UInt64, total) for _ in range(2))
+        # Of every pixel: the light that it and all pixels to its right get, the light that only those get, and the
+        # increase of the first from pixel to pixel.
+        self._sums = dr.zeros(mi.UInt64, total * PACKET)
         # The `_Place` of each column, and last of a column without window.
         table = np.zeros((len(windows.left) + 1, PLACE), np.uint32)
         table[:-1, :5] = np.stack([windows.left, windows.top, windows.width, windows.height, self._starts[:-1]], -1)
         self._table = mi.UInt32(table.ravel())
         self.none = dr.opaque(mi.UInt32, len(windows.left))
         self._size = tuple(dr.opaque(mi.Float64, side) for side in shape[::-1])
-        dr.eval(self._table, self._level, self._slope)
+        dr.eval(self._table, self._sums)
 
     def light(self) -> NDArray[np.float64]:
         """The light accumulated so far, one window after the other as `Windows.pixels` numbers them."""
-        level, slope = (np.cumsum(mi.Int64(layer).numpy()[: self._starts[-1]]) for layer in (self._level, self._slope))
+        own, after, slope, _ = mi.Int64(self._sums).numpy()[: self._starts[-1] * PACKET].reshape(-1, PACKET).T
+        level = own.copy()
+        level[1:] += after[:-1]
+        level, slope = np.cumsum(level), np.cumsum(slope)
         slope *= self.windows.columns_of_film()
         level += slope
         return level * QUANTUM
 
     def evaluate(self) -> None:
         """Run all kernels begun so far to their end: the arrays of waiting ones would fill the memory."""
-        dr.eval(self._level, self._slope)
+        dr.eval(self._sums)
         dr.sync_thread()
 
     def lay(
@@ -182,19 +186,18 @@ class ColumnCanvas:
         squares = xa * xa + xa * xb + xb * xb
         mixed = ya * (2 * xa + xb) + yb * (xa + 2 * xb)
         beside = dr.round(rise * (0.5 * corner * (xa + xb) + plane.x * squares / 6 + plane.y * mixed / 6))
-        x, y = dr.clip(at[0] - place.left, 0, place.width), at[1] - place.top
-        after = dr.clip(at[0] + 1 - place.left, 0, place.width)
+        x, y = at[0] - place.left, at[1] - place.top
         on = (y >= 0) & (y < place.height) & (place.width > 0)
         line = place.start + mi.UInt32(y) * mi.UInt32(place.width + 1)
-        # Unsigned, because that wraps around below zero and every backend can add it.
-        for layer, column_at, amount in (
-            (self._level, x, level - beside),
-            (self._level, after, beside),
-            (self._slope, x, slope),
-        ):
-            index = line + mi.UInt32(column_at)
-            # Directly: lines of one packet mostly add to different entries, and to look for equal ones costs more.
-            dr.scatter_add(layer, mi.UInt64(mi.Int64(amount)), index, on & (amount != 0), mode=dr.ReduceMode.Direct)
+        # Outside the window both are added to the same entry.
+        outside = (x < 0) | (x >= place.width)
+        level, beside = mi.Int64(level - beside), mi.Int64(beside)
+        add_packet(
+            self._sums,
+            line + mi.UInt32(dr.clip(x, 0, place.width)),
+            (level + dr.select(outside, beside, 0), dr.select(outside, 0, beside), mi.Int64(slope)),
+            on,
+        )
 
 
 def _cross(a: mi.Vector2d, b: mi.Vector2d) -> mi.Float64:

@@ -44,7 +44,7 @@ FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, 
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
 WHOLE = 1e-6  # by which float32 changes the share of the pupil that is open
 HALVINGS = 5  # of a side of a piece, for the edge of a shadow
-MOST_WORK = 1 << 23  # entries of windows that are accumulated at a time
+MOST_WORK = 1 << 22  # entries of windows that are accumulated at a time
 LEFT = 1 / 3  # error over the change by twice the cells and pieces, of second order
 MOST_CHANGE = 6e4  # relative, below the largest number of float16
 
