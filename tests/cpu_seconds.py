@@ -1,7 +1,8 @@
 """Plugin of pytest: CPU seconds of the tests, the dearest ten of them, ten files and all processes, at the end.
 
 Wall times on a busy machine say little, so that the budget of the suite is one of CPU time. The time of a test is that
-of this process with all its threads and of the child processes that have ended meanwhile.
+of this process with all its threads and of the child processes that have ended meanwhile. With `--quick`, the tests
+that a committed table of these times lists are left out.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import pytest
 
 BUDGET = 600.0  # seconds of CPU of the whole suite with an empty kernel cache: five minutes of two cores
 DEAREST = 10
+DEAR = Path(__file__).with_name("dear_tests.csv")  # one test in nine, with three quarters of the time
 
 
 def cpu() -> float:
@@ -35,6 +37,15 @@ class Spent:
         outcome = yield
         self.last, before = cpu(), self.last
         outcome.get_result().cpu = self.last - before
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, config, items) -> None:
+        if config.getoption("quick"):
+            with DEAR.open(newline="", encoding="utf-8") as file:
+                dear = {row["test"] for row in csv.DictReader(file)}
+            left_out = [item for item in items if item.nodeid in dear]
+            items[:] = [item for item in items if item.nodeid not in dear]
+            config.hook.pytest_deselected(items=left_out)
 
     def pytest_runtest_logreport(self, report) -> None:
         self.tests[report.nodeid] += getattr(report, "cpu", 0.0)
@@ -63,7 +74,8 @@ class Spent:
                 terminalreporter.write_line(f"{seconds:7.1f}  {name}")
         if table := config.getoption("cpu_table"):
             with Path(table).open("w", newline="", encoding="utf-8") as file:
-                rows = [(f"{seconds:.2f}", name) for name, seconds in self.tests.most_common()]
+                least, spent = config.getoption("cpu_least"), self.tests.most_common()
+                rows = [(f"{seconds:.2f}", name) for name, seconds in spent if seconds >= least]
                 csv.writer(file).writerows([("cpu_seconds", "test"), *rows])
         limit = config.getoption("cpu_limit")
         verdict = "over" if self.total > (BUDGET if limit is None else limit) else "within"
@@ -75,6 +87,9 @@ def pytest_addoption(parser) -> None:
     text = "fail if the tests take more CPU seconds than this; without it, the summary tells it"
     parser.addoption("--cpu-limit", type=float, default=None, metavar="SECONDS", help=text)
     parser.addoption("--cpu-table", metavar="FILE.csv", help="write the CPU seconds of every test")
+    text = "leave out of the table tests that take less"
+    parser.addoption("--cpu-least", type=float, default=0.0, metavar="SECONDS", help=text)
+    parser.addoption("--quick", action="store_true", help=f"leave out the tests listed in tests/{DEAR.name}")
 
 
 def pytest_configure(config) -> None:

@@ -70,7 +70,6 @@ def results(tmp_path_factory):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CHOSEN)
 def test_an_example_runs_and_finds_its_number(name, results):
     if not can_run(name):

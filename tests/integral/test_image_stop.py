@@ -128,7 +128,6 @@ def test_monte_carlo_agrees_where_silhouettes_cross_the_border(borders):
     assert image.power.sum() < 0.95 * whole.sum()
 
 
-@pytest.mark.slow
 def test_both_domains_agree():
     body = sphere(158.0, 3.0, 8.5, -3.0)
     view = camera_scene(body, image_stop_diameter=STOP)

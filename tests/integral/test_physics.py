@@ -226,7 +226,6 @@ def over_etendue(diameter, **lens):
     return picture / (SIDE**2 * np.pi * (diameter / 2) ** 2 / FOCUS**2)
 
 
-@pytest.mark.slow
 def test_diaphragm_tends_to_the_pinhole_through_five_decades_without_a_jump():
     """Rationale: lim D → 0 is the pinhole model; what refines a picture, and float32, must not show on the way.
 
@@ -243,7 +242,6 @@ def test_diaphragm_tends_to_the_pinhole_through_five_decades_without_a_jump():
         assert np.abs(first - pinhole).max() < (BLUR_RTOL + 0.006 * diameter**2) * pinhole.max(), diameter
 
 
-@pytest.mark.slow
 def test_diaphragm_tends_to_hrrt_as_it_opens_to_the_lens_border():
     """Rationale: lim D → lens diameter is the model without a diaphragm.
 

@@ -285,7 +285,6 @@ def test_variance_of_monte_carlo_follows_the_signal():
         assert np.exp(np.std(np.log(ratio))) < 1.5
 
 
-@pytest.mark.slow
 def test_intervals_contain_the_reference_on_a_fine_film(mono):
     """256 samples on 72 × 8 pixels: magnification and distance within 3 sd, of at most 5e-5 and 6 µm.
 
@@ -302,7 +301,6 @@ def test_intervals_contain_the_reference_on_a_fine_film(mono):
         assert 0 < found.sd[name] < bound
 
 
-@pytest.mark.slow
 def test_pose_of_the_nylon_cylinder(mono):
     """One image by `path`, 256 samples: view to 0.2 degrees, distance to 0.08 mm, magnification to 1e-3, within 4 sd.
 

@@ -10,7 +10,7 @@ from small_scenes import SCENES
 
 import mitsuba_fspt as fspt
 
-pytestmark = [pytest.mark.usefixtures("mono"), pytest.mark.slow]
+pytestmark = pytest.mark.usefixtures("mono")
 
 PAIRS = 6  # 20 pairs at 16 to 256 samples: scripts/z_test.py, docs/z_test.csv
 FILM = {"f_number": 2.8, "view": 90, "width": 16, "height": 16, "pixel_pitch": 1.728}
