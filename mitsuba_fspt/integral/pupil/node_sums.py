@@ -17,7 +17,7 @@ from . import node_rules
 
 # Triangles a pixel up to which packets of neighbouring lines of sight are traced faster than single ones: of a node on
 # neighbouring pixels, and of the transects of one pixel.
-NODES_TOGETHER, TRANSECTS_TOGETHER = 4.0, 0.5
+NODES_TOGETHER, TRANSECTS_TOGETHER = 4.0, 2.0
 
 
 @dataclass
