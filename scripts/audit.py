@@ -32,7 +32,7 @@ import markdown_tables
 import numpy as np
 import tests_folder  # noqa: F401
 from references.bodies import Triangles
-from references.random_scenes import FAMILIES, MESH_FAMILIES, RandomScene, linear_on, random_scene
+from references.random_scenes import ALL_FAMILIES, MESH_FAMILIES, RandomScene, linear_on, random_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.integral.estimator import Estimator
@@ -111,9 +111,7 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.scenes)
     names = (
-        arguments.family.split(",")
-        if arguments.family
-        else list(MESH_FAMILIES if arguments.matrix else FAMILIES | MESH_FAMILIES)
+        arguments.family.split(",") if arguments.family else list(MESH_FAMILIES if arguments.matrix else ALL_FAMILIES)
     )
     arguments.out.mkdir(exist_ok=True)
     if arguments.ablate:

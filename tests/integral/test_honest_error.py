@@ -165,6 +165,7 @@ def test_a_finer_rtol_states_no_larger_error(name):
         pytest.param("bitmaps", 2, 1e-3, [(36, 54)], id="texels whose steps are no jumps"),
         pytest.param("plates", 112, 1e-3, [(19, 10)], id="edge along the transects"),
         pytest.param("boxes", 122, 1e-3, [(36, 14)], id="edge of a box along the transects"),
+        pytest.param("exit laws edge-on", 26, 1e-3, [(42, 10), (43, 10), (44, 10)], id="end between two edges"),
     ],
 )
 def test_the_error_bounds_the_error_where_two_levels_agree_by_chance(family, seed, rtol, pixels):
@@ -172,8 +173,8 @@ def test_the_error_bounds_the_error_where_two_levels_agree_by_chance(family, see
 
     Seen to fail with an error of transects that falls as n^(-3/2) everywhere (up to 1.8 times that stated), with
     elements of the surface whose errors along a pixel's side are taken for independent (up to 6.3 times), without
-    the error of a second edge between transects (2.6 and 7 times), and where no step of the radiance within a body is
-    a jump (1.7 times).
+    the error of a second edge between transects (2.6 and 7 times), where no step of the radiance within a body is
+    a jump (1.7 times), and with one edge in an interval of the scan that meets a third body (5 times).
     """
     made = random_scene(family, seed)
     image = fspt.render(made.scene(), method="integral", rtol=rtol, pixel=made.reference.pixel)

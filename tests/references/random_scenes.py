@@ -68,6 +68,7 @@ class _Maker:
     index: float | None = None
     centre: bool = False
     crops: bool = False
+    edge_on: bool = False
 
     def __post_init__(self) -> None:
         r = self.random
@@ -94,8 +95,15 @@ class _Maker:
                 return centre
         return None
 
-    def turn(self, facing: bool = True) -> Array:
-        """Random rotation (3, 3); every third time by multiples of a right angle. `facing`: +z turned to the lens."""
+    def turn(self, centre: Array | None, facing: bool = True, end: float = 0.0) -> Array:
+        """Random rotation (3, 3) of a body about its centre; every third time by multiples of a right angle.
+
+        facing : +z turned to the lens
+        end : distance of a flat end from the centre [mm], along +z, whose plane passes the pupil or its surroundings if
+            bodies are `edge_on`
+        """
+        if self.edge_on and centre is not None:
+            return self._edge_on(centre, end)
         if self.random.random() < 0.3:
             matrix = np.diag([-1.0, 1.0, -1.0])
         else:
@@ -105,6 +113,18 @@ class _Maker:
         if facing and matrix[2, 2] > 0:
             matrix[:, [0, 2]] *= -1
         return matrix
+
+    def _edge_on(self, centre: Array, end: float) -> Array:
+        """Rotation (3, 3) about `centre` that puts the end in a plane within 1.2 radii of the lens centre."""
+        r, far = self.random, float(np.linalg.norm(centre))
+        across, other = (np.cross(centre / far, axis) for axis in np.linalg.qr(r.normal(size=(3, 3)))[0][:2])
+        across = across / np.linalg.norm(across)
+        radius = self.lens["focal_length"] / self.lens["f_number"] / 2
+        sine = (end + radius * r.uniform(-1.2, 1.2)) / far
+        normal = math.sqrt(1 - sine**2) * across - sine * centre / far
+        side = np.cross(normal, other)
+        side /= np.linalg.norm(side)
+        return np.stack([side, np.cross(normal, side), normal], axis=1)
 
     @property
     def law(self) -> dict[str, Any]:
@@ -147,21 +167,24 @@ class _Maker:
 
     def plate(self, dark: bool = False, **place: Any) -> None:
         half = np.exp(self.random.uniform(np.log(0.5), np.log(12), 2))
-        centre, turn = self.place(float(np.hypot(*half)), **place), self.turn()
+        centre = self.place(float(np.hypot(*half)), **place)
+        turn = self.turn(centre)
         if centre is not None:
             shape = Simple(Rectangle(centre, turn[:, 0] * half[0], turn[:, 1] * half[1]))
             self.glowing(shape, {"type": "rectangle", "to_world": _matrix(turn * [*half, 1], centre)}, dark)
 
     def disk(self, dark: bool = False, **place: Any) -> None:
         radius = float(np.exp(self.random.uniform(np.log(0.4), np.log(12))))
-        centre, turn = self.place(radius, **place), self.turn()
+        centre = self.place(radius, **place)
+        turn = self.turn(centre)
         if centre is not None:
             shape = Simple(Disc(centre, turn[:, 2], radius))
             self.glowing(shape, {"type": "disk", "to_world": _matrix(turn * radius, centre)}, dark)
 
     def cylinder(self) -> None:
         radius, height = self.random.uniform(1, 8), self.random.uniform(2, 25)
-        centre, turn = self.place(math.hypot(radius, height / 2)), self.turn(False)
+        centre = self.place(math.hypot(radius, height / 2))
+        turn = self.turn(centre, False, height / 2)
         if centre is None:
             return
         axis, level = turn[:, 2], self.exitance()
@@ -200,7 +223,8 @@ class _Maker:
         import mitsuba as mi
 
         radius = float(np.linalg.norm(solid.vertices, axis=1).max())
-        centre, turn = self.place(radius), self.turn(False)
+        centre = self.place(radius)
+        turn = self.turn(centre, False, float(solid.vertices[:, 2].max()))
         if centre is None:
             return
         vertices = (np.asarray(solid.vertices) @ turn.T + centre).astype(np.float32).astype(np.float64)
@@ -216,7 +240,8 @@ class _Maker:
         import mitsuba as mi
 
         half = self.random.uniform(2, 14, 2)
-        centre, turn = self.place(float(np.hypot(*half))), self.turn()
+        centre = self.place(float(np.hypot(*half)))
+        turn = self.turn(centre)
         if centre is None:
             return
         rows, columns = (int(n) for n in self.random.integers(2, 17, 2))
@@ -335,6 +360,10 @@ def _centre(maker: _Maker) -> None:
     maker.centre = True
 
 
+def _edge_on(maker: _Maker) -> None:
+    maker.edge_on = True
+
+
 def _crop(maker: _Maker) -> None:
     maker.crops = True
 
@@ -369,19 +398,25 @@ MESH_FAMILIES: dict[str, Callable[[_Maker], None]] = {
     "Fresnel ellipsoids": _in_turn(_fresnel, _ELLIPSOIDS),
     "stopped ellipsoids": _in_turn(_stops, _ELLIPSOIDS),
     "cropped ellipsoids": _in_turn(_crop, _ELLIPSOIDS),
+    "boxes edge-on": _in_turn(_edge_on, FAMILIES["boxes"]),
 }
+# Bodies with a flat end that the lens sees edge-on: the planes of ends cross the pupil or pass close to it.
+EDGE_ON_FAMILIES: dict[str, Callable[[_Maker], None]] = {
+    f"{name} edge-on": _in_turn(_edge_on, FAMILIES[name])
+    for name in ("cylinders", "plates", "bitmaps", "exit laws", "stops", "centre", "crops", "panes and mirrors")
+}
+ALL_FAMILIES = {**FAMILIES, **MESH_FAMILIES, **EDGE_ON_FAMILIES}
 
 
 def random_scene(family: str, seed: int, finer: int = 1) -> RandomScene:
-    """The scene of a family of `FAMILIES` or `MESH_FAMILIES` with this seed, on a film of `finer` times as many pixels
+    """The scene of a family of `ALL_FAMILIES` with this seed, on a film of `finer` times as many pixels
     along each side.
     """
-    families = {**FAMILIES, **MESH_FAMILIES}
     for attempt in itertools.count():
-        maker = _Maker(np.random.default_rng([seed, list(families).index(family), attempt]))
+        maker = _Maker(np.random.default_rng([seed, list(ALL_FAMILIES).index(family), attempt]))
         maker.size = finer * maker.size[0], finer * maker.size[1]
         maker.lens["pixel_pitch"] /= finer
-        families[family](maker)
+        ALL_FAMILIES[family](maker)
         if any(body.exitance is not None for body in maker.bodies):
             return maker.finish(f"{family} {seed}")
     raise AssertionError

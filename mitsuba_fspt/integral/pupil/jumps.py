@@ -35,8 +35,9 @@ def integrate_transect(
     number of jumps, depth of the edge at the largest jump [mm], number of lines of sight.
 
     The transect is split at its `MOST_JUMPS` largest jumps. A scan of `along.scan` + 1 points finds the intervals with
-    jumps; `along.bisections` halve each of them towards the larger difference. Every piece between jumps that is not
-    dark has `along.nodes` nodes at even distances, the first at the share `phase` of a distance.
+    jumps; `along.bisections` halve each of them towards the larger difference. Where they meet a third body, there is
+    another jump. Every piece between jumps that is not dark has `along.nodes` nodes at even distances, the first at the
+    share `phase` of a distance.
     outline : size that an outline counts as, in units of the radiance [W/mm²/sr]
     least : smallest jump of the radiance on one body [W/mm²/sr]
     steep : a jump on one body is larger than so many times the mean of the other steps of the scan
@@ -118,11 +119,12 @@ class _Jump:
             before, after = dr.maximum(before, 0), dr.maximum(after, 0)
         return dr.abs(self.after.x - self.before.x) + dr.select(before != after, outline, 0)
 
-    def larger_half(self, s: mi.Float, seen: Seen, outline: mi.Float) -> _Jump:
-        """Of the two parts on either side of s, where the line of sight is `seen`, the one with the larger jump."""
+    def halves(self, s: mi.Float, seen: Seen, outline: mi.Float) -> tuple[_Jump, _Jump]:
+        """The two parts on either side of s, where the line of sight is `seen`; first the one with the larger jump."""
         left = _Jump(mi.Point2f(self.at.x, s), self.before, seen)
         right = _Jump(mi.Point2f(s, self.at.y), seen, self.after)
-        return dr.select(left.size(outline) >= right.size(outline), left, right)
+        larger = left.size(outline) >= right.size(outline)
+        return dr.select(larger, left, right), dr.select(larger, right, left)
 
 
 @dataclass
@@ -153,6 +155,20 @@ class _Search:
                 ordered[i], place = dr.minimum(other, place), dr.maximum(other, place)
             ordered.append(place)
         return ordered
+
+    def bisected(self, turn: mi.UInt32, halves: tuple[_Jump, _Jump], outline: mi.Float) -> _Search:
+        """The search with the jump number `turn` replaced by the first of its `halves`.
+
+        Where a third body is between those at its ends, as where the lens sees a face edge-on, there is an outline in
+        the other half, too: one more jump, if there is a place for it.
+        """
+        half, other = halves
+        two = (other.size(outline) >= outline) & (self.jumps < MOST_JUMPS)
+        largest = [
+            dr.select(turn == k, half, dr.select(two & (self.jumps == k), other, old))
+            for k, old in enumerate(self.largest)
+        ]
+        return replace(self, largest=largest, jumps=self.jumps + dr.select(two, mi.UInt32(1), 0))
 
 
 def _met(seen: Seen) -> mi.Bool:
@@ -198,10 +214,6 @@ def _search(
         lit = dr.select(_met(seen), mi.Point2f(dr.minimum(found.lit.x, s), s), found.lit)
         return _Search(largest, s, seen, total, lit, jumps, found.rays)
 
-    def bisect(found: _Search, turn: mi.UInt32, jump: _Jump, s: mi.Float, seen: Seen) -> _Search:
-        half = jump.larger_half(s, seen, outline)
-        return replace(found, largest=[dr.select(turn == k, half, old) for k, old in enumerate(found.largest)])
-
     def once(found: _Search) -> tuple[_Search]:
         k = found.rays
         scans, inside = k <= intervals, (k > 0) & (k < intervals)
@@ -212,7 +224,7 @@ def _search(
             jump = dr.select(turn == i, other, jump)
         s = dr.select(scans, even, jump.middle())
         seen = trace(s)
-        found = dr.select(scans, scan(found, s, seen), bisect(found, turn, jump, s, seen))
+        found = dr.select(scans, scan(found, s, seen), found.bisected(turn, jump.halves(s, seen, outline), outline))
         found.rays = k + 1
         return (found,)
 

@@ -135,7 +135,7 @@ LEAST_NET = 256  # transects from which those across a sharp edge are a net
 STEPS = {2: (1, 1), 8: (3, 5), 24: (5, 11), 72: (19, 61)}
 TREND = 3  # degree across the pupil of the trend that is subtracted from the scatter
 TRENDS = TREND + 2  # polynomials of the trend
-SCANS = (4, 6, 10, 16, 24, 32)  # intervals of the scan at each level; of two edges in one interval none is found
+SCANS = (4, 6, 10, 16, 24, 32)  # intervals of the scan at each level; of two edges of one body in one none is found
 LEAST_PARTS = 32  # of an interval of the first scan, to which bisection resolves a jump at any rtol
 MOST_JUMPS = 3  # jumps at which a transect is split: one body before another has three outlines
 
