@@ -2,7 +2,7 @@
 
 Wall times on a busy machine say little, so that the budget of the suite is one of CPU time. The time of a test is that
 of this process with all its threads and of the child processes that have ended meanwhile. With `--quick`, the tests
-that a committed table of these times lists are left out.
+that a committed table lists are left out.
 """
 
 from __future__ import annotations
@@ -16,12 +16,24 @@ import pytest
 
 BUDGET = 600.0  # seconds of CPU of the whole suite with an empty kernel cache: five minutes of two cores
 DEAREST = 10
-DEAR = Path(__file__).with_name("dear_tests.csv")  # one test in nine, with three quarters of the time
+DEAR = Path(__file__).with_name("dear_tests.csv")  # functions of which a case takes `LEAST_DEAR` seconds
+LEAST_DEAR = 1.0
 
 
 def cpu() -> float:
     """CPU seconds of this process and of its children that have ended."""
     return sum(os.times()[:4])
+
+
+def dear_tests() -> dict[str, float]:
+    """CPU seconds of the dearest case of each function in the table."""
+    with DEAR.open(newline="", encoding="utf-8") as file:
+        return {row["test"]: float(row["cpu_seconds"]) for row in csv.DictReader(file)}
+
+
+def function_of(name: str) -> str:
+    """Name of a test without its case."""
+    return name.partition("[")[0]
 
 
 class Spent:
@@ -40,11 +52,11 @@ class Spent:
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, config, items) -> None:
+        """With `--quick`, leave out all cases of the functions of the table: they share what is made once."""
         if config.getoption("quick"):
-            with DEAR.open(newline="", encoding="utf-8") as file:
-                dear = {row["test"] for row in csv.DictReader(file)}
-            left_out = [item for item in items if item.nodeid in dear]
-            items[:] = [item for item in items if item.nodeid not in dear]
+            dear = dear_tests()
+            left_out = [item for item in items if function_of(item.nodeid) in dear]
+            items[:] = [item for item in items if function_of(item.nodeid) not in dear]
             config.hook.pytest_deselected(items=left_out)
 
     def pytest_runtest_logreport(self, report) -> None:
@@ -74,9 +86,18 @@ class Spent:
                 terminalreporter.write_line(f"{seconds:7.1f}  {name}")
         if table := config.getoption("cpu_table"):
             with Path(table).open("w", newline="", encoding="utf-8") as file:
-                least, spent = config.getoption("cpu_least"), self.tests.most_common()
-                rows = [(f"{seconds:.2f}", name) for name, seconds in spent if seconds >= least]
+                rows = [(f"{seconds:.2f}", name) for name, seconds in self.tests.most_common()]
                 csv.writer(file).writerows([("cpu_seconds", "test"), *rows])
+        if config.getoption("list_dear"):
+            dear = dear_tests() if config.getoption("quick") else {}
+            for name, seconds in self.tests.items():
+                if seconds >= LEAST_DEAR:
+                    dear[function_of(name)] = max(dear.get(function_of(name), 0.0), seconds)
+            with DEAR.open("w", newline="", encoding="utf-8") as file:
+                rows = [(f"{seconds:.1f}", name) for name, seconds in Counter(dear).most_common()]
+                csv.writer(file, lineterminator="\n").writerows([("cpu_seconds", "test"), *rows])
+        if config.getoption("quick"):
+            terminalreporter.write_line(f"--quick: the cases of {len(dear_tests())} functions were left out")
         limit = config.getoption("cpu_limit")
         verdict = "over" if self.total > (BUDGET if limit is None else limit) else "within"
         text = f"{self.total:7.1f}  in all, {verdict} the budget of {BUDGET if limit is None else limit:.0f}"
@@ -87,9 +108,9 @@ def pytest_addoption(parser) -> None:
     text = "fail if the tests take more CPU seconds than this; without it, the summary tells it"
     parser.addoption("--cpu-limit", type=float, default=None, metavar="SECONDS", help=text)
     parser.addoption("--cpu-table", metavar="FILE.csv", help="write the CPU seconds of every test")
-    text = "leave out of the table tests that take less"
-    parser.addoption("--cpu-least", type=float, default=0.0, metavar="SECONDS", help=text)
     parser.addoption("--quick", action="store_true", help=f"leave out the tests listed in tests/{DEAR.name}")
+    text = f"write that list: functions of which a case took {LEAST_DEAR:.0f} s of CPU; with --quick, add to it"
+    parser.addoption("--list-dear", action="store_true", help=text)
 
 
 def pytest_configure(config) -> None:

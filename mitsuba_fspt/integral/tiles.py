@@ -20,11 +20,12 @@ from ..runtime.errors import SceneError
 from ..runtime.memory import available_memory
 from .shortcuts import Finding
 from .solution import Solution
+from .surface.pixel_sums import memory_of
 
 SIDE = 2048  # pixels along a tile with its rim; Dr.Jit allocates powers of two
 LARGE = 1 << 26  # pixels: the planes of a larger image are of float32, as they are in its file
-# Beside the planes: bytes that the work on one tile takes; then a pixel, that checks and the file take, and that copies
-# of planes of float64 in float32 take, by the bytes of a value.
+# Beside the planes: bytes that the work on one tile takes, sums by faces apart; then a pixel, that checks and the file
+# take, and that copies of planes of float64 in float32 take, by the bytes of a value.
 WORK, WRITING = 1 << 30, {4: 2, 8: 14}
 REACH = 2  # pixels around that the error of a displacement depends on
 COUNT = re.compile(r"\b\d+\b")
@@ -118,7 +119,7 @@ def _steepest(power: NDArray[np.float64]) -> NDArray[np.float64]:
 def _require_memory(full: tuple[int, int], size: int) -> None:
     """Raise SceneError where three planes with values of `size` bytes, and the work or the writing, do not fit."""
     pixels = math.prod(full)
-    needed = pixels * 3 * size + max(WORK, pixels * WRITING[size])
+    needed = pixels * 3 * size + max(WORK + memory_of(2 * SIDE**2), pixels * WRITING[size])
     free = available_memory() if pixels > SIDE**2 else None
     if free is not None and needed > free:
         height, width = full

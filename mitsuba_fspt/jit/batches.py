@@ -24,8 +24,8 @@ def batches(index: mi.UInt32, lines_each: int = 1, most: int = BATCH) -> list[mi
     ]
 
 
-def batch_slices(lines: NDArray[np.int64]) -> Iterator[slice]:
-    """Slices of consecutive items with at most `BATCH` lines of sight together, or of a single item with more.
+def batch_slices(lines: NDArray[np.int64], most: int = BATCH) -> Iterator[slice]:
+    """Slices of consecutive items with at most `most` lines of sight together, or of a single item with more.
 
     `lines`, shape (n,): number of lines of sight of each item.
     """
@@ -33,7 +33,7 @@ def batch_slices(lines: NDArray[np.int64]) -> Iterator[slice]:
     first = 0
     while first < len(lines):
         done = ends[first - 1] if first else 0
-        last = max(first + 1, int(np.searchsorted(ends, done + BATCH, side="right")))
+        last = max(first + 1, int(np.searchsorted(ends, done + most, side="right")))
         yield slice(first, last)
         first = last
 

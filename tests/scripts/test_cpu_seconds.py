@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 import subprocess
@@ -38,7 +37,7 @@ def test_dearest_tests_and_the_limit(tmp_path):
     (tmp_path / "test_busy.py").write_text(BUSY)
     plugins = ("-p", "no:cacheprovider", "-p", "xdist", "-p", "cpu_seconds")
     command = [sys.executable, "-m", "pytest", "-q", *plugins, "-n", "2", "--cpu-limit", "1"]
-    command += ["--cpu-table", "spent.csv", "--cpu-least", "0.5", "test_busy.py"]
+    command += ["--cpu-table", "spent.csv", "test_busy.py"]
     paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": paths, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
@@ -52,23 +51,38 @@ def test_dearest_tests_and_the_limit(tmp_path):
     head, *rows = (tmp_path / "spent.csv").read_text().splitlines()
     assert head == "cpu_seconds,test"
     assert sorted(row.partition(",")[2] for row in rows) == [
-        f"test_busy.py::test_{name}" for name in ("here", "in_a_child")
+        f"test_busy.py::test_{name}" for name in ("asleep", "here", "in_a_child")
     ]
 
 
-def test_a_quick_run_leaves_out_the_tests_of_the_table(monkeypatch, tmp_path):
-    """Of three tests the one in the table; the others, and their order, stay. The committed table names files that are
-    there."""
-    with cpu_seconds.DEAR.open(newline="") as file:
-        assert all((TESTS.parent / row["test"].partition("::")[0]).exists() for row in csv.DictReader(file))
+def test_a_quick_run_leaves_out_the_functions_of_the_table(monkeypatch, tmp_path):
+    """All cases of the function in the table, no other one; a quick run adds to the table, a whole one writes it anew.
+
+    The committed table names functions that are there.
+    """
+    for name in cpu_seconds.dear_tests():
+        file, *_, function = name.split("::")
+        assert f"def {function}(" in (TESTS.parent / file).read_text(), name
     table = tmp_path / "dear_tests.csv"
-    table.write_text('cpu_seconds,test\n5.00,"a.py::test[1, 2]"\n')
+    table.write_text("cpu_seconds,test\n5.0,a.py::test\n")
     monkeypatch.setattr(cpu_seconds, "DEAR", table)
-    left_out = []
-    hook = SimpleNamespace(pytest_deselected=lambda items: left_out.extend(items))
-    items = [SimpleNamespace(nodeid=name) for name in ("b.py::test", "a.py::test[1, 2]", "a.py::test")]
-    for quick in (False, True):
-        config = SimpleNamespace(getoption={"quick": quick}.get, hook=hook)
-        cpu_seconds.Spent().pytest_collection_modifyitems(config, items)
-        assert [item.nodeid for item in items] == ["b.py::test", *["a.py::test[1, 2]"] * (not quick), "a.py::test"]
-    assert [item.nodeid for item in left_out] == ["a.py::test[1, 2]"]
+    names = ["b.py::test", "a.py::test[1, 2]", "a.py::test", "a.py::test_b"]
+    left_out, lines = [], []
+    hook = SimpleNamespace(pytest_deselected=lambda items: left_out.extend(item.nodeid for item in items))
+    reporter = SimpleNamespace(section=lambda text: None, write_line=lambda text, **marks: lines.append(text))
+    for quick, stay, written in (
+        (False, names, {"a.py::test": 5.0}),
+        (True, ["b.py::test", "a.py::test_b"], {"a.py::test": 5.0, "a.py::test_b": 1.5}),
+        (False, names, {"a.py::test_b": 1.5}),
+    ):
+        items = [SimpleNamespace(nodeid=name) for name in names]
+        options = {"quick": quick, "list_dear": len(lines) > 0}
+        config = SimpleNamespace(getoption=options.get, hook=hook)
+        spent = cpu_seconds.Spent()
+        spent.pytest_collection_modifyitems(config, items)
+        assert [item.nodeid for item in items] == stay
+        spent.tests |= {"a.py::test_b[x]": 1.5, "a.py::test_b[y]": 0.5, "b.py::test": 0.9}
+        spent.pytest_terminal_summary(reporter, config)
+        assert cpu_seconds.dear_tests() == written
+    assert left_out == ["a.py::test[1, 2]", "a.py::test"]
+    assert "--quick: the cases of 2 functions were left out" in lines

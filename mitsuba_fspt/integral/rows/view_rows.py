@@ -32,8 +32,9 @@ from ..lines.visible_window import visible_window
 from ..quadrature import Quadrature
 from ..solution import Solution
 from ..surface.column_canvas import Windows
-from ..surface.column_form import MOST_CHANGE, Columns, column_windows, columns_of
+from ..surface.column_form import MOST_CHANGE, MOST_WORK, Columns, column_windows, columns_of
 from ..surface.face_light import FaceLight
+from ..surface.pixel_sums import memory_of
 from .row_form import rows_of
 from .sparse_rows import SparseRows
 
@@ -330,7 +331,7 @@ def _rows(
 
 def _require_memory(entries: int, pixels: int, most_bytes: int | None) -> None:
     """Raise TransportError where one view, with at the most so many entries, does not fit into memory."""
-    needed = entries * ENTRY + pixels * PIXEL + WORK
+    needed = entries * ENTRY + pixels * PIXEL + WORK + memory_of(min(entries, MOST_WORK))
     free = available_memory() if most_bytes is None else most_bytes
     if free is not None and needed > free:
         raise TransportError(

@@ -2,8 +2,8 @@
 
 The rectangle of pixels that a column (the hat function of a vertex, or a face) lights is computed beforehand. All
 rectangles lie one after the other in one flat buffer. As in `footprint`, edges of polygons add the light to their
-right, and cumulative sums along the rows complete it; here the density of light varies linearly over a polygon, and a
-second sum contains the part that grows with the pixel's column. All sums are of integers: their order has no effect,
+right, and cumulative sums along the rows complete it; here the density of light varies linearly over a polygon, and
+another sum contains the part that grows with the pixel's column. All sums are of integers: their order has no effect,
 and the light is exactly 0 outside a polygon.
 """
 
@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .footprint import PACKET, add_packet, along_edges
+from .footprint import along_edges
+from .pixel_sums import PixelSums
 
 PLACE = 8  # numbers of a `_Place` in the table, a power of two
 QUANTUM = 2.0**-46  # of the light on a pixel, over that of a pixel filled by 1 W/mm²/sr
@@ -104,21 +105,20 @@ class ColumnCanvas:
     def __init__(self, shape: tuple[int, int], windows: Windows) -> None:
         self.shape, self.windows = shape, windows
         self._starts = np.concatenate([[0], np.cumsum(windows.areas)])
-        total = max(int(self._starts[-1]), 1)
         # Of every pixel: the light that it and all pixels to its right get, the light that only those get, and the
         # increase of the first from pixel to pixel.
-        self._sums = dr.zeros(mi.UInt64, total * PACKET)
+        self._sums = PixelSums(int(self._starts[-1]))
         # The `_Place` of each column, and last of a column without window.
         table = np.zeros((len(windows.left) + 1, PLACE), np.uint32)
         table[:-1, :5] = np.stack([windows.left, windows.top, windows.width, windows.height, self._starts[:-1]], -1)
         self._table = mi.UInt32(table.ravel())
         self.none = dr.opaque(mi.UInt32, len(windows.left))
         self._size = tuple(dr.opaque(mi.Float64, side) for side in shape[::-1])
-        dr.eval(self._table, self._sums)
+        self._sums.evaluate(self._table)
 
     def light(self) -> NDArray[np.float64]:
         """The light accumulated so far, one window after the other as `Windows.pixels` numbers them."""
-        own, after, slope, _ = mi.Int64(self._sums).numpy()[: self._starts[-1] * PACKET].reshape(-1, PACKET).T
+        own, after, slope, _ = self._sums.array().T
         level = own.copy()
         level[1:] += after[:-1]
         level, slope = np.cumsum(level), np.cumsum(slope)
@@ -128,7 +128,7 @@ class ColumnCanvas:
 
     def evaluate(self) -> None:
         """Run all kernels begun so far to their end: the arrays of waiting ones would fill the memory."""
-        dr.eval(self._sums)
+        self._sums.evaluate()
         dr.sync_thread()
 
     def lay(
@@ -152,6 +152,7 @@ class ColumnCanvas:
         low_x = dr.minimum(dr.minimum(ring[0].x, ring[1].x), dr.minimum(ring[2].x, ring[3].x))
         active &= (low_x < self._size[0]) & (low_y < self._size[1]) & (high_y > 0)
         places = [self._place(column, active) for column in columns]
+        mode = self._sums.mode(dr.width(turn))
         scaled = [Plane(way * plane.at, way * plane.x, way * plane.y) for plane in planes]
 
         def add(a: mi.Point2d, b: mi.Point2d, _crosses: mi.Bool) -> None:
@@ -159,7 +160,7 @@ class ColumnCanvas:
             (xa, ya), (xb, yb) = ((p.x - column, p.y - row) for p in (a, b))
             x, y = mi.Int32(dr.clip(column, -1, self._size[0])), mi.Int32(dr.clip(row, -1, self._size[1]))
             for place, plane in zip(places, scaled, strict=True):
-                self._add(place, plane, (column, row), (xa, ya, xb, yb), (x, y))
+                self._add(place, plane, (column, row), (xa, ya, xb, yb), (x, y), mode)
 
         along_edges(ring, active, self._size, add, count)
 
@@ -169,7 +170,7 @@ class ColumnCanvas:
         window = (dr.gather(mi.Int32, fields, first + k, active) for k in range(4))
         return _Place(*window, start=dr.gather(mi.UInt32, self._table, first + 4, active))
 
-    def _add(self, place: _Place, plane: Plane, pixel: tuple, ends: tuple, at: tuple) -> None:
+    def _add(self, place: _Place, plane: Plane, pixel: tuple, ends: tuple, at: tuple, mode: dr.ReduceMode) -> None:
         """Add the light to the right of a part ab of an edge: to its pixel and to all beyond in its row.
 
         pixel : column and row; ends : xa, ya, xb, yb in that pixel; at : the same pixel as whole numbers
@@ -192,12 +193,8 @@ class ColumnCanvas:
         # Outside the window both are added to the same entry.
         outside = (x < 0) | (x >= place.width)
         level, beside = mi.Int64(level - beside), mi.Int64(beside)
-        add_packet(
-            self._sums,
-            line + mi.UInt32(dr.clip(x, 0, place.width)),
-            (level + dr.select(outside, beside, 0), dr.select(outside, 0, beside), mi.Int64(slope)),
-            on,
-        )
+        amounts = level + dr.select(outside, beside, 0), dr.select(outside, 0, beside), mi.Int64(slope)
+        self._sums.add(line + mi.UInt32(dr.clip(x, 0, place.width)), amounts, on, mode)
 
 
 def _cross(a: mi.Vector2d, b: mi.Vector2d) -> mi.Float64:

@@ -15,12 +15,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .pixel_sums import PACKET, PixelSums
+
 GRID = 2.0**-20  # corners lie on a grid this fine [pixels], where differences of coordinates are exact
 SPECK = 2.0**-4  # half the side [pixels] of the square that stands for a polygon folded over
-LEAST_CANVAS = 1 << 12  # pixels for which a canvas has room
 DENSEST = 2.0**57  # largest density of a polygon [quanta a pixel]
-PACKET = 4  # entries of a pixel, added in one operation
-MOST_COPIES = 1 << 30  # bytes that the threads' own copies of all entries may take
+
+Part = tuple["mi.Float64", "mi.Float64", list["mi.Float64"]]  # column, row, and the amounts of `Canvas._add`
 
 
 class Canvas:
@@ -32,17 +33,15 @@ class Canvas:
 
     def __init__(self, shape: tuple[int, int], quanta: Sequence[float], centres: bool) -> None:
         self.shape, self.quanta, self.centres = shape, quanta, centres
-        # Of a power of two and with opaque numbers: another film is the same kernel.
-        size = max(LEAST_CANVAS, 1 << (shape[0] * shape[1] - 1).bit_length())
         # Of every pixel and quantity: what it and all pixels to its right get, and what only those get.
-        self.sums = dr.zeros(mi.UInt64, size * PACKET)
+        self.sums = PixelSums(shape[0] * shape[1])
+        # Opaque numbers: another film is the same kernel.
         self._scales = [dr.opaque(mi.Float64, 1 / quantum) for quantum in quanta]
         self._height, self._width = (dr.opaque(mi.Float64, side) for side in shape)
 
     def images(self) -> list[NDArray[np.float64]]:
         """Each quantity accumulated so far, shape (h, w)."""
-        height, width = self.shape
-        sums = mi.Int64(self.sums).numpy()[: height * width * PACKET].reshape(height, width, PACKET)
+        sums = self.sums.array().reshape(*self.shape, PACKET)
         images = []
         for k, quantum in enumerate(self.quanta):
             step, after = sums[..., 2 * k].copy(), sums[..., 2 * k + 1]
@@ -65,52 +64,44 @@ class Canvas:
         low, high = _bound(dr.minimum, ring), _bound(dr.maximum, ring)
         # False also where a corner is not finite.
         active &= (low.x < self._width) & (low.y < self._height) & (high.y > 0) & (low.x > -dr.inf) & (high.x < dr.inf)
-        add = self._add_crossing if self.centres else self._add_area
-        along_edges(ring, active, (self._width, self._height), lambda a, b, crosses: add(densities, a, b, crosses))
+        amounts, mode = _crossing if self.centres else _area, self.sums.mode(dr.width(area))
 
-    def _add_area(self, densities: Sequence[mi.Float64], a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> None:
-        """Add the area to the right of ab, within one pixel, to this pixel and to all beyond in its row."""
-        column, row = (dr.floor(dr.minimum(a[n], b[n])) for n in (0, 1))
-        beyond = 0.5 * (a.x + b.x) - column
-        amounts = []
-        for density in densities:
-            # A difference of two rounded heights, each a function of one point: around a polygon they cancel.
-            rise = dr.round(density * (b.y - row)) - dr.round(density * (a.y - row))
-            after = dr.round(density * (b.y - a.y) * beyond)
-            amounts += [rise - after, after]
-        self._add(column, row, amounts)
+        def add(a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> None:
+            self._add(*amounts(densities, a, b, crosses), mode)
 
-    def _add_crossing(self, densities: Sequence[mi.Float64], a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> None:
-        """Where ab ends on a line of centres, add the density to all centres to the right."""
-        amounts = []
-        for density in densities:
-            rise = dr.round(dr.select(b.y > a.y, density, -density))
-            amounts += [dr.select(crosses, rise, 0), mi.Float64(0)]
-        self._add(dr.ceil(b.x), b.y, amounts)
+        along_edges(ring, active, (self._width, self._height), add)
 
-    def _add(self, column: mi.Float64, row: mi.Float64, amounts: Sequence[mi.Float64]) -> None:
+    def _add(self, column: mi.Float64, row: mi.Float64, amounts: Sequence[mi.Float64], mode: dr.ReduceMode) -> None:
         """Add, of each quantity, the first amount to all pixels of a row from a column on, the second from the next."""
         on = (column < self._width) & (row >= 0) & (row < self._height)
         at = mi.UInt32(dr.select(on, row * self._width + dr.maximum(column, 0), 0))
         packet = []
         for first, after in zip(map(mi.Int64, amounts[::2]), map(mi.Int64, amounts[1::2]), strict=True):
-            # Beside the canvas both are added to its first column.
+            # Left of the canvas both are added to its first column.
             packet += [first + dr.select(column < 0, after, 0), dr.select(column < 0, 0, after)]
-        add_packet(self.sums, at, packet, on)
+        self.sums.add(at, packet, on, mode)
 
 
-def add_packet(sums: mi.UInt64, at: mi.UInt32, amounts: Sequence[mi.Int64], active: mi.Bool) -> None:
-    """Add up to `PACKET` amounts to the entries of `sums` from `PACKET`·at on.
+def _area(densities: Sequence[mi.Float64], a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> Part:
+    """The area to the right of ab, within one pixel, in this pixel and in all beyond in its row."""
+    column, row = (dr.floor(dr.minimum(a[n], b[n])) for n in (0, 1))
+    beyond = 0.5 * (a.x + b.x) - column
+    amounts = []
+    for density in densities:
+        # A difference of two rounded heights, each a function of one point: around a polygon they cancel.
+        rise = dr.round(density * (b.y - row)) - dr.round(density * (a.y - row))
+        after = dr.round(density * (b.y - a.y) * beyond)
+        amounts += [rise - after, after]
+    return column, row, amounts
 
-    Each thread adds to its own copy of `sums` where these fit into `MOST_COPIES`: in a sixth of the time of atomic
-    additions one by one, which would be most of the time of a polygon smaller than a pixel.
-    """
-    packet = dr.zeros(dr.uint64_array_t(mi.Vector4f))
-    for k, amount in enumerate(amounts):
-        packet[k] = mi.UInt64(amount)  # unsigned, because that wraps around below zero and every backend can add it
-    copies = 8 * dr.width(sums) * dr.thread_count()
-    alone = dr.backend_v(sums) == dr.JitBackend.LLVM and copies <= MOST_COPIES
-    dr.scatter_add(sums, packet, at, active, mode=dr.ReduceMode.Expand if alone else dr.ReduceMode.Direct)
+
+def _crossing(densities: Sequence[mi.Float64], a: mi.Point2d, b: mi.Point2d, crosses: mi.Bool) -> Part:
+    """Where ab ends on a line of centres, the density at all centres to the right."""
+    amounts = []
+    for density in densities:
+        rise = dr.round(dr.select(b.y > a.y, density, -density))
+        amounts += [dr.select(crosses, rise, 0), mi.Float64(0)]
+    return dr.ceil(b.x), b.y, amounts
 
 
 def along_edges(

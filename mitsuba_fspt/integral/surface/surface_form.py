@@ -225,7 +225,7 @@ class _Refinement:
             active &= scale * discs[CORNERS[0]][2] > 0
         lights = (eq9(mi.Float64(radiance), mi.Float64(etendue)), mi.Float64(etendue / dr.square(dr.square(cos_theta))))
         canvas.lay(lights, polygon, active)
-        dr.eval(radiance, canvas.sums)
+        canvas.sums.evaluate(radiance)
         return float(dr.max(radiance)[0])
 
 
