@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 PACKET = 4  # numbers of a pixel, added in one operation
 BYTES = 8 * PACKET  # of a pixel
 LEAST = 1 << 12  # pixels for which there is room at least
-COPIES = (
-    1 << 29
-)  # bytes that the copies of all threads take at the most, twice as Dr.Jit keeps those of the last kernel
+# Bytes that the copies of all threads take at the most; Dr.Jit keeps those of the kernel before, too.
+COPIES = 1 << 29
 # A pixel is cleared and added up in 4 ns a number and copy, a polygon is laid 250 ns sooner: copies of `SMALL` pixels
 # take 4 ms, others are made where there is a polygon for so many pixels of all copies.
 SMALL, PIXELS_PER_POLYGON = 1 << 18, 16
@@ -70,7 +69,6 @@ def most_pixels() -> int:
 
 
 def memory_of(pixels: int) -> int:
-    """Bytes that sums of so many pixels and their copies take at the most."""
+    """Bytes that sums of up to so many pixels and their copies take at the most."""
     whole = room(pixels) * BYTES
-    copies = whole * dr.thread_count()
-    return whole + (2 * copies if copies <= COPIES else 0)
+    return whole + 2 * min(whole * dr.thread_count(), COPIES)

@@ -38,6 +38,9 @@ def test_copies_only_where_they_are_worth_their_time_and_fit(monkeypatch):
     assert large.mode(1000) == dr.ReduceMode.Direct
     assert large.mode(1 << 20) == dr.ReduceMode.Expand
     assert pixel_sums.most_pixels() == 1 << 22
+    # Of more pixels than have copies, too, as fewer ones are among those that memory is asked for.
+    for pixels in (1 << 20, 1 << 22, 1 << 24):
+        assert pixel_sums.memory_of(pixels) >= 32 * pixels + 2 * min(4 * 32 * pixels, 1 << 29)
     monkeypatch.setattr(pixel_sums, "COPIES", 1 << 25)
     assert large.mode(1 << 20) == dr.ReduceMode.Direct
 
