@@ -21,6 +21,7 @@ OF_THE_LENS = (
     *("pupil_magnification", "distortion", "vignetting"),
 )
 CAMERAS = ("perspective", "thinlens", "orthographic")  # of Mitsuba
+AXIS_ROUNDING = 2e-4  # of the length of a rotation's axis, by four digits a number: Mitsuba scales by up to twice that
 NEEDED = {"bitmap": ("filename", "data", "bitmap"), "volume": ("volume",)}  # without one, the texture crashes Mitsuba
 
 
@@ -32,6 +33,7 @@ def check_text(path: Path, scene: SceneXml) -> None:
         _check_source(path, node, scene)
         _check_parents(path, node)
         _check_sensor(path, node, scene)
+        _check_rotation(path, node, scene)
 
 
 def check_values(path: Path, scene: SceneXml) -> None:
@@ -113,3 +115,32 @@ def _check_parents(path: Path, node: ElementTree.Element) -> None:
     for child in node if node.tag != "shape" else ():
         if child.get("type") == "fspt_surface" and not child.get("id"):
             raise SceneError(f"{path}: an fspt_surface stands in <{node.tag}>. Put it into the <shape> that glows.")
+
+
+def _check_rotation(path: Path, node: ElementTree.Element, scene: SceneXml) -> None:
+    """Raise SceneError for a rotation about an axis of another length than 1: Mitsuba would stretch what it turns.
+
+    Values that Mitsuba cannot parse are left to it.
+    """
+    if node.tag != "rotate":
+        return
+    given = node.get("value")
+    texts = [node.get(name, "0") for name in "xyz"] if given is None else re.split(r"[\s,]+", given.strip())
+    texts = [scene.fill_in(text).strip() for text in texts]
+    if not all(map(is_number, texts)):
+        return
+    axis = [float(text) for text in (texts if len(texts) == 3 else 3 * texts[:1])]
+    length = math.hypot(*axis)
+    if abs(length - 1) > AXIS_ROUNDING:
+        of = " ".join(texts)
+        mend = (
+            "Give one such as y = 1."
+            if not 0 < length < math.inf
+            else (
+                "Give " + ", ".join(f'{name}="{one / length:.6f}"' for name, one in zip("xyz", axis, strict=True)) + "."
+            )
+        )
+        raise SceneError(
+            f"{path}: the axis {of} of a <rotate> must have the length 1, got {length:.6g}: Mitsuba stretches what it "
+            f"turns. {mend}"
+        )

@@ -236,6 +236,15 @@ FILES = {
         {"shapes": 2 * BALL_XML.replace("<shape", '<shape name="ball"')},
         "s.xml: 'scene' has 'ball' more than once",
     ),
+    "a rotation about an axis of another length": (
+        of_ball("<emitter", '<transform name="to_world"><rotate x="1" y="2" z="2" angle="77"/></transform><emitter'),
+        "s.xml: the axis 1 2 2 of a <rotate> must have the length 1, got 3: Mitsuba stretches what it turns. Give "
+        'x="0.333333", y="0.666667", z="0.666667".',
+    ),
+    "a rotation about no axis": (
+        of_ball("<emitter", '<transform name="to_world"><rotate value="0, 0, 0" angle="77"/></transform><emitter'),
+        "s.xml: the axis 0 0 0 of a <rotate> must have the length 1, got 0",
+    ),
     "a tag that is none": ({"more": '<lense type="fspt_lens"/>'}, "lense"),
 }
 

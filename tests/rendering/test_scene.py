@@ -237,6 +237,16 @@ def test_a_parameter_of_the_lens_in_another_sensor_is_refused(tmp_path, left):
         fspt.load(write_scene(tmp_path / "s.xml", sensor=sensor))
 
 
+@pytest.mark.parametrize("axis", ['z="1"', 'x="0.5774" y="-0.5773" z="0.5773"', 'value="0, $way, 0"'])
+def test_a_rotation_about_an_axis_of_length_1_turns_a_shape_without_stretching_it(tmp_path, axis):
+    """Mitsuba takes the axis as it is. Four digits of it change lengths by less than 4e-4."""
+    turned = BALL_XML.replace("<emitter", f'<transform name="to_world"><rotate {axis} angle="77"/></transform><emitter')
+    way = '<default name="way" value="-1"/>'
+    scene = fspt.load(write_scene(tmp_path / "s.xml", shapes=way + turned))
+    axes = np.array(mi.traverse(scene)["sphere.to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
+    assert np.linalg.svd(axes)[1] / 3 == pytest.approx([1, 1, 1], abs=4e-4)  # a ball of radius 3
+
+
 def test_unnamed_shapes_and_sensors_get_names_that_stay(tmp_path):
     path = write_scene(tmp_path / "s.xml", shapes=BALL_XML * 2 + BALL_XML.replace("<shape", '<shape id="mouse"'))
     keys = [set(mi.traverse(fspt.load(path)).keys()) for _ in range(2)]
