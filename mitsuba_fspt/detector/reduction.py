@@ -33,6 +33,7 @@ from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time
+from .dark_charge import shown_charge
 from .flat_field import FlatField, flat_field, require_no_flat
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
 from .saturation import full_pixels, saturated
@@ -304,22 +305,25 @@ def _background(
     [e-²]. Electrons are those before the register.
 
     A dark frame, or a number in its place, has the same exposure time as the counts and contains the bias. Both frames
-    contain the spurious charge.
+    contain the spurious charge. What a dark frame shows above the bias counts as charge, see `shown_charge`.
     """
     shape = raw.values.shape
     gain = detector.on_pixels("gain", shape) / detector.em_gain  # electrons before the register per DN
     dark_charge, spurious = exposed.dark(detector, shape), exposed.spurious(detector)
     charge = dark_charge + spurious
     reading = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2 + gain**2 / 12
+    empty = raw.bias if bias is None else frame_like(bias, "bias", shape).values  # without dark charge
+    zero = detector.on_pixels("bias", shape) if empty is None else empty - spurious / gain
     if dark is not None and not isinstance(dark, (str, os.PathLike)) and np.ndim(dark) == 0:
         level = number("reduce: 'dark'", dark, DetectorError, "500")
         if not 0 <= level < np.inf:
             raise DetectorError(f"reduce: 'dark' must be >= 0 DN, got {level:g}. Give the bias and the dark current.")
-        return level, charge, 0.0
+        return level, shown_charge(gain * (level - zero), charge, reading, detector.excess, math.inf), 0.0
     frame = raw.background if dark is None and raw.background is not None else dark
     if frame is not None:
         found = frame_like(frame, "dark", raw.values.shape)
         require_same_time("dark", found, "counts", exposed.exposure_time)
+        charge = shown_charge(gain * (found.values - zero), charge, reading, detector.excess, found.frames)
         return found.values, charge, (detector.excess * charge + reading) / found.frames
     frame = raw.bias if bias is None and raw.bias is not None else bias
     if frame is not None:

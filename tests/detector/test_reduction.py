@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.detector.reduction import calibrated, read_measured, reduced
 from mitsuba_fspt.images.comparison import compare
 from mitsuba_fspt.images.image import Image, read
+from mitsuba_fspt.images.noise_model import NoiseModel
 from mitsuba_fspt.optics.thin_lens import Lens
 from mitsuba_fspt.optics.uniform_source import uniform_power
 from mitsuba_fspt.runtime.errors import DetectorError, ImageError
@@ -132,6 +134,49 @@ def test_dark_charge_and_frames_add_their_noise():
         per_watt, read, dark = (found.metadata[n] for n in ("electrons_per_watt", "read_noise", "dark_electrons"))
         chi2 = ((found.power.astype(float) * per_watt) ** 2).mean() / (read**2 + dark)
         assert chi2 == pytest.approx(1, abs=4 * (2 / 4096) ** 0.5)
+
+
+@pytest.mark.parametrize("frames", [1, 16])
+def test_the_charge_of_hot_pixels_in_a_dark_frame_has_its_noise(frames, caplog):
+    """5 % of the pixels have 2000 electrons in the dark, which the numbers do not know: χ² is 1 on them and the others.
+
+    It was some 170 on them. A bias that has drifted by 4 DN changes nothing and is not reported.
+    """
+    pytest.importorskip("ccdproc")
+    rng = np.random.default_rng(3)
+    hot = rng.random((64, 64)) < 0.05
+    charge = np.where(hot, 2000.0, 0.06)
+
+    def counts(drift, number):
+        electrons = rng.poisson(np.broadcast_to(charge, (number, 64, 64))) + rng.normal(0, 3.5, (number, 64, 64))
+        return np.rint(500 + drift + electrons / 1.6)
+
+    for drift in (0, 4):
+        found = CCD.reduce(counts(drift, 1)[0], **SETTINGS, dark=counts(drift, frames))
+        chi2 = np.square(found.power.astype(float)) / NoiseModel.of(found).dark
+        assert chi2[hot].mean() == pytest.approx(1, abs=4 * (2 / hot.sum()) ** 0.5)
+        assert chi2[~hot].mean() == pytest.approx(1, abs=4 * (2 / np.sum(~hot)) ** 0.5)
+    assert not caplog.messages
+
+
+def test_the_charge_of_a_warm_camera_in_a_dark_frame_has_its_noise(caplog):
+    """100 electrons a pixel in the dark, which the numbers do not know: χ² is 1, it was 8, and one line says so.
+
+    It says so, too, where a number stands for the frame.
+    """
+    pytest.importorskip("ccdproc")
+    warm, dark = replace(CCD, dark_current=100 / 60), Image(np.zeros((64, 64)))
+    frames = np.array([warm.expose(dark, 60, 650, seed=k).counts for k in range(5)], float)
+    for given in (frames[1:], float(frames[1:].mean())):
+        caplog.clear()
+        found = CCD.reduce(frames[0], **SETTINGS, dark=given)
+        chi2 = np.square(found.power.astype(float)) / NoiseModel.of(found).dark
+        assert chi2.mean() == pytest.approx(1, abs=4 * (2 / 4096) ** 0.5)
+        (line,) = caplog.messages
+        assert re.search(r"the dark frame has (99|100|101)(\.\d)? electrons more than bias and dark current", line)
+    caplog.clear()  # with a bias frame, the number of the bias does not matter
+    replace(warm, bias=0).reduce(frames[0], **SETTINGS, dark=frames[1:], bias=np.full((64, 64), 500.0))
+    assert not caplog.messages
 
 
 def test_a_total_below_zero_is_reported(caplog):
