@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
 from ..images.frame_file import FITS, TIFF, read_frame
-from ..images.tiff_pages import read_tiff
+from ..images.tiff_pages import channels_of, read_tiff
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
 
@@ -108,6 +108,11 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
     if path.suffix.lower() in (*TIFF, *FITS):
         _require_counts(path)
     array, header = read_frame(path, f"counts '{path}'")
+    if path.suffix.lower() in TIFF and (channels := channels_of(path)) > 1:
+        raise ImageError(
+            f"counts '{path}' have {channels} channels or colours, which are no frames of one exposure. Save one of "
+            "them, or frames as slices or times."
+        )
     array = array.astype(np.uint8) if array.dtype == bool else array  # a frame of bad pixels
     return replace(counts_of(array, str(path), frames), **header)
 

@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import LONGEST_TEXT, ImageError, one_line
 from ..runtime.extras import require
 
 if TYPE_CHECKING:
-    from tifffile import TiffFile
+    from tifffile import TiffFile, TiffPageSeries
 
 LOG = logging.getLogger("mitsuba_fspt")
 TAG = re.compile(r"TiffTag (\d+)")
 SMALLEST_PAGE = 18  # bytes of a page with one tag
 PRIVATE = 32768  # least number of a private tag, which says nothing about the pixels
+ORIENTATION = 274  # number of the tag; 1 where the first row is the top one and the first column that on the left
+CHANNELS = "CS"  # axes of tifffile: colours, and samples of a pixel
 
 
 def read_tiff(path: Path, thing: str) -> NDArray[Any]:
-    """Images of a TIFF file, (h, w) or (pages, h, w, …) as they are stored.
+    """Images of a TIFF file, (h, w) or (pages, h, w, …), row 0 at the top.
 
-    What tifffile reports about tags that do not matter is one line on stderr.
+    Values are as they are stored. Where the file's Orientation says that another row is the top one, the images are
+    turned, which one line on stderr says. What tifffile reports about tags that do not matter is one line on stderr.
 
     thing : what the file is, for messages, such as "counts 'a.tif'"
 
@@ -43,7 +48,7 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
             if _has_page(file, path.stat().st_size // SMALLEST_PAGE + 1):
                 raise ValueError("its pages follow each other in a circle")
             series = file.series[0]
-            images = series.asarray()
+            images, turned = _upright(series)
             missing = sum(page is None for page in series.pages)
     except Exception as cause:  # whatever a damaged file makes tifffile raise
         raise _damaged(thing, cause) from cause
@@ -56,7 +61,33 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
     if texts:
         more = f" (and {len(texts) - 1} more)" if len(texts) > 1 else ""
         LOG.warning("fspt: %s: tifffile reports: %s%s. Check the image.", thing, one_line(texts[0], LONGEST_TEXT), more)
+    if turned != 1:
+        LOG.warning("fspt: %s: its rows do not begin at the top left (Orientation %d); it is turned.", thing, turned)
     return images
+
+
+def channels_of(path: Path) -> int:
+    """Number of colours or samples of each pixel of a TIFF file that `read_tiff` has read."""
+    import tifffile
+
+    with _reports(), tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        sizes = (size for axis, size in zip(series.axes, series.shape, strict=True) if axis in CHANNELS)
+        return math.prod(sizes)
+
+
+def _upright(series: TiffPageSeries) -> tuple[NDArray[Any], int]:
+    """Images of a series with the top row first and the left column first, and its Orientation."""
+    images = series.asarray()
+    tag = series.keyframe.tags.get(ORIENTATION)
+    orientation = 1 if tag is None else int(tag.value)
+    if not 1 <= orientation <= 8 or not {"Y", "X"} <= set(series.axes) or images.ndim != len(series.axes):
+        return images, 1
+    y, x = series.axes.index("Y"), series.axes.index("X")
+    if orientation > 4:  # rows are columns
+        images = np.swapaxes(images, y, x)
+    flipped = [axis for axis, kinds in ((y, (3, 4, 7, 8)), (x, (2, 3, 6, 7))) if orientation in kinds]
+    return np.flip(images, flipped), orientation
 
 
 def _has_page(file: TiffFile, number: int) -> bool:

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 
+from mitsuba_fspt.detector.counts import read_counts
 from mitsuba_fspt.images.tiff_pages import read_tiff
 from mitsuba_fspt.runtime.errors import ImageError
 
@@ -37,6 +38,48 @@ def stack(tmp_path):
 
 def test_a_stack_is_read(stack):
     np.testing.assert_array_equal(read_tiff(stack, "counts 'counts.tif'"), FRAMES)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_images_are_turned_upright(tmp_path, caplog, orientation):
+    """The tag says where the first row and the first column are, e.g. 6: on the right and at the top (TIFF 6.0)."""
+    upright = FRAMES[0]
+    stored = {
+        1: upright,
+        2: upright[:, ::-1],
+        3: upright[::-1, ::-1],
+        4: upright[::-1],
+        5: upright.T,
+        6: upright.T[::-1],  # its first row is the last column, from the top
+        7: upright.T[::-1, ::-1],
+        8: upright.T[:, ::-1],
+    }[orientation]
+    path = tmp_path / "counts.tif"
+    tifffile.imwrite(path, np.stack(2 * [stored]), photometric="minisblack", extratags=[(274, 3, 1, orientation, True)])
+    np.testing.assert_array_equal(read_tiff(path, "counts 'counts.tif'"), np.stack(2 * [upright]))
+    assert len(caplog.messages) == (orientation != 1)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"photometric": "rgb", "planarconfig": "separate"},
+        {"ome": True, "metadata": {"axes": "CYX"}},
+        {"imagej": True, "metadata": {"axes": "CYX"}},
+    ],
+)
+def test_channels_are_no_frames_of_counts(tmp_path, how):
+    """Of the images through two filters, or of three colours, the mean was taken, as of frames."""
+    path = tmp_path / "counts.tif"
+    tifffile.imwrite(path, FRAMES if "planarconfig" in how else FRAMES[:2], **how)
+    with pytest.raises(ImageError, match=r"counts\.tif' have [23] channels or colours, which are no frames"):
+        read_counts(path)
+
+
+def test_frames_over_time_or_depth_are_a_stack(tmp_path):
+    for axes in ("TYX", "ZYX"):
+        tifffile.imwrite(tmp_path / "counts.tif", FRAMES, ome=True, metadata={"axes": axes})
+        assert read_counts(tmp_path / "counts.tif").frames == 3
 
 
 def test_pages_in_a_circle_are_refused(stack):
