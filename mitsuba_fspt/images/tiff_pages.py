@@ -86,7 +86,7 @@ def _upright(series: TiffPageSeries) -> tuple[NDArray[Any], int]:
     y, x = series.axes.index("Y"), series.axes.index("X")
     if orientation > 4:  # rows are columns
         images = np.swapaxes(images, y, x)
-    flipped = [axis for axis, kinds in ((y, (3, 4, 7, 8)), (x, (2, 3, 6, 7))) if orientation in kinds]
+    flipped = tuple(axis for axis, kinds in ((y, (3, 4, 7, 8)), (x, (2, 3, 6, 7))) if orientation in kinds)
     return np.flip(images, flipped), orientation
 
 
