@@ -253,8 +253,9 @@ def _exposed(path: Path, counts: Counts, camera: Detector, given: dict[str, Any]
 def _record(image: Image, name: Path) -> dict[str, Any]:
     """Numbers about a reduced image, ready for JSON."""
     kept = ("electrons_per_watt", "read_noise", "gain_error", "masked_pixels", "flat_masked_pixels")
-    error = float(np.sqrt((image.error.astype(np.float64) ** 2).sum())) if image.error is not None else 0.0
-    return {"output": str(name), "power": float(image.power.sum()), "error": error} | {
+    power, own = float(image.power.sum()), 0.0 if image.error is None else np.linalg.norm(image.error[image.kept])
+    error = float(np.hypot(own, power * (image.gain_error or 0.0)))
+    return {"output": str(name), "power": power, "error": error} | {
         k: image.metadata[k] for k in kept if k in image.metadata
     }
 

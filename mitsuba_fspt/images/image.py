@@ -137,7 +137,7 @@ class Image(ImageData):
 
         Standard errors, which are taken as independent, add up in squares; the integral's, which are bounds, add up. Of
         the metadata, entries remain that both have. The sum of two measured images with the same `electrons_per_watt`
-        keeps it, with the read noise of both. A pixel that one of them masks is masked.
+        keeps it, with the read noise of both. The larger `gain_error` remains. What one of them masks is masked.
 
         Raises
         ------

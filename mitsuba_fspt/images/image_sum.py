@@ -30,6 +30,8 @@ def combined(one: Sum, other: ImageData, sign: int) -> Sum:
         power[mask] = 0
     coverage = one.coverage if _same(one.coverage, other.coverage) else None
     known = _metadata(one, other) | _source_power(one, other, sign)
+    if gain_error := max(image.gain_error or 0.0 for image in (one, other)):
+        known["gain_error"] = gain_error
     planes: dict[str, Any] = dict.fromkeys(BESIDE)
     planes |= {"error": _error(one, other), "coverage": coverage, "mask": mask}
     if sign == 1 and _of_one_detector(one, other):

@@ -36,7 +36,7 @@ class Measurement:
     masked : number of the region's pixels that the image masks, such as saturated ones; no number above counts them
 
     The errors are None for an image without errors. Those of the integral are bounds and add up; standard errors of
-    Monte Carlo add up in squares.
+    Monte Carlo and of counts add up in squares, with the `gain_error` of counts, which is common to all pixels.
     """
 
     total_flux: float
@@ -100,6 +100,7 @@ def measure(
     if converted.error is not None:
         errors = converted.error[mask]
         error = float(errors.sum() if is_deterministic(image) else math.sqrt(np.square(errors).sum()))
+        error = math.hypot(error, (image.gain_error or 0.0) * float(values.sum()))
     return Measurement(
         total_flux=math.pi * area * float(values.sum()),
         total_flux_error=None if error is None else math.pi * area * error,

@@ -97,6 +97,16 @@ def test_sums_of_scaled_images_stay_scaled():
         (one + two).scaled(2.0)
 
 
+@pytest.mark.parametrize("errors", [(0.05, 0.02), (0.02, 0.05), (0.05, None)])
+def test_sums_and_differences_keep_the_larger_gain_error(errors):
+    """It was lost where the two differ, and with it most of the width of the intervals of `invert`."""
+    one, other = (
+        fspt.Image(np.ones((2, 2)), np.ones((2, 2)), metadata={} if error is None else {"gain_error": error})
+        for error in errors
+    )
+    assert (one + other).gain_error == (one - other).gain_error == 0.05
+
+
 def test_the_sum_of_two_exposures_has_the_noise_of_both():
     """30 seeds, faint light, a flat field: χ² is 1 for sums and differences, and by `invert`'s variance of a sum.
 
