@@ -22,6 +22,8 @@ NEGATIVE_ROUNDING = 1e-6  # of the largest J_n: interpolation in float32 may tur
 FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # elements checked on a shape: at least FEWEST, one a texel up to MOST_TEXELS
 # Beginnings of the names of Mitsuba's classes for a colour, and for a value at each wavelength.
 COLOURS, SPECTRA = ("SRGB", "D65"), ("Regular", "Irregular", "BlackBody")
+HALF_FLOATS = re.compile(r'name = "[^"]*\.exr"', re.IGNORECASE)  # in the description of a bitmap of 16-bit floats
+SMALLEST_HALF = 2.0**-14  # smallest 16-bit float with all its digits, to 5e-4
 CORNERS_AND_CENTRE = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
 
 
@@ -163,7 +165,11 @@ def at_corners(mesh: mi.Shape, texture: mi.Texture) -> tuple[mi.Float, mi.Float,
 
 
 def _check_bitmap(texture: mi.Texture) -> None:
-    """Raise ExitanceError for a bitmap in colour, or of whole numbers that Mitsuba decodes as sRGB."""
+    """Raise ExitanceError for a bitmap in colour, of whole numbers that Mitsuba decodes as sRGB, or too dark for its
+    16-bit floats.
+
+    Mitsuba stores whole numbers of 16 bits as floats of 16 bits, as it stores an EXR of such floats.
+    """
     values = mi.traverse(texture)
     if "data" not in values:
         return
@@ -174,10 +180,17 @@ def _check_bitmap(texture: mi.Texture) -> None:
             f"fspt_surface: 'exitance' is a bitmap of {channels} channels that differ, J_n is one number. Give one of "
             "one channel, as a float EXR."
         )
-    if not dr.is_float_v(values["data"]) and "raw = 0" in str(texture):  # no other way to ask a texture for `raw`
+    half, described = dr.is_half_v(values["data"]), str(texture)  # no other way to ask a texture for `raw` and its file
+    whole = not dr.is_float_v(values["data"]) or (half and not HALF_FLOATS.search(described))
+    if whole and "raw = 0" in described:
         raise ExitanceError(
             f"fspt_surface: 'exitance' is a picture of {width} × {height} whole numbers, which are decoded as sRGB. "
             'Give W/mm² as a float EXR, or add <boolean name="raw" value="true"/> for shares of the largest number.'
+        )
+    if half and 0 < (largest := float(texels.max())) < SMALLEST_HALF:
+        raise ExitanceError(
+            f"fspt_surface: 'exitance' is a bitmap of 16-bit floats up to {largest:.3g} W/mm², where these have steps "
+            "of 6e-8. Save it with 32-bit floats."
         )
 
 

@@ -124,17 +124,38 @@ RED_GREEN_BLUE = np.full((2, 4, 3), [3, 2, 1], np.float32)
         (RED_GREEN_BLUE, True, "a bitmap of 3 channels that differ, J_n is one number"),
         (RED_GREEN_BLUE.astype(np.uint8), False, "a bitmap of 3 channels that differ"),
         (np.full((2, 4, 1), 128, np.uint8), False, "a picture of 4 × 2 whole numbers, which are decoded as sRGB"),
+        (np.full((2, 4, 1), 128 << 8, np.uint16), False, "a picture of 4 × 2 whole numbers, which are decoded as sRGB"),
+        (np.full((2, 4, 1), 3, np.uint16), True, "a bitmap of 16-bit floats up to 4.58e-05 W/mm², where these have"),
     ],
-    ids=["colours", "coloured picture", "grey picture"],
+    ids=["colours", "coloured picture", "grey picture", "grey picture of 16 bits", "dark picture of 16 bits"],
 )
 def test_bitmaps_that_are_no_watts_are_refused(pixels, raw, message):
-    """Mitsuba makes luminance of the one and bends the values of the other: 128 of 255 would be 0.22 W/mm²."""
+    """Mitsuba makes luminance of the one and bends the values of the other: 128 of 255 would be 0.22 W/mm².
+
+    Of 16 bits it takes floats of 16 bits, so that the type of the texels does not show it.
+    """
     with pytest.raises(RuntimeError, match=message):
         world_scene(ball({"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": raw}))
 
 
+def test_an_exr_of_16_bit_floats_is_watts(tmp_path):
+    """It needs no `raw`, but has steps of 6e-8: J_n of at most 1e-6 was wrong by up to 3 % on every texel."""
+    bitmap = {"type": "bitmap", "filename": str(tmp_path / "jn.exr")}
+    for value, fits in ((0.25, True), (1e-6, False)):
+        mi.Bitmap(np.full((2, 4, 1), value, np.float16)).write(bitmap["filename"])
+        if fits:
+            assert float(
+                mi.traverse(world_scene(ball(bitmap)).emitters()[0].surface.exitance)["data"].array[0]
+            ) == pytest.approx(value, rel=1e-3)
+            continue
+        with pytest.raises(RuntimeError, match=r"16-bit floats up to 1\.01e-06 W/mm²"):
+            world_scene(ball(bitmap))
+
+
 @pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("value", [np.uint8(51), np.float32(0.2)], ids=["whole", "float"])
+@pytest.mark.parametrize(
+    "value", [np.uint8(51), np.uint16(13107), np.float32(0.2)], ids=["whole", "whole of 16 bits", "float"]
+)
 def test_raw_bitmaps_in_grey_are_watts(value, channels):
     """Expected: those of a number; whole numbers are shares of the largest, 255."""
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 4, channels), value)), "raw": True}
