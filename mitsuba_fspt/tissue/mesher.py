@@ -1,4 +1,7 @@
-"""Tetrahedra from files: a tetrahedral mesh as stored, or a closed surface filled by the mesher fTetWild."""
+"""Tetrahedra from files: a tetrahedral mesh as stored, or a closed surface filled by the mesher fTetWild.
+
+Border triangles of either stand for a smooth surface through their vertices (`smooth_surface`).
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -48,7 +52,7 @@ def read_tetrahedra(
             )
         return tetrahedralize(points, raw.cells, edge)
     if labels is None:
-        return Tetrahedra(points, raw.cells).without_unused()
+        return _with_smooth_border(Tetrahedra(points, raw.cells).without_unused())
     found = [f for f in raw.fields if f.name == labels and f.values.shape == (len(raw.cells),)]
     if not found:
         names = ", ".join(f"'{f.name}'" for f in raw.fields) or "none"
@@ -58,7 +62,12 @@ def read_tetrahedra(
     values = found[0].values
     if not (values == np.round(values)).all():
         raise FluxError(f"geometry: the labels '{labels}' of '{path}' must be whole numbers. Name another field.")
-    return Tetrahedra(points, raw.cells, values.astype(np.int64)).without_unused()
+    return _with_smooth_border(Tetrahedra(points, raw.cells, values.astype(np.int64)).without_unused())
+
+
+def _with_smooth_border(mesh: Tetrahedra) -> Tetrahedra:
+    """The same mesh, whose `snap` moves points onto the smooth surface through the vertices of its border."""
+    return replace(mesh, snap=SmoothSurface(mesh.vertices, mesh.border, mesh.edge / 2).nearest)
 
 
 def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:

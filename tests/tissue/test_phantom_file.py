@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import trimesh
 from typer.testing import CliRunner
 
 from mitsuba_fspt.cli.flux import app
+from mitsuba_fspt.optics.boundary import boundary_a
 from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Cylinder, Sphere
 from mitsuba_fspt.phantom.phantom import Phantom
@@ -193,6 +195,31 @@ def test_tetrahedra_with_labels_from_a_file(tmp_path: Path) -> None:
         read_tetrahedra(tmp_path / "tissue.vtu", 2, labels="organ")
     with pytest.raises(FluxError, match="'length_unit' must be one of mm, cm, m, got 'inch'"):
         read_tetrahedra(tmp_path / "tissue.vtu", 2, "inch")
+
+
+def test_the_border_of_tetrahedra_from_a_file_is_smooth(tmp_path: Path) -> None:
+    """Rationale: tetrahedra of a sphere, a source in its middle: J_n is that of the sphere and equal everywhere.
+
+    Expected behaviour: the exact total of diffusion within 0.05 %, ripple below 0.2 %. With plane facets it was 0.6 %
+    and 4 %, under SP3, whose flow along the border has second derivatives, 65 %.
+    """
+    skfem = pytest.importorskip("skfem")
+    radius, mua, musp = 6.0, 0.02, 1.0
+    ball = skfem.MeshTet.init_ball(3)
+    np.savez(tmp_path / "ball.npz", vertices=radius * ball.p.T, tetrahedra=ball.t.T)
+    solution = solve(
+        read_tetrahedra(tmp_path / "ball.npz", 2), [Medium(mua, musp)], [Source(Sphere((0, 0, 0)))], model="diffusion"
+    )
+    d = 1 / (3 * (mua + musp))
+    k, robin = math.sqrt(mua / d), 1 / (2 * boundary_a("robin", 1.37))
+    free = math.exp(-k * radius) / radius, -math.exp(-k * radius) * (k * radius + 1) / radius**2  # φ/φ_0 and its slope
+    bound = math.sinh(k * radius) / radius, (k * radius * math.cosh(k * radius) - math.sinh(k * radius)) / radius**2
+    share = -(robin * free[0] + d * free[1]) / (robin * bound[0] + d * bound[1])
+    exact = robin * (free[0] + share * bound[0]) / d * radius**2
+    assert exact == pytest.approx(0.6008, abs=1e-4)
+    assert solution.solved.exited == pytest.approx(exact, rel=5e-4)
+    exitance = solution.phantom(0.7).exitance
+    assert np.ptp(exitance) / exitance.mean() < 2e-3
 
 
 def test_surface_without_a_mesher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
