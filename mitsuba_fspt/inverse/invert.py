@@ -463,9 +463,10 @@ class Problem:
         leaves out has one size on the whole surface.
         """
         power = self.measurement.power[self.rows] + fit.correction
-        noise = np.sqrt(np.maximum(fit.sigma**2 - fit.numerical**2, 0))[:, None]
+        noise = np.sqrt(np.maximum(fit.sigma**2 - fit.numerical**2, 0))
         common = rng.standard_normal((self.factors.views, size))[self.factors.view]
-        data = power[:, None] + noise * rng.standard_normal((len(power), size)) + fit.numerical[:, None] * common
+        data = power[:, None] + self.measurement.drawn(self.rows, self.signal(fit.x), noise, size, rng)
+        data += fit.numerical[:, None] * common
         data += between[:, None] * rng.standard_normal(size)
         right = self._right(design, data, fit.sigma, fit.weight)
         rough = self.smoothness.root.T @ rng.standard_normal((self.surface.unknowns, size))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -54,6 +55,8 @@ class Noise:
         samples gave, and the variance is a smooth function of the signal instead
     relative : relative standard error of the pixels' response, (views, h, w) or a number
     excess : F² of an electron-multiplying register, (views,) or a number
+    detector : (views,) number of the detector and flat field of each view: pixels of one have the same response in all
+        views
     """
 
     shot: Array
@@ -61,6 +64,7 @@ class Noise:
     sampled: NDArray[np.bool_]
     relative: Array | float = 0.0
     excess: Array | float = 1.0
+    detector: NDArray[np.int64] | int = 0
 
     def variance(self, signal: Array, used: NDArray[np.bool_]) -> Array:
         """Variance [W²] for a fitted signal [W], NaN where it is not known, of the pixels `used`; (views, h, w)."""
@@ -223,6 +227,24 @@ class Measurement:
             )
         return np.sqrt(variance)
 
+    def drawn(
+        self, rows: NDArray[np.int64], signal: Array, deviation: Array, size: int, rng: np.random.Generator
+    ) -> Array:
+        """Random noise (N, size) [W] of the pixels `rows` with a fitted signal [W] and the `deviation` (N,) [W] of it.
+
+        Its part by the response of a pixel (M.24) is the same in all views of one detector.
+        """
+        response = self.relative[rows] * np.maximum(signal, 0)
+        own = np.sqrt(np.maximum(deviation**2 - response**2, 0))
+        found = own[:, None] * rng.standard_normal((len(rows), size))
+        if response.any():
+            views, *film = self.noise.shot.shape
+            view, pixel = np.divmod(rows, math.prod(film))
+            detector = np.broadcast_to(self.noise.detector, views)[view]
+            each, number_ = np.unique(detector * math.prod(film) + pixel, return_inverse=True)
+            found += response[:, None] * rng.standard_normal((len(each), size))[number_]
+        return found
+
     def chi2(self, rows: NDArray[np.int64], signal: Array, sigma: Array) -> Chi2:
         """Σ (noise/σ)² of the pixels `rows` for a fitted signal [W] and its σ [W]."""
         images, used = self.as_images(rows, signal)
@@ -323,7 +345,18 @@ def noise_of(
                 f"{verb}: image {k} has neither 'electrons_per_watt' nor an error. Reduce it from its counts"
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
-    return Noise(shot, other, drawn, relative, excess)
+    return Noise(shot, other, drawn, relative, excess, _detectors(images))
+
+
+def _detectors(images: Sequence[Image]) -> NDArray[np.int64]:
+    """(views,) the same number for images of one detector, by its name, that were corrected by the same flat field."""
+    known: dict[object, int] = {}
+    flats = ((image.flat, image.flat_error) for image in images)
+    keys = [
+        (image.metadata.get("detector"), *(None if flat is None else flat.tobytes() for flat in own))
+        for image, own in zip(images, flats, strict=True)
+    ]
+    return np.array([known.setdefault(key, len(known)) for key in keys], np.int64)
 
 
 def without_glare(power: Array, noise: Noise, masks: NDArray[np.bool_], glare: float) -> tuple[Array, Noise]:
