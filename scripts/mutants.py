@@ -699,8 +699,8 @@ MUTANTS = (
     Mutant(
         "noise of the draws",
         "inverse/invert.py",
-        "noise * rng.standard_normal((len(power), size))",
-        "0.5 * noise * rng.standard_normal((len(power), size))",
+        "self.signal(fit.x), noise, size, rng)",
+        "self.signal(fit.x), 0.5 * noise, size, rng)",
         (INVERT,),
     ),
     Mutant(
