@@ -83,7 +83,8 @@ def import_flux(
 
 def _unit_entries(found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
     """Entries of the provenance: the unit of the mesh if it is neither mm nor `given`, and a warning of odd size."""
-    entries = {} if given or unit == "mm" else {"mesh_unit": f"{unit}, by the standard of its format; scaled to mm"}
+    scaled = f"{unit}, by the standard of its format; scaled to mm, values from W/{unit}^2 to W/mm^2"
+    entries = {} if given or unit == "mm" else {"mesh_unit": scaled}
     with np.errstate(over="ignore"):  # Phantom refuses vertices so far away
         diagonal = float(np.linalg.norm(np.ptp(found.vertices[found.faces].reshape(-1, 3), axis=0)))
     warning = unit_warning(diagonal, unit)

@@ -95,7 +95,9 @@ def test_a_glb_is_in_metres(tmp_path):
     phantom = import_flux(tmp_path / "mesh.glb", law(VERTICES))
     assert phantom.area == pytest.approx(1e6 * in_mm.area)
     assert phantom.power == pytest.approx(in_mm.power)
-    assert phantom.report()["mesh_unit"] == "m, by the standard of its format; scaled to mm"
+    assert (
+        phantom.report()["mesh_unit"] == "m, by the standard of its format; scaled to mm, values from W/m^2 to W/mm^2"
+    )
     assert "mesh_unit" not in in_mm.report()
 
 
@@ -328,6 +330,22 @@ def test_nirfast(tmp_path, suffix):
     np.testing.assert_array_equal(by_base_name.exitance, phantom.exitance)
     in_memory = import_flux((nodes, elements + 1), phi, format="nirfast")
     np.testing.assert_allclose(in_memory.exitance, phantom.exitance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_rows_that_are_numbered_in_another_order_are_refused(tmp_path, first):
+    """A table by nodes, sorted by something else: the values were taken in the order of the rows."""
+    ball = trimesh.creation.icosphere(1, 10.0)
+    numbers = np.arange(len(ball.vertices))
+    for order, good in ((numbers, True), (numbers[::-1], False)):
+        rows = [f"{first + k},{1e-6 * k}" for k in order]
+        (tmp_path / "jn.csv").write_text("\n".join(["node,jn", *rows]))
+        if good:
+            found = import_flux((ball.vertices, ball.faces), tmp_path / "jn.csv", field="jn")
+            np.testing.assert_allclose(found.exitance, 1e-6 * numbers)
+            continue
+        with pytest.raises(FluxError, match="column 1 numbers the rows, but not in ascending order"):
+            import_flux((ball.vertices, ball.faces), tmp_path / "jn.csv", field="jn")
 
 
 @pytest.mark.parametrize("number", [2, np.int64(2), "2"])
