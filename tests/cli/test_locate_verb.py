@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from cylinder_views import cylinder_views, exact
+from cylinder_views import cylinder_views, exact, tetrahedra_made_once
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.detector.reduction import read_measured
@@ -29,7 +29,8 @@ def folder(tmp_path_factory, mono):
         for k, plane in enumerate(matrix.forward(exact(vertices, [SOURCE], band))):
             exposure = CCD.expose(fspt.Image(plane, metadata={"pixel_pitch": 0.5}), 60, 650, seed=k)
             exposure.write(folder / f"{band}_{k}.exr")
-    return folder
+    with tetrahedra_made_once():
+        yield folder
 
 
 def names(band):

@@ -25,8 +25,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("tiles", [3, 8])
-@pytest.mark.parametrize("kind", SHAPES)
+@pytest.mark.parametrize(("kind", "tiles"), [("disk", 3), ("sphere", 8), ("cylinder", 3)])
 def test_bright_texels_of_a_tiled_bitmap_keep_their_light(kind, tiles):
     """Expected: the power of the surface form, which begins at the texels.
 
@@ -152,9 +151,10 @@ def test_an_exr_of_16_bit_floats_is_watts(tmp_path):
             world_scene(ball(bitmap))
 
 
-@pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize(
-    "value", [np.uint8(51), np.uint16(13107), np.float32(0.2)], ids=["whole", "whole of 16 bits", "float"]
+    ("value", "channels"),
+    [(np.uint8(51), 3), (np.uint16(13107), 1), (np.float32(0.2), 1)],
+    ids=["whole", "whole of 16 bits", "float"],
 )
 def test_raw_bitmaps_in_grey_are_watts(value, channels):
     """Expected: those of a number; whole numbers are shares of the largest, 255."""

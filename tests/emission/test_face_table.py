@@ -59,28 +59,34 @@ OBJECTS = MESHES | {
 }
 
 
-@pytest.mark.parametrize("build", OBJECTS.values(), ids=OBJECTS)
-def test_packets_of_lines_of_sight_meet_the_same_surfaces_as_single_ones(build, tmp_path, monkeypatch):
-    """Seen to fail with packets of which one line of sight in sixteen is lost."""
-    scene, found = build(tmp_path / "body.ply"), []
-    for most in (-1.0, np.inf):
-        monkeypatch.setattr("mitsuba_fspt.integral.pupil.node_sums.NODES_TOGETHER", most)
-        monkeypatch.setattr("mitsuba_fspt.integral.pupil.jumps.TRANSECTS_TOGETHER", most)
-        found.append(solved(scene, rtol=3e-3))
-    singly, together = found
-    np.testing.assert_allclose(together.power, singly.power, rtol=0, atol=10 * FLOAT32 * singly.power.max())
-    np.testing.assert_allclose(together.coverage, singly.coverage, atol=10 * FLOAT32)
-
-
 def by_table(solution):
     return {finding.name: finding.taken for finding in solution.findings}["record"]
 
 
-@pytest.mark.parametrize("build", MESHES.values(), ids=MESHES)
-def test_the_same_light_as_by_surface_records(build, tmp_path):
-    """Seen to fail without the normals, with corners in another order, and with all meshes' faces from number 0."""
-    scene = build(tmp_path / "body.ply")
-    table, record = solved(scene, rtol=3e-3), solved(scene, "record", rtol=3e-3)
+@pytest.mark.parametrize("name", OBJECTS)
+def test_the_same_light_as_by_surface_records_and_by_single_lines_of_sight(name, tmp_path, monkeypatch):
+    """The table against surface records on meshes; packets of lines of sight against single ones where there are
+    several kinds of surfaces, faces turned round, or no faces.
+
+    Seen to fail without the normals, with corners in another order, with all meshes' faces from number 0, and with
+    packets of which one line of sight in sixteen is lost.
+    """
+    scene = OBJECTS[name](tmp_path / "body.ply")
+    limits = "node_sums.NODES_TOGETHER", "jumps.TRANSECTS_TOGETHER"
+
+    def found(*without, most):
+        for limit in limits:
+            monkeypatch.setattr(f"mitsuba_fspt.integral.pupil.{limit}", most)
+        return solved(scene, *without, rtol=1e-2)
+
+    table = found(most=np.inf)
+    if name in ("several", "inside out", "ball", "tube"):
+        singly = found(most=-1.0)
+        np.testing.assert_allclose(table.power, singly.power, rtol=0, atol=10 * FLOAT32 * singly.power.max())
+        np.testing.assert_allclose(table.coverage, singly.coverage, atol=10 * FLOAT32)
+    if name not in MESHES:
+        return
+    record = found("record", most=np.inf)
     assert (by_table(table), by_table(record)) == (True, False)
     np.testing.assert_allclose(table.power, record.power, rtol=0, atol=1e-4 * record.power.max())
     assert np.median(np.abs(table.power - record.power)) <= FLOAT32 * record.power.max()

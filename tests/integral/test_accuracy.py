@@ -39,12 +39,8 @@ RTOL = 1e-3
 # Parts of the film (x, y, width, height): a corner, the brightest spot, edges, a sphere's edge behind another sphere.
 CASES = [
     ("nylon_cylinder", 0, 2.8, (16, 12, 8, 7)),
-    ("nylon_cylinder", 90, 2.8, (9, 5, 8, 7)),
-    ("nylon_cylinder", 0, 8.0, (24, 19, 8, 7)),
     ("nylon_cylinder", 90, 8.0, (16, 4, 8, 7)),
     ("two_spheres", 0, 2.8, (19, 8, 9, 8)),
-    ("two_spheres", 0, 8.0, (17, 8, 9, 8)),
-    ("textured_sphere", 0, 2.8, (16, 12, 8, 7)),
     ("textured_sphere", 90, 8.0, (13, 5, 8, 7)),
 ]
 
@@ -103,8 +99,8 @@ def painted_exitance(points):
 def test_every_pixel_is_as_accurate_as_asked(case):
     """Rationale: rtol bounds the error of every pixel relative to the brightest one.
 
-    Expected: no pixel differs from the reference by more than rtol. Seen to fail with cos⁴θ → cos³θ (all cases) and
-    with one bisection of each jump (where silhouettes are in focus).
+    Expected: no pixel differs from the reference by more than rtol. Seen to fail with cos⁴θ → cos³θ (but for the
+    middle of the film). Of jumps that are found too roughly: tests/integral/test_order.py.
     """
     image, expected, error = pictures(*case)
     assert image.shape == case[3][:1:-1]
@@ -117,7 +113,7 @@ def test_error_bounds_the_error():
     """Rationale: `error` is the estimated absolute error of each pixel.
 
     Expected: a bound for 99 pixels of 100, beside the standard error of the reference. Seen to fail with cos⁴θ → cos³θ
-    (48 of 100) and with a tenth of the error stated (83 of 100).
+    and with a tenth of the error stated (89 of 100).
     """
     bounded = [
         np.abs(image.power - expected) <= image.error + error
@@ -216,8 +212,7 @@ def test_pixels_beside_a_crop_window_are_not_refined():
     assert part.metadata["nodes"] < whole.metadata["nodes"] / 8
 
 
-@pytest.mark.parametrize("domain", ["pupil", "surface"])
-@pytest.mark.parametrize("depth", [FOCUS, FOCUS + 3])
+@pytest.mark.parametrize(("depth", "domain"), [(FOCUS, "pupil"), (FOCUS + 3, "pupil"), (FOCUS + 3, "surface")])
 def test_tolerance_is_a_share_of_the_brightest_pixel_of_the_crop_window(depth, domain):
     """A sphere beside a disk ten times as bright that ends at the edge of the window.
 
@@ -299,8 +294,7 @@ def rippled_power(depth, wave, angle, radius, side):
     return (side * radius / FOCUS) ** 2 * (glow * cos2**2) @ weight
 
 
-@pytest.mark.parametrize("angle", [0, 45])
-@pytest.mark.parametrize("rtol", [1e-2, 1e-4])
+@pytest.mark.parametrize(("rtol", "angle"), [(1e-2, 0), (1e-4, 45)])
 def test_ripples_finer_than_the_blur_are_seen(angle, rtol):
     """Rationale: J_n that rises and falls within the blur disc nearly averages out; four nodes see a part of it.
 

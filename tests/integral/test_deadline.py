@@ -16,7 +16,7 @@ from mitsuba_fspt.runtime.deadline import Deadline
 from mitsuba_fspt.runtime.errors import SceneError
 
 # How often work may be left out before it is: between the levels, or between batches of a thousand lines of sight.
-BETWEEN_LEVELS, BETWEEN_BATCHES = (0, 1, 2, 3, 5, 9, 30), (3, 5, 12)
+BETWEEN_LEVELS, BETWEEN_BATCHES = (0, 1, 3, 9, 30), (3, 12)
 
 
 class After(Deadline):
@@ -36,12 +36,12 @@ class After(Deadline):
 def scene_of(name):
     if name == "ball":
         return world_scene(ball(radius=12.0), sensor=lens(size=16, pitch=1.2, f_number=2.8))
-    return load_scene(name, crop=(4, 4, 20, 16))
+    return load_scene(name, crop=(10, 6, 12, 10))
 
 
 @pytest.mark.parametrize(("name", "batch"), [("ball", progress.BATCH), ("two_spheres", progress.BATCH >> 8)])
 def test_errors_bound_the_error_at_any_deadline(name, batch, monkeypatch):
-    """Against the image at a tenth of rtol: at most one pixel in a hundred is off by more than its error.
+    """Against the image at a fifth of rtol: at most one pixel in a hundred is off by more than its error.
 
     The errors fall, but for jumps that are found late. Seen to fail with the error 0 on pixels that a level has not
     reached, and with changes counted there.
@@ -51,7 +51,7 @@ def test_errors_bound_the_error_at_any_deadline(name, batch, monkeypatch):
     scene = scene_of(name)
     sensor, integrator = scene.sensors()[0], integrator_of(scene, "integral")
     quadrature = replace(integrator.quadrature, rtol=1e-3)
-    truth = integrator.solve(scene, sensor, replace(quadrature, rtol=1e-4))
+    truth = integrator.solve(scene, sensor, replace(quadrature, rtol=2e-4))
     sums = []
     for stop in stops:
         found = integrator.solve(scene, sensor, quadrature, deadline=(deadline := After(stop)))

@@ -44,18 +44,17 @@ def power_past(glowing, dark, f_number):
 
 PAST = [
     ((0.0, 0.0, 149.6, 2.5), (0.0, 3.0, 95.1, 5.0), 1.4),
-    ((2.0, 2.0, 149.6, 2.0), (1.0, 5.0, 95.1, 6.0), 2.8),
     ((3.5, -0.5, 149.6, 3.0), (2.0, 3.9, 95.1, 5.5), 1.4),
     ((-0.3, 2.7, 149.2, 4.8), (1.3, 0.7, 95.9, 6.1), 5.6),
 ]
-# Of the first and the last the dim disk sends its light from the surface, at 20000 lines a pixel as well as at 200000.
-DIM = list(zip([1e-7] * 4, PAST, [20_000, 200_000, 200_000, 20_000], strict=True))
+# Of the first the dim disk sends its light from the surface, at 20000 lines a pixel as well as at 200000.
+DIM = [(1e-7, PAST[0], 20_000), (1e-7, PAST[1], 200_000)]
 
 
-@pytest.mark.parametrize(("dim", "disks", "max_nodes"), [*((0, disks, 200_000) for disks in PAST), *DIM])
+@pytest.mark.parametrize(("dim", "disks", "max_nodes"), [(0, PAST[1], 200_000), (0, PAST[2], 200_000), *DIM])
 def test_light_past_a_dark_disk_arrives(disks, dim, max_nodes):
     """Seen to fail where dark outlines end a pixel's refinement: off by 0.05 to 0.23 of the brightest pixel, zeros
-    without an error. In the last case four nodes meet but the dark disk, and the image was black; in packets of rays,
+    without an error. Of the last pair four nodes meet but the dark disk, and the image was black; in packets of rays,
     which pass by the dark disk here and there, 0.35 of the peak shines through it. A disk that glows ever so little
     changes nothing: it settles no pixel either.
     """

@@ -98,19 +98,15 @@ def test_pupil_form_where_all_is_smooth(build):
     assert errors[3] < 5e-7
 
 
-@pytest.mark.parametrize(
-    "build",
-    [lambda: uniform(185.0, 14.0), lambda: rippled(167.0, 0.6)],
-    ids=["uniform J_n, blurred", "rippled J_n, nearly in focus"],
-)
-def test_surface_form_where_all_is_smooth(build):
+def test_surface_form_where_all_is_smooth():
     """Rationale: pieces of the surface and cells of the pupil, two dimensions each, are sampled in their middles, which
     leaves errors ∝ h²; with h ∝ lines^(-1/4) the order is 1/2.
 
-    Expected: order 0.4 over one and a half decades of work (measured 0.62 and 0.46) and, at rtol = 3e-3, an error of
-    5e-4. Seen to fail with the cosine at the surface dropped (0.32 and 0.18).
+    Expected, of rippled J_n nearly in focus: order 0.4 over one and a half decades of work (measured 0.46; of uniform
+    J_n, blurred, 0.62) and, at rtol = 3e-3, an error of 5e-4. Seen to fail with the cosine at the surface dropped
+    (0.18).
     """
-    scene, truth = build()
+    scene, truth = rippled(167.0, 0.6)
     rays, errors = measured(scene, truth, "surface", rtol=(0.3, 0.03, 1e-2, 3e-3))
     assert order(rays, errors) > 0.4
     assert errors[-1] < 5e-4
@@ -119,12 +115,10 @@ def test_surface_form_where_all_is_smooth(build):
 # --- where a silhouette crosses the pixels ---
 
 
-# Pitch, nodes of the reference, and objects from near to far: kind, centre, radius. All edges are out of focus.
+# Pitch, nodes of the reference, and an object: kind, centre, radius. All edges are out of focus.
 EDGED = {
     "disk": (0.6, 1 << 17, ("disk", (-37.0, -15.0, 140.0), 40.0)),
-    "sphere": (0.6, 1 << 17, ("sphere", (-40.0, -15.0, 225.0), 40.0)),
     "small sphere": (0.6, 1 << 15, ("sphere", (-12.0, -5.0, 185.0), 12.0)),
-    "two spheres": (0.6, 1 << 14, ("sphere", (1.0, -0.5, 145.0), 1.5), ("sphere", (-2.5, 0.0, 180.0), 5.0)),
 }
 
 
@@ -145,13 +139,11 @@ def edged_truth(name):
     return truth, np.sqrt(np.mean(error**2)) / truth.max()
 
 
-@pytest.mark.parametrize(
-    ("name", "least", "ceiling"), [("disk", 1.7, 1e-5), ("sphere", 1.7, 1e-5), ("small sphere", 1.2, 1e-4)]
-)
+@pytest.mark.parametrize(("name", "least", "ceiling"), [("disk", 1.7, 1e-5), ("small sphere", 1.2, 1e-4)])
 def test_pupil_form_where_one_edge_crosses_the_pixels(name, least, ceiling):
     """Rationale: transects find an edge by bisection, and only the three places along it are left to sample.
 
-    Expected, from 4 nodes to 72 transects: 1.7 where the edge is nearly straight (measured 2.05 and 2.20), above the
+    Expected, from 4 nodes to 72 transects: 1.7 where the edge is nearly straight (measured 2.05), above the
     1.5 that the estimate of the error counts on; 1.2 where the limb turns by 0.1 rad within a pixel (measured 1.46).
     The fit ends there: the last levels are made for whatever bends, and stay at 1e-5. Seen to fail with cos⁴θ → cos³θ
     (1.0 to 1.1), with four bisections of each edge (0.9 to 1.0) and with transects beside their places (0.3 to 0.6).
@@ -162,17 +154,13 @@ def test_pupil_form_where_one_edge_crosses_the_pixels(name, least, ceiling):
     assert errors[-1] < ceiling
 
 
-@pytest.mark.parametrize(
-    ("name", "rtols", "ceiling"),
-    [("small sphere", (0.3, 0.03, 1e-2, 1e-3), 2e-4), ("two spheres", (0.3, 0.03, 1e-2), 3e-3)],
-)
-def test_surface_form_where_edges_cross_the_pixels(name, rtols, ceiling):
+def test_surface_form_where_edges_cross_the_pixels():
     """Rationale: what faces away or is hidden is decided line by line, at places that fill surface and pupil evenly.
 
-    Expected: order 0.4, no worse than where all is smooth (measured 1.14 at a limb; 0.49 where one sphere hides a part
-    of another one). Seen to fail with the cosine at the surface dropped (0.0).
+    Expected: order 0.4, no worse than where all is smooth (measured 1.14 at a limb). Seen to fail with the cosine at
+    the surface dropped (0.0).
     """
-    scene, truth, floor = edged(name)
-    rays, errors = measured(scene, truth, "surface", rtol=rtols)
+    scene, truth, floor = edged("small sphere")
+    rays, errors = measured(scene, truth, "surface", rtol=(0.3, 0.03, 1e-2, 1e-3))
     assert order(rays, errors, floor) > 0.4
-    assert errors[-1] < ceiling
+    assert errors[-1] < 2e-4

@@ -212,7 +212,7 @@ def test_small_diaphragm_tends_to_the_pinhole():
     assert np.abs(wide / wide.max() - pinhole / pinhole.max()).max() > 0.1  # where the focus does matter
 
 
-BLUR_RTOL = 3e-4
+BLUR_RTOL = 6e-4
 
 
 def over_etendue(diameter, **lens):
@@ -229,7 +229,7 @@ def over_etendue(diameter, **lens):
 def test_diaphragm_tends_to_the_pinhole_through_five_decades_without_a_jump():
     """Rationale: lim D → 0 is the pinhole model; what refines a picture, and float32, must not show on the way.
 
-    Expected: of the peak, 3e-4 and what the blur changes in truth, ∝ D² here, 0.0055 (D/mm)² at most; and 3e-4 between
+    Expected: of the peak, 6e-4 and what the blur changes in truth, ∝ D² here, 0.0055 (D/mm)² at most; and 6e-4 between
     two D that differ by 1e-4 of themselves, silhouettes and covered silhouettes included.
     Seen to fail with a pupil 0.2 mm wider in radius than its étendue, and with D² → D^1.9999 in that.
     """
@@ -245,8 +245,8 @@ def test_diaphragm_tends_to_the_pinhole_through_five_decades_without_a_jump():
 def test_diaphragm_tends_to_hrrt_as_it_opens_to_the_lens_border():
     """Rationale: lim D → lens diameter is the model without a diaphragm.
 
-    Expected: of the peak, 3e-4 and what the blur changes in truth, ∝ what is left to open, 0.42 times here.
-    Seen to fail with the border 0.01 mm wider than it is.
+    Expected: of the peak, 6e-4 and what the blur changes in truth, ∝ what is left to open, 0.42 times here.
+    Seen to fail with the border 0.02 mm wider than it is.
     """
     open_ = over_etendue(20.0, model="hrrt", lens_diameter=20.0)
     for decade in (1, 4):

@@ -33,17 +33,16 @@ def both(scene, monkeypatch, side=SIDE, **accuracy):
 
 
 @pytest.mark.parametrize(
-    ("name", "accuracy"),
+    ("name", "film", "side", "accuracy"),
     [
-        ("two_spheres", {"rtol": 3e-3}),
-        ("nylon_cylinder", {"rtol": 3e-3, "pixel": "centre"}),
-        ("nylon_cylinder", {"rtol": 0.1, "domain": "surface"}),
+        ("nylon_cylinder", 160, 68, {"rtol": 3e-3, "pixel": "centre"}),
+        ("two_spheres", 96, 44, {"rtol": 0.1, "domain": "surface"}),
     ],
 )
-def test_tiles_and_one_piece_agree_within_the_errors_of_both(name, accuracy, monkeypatch):
-    """Seams that are smaller: `test_there_are_no_seams`."""
-    scene = scene_of(name, 160)
-    whole, tiled = both(scene, monkeypatch, 68, **accuracy)
+def test_tiles_and_one_piece_agree_within_the_errors_of_both(name, film, side, accuracy, monkeypatch):
+    """Seams that are smaller, by the pupil form of two bodies: `test_there_are_no_seams`."""
+    scene = scene_of(name, film)
+    whole, tiled = both(scene, monkeypatch, side, **accuracy)
     assert len(tiles_of(visible_window(scene, scene.sensors()[0].camera))) > 3
     apart, errors = np.abs(tiled.power - whole.power), tiled.error + whole.error
     assert (apart <= errors).all()
@@ -62,7 +61,8 @@ def test_there_are_no_seams(monkeypatch):
     Seen to fail with tiles without a rim.
     """
     scene = scene_of("two_spheres", 160)
-    whole, tiled = both(scene, monkeypatch, 68, rtol=1e-3)
+    whole, tiled = both(scene, monkeypatch, 68, rtol=3e-3)
+    assert (np.abs(tiled.power - whole.power) <= tiled.error + whole.error).all()
     apart = np.abs(tiled.power - whole.power) / whole.power.max()
     seam = np.zeros(apart.shape, bool)
     for tile in tiles_of(visible_window(scene, scene.sensors()[0].camera)):
@@ -71,7 +71,7 @@ def test_there_are_no_seams(monkeypatch):
             seam[row, left : left + tile.full[1]] = True
             seam[top : top + tile.full[0], column] = True
     lit = whole.power > 0
-    assert apart[seam & lit].mean() < 1e-5
+    assert apart[seam & lit].mean() < 3e-5
 
 
 def test_a_dim_tile_takes_no_more_lines_than_the_bright_one_asks_for(monkeypatch):

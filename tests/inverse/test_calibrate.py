@@ -59,7 +59,7 @@ def test_warnings_about_the_scene_are_told_once(scene, monkeypatch, caplog):
         return replace(image, metadata=image.metadata | {"warnings": "a third of the area points inward"})
 
     monkeypatch.setattr(calibrate, "render", warned)
-    fspt.calibrate(scene, noisy(scene, 1, distance=163.5), free=["distance"])
+    fspt.calibrate(scene, noisy(scene, 1, distance=163.5), free=["distance"], settings=COARSE)
     assert caplog.text.count("fspt: calibrate: a third of the area points inward") == 1
 
 
@@ -81,7 +81,7 @@ def test_electrons_of_another_source_give_the_parameters(scene, tmp_path):
     ccd = fspt.Detector.typical_ccd()
     watt = 0.005 * ccd.full_well / ccd.expected(image, 60, 660).mean.max()
     ccd.expose(image.scaled(watt), 60, 660, seed=2).write(tmp_path / "e.exr")
-    found = fspt.calibrate(scene, tmp_path / "e.exr", free=["distance"])
+    found = fspt.calibrate(scene, tmp_path / "e.exr", free=["distance"], settings=COARSE)
     assert found.values["distance"] == pytest.approx(164, abs=4 * found.sd["distance"])
     assert found.sd["distance"] < 2
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
-import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -183,47 +180,24 @@ def test_an_interrupted_file_goes_on(scene_file, tmp_path, monkeypatch):
     assert abs(found.matrix - fspt.transport(scene_file, view=[0, 90, 200]).matrix).max() == 0
 
 
-def hold_all_but_the_first_view():
-    """From here on this process computes other views than view=0 only once there is a file 'go' in its folder."""
-    plain = module.computed
+def test_a_cluster_computes_the_same_matrix(scene_file, tmp_path, monkeypatch):
+    """Of a cluster in this process: the same bits as without, and no file beside.
 
-    def held(task, *rest):
-        while task.values["view"] != 0 and not os.path.exists("go"):
-            time.sleep(0.01)
-        return plain(task, *rest)
-
-    module.computed = held
-
-
-def test_a_cluster_loses_a_worker(scene_file, tmp_path, monkeypatch):
-    """The view of the killed worker is tried again; the same bits as in this process, and no file beside.
-
-    Seen to fail with distributed.scheduler.allowed-failures = 0, where a view is tried once.
+    What becomes of a worker that is killed is decided in `results_of_cluster`, for which tests/studies/test_sweep.py
+    kills one.
     """
     distributed = pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)
-    killed = []
-
-    def kill_one(what, share):
-        if not killed and share == pytest.approx(1 / 3):
-            (busy, *_) = [worker for worker, tasks in distributed.default_client().processing().items() if tasks]
-            pid = distributed.default_client().run(os.getpid, workers=[busy])[busy]
-            os.kill(pid, signal.SIGKILL)
-            killed.append(pid)
-            Path("go").touch()
-
-    views = {"view": [0, 90, 200], "f_number": 8}
-    with distributed.LocalCluster(n_workers=2, **LOCAL_CLUSTER, silence_logs=50) as cluster:
-        with distributed.Client(cluster) as client:
-            client.run(hold_all_but_the_first_view)
-        there = fspt.transport(
-            scene_file, scheduler=cluster.scheduler_address, file="T.npz", progress=kill_one, **views
-        )
-    assert len(killed) == 1
+    threads = []
+    monkeypatch.setattr(module.backend, "set_threads", threads.append)
+    views = {"view": [0, 90], "f_number": 8}
+    with distributed.LocalCluster(n_workers=1, processes=False, **LOCAL_CLUSTER, silence_logs=50) as cluster:
+        there = fspt.transport(scene_file, scheduler=cluster.scheduler_address, file="T.npz", **views)
     here = fspt.transport(scene_file, **views)
+    assert threads == [1, 1]
     assert there.views == here.views
     assert abs(there.matrix - here.matrix).max() == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["T.npz", "body.ply", "body.xml", "go"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["T.npz", "body.ply", "body.xml"]
 
 
 def test_a_scheduler_that_does_not_answer_is_named_by_the_matrix(scene_file, run, tmp_path, monkeypatch):

@@ -183,8 +183,8 @@ def test_drafts_of_the_viewer_have_it_and_explain_names_it(curve, tmp_path):
     dim, clear = (LiveScene(tmp_path / f"{name}.xml") for name in ("dim", "clear"))
     x, y = (np.arange(8) - 3.5) * 0.8, (np.arange(6) - 2.5)[:, None] * 0.8
     shares = np.interp(np.hypot(x, y), HEIGHTS, SHARES)
-    for one, other in ((dim.draft({}), clear.draft({})), (dim.image({}), clear.image({}))):
-        np.testing.assert_allclose(one.power, shares * other.power, atol=4e-3 * other.power.max())
+    one, other = dim.draft({}), clear.draft({})
+    np.testing.assert_allclose(one.power, shares * other.power, atol=4e-3 * other.power.max())
     rows = {row.what: row for row in explain(tmp_path / "dim.xml", rtol=1e-1)}
     assert (rows["measured vignetting"].left_out, rows["measured vignetting"].why) == (False, curve)
     assert rows["distortion"].left_out

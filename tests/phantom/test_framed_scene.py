@@ -32,9 +32,9 @@ def box(path, size=(20, 8, 60), centre=(100, -40, 7), face=False):
     return write_ply(path, corners, faces, **glow)
 
 
-@pytest.mark.parametrize("view", [0, 90, 37])
-def test_it_is_the_shipped_scene_to_the_last_bit(view):
+def test_it_is_the_shipped_scene_to_the_last_bit():
     """Seen to fail with the turn clockwise, and with the camera focused on the axis."""
+    view = 37
     text = fspt.scene_xml(CYLINDER, focal_length=55, f_number=8, magnification=0.5, **SMALL)
     image = fspt.render(fspt.load(text, view=view, rtol=1e-2))
     shipped = fspt.render(fspt.load(SCENES / "nylon_cylinder.xml", view=view, rtol=1e-2, **SMALL))
@@ -52,10 +52,9 @@ def test_the_text_has_the_defaults_of_the_shipped_scenes():
 
 
 @pytest.mark.parametrize(
-    ("size", "film", "side"),
-    [((20, 8, 60), (40, 32), 0), ((60, 8, 6), (40, 32), 1), ((5, 5, 5), (24, 60), 1)],
+    ("focal_length", "size", "film", "side"),
+    [(105, (20, 8, 60), (40, 32), 0), (12, (60, 8, 6), (40, 32), 1), (105, (5, 5, 5), (24, 60), 1)],
 )
-@pytest.mark.parametrize("focal_length", [12, 105])
 def test_the_phantom_fills_most_of_the_film_and_is_whole_in_every_view(tmp_path, size, film, side, focal_length):
     """Far from the world's origin, too; the widest view reaches 0.8 to 1 of the film's height or width."""
     text = fspt.scene_xml(

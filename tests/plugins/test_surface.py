@@ -545,8 +545,7 @@ def test_corners_of_all_elements_are_found(kind):
         assert float(dr.max(dr.norm(si.p - mi.Point3f(7, -3, 165)))[0]) < 6 * np.sqrt(3) + 1e-4
 
 
-@pytest.mark.parametrize("angle", [0, 90, 180])
-@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+@pytest.mark.parametrize(("kind", "angle"), [("sphere", 90), ("cylinder", 90), ("cylinder", 180)])
 def test_elements_of_turned_shapes_lie_where_their_parameters_say(kind, angle):
     """Rationale: shapes turned by 90° do not find some of their own points when asked for them by (u, v).
 
@@ -564,6 +563,6 @@ def test_elements_of_turned_shapes_lie_where_their_parameters_say(kind, angle):
     si, _ = elements.place(dr.arange(mi.UInt32, elements.count), mi.Point2f(0.3, 0.6))
     u, v = (number % elements.side + 0.3) / elements.side, (number // elements.side + 0.6) / elements.side
     np.testing.assert_allclose(si.uv.numpy(), [u, v], atol=1e-5)
-    traced, integral = fspt.render(scene, method="ptracer", spp=512, seed=1), fspt.render(scene, rtol=1e-3)
+    traced, integral = fspt.render(scene, method="ptracer", spp=128, seed=1), fspt.render(scene, rtol=1e-3)
     noise = np.sqrt((traced.error**2).sum())
     assert traced.power.sum() == pytest.approx(integral.power.sum(), abs=4 * noise + 1e-3 * integral.power.sum())

@@ -26,14 +26,13 @@ def power(*bodies, camera=CAMERA, stops=None, pixel="area", goal=1e-6):
     return FanReference(camera, stops or Stops.of(camera), bodies, pixel).power(PIXELS, goal * peak, most=2048)
 
 
-@pytest.mark.parametrize("pixel", ["area", "centre"])
 @pytest.mark.parametrize(
-    "shape",
+    ("shape", "pixel"),
     [
-        Sphere([0, 1, 170], 6.0),
-        Disc([2, 0, 150], [0.3, 0.1, -1.0], 5.0),
-        Rectangle([1, 1, 175], [-5, 1, 0.3], [0.5, 2.5, 0.0]),
-        Cylinder([0, 0, 168], [1.0, 0.4, 0.2], 3.0, 11.0),
+        (Sphere([0, 1, 170], 6.0), "area"),
+        (Disc([2, 0, 150], [0.3, 0.1, -1.0], 5.0), "centre"),
+        (Rectangle([1, 1, 175], [-5, 1, 0.3], [0.5, 2.5, 0.0]), "area"),
+        (Cylinder([0, 0, 168], [1.0, 0.4, 0.2], 3.0, 11.0), "centre"),
     ],
 )
 def test_it_is_the_lattice_reference(shape, pixel):

@@ -98,7 +98,9 @@ def test_fine_mesh_of_a_sphere_converges_to_the_sphere():
     exact, _ = pupil_form(lens, [Sphere(centre, 4.0)], wavy, 2**15, "lattice")
     off = []
     for subdivisions in (2, 3, 4):
-        power, _ = mesh_truth(lens, ball_mesh(centre, 4.0, subdivisions, wavy), levels=((128, 8),))
+        power, _ = mesh_truth(
+            lens, ball_mesh(centre, 4.0, subdivisions, wavy), levels=((128, 4 if subdivisions < 4 else 8),)
+        )
         off.append(1 - power.sum() / exact.sum())
     assert 0 < off[2] < 1e-3
     assert rms(power - exact) < 1e-3 * exact.max()

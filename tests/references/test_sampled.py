@@ -38,7 +38,7 @@ def test_uniform_sheet_meets_the_closed_form(distance, pixel):
     assert error.max() < 1e-4 * power.max()
 
 
-@pytest.mark.parametrize("focus_distance", [165.0, 190.0, 230.0])
+@pytest.mark.parametrize("focus_distance", [165.0, 230.0])
 def test_power_is_conserved_at_every_focus(focus_distance):
     """Rationale: Σ P = ∫_S J_n f dS does not depend on the focus: refocusing conserves the light.
     Expected: to 1e-4, the silhouette's error at 2048 lines of sight a pixel.
@@ -77,18 +77,14 @@ def test_power_follows_the_squared_diameter_down_to_the_pinhole():
 
 @pytest.mark.parametrize(
     ("body", "pixel"),
-    [
-        (Sphere([2, 1, 205.0], 9.0), "centre"),
-        (Sphere([1, -1, 115.0], 8.0), "centre"),
-        (Cylinder([0, 1, 215.0], [0.3, 1, 0.4], 7.0, 16.0), "area"),
-    ],
+    [(Sphere([1, -1, 115.0], 8.0), "centre"), (Cylinder([0, 1, 215.0], [0.3, 1, 0.4], 7.0, 16.0), "area")],
 )
 def test_pupil_form_and_surface_form_are_one_integral(body, pixel):
     """Rationale: dS |cos θ_s|/|r_vd − r|² = dA_a cos θ/|r_vd − a|² turns one into the other, on both sides.
     Expected: within the errors stated, and 5e-3 of the peak, silhouettes included; in the sum 5e-4.
     """
     lens = camera(pixel_pitch=1.6)
-    by_pupil, error = pupil_form(lens, [body], wavy, 2**14, "lattice", pixel)
+    by_pupil, error = pupil_form(lens, [body], wavy, 2**13, "lattice", pixel)
     by_surface, other = surface_form(lens, body, wavy, 2**18, pixel)
     assert np.count_nonzero(by_pupil) > 8
     assert rms(by_surface - by_pupil) < np.hypot(rms(error), rms(other))

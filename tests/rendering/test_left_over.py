@@ -30,8 +30,10 @@ print(fspt.render(fspt.load("good.xml"), **settings).power.max())
 """
 
 
-@pytest.mark.parametrize("method", ["integral", "path"])
-@pytest.mark.parametrize("what", FAILING)
+@pytest.mark.parametrize(
+    ("what", "method"),
+    [("a shape", "integral"), ("a lens", "path"), ("another shape", "integral"), ("its own light", "path")],
+)
 def test_a_scene_that_failed_leaves_the_next_one_alone(tmp_path, what, method):
     """Its emitter may outlive its shape, which Dr.Jit has it look for; seen to crash the process."""
     write_scene(tmp_path / "good.xml")

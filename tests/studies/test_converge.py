@@ -26,6 +26,8 @@ from mitsuba_fspt.studies.convergence_report import COLUMNS, png_file, write_csv
 ALL = ["integral", "integral, surface form", "sum over points"]
 ALL += [f"path, {sampler}" for sampler in converge_methods.SAMPLERS] + ["ptracer"]
 
+SAMPLERS = ("multijitter", "independent", "stratified")
+
 # --- what follows from the numbers ---
 
 
@@ -122,8 +124,7 @@ def test_text_and_json_contain_the_results():
 # --- what is measured ---
 
 
-@pytest.mark.parametrize("errors", [[0.1], [0.1, 0.01], [0.0]])
-@pytest.mark.parametrize("stated", [0.0, 1e-7])
+@pytest.mark.parametrize(("errors", "stated"), [([0.1], 1e-7), ([0.1, 0.01], 0.0), ([0.0], 0.0)])
 def test_a_picture_of_few_settings_or_without_an_error_of_the_reference(tmp_path, errors, stated):
     """Seen to fail: warnings of an axis that starts at 0."""
     few = found(*(row("ptracer", error, (0.001,)) for error in errors), stated=stated)
@@ -145,21 +146,24 @@ def short(monkeypatch):
 
 
 @pytest.mark.usefixtures("mono", "short")
-def test_every_method_comes_nearer_with_its_knob(tmp_path):
+def test_every_method_comes_nearer_with_its_knob(tmp_path, monkeypatch):
     """Expected: nearer by a third at the least; 64 times the samples give a factor of 8 by the law of Monte Carlo.
 
+    The samplers are Mitsuba's own, of which three of five are enough here.
     A quarter of a sphere behind the virtual detector plane, as blurred as the sum over points needs it.
     """
+    monkeypatch.setattr(converge_methods, "SAMPLERS", SAMPLERS)
+    methods = [name for name in ALL if not name.startswith("path") or name.split()[1] in SAMPLERS]
     across, down = 10, 8
     crop = (WIDTH // 2, HEIGHT // 2, across, down)
     scene = small_scenes.camera_scene(small_scenes.sphere(220.0, 6.0), exitance=1e-3, crop=crop)
     told = fspt.converge(scene, rounds=1, budget=100.0)
-    assert told.methods == ALL
+    assert told.methods == methods
     assert told.skipped == {}
     assert 0 < told.full < across * down
     assert told.stated < 1e-3
     assert told.raw_rate > 0
-    for method in ALL:
+    for method in methods:
         rows = told.of(method)
         assert rows[-1].rms < rows[0].rms / 1.5, method
         assert rows[-1].rms < 0.05, method
@@ -322,10 +326,10 @@ def test_the_verb_writes_its_files_and_prints_the_table(tmp_path, capfd, monkeyp
     assert "reference: r.npz, stated error 1.0e-03 RMS" in out
     assert "| path, multijitter " in out
     assert sorted(os.listdir("out")) == ["s_converge.csv", "s_converge.png"]
-    monkeypatch.setattr(converge_methods, "SAMPLERS", ("independent",))
+    monkeypatch.setattr(converge, "converge", lambda *_, **__: found(row("path, independent")))
     assert app.run(["converge", "s.xml", *options, "--json"]) == 0
     told = json.loads(capfd.readouterr().out)
-    assert told["shape"] == [6, 8]
+    assert told["shape"] == [2, 3]
     assert {line["method"] for line in told["rows"]} == set(told["methods"])
 
 

@@ -507,11 +507,21 @@ def test_a_parameter_named_like_a_column(tmp_path):
         fspt.sweep(path, {"power": [1, 2]}, "o")
 
 
-@pytest.mark.parametrize("how", [{}, {"jobs": 2}, {"jobs": 1, "scheduler": "local"}])
-def test_points_that_fail_are_named_and_leave_the_others(tmp_path, how):
+@pytest.fixture
+def cluster_here(monkeypatch):
+    """Address of a cluster whose worker is this process."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr("mitsuba_fspt.studies.point_renderer.set_threads", lambda count: None)
+    with distributed.LocalCluster(n_workers=1, processes=False, **workers.LOCAL_CLUSTER, silence_logs=50) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.mark.parametrize("where", ["here", "processes", "cluster"])
+def test_points_that_fail_are_named_and_leave_the_others(tmp_path, where, request):
     """Seen to fail: what came after the first of them was not rendered."""
-    if "scheduler" in how:
-        pytest.importorskip("distributed")
+    how = {"jobs": 2} if where == "processes" else {}
+    if where == "cluster":
+        how = {"scheduler": request.getfixturevalue("cluster_here")}
     sensor = LENS_XML.replace('"0.8"', '"$pitch"')
     path = write_scene(tmp_path / "x.xml", sensor='<default name="pitch" value="1"/>' + sensor)
     told = []
@@ -520,10 +530,10 @@ def test_points_that_fail_are_named_and_leave_the_others(tmp_path, how):
     assert told[-1] == 1
     assert sorted(os.listdir("o")) == ["index.csv", "x_pitch=0.4.exr", "x_pitch=0.8.exr"]
     assert len((tmp_path / "o" / "index.csv").read_text().splitlines()) == 3
-    if "scheduler" in how:  # one way of several processes is enough for the line
+    if how:  # the line is the same however the points are shared out
         return
     with pytest.raises(fspt.FsptError) as caught:
-        fspt.sweep(path, {"pitch": [-1, 0.8, -2, -3]}, "o", **how)
+        fspt.sweep(path, {"pitch": [-1, 0.8, -2, -3]}, "o")
     assert re.search(r"^pitch=-1: .* 3 of 4 points failed; the others: pitch=-2, pitch=-3\.$", str(caught.value))
     assert len((tmp_path / "o" / "index.csv").read_text().splitlines()) == 2
 
