@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
+# Numbers of the lens that images and views are compared by, beside those of `REAL_LENS`.
+LENS = (
+    *("focal_length", "f_number", "magnification", "model", "transmittance"),
+    *("lens_diameter", "diaphragm_distance", "image_stop_diameter", "numerical_aperture"),
+)
 # What a real lens adds: name, key by which images and views are compared, and its value for a lens without it.
 REAL_LENS: dict[str, tuple[str, object]] = {
     "pupil_magnification": ("pupil_magnification", 1.0),
@@ -365,9 +370,10 @@ def _differences(
     digest = metadata.get("mesh_digest")
     if digest is not None and not same_mesh(str(digest), str(matrix.metadata["mesh_digest"])):
         notes.append(f"image {number} shows another mesh than the one of the matrix.")
-    for name in ("focal_length", "f_number", "magnification", "model"):
-        if name in metadata and name in lens and metadata[name] != lens[name] and name not in other:
-            notes.append(f"image {number} has {name} = {metadata[name]}, its view of the matrix {lens[name]}.")
+    for name in LENS if "focal_length" in metadata else ():
+        if metadata.get(name) != lens.get(name) and name not in other:
+            given, own = (of.get(name, "none") for of in (metadata, lens))
+            notes.append(f"image {number} has {name} = {given}, its view of the matrix {own}.")
     for name, (key, usual) in REAL_LENS.items() if "focal_length" in metadata else ():
         if metadata.get(key, usual) != lens.get(key, usual) and name not in other:
             given = (of.get(name, usual) for of in (metadata, lens))

@@ -233,6 +233,10 @@ def test_images_are_held_against_the_views(scene_file, matrix, caplog):
     assert [record.getMessage() for record in caplog.records] == [
         "fspt: image 0 shows another mesh than the one of the matrix."
     ]
+    for name, value, own in (("transmittance", 0.5, 1.0), ("lens_diameter", 30.0, "none")):
+        caplog.clear()  # the power is that through a filter, J_n would be half of what it is
+        matrix.backward([fspt.Image(image.power, metadata=image.metadata | {name: value}) for image in images])
+        assert caplog.messages == [f"fspt: image 0 has {name} = {value}, its view of the matrix {own}."]
     caplog.clear()
     counts = [np.full(image.shape, 600) for image in images]
     camera = fspt.Detector.typical_ccd()
