@@ -130,15 +130,6 @@ def test_monte_carlo_agrees_where_silhouettes_cross_the_border():
     assert image.power.sum() < 0.95 * whole.sum()
 
 
-def test_both_domains_agree():
-    body = sphere(158.0, 3.0, 8.5, -3.0)
-    view = camera_scene(body, image_stop_diameter=STOP)
-    pupil, surface = (fspt.render(view, domain=domain, rtol=5e-3) for domain in ("pupil", "surface"))
-    np.testing.assert_allclose(pupil.power, surface.power, atol=5e-3 * pupil.power.max())
-    assert (np.abs(pupil.power - surface.power) <= pupil.error + surface.error).all()
-    assert np.any(pupil.power != surface.power)
-
-
 def test_at_pixel_centres_the_stop_takes_whole_pixels():
     """`pixel = centre` is the value at the centre times the area, in the paper's way."""
     free, stopped = (
@@ -150,11 +141,13 @@ def test_at_pixel_centres_the_stop_takes_whole_pixels():
 
 
 def test_a_stop_wider_than_the_film_changes_no_bit():
-    body = sphere(150.0, 6.0)
+    body, quarter = sphere(150.0, 6.0), (10, 8, 10, 8)
     for domain in ("pupil", "surface"):
         free, wide = (
-            power(camera_scene(body, **s), domain=domain, rtol=0.1) for s in ({}, {"image_stop_diameter": 100.0})
+            power(camera_scene(body, crop=quarter, **s), domain=domain, rtol=0.1)
+            for s in ({}, {"image_stop_diameter": 100.0})
         )
+        assert free.any()
         np.testing.assert_array_equal(free, wide)
 
 

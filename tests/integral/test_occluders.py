@@ -51,7 +51,7 @@ PAST = [
 DIM = [(1e-7, PAST[0], 20_000), (1e-7, PAST[1], 200_000)]
 
 
-@pytest.mark.parametrize(("dim", "disks", "max_nodes"), [(0, PAST[1], 200_000), (0, PAST[2], 200_000), *DIM])
+@pytest.mark.parametrize(("dim", "disks", "max_nodes"), [(0, PAST[2], 200_000), *DIM])
 def test_light_past_a_dark_disk_arrives(disks, dim, max_nodes):
     """Seen to fail where dark outlines end a pixel's refinement: off by 0.05 to 0.23 of the brightest pixel, zeros
     without an error. Of the last pair four nodes meet but the dark disk, and the image was black; in packets of rays,

@@ -63,15 +63,6 @@ def test_warnings_about_the_scene_are_told_once(scene, monkeypatch, caplog):
     assert caplog.text.count("fspt: calibrate: a third of the area points inward") == 1
 
 
-def test_monte_carlo_gives_the_parameters_of_its_scene(scene):
-    """An image by `path` with its own standard error; gain beside the distance."""
-    image = fspt.render(fspt.load(scene, distance=164), method="path", spp=512, seed=4)
-    found = fspt.calibrate(scene, image, free=["distance", "gain"], settings=COARSE)
-    assert found.values["gain"] == pytest.approx(1, abs=4 * found.sd["gain"])
-    assert found.values["distance"] == pytest.approx(164, abs=4 * found.sd["distance"])
-    assert found.covariance.shape == (2, 2)
-
-
 def test_electrons_of_another_source_give_the_parameters(scene, tmp_path):
     """The file that `expose` writes of the scene with a source far below 1 W: the images are of that source, too.
 

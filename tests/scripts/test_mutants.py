@@ -27,7 +27,7 @@ def test_a_text_that_is_not_there_is_refused():
         mutants.Mutant("square", "a.py", "x**2", "x", ()).applied("x**3")
 
 
-@pytest.mark.parametrize(("expected", "result"), [("4", "caught"), ("2 + 2", "caught"), ("code.area(2)", "survived")])
+@pytest.mark.parametrize(("expected", "result"), [("2 + 2", "caught"), ("code.area(2)", "survived")])
 def test_a_mutant_is_caught_by_a_test_alone(tmp_path, expected, result):
     """The last test compares the code with itself."""
     (tmp_path / "mitsuba_fspt").mkdir()
