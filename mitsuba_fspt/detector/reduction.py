@@ -10,6 +10,7 @@ of a flat field below 1 collects fewer electrons per watt, flat · k. The image 
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import os
@@ -44,10 +45,20 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
+DIGITS = 16  # of the digest of a subtracted frame
 DARKER = 5.0  # standard deviations of a total below 0: noise makes more once in 3 million images
 REPLACED = (
     *("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"),
-    *("flat_kind", "flat_masked_pixels", "em_gain", "excess_noise", "spurious_charge", "prnu"),
+    *(
+        "frame_electrons",
+        "frame_digest",
+        "flat_kind",
+        "flat_masked_pixels",
+        "em_gain",
+        "excess_noise",
+        "spurious_charge",
+        "prnu",
+    ),
     *(name + end for name in MAPPED for end in (MAP, DIGEST)),
 )
 OPTIONAL = ("pixel_pitch", "em_gain", "excess_noise", "spurious_charge", "prnu")  # entries that an exposure may lack
@@ -200,8 +211,17 @@ def reduce_counts(
     independent = detector.excess * charge + gain**2 / 12 + raw.frames * added  # gain²/12: variance of the rounding
     mask = full | rays | corrections.bad(shape)
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
+    if np.any(added):
+        noise: Metadata = {"frame_electrons": float(np.median(added)) * raw.frames**2, "frame_digest": _digest(level)}
+        image = replace(image, metadata=image.metadata | noise)
     _report_darkness(image)
     return image
+
+
+def _digest(level: Array | float) -> str:
+    """Digest of a subtracted frame, the same for a constant more, such as the dark current of another time."""
+    pixels = np.ravel(level)
+    return hashlib.sha256((np.round(pixels - pixels[0], 3) + 0.0).tobytes()).hexdigest()[:DIGITS]
 
 
 def _tell_time(raw: Counts, exposed: Exposed) -> None:

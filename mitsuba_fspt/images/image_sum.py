@@ -18,6 +18,7 @@ from .pixel_axes import PixelAxes
 from .z_test import is_deterministic
 
 Sum = TypeVar("Sum", bound=ImageData)
+FRAME = ("frame_electrons", "frame_digest")  # of a subtracted frame
 SQUARES = ("read_noise", "dark_electrons")  # numbers of the noise that add up, the former in squares
 
 
@@ -30,6 +31,8 @@ def combined(one: Sum, other: ImageData, sign: int) -> Sum:
         power[mask] = 0
     coverage = one.coverage if _same(one.coverage, other.coverage) else None
     known = _metadata(one, other) | _source_power(one, other, sign)
+    for name in FRAME:  # of which each of the two may have another share
+        known.pop(name, None)
     if gain_error := max(image.gain_error or 0.0 for image in (one, other)):
         known["gain_error"] = gain_error
     planes: dict[str, Any] = dict.fromkeys(BESIDE)

@@ -30,12 +30,14 @@ class NoiseModel:
     dark : [W²], variance without light: read-out, dark current, spurious charge, rounding, subtracted frames
     relative : relative standard error of the pixel's response
     excess : F²
+    frame : [W²], the part of `dark` by a subtracted frame, which is the same in all images that it was subtracted from
     """
 
     shot: Array
     dark: Array
     relative: Array
     excess: float
+    frame: Array
 
     @classmethod
     def of(cls, image: ImageData, thing: str = "image") -> NoiseModel | None:
@@ -58,7 +60,9 @@ class NoiseModel:
         each = np.full(image.shape, per_watt) if image.flat is None else per_watt * image.flat.astype(np.float64)
         noise = math.hypot(read, math.sqrt(dark)) if image.dark_noise is None else image.dark_noise.astype(np.float64)
         error = 0.0 if image.flat_error is None else image.flat_error.astype(np.float64)
-        return cls(excess / each, (noise / each) ** 2, np.hypot(error, np.full(image.shape, prnu)), excess)
+        frame = number(f"{thing}, 'frame_electrons'", image.metadata.get("frame_electrons", 0.0), ImageError, "1.2")
+        relative = np.hypot(error, np.full(image.shape, prnu))
+        return cls(excess / each, (noise / each) ** 2, relative, excess, max(frame, 0.0) / each**2)
 
     def variance(self, power: Array) -> Array:
         """Variance [W²] for the light `power` [W]; that of a negative one is the variance without light."""

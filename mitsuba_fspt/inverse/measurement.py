@@ -57,6 +57,8 @@ class Noise:
     excess : F² of an electron-multiplying register, (views,) or a number
     detector : (views,) number of the detector and flat field of each view: pixels of one have the same response in all
         views
+    frame : [W²], (views, h, w) or a number, the part of `other` by a subtracted frame
+    subtracted : (views,) number of that frame: the noise of one is the same in all views
     """
 
     shot: Array
@@ -65,6 +67,8 @@ class Noise:
     relative: Array | float = 0.0
     excess: Array | float = 1.0
     detector: NDArray[np.int64] | int = 0
+    frame: Array | float = 0.0
+    subtracted: NDArray[np.int64] | int = 0
 
     def variance(self, signal: Array, used: NDArray[np.bool_]) -> Array:
         """Variance [W²] for a fitted signal [W], NaN where it is not known, of the pixels `used`; (views, h, w)."""
@@ -232,17 +236,20 @@ class Measurement:
     ) -> Array:
         """Random noise (N, size) [W] of the pixels `rows` with a fitted signal [W] and the `deviation` (N,) [W] of it.
 
-        Its part by the response of a pixel (M.24) is the same in all views of one detector.
+        Its parts by the response of a pixel (M.24) and by a subtracted frame are the same in all views of one detector
+        or frame.
         """
         response = self.relative[rows] * np.maximum(signal, 0)
-        own = np.sqrt(np.maximum(deviation**2 - response**2, 0))
+        frame = np.sqrt(np.broadcast_to(self.noise.frame, self.noise.shot.shape).ravel()[rows])
+        own = np.sqrt(np.maximum(deviation**2 - response**2 - frame**2, 0))
         found = own[:, None] * rng.standard_normal((len(rows), size))
-        if response.any():
-            views, *film = self.noise.shot.shape
-            view, pixel = np.divmod(rows, math.prod(film))
-            detector = np.broadcast_to(self.noise.detector, views)[view]
-            each, number_ = np.unique(detector * math.prod(film) + pixel, return_inverse=True)
-            found += response[:, None] * rng.standard_normal((len(each), size))[number_]
+        views, *film = self.noise.shot.shape
+        view, pixel = np.divmod(rows, math.prod(film))
+        for common, kind in ((response, self.noise.detector), (frame, self.noise.subtracted)):
+            if common.any():
+                of_view = np.broadcast_to(kind, views)[view]
+                each, number_ = np.unique(of_view * math.prod(film) + pixel, return_inverse=True)
+                found += common[:, None] * rng.standard_normal((len(each), size))[number_]
         return found
 
     def chi2(self, rows: NDArray[np.int64], signal: Array, sigma: Array) -> Chi2:
@@ -311,7 +318,8 @@ def noise_of(
         raise InversionError(
             f"{verb}: 'sampled' must be True or False, got {sampled!r}. Give True for images of a Monte Carlo."
         )
-    shot, other, relative, excess = np.zeros(shape), np.zeros(shape), np.zeros(shape), np.ones(shape[0])
+    shot, other, relative, frame = (np.zeros(shape) for _ in range(4))
+    excess = np.ones(shape[0])
     drawn = np.full(shape[0], bool(sampled))
     if error is not None:
         other[...] = _checked_error(error, shape, verb) ** 2
@@ -337,6 +345,7 @@ def noise_of(
                     f"{verb}: image {k} has the noise of electrons, not that of a Monte Carlo. Leave out 'sampled'."
                 )
             shot[k], other[k], relative[k], excess[k] = model.shot, model.dark, model.relative, model.excess
+            frame[k] = model.frame
         elif image.error is not None:
             other[k] = image.error.astype(np.float64) ** 2
             drawn[k] |= "passes" in image.metadata
@@ -345,17 +354,24 @@ def noise_of(
                 f"{verb}: image {k} has neither 'electrons_per_watt' nor an error. Reduce it from its counts"
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
-    return Noise(shot, other, drawn, relative, excess, _detectors(images))
+    frames = _numbered([image.metadata.get("frame_digest") for image in images])
+    return Noise(shot, other, drawn, relative, excess, _detectors(images), frame, frames)
 
 
 def _detectors(images: Sequence[Image]) -> NDArray[np.int64]:
     """(views,) the same number for images of one detector, by its name, that were corrected by the same flat field."""
-    known: dict[object, int] = {}
     flats = ((image.flat, image.flat_error) for image in images)
-    keys = [
-        (image.metadata.get("detector"), *(None if flat is None else flat.tobytes() for flat in own))
-        for image, own in zip(images, flats, strict=True)
-    ]
+    return _numbered(
+        [
+            (image.metadata.get("detector"), *(None if flat is None else flat.tobytes() for flat in own))
+            for image, own in zip(images, flats, strict=True)
+        ]
+    )
+
+
+def _numbered(keys: Sequence[object]) -> NDArray[np.int64]:
+    """Number of each key, the same for equal ones."""
+    known: dict[object, int] = {}
     return np.array([known.setdefault(key, len(known)) for key in keys], np.int64)
 
 
@@ -382,7 +398,8 @@ def without_glare(power: Array, noise: Noise, masks: NDArray[np.bool_], glare: f
     level = glare * np.nan_to_num(filled).mean(axis=(1, 2), keepdims=True)
     share, light = 1 - glare, np.maximum(level, 0)
     other = (noise.other + noise.shot * light + (noise.relative * light) ** 2) / share**2
-    return (power - level) / share, replace(noise, shot=noise.shot / share, other=other)
+    frame = noise.frame / share**2
+    return (power - level) / share, replace(noise, shot=noise.shot / share, other=other, frame=frame)
 
 
 def _median_around(images: Array) -> Array:

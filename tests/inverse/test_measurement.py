@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from sphere_views import passes_of
 
+from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.inverse.measurement import Measurement, Noise, noise_of, tell_misfit
 from mitsuba_fspt.runtime.errors import InversionError
@@ -99,6 +100,29 @@ def test_the_response_of_a_pixel_is_the_same_in_all_views_of_a_detector():
         assert np.var(drawn) == pytest.approx(2500 + 100**2, rel=0.03)
         assert found[:3, 3:].diagonal() == pytest.approx(3 * [share], abs=0.03)
         assert abs(found[0, [1, 2, 4, 5]]).max() < 0.03
+
+
+def test_the_noise_of_a_subtracted_frame_is_the_same_in_all_views():
+    """No light, one dark frame for two images: half of the variance is common to them; none with a frame for each."""
+    pytest.importorskip("ccdproc")
+    camera, none = Detector.typical_ccd(), Image(np.zeros((4, 4)))
+    counts = [camera.expose(none, 60, 650, seed=k).counts for k in range(4)]
+    rows = np.array([1, 5, 7, 17, 21, 23])
+    for darks, share in (((2, 2), 0.5), ((2, 3), 0.0)):
+        images = [
+            camera.reduce(counts[k], exposure_time=60, wavelength_nm=650, dark=counts[d]) for k, d in enumerate(darks)
+        ]
+        noise = noise_of((2, 4, 4), images)
+        measurement = Measurement(np.zeros(32), noise, np.zeros(32, bool), 0.0, matrix=None)
+        deviation = np.sqrt(noise.other.ravel()[rows])
+        drawn = measurement.drawn(rows, np.zeros(6), deviation, 20000, np.random.default_rng(1))
+        assert np.var(drawn, axis=1) == pytest.approx(deviation**2, rel=0.05)
+        found = np.corrcoef(drawn)
+        assert found[:3, 3:].diagonal() == pytest.approx(3 * [share], abs=0.03)
+        assert abs(found[0, [1, 2, 4, 5]]).max() < 0.03
+    both = images[0] + images[1]  # with another share of either frame
+    assert not {"frame_electrons", "frame_digest"} & set(both.metadata)
+    assert noise_of((1, 4, 4), [both]).frame.max() == 0
 
 
 @pytest.mark.parametrize(("electrons", "read_noise"), [(0.02, 0.0), (0.5, 0.0), (3.0, 1.0), (1000.0, 3.5)])
