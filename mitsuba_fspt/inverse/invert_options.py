@@ -36,10 +36,11 @@ class Options:
         object.__setattr__(self, "crease_angle", angle)
         if self.method not in ("smooth", "mlem"):
             raise InversionError(f"invert: 'method' must be 'smooth' or 'mlem', got {self.method!r}. Give one of them.")
-        if self.method == "mlem" and (self.samples or self.weight or self.gain_per_view):
+        smooth = self.weight or self.crease_angle != CREASE_ANGLE
+        if self.method == "mlem" and (self.samples or smooth or self.gain_per_view):
             raise InversionError(
-                "invert: method 'mlem' has no weight and no intervals, nor factors of views. Leave out weight, samples "
-                "and gain_per_view."
+                "invert: method 'mlem' has no weight, creases and intervals, nor factors of views. Leave out weight, "
+                "crease_angle, samples and gain_per_view."
             )
         if self.weight is not None:
             weight = number("invert: 'weight'", self.weight, InversionError, "1.0")

@@ -276,6 +276,8 @@ def test_mlem(case):
     assert -1e-3 < minus(found.solution / 1e-3)[0] - best.fun < found.decrement / 2
     with pytest.raises(InversionError, match="no weight and no intervals"):
         fspt.invert(matrix, images, method="mlem", samples=20)
+    with pytest.raises(InversionError, match="method 'mlem' has no weight, creases"):
+        fspt.invert(matrix, images, method="mlem", crease_angle=20)
     with pytest.raises(InversionError, match="'method' must be"):
         fspt.invert(matrix, images, method="art")
     with pytest.raises(InversionError, match="needs electrons"):
