@@ -274,7 +274,7 @@ def test_mlem(case):
     best = minimize(minus, np.ones(matrix.shape[1]), jac=True, bounds=[(0, None)] * matrix.shape[1], method="L-BFGS-B",
                     options={"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14, "gtol": 1e-8})  # fmt: skip
     assert -1e-3 < minus(found.solution / 1e-3)[0] - best.fun < found.decrement / 2
-    with pytest.raises(InversionError, match="no weight and no intervals"):
+    with pytest.raises(InversionError, match="no weight, creases and intervals"):
         fspt.invert(matrix, images, method="mlem", samples=20)
     with pytest.raises(InversionError, match="method 'mlem' has no weight, creases"):
         fspt.invert(matrix, images, method="mlem", crease_angle=20)
