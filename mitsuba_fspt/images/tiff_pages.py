@@ -49,6 +49,7 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
                 raise ValueError("its pages follow each other in a circle")
             series = file.series[0]
             images, turned = _upright(series)
+            inverted = series.keyframe.photometric == tifffile.PHOTOMETRIC.MINISWHITE
             missing = sum(page is None for page in series.pages)
     except Exception as cause:  # whatever a damaged file makes tifffile raise
         raise _damaged(thing, cause) from cause
@@ -63,6 +64,10 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
         LOG.warning("fspt: %s: tifffile reports: %s%s. Check the image.", thing, one_line(texts[0], LONGEST_TEXT), more)
     if turned != 1:
         LOG.warning("fspt: %s: its rows do not begin at the top left (Orientation %d); it is turned.", thing, turned)
+    if inverted:
+        LOG.warning(
+            "fspt: %s: it says that 0 is white (PhotometricInterpretation 0); more is taken as more light.", thing
+        )
     return images
 
 

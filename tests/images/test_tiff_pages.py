@@ -60,6 +60,15 @@ def test_images_are_turned_upright(tmp_path, caplog, orientation):
     assert len(caplog.messages) == (orientation != 1)
 
 
+def test_a_picture_of_which_0_is_white_is_reported(tmp_path, caplog):
+    """Its values are taken as they are, as by ImageJ, which shows them inverted."""
+    for kind, lines in (("minisblack", 0), ("miniswhite", 1)):
+        tifffile.imwrite(tmp_path / "counts.tif", FRAMES[0], photometric=kind)
+        np.testing.assert_array_equal(read_tiff(tmp_path / "counts.tif", "counts"), FRAMES[0])
+        assert [text for text in caplog.messages if "says that 0 is white" in text] == caplog.messages
+        assert len(caplog.messages) == lines
+
+
 @pytest.mark.parametrize(
     "how",
     [
