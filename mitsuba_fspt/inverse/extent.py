@@ -179,7 +179,8 @@ class Profile:
         near = [self._known[k][1] for k in ((at - 1, at) if at else (0, 0))]
         share = (square - squares[at - 1]) / (squares[at] - squares[at - 1]) if at else 0.0
         noise = [self._fit.covariance(one) for one in near]
-        sd = [np.sqrt(np.diag(a + self._fit.by_model(one, a))) for one, a in zip(near, noise, strict=True)]
+        beyond = [self._fit.by_model(one, a) + self._fit.by_common(one, a) for one, a in zip(near, noise, strict=True)]
+        sd = [np.sqrt(np.diag(a + b)) for a, b in zip(noise, beyond, strict=True)]
         each = [(one.values, b) for one, b in zip(near, sd, strict=True)]
         values, deviations = ((1 - share) * a + share * b for a, b in zip(*each, strict=True))
         return values, deviations

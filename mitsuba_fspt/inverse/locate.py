@@ -226,7 +226,8 @@ def _located(fit: SourceFit, spreads: Sequence[Sequence[Spread]], options: _Opti
     order = np.argsort(-found.powers, kind="stable")
     found, extents = found.sorted(), [profiles[k].extent() for k in order] if profiles else None
     noise = fit.covariance(found)
-    covariance, linear = noise + fit.by_model(found, noise), fit.is_linear(found, noise, z)
+    covariance = noise + fit.by_model(found, noise) + fit.by_common(found, noise)
+    linear = fit.is_linear(found, noise, z)
     p_values = fit.p_values(found, len(grid.inner), numbers)
     _tell(linear, p_values, count, options.settings)
     power = fit.power / fit.factors(found)[fit.view]

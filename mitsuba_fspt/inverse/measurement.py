@@ -236,20 +236,31 @@ class Measurement:
     ) -> Array:
         """Random noise (N, size) [W] of the pixels `rows` with a fitted signal [W] and the `deviation` (N,) [W] of it.
 
-        Its parts by the response of a pixel (M.24) and by a subtracted frame are the same in all views of one detector
-        or frame.
+        A part of it is the same in several views, see `common`.
+        """
+        parts = self.common(rows, signal)
+        own = np.sqrt(np.maximum(deviation**2 - sum(part**2 for part, _ in parts), 0))
+        found = own[:, None] * rng.standard_normal((len(rows), size))
+        for part, shared in parts:
+            found += part[:, None] * rng.standard_normal((shared.max() + 1, size))[shared]
+        return found
+
+    def common(self, rows: NDArray[np.int64], signal: Array) -> list[tuple[Array, NDArray[np.int64]]]:
+        """Noise of the pixels `rows` that views have in common, by the response (M.24) and by a subtracted frame.
+
+        Of each its standard deviation (N,) [W], and a number (N,), the same for the same pixel of one detector or
+        frame.
         """
         response = self.relative[rows] * np.maximum(signal, 0)
         frame = np.sqrt(np.broadcast_to(self.noise.frame, self.noise.shot.shape).ravel()[rows])
-        own = np.sqrt(np.maximum(deviation**2 - response**2 - frame**2, 0))
-        found = own[:, None] * rng.standard_normal((len(rows), size))
         views, *film = self.noise.shot.shape
         view, pixel = np.divmod(rows, math.prod(film))
-        for common, kind in ((response, self.noise.detector), (frame, self.noise.subtracted)):
-            if common.any():
+        found = []
+        for part, kind in ((response, self.noise.detector), (frame, self.noise.subtracted)):
+            if part.any():
                 of_view = np.broadcast_to(kind, views)[view]
-                each, number_ = np.unique(of_view * math.prod(film) + pixel, return_inverse=True)
-                found += common[:, None] * rng.standard_normal((len(each), size))[number_]
+                shared = np.unique(of_view * math.prod(film) + pixel, return_inverse=True)[1]
+                found.append((part, shared.astype(np.int64)))
         return found
 
     def chi2(self, rows: NDArray[np.int64], signal: Array, sigma: Array) -> Chi2:

@@ -327,6 +327,21 @@ class SourceFit:
         change = covariance @ (found.slopes.T @ found.noise.over(self.model_errors(found)))
         return np.asarray(change @ change.T)
 
+    def by_common(self, found: PointSources, covariance: Array) -> Array:
+        """(4K, 4K) covariance of the `values` by noise that views have in common, beyond that of as much noise without.
+
+        The fit weighs pixels as independent ones.
+        """
+        lever = found.noise.over(found.sigma[:, None] * found.slopes) @ covariance
+        extra = np.zeros_like(covariance)
+        for band, part in zip(self.bands, self.parts, strict=True):
+            for deviation, shared in band.measurement.common(band.rows, found.signal[part]):
+                change = lever[part] * (deviation / found.sigma[part])[:, None]
+                sums = np.zeros((shared.max() + 1, change.shape[1]))
+                np.add.at(sums, shared, change)
+                extra += sums.T @ sums - change.T @ change
+        return extra
+
     def p_values(self, found: PointSources, places: int, numbers: int = 4) -> Array:
         """(K,) probability, at most, that noise alone makes a source fit as well as each of these.
 

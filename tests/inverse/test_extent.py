@@ -109,6 +109,7 @@ def test_ends_of_a_parabola(height, square, by_model):
         minimum=minimum,
         covariance=lambda _: np.eye(4),
         by_model=lambda *_: np.zeros((4, 4)),
+        by_common=lambda *_: np.zeros((4, 4)),
     )
     found = SimpleNamespace(positions=np.zeros((1, 3)), radii=np.zeros(1))
     profile = Known(fit, found, 0, 1.645, ExtentSettings())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from sphere_views import passes_of
@@ -9,6 +11,8 @@ from sphere_views import passes_of
 from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.inverse.measurement import Measurement, Noise, noise_of, tell_misfit
+from mitsuba_fspt.inverse.source_fit import SourceFit
+from mitsuba_fspt.inverse.view_factors import PixelNoise
 from mitsuba_fspt.runtime.errors import InversionError
 
 
@@ -123,6 +127,28 @@ def test_the_noise_of_a_subtracted_frame_is_the_same_in_all_views():
     both = images[0] + images[1]  # with another share of either frame
     assert not {"frame_electrons", "frame_digest"} & set(both.metadata)
     assert noise_of((1, 4, 4), [both]).frame.max() == 0
+
+
+@pytest.mark.parametrize("factors", [0.0, 0.1])
+def test_noise_in_common_widens_the_intervals_of_sources(factors):
+    """Two views of 6 pixels, 0.6 of the variance in common: the covariance of weighted least squares is exact."""
+    rng = np.random.default_rng(2)
+    rows, sigma, signal, shape = np.array([0, 1, 3, 4, 6, 7, 9, 11]), rng.uniform(1, 2, 8), np.zeros(8), (2, 2, 3)
+    frame = np.zeros(12)
+    frame[rows] = 0.6 * sigma**2
+    noise = Noise(np.zeros(shape), np.zeros(shape), np.zeros(2, bool), frame=frame.reshape(shape))
+    measurement = Measurement(np.zeros(12), noise, np.zeros(12, bool), 0.0, matrix=None)
+    own = PixelNoise(sigma, factors * rng.uniform(1, 2, 8), rows // 6)
+    changes = rng.uniform(0.5, 1.5, (8, 4)) + np.eye(8, 4)
+    found = SimpleNamespace(noise=own, sigma=sigma, signal=signal, slopes=own.over(changes))
+    fit = SimpleNamespace(bands=[SimpleNamespace(measurement=measurement, rows=rows)], parts=[slice(0, 8)])
+    covariance = np.linalg.inv(found.slopes.T @ found.slopes)
+    extra = SourceFit.by_common(fit, found, covariance)
+    estimate = covariance @ found.slopes.T @ own.over(np.eye(8))  # of the values, from the residuals [W]
+    shared = 0.6 * np.outer(sigma, sigma) * ((rows % 6)[:, None] == rows % 6)
+    expected = estimate @ (shared - np.diag(np.diag(shared))) @ estimate.T
+    np.testing.assert_allclose(extra, expected, rtol=1e-9, atol=1e-12 * abs(expected).max())
+    assert abs(extra).max() > 0.1 * abs(covariance).max()
 
 
 @pytest.mark.parametrize(("electrons", "read_noise"), [(0.02, 0.0), (0.5, 0.0), (3.0, 1.0), (1000.0, 3.5)])
