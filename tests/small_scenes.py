@@ -64,6 +64,21 @@ def look_at_crop(scene, x, y, width, height):
     film.update()
 
 
+def by_elements(scene, **accuracy):
+    """Image of a scene by the elements of all surfaces, also of meshes: by none of the code of images by faces.
+
+    `accuracy`: of `Quadrature`.
+    """
+    from mitsuba_fspt.camera.of_sensor import camera_of
+    from mitsuba_fspt.integral.quadrature import Quadrature
+    from mitsuba_fspt.integral.solver import Solver
+    from mitsuba_fspt.integral.surface import surface_form
+
+    camera = camera_of(scene.sensors()[0])
+    window = Solver().visible_window(scene, camera, False, ())
+    return surface_form.solve(scene, camera, window, Quadrature(**accuracy))
+
+
 def camera_scene(*shapes, exitance=1.0, crop=None, lamp=None, bodies=(), **optics):
     """Scene of shapes that glow with `exitance` [W/mm²], unless they bring their own 'emitter', before the lens.
 

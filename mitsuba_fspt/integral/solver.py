@@ -24,7 +24,7 @@ from .lines.eq9 import View
 from .lines.nested_bsdfs import check_followed
 from .lines.scene_checks import check_scene, check_surfaces_alone
 from .lines.specular import Specular
-from .lines.traced_scene import TracedScene, poses_of
+from .lines.traced_scene import TracedScene, pose_of, positions_of
 from .lines.visible_window import glowing_boxes
 from .progress import Progress
 from .pupil import interpolated, pupil_form
@@ -34,6 +34,8 @@ from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
 from .surface import face_image, surface_form
+from .surface.face_image import FaceImage
+from .surface.face_light import FaceLight
 from .tiles import Mosaic
 from .work_log import WorkLog
 
@@ -51,7 +53,8 @@ class Solver:
     def __init__(self) -> None:
         # A reference to the scene itself would be a cycle: the integrator that holds this solver is its child.
         self._traced = TracedScene()
-        self._window, self._narrow, self._edge_on, self._faces, self._grid_of_blocks = (CachedValue() for _ in range(5))
+        self._window, self._narrow, self._edge_on = (CachedValue() for _ in range(3))
+        self._faces, self._seen_faces, self._grid_of_blocks = (CachedValue() for _ in range(3))
 
     def solve(
         self,
@@ -133,13 +136,23 @@ class Solver:
         edition = editions_of(shapes)
         return None if edition is None else self._faces.recall(edition, lambda: FaceTable.of(shapes))
 
+    def _faces_seen(self, window: Window, view: View, convex: bool) -> list[FaceLight]:
+        """`face_image.faces_seen` on the pixels of a window; cached."""
+        scene, camera = view.scene, view.camera
+        shapes = scene.shapes()
+        state = (editions_of(shapes), [pose_of(shape) for shape in shapes], camera.state, window, convex)
+        find = partial(face_image.faces_seen, scene, camera, window, convex)
+        return self._seen_faces.recall(state, find, positions_of(shapes))
+
     def _narrow_light(self, view: View, window: Window) -> NarrowLight:
         """Light of bodies and spots that lines of sight may miss; cached."""
-        return self._narrow.recall(_seen_state(view, window), lambda: narrow_light(_points(view), window))
+        held = positions_of(view.scene.shapes())
+        return self._narrow.recall(_seen_state(view, window), lambda: narrow_light(_points(view), window), held)
 
     def _light_edge_on(self, view: View, window: Window) -> NDArray[np.float64]:
         """`NarrowLight.edge_on` on the pixels of a window; cached."""
-        return self._edge_on.recall(_seen_state(view, window), lambda: edge_on_light(_points(view), window))
+        held = positions_of(view.scene.shapes())
+        return self._edge_on.recall(_seen_state(view, window), lambda: edge_on_light(_points(view), window), held)
 
     def _fill(
         self,
@@ -181,8 +194,7 @@ class Solver:
         inside, cut = window.field_stop(camera)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
-            known = surface_form.solve(scene, camera, window, quadrature, None, least_peak, progress, specular)
-            return _with_dark_coverage(known, view, window)
+            return self._by_surface(window, view, quadrature, least_peak, progress)
         blocks, why = self._blocks(view, window, quadrature)
         if blocks:
             if solution := self._by_blocks(view, blocks, quadrature, least_peak, progress):
@@ -198,11 +210,9 @@ class Solver:
         light, form = narrow.in_focus, partial(pupil_form.solve, view, window, quadrature, edge_on=narrow.edge_on)
         if progress.deadline.passed():
             where = np.zeros(window.shape, bool)
-        by_faces, by_elements, on_faces = None, where, np.zeros(window.shape, bool)
-        if not (everywhere or specular) and face_image.applies(scene, quadrature):
-            by_faces = face_image.FaceImage(scene, camera, window, quadrature, peak)
-            on_faces = where & window.fully_open(camera)
-            by_elements = where & ~on_faces
+        by_faces = self._face_image(window, view, quadrature, peak)
+        on_faces = where & window.fully_open(camera) if by_faces else np.zeros(window.shape, bool)
+        by_elements = where & ~on_faces
         if by_elements.any():
             part, rest = progress.part(0, 2), progress.part(1, 2)
             known = surface_form.solve(scene, camera, window, quadrature, by_elements, peak, part, specular)
@@ -216,6 +226,28 @@ class Solver:
             solution = form(light, None, least_peak, progress)
         solution = replace(solution, findings=(Finding("smooth blocks", False, why), *solution.findings))
         return _with_missed(solution, narrow, on_faces | by_elements | ~(inside | cut), cut, window, view)
+
+    def _by_surface(
+        self, window: Window, view: View, quadrature: Quadrature, least_peak: float, progress: Progress
+    ) -> Solution:
+        """Solution by the surface form alone: from the faces of meshes, from elements of other surfaces."""
+        scene, camera = view.scene, view.camera
+        dark_too = not quadrature.takes("dark")
+        by_faces = self._face_image(window, view, quadrature, least_peak, dark_too)
+        if by_faces and window.fully_open(camera).all():
+            known = by_faces.run(np.ones(window.shape, bool), least_peak, progress, surface_form.MOST_LINES)
+        else:
+            known = surface_form.solve(scene, camera, window, quadrature, None, least_peak, progress, view.specular)
+        return _with_dark_coverage(known, view, window)
+
+    def _face_image(
+        self, window: Window, view: View, quadrature: Quadrature, least_peak: float, dark_too: bool = True
+    ) -> FaceImage | None:
+        """Image by the faces of all emitters, None where it does not apply."""
+        if view.specular or not face_image.applies(view.scene, quadrature):
+            return None
+        seen = partial(self._faces_seen, window, view, quadrature.takes("occlusion"))
+        return FaceImage(view.scene, view.camera, window, quadrature, least_peak, seen, dark_too)
 
     def _blocks(self, view: View, window: Window, quadrature: Quadrature) -> tuple[tuple[Blocks, ...], str]:
         """Blocks of pixels between which the image may be interpolated; the reason if there are none."""
@@ -252,7 +284,8 @@ def _seen_state(view: View, window: Window) -> tuple[object, ...]:
     scene, specular = view.scene, view.specular
     editions = [edition_of(emitter) for emitter in scene.emitters()]
     through = specular.state() if specular else ()
-    return editions, glowing_boxes(scene), poses_of(scene.shapes()), through, view.camera.state, window
+    poses = [pose_of(shape) for shape in scene.shapes()]
+    return editions, glowing_boxes(scene), poses, through, view.camera.state, window
 
 
 def _refuse_bending(specular: Specular | None, quadrature: Quadrature) -> None:

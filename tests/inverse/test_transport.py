@@ -16,6 +16,7 @@ from small_scenes import (
     RADIUS,
     WIDTH,
     attribute,
+    by_elements,
     filled,
     glow,
     lens,
@@ -167,7 +168,7 @@ def test_faces_of_many_pixels_far_out_of_focus(tmp_path):
     matrix = fspt.transport(scene, rtol=RTOL)
     exitance = 0.1 + np.random.default_rng(3).random(matrix.shape[1])
     shine(scene, "vertex", exitance)
-    image = fspt.render(scene, method="integral", rtol=RTOL / 10, domain="surface", max_nodes=1 << 13)
+    image = by_elements(scene, rtol=RTOL / 10, max_nodes=1 << 13)
     off = np.abs(matrix.forward(exitance)[0] - image.power)
     assert (off - image.error).max() <= RTOL * image.power.max()
     assert (off <= matrix.error(exitance)[0] + image.error).mean() > 0.99
@@ -275,7 +276,7 @@ def test_a_column_alone_is_the_image_of_one_vertex(tmp_path):
         exitance = np.zeros(len(fine))
         exitance[vertex] = 1
         shine(scene, "vertex", exitance)
-        image = fspt.render(scene, method="integral", rtol=1e-2, domain="surface", max_nodes=1 << 14)
+        image = by_elements(scene, rtol=1e-2, max_nodes=1 << 14)
         column = matrix.forward(exitance)[0]
         peak = image.power.max()
         assert 0 < image.error.max() <= bound / 2 * peak, vertex

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from small_scenes import attribute, ball, glow, lens, mi, world_scene, write_ply
+from small_scenes import attribute, ball, by_elements, glow, lens, mi, world_scene, write_ply
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.integral.rows import exitance_rows
@@ -175,12 +175,12 @@ def test_texels_of_a_bitmap():
 
 
 def test_forward_mode_is_the_image_of_the_tangent(tmp_path):
-    """By the surface form, which finds the steps between small faces more exactly."""
+    """By elements of the surface, which find the steps between small faces more exactly."""
     on = "vertex"
     scene = mesh_scene(tmp_path, on)
     key = f"shape_0.{on}_exitance"
     tangent = VALUES[on][::-1].copy()
-    expected = fspt.render(mesh_scene(tmp_path, on, tangent), domain="surface", rtol=RTOL / 2)
+    expected = by_elements(mesh_scene(tmp_path, on, tangent), rtol=RTOL / 2)
     off = np.abs(forward(scene, key, tangent)[..., 0] - expected.power)
     assert (off - expected.error).max() <= RTOL * expected.power.max()
 

@@ -48,14 +48,13 @@ class TracedScene:
             if robust is scene:
                 self._lossless, self._robust = marks, None
                 return scene
-            positions = tuple(buffers(shape)[0] for shape in shapes if shape.is_mesh())
-            self._robust = old = RobustCopy(robust, state, positions)
+            self._robust = old = RobustCopy(robust, state, positions_of(shapes))
         return old.scene
 
 
-def poses_of(shapes: list[mi.Shape]) -> list[tuple[float, ...]]:
-    """Poses of shapes, which may hide one another; empty for a single shape."""
-    return [pose_of(shape) for shape in shapes] if len(shapes) > 1 else []
+def positions_of(shapes: list[mi.Shape]) -> tuple[mi.Float, ...]:
+    """Vertex buffers of all meshes, whose indices are part of their poses."""
+    return tuple(buffers(shape)[0] for shape in shapes if shape.is_mesh())
 
 
 def pose_of(shape: mi.Shape) -> tuple[float, ...]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -32,6 +32,7 @@ from ..lines.eq9 import most_radiance
 from ..lines.occlusion import hides_nothing
 from ..progress import SILENT, Progress
 from ..quadrature import TOGETHER, Quadrature
+from ..shortcuts import Finding
 from ..solution import Solution
 from .column_canvas import ColumnCanvas, Windows
 from .column_form import FaceLines, falloff_on_pixels
@@ -68,17 +69,37 @@ def applies(scene: mi.Scene, quadrature: Quadrature) -> bool:
     )
 
 
+def faces_seen(scene: mi.Scene, camera: Camera, window: Window, convex: bool = True) -> list[FaceLight]:
+    """Faces of each emitting mesh as the camera sees them on a window, without a second border of the lens.
+
+    convex : a single convex shape is searched for no occluders
+    """
+    camera = camera.without_borders()
+    seen = [FaceLight.seen(surface, camera, window.corner, window.shape) for surface in surfaces_of(scene)]
+    return seen if convex and hides_nothing(scene) else [faces.behind(scene, camera) for faces in seen]
+
+
 class FaceImage:
     """The pixels of a `window` by faces, for scenes to which this `applies`.
 
-    A second border of the lens is ignored: only pixels that are `Window.fully_open` are right.
+    A second border of the lens is ignored: only pixels that are `Window.fully_open` are right. `seen`: gives what
+    `faces_seen` returns for this scene, camera and window, where that is kept. `dark_too`: faces on which J_n = 0 are
+    laid, too, for the coverage.
     """
 
     def __init__(
-        self, scene: mi.Scene, camera: Camera, window: Window, quadrature: Quadrature, least_peak: float = 0.0
+        self,
+        scene: mi.Scene,
+        camera: Camera,
+        window: Window,
+        quadrature: Quadrature,
+        least_peak: float = 0.0,
+        seen: Callable[[], list[FaceLight]] | None = None,
+        dark_too: bool = True,
     ) -> None:
-        self.scene, self.window, self.quadrature = scene, window, quadrature
+        self.scene, self.window, self.quadrature, self.dark_too = scene, window, quadrature, dark_too
         self.camera = camera.without_borders()
+        self._seen = seen or partial(faces_seen, scene, camera, window, quadrature.takes("occlusion"))
         self.surfaces = surfaces_of(scene)
         self.most = max(s.brightest for s in self.surfaces) or 1.0  # J_n in units of which light is laid [W/mm²]
         self.value, self.error, self.coverage = (np.zeros(window.shape) for _ in range(3))
@@ -88,16 +109,9 @@ class FaceImage:
         self.plans: list[Plan] = []
 
     @cached_property
-    def alone(self) -> bool:
-        """True if nothing hides a part of a surface."""
-        return hides_nothing(self.scene)
-
-    @cached_property
     def faces(self) -> list[FaceLight]:
         """Faces of each mesh as the camera sees them."""
-        window = self.window
-        seen = [FaceLight.seen(s, self.camera, window.corner, window.shape) for s in self.surfaces]
-        return seen if self.alone else [faces.behind(self.scene, self.camera) for faces in seen]
+        return self._seen()
 
     @cached_property
     def exitance(self) -> list[tuple[mi.Float, ...]]:
@@ -120,20 +134,21 @@ class FaceImage:
         y, x = np.divmod(np.arange(math.prod(self.window.shape)), self.window.shape[1])
         return falloff_on_pixels(self.camera, x, y, self.window.corner).reshape(self.window.shape)
 
-    def run(self, where: NDArray[np.bool_], least_peak: float, progress: Progress = SILENT) -> Solution:
+    def run(
+        self, where: NDArray[np.bool_], least_peak: float, progress: Progress = SILENT, most: int = OTHERS
+    ) -> Solution:
         """Power [W], error [W] and coverage of the crop window, complete on the pixels marked in `where` (h, w).
 
         least_peak : lower bound of the brightest pixel's mean radiance on film [W/mm²/sr]
-
-        From the third level on, a level is entered only if its images take less time than the lines of sight that its
-        pixels take otherwise.
+        most : lines of sight a pixel in whose time a level from the third on may be computed, at most half of
+            `max_nodes`
         """
         self.error = np.zeros(self.window.shape)
         rule, around = ColumnRule.of(self.quadrature.rtol), _wider(where)
         self.level, self.plans = 0, [plan.halved().halved() for plan in self._plans(rule, least_peak)]
         if where.any() and (first := self._level(self.plans, around, None)):
             self.value, self.coverage = first
-        lines = min(OTHERS, self.quadrature.most_nodes / 2)
+        lines = min(most, self.quadrature.most_nodes / 2)
         self._refine(where, least_peak, lambda count: lines * count, progress)
         if self.level == 0:
             self.error = _largest(self.value)
@@ -183,7 +198,17 @@ class FaceImage:
         coverage = self.window.expand(np.clip(self.coverage, 0, 1))
         complete = self.window.expand(where.astype(np.float64)) > 0
         rays, levels, self.rays, self.levels = self.rays, tuple(self.levels), 0, []
-        return Solution(power, error, coverage, rays, levels, complete)
+        return Solution(power, error, coverage, rays, levels, complete, self._findings())
+
+    def _findings(self) -> tuple[Finding, ...]:
+        """Shortcuts of an image by faces alone."""
+        hidden, count = any(faces.shadows for faces in self.faces), sum(len(faces.corners) for faces in self.faces)
+        dark = sum(int(np.count_nonzero(most <= 0)) for most, _ in self.radiance)
+        seen = "one surface may occlude another" if hidden else "one convex shape does not occlude itself"
+        return (
+            Finding("occlusion", not hidden, seen),
+            Finding("dark", dark > 0 and not self.dark_too, f"{dark} of {count} faces are dark"),
+        )
 
     def _finer(self, plans: list[Plan], rule: ColumnRule, level: int, least_peak: float) -> list[Plan]:
         """The plans of the next level: at the second level with all cells that the accuracy requires, as the brightest
@@ -237,7 +262,11 @@ class FaceImage:
 
     def _touching(self, mark: NDArray[np.bool_]) -> list[Index]:
         """Faces of each mesh whose light may reach a marked pixel."""
-        return [np.flatnonzero(faces.bright & touching(faces.low, faces.high, mark)) for faces in self.faces]
+        least = -math.inf if self.dark_too else 0.0
+        return [
+            np.flatnonzero(faces.bright & (most > least) & touching(faces.low, faces.high, mark))
+            for faces, (most, _) in zip(self.faces, self.radiance, strict=True)
+        ]
 
     def _cost(self, plans: list[Plan], mark: NDArray[np.bool_]) -> int:
         """Number of images of pieces, or of cells, that a level lays."""
