@@ -130,6 +130,9 @@ ACROSS = (2, 4, 6, 8, 16)
 # Directions of the other two coordinates from the middle, at each position across the pupil [degrees]. Levels with
 # equal coordinates would miss the same bodies, such as a plate edge-on through the virtual detector plane.
 TURNS = {2: [[45], [225]], 8: [[30, 210], [120, 300]] * 2, 24: [[0, 90, 180, 270]] * 6}
+# Of 122 pixels of meshes with 1,024 transects 13 % are wrong by more than 6 deviations over 1,024, 1 % by more than 18
+# (the largest 27).
+NET_SCATTER = 3.0
 LEAST_NET = 256  # transects from which those across a sharp edge are a net
 # Generating vectors of the lattices of transects across a sharp edge: those of least centred discrepancy.
 STEPS = {2: (1, 1), 8: (3, 5), 24: (5, 11), 72: (19, 61)}
@@ -200,6 +203,14 @@ class Transects:
     def is_net(self) -> bool:
         """Whether `sharp` is a net: every box of its size holds one transect."""
         return len(self) >= LEAST_NET
+
+    @property
+    def relative_scatter(self) -> float:
+        """Error across a blurred edge for a given deviation over n, over that of Gauss's nodes: two have no trend, on a
+        net the error of a kink falls more slowly."""
+        if len(self) == 2:
+            return 1 / 3
+        return 1.0 if len(self) <= TRANSECT_LEVELS[len(ACROSS) - 1] else NET_SCATTER
 
     @property
     def phase(self) -> NDArray[np.float64]:

@@ -332,8 +332,8 @@ def apply_transects(
         dr.scatter(done, mi.Bool(True), touched)
     number, estimator = dr.opaque(mi.Float64, len(rule)), draft.estimator
     variance = found.squares - found.value * found.value
-    scatter = estimator.scatter if len(rule) > 2 else estimator.scatter / 3
-    blurred = dr.opaque(mi.Float64, scatter) * dr.safe_sqrt(variance - found.trend) / number
+    scatter = dr.opaque(mi.Float64, estimator.scatter * rule.relative_scatter)
+    blurred = scatter * dr.safe_sqrt(variance - found.trend) / number
     # A sharp edge slants: each transect crosses a part of its own. A second edge may lie between two of them.
     slant = estimator.slant * dr.safe_sqrt(variance) / (number * dr.sqrt(number))
     sharp = dr.maximum(slant, found.between)
