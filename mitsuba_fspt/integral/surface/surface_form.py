@@ -26,7 +26,7 @@ from ..lines.eq9 import eq9, etendue_from_surface, most_radiance
 from ..lines.occlusion import hides_nothing
 from ..lines.specular import Specular, transmission
 from ..progress import SILENT, Progress
-from ..quadrature import Quadrature
+from ..quadrature import TOGETHER, Quadrature
 from ..shortcuts import Finding
 from ..solution import Solution
 from . import pupil_cells
@@ -41,6 +41,7 @@ MOST_LINES = 1 << 16  # a pixel of an image
 # times brighter than the brightest pixel.
 HANDED_ON, HANDED_ON_PEAK = 1 << 12, 10.0
 BLURRED = 0.5  # of the blur radius: side below which a piece of a small shape is imaged as a point
+FALL = 0.5  # error over that of the level before, where it falls with the root of the lines
 DARK_LINES = 4096  # lines of sight a pixel from which on a pixel without light counts as dark
 SAFETY = 3.0  # error over the largest last change of a pixel and of its neighbours
 CARRIED = 0.4  # least error over that of the level before, as two levels may agree by chance
@@ -87,7 +88,7 @@ class _Refinement:
         self.glows = [Glow.seen(emitter, camera, window, quadrature.rtol, dark) for emitter in scene.emitters()]
         self.value, self.error, self.coverage = (np.zeros(self.window.shape) for _ in range(3))
         self.peak = float(np.finfo(np.float32).tiny)
-        self.rays = 0
+        self.rays = self.last_rays = 0
         self.levels: list[str] = []
 
     def run(self, where: NDArray[np.bool_] | None, least_peak: float, progress: Progress) -> Solution:
@@ -104,6 +105,8 @@ class _Refinement:
         levels = 2 + math.floor(math.log(most / (FIRST_LINES * FIRST_GROWTH), GROWTH))
         recent, grid = None, Grid(self.window.shape)
         while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
+            if partial and len(self.levels) > 1 and not self._pays(mark, least_peak):
+                break
             progress(len(self.levels) / levels)
             found = None if progress.deadline.passed() else self._level(lines, mark, progress.deadline)
             if found is None:
@@ -134,6 +137,14 @@ class _Refinement:
         bright = HANDED_ON_PEAK * self._tolerance(least_peak) / self.quadrature.rtol
         most = HANDED_ON if partial and most_radiance(self.scene) <= bright else MOST_LINES
         return max(min(self.quadrature.most_nodes, most), FIRST_LINES * FIRST_GROWTH)
+
+    def _pays(self, mark: NDArray[np.bool_], least_peak: float) -> bool:
+        """Whether the next level takes no more lines of sight than lattices on the marked pixels, or ends half of them
+        if their errors fall by `FALL`; with `max_nodes` always."""
+        lattices = max(self.quadrature.most_nodes * np.count_nonzero(mark), TOGETHER)
+        if self.quadrature.max_nodes is not None or GROWTH * self.last_rays <= lattices:
+            return True
+        return bool(np.median(self.error[mark]) * FALL <= self._tolerance(least_peak))
 
     def _tolerance(self, least_peak: float) -> float:
         """Tolerance [W/mm²/sr]."""
@@ -166,6 +177,7 @@ class _Refinement:
                     peak = max(peak, self._lay(canvas, batch))
                     rays += int(batch.lines.sum())
             self.rays += rays
+            self.last_rays = rays
             if peak <= HEADROOM * self.peak:
                 break
             self.peak = peak  # beyond the range of the quanta: once more with larger ones
