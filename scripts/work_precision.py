@@ -39,6 +39,7 @@ def main() -> None:
     parser.add_argument("--budget", default="2")
     parser.add_argument("--readme", type=Path, metavar="FILE.md", help="write the table between its markers there")
     arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
     if not arguments.truth.exists():
         write_truth(arguments.truth)
     # Named in CSV and PNG: as seen from where the script is run, not from the root of the machine.
