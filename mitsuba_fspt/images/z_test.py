@@ -39,6 +39,9 @@ class ZTest:
     noisy : number of the tested pixels whose bound is at most half the standard error
     detectable : smallest difference on the standard's brightest pixel, over its power, for which p < 0.01; None if
         that pixel is not tested
+    gain : share of the power of a measured image with a `gain_error` that is taken as too much, most probably on all
+        pixels; the differences are those without it, and the share over its deviation counts for `p_value` like a
+        pixel. None without such an image
     """
 
     max_z: float
@@ -48,9 +51,10 @@ class ZTest:
     unjudged: int
     noisy: int
     detectable: float | None
+    gain: float | None = None
 
     def render_text(self) -> str:
-        """Two lines: the test, and the smallest difference that it detects."""
+        """The test, the smallest difference that it detects, and the `gain` if there is one: a line each."""
         chi2 = "none   the integral's errors exceed the noise" if self.chi2 is None else f"{self.chi2:.3f}   per pixel"
         test = f"chi2   {chi2}; largest |z| {self.max_z:.2f} of {self.pixels} pixels, p {self.p_value:.2g}"
         if self.detectable is None or self.detectable >= 1:
@@ -59,7 +63,9 @@ class ZTest:
             power = (
                 f"{self.detectable:.2e}   smallest difference of the brightest pixel, over its power, for p < {LEVEL}"
             )
-        return f"{test}\npower  {power}"
+        if self.gain is None:
+            return f"{test}\npower  {power}"
+        return f"{test}\npower  {power}\ngain   {self.gain:+.2%}   of the measured power, too much by gain_error"
 
 
 def is_deterministic(image: ImageData) -> bool:
@@ -94,16 +100,18 @@ def z_test(calculated: ImageData, standard: ImageData) -> ZTest | None:
     z = np.abs(found.signed_z()[tested])
     noisy = tested & (found.bound <= NOISY * found.error)
     whole = np.abs(found.normal(found.difference, found.error))[noisy]
-    p_one = math.erfc(float(z.max()) / math.sqrt(2)) if pixels else 1.0
+    largest = max(float(z.max(initial=0.0)), abs(found.gain_z))
+    p_one, tests = math.erfc(largest / math.sqrt(2)), pixels + (found.gain is not None)
     return ZTest(
-        max_z=float(z.max()) if pixels else 0.0,
+        max_z=float(z.max(initial=0.0)),
         chi2=float(np.square(whole).mean()) if whole.size else None,
-        # log1p and expm1 keep a p_one far below 1e-16, which 1 − (1 − p_one)^pixels would round to 0.
-        p_value=abs(math.expm1(pixels * math.log1p(-p_one))) if p_one < 1 else 1.0,
+        # log1p and expm1 keep a p_one far below 1e-16, which 1 − (1 − p_one)^tests would round to 0.
+        p_value=abs(math.expm1(tests * math.log1p(-p_one))) if p_one < 1 else 1.0,
         pixels=pixels,
         unjudged=int(np.count_nonzero((found.error == 0) & (found.excess > 0))),
         noisy=int(noisy.sum()),
         detectable=found.detectable(brightest(standard, found.kept), pixels),
+        gain=found.gain,
     )
 
 
@@ -112,7 +120,9 @@ class _Differences:
 
     power : of the standard [W]
     kept : pixels masked in neither image
-    difference : P_cal − P_std [W]; 0 on masked pixels, like `error`
+    difference : P_cal − P_std [W] without `gain`; 0 on masked pixels, like `error`
+    gain, gain_z : share of measured images' power that is taken as too much, None where no image has a `gain_error`;
+        that of the pixels alone over its standard deviation and `gain_error`
     bound : error of the deterministic images [W]
     excess : max(|difference| − bound, 0) [W]
     error : standard error s of the difference [W]
@@ -127,7 +137,6 @@ class _Differences:
         self.kept = calculated.kept & standard.kept
         self.difference = np.where(self.kept, p_cal - self.power, 0)
         self.bound = error_bound(calculated, standard)
-        self.excess = np.maximum(np.abs(self.difference) - self.bound, 0)
         variance, spread = np.zeros(self.power.shape), np.zeros(self.power.shape)
         noisy = [image for image in (calculated, standard) if image.error is not None and not is_deterministic(image)]
         self.scale = (
@@ -143,7 +152,29 @@ class _Differences:
         self.error = np.where(self.kept, self.scale * np.sqrt(variance), 0)
         self.freedom = np.divide(variance**2, spread, out=np.full_like(spread, np.inf), where=spread > 0)
         self.tested = (self.error > 0) & ((p_cal != 0) | (self.power != 0))
+        self.gain_z = 0.0
+        self.gain = self._without_gain(calculated, standard)
+        self.excess = np.maximum(np.abs(self.difference) - self.bound, 0)
         self.missed = self._missed(calculated, standard)
+
+    def _without_gain(self, calculated: ImageData, standard: ImageData) -> float | None:
+        """Take the power that measured images most probably have too much out of the difference; returns its share.
+
+        A share g of an image's power, normal about 0 with the deviation `gain_error`, is too much on all its pixels.
+        With its part b of the difference d, Σ (d − g b)²/(s² + bound²) + (g/gain_error)² is least for this g.
+        """
+        deviations = [image.gain_error or 0.0 for image in (calculated, standard)]
+        deviation = math.hypot(*deviations)
+        if not deviation or not self.tested.any():
+            return None
+        light = calculated.power if deviations[0] else -self.power
+        d, b, s = (np.asarray(of, np.float64)[self.tested] / self.scale for of in (self.difference, light, self.error))
+        weight = 1 / (s * s + np.square(self.bound[self.tested] / self.scale))
+        moment, curvature = float((weight * b * d).sum()), float((weight * b * b).sum())
+        self.gain_z = moment / curvature / math.hypot(deviation, curvature**-0.5) if curvature else 0.0
+        gain = moment / (curvature + deviation**-2)
+        self.difference = np.where(self.kept, self.difference - gain * light, 0)
+        return gain
 
     def _missed(self, calculated: ImageData, standard: ImageData) -> Plane:
         """Standard deviation [W] missing in s where Monte Carlo is darker than a deterministic image by d.

@@ -181,6 +181,32 @@ def test_error_of_the_integral_is_a_bound():
     assert z.detectable == pytest.approx((3 + 2 * 2.9342) / 8, rel=1e-3)
 
 
+@pytest.mark.parametrize("first", ["measured", "calculated"])
+def test_a_gain_error_is_common_to_all_pixels(first):
+    """A measured image 5 % too bright, with a gain error of 5 % and noise of 1 % of the brightest pixel.
+
+    Expected: the share 0.05/1.05 of its power, chi2 1; without the gain error, or with one of 0.5 %, it differs. Seen
+    to fail (p = 0) with the gain error left out, and with the sign of the standard's light turned.
+    """
+    rng = np.random.default_rng(5)
+    noise = 0.01 * TRUTH.max()
+    exact = Image(TRUTH, np.full(TRUTH.shape, 1e-6), metadata=INTEGRAL)
+
+    def z_test(gain_error):
+        counts = Image(power, np.full(TRUTH.shape, noise), metadata={"gain_error": gain_error} if gain_error else {})
+        return compare(*((counts, exact) if first == "measured" else (exact, counts))).z_test
+
+    power = 1.05 * TRUTH + noise * rng.standard_normal(TRUTH.shape)
+    found = z_test(0.05)
+    assert found.gain == pytest.approx(0.05 / 1.05, abs=3e-3)
+    assert found.chi2 == pytest.approx(1, abs=4 * math.sqrt(2 / TRUTH.size))
+    assert found.p_value > 1e-3
+    assert "\ngain   +4." in found.render_text()
+    assert z_test(0.0).gain is None
+    assert z_test(0.0).p_value < 1e-6
+    assert z_test(0.005).p_value < 1e-6  # nearly ten deviations
+
+
 def test_noise_is_judged_where_it_exceeds_the_bound():
     """Bounds far above the noise leave no power, and the test says so; far below it, chi2 is 1.
 

@@ -43,6 +43,11 @@ def saturated(true):
     return image
 
 
+def numbers(test):
+    """The fields of a z-test that are there."""
+    return {name: value for name, value in asdict(test).items() if value is not None}
+
+
 @pytest.mark.parametrize("swapped", [False, True])
 def test_a_comparison_leaves_out_what_either_image_masks(true, saturated, swapped):
     """It is that of the other pixels alone. Seen to fail with a ratio of 0.24 for 1."""
@@ -52,7 +57,7 @@ def test_a_comparison_leaves_out_what_either_image_masks(true, saturated, swappe
     assert (found.masked, expected.masked) == (192, 0)
     for name in ("me", "cf", "max_error", "rms", "ratio"):
         assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-12)
-    assert asdict(found.z_test) == pytest.approx(asdict(expected.z_test), rel=1e-12)
+    assert numbers(found.z_test) == pytest.approx(numbers(expected.z_test), rel=1e-12)
     assert found.profiles[0].index == expected.profiles[0].index
     assert found.to_dict()["masked"] == 192
     assert "masked 192   pixels" in found.render_text()
