@@ -107,10 +107,11 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
         raise ImageError(f"counts '{path}' do not exist. Check the name.")
     if path.suffix.lower() in (*TIFF, *FITS):
         _require_counts(path)
-    array, header = read_frame(path, f"counts '{path}'")
-    if path.suffix.lower() in TIFF and (channels := channels_of(path)) > 1:
+    thing = f"counts '{path}'"
+    array, header = read_frame(path, thing)
+    if path.suffix.lower() in TIFF and (channels := channels_of(path, thing)) > 1:
         raise ImageError(
-            f"counts '{path}' have {channels} channels or colours, which are no frames of one exposure. Save one of "
+            f"{thing} have {channels} channels or colours, which are no frames of one exposure. Save one of "
             "them, or frames as slices or times."
         )
     array = array.astype(np.uint8) if array.dtype == bool else array  # a frame of bad pixels

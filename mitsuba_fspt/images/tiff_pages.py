@@ -71,14 +71,22 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
     return images
 
 
-def channels_of(path: Path) -> int:
-    """Number of colours or samples of each pixel of a TIFF file that `read_tiff` has read."""
+def channels_of(path: Path, thing: str) -> int:
+    """Number of colours or samples of each pixel of a TIFF file that `read_tiff` has read.
+
+    It is 1 where each sample of more than 8 bits is stored as an image by itself: so tifffile writes a stack of three
+    or four frames unless it is told otherwise, which one line on stderr says of `thing`.
+    """
     import tifffile
 
     with _reports(), tifffile.TiffFile(path) as file:
         series = file.series[0]
-        sizes = (size for axis, size in zip(series.axes, series.shape, strict=True) if axis in CHANNELS)
-        return math.prod(sizes)
+        sizes = {axis: size for axis, size in zip(series.axes, series.shape, strict=True) if axis in CHANNELS}
+        apart = series.keyframe.planarconfig == tifffile.PLANARCONFIG.SEPARATE
+        wide = np.dtype(series.dtype).itemsize > 1
+    if apart and wide and (samples := sizes.pop("S", 1)) > 1:
+        LOG.warning("fspt: %s: its %d samples of each pixel are taken for frames of one exposure.", thing, samples)
+    return math.prod(sizes.values())
 
 
 def _upright(series: TiffPageSeries) -> tuple[NDArray[Any], int]:

@@ -72,6 +72,7 @@ def test_a_picture_of_which_0_is_white_is_reported(tmp_path, caplog):
 @pytest.mark.parametrize(
     "how",
     [
+        {"photometric": "rgb", "planarconfig": "contig"},
         {"photometric": "rgb", "planarconfig": "separate"},
         {"ome": True, "metadata": {"axes": "CYX"}},
         {"imagej": True, "metadata": {"axes": "CYX"}},
@@ -80,9 +81,27 @@ def test_a_picture_of_which_0_is_white_is_reported(tmp_path, caplog):
 def test_channels_are_no_frames_of_counts(tmp_path, how):
     """Of the images through two filters, or of three colours, the mean was taken, as of frames."""
     path = tmp_path / "counts.tif"
-    tifffile.imwrite(path, FRAMES if "planarconfig" in how else FRAMES[:2], **how)
+    kind = how.get("planarconfig")
+    images = {"contig": np.moveaxis(FRAMES, 0, -1), "separate": FRAMES.astype(np.uint8)}.get(kind, FRAMES[:2])
+    tifffile.imwrite(path, images, **how)
     with pytest.raises(ImageError, match=r"counts\.tif' have [23] channels or colours, which are no frames"):
         read_counts(path)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of a tifffile that will no longer guess colours
+@pytest.mark.parametrize("number", [2, 3, 4, 5])
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_a_stack_of_any_number_of_frames_is_read(tmp_path, caplog, number, kind):
+    """tifffile writes three or four frames as the colours of a picture."""
+    frames = np.arange(number * 6 * 5).reshape(number, 6, 5).astype(kind)
+    path = tmp_path / "counts.tif"
+    tifffile.imwrite(path, frames)
+    found = read_counts(path)
+    assert found.frames == number
+    np.testing.assert_array_equal(found.values, frames.mean(axis=0))
+    with tifffile.TiffFile(path) as file:
+        guessed = "S" in file.series[0].axes
+    assert ["taken for frames" in text for text in caplog.messages] == [True] * guessed
 
 
 def test_frames_over_time_or_depth_are_a_stack(tmp_path):
