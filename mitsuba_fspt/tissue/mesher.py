@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -67,7 +68,26 @@ def read_tetrahedra(
 
 def _with_smooth_border(mesh: Tetrahedra) -> Tetrahedra:
     """The same mesh, whose `snap` moves points onto the smooth surface through the vertices of its border."""
-    return replace(mesh, snap=SmoothSurface(mesh.vertices, mesh.border, mesh.edge / 2).nearest)
+    return replace(mesh, snap=_SmoothBorder(mesh))
+
+
+class _SmoothBorder:
+    """Smooth surface through the vertices of a mesh's border, made when the first points are moved onto it."""
+
+    def __init__(self, mesh: Tetrahedra) -> None:
+        self._mesh = mesh
+
+    @cached_property
+    def _surface(self) -> SmoothSurface:
+        """Of triangles of the border's own size: the cells inside may be much larger."""
+        faces = self._mesh.border
+        corners = self._mesh.vertices[faces]
+        size = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+        return SmoothSurface(self._mesh.vertices, faces, size)
+
+    def __call__(self, points: Array) -> Array:
+        """Points (N, 3) [mm] moved onto the surface."""
+        return self._surface.nearest(points)
 
 
 def tetrahedralize(vertices: Array, faces: Index, edge: float) -> Tetrahedra:

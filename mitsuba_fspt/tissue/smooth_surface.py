@@ -8,7 +8,7 @@ A point p of a triangle with the corners p_k, the normals n_k there and the bary
 
 which is on the body up to the third order of the triangle's size (T. Boubekeur, M. Alexa, ACM Trans. Graph. 27, 141
 (2008), with ½, which is exact for quadrics). Corners stay, and plane faces, and creases: the normal of a corner is that
-of the faces around it whose normals differ from the triangle's by at most 45°.
+of the faces around it whose normals differ from the triangle's by less than 45°: chamfers and octagons stay sharp.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from trimesh.triangles import points_to_barycentric
 from .border_curvature import CREASE
 from .border_surface import nearest_triangles
 
+ROUNDING = 1e-6  # of the cosine of 45° between faces whose vertices are rounded, as to float32
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -63,7 +64,8 @@ class SmoothSurface:
         corner = np.repeat(np.arange(len(vertex)), count)
         place = np.arange(len(corner)) - np.repeat(np.cumsum(count) - count - start, count)
         other, which = np.divmod(self._by_vertex[place], 3)
-        smooth = np.einsum("pi,pi->p", self._normals[other], self._normals[face[corner // 3]]) >= math.cos(CREASE)
+        cosine = np.einsum("pi,pi->p", self._normals[other], self._normals[face[corner // 3]])
+        smooth = cosine > math.cos(CREASE) + ROUNDING
         weight = np.where(smooth, self._weights[other, which], 0)
         sums = [np.bincount(corner, weight * self._normals[other, k], 3 * len(face)) for k in range(3)]
         normals = np.stack(sums, axis=1)
