@@ -11,6 +11,7 @@ import trimesh
 
 from mitsuba_fspt.phantom.flux_import import import_flux
 from mitsuba_fspt.phantom.formats import surface_files
+from mitsuba_fspt.phantom.formats.table import read_values
 from mitsuba_fspt.phantom.surface_mesh import face_normals
 from mitsuba_fspt.runtime.errors import FluxError
 
@@ -346,6 +347,16 @@ def test_rows_that_are_numbered_in_another_order_are_refused(tmp_path, first):
             continue
         with pytest.raises(FluxError, match="column 1 numbers the rows, but not in ascending order"):
             import_flux((ball.vertices, ball.faces), tmp_path / "jn.csv", field="jn")
+
+
+@pytest.mark.parametrize(("field", "column"), [("jn", 2), (3, 2), ("label", 1)])
+def test_a_column_of_labels_is_no_numbering_of_other_rows(tmp_path, field, column):
+    """Nodes in order stand beside labels 3, 1, 2, 4, or these are the values; refused before."""
+    table = np.array([[1, 3, 0.1], [2, 1, 0.2], [3, 2, 0.3], [4, 4, 0.4]])
+    np.savetxt(tmp_path / "jn.csv", table, delimiter=",", header="node,label,jn", comments="")
+    np.testing.assert_array_equal(read_values(tmp_path / "jn.csv", str(field)), table[:, column])
+    np.savetxt(tmp_path / "jn.csv", table[:, 1:], delimiter=",", header="label,jn", comments="")
+    np.testing.assert_array_equal(read_values(tmp_path / "jn.csv", "label"), table[:, 1])
 
 
 @pytest.mark.parametrize("number", [2, np.int64(2), "2"])

@@ -46,20 +46,28 @@ def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
         name = pick(numbers, name or None, str(path))
         return column(numbers[name], [], number or None, f"{path} '{name}'")
     table, names = read_table(path)
-    _require_order(table, str(path))
+    _require_order(table, names, field, str(path))
     return column(table, names, field, str(path))
 
 
-def _require_order(table: NDArray[np.float64], where: str) -> None:
-    """Raise FluxError for a column that numbers the rows, from 0 or 1, in another order than that of the file."""
-    count = np.arange(len(table))
+def _require_order(table: NDArray[np.float64], names: list[str], field: str | None, where: str) -> None:
+    """Raise FluxError for a column that numbers the rows, from 0 or 1, in another order than that of the file.
+
+    Not if another column numbers them in this order; the column that `field` chooses holds values and no numbers.
+    """
+    count, shuffled = np.arange(len(table)), []
     for number, numbers in enumerate(table.T if table.shape[1] > 1 else (), start=1):
-        ordered = np.sort(numbers) - numbers.min()
-        if numbers.min() in (0, 1) and np.array_equal(ordered, count) and (np.diff(numbers) < 0).any():
-            raise FluxError(
-                f"{where}: column {number} numbers the rows, but not in ascending order, and values are taken in the "
-                "order of the rows. Sort them by it."
-            )
+        chosen = field is not None and field in (str(number), *names[number - 1 : number])
+        if chosen or numbers.min() not in (0, 1) or not np.array_equal(np.sort(numbers) - numbers.min(), count):
+            continue
+        if (np.diff(numbers) > 0).all():
+            return
+        shuffled.append(number)
+    if shuffled:
+        raise FluxError(
+            f"{where}: column {shuffled[0]} numbers the rows, but not in ascending order, and values are taken in the "
+            "order of the rows. Sort them by it."
+        )
 
 
 def pick(candidates: dict[str, NDArray], field: str | None, where: str) -> str:
