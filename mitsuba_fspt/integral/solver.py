@@ -16,6 +16,7 @@ from ..camera.camera import Camera
 from ..camera.window import Boxes, Window, window_of
 from ..emission.face_table import FaceTable, editions_of
 from ..emission.of_emitter import edition_of
+from ..jit.mesh_buffers import face_count
 from ..jit.recording import recording
 from ..runtime.cached_value import CachedValue
 from ..runtime.deadline import Deadline
@@ -24,7 +25,7 @@ from .lines.eq9 import View
 from .lines.nested_bsdfs import check_followed
 from .lines.scene_checks import check_scene, check_surfaces_alone
 from .lines.specular import Specular
-from .lines.traced_scene import TracedScene, pose_of, positions_of
+from .lines.traced_scene import TracedScene, geometry_of, pose_of
 from .lines.visible_window import glowing_boxes
 from .progress import Progress
 from .pupil import interpolated, pupil_form
@@ -45,6 +46,9 @@ UNCERTAINTY = 2.0  # largest ratio of that light and its estimate
 PLAIN = 0.7  # of rtol: tolerance of the light by plain courses (`Specular.part`); the rest is that of all others
 OTHERS = 4  # largest number of lines of sight of a pixel over that for all other courses
 FAINTER = 0.1  # least weight of these over that of plain ones
+
+
+MOST_KEPT = 1 << 20  # faces as a camera sees them, of 130 bytes each, that are kept between renders
 
 
 class Solver:
@@ -137,21 +141,23 @@ class Solver:
         return None if edition is None else self._faces.recall(edition, lambda: FaceTable.of(shapes))
 
     def _faces_seen(self, window: Window, view: View, convex: bool) -> list[FaceLight]:
-        """`face_image.faces_seen` on the pixels of a window; cached."""
+        """`face_image.faces_seen` on the pixels of a window; cached unless there are more than `MOST_KEPT`."""
         scene, camera = view.scene, view.camera
         shapes = scene.shapes()
         state = (editions_of(shapes), [pose_of(shape) for shape in shapes], camera.state, window, convex)
         find = partial(face_image.faces_seen, scene, camera, window, convex)
-        return self._seen_faces.recall(state, find, positions_of(shapes))
+        if sum(face_count(shape) for shape in shapes if shape.is_mesh()) > MOST_KEPT:
+            return find()
+        return self._seen_faces.recall(state, find, [geometry_of(shape) for shape in shapes])
 
     def _narrow_light(self, view: View, window: Window) -> NarrowLight:
         """Light of bodies and spots that lines of sight may miss; cached."""
-        held = positions_of(view.scene.shapes())
+        held = [geometry_of(shape) for shape in view.scene.shapes()]
         return self._narrow.recall(_seen_state(view, window), lambda: narrow_light(_points(view), window), held)
 
     def _light_edge_on(self, view: View, window: Window) -> NDArray[np.float64]:
         """`NarrowLight.edge_on` on the pixels of a window; cached."""
-        held = positions_of(view.scene.shapes())
+        held = [geometry_of(shape) for shape in view.scene.shapes()]
         return self._edge_on.recall(_seen_state(view, window), lambda: edge_on_light(_points(view), window), held)
 
     def _fill(
@@ -236,6 +242,8 @@ class Solver:
         by_faces = self._face_image(window, view, quadrature, least_peak, dark_too)
         if by_faces and window.fully_open(camera).all():
             known = by_faces.run(np.ones(window.shape, bool), least_peak, progress, surface_form.MOST_LINES)
+            if progress.log:
+                progress.log.add("images of faces", window.count, known.rays)
         else:
             known = surface_form.solve(scene, camera, window, quadrature, None, least_peak, progress, view.specular)
         return _with_dark_coverage(known, view, window)

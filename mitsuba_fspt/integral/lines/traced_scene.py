@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ...camera.camera import Camera
 from ...emission.face_table import shape_number
 from ...emission.of_emitter import mark_of
-from ...jit.mesh_buffers import box_of, buffers
+from ...jit.mesh_buffers import box_of, buffers, flat
 from ...jit.robust_tracing import robust_scene
 
 
@@ -19,13 +20,13 @@ class RobustCopy:
     """Robust copy of a scene that loses rays: of its shapes alone, so that nothing in it refers to the integrator.
 
     state : marks of the emitters, and numbers and poses of the shapes that it was built from
-    positions : vertex buffers of the shapes. Poses are compared by the indices of these buffers; while the buffers are
-        kept, no other one can get the same index
+    geometry : buffers of the shapes. Poses are compared by the indices of these buffers; while the buffers are kept, no
+        other one can get the same index
     """
 
     scene: mi.Scene
     state: tuple[list[object], list[tuple[int, tuple[float, ...]]]]
-    positions: tuple[mi.Float, ...]
+    geometry: list[list[dr.ArrayBase]]
 
 
 class TracedScene:
@@ -48,20 +49,24 @@ class TracedScene:
             if robust is scene:
                 self._lossless, self._robust = marks, None
                 return scene
-            self._robust = old = RobustCopy(robust, state, positions_of(shapes))
+            self._robust = old = RobustCopy(robust, state, [geometry_of(shape) for shape in shapes])
         return old.scene
 
 
-def positions_of(shapes: list[mi.Shape]) -> tuple[mi.Float, ...]:
-    """Vertex buffers of all meshes, whose indices are part of their poses."""
-    return tuple(buffers(shape)[0] for shape in shapes if shape.is_mesh())
+def geometry_of(shape: mi.Shape) -> list[dr.ArrayBase]:
+    """Buffers of a shape's geometry, whose indices are part of its pose: vertices and faces, control points, a grid."""
+    if shape.is_mesh():
+        return list(buffers(shape))
+    own = (flat(value) for name, value in mi.traverse(shape) if "." not in name)
+    return [value for value in own if isinstance(value, mi.Float | mi.UInt32)]
 
 
 def pose_of(shape: mi.Shape) -> tuple[float, ...]:
-    """Bounding box of a shape, with the index of its vertex buffer or the matrix of its `to_world`."""
+    """Bounding box of a shape, with the indices of its buffers and the matrix of its `to_world`."""
     own = box_of([shape])
-    box = (*own.min, *own.max)
-    if shape.is_mesh():
-        return (buffers(shape)[0].index, *box)
+    indices = (buffer.index for buffer in geometry_of(shape))
+    pose = (*own.min, *own.max, *indices)
     parameters = mi.traverse(shape)
-    return (*box, *np.ravel(parameters["to_world"].matrix).tolist()) if "to_world" in parameters else box
+    if shape.is_mesh() or "to_world" not in parameters:
+        return pose
+    return (*pose, *np.ravel(parameters["to_world"].matrix).tolist())

@@ -105,7 +105,8 @@ class _Refinement:
         levels = 2 + math.floor(math.log(most / (FIRST_LINES * FIRST_GROWTH), GROWTH))
         recent, grid = None, Grid(self.window.shape)
         while mark.any() and (lines := lines * (FIRST_GROWTH if lines == FIRST_LINES else GROWTH)) <= most:
-            if partial and len(self.levels) > 1 and not self._pays(mark, least_peak):
+            dark = lines <= DARK_LINES and (mark & (self.coverage == 0)).any()
+            if partial and len(self.levels) > 1 and not dark and not self._pays(mark, least_peak):
                 break
             progress(len(self.levels) / levels)
             found = None if progress.deadline.passed() else self._level(lines, mark, progress.deadline)
