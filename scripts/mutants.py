@@ -435,8 +435,8 @@ MUTANTS = (
     Mutant(
         "excess noise of the dark charge",
         "detector/reduction.py",
-        "independent = detector.excess * charge",
-        "independent = charge",
+        "independent = detector.excess * dark.charge",
+        "independent = dark.charge",
         (CAMERAS,),
     ),
     Mutant(
@@ -456,8 +456,8 @@ MUTANTS = (
     Mutant(
         "spurious charge of a bias frame",
         "detector/reduction.py",
-        "found.values + dark_charge / gain",
-        "found.values + charge / gain",
+        "empty.values + dark_charge / gain",
+        "empty.values + charge / gain",
         (CAMERAS,),
     ),
     Mutant(

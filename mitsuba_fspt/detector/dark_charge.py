@@ -9,11 +9,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
-SURE = 5.0  # standard deviations of a dark frame: noise alone makes a pixel so bright once in 3 million
+SURE = 5.0  # standard deviations of a dark frame less the bias: noise alone makes a pixel so bright once in 3 million
 
 
 def shown_charge(
-    shown: Array | float, stated: Array | float, reading: Array | float, excess: float, frames: float
+    shown: Array | float,
+    stated: Array | float,
+    reading: Array | float,
+    excess: float,
+    frames: float,
+    zero: Array | float = 0.0,
 ) -> Array | float:
     """Charge without light [e-] of each pixel before the register, (h, w) or a number.
 
@@ -26,6 +31,7 @@ def shown_charge(
     reading : variance of reading a pixel [e-²]
     excess : F² of the register
     frames : number of frames that the dark frame is the mean of; inf for a number
+    zero : variance of the subtracted bias frame [e-²]; 0 for a number
     """
     surplus = shown - stated
     middle = float(np.median(surplus))
@@ -39,5 +45,5 @@ def shown_charge(
         stated = stated + middle
     known = excess * stated + reading  # variance without light
     hot = surplus - middle
-    sure = (excess * hot > known) & (hot > SURE * np.sqrt(known / frames))
+    sure = (excess * hot > known) & (hot > SURE * np.sqrt(known / frames + zero))
     return stated + np.where(sure, hot, 0.0) if np.any(sure) else stated

@@ -116,6 +116,20 @@ class Exposed:
 
 
 @dataclass(frozen=True, eq=False)
+class Background:
+    """What counts have without light, numbers or arrays (h, w); electrons are those before the register.
+
+    level : to subtract [DN]
+    charge : dark and spurious charge [e-]
+    added : variance that a subtracted frame adds [e-²], 0 for a number
+    """
+
+    level: Array | float
+    charge: Array | float
+    added: Array | float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Corrections:
     """What corrects counts, see `Detector.reduce`: frames, the flat field with its kind, and pixels to leave out."""
 
@@ -204,15 +218,16 @@ def reduce_counts(
     shape = raw.values.shape
     full = full_pixels(detector, raw, "counts")
     rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)
-    level, charge, added = _background(detector, raw, exposed, corrections.bias, corrections.dark)
+    dark = _background(detector, raw, exposed, corrections.bias, corrections.dark)
     flat = corrections.flat_field(detector, raw, exposed)
     gain = detector.on_pixels("gain", shape) / detector.em_gain
-    electrons = _corrected(raw.values, level, flat) * gain
-    independent = detector.excess * charge + gain**2 / 12 + raw.frames * added  # gain²/12: variance of the rounding
+    electrons = _corrected(raw.values, dark.level, flat) * gain
+    independent = detector.excess * dark.charge + gain**2 / 12 + raw.frames * dark.added  # gain²/12: of the rounding
     mask = full | rays | corrections.bad(shape)
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
-    if np.any(added):
-        noise: Metadata = {"frame_electrons": float(np.median(added)) * raw.frames**2, "frame_digest": _digest(level)}
+    if np.any(dark.added):
+        common = float(np.median(dark.added)) * raw.frames**2
+        noise: Metadata = {"frame_electrons": common, "frame_digest": _digest(dark.level)}
         image = replace(image, metadata=image.metadata | noise)
     _report_darkness(image)
     return image
@@ -320,9 +335,8 @@ def calibrated(detector: Own, image: Image, power: Array, error: float) -> Own:
 
 def _background(
     detector: DetectorParameters, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | float | None
-) -> tuple[Array | float, Array | float, Array | float]:
-    """Level to subtract [DN], a number or a frame; the dark and spurious charge [e-]; the variance that the frame adds
-    [e-²]. Electrons are those before the register.
+) -> Background:
+    """What the counts have without light.
 
     A dark frame, or a number in its place, has the same exposure time as the counts and contains the bias. Both frames
     contain the spurious charge. What a dark frame shows above the bias counts as charge, see `shown_charge`.
@@ -332,24 +346,28 @@ def _background(
     dark_charge, spurious = exposed.dark(detector, shape), exposed.spurious(detector)
     charge = dark_charge + spurious
     reading = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2 + gain**2 / 12
-    empty = raw.bias if bias is None else frame_like(bias, "bias", shape).values  # without dark charge
-    zero = detector.on_pixels("bias", shape) if empty is None else empty - spurious / gain
+    given = raw.bias if bias is None else bias
+    empty = None if given is None else frame_like(given, "bias", shape)  # without dark charge
+    zero = detector.on_pixels("bias", shape)
+    noise: Array | float = 0.0  # variance of the bias frame
+    if empty is not None:
+        zero, noise = empty.values - spurious / gain, (detector.excess * spurious + reading) / empty.frames
     if dark is not None and not isinstance(dark, (str, os.PathLike)) and np.ndim(dark) == 0:
         level = number("reduce: 'dark'", dark, DetectorError, "500")
         if not 0 <= level < np.inf:
             raise DetectorError(f"reduce: 'dark' must be >= 0 DN, got {level:g}. Give the bias and the dark current.")
-        return level, shown_charge(gain * (level - zero), charge, reading, detector.excess, math.inf), 0.0
+        shown = gain * (level - zero)
+        return Background(level, shown_charge(shown, charge, reading, detector.excess, math.inf, noise))
     frame = raw.background if dark is None and raw.background is not None else dark
     if frame is not None:
-        found = frame_like(frame, "dark", raw.values.shape)
+        found = frame_like(frame, "dark", shape)
         require_same_time("dark", found, "counts", exposed.exposure_time)
-        charge = shown_charge(gain * (found.values - zero), charge, reading, detector.excess, found.frames)
-        return found.values, charge, (detector.excess * charge + reading) / found.frames
-    frame = raw.bias if bias is None and raw.bias is not None else bias
-    if frame is not None:
-        found = frame_like(frame, "bias", raw.values.shape)
-        return found.values + dark_charge / gain, charge, (detector.excess * spurious + reading) / found.frames
-    return detector.on_pixels("bias", shape) + charge / gain, charge, 0.0
+        shown = gain * (found.values - zero)
+        charge = shown_charge(shown, charge, reading, detector.excess, found.frames, noise)
+        return Background(found.values, charge, (detector.excess * charge + reading) / found.frames)
+    if empty is not None:
+        return Background(empty.values + dark_charge / gain, charge, noise)
+    return Background(detector.on_pixels("bias", shape) + charge / gain, charge)
 
 
 def _corrected(values: Array, level: Array | float, flat: FlatField | None) -> Array:

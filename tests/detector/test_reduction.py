@@ -159,6 +159,16 @@ def test_the_charge_of_hot_pixels_in_a_dark_frame_has_its_noise(frames, caplog):
     assert not caplog.messages
 
 
+def test_the_noise_of_a_bias_frame_makes_no_pixel_hot():
+    """Mean of 100 dark frames, one bias frame: 15 % of the pixels were hot by the noise of the latter."""
+    pytest.importorskip("ccdproc")
+    rng = np.random.default_rng(3)
+    quiet = replace(CCD, dark_current=0.0, read_noise=1.0, gain=0.5)
+    light, bias, *darks = np.rint(500 + rng.normal(0, 2, (102, 64, 64)))
+    found = quiet.reduce(light, **SETTINGS, bias=bias, dark=np.array(darks))
+    assert np.ptp(NoiseModel.of(found).dark) == 0
+
+
 def test_the_charge_of_a_warm_camera_in_a_dark_frame_has_its_noise(caplog):
     """100 electrons a pixel in the dark, which the numbers do not know: χ² is 1, it was 8, and one line says so.
 
