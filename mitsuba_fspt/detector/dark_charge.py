@@ -1,15 +1,54 @@
-"""Charge that a dark frame shows above the bias: the counts have it, too, with its shot noise."""
+"""What counts have without light, its noise, and the charge that a dark frame shows above the bias."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..images.formats import Metadata
+
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
 SURE = 5.0  # standard deviations of a dark frame less the bias: noise alone makes a pixel so bright once in 3 million
+SAME_SHARE = 1e-6  # largest range of the share of a frame's noise that counts as one number
+DIGITS = 16  # of the digest of a subtracted frame
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """What counts have without light, numbers or arrays (h, w); electrons are those before the register.
+
+    level : to subtract [DN]
+    charge : dark and spurious charge [e-]
+    added : variance that a subtracted frame adds [e-²], 0 for a number
+    frame : values of that frame [DN], None for a number
+    """
+
+    level: Array | float
+    charge: Array | float
+    added: Array | float = 0.0
+    frame: Array | None = None
+
+    def shared(self, independent: Array | float, frames: int) -> Metadata:
+        """Metadata of the noise that images have in common from which the same frame was subtracted.
+
+        `frame_share` of the variance of a pixel without light, where it is the same on all pixels; else
+        `frame_electrons` of the median pixel [e-²]. Empty for a number in place of a frame.
+
+        independent : variance without light of one of the `frames` frames [e-²], without that of the subtracted one
+        """
+        if self.frame is None or not np.any(self.added):
+            return {}
+        common = frames * np.asarray(self.added)  # of one frame of the sum, as `independent` is
+        share = common / (independent + common)
+        found: Metadata = {"frame_digest": _digest(self.frame)}
+        if np.ptp(share) <= SAME_SHARE:
+            return found | {"frame_share": float(np.mean(share))}
+        return found | {"frame_electrons": float(np.median(common)) * frames}
 
 
 def shown_charge(
@@ -47,3 +86,8 @@ def shown_charge(
     hot = surplus - middle
     sure = (excess * hot > known) & (hot > SURE * np.sqrt(known / frames + zero))
     return stated + np.where(sure, hot, 0.0) if np.any(sure) else stated
+
+
+def _digest(frame: Array) -> str:
+    """Digest of the values of a subtracted frame."""
+    return hashlib.sha256((frame + 0.0).tobytes()).hexdigest()[:DIGITS]  # + 0: of -0, too

@@ -10,7 +10,6 @@ of a flat field below 1 collects fewer electrons per watt, flat · k. The image 
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 import os
@@ -27,14 +26,14 @@ from ..images.exposure import Exposure
 from ..images.formats import Metadata, read_planes
 from ..images.frame_file import FITS, TIFF
 from ..images.image import Image, image_or_exposure
-from ..images.noise_model import NoiseModel
+from ..images.noise_model import FRAME, NoiseModel
 from ..images.pixel_map import DIGEST, MAP, recorded_map
 from ..optics.light import Light
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time
-from .dark_charge import shown_charge
+from .dark_charge import Background, shown_charge
 from .flat_field import FlatField, flat_field, require_no_flat
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
 from .saturation import full_pixels, saturated
@@ -45,13 +44,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
-DIGITS = 16  # of the digest of a subtracted frame
 DARKER = 5.0  # standard deviations of a total below 0: noise makes more once in 3 million images
 REPLACED = (
     *("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"),
     *(
-        "frame_electrons",
-        "frame_digest",
+        *FRAME,
         "flat_kind",
         "flat_masked_pixels",
         "em_gain",
@@ -113,20 +110,6 @@ class Exposed:
     def spurious(self, detector: DetectorParameters) -> float:
         """Electrons of the spurious charge in a pixel read out."""
         return detector.spurious_charge * self.area(detector)
-
-
-@dataclass(frozen=True, eq=False)
-class Background:
-    """What counts have without light, numbers or arrays (h, w); electrons are those before the register.
-
-    level : to subtract [DN]
-    charge : dark and spurious charge [e-]
-    added : variance that a subtracted frame adds [e-²], 0 for a number
-    """
-
-    level: Array | float
-    charge: Array | float
-    added: Array | float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,21 +205,15 @@ def reduce_counts(
     flat = corrections.flat_field(detector, raw, exposed)
     gain = detector.on_pixels("gain", shape) / detector.em_gain
     electrons = _corrected(raw.values, dark.level, flat) * gain
-    independent = detector.excess * dark.charge + gain**2 / 12 + raw.frames * dark.added  # gain²/12: of the rounding
+    independent = detector.excess * dark.charge + gain**2 / 12  # gain²/12: variance of the rounding
+    read = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2
+    shared = dark.shared(independent + read, raw.frames)
+    independent = independent + raw.frames * dark.added
     mask = full | rays | corrections.bad(shape)
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
-    if np.any(dark.added):
-        common = float(np.median(dark.added)) * raw.frames**2
-        noise: Metadata = {"frame_electrons": common, "frame_digest": _digest(dark.level)}
-        image = replace(image, metadata=image.metadata | noise)
+    image = replace(image, metadata=image.metadata | shared)
     _report_darkness(image)
     return image
-
-
-def _digest(level: Array | float) -> str:
-    """Digest of a subtracted frame, the same for a constant more, such as the dark current of another time."""
-    pixels = np.ravel(level)
-    return hashlib.sha256((np.round(pixels - pixels[0], 3) + 0.0).tobytes()).hexdigest()[:DIGITS]
 
 
 def _tell_time(raw: Counts, exposed: Exposed) -> None:
@@ -364,9 +341,9 @@ def _background(
         require_same_time("dark", found, "counts", exposed.exposure_time)
         shown = gain * (found.values - zero)
         charge = shown_charge(shown, charge, reading, detector.excess, found.frames, noise)
-        return Background(found.values, charge, (detector.excess * charge + reading) / found.frames)
+        return Background(found.values, charge, (detector.excess * charge + reading) / found.frames, found.values)
     if empty is not None:
-        return Background(empty.values + dark_charge / gain, charge, noise)
+        return Background(empty.values + dark_charge / gain, charge, noise, empty.values)
     return Background(detector.on_pixels("bias", shape) + charge / gain, charge)
 
 

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from ..runtime.errors import ImageError
 from .formats import BESIDE, Metadata
 from .image_data import ImageData
-from .noise_model import NUMBERS
+from .noise_model import FRAME, NUMBERS
 from .pixel_axes import PixelAxes
 from .z_test import is_deterministic
 
 Sum = TypeVar("Sum", bound=ImageData)
-FRAME = ("frame_electrons", "frame_digest")  # of a subtracted frame
 SQUARES = ("read_noise", "dark_electrons")  # numbers of the noise that add up, the former in squares
 
 

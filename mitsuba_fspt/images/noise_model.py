@@ -9,7 +9,9 @@ relative error ε of the response are planes of the image or numbers of its meta
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,8 @@ from .image_data import ImageData
 
 Array = NDArray[np.float64]
 NUMBERS = ("read_noise", "dark_electrons", "excess_noise", "prnu")  # of the metadata, beside `electrons_per_watt`
+
+FRAME = ("frame_electrons", "frame_share", "frame_digest")  # of the metadata: noise of a subtracted frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +64,27 @@ class NoiseModel:
         each = np.full(image.shape, per_watt) if image.flat is None else per_watt * image.flat.astype(np.float64)
         noise = math.hypot(read, math.sqrt(dark)) if image.dark_noise is None else image.dark_noise.astype(np.float64)
         error = 0.0 if image.flat_error is None else image.flat_error.astype(np.float64)
-        frame = number(f"{thing}, 'frame_electrons'", image.metadata.get("frame_electrons", 0.0), ImageError, "1.2")
-        relative = np.hypot(error, np.full(image.shape, prnu))
-        return cls(excess / each, (noise / each) ** 2, relative, excess, max(frame, 0.0) / each**2)
+        relative, without = np.hypot(error, np.full(image.shape, prnu)), (noise / each) ** 2
+        return cls(excess / each, without, relative, excess, _of_frame(image.metadata, thing, without, each))
 
     def variance(self, power: Array) -> Array:
         """Variance [W²] for the light `power` [W]; that of a negative one is the variance without light."""
         light = np.maximum(power, 0)
         return self.shot * light + self.dark + (self.relative * light) ** 2
+
+
+def _of_frame(metadata: Mapping[str, Any], thing: str, dark: Array, each: Array) -> Array:
+    """Part [W²] of the variance `dark` by a subtracted frame; `each`: electrons per watt.
+
+    Raises ImageError for numbers that are no variance and no share.
+    """
+    share, most = (
+        number(f"{thing}, '{name}'", metadata.get(name, 0.0), ImageError, "0.5")
+        for name in ("frame_share", "frame_electrons")
+    )
+    if not (0 <= share <= 1 and 0 <= most < math.inf):
+        raise ImageError(
+            f"{thing} has {most:g} e-² of a subtracted frame, or its share {share:g}, outside 0 to 1. Reduce it again "
+            "from its counts."
+        )
+    return np.minimum(share * dark + most / each**2, dark)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from sphere_views import passes_of
 
 from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.images.image import Image
+from mitsuba_fspt.images.noise_model import NoiseModel
 from mitsuba_fspt.inverse.measurement import Measurement, Noise, noise_of, tell_misfit
 from mitsuba_fspt.inverse.source_fit import SourceFit
 from mitsuba_fspt.inverse.view_factors import PixelNoise
@@ -125,8 +127,43 @@ def test_the_noise_of_a_subtracted_frame_is_the_same_in_all_views():
         assert found[:3, 3:].diagonal() == pytest.approx(3 * [share], abs=0.03)
         assert abs(found[0, [1, 2, 4, 5]]).max() < 0.03
     both = images[0] + images[1]  # with another share of either frame
-    assert not {"frame_electrons", "frame_digest"} & set(both.metadata)
+    assert not {"frame_electrons", "frame_share", "frame_digest"} & set(both.metadata)
     assert noise_of((1, 4, 4), [both]).frame.max() == 0
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_half_of_the_noise_of_a_hot_pixel_is_common_to_views(frames):
+    """Of images and dark frames that are means of as many frames. It was 0.003 on pixels of 2000 electrons."""
+    pytest.importorskip("ccdproc")
+    rng = np.random.default_rng(3)
+    charge = np.where(np.arange(64).reshape(8, 8) % 9, 0.06, 2000.0)
+    light, dark = np.rint(500 + rng.poisson(np.broadcast_to(charge, (2, frames, 8, 8))) / 1.6)
+    image = Detector.typical_ccd().reduce(light, exposure_time=60, wavelength_nm=650, dark=dark)
+    noise = noise_of((1, 8, 8), [image])
+    np.testing.assert_allclose(noise.frame / noise.other, 0.5, rtol=1e-6)
+
+
+def test_images_of_two_times_have_the_noise_of_one_bias_frame_in_common(tmp_path):
+    """With a map of the dark current, of which another time subtracts another multiple. They had two digests."""
+    pytest.importorskip("ccdproc")
+    current = np.linspace(0.001, 0.2, 64).reshape(8, 8)
+    np.save(tmp_path / "current.npy", current)
+    camera = replace(Detector.typical_ccd(), dark_current=str(tmp_path / "current.npy"))
+    bias = 500 + np.arange(64.0).reshape(8, 8) % 5
+    images = [camera.reduce(bias, exposure_time=time, wavelength_nm=650, bias=bias) for time in (30, 60)]
+    assert noise_of((2, 8, 8), images).subtracted.tolist() == [0, 0]
+    for image in images:  # the variance of reading a pixel, 3.5² + 1.6²/12
+        part = NoiseModel.of(image).frame * image.metadata["electrons_per_watt"] ** 2
+        np.testing.assert_allclose(part, 3.5**2 + 1.6**2 / 12)
+    other = camera.reduce(bias, exposure_time=60, wavelength_nm=650, bias=bias + 1e-4)
+    assert noise_of((2, 8, 8), [images[0], other]).subtracted.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("wrong", [{"frame_share": 1.5}, {"frame_share": np.nan}, {"frame_electrons": np.inf}])
+def test_noise_of_a_frame_that_none_has_is_refused(wrong):
+    numbers = {"electrons_per_watt": 1.0, "read_noise": 2.0}
+    with pytest.raises(InversionError, match=r"image 0 has .* of a subtracted frame, or its share"):
+        noise_of((1, 4, 4), [Image(np.ones((4, 4)), metadata=numbers | wrong)])
 
 
 @pytest.mark.parametrize("factors", [0.0, 0.1])
