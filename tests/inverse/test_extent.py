@@ -220,12 +220,13 @@ def test_uncertain_absorption_widens_the_radius(case, sphere, few_radii):
 
 def test_an_uncertain_ratio_of_the_bands_widens_the_radius(case, sphere, few_radii):
     """Rationale: factors of the bands of 5 % make the ratio uncertain by 7 %, as much as a sphere of 1.3 mm; a common
-    factor of 5 % would not change the ratio. Seen to fail with the factors left out of the noise."""
+    factor of 5 % does not change the ratio. Seen to fail with the factors left out of the noise."""
     images = case.images(1.5, 3000, gain_error=0.05)
     plain = sphere.sources[0].radius_interval
-    apart = case.locate(images, band_correlation=0.0).sources[0].radius_interval
+    apart, common = (case.locate(images, band_correlation=rho).sources[0].radius_interval for rho in (0.0, 1.0))
     assert apart[0] < 1.5 < apart[1]
     assert np.ptp(apart) > 8 * np.ptp(plain)
+    np.testing.assert_allclose(common, plain, atol=0.02)
 
 
 def test_factors_of_bands_are_fitted(case, caplog):

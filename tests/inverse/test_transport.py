@@ -287,6 +287,8 @@ def test_a_column_alone_is_the_image_of_one_vertex(tmp_path):
     "optics",
     [
         {"model": "pinhole"},
+        {"model": "hrrt", "lens_diameter": 25.0},
+        {"model": "ripoll", "numerical_aperture": 0.05},
         {"image_stop_diameter": 6.0},
         {"lens_diameter": 22.0, "diaphragm_distance": 15.0, "f_number": 4.0},
         {"emission": {"emission": "fresnel", "int_ior": 1.37}},

@@ -19,7 +19,7 @@ from mitsuba_fspt.inverse import transport as module
 from mitsuba_fspt.inverse.transport_file import PartialFile
 from mitsuba_fspt.rendering.provenance import mesh_digest, same_mesh
 from mitsuba_fspt.runtime import workers
-from mitsuba_fspt.runtime.errors import SceneError, TransportError
+from mitsuba_fspt.runtime.errors import BackendError, SceneError, TransportError
 from mitsuba_fspt.runtime.workers import LOCAL_CLUSTER
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -184,20 +184,46 @@ def test_a_cluster_computes_the_same_matrix(scene_file, tmp_path, monkeypatch):
     """Of a cluster in this process: the same bits as without, and no file beside.
 
     What becomes of a worker that is killed is decided in `results_of_cluster`, for which tests/studies/test_sweep.py
-    kills one.
+    kills one; here each view goes through it.
     """
     distributed = pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)
     threads = []
     monkeypatch.setattr(module.backend, "set_threads", threads.append)
+    tried, retrying = [], workers.results_of_cluster
+
+    def noted(points, *rest):
+        tried.extend(points)
+        return retrying(points, *rest)
+
+    monkeypatch.setattr(workers, "results_of_cluster", noted)
     views = {"view": [0, 90], "f_number": 8}
     with distributed.LocalCluster(n_workers=1, processes=False, **LOCAL_CLUSTER, silence_logs=50) as cluster:
         there = fspt.transport(scene_file, scheduler=cluster.scheduler_address, file="T.npz", **views)
     here = fspt.transport(scene_file, **views)
     assert threads == [1, 1]
+    assert [task.values["view"] for task in tried] == [0, 90]
     assert there.views == here.views
     assert abs(there.matrix - here.matrix).max() == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["T.npz", "body.ply", "body.xml"]
+
+
+def test_a_view_that_ends_every_worker_is_named_and_others_stay(scene_file, tmp_path, monkeypatch):
+    """What `results_of_cluster` gives of such a view is raised; seen to fail with the error taken for a result."""
+
+    def killed(points, *_):
+        yield points[0], module.computed(points[0])
+        yield points[1], workers.lost_workers(points[1], "transport")
+
+    monkeypatch.setattr(workers, "results_of_cluster", killed)
+    file = tmp_path / "T.npz"
+    with pytest.raises(BackendError, match="transport: 3 worker processes died at view=90"):
+        fspt.transport(scene_file, view=[0, 90], scheduler="tcp://127.0.0.1:1", file=file)
+    monkeypatch.setattr(workers, "results_of_cluster", lambda points, *_: [(p, module.computed(p)) for p in points])
+    calls, plain = [], module.computed
+    monkeypatch.setattr(module, "computed", lambda task, *rest: calls.append(task.label) or plain(task, *rest))
+    fspt.transport(scene_file, view=[0, 90], scheduler="tcp://127.0.0.1:1", file=file)
+    assert calls == ["view=90"]
 
 
 def test_a_scheduler_that_does_not_answer_is_named_by_the_matrix(scene_file, run, tmp_path, monkeypatch):

@@ -43,6 +43,8 @@ def by_attribute(path, level):
         (by_bitmap, "ptracer"),
         (by_attribute, "ptracer"),
         (by_bitmap, "pupil"),
+        (by_bitmap, "surface"),
+        (by_attribute, "surface"),
     ],
 )
 def test_a_dark_body_gives_a_dark_image_and_a_warning(body, method, tmp_path):

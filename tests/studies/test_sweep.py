@@ -538,18 +538,20 @@ def test_points_that_fail_are_named_and_leave_the_others(tmp_path, where, reques
     assert len((tmp_path / "o" / "index.csv").read_text().splitlines()) == 2
 
 
-def test_ctrl_c_leaves_one_line_and_what_is_done(tmp_path):
+@pytest.mark.parametrize("jobs", [[], ["--jobs", "2"]])
+def test_ctrl_c_leaves_one_line_and_what_is_done(tmp_path, jobs):
     """Ctrl-C goes to all processes of the terminal, and only the first of them acts on it."""
     define = ["-D", "f_number=2.8,4,5.6,8,11,16,22,32", "-D", "distance=165,170,175,180"]
-    command = [sys.executable, "-m", "mitsuba_fspt", "sweep", "s.xml", *define, "-o", "o", "--jobs", "2"]
+    command = [sys.executable, "-m", "mitsuba_fspt", "sweep", "s.xml", *define, "-o", "o", *jobs]
     pipe = subprocess.PIPE
     process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not list(tmp_path.glob("o/s_*.exr")):
         time.sleep(0.01)
-    for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
-        os.kill(int(child), signal.SIGINT)
-    time.sleep(0.3)
+    if jobs:
+        for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
+            os.kill(int(child), signal.SIGINT)
+        time.sleep(0.3)
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, "")
