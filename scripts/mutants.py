@@ -745,6 +745,27 @@ MUTANTS = (
         '"cm": 100.0',
         ("tests/phantom/test_flux_units.py", "tests/phantom/test_flux_import.py"),
     ),
+    Mutant(
+        "bent edge of a shadow",
+        "integral/surface/column_form.py",
+        "PARABOLA = 4 / 3",
+        "PARABOLA = 0.0",
+        ("tests/integral/surface/test_face_image.py",),
+    ),
+    Mutant(
+        "error of a net of transects",
+        "integral/pupil/node_rules.py",
+        "NET_SCATTER = 3.0",
+        "NET_SCATTER = 1.0",
+        ("tests/integral/test_honest_error.py",),
+    ),
+    Mutant(
+        "gain error of the z-test",
+        "images/z_test.py",
+        "self.difference - gain * light",
+        "self.difference",
+        ("tests/images/test_comparison.py",),
+    ),
 )
 
 
