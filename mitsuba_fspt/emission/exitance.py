@@ -181,6 +181,12 @@ def _check_bitmap(texture: mi.Texture) -> None:
             "one channel, as a float EXR."
         )
     half, described = dr.is_half_v(values["data"]), str(texture)  # no other way to ask a texture for `raw` and its file
+    if half and 'name = ""' in described and "raw = 0" in described:
+        raise ExitanceError(
+            f"fspt_surface: 'exitance' is a bitmap in memory of {width} × {height} texels of 16 bits, and Mitsuba does "
+            "not tell whether they are floats or whole numbers, which it decodes as sRGB. Convert it to Float32 in "
+            "W/mm², or set raw to true."
+        )
     whole = not dr.is_float_v(values["data"]) or (half and not HALF_FLOATS.search(described))
     if whole and "raw = 0" in described:
         raise ExitanceError(

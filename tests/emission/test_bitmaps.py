@@ -123,10 +123,11 @@ RED_GREEN_BLUE = np.full((2, 4, 3), [3, 2, 1], np.float32)
         (RED_GREEN_BLUE, True, "a bitmap of 3 channels that differ, J_n is one number"),
         (RED_GREEN_BLUE.astype(np.uint8), False, "a bitmap of 3 channels that differ"),
         (np.full((2, 4, 1), 128, np.uint8), False, "a picture of 4 × 2 whole numbers, which are decoded as sRGB"),
-        (np.full((2, 4, 1), 128 << 8, np.uint16), False, "a picture of 4 × 2 whole numbers, which are decoded as sRGB"),
+        (np.full((2, 4, 1), 128 << 8, np.uint16), False, "4 × 2 texels of 16 bits, .* Convert it to Float32 in W/mm²,"),
+        (np.full((2, 4, 1), 0.2, np.float16), False, "not tell whether they are floats or whole numbers"),
         (np.full((2, 4, 1), 3, np.uint16), True, "a bitmap of 16-bit floats up to 4.58e-05 W/mm², where these have"),
     ],
-    ids=["colours", "coloured picture", "grey picture", "grey picture of 16 bits", "dark picture of 16 bits"],
+    ids=["colours", "coloured picture", "grey picture", "grey of 16 bits", "16-bit floats", "dark of 16 bits"],
 )
 def test_bitmaps_that_are_no_watts_are_refused(pixels, raw, message):
     """Mitsuba makes luminance of the one and bends the values of the other: 128 of 255 would be 0.22 W/mm².
@@ -135,6 +136,13 @@ def test_bitmaps_that_are_no_watts_are_refused(pixels, raw, message):
     """
     with pytest.raises(RuntimeError, match=message):
         world_scene(ball({"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": raw}))
+
+
+def test_a_file_of_16_bit_whole_numbers_is_refused(tmp_path):
+    path = str(tmp_path / "jn.png")
+    mi.Bitmap(np.full((2, 4, 1), 128 << 8, np.uint16)).write(path)
+    with pytest.raises(RuntimeError, match="a picture of 4 × 2 whole numbers, which are decoded as sRGB"):
+        world_scene(ball({"type": "bitmap", "filename": path}))
 
 
 def test_an_exr_of_16_bit_floats_is_watts(tmp_path):
