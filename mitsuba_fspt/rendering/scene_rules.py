@@ -127,11 +127,12 @@ def _check_rotation(path: Path, node: ElementTree.Element, scene: SceneXml) -> N
     given = node.get("value")
     texts = [node.get(name, "0") for name in "xyz"] if given is None else re.split(r"[\s,]+", given.strip())
     texts = [scene.fill_in(text).strip() for text in texts]
-    if not all(map(is_number, texts)):
+    try:
+        axis = [float(text) for text in (texts if len(texts) == 3 else 3 * texts[:1])]
+    except ValueError:
         return
-    axis = [float(text) for text in (texts if len(texts) == 3 else 3 * texts[:1])]
     length = math.hypot(*axis)
-    if abs(length - 1) > AXIS_ROUNDING:
+    if not abs(length - 1) <= AXIS_ROUNDING:  # NaN, too
         of = " ".join(texts)
         mend = (
             "Give one such as y = 1."

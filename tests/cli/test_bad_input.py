@@ -241,6 +241,10 @@ FILES = {
         "s.xml: the axis 1 2 2 of a <rotate> must have the length 1, got 3: Mitsuba stretches what it turns. Give "
         'x="0.333333", y="0.666667", z="0.666667".',
     ),
+    "a rotation about an axis that is no number": (
+        of_ball("<emitter", '<transform name="to_world"><rotate x="nan" angle="77"/></transform><emitter'),
+        "s.xml: the axis nan 0 0 of a <rotate> must have the length 1, got nan",
+    ),
     "a rotation about no axis": (
         of_ball("<emitter", '<transform name="to_world"><rotate value="0, 0, 0" angle="77"/></transform><emitter'),
         "s.xml: the axis 0 0 0 of a <rotate> must have the length 1, got 0",
