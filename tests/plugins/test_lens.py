@@ -213,7 +213,10 @@ def test_a_crop_window_is_a_part_of_the_film():
 
 
 def pictures(settings, spp=2000):
-    """Integral, path and ptracer of a sphere, off the axis, and the Monte Carlo errors."""
+    """Integral, path and ptracer of a sphere, off the axis, and the Monte Carlo errors.
+
+    The sums of 2,000 samples a pixel still determine the ratio to 1e-2.
+    """
     scene = world_scene(ball(2e-3, center=(6, 1.5, -1)), sensor=lens(size=12, pitch=0.9, **settings))
     return [
         fspt.render(scene),
