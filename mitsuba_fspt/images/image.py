@@ -137,7 +137,8 @@ class Image(ImageData):
 
         Standard errors, which are taken as independent, add up in squares; the integral's, which are bounds, add up. Of
         the metadata, entries remain that both have. The sum of two measured images with the same `electrons_per_watt`
-        keeps it, with the read noise of both. The larger `gain_error` remains. What one of them masks is masked.
+        keeps it, with the read noise of both. The larger `gain_error` remains, an upper bound. What one of them masks
+        is masked.
 
         Raises
         ------
@@ -146,7 +147,11 @@ class Image(ImageData):
         return self._combined(other, 1)
 
     def __sub__(self, other: object) -> Image:
-        """Power of this image less that of the other; errors add up and metadata remain as in a sum."""
+        """Power of this image less that of the other; errors add up and metadata remain as in a sum.
+
+        A `gain_error` remains if both images name the same detector and have the same one. Others, times the power of
+        their image, are part of the errors.
+        """
         return self._combined(other, -1)
 
     def _combined(self, other: object, sign: int) -> Image:

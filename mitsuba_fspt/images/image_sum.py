@@ -32,10 +32,13 @@ def combined(one: Sum, other: ImageData, sign: int) -> Sum:
     known = _metadata(one, other) | _source_power(one, other, sign)
     for name in FRAME:  # of which each of the two may have another share
         known.pop(name, None)
-    if gain_error := max(image.gain_error or 0.0 for image in (one, other)):
+    known.pop("gain_error", None)
+    gain_error, own = _gain_errors(one, other, sign)
+    if gain_error:
         known["gain_error"] = gain_error
     planes: dict[str, Any] = dict.fromkeys(BESIDE)
-    planes |= {"error": _error(one, other), "coverage": coverage, "mask": mask}
+    error = _error(one, other)
+    planes |= {"error": None if error is None else np.hypot(error, own), "coverage": coverage, "mask": mask}
     if sign == 1 and _of_one_detector(one, other):
         read, dark = ([float(image.metadata[name]) for image in (one, other)] for name in SQUARES)
         known |= {"read_noise": math.hypot(*read), "dark_electrons": sum(dark)}
@@ -46,6 +49,20 @@ def combined(one: Sum, other: ImageData, sign: int) -> Sum:
     if mask is not None:
         known["masked_pixels"] = int(mask.sum())
     return replace(one, power=power, metadata=known, **planes)
+
+
+def _gain_errors(one: ImageData, other: ImageData, sign: int) -> tuple[float, NDArray[np.float64] | float]:
+    """Gain error of a sum or difference, and the error [W] of its pixels by those of the images that it has not.
+
+    A sum has the larger one, an upper bound. So has a difference of two images that name the same detector with the
+    same gain error; other factors are not common to its pixels.
+    """
+    errors = [image.gain_error or 0.0 for image in (one, other)]
+    names = [image.metadata.get("detector") for image in (one, other)]
+    if sign == 1 or (names[0] is not None and names[0] == names[1] and errors[0] == errors[1]):
+        return max(errors), 0.0
+    parts = (gain * image.power.astype(np.float64) for gain, image in zip(errors, (one, other), strict=True))
+    return 0.0, np.hypot(*parts)
 
 
 def _of_one_detector(one: ImageData, other: ImageData) -> bool:

@@ -98,13 +98,31 @@ def test_sums_of_scaled_images_stay_scaled():
 
 
 @pytest.mark.parametrize("errors", [(0.05, 0.02), (0.02, 0.05), (0.05, None)])
-def test_sums_and_differences_keep_the_larger_gain_error(errors):
+def test_sums_keep_the_larger_gain_error(errors):
     """It was lost where the two differ, and with it most of the width of the intervals of `invert`."""
     one, other = (
         fspt.Image(np.ones((2, 2)), np.ones((2, 2)), metadata={} if error is None else {"gain_error": error})
         for error in errors
     )
-    assert (one + other).gain_error == (one - other).gain_error == 0.05
+    assert (one + other).gain_error == 0.05
+
+
+@pytest.mark.parametrize(
+    ("known", "gain_error", "error"),
+    [
+        ({}, None, np.sqrt(0.5**2 + 0.1**2 + 0.1**2)),  # a model
+        ({"detector": "b", "gain_error": 0.05}, None, np.sqrt(0.5**2 + 0.1**2 + 0.5**2 + 0.1**2)),
+        ({"detector": "a", "gain_error": 0.02}, None, np.sqrt(0.5**2 + 0.1**2 + 0.2**2 + 0.1**2)),
+        ({"detector": "a", "gain_error": 0.05}, 0.05, np.sqrt(0.1**2 + 0.1**2)),
+    ],
+)
+def test_a_difference_has_the_gain_errors_of_both_images(known, gain_error, error):
+    """10 W to 5 %, less 10 W: it had 5 % of 0 W."""
+    plane = np.full((2, 2), 10.0)
+    one = fspt.Image(plane, plane / 100, metadata={"detector": "a", "gain_error": 0.05})
+    found = one - fspt.Image(plane, plane / 100, metadata=known)
+    assert found.gain_error == gain_error
+    np.testing.assert_allclose(found.error, error, rtol=1e-6)
 
 
 def test_the_sum_of_two_exposures_has_the_noise_of_both():
