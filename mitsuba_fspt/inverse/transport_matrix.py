@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
 # Numbers of the lens that images and views are compared by, beside those of `REAL_LENS`.
+ALWAYS = ("focal_length", "f_number", "magnification", "model", "transmittance")  # of every lens: compared where stated
 LENS = (
-    *("focal_length", "f_number", "magnification", "model", "transmittance"),
+    *ALWAYS,
     *("lens_diameter", "diaphragm_distance", "image_stop_diameter", "numerical_aperture"),
 )
 # What a real lens adds: name, key by which images and views are compared, and its value for a lens without it.
@@ -370,12 +371,14 @@ def _differences(
     digest = metadata.get("mesh_digest")
     if digest is not None and not same_mesh(str(digest), str(matrix.metadata["mesh_digest"])):
         notes.append(f"image {number} shows another mesh than the one of the matrix.")
+    whole = "model" in metadata  # all numbers of the lens: what is missing there, the lens has not
     for name in LENS if "focal_length" in metadata else ():
-        if metadata.get(name) != lens.get(name) and name not in other:
+        stated = (name in metadata and name in lens) if name in ALWAYS else (name in metadata or whole)
+        if metadata.get(name) != lens.get(name) and name not in other and stated:
             given, own = (of.get(name, "none") for of in (metadata, lens))
             notes.append(f"image {number} has {name} = {given}, its view of the matrix {own}.")
     for name, (key, usual) in REAL_LENS.items() if "focal_length" in metadata else ():
-        if metadata.get(key, usual) != lens.get(key, usual) and name not in other:
+        if metadata.get(key, usual) != lens.get(key, usual) and name not in other and (key in metadata or whole):
             given = (of.get(name, usual) for of in (metadata, lens))
             notes.append("image {} has {} = {}, its view of the matrix {}.".format(number, name, *given))
     return notes

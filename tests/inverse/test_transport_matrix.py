@@ -264,6 +264,16 @@ def test_images_are_held_against_the_views(scene_file, matrix, caplog):
         matrix.backward([fspt.Image(image.power, metadata=image.metadata | {name: value}) for image in images])
         assert caplog.messages == [f"fspt: image 0 has {name} = {value}, its view of the matrix {own}."]
     caplog.clear()
+    some = [{name: image.metadata[name] for name in ("focal_length", "f_number", "pixel_pitch")} for image in images]
+    for f_number, lines in ((2.8, 0), (4.0, 1)):  # of a lens whose other numbers the metadata do not state
+        matrix.backward(
+            [
+                fspt.Image(image.power, metadata=known | {"f_number": f_number})
+                for image, known in zip(images, some, strict=True)
+            ]
+        )
+        assert len(caplog.messages) == lines
+    caplog.clear()
     counts = [np.full(image.shape, 600) for image in images]
     camera = fspt.Detector.typical_ccd()
     numbers = {"exposure_time": 60, "wavelength_nm": 650}
