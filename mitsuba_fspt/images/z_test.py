@@ -39,9 +39,9 @@ class ZTest:
     noisy : number of the tested pixels whose bound is at most half the standard error
     detectable : smallest difference on the standard's brightest pixel, over its power, for which p < 0.01; None if
         that pixel is not tested
-    gain : share of the power of a measured image with a `gain_error` that is taken as too much, most probably on all
-        pixels; the differences are those without it, and the share over its deviation counts for `p_value` like a
-        pixel. None without such an image
+    gain : share by which a measured image with a `gain_error` is brighter than the other on all pixels, most probably;
+        the differences are those without it, and the share over its deviation counts for `p_value` like a pixel. None
+        without such an image
     """
 
     max_z: float
@@ -65,7 +65,7 @@ class ZTest:
             )
         if self.gain is None:
             return f"{test}\npower  {power}"
-        return f"{test}\npower  {power}\ngain   {self.gain:+.2%}   of the measured power, too much by gain_error"
+        return f"{test}\npower  {power}\ngain   {self.gain:+.2%}   by which the measured image is brighter"
 
 
 def is_deterministic(image: ImageData) -> bool:
@@ -121,8 +121,8 @@ class _Differences:
     power : of the standard [W]
     kept : pixels masked in neither image
     difference : P_cal − P_std [W] without `gain`; 0 on masked pixels, like `error`
-    gain, gain_z : share of measured images' power that is taken as too much, None where no image has a `gain_error`;
-        that of the pixels alone over its standard deviation and `gain_error`
+    gain, gain_z : share by which a measured image is brighter, None where no image has a `gain_error`; that of the
+        pixels alone over its standard deviation and `gain_error`
     bound : error of the deterministic images [W]
     excess : max(|difference| − bound, 0) [W]
     error : standard error s of the difference [W]
@@ -158,21 +158,31 @@ class _Differences:
         self.missed = self._missed(calculated, standard)
 
     def _without_gain(self, calculated: ImageData, standard: ImageData) -> float | None:
-        """Take the power that measured images most probably have too much out of the difference; returns its share.
+        """Take the share by which a measured image is brighter than the other, most probably, out of the difference.
 
-        A share g of an image's power, normal about 0 with the deviation `gain_error`, is too much on all its pixels.
-        With its part b of the difference d, Σ (d − g b)²/(s² + bound²) + (g/gain_error)² is least for this g.
+        A share g of the light t, normal about 0 with the deviation δ = `gain_error`, is common to all its pixels. With
+        the light b = ± t of the other image in the difference d, Σ (d − g b)²/(s² + bound²) is least for
+        g = Σ w b d/Σ w b², whose standard deviation σ follows from the scatter over the pixels; g δ²/(δ² + σ²) is
+        returned. The noise of b itself would count as g = −1 and is taken out of both sums.
         """
         deviations = [image.gain_error or 0.0 for image in (calculated, standard)]
         deviation = math.hypot(*deviations)
         if not deviation or not self.tested.any():
             return None
-        light = calculated.power if deviations[0] else -self.power
-        d, b, s = (np.asarray(of, np.float64)[self.tested] / self.scale for of in (self.difference, light, self.error))
-        weight = 1 / (s * s + np.square(self.bound[self.tested] / self.scale))
-        moment, curvature = float((weight * b * d).sum()), float((weight * b * b).sum())
-        self.gain_z = moment / curvature / math.hypot(deviation, curvature**-0.5) if curvature else 0.0
-        gain = moment / (curvature + deviation**-2)
+        sign, other = (1, standard) if deviations[0] else (-1, calculated)
+        light = sign * other.power.astype(np.float64)
+        noise = 0.0 if other.error is None or is_deterministic(other) else np.asarray(other.error, np.float64)
+        noise = np.broadcast_to(noise, light.shape)
+        given = self.difference, light, self.error, self.bound, noise
+        d, b, s, bound, own = (of[self.tested] / self.scale for of in given)
+        weight = 1 / (s * s + bound * bound)
+        squares, products = weight * (b * b - own * own), weight * (b * d + own * own)
+        if not (curvature := float(squares.sum())) > 0:
+            return 0.0
+        alone = float(products.sum()) / curvature
+        variance = float(np.square(products - alone * squares).sum()) / curvature**2
+        self.gain_z = alone / math.sqrt(deviation**2 + variance)
+        gain = alone * deviation**2 / (deviation**2 + variance)
         self.difference = np.where(self.kept, self.difference - gain * light, 0)
         return gain
 
