@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .image_data import ImageData
+from .noise_model import NoiseModel
 
 LEVEL = 0.01  # probability of a false alarm, to which `ZTest.detectable` refers
 NOISY = 0.5  # largest bound over standard error of a pixel that counts for chi2: a bias of that size adds 0.25 to it
@@ -22,9 +23,10 @@ class ZTest:
 
     s is the standard error of the difference, √(s_cal² + s_std²). The `error` of a deterministic image (`method` =
     integral in its metadata) is no standard deviation: it is the bound of that image's error. Any other image's `error`
-    is a standard error. If the metadata hold `passes`, s was estimated from the scatter of that number of passes, and z
-    follows Student's t with passes − 1 degrees of freedom (for two such images: Welch's number). The values of z below
-    are converted to those of a normal distribution with the same probability.
+    is a standard error; that of a measured image beside the integral is taken for the integral's light. If the metadata
+    hold `passes`, s was estimated from the scatter of that number of passes, and z follows Student's t with passes − 1
+    degrees of freedom (for two such images: Welch's number). The values of z below are converted to those of a normal
+    distribution with the same probability.
 
     Attributes
     ----------
@@ -115,6 +117,22 @@ def z_test(calculated: ImageData, standard: ImageData) -> ZTest | None:
     )
 
 
+def _standard_error(image: ImageData, other: ImageData) -> Plane | None:
+    """Standard error [W] of an image, (h, w): of a measured one beside an exact one that of the exact light.
+
+    The error that a measured image states follows from its own light (Eq. M.24), and is too small where noise made it
+    dark.
+    """
+    if image.error is None:
+        return None
+    model = NoiseModel.of(image) if is_deterministic(other) else None
+    return (
+        np.asarray(image.error, np.float64)
+        if model is None
+        else np.sqrt(model.variance(other.power.astype(np.float64)))
+    )
+
+
 class _Differences:
     """Difference of two images and its errors, arrays of shape (h, w).
 
@@ -138,14 +156,13 @@ class _Differences:
         self.difference = np.where(self.kept, p_cal - self.power, 0)
         self.bound = error_bound(calculated, standard)
         variance, spread = np.zeros(self.power.shape), np.zeros(self.power.shape)
-        noisy = [image for image in (calculated, standard) if image.error is not None and not is_deterministic(image)]
-        self.scale = (
-            max([float(np.abs(image.error).max()) for image in noisy if image.error is not None], default=0.0) or 1.0
-        )
-        for image in noisy:
-            own = np.square(
-                np.asarray(image.error, np.float64) / self.scale
-            )  # over their largest: s⁴ must not underflow
+        pairs = ((calculated, standard), (standard, calculated))
+        noisy = [(own, _standard_error(own, other)) for own, other in pairs if not is_deterministic(own)]
+        self.scale = max([float(np.abs(error).max()) for _, error in noisy if error is not None], default=0.0) or 1.0
+        for image, error in noisy:
+            if error is None:
+                continue
+            own = np.square(error / self.scale)  # over their largest: s⁴ must not underflow
             variance += own
             passes = int(image.metadata.get("passes", 0))
             spread += own * own / (passes - 1) if passes > 1 else 0.0
