@@ -125,12 +125,9 @@ def _standard_error(image: ImageData, other: ImageData) -> Plane | None:
     """
     if image.error is None:
         return None
-    model = NoiseModel.of(image) if is_deterministic(other) else None
-    return (
-        np.asarray(image.error, np.float64)
-        if model is None
-        else np.sqrt(model.variance(other.power.astype(np.float64)))
-    )
+    if is_deterministic(other) and (model := NoiseModel.of(image)):
+        return np.sqrt(model.variance(other.power.astype(np.float64)))
+    return np.asarray(image.error, np.float64)
 
 
 class _Differences:

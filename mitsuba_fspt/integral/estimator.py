@@ -36,7 +36,7 @@ class Estimator(Thresholds):
     order : least power by which the error of transects falls with their number; two thirds of it at corners
     scatter : remaining error of transects across a blurred edge over the deviation between them, without its trend, and
         their number: J_n may have a kink between two. A third of it for two transects, which have no trend, three
-        times as much on a net
+        times as much for the net of the last level
     slant : the same of transects across a sharp edge, over their number to the power 3/2: the edge is slanted
     neighbour_share : share of a neighbour's remaining error that counts, as its edge may reach into the pixel; all of
         it where an edge is sharp

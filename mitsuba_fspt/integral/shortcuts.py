@@ -26,3 +26,16 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{SHORTCUTS[self.name]}: {'left out' if self.taken else 'kept'}, {self.why}"
+
+
+def on_surfaces(hidden: bool, dark: int, count: int, what: str, laid: bool) -> tuple[Finding, ...]:
+    """Findings of an image by the surface form.
+
+    hidden : True where occluders were searched for. dark, count : number of elements or faces, as `what` says, that do
+    not glow, and of all; `laid`: the dark ones, too
+    """
+    seen = "one surface may occlude another" if hidden else "one convex shape does not occlude itself"
+    return (
+        Finding("occlusion", not hidden, seen),
+        Finding("dark", dark > 0 and not laid, f"{dark} of {count} {what} are dark"),
+    )

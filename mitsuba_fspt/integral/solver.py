@@ -46,8 +46,6 @@ UNCERTAINTY = 2.0  # largest ratio of that light and its estimate
 PLAIN = 0.7  # of rtol: tolerance of the light by plain courses (`Specular.part`); the rest is that of all others
 OTHERS = 4  # largest number of lines of sight of a pixel over that for all other courses
 FAINTER = 0.1  # least weight of these over that of plain ones
-
-
 MOST_KEPT = 1 << 20  # faces as a camera sees them, of 130 bytes each, that are kept between renders
 
 

@@ -32,7 +32,7 @@ from ..lines.eq9 import most_radiance
 from ..lines.occlusion import hides_nothing
 from ..progress import SILENT, Progress
 from ..quadrature import TOGETHER, Quadrature
-from ..shortcuts import Finding
+from ..shortcuts import Finding, on_surfaces
 from ..solution import Solution
 from .column_canvas import ColumnCanvas, Windows
 from .column_form import FaceLines, falloff_on_pixels
@@ -204,11 +204,7 @@ class FaceImage:
         """Shortcuts of an image by faces alone."""
         hidden, count = any(faces.shadows for faces in self.faces), sum(len(faces.corners) for faces in self.faces)
         dark = sum(int(np.count_nonzero(most <= 0)) for most, _ in self.radiance)
-        seen = "one surface may occlude another" if hidden else "one convex shape does not occlude itself"
-        return (
-            Finding("occlusion", not hidden, seen),
-            Finding("dark", dark > 0 and not self.dark_too, f"{dark} of {count} faces are dark"),
-        )
+        return on_surfaces(hidden, dark, count, "faces", self.dark_too)
 
     def _finer(self, plans: list[Plan], rule: ColumnRule, level: int, least_peak: float) -> list[Plan]:
         """The plans of the next level: at the second level with all cells that the accuracy requires, as the brightest

@@ -27,7 +27,7 @@ from ..lines.occlusion import hides_nothing
 from ..lines.specular import Specular, transmission
 from ..progress import SILENT, Progress
 from ..quadrature import TOGETHER, Quadrature
-from ..shortcuts import Finding
+from ..shortcuts import Finding, on_surfaces
 from ..solution import Solution
 from . import pupil_cells
 from .footprint import Canvas
@@ -156,11 +156,7 @@ class _Refinement:
 
     def _findings(self) -> tuple[Finding, ...]:
         dark, count = (sum(getattr(glow, name) for glow in self.glows) for name in ("dark", "count"))
-        seen = "one surface may occlude another" if self.hidden else "one convex shape does not occlude itself"
-        return (
-            Finding("occlusion", not self.hidden, seen),
-            Finding("dark", dark > 0, f"{dark} of {count} elements are dark"),
-        )
+        return on_surfaces(self.hidden, dark, count, "elements", False)
 
     def _level(self, lines: int, mark: NDArray[np.bool_], deadline: Deadline | None = None) -> list[Plane] | None:
         """Value and coverage from all elements with light on a marked pixel, at so many lines of sight a pixel.
