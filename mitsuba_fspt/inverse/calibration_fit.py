@@ -3,8 +3,9 @@
     σ_i² = P_i/k + σ_other² + e_i² (Eq. M.24, P the fitted image),   C = (Jᵀ J)⁻¹ + g² b bᵀ,   J = ∂(P/σ)/∂p
 
 with b = (Jᵀ J)⁻¹ Jᵀ P/σ, the change of the parameters by a common factor of the powers, and g its uncertainty: Eq. M.26
-of docs/model.md. J comes from differences to both sides where the fit starts and where it ends, and from the images of
-the search between (Broyden, Math. Comp. 19, 577 (1965)), each of which a slope would cost two of for each parameter.
+of docs/model.md. What noise that views have in common adds to C is in `common_noise`. J comes from differences to both
+sides where the fit starts and where it ends, and from the images of the search between (Broyden, Math. Comp. 19, 577
+(1965)), each of which a slope would cost two of for each parameter.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ..runtime.errors import InversionError
+from .common_noise import beyond_independent
 from .measurement import Chi2, Noise
 
 Array = NDArray[np.float64]
@@ -181,6 +183,9 @@ class CalibrationFit:
         inverse = np.linalg.inv(slopes.T @ slopes)
         factor = inverse @ (slopes.T @ (image / sigma)[used])  # Eq. M.26
         covariance = inverse + self.measured.gain_error**2 * np.outer(factor, factor)
+        covariance += beyond_independent(
+            self.measured.noise.common(image, used), slopes @ inverse / sigma[used][:, None]
+        )
         scale = np.outer(self._steps, self._steps)
         return Fitted(self._values(y), covariance * scale, float(residual @ residual), noise, condition)
 

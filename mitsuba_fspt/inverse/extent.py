@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..runtime.errors import InversionError
 from ..runtime.progress_bar import Progress
+from .common_noise import beyond_independent
 from .source_fit import PointSources, SourceFit
 
 Array = NDArray[np.float64]
@@ -186,17 +187,21 @@ class Profile:
         return values, deviations
 
     def _by_model(self) -> float:
-        """Variance of the squared radius by the errors of the equation itself, over that by the noise of the images."""
+        """Variance of the squared radius by errors of the equation itself, and by noise that images have in common
+        beyond that of as much noise without, over that by the images' noise as independent.
+        """
         at = self._least()
         other = at - 1 if at else min(at + 1, len(self._known) - 1)
         (q, one), (p, two) = self._known[at], self._known[other]
-        errors = one.noise.over(self._fit.model_errors(one))
-        if p == q or not errors.size:
+        errors, common = one.noise.over(self._fit.model_errors(one)), self._fit.in_common(one)
+        if p == q or not (errors.size or any(part.deviation.any() for part in common)):
             return 0.0
         along = one.noise.over((two.signal - one.signal) / (p - q))
         beside = np.linalg.qr(one.slopes)[0]
         along -= beside @ (beside.T @ along)
-        return float(((along @ errors) ** 2).sum() / (along @ along))
+        along /= np.linalg.norm(along)
+        extra = float(beyond_independent(common, one.noise.from_pixels(along[:, None]))[0, 0])
+        return float(((along @ errors) ** 2).sum()) + extra
 
 
 def with_radii(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
-import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -21,6 +21,7 @@ from ..images.image import Image
 from ..images.noise_model import NoiseModel
 from ..runtime.errors import ImageError, InversionError
 from ..runtime.numbers import number
+from .common_noise import CommonNoise, squared_correlations
 from .stray_matrix import stray_light_of, without_glare_of
 from .transport_matrix import TransportMatrix
 
@@ -31,6 +32,7 @@ WIDE = 0.9  # chi2 below which a warning says that errors are stated too large: 
 # Of Eq. M.27: steps of ln P; the number of groups for one variance, since the square of one standard error from eight
 # passes is wrong by a half; and the share of the brightest pixel below which pixels count as equally dark.
 ALIKE, GROUPS, FAINT = 0.05, 16, 1e-4
+WIDEST = 1 << 24  # pixels in a row of a film, at most
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Chi2:
     """Σ (noise/σ)² of pixels as the stated noise alone makes it.
 
     mean : without the numerical error of the fitted signal; with it at its bound, the number of pixels
-    variance : 2 a pixel for normal noise, more for few electrons
+    variance : 2 a pixel for normal noise, more for few electrons, and for noise that images have in common
     """
 
     mean: float
@@ -56,9 +58,10 @@ class Noise:
     relative : relative standard error of the pixels' response, (views, h, w) or a number
     excess : F² of an electron-multiplying register, (views,) or a number
     detector : (views,) number of the detector and flat field of each view: pixels of one have the same response in all
-        views
+        images, of other bands, too
     frame : [W²], (views, h, w) or a number, the part of `other` by a subtracted frame
-    subtracted : (views,) number of that frame: the noise of one is the same in all views
+    subtracted : (views,) number of that frame: the noise of one is the same in all images
+    first : (views, 2) row and column on the film of the first pixel of each view
     """
 
     shot: Array
@@ -69,6 +72,7 @@ class Noise:
     detector: NDArray[np.int64] | int = 0
     frame: Array | float = 0.0
     subtracted: NDArray[np.int64] | int = 0
+    first: NDArray[np.int64] | int = 0
 
     def variance(self, signal: Array, used: NDArray[np.bool_]) -> Array:
         """Variance [W²] for a fitted signal [W], NaN where it is not known, of the pixels `used`; (views, h, w)."""
@@ -90,7 +94,23 @@ class Noise:
         drawn = np.broadcast_to(self.sampled[:, None, None], used.shape)[used] & (signal[used] > 0)
         fourth[drawn] = variance[drawn] ** 3 / signal[used][drawn] ** 2
         square = sigma[used] ** 2
-        return Chi2(float((variance / square).sum()), float(((2 * variance**2 + fourth) / square**2).sum()))
+        pairs = 2 * squared_correlations(self.common(signal, used), sigma[used])
+        return Chi2(float((variance / square).sum()), float(((2 * variance**2 + fourth) / square**2).sum()) + pairs)
+
+    def common(self, signal: Array, used: NDArray[np.bool_]) -> list[CommonNoise]:
+        """Noise of the pixels `used` that images have in common for a fitted signal (views, h, w) [W].
+
+        By the response (M.24), and by a subtracted frame.
+        """
+        view, row, column = np.nonzero(used)
+        top, left = np.broadcast_to(self.first, (len(used), 2))[view].T
+        pixel = (row + top) * WIDEST + column + left
+        response = np.broadcast_to(self.relative, used.shape)[used] * np.maximum(signal[used], 0)
+        frame = np.sqrt(np.broadcast_to(self.frame, used.shape)[used])
+        return [
+            CommonNoise(part, np.broadcast_to(origin, len(used))[view], pixel)
+            for part, origin in ((response, self.detector), (frame, self.subtracted))
+        ]
 
 
 def sampling_variance(signal: Array, squares: Array, used: NDArray[np.bool_]) -> Array:
@@ -239,29 +259,17 @@ class Measurement:
         A part of it is the same in several views, see `common`.
         """
         parts = self.common(rows, signal)
-        own = np.sqrt(np.maximum(deviation**2 - sum(part**2 for part, _ in parts), 0))
+        own = np.sqrt(np.maximum(deviation**2 - sum(part.deviation**2 for part in parts), 0))
         found = own[:, None] * rng.standard_normal((len(rows), size))
-        for part, shared in parts:
-            found += part[:, None] * rng.standard_normal((shared.max() + 1, size))[shared]
+        for part in parts:
+            if part.deviation.any():
+                numbers = rng.standard_normal((part.shared.max() + 1, size))
+                found += part.deviation[:, None] * numbers[part.shared]
         return found
 
-    def common(self, rows: NDArray[np.int64], signal: Array) -> list[tuple[Array, NDArray[np.int64]]]:
-        """Noise of the pixels `rows` that views have in common, by the response (M.24) and by a subtracted frame.
-
-        Of each its standard deviation (N,) [W], and a number (N,), the same for the same pixel of one detector or
-        frame.
-        """
-        response = self.relative[rows] * np.maximum(signal, 0)
-        frame = np.sqrt(np.broadcast_to(self.noise.frame, self.noise.shot.shape).ravel()[rows])
-        views, *film = self.noise.shot.shape
-        view, pixel = np.divmod(rows, math.prod(film))
-        found = []
-        for part, kind in ((response, self.noise.detector), (frame, self.noise.subtracted)):
-            if part.any():
-                of_view = np.broadcast_to(kind, views)[view]
-                shared = np.unique(of_view * math.prod(film) + pixel, return_inverse=True)[1]
-                found.append((part, shared.astype(np.int64)))
-        return found
+    def common(self, rows: NDArray[np.int64], signal: Array) -> list[CommonNoise]:
+        """Noise of the pixels `rows`, ascending, that images have in common; see `Noise.common`."""
+        return self.noise.common(*self.as_images(rows, signal))
 
     def chi2(self, rows: NDArray[np.int64], signal: Array, sigma: Array) -> Chi2:
         """Σ (noise/σ)² of the pixels `rows` for a fitted signal [W] and its σ [W]."""
@@ -366,24 +374,34 @@ def noise_of(
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
     frames = _numbered([image.metadata.get("frame_digest") for image in images])
-    return Noise(shot, other, drawn, relative, excess, _detectors(images), frame, frames)
+    return Noise(shot, other, drawn, relative, excess, _detectors(images), frame, frames, _first(images))
 
 
 def _detectors(images: Sequence[Image]) -> NDArray[np.int64]:
-    """(views,) the same number for images of one detector, by its name, that were corrected by the same flat field."""
-    flats = ((image.flat, image.flat_error) for image in images)
+    """(views,) the same number for images of one detector, by name and binning, and of one flat field."""
+    flats = ([image.flat, image.flat_error] for image in images)
     return _numbered(
         [
-            (image.metadata.get("detector"), *(None if flat is None else flat.tobytes() for flat in own))
+            (
+                *(image.metadata.get(name, default) for name, default in (("detector", None), ("binning", 1))),
+                *(None if flat is None else hashlib.sha256(flat.tobytes()).hexdigest() for flat in own),
+            )
             for image, own in zip(images, flats, strict=True)
         ]
     )
 
 
 def _numbered(keys: Sequence[object]) -> NDArray[np.int64]:
-    """Number of each key, the same for equal ones."""
-    known: dict[object, int] = {}
-    return np.array([known.setdefault(key, len(known)) for key in keys], np.int64)
+    """Number of each key, from its digest: the same for equal ones, in other bands, too."""
+    digests = (hashlib.sha256(repr(key).encode()).digest() for key in keys)
+    return np.array([int.from_bytes(digest[:7], "big") for digest in digests], np.int64)
+
+
+def _first(images: Sequence[Image]) -> NDArray[np.int64]:
+    """(views, 2) row and column on the film of the first pixel of each image."""
+    return np.array(
+        [[int(float(image.metadata.get(f"crop_offset_{axis}", 0))) for axis in "yx"] for image in images], np.int64
+    )
 
 
 def without_glare(power: Array, noise: Noise, masks: NDArray[np.bool_], glare: float) -> tuple[Array, Noise]:

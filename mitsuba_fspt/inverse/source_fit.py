@@ -23,6 +23,7 @@ from ..runtime.errors import FluxError, InversionError
 from ..runtime.numbers import number
 from ..runtime.progress_bar import Progress
 from .band_images import BandImages, of_each
+from .common_noise import CommonNoise, beyond_independent, joined, squared_correlations
 from .measurement import Chi2
 from .patterns import Patterns, Seen, views_of
 from .sensitivity_picture import view_labels
@@ -188,11 +189,15 @@ class SourceFit:
         return np.asarray(np.linalg.inv(slopes.T @ slopes + np.diag(prior)))
 
     def joint_sd(self, found: PointSources) -> Array:
-        """Standard deviations in the order of `joint_covariance`, with the errors of the equation itself (Eq. M.51)."""
+        """Standard deviations in the order of `joint_covariance`, with the errors of the equation itself (Eq. M.51) and
+        noise that images have in common.
+        """
         covariance = self.joint_covariance(found)
         slopes = np.column_stack([found.changes / found.sigma[:, None], found.noise.all_columns])
-        change = covariance @ (slopes.T @ (self.model_errors(found) / found.sigma[:, None]))
-        return np.sqrt(np.diag(covariance) + (change**2).sum(axis=1))
+        estimate = slopes @ covariance / found.sigma[:, None]
+        change = estimate.T @ self.model_errors(found)
+        extra = beyond_independent(self.in_common(found), estimate)
+        return np.sqrt(np.diag(covariance + extra) + (change**2).sum(axis=1))
 
     def fitted(self, found: PointSources) -> Array:
         """(N,) fitted power [W], with the factors of the views and the coefficients as fitted."""
@@ -203,9 +208,12 @@ class SourceFit:
         return np.asarray(fitted)
 
     def noise(self, found: PointSources) -> list[Chi2]:
-        """Σ (noise/σ)² of each band as its stated noise makes it."""
-        each = zip(self.bands, self.parts, strict=True)
-        return [b.measurement.chi2(b.rows, found.signal[own], found.sigma[own]) for b, own in each]
+        """Σ (noise/σ)² of each band as its stated noise makes it, and what noise in common to bands adds."""
+        each, sigma = list(zip(self.bands, self.parts, strict=True)), found.sigma
+        own = [b.measurement.chi2(b.rows, found.signal[part], sigma[part]) for b, part in each]
+        parts = [b.measurement.common(b.rows, found.signal[part]) for b, part in each]
+        alone = sum(squared_correlations(one, sigma[part]) for one, (_, part) in zip(parts, each, strict=True))
+        return [*own, Chi2(0.0, 2 * (squared_correlations(joined(parts), sigma) - alone))]
 
     def structure(self, found: PointSources) -> Structure:
         """Test of the residuals for structure: over views, around sources, by coefficients of the tissue."""
@@ -327,20 +335,17 @@ class SourceFit:
         change = covariance @ (found.slopes.T @ found.noise.over(self.model_errors(found)))
         return np.asarray(change @ change.T)
 
+    def in_common(self, found: PointSources) -> list[CommonNoise]:
+        """Noise of the pixels that images, of all bands, have in common."""
+        each = zip(self.bands, self.parts, strict=True)
+        return joined([band.measurement.common(band.rows, found.signal[own]) for band, own in each])
+
     def by_common(self, found: PointSources, covariance: Array) -> Array:
-        """(4K, 4K) covariance of the `values` by noise that views have in common, beyond that of as much noise without.
+        """(4K, 4K) covariance of the `values` by common noise of images, beyond that of as much noise without.
 
         The fit weighs pixels as independent ones.
         """
-        lever = found.noise.over(found.sigma[:, None] * found.slopes) @ covariance
-        extra = np.zeros_like(covariance)
-        for band, part in zip(self.bands, self.parts, strict=True):
-            for deviation, shared in band.measurement.common(band.rows, found.signal[part]):
-                change = lever[part] * (deviation / found.sigma[part])[:, None]
-                sums = np.zeros((shared.max() + 1, change.shape[1]))
-                np.add.at(sums, shared, change)
-                extra += sums.T @ sums - change.T @ change
-        return extra
+        return beyond_independent(self.in_common(found), found.noise.from_pixels(found.slopes @ covariance))
 
     def p_values(self, found: PointSources, places: int, numbers: int = 4) -> Array:
         """(K,) probability, at most, that noise alone makes a source fit as well as each of these.
@@ -356,8 +361,9 @@ class SourceFit:
             own = slice(4 * k, 4 * k + 4)
             changes = np.column_stack([np.delete(found.changes, own, axis=1), found.changes[:, own]])
             directions = np.linalg.qr(noise.over(changes))[0][:, -4:]  # what this source adds to the others
-            without = noise.over(self._target - others.signal)
-            values[k] = places * chi2.sf(((directions.T @ without) ** 2).sum(), numbers)
+            effect = directions.T @ noise.over(self._target - others.signal)
+            spread = np.eye(4) + beyond_independent(self.in_common(others), noise.from_pixels(directions))
+            values[k] = places * chi2.sf(effect @ np.linalg.solve(spread, effect), numbers)
         return values.clip(max=1.0)
 
     def is_linear(self, found: PointSources, covariance: Array, z: float) -> bool:

@@ -116,6 +116,10 @@ class PixelNoise:
         share = (1 - (1 + self.squares) ** -0.5) / np.where(self.squares > 0, self.squares, 1.0)
         return np.asarray(over - self.columns @ (share * (self.columns.T @ over).T).T)
 
+    def from_pixels(self, white: Array) -> Array:
+        """(N, k) change by each pixel [1/W] of sums with the weights `white` (N, k) of what `over` gives."""
+        return np.asarray((self.over((white.T * self.sigma).T).T / self.sigma).T)
+
     def unknowns(self, residual: Array) -> Array:
         """(views,) most likely g_v for residuals (N,) over σ."""
         return np.asarray((self.columns.T @ residual) / (1 + self.squares))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.images.noise_model import NoiseModel
 from mitsuba_fspt.inverse.measurement import Measurement, Noise, noise_of, tell_misfit
-from mitsuba_fspt.inverse.source_fit import SourceFit
-from mitsuba_fspt.inverse.view_factors import PixelNoise
 from mitsuba_fspt.runtime.errors import InversionError
 
 
@@ -151,12 +148,12 @@ def test_images_of_two_times_have_the_noise_of_one_bias_frame_in_common(tmp_path
     camera = replace(Detector.typical_ccd(), dark_current=str(tmp_path / "current.npy"))
     bias = 500 + np.arange(64.0).reshape(8, 8) % 5
     images = [camera.reduce(bias, exposure_time=time, wavelength_nm=650, bias=bias) for time in (30, 60)]
-    assert noise_of((2, 8, 8), images).subtracted.tolist() == [0, 0]
+    assert len(set(noise_of((2, 8, 8), images).subtracted)) == 1
     for image in images:  # the variance of reading a pixel, 3.5² + 1.6²/12
         part = NoiseModel.of(image).frame * image.metadata["electrons_per_watt"] ** 2
         np.testing.assert_allclose(part, 3.5**2 + 1.6**2 / 12)
     other = camera.reduce(bias, exposure_time=60, wavelength_nm=650, bias=bias + 1e-4)
-    assert noise_of((2, 8, 8), [images[0], other]).subtracted.tolist() == [0, 1]
+    assert len(set(noise_of((2, 8, 8), [images[0], other]).subtracted)) == 2
 
 
 @pytest.mark.parametrize("wrong", [{"frame_share": 1.5}, {"frame_share": np.nan}, {"frame_electrons": np.inf}])
@@ -164,28 +161,6 @@ def test_noise_of_a_frame_that_none_has_is_refused(wrong):
     numbers = {"electrons_per_watt": 1.0, "read_noise": 2.0}
     with pytest.raises(InversionError, match=r"image 0 has .* of a subtracted frame, or its share"):
         noise_of((1, 4, 4), [Image(np.ones((4, 4)), metadata=numbers | wrong)])
-
-
-@pytest.mark.parametrize("factors", [0.0, 0.1])
-def test_noise_in_common_widens_the_intervals_of_sources(factors):
-    """Two views of 6 pixels, 0.6 of the variance in common: the covariance of weighted least squares is exact."""
-    rng = np.random.default_rng(2)
-    rows, sigma, signal, shape = np.array([0, 1, 3, 4, 6, 7, 9, 11]), rng.uniform(1, 2, 8), np.zeros(8), (2, 2, 3)
-    frame = np.zeros(12)
-    frame[rows] = 0.6 * sigma**2
-    noise = Noise(np.zeros(shape), np.zeros(shape), np.zeros(2, bool), frame=frame.reshape(shape))
-    measurement = Measurement(np.zeros(12), noise, np.zeros(12, bool), 0.0, matrix=None)
-    own = PixelNoise(sigma, factors * rng.uniform(1, 2, 8), rows // 6)
-    changes = rng.uniform(0.5, 1.5, (8, 4)) + np.eye(8, 4)
-    found = SimpleNamespace(noise=own, sigma=sigma, signal=signal, slopes=own.over(changes))
-    fit = SimpleNamespace(bands=[SimpleNamespace(measurement=measurement, rows=rows)], parts=[slice(0, 8)])
-    covariance = np.linalg.inv(found.slopes.T @ found.slopes)
-    extra = SourceFit.by_common(fit, found, covariance)
-    estimate = covariance @ found.slopes.T @ own.over(np.eye(8))  # of the values, from the residuals [W]
-    shared = 0.6 * np.outer(sigma, sigma) * ((rows % 6)[:, None] == rows % 6)
-    expected = estimate @ (shared - np.diag(np.diag(shared))) @ estimate.T
-    np.testing.assert_allclose(extra, expected, rtol=1e-9, atol=1e-12 * abs(expected).max())
-    assert abs(extra).max() > 0.1 * abs(covariance).max()
 
 
 @pytest.mark.parametrize(("electrons", "read_noise"), [(0.02, 0.0), (0.5, 0.0), (3.0, 1.0), (1000.0, 3.5)])
