@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.formats import Metadata
+from ..images.noise_model import frame_recorded
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
 SURE = 5.0  # standard deviations of a dark frame less the bias: noise alone makes a pixel so bright once in 3 million
-SAME_SHARE = 1e-6  # largest range of the share of a frame's noise that counts as one number
 DIGITS = 16  # of the digest of a subtracted frame
 
 
@@ -44,11 +44,7 @@ class Background:
         if self.frame is None or not np.any(self.added):
             return {}
         common = frames * np.asarray(self.added)  # of one frame of the sum, as `independent` is
-        share = common / (independent + common)
-        found: Metadata = {"frame_digest": _digest(self.frame)}
-        if np.ptp(share) <= SAME_SHARE:
-            return found | {"frame_share": float(np.mean(share))}
-        return found | {"frame_electrons": float(np.median(common)) * frames}
+        return frame_recorded(_digest(self.frame), common * frames, (independent + common) * frames)
 
 
 def shown_charge(

@@ -135,8 +135,9 @@ class Image(ImageData):
     def __add__(self, other: object) -> Image:
         """Power of both images, pixel by pixel, with its error.
 
-        Standard errors, which are taken as independent, add up in squares; the integral's, which are bounds, add up. Of
-        the metadata, entries remain that both have. The sum of two measured images with the same `electrons_per_watt`
+        Standard errors add up in squares, but for noise that two reduced images have in common, by the response of
+        their pixels or by one frame subtracted from both, which adds up itself; the integral's, which are bounds, add
+        up. Of the metadata, entries remain that both have. The sum of two measured images with the same `electrons_per_watt`
         keeps it, with the read noise of both. The larger `gain_error` remains, an upper bound. What one of them masks
         is masked.
 
@@ -147,7 +148,8 @@ class Image(ImageData):
         return self._combined(other, 1)
 
     def __sub__(self, other: object) -> Image:
-        """Power of this image less that of the other; errors add up and metadata remain as in a sum.
+        """Power of this image less that of the other; errors add up and metadata remain as in a sum; noise in
+        common cancels.
 
         A `gain_error` remains if both images name the same detector and have the same one. Others, times the power of
         their image, are part of the errors.

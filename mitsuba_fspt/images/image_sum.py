@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from ..runtime.errors import ImageError
 from .formats import BESIDE, Metadata
 from .image_data import ImageData
-from .noise_model import FRAME, NUMBERS
+from .noise_model import FRAME, NUMBERS, NoiseModel, covariance, frame_recorded
 from .pixel_axes import PixelAxes
 from .z_test import is_deterministic
 
+Plane = NDArray[np.float64]
 Sum = TypeVar("Sum", bound=ImageData)
 SQUARES = ("read_noise", "dark_electrons")  # numbers of the noise that add up, the former in squares
 
@@ -37,12 +38,12 @@ def combined(one: Sum, other: ImageData, sign: int) -> Sum:
     if gain_error:
         known["gain_error"] = gain_error
     planes: dict[str, Any] = dict.fromkeys(BESIDE)
-    error = _error(one, other)
+    error = _error(one, other, sign)
     planes |= {"error": None if error is None else np.hypot(error, own), "coverage": coverage, "mask": mask}
     if sign == 1 and _of_one_detector(one, other):
-        read, dark = ([float(image.metadata[name]) for image in (one, other)] for name in SQUARES)
-        known |= {"read_noise": math.hypot(*read), "dark_electrons": sum(dark)}
-        planes |= {"flat": one.flat, "flat_error": one.flat_error, "dark_noise": _dark_noise(one, other)}
+        noise, dark_noise = _noise_without_light(one, other)
+        known |= noise
+        planes |= {"flat": one.flat, "flat_error": one.flat_error, "dark_noise": dark_noise}
     else:  # no shot noise of the sum follows from its power: the error alone states it
         for name in ("electrons_per_watt", *NUMBERS):
             known.pop(name, None)
@@ -77,19 +78,45 @@ def _of_one_detector(one: ImageData, other: ImageData) -> bool:
     )
 
 
-def _dark_noise(one: ImageData, other: ImageData) -> NDArray[np.float64] | None:
-    """Dark noise [e-] of the sum of two measured images, (h, w); None if both have the same on all pixels."""
-    if one.dark_noise is None and other.dark_noise is None:
-        return None
-    planes = []
+def _frames(one: ImageData, other: ImageData) -> tuple[set[str], list[Plane]]:
+    """Digests of the subtracted frames, and the variance [e-²] by them in each image, (h, w), 0 without one."""
+    found, planes = set(), []
     for image in (one, other):
-        read, dark = (float(image.metadata[name]) for name in SQUARES)
-        planes.append(math.hypot(read, math.sqrt(dark)) if image.dark_noise is None else image.dark_noise)
-    return np.hypot(*(np.broadcast_to(plane, one.shape).astype(np.float64) for plane in planes))
+        digest, model = image.metadata.get("frame_digest"), NoiseModel.of(image)
+        if model is None or not model.frame.any():
+            planes.append(np.zeros(image.shape))
+            continue
+        found.add(str(digest))
+        planes.append(model.frame * (model.excess / model.shot) ** 2)
+    return found, planes
 
 
-def _error(one: ImageData, other: ImageData) -> NDArray[np.float64] | None:
-    """Standard errors added in squares; bounds, of which the integral's are, added up. None where one is unknown.
+def _dark_variance(image: ImageData) -> Plane | float:
+    """Variance without light of a measured image [e-²], (h, w), or a number where all pixels have the same."""
+    if image.dark_noise is not None:
+        return image.dark_noise.astype(np.float64) ** 2
+    return float(image.metadata["read_noise"]) ** 2 + float(image.metadata["dark_electrons"])
+
+
+def _noise_without_light(one: ImageData, other: ImageData) -> tuple[Metadata, Plane | None]:
+    """Noise without light of the sum of two measured images: its numbers, and its plane [e-], None if both have none.
+
+    The noise of one frame that was subtracted from both adds up itself, not in squares.
+    """
+    digests, (first, second) = _frames(one, other)
+    both = 2 * np.sqrt(first * second) if len(digests) == 1 else 0 * first
+    total = _dark_variance(one) + _dark_variance(other) + both
+    read, dark = ([float(image.metadata[name]) for image in (one, other)] for name in SQUARES)
+    known: Metadata = {"read_noise": math.hypot(*read), "dark_electrons": sum(dark) + float(np.median(both))}
+    if len(digests) == 1:
+        known |= frame_recorded(digests.pop(), first + second + both, total)
+    alike = one.dark_noise is None and other.dark_noise is None
+    return known, None if alike else np.broadcast_to(np.sqrt(total), one.shape)
+
+
+def _error(one: ImageData, other: ImageData, sign: int) -> Plane | None:
+    """Standard errors added in squares, with what reduced images have in common; bounds, of which the integral's are,
+    added up. None where one is unknown.
 
     Monte Carlo images of one seed have noise in common: their errors add up, too, the bound of any correlation.
     """
@@ -99,7 +126,7 @@ def _error(one: ImageData, other: ImageData) -> NDArray[np.float64] | None:
     seeds = [image.metadata.get("seed") for image in (one, other)]
     if is_deterministic(one) or is_deterministic(other) or (seeds[0] is not None and seeds[0] == seeds[1]):
         return first + second
-    return np.sqrt(first**2 + second**2)
+    return np.sqrt(np.maximum(first**2 + second**2 + 2 * sign * covariance(one, other), 0))
 
 
 def _metadata(one: ImageData, other: ImageData) -> Metadata:

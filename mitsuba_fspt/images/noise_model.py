@@ -8,6 +8,7 @@ relative error ε of the response are planes of the image or numbers of its meta
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,11 +19,13 @@ from numpy.typing import NDArray
 
 from ..runtime.errors import ImageError
 from ..runtime.numbers import number
+from .formats import Metadata
 from .image_data import ImageData
 
 Array = NDArray[np.float64]
 NUMBERS = ("read_noise", "dark_electrons", "excess_noise", "prnu")  # of the metadata, beside `electrons_per_watt`
 
+SAME_SHARE = 1e-6  # largest range of the share of a frame's noise that counts as one number
 FRAME = ("frame_electrons", "frame_share", "frame_digest")  # of the metadata: noise of a subtracted frame
 
 
@@ -71,6 +74,44 @@ class NoiseModel:
         """Variance [W²] for the light `power` [W]; that of a negative one is the variance without light."""
         light = np.maximum(power, 0)
         return self.shot * light + self.dark + (self.relative * light) ** 2
+
+
+def response_of(image: ImageData) -> tuple[object, ...]:
+    """What images have in common whose pixels have one response: detector, binning, and digests of a flat field."""
+    planes = (
+        None if one is None else hashlib.sha256(one.astype(np.float32).tobytes()).hexdigest()
+        for one in (image.flat, image.flat_error)
+    )
+    return image.metadata.get("detector"), image.metadata.get("binning", 1), *planes
+
+
+def covariance(one: ImageData, other: ImageData) -> Array:
+    """Covariance (h, w) [W²] of two images of the same pixels: by one frame subtracted from both, and by the response.
+
+    0 for images that were not reduced. Raises ImageError as `NoiseModel.of`.
+    """
+    found, models = np.zeros(one.shape), [NoiseModel.of(image) for image in (one, other)]
+    if models[0] is None or models[1] is None:
+        return found
+    digests = [image.metadata.get("frame_digest") for image in (one, other)]
+    if digests[0] is not None and digests[0] == digests[1]:
+        found += np.sqrt(models[0].frame * models[1].frame)
+    parts = [m.relative * np.maximum(image.power, 0) for m, image in zip(models, (one, other), strict=True) if m]
+    if all(part.any() for part in parts) and response_of(one) == response_of(other):
+        found += parts[0] * parts[1]
+    return found
+
+
+def frame_recorded(digest: str, common: Array | float, total: Array | float) -> Metadata:
+    """Metadata of the noise by a subtracted frame: its share of the variance without light, where all pixels have the
+    same, else its variance on the median pixel.
+
+    common, total : variances by the frame and in all [e-²], (h, w) or numbers
+    """
+    share = np.asarray(common / total)
+    if np.ptp(share) <= SAME_SHARE:
+        return {"frame_digest": digest, "frame_share": float(np.mean(share))}
+    return {"frame_digest": digest, "frame_electrons": float(np.median(common))}
 
 
 def _of_frame(metadata: Mapping[str, Any], thing: str, dark: Array, each: Array) -> Array:

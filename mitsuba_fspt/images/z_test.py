@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .image_data import ImageData
-from .noise_model import NoiseModel
+from .noise_model import NoiseModel, covariance
 
 LEVEL = 0.01  # probability of a false alarm, to which `ZTest.detectable` refers
 NOISY = 0.5  # largest bound over standard error of a pixel that counts for chi2: a bias of that size adds 0.25 to it
@@ -21,7 +21,8 @@ Plane = NDArray[np.float64]
 class ZTest:
     """Test of the differences in units of their standard error, z = max(|P_cal − P_std| − bound, 0) / s.
 
-    s is the standard error of the difference, √(s_cal² + s_std²). The `error` of a deterministic image (`method` =
+    s is the standard error of the difference, √(s_cal² + s_std²), without the noise that two reduced images have in
+    common. The `error` of a deterministic image (`method` =
     integral in its metadata) is no standard deviation: it is the bound of that image's error. Any other image's `error`
     is a standard error; that of a measured image beside the integral is taken for the integral's light. If the metadata
     hold `passes`, s was estimated from the scatter of that number of passes, and z follows Student's t with passes − 1
@@ -163,6 +164,7 @@ class _Differences:
             variance += own
             passes = int(image.metadata.get("passes", 0))
             spread += own * own / (passes - 1) if passes > 1 else 0.0
+        variance -= 2 * covariance(calculated, standard) / self.scale / self.scale
         self.error = np.where(self.kept, self.scale * np.sqrt(variance), 0)
         self.freedom = np.divide(variance**2, spread, out=np.full_like(spread, np.inf), where=spread > 0)
         self.tested = (self.error > 0) & ((p_cal != 0) | (self.power != 0))

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from ..detector.reduction import measured
 from ..images.exposure import Exposure
 from ..images.image import Image
-from ..images.noise_model import NoiseModel
+from ..images.noise_model import NoiseModel, response_of
 from ..runtime.errors import ImageError, InversionError
 from ..runtime.numbers import number
 from .common_noise import CommonNoise, squared_correlations
@@ -373,22 +373,9 @@ def noise_of(
                 f"{verb}: image {k} has neither 'electrons_per_watt' nor an error. Reduce it from its counts"
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
+    detectors = _numbered([response_of(image) for image in images])
     frames = _numbered([image.metadata.get("frame_digest") for image in images])
-    return Noise(shot, other, drawn, relative, excess, _detectors(images), frame, frames, _first(images))
-
-
-def _detectors(images: Sequence[Image]) -> NDArray[np.int64]:
-    """(views,) the same number for images of one detector, by name and binning, and of one flat field."""
-    flats = ([image.flat, image.flat_error] for image in images)
-    return _numbered(
-        [
-            (
-                *(image.metadata.get(name, default) for name, default in (("detector", None), ("binning", 1))),
-                *(None if flat is None else hashlib.sha256(flat.tobytes()).hexdigest() for flat in own),
-            )
-            for image, own in zip(images, flats, strict=True)
-        ]
-    )
+    return Noise(shot, other, drawn, relative, excess, detectors, frame, frames, _first(images))
 
 
 def _numbered(keys: Sequence[object]) -> NDArray[np.int64]:
