@@ -41,7 +41,8 @@ def fit_warnings(
     between, edge = problem.between(fit.x)
     common = hstack([common_errors(fit.numerical / fit.sigma, views), csr_array((between / fit.sigma)[:, None])])
     residual = (measurement.power[rows] + fit.correction - signal) / fit.sigma  # Eq. M.29
-    found = structure(residual, slopes, solve, Patterns.of(views), csr_array(common))
+    parts = measurement.common(rows, signal)
+    found = structure(residual, slopes, solve, Patterns.of(views), csr_array(common), None, parts, fit.sigma)
     right = slopes.T @ (between / fit.sigma)
     largest = float(max(right @ solve(right), 0.0) ** 0.5)
     coarse = [] if largest < norm.ppf((1 + confidence) / 2) else [_coarse(largest, edge, problem.settings.fine)]

@@ -239,7 +239,8 @@ class SourceFit:
         inverse = self.joint_covariance(found)
         errors = csr_array(block_diag(known, format="csr"))
         residual = (self.power - self.fitted(found)) / found.sigma
-        return structure(residual, slopes, lambda x: inverse @ x, Patterns.of(views, rings, tissue), errors)
+        patterns, parts = Patterns.of(views, rings, tissue), self.in_common(found)
+        return structure(residual, slopes, lambda x: inverse @ x, patterns, errors, None, parts, found.sigma)
 
     def images(self, values: Array) -> Array | dict[str, Array]:
         """Values (N,) of the pixels as images, (views, height, width); by the names of the bands where they have names.

@@ -5,7 +5,8 @@ K = B A⁻¹ Bᵀ. Residuals over σ have the covariance I − K, and patterns Z
 
     C = Zᵀ(I − K)Z + Σ_u [Zᵀ(I − K)u] [Zᵀ(I − K)u]ᵀ,   E s = Zᵀ(I − K)Z a
 
-for known common errors u and patterns a: Eq. M.34 of docs/model.md.
+for known common errors u and patterns a: Eq. M.34 of docs/model.md. Noise with the correlations X that images have in
+common adds Zᵀ(I − K)X(I − K)Z to C.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from scipy.sparse import csr_array
 from scipy.special import gammaln
 from scipy.stats import chi2
 
+from .common_noise import CommonNoise
 from .patterns import Pattern, Patterns, Seen
 
 Array = NDArray[np.float64]
@@ -52,6 +54,7 @@ class StructureSettings:
         that the penalty smooths away; in directions with more of it, the test would be one of the prior
     rougher : variance of J_n in a direction, over that of the prior. The weight is a mean over all roughness
         (Eq. M.25); where few features of J_n have most of it, each has many times its share
+    least : least share of its variance that a direction keeps where noise in common cancels
     absorbed : least share of a direction that the fit leaves in the residuals; below it rounding counts
     named : most causes that are named
     shown : least share of the squared length of a cause that the residuals show. What the fit absorbs but for less, as
@@ -61,6 +64,7 @@ class StructureSettings:
     chance: float = 1e-4
     noise: float = 0.5
     rougher: float = 25.0
+    least: float = 0.01
     absorbed: float = 1e-3
     named: int = 3
     shown: float = 1e-2
@@ -137,11 +141,14 @@ def structure(
     patterns: Patterns,
     known: Columns,
     settings: StructureSettings | None = None,
+    parts: Sequence[CommonNoise] = (),
+    sigma: Array | None = None,
 ) -> Structure:
     """Test of the residuals (N,) over σ, the most likely causes first.
 
     slopes : (N, m) of the fitted pixels over σ with the unknowns;  solve : A⁻¹ of (m, k)
     known : (N, k) standard deviations over σ of errors that many pixels have in common, contained in the intervals
+    parts : of the noise that images have in common, with sigma (N,), σ [W]
     """
     settings = settings or StructureSettings()
     z = patterns.columns
@@ -155,6 +162,8 @@ def structure(
     kept = _directions(cross, mean, noise, settings)
     smoothed = (settings.rougher - 1) * (mean - noise)
     covariance = kept.T @ (mean + smoothed + common @ common.T) @ kept
+    if kept.size and sigma is not None and any(part.deviation.any() for part in parts):
+        covariance = _with(covariance, kept.T @ _by_noise_in_common(z, slopes, lift, parts, sigma) @ kept, settings)
     white = kept @ np.linalg.inv(np.linalg.cholesky(covariance)).T if kept.size else kept
     score = white.T @ (z.T @ residual)
     effect = white.T @ mean * patterns.lengths
@@ -162,6 +171,30 @@ def structure(
     total, count = float(score @ score), len(score)
     log_p = _ln_tail(total, count) if count else 0.0
     return Structure(total, count, log_p, tuple(_causes(score, effect, causes, log_p, settings)))
+
+
+def _by_noise_in_common(
+    z: csr_array, slopes: Columns, lift: Array, parts: Sequence[CommonNoise], sigma: Array
+) -> Array:
+    """(p, p) Zᵀ(I − K)X(I − K)Z with the correlations X of different pixels."""
+    extra = np.zeros((z.shape[1], z.shape[1]))
+    for part in parts:
+        share = part.deviation / sigma
+        groups = csr_array((share, (part.shared, np.arange(len(share)))))
+        sums = _dense(groups @ z) - _dense(groups @ slopes) @ lift
+        extra += sums.T @ sums
+        for k in range(0, len(share), CHUNK):
+            own = slice(k, k + CHUNK)
+            left = share[own, None] * (_dense(z[own]) - _dense(slopes[own] @ lift))
+            extra -= left.T @ left
+    return extra
+
+
+def _with(covariance: Array, extra: Array, settings: StructureSettings) -> Array:
+    """Sum of a covariance and of what noise in common adds, of which each direction keeps a share `least`."""
+    values, vectors = eigh(extra, covariance)
+    back = covariance @ vectors
+    return np.asarray(covariance + back * np.maximum(values, settings.least - 1) @ back.T)
 
 
 def _share(effect: Array, lengths: Array, cause: Pattern) -> float:
