@@ -17,8 +17,9 @@ LEAST_STATED, FLOAT32_FLOOR = 0.05, 2e-7
 # Lines of sight of a pixel at the most, from this rtol on; below it more: on a pixel with an edge the error of lattices
 # falls with their number to the power 3/4. No more than the limit in any case.
 MOST_NODES, WORTH_MORE, LINES_ORDER, LIMIT = 1 << 16, 1e-3, 4 / 3, 1 << 22
-# Lines of sight that all pixels together may take in any case unless `max_nodes` is given: few pixels cost little.
-TOGETHER = 1 << 24
+# Lines of sight that all pixels together may take in any case unless `max_nodes` is given: few pixels cost little. By
+# the surface form and by faces one takes up to four times as long as by lattices.
+TOGETHER, TOGETHER_BY_SURFACE = 1 << 26, 1 << 24
 LEAST_WEIGHT = 0.1  # of rtol: smallest share that is followed through or off specular surfaces; less counts as error
 MOST_SPECULAR = 64  # specular surfaces one after the other
 
@@ -33,7 +34,7 @@ class Quadrature:
     max_nodes : largest number of lines of sight of a pixel, four in any case (domain 'surface': on average, 256 …
         65,536 in any case); bounds the time; where it is reached, `error` may exceed rtol. None, the default: 65,536,
         below rtol 1e-3 more, with the power 4/3 of 1/rtol to 2²² at the most; lattices on few pixels also take more,
-        as long as all of them take at most 2²⁴ together
+        as long as all of them take at most 2²⁶ together
     max_specular : largest number of specular surfaces on a line of sight, 0 … 64 (default 8); light beyond is in the
         error
     shortcuts_off : names of `SHORTCUTS` that are not taken; shortcuts change the image by less than rtol

@@ -55,7 +55,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
      * - max_nodes
        - |int|
        - Largest number of lines of sight per pixel, at least four (Default: 65536, below rtol 1e-3 more, up to 4194304
-         at 5e-5; few pixels take more, together at most 17 million). Where it is reached, the error is larger than
+         at 5e-5; few pixels take more, together at most 67 million). Where it is reached, the error is larger than
          requested and stated. In domain surface it is the mean per pixel, at least 256 and at most 65536.
      * - max_specular
        - |int|

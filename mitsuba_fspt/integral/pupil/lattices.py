@@ -26,16 +26,19 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ...jit.pixel_grid import Mask, PixelArray
+    from ..lines.specular import Specular
 
 # Generating vector for x and y of pixel and pupil: of a million random ones with no two-dimensional projection whose
 # dual vector is below 0.45 of the longest one possible, that of the least error P₂ (Sloan and Joe 1994) over 2¹⁰ … 2¹⁸
 # points.
 VECTOR = (1, 949661, 683229, 634757)
-FIRST, GROWTH, MOST = 1 << 10, 4, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
+FIRST, GROWTH, MOST = 1 << 10, 2, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
 SHIFTS = 16
 ORDER = 3 / 4  # power with which the error is expected to fall with the number of points, as at a jump
 CHANCE = 1e-3  # with which the stated error is exceeded, by Student's t, and as all points may miss light
-LEGS = 8  # lines of sight that one through or off specular surfaces counts as, unless `max_nodes` is given
+# Lines of sight that one by way of specular shapes counts as, unless `max_nodes` is given: one more for each of them,
+# and so many at the most.
+LEGS = 8
 
 
 def refine_by_lattices(draft: Draft) -> None:
@@ -46,11 +49,11 @@ def refine_by_lattices(draft: Draft) -> None:
     """
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
     deadline, tolerance = draft.progress.deadline, draft.tolerance
-    before = draft.rays
+    before, legs = draft.rays, _legs(draft.view.specular)
 
     def most_points(pixels: int) -> int:
         """Points of the largest lattice that so many pixels may take next."""
-        return _most_points(draft.quadrature, LEGS if draft.view.specular else 1, pixels, draft.rays - before)
+        return _most_points(draft.quadrature, legs, pixels, draft.rays - before)
 
     if most_points(1) < FIRST or not dr.any(above):
         return
@@ -82,6 +85,11 @@ def refine_by_lattices(draft: Draft) -> None:
         if not dr.any(left):
             break
         means = means.of(left)
+
+
+def _legs(specular: Specular | None) -> int:
+    """Lines of sight that one counts as."""
+    return min(1 + len(specular.names), LEGS) if specular else 1
 
 
 def _exceeded_with(chance: float) -> tuple[float, float]:

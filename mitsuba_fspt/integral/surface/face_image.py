@@ -31,7 +31,7 @@ from ...runtime.deadline import Deadline
 from ..lines.eq9 import most_radiance
 from ..lines.occlusion import hides_nothing
 from ..progress import SILENT, Progress
-from ..quadrature import TOGETHER, Quadrature
+from ..quadrature import TOGETHER_BY_SURFACE, Quadrature
 from ..shortcuts import Finding, on_surfaces
 from ..solution import Solution
 from .column_canvas import ColumnCanvas, Windows
@@ -160,7 +160,7 @@ class FaceImage:
 
         def worth(count: int) -> float:
             lines = self.quadrature.most_nodes * count / 2
-            return lines if self.quadrature.max_nodes is not None else max(lines, TOGETHER)
+            return lines if self.quadrature.max_nodes is not None else max(lines, TOGETHER_BY_SURFACE)
 
         self._refine(where, least_peak, worth, progress)
         return self._solution(where)

@@ -26,7 +26,7 @@ from ..lines.eq9 import eq9, etendue_from_surface, most_radiance
 from ..lines.occlusion import hides_nothing
 from ..lines.specular import Specular, transmission
 from ..progress import SILENT, Progress
-from ..quadrature import TOGETHER, Quadrature
+from ..quadrature import TOGETHER_BY_SURFACE, Quadrature
 from ..shortcuts import Finding, on_surfaces
 from ..solution import Solution
 from . import pupil_cells
@@ -140,10 +140,10 @@ class _Refinement:
         return max(min(self.quadrature.most_nodes, most), FIRST_LINES * FIRST_GROWTH)
 
     def _pays(self, mark: NDArray[np.bool_], least_peak: float) -> bool:
-        """Whether the next level takes no more lines of sight than lattices on the marked pixels, or ends half of them
-        if their errors fall by `FALL`; with `max_nodes` always."""
-        lattices = max(self.quadrature.most_nodes * np.count_nonzero(mark), TOGETHER)
-        if self.quadrature.max_nodes is not None or GROWTH * self.last_rays <= lattices:
+        """Whether the next level takes no more lines than the marked pixels may take, or ends half of them if their
+        errors fall by `FALL`; with `max_nodes` always."""
+        most = max(self.quadrature.most_nodes * np.count_nonzero(mark), TOGETHER_BY_SURFACE)
+        if self.quadrature.max_nodes is not None or GROWTH * self.last_rays <= most:
             return True
         return bool(np.median(self.error[mark]) * FALL <= self._tolerance(least_peak))
 

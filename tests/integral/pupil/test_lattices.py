@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from mitsuba_fspt.integral.pupil.lattices import (
     VECTOR,
     Means,
     _largest_errors,
+    _legs,
     _most_points,
 )
 from mitsuba_fspt.integral.quadrature import Quadrature
@@ -128,7 +130,7 @@ def test_every_size_of_lattice_is_even():
 
 
 def test_where_all_pixels_would_take_too_many_lines_those_of_the_largest_errors_take_them(looked_at):
-    """Lines of sight by way of specular surfaces count as `LEGS`; seen to fail where all of the pixels take them.
+    """Lines of sight by way of specular surfaces count as several; seen to fail where all of the pixels take them.
 
     No more of them where all errors are equal. Seen to fail there with a threshold for the error: all pixels took them.
     """
@@ -136,8 +138,9 @@ def test_where_all_pixels_would_take_too_many_lines_those_of_the_largest_errors_
     import mitsuba as mi
 
     draft, _ = looked_at
-    most_points = partial(_most_points, draft.quadrature, LEGS)
-    few = TOGETHER // LEGS // (SHIFTS * FIRST)
+    legs = 4 * LEGS  # fewer lines than the pixels of the film would take
+    most_points = partial(_most_points, draft.quadrature, legs)
+    few = TOGETHER // legs // (SHIFTS * FIRST)
     assert most_points(few) == FIRST > most_points(few + 1)
     before, count = draft.error, len(draft.grid)
     try:
@@ -154,3 +157,9 @@ def test_where_all_pixels_would_take_too_many_lines_those_of_the_largest_errors_
     assert chosen[chosen > 0].min() == count - number + 1
     # With `max_nodes` given, no line counts as more than one.
     assert _most_points(Quadrature(max_nodes=1 << 16), LEGS, 1) == _most_points(Quadrature(max_nodes=1 << 16), 1, 1)
+
+
+def test_a_line_of_sight_counts_once_more_for_each_specular_shape():
+    assert _legs(None) == 1
+    assert _legs(SimpleNamespace(names=("pane",))) == 2
+    assert _legs(SimpleNamespace(names=("pane",) * 20)) == LEGS
