@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import LONGEST_TEXT, BackendError, ImageError, one_line
-from .tiff_pages import read_tiff
+from .tiff_pages import read_tiff, tell_left_out
 
 LOG = logging.getLogger("mitsuba_fspt")
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
@@ -46,7 +46,7 @@ def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
 
 
 def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Data of a FITS file, row 0 at the top, and what its header states.
+    """Data of the first image of a FITS file, row 0 at the top, and what its header states; others are told.
 
     EXPTIME or EXPOSURE in s, XBINNING, and XPIXSZ, the side of a binned pixel in µm, as imaging programs write them.
     """
@@ -57,7 +57,10 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     try:
         with warnings.catch_warnings(record=True) as reports, fits.open(path, memmap=False) as file:
             warnings.simplefilter("always")
-            unit = next(unit for unit in file if unit.data is not None)
+            units = [unit for unit in file if unit.is_image and unit.header.get("NAXIS")]
+            if not units:
+                raise ValueError("it holds no image")
+            unit = units[0]
             keys = ("EXPTIME", "EXPOSURE", "XBINNING", "YBINNING", "ROWORDER", "XPIXSZ", "YPIXSZ")
             time, other, sides, rows, order, wide, high = (
                 unit.header.get(key, file[0].header.get(key)) for key in keys
@@ -77,6 +80,9 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
             raise ImageError(f"{thing}: an incomplete FITS file: {text}. Copy the file again.")
     if texts:
         LOG.warning("fspt: %s: astropy reports: %s. Check the image.", thing, texts[0])
+    if len(units) > 1:
+        names = ", ".join(unit.name or "without a name" for unit in units)
+        tell_left_out(thing, f"{len(units)} images ({names})")
     if None not in (sides, rows) and sides != rows:
         raise ImageError(f"{thing}: binned {sides} x {rows}. Give a frame of square binning.")
     if str(order).strip().upper() == "BOTTOM-UP" and data.ndim > 1:

@@ -31,7 +31,8 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
     """Images of a TIFF file, (h, w) or (pages, h, w, …), row 0 at the top.
 
     Values are as they are stored. Where the file's Orientation says that another row is the top one, the images are
-    turned, which one line on stderr says. What tifffile reports about tags that do not matter is one line on stderr.
+    turned, which one line on stderr says. Of several series of pages the first is read, and of what tifffile reports
+    about tags that do not matter the first; one line on stderr says either.
 
     thing : what the file is, for messages, such as "counts 'a.tif'"
 
@@ -47,7 +48,7 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
         with _reports() as reports, tifffile.TiffFile(path) as file:
             if _has_page(file, path.stat().st_size // SMALLEST_PAGE + 1):
                 raise ValueError("its pages follow each other in a circle")
-            series = file.series[0]
+            series, count = file.series[0], len(file.series)
             images, turned = _upright(series)
             inverted = series.keyframe.photometric == tifffile.PHOTOMETRIC.MINISWHITE
             missing = sum(page is None for page in series.pages)
@@ -64,11 +65,22 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
         LOG.warning("fspt: %s: tifffile reports: %s%s. Check the image.", thing, one_line(texts[0], LONGEST_TEXT), more)
     if turned != 1:
         LOG.warning("fspt: %s: its rows do not begin at the top left (Orientation %d); it is turned.", thing, turned)
+    if count > 1:
+        tell_left_out(thing, f"{count} series of pages")
     if inverted:
         LOG.warning(
             "fspt: %s: it says that 0 is white (PhotometricInterpretation 0); more is taken as more light.", thing
         )
     return images
+
+
+def tell_left_out(thing: str, images: str) -> None:
+    """Say in one line on stderr that a file has several `images`, such as "2 series of pages", and one is read."""
+    LOG.warning(
+        "fspt: %s: only the first of its %s is read. Save frames of one exposure as one stack, others as own files.",
+        thing,
+        images,
+    )
 
 
 def channels_of(path: Path, thing: str) -> int:

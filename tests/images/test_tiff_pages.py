@@ -138,3 +138,28 @@ def test_a_private_tag_that_is_wrong_is_one_line(tmp_path, caplog):
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.startswith("fspt: counts 'counts.tif': tifffile reports: ")
     assert line.endswith("Check the image.")
+
+
+def test_of_several_series_the_first_is_read_with_a_line(tmp_path, caplog):
+    """As tifffile writes pages one after the other. The second was left out without a word."""
+    tifffile = pytest.importorskip("tifffile")
+    file, frame = tmp_path / "two.tif", np.arange(12, dtype=np.uint16).reshape(3, 4)
+    with tifffile.TiffWriter(file) as out:
+        out.write(frame)
+        out.write(frame + 5)
+    np.testing.assert_array_equal(read_counts(file).values, frame)
+    assert f"counts '{file}': only the first of its 2 series of pages is read" in caplog.text
+
+
+def test_of_several_images_of_a_fits_file_the_first_is_read_with_a_line(tmp_path, caplog):
+    """After a table, too, which was taken for the image. The second image was left out without a word."""
+    fits = pytest.importorskip("astropy.io.fits")
+    file, frame = tmp_path / "two.fits", np.arange(12, dtype=np.uint16).reshape(3, 4)
+    table = fits.BinTableHDU(np.zeros(3, [("time", "f4")]))
+    images = [fits.CompImageHDU(frame, name="LIGHT"), fits.ImageHDU(frame + 5, name="MASK")]
+    fits.HDUList([fits.PrimaryHDU(), table, *images]).writeto(file)
+    np.testing.assert_array_equal(read_counts(file).values, frame)
+    assert f"counts '{file}': only the first of its 2 images (LIGHT, MASK) is read" in caplog.text
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(file, overwrite=True)
+    with pytest.raises(ImageError, match="it holds no image"):
+        read_counts(file)
