@@ -93,7 +93,7 @@ def invert(
     ImageError : a file of an image cannot be read.
     """
     require_matrix(matrix)
-    options = Options(weight, samples, seed, confidence, method, crease_angle, gain_per_view)
+    options = Options(weight, samples, seed, confidence, method, crease_angle, gain_per_view, prior)
     measurement = Measurement.of(matrix, images, error, mask, gain_error, sampled)
     surface = replace(Surface.of(matrix, scene), crease_angle=options.crease_angle)
     settings, prior = settings or Settings(), prior or Prior()

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..runtime.errors import InversionError
 from ..runtime.numbers import number, whole
+from .smoothness import Prior
 from .surface import CREASE_ANGLE
 from .transport_matrix import TransportMatrix
 from .view_factors import checked_factor
@@ -24,6 +25,7 @@ class Options:
     method: str = "smooth"
     crease_angle: float = CREASE_ANGLE
     gain_per_view: float = 0.0
+    prior: Prior | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "gain_per_view", checked_factor("invert", self.gain_per_view))
@@ -36,11 +38,11 @@ class Options:
         object.__setattr__(self, "crease_angle", angle)
         if self.method not in ("smooth", "mlem"):
             raise InversionError(f"invert: 'method' must be 'smooth' or 'mlem', got {self.method!r}. Give one of them.")
-        smooth = self.weight or self.crease_angle != CREASE_ANGLE
+        smooth = self.weight or self.crease_angle != CREASE_ANGLE or self.prior
         if self.method == "mlem" and (self.samples or smooth or self.gain_per_view):
             raise InversionError(
-                "invert: method 'mlem' has no weight, creases and intervals, nor factors of views. Leave out weight, "
-                "crease_angle, samples and gain_per_view."
+                "invert: method 'mlem' has no weight, creases and intervals, nor a prior and factors of views. Leave "
+                "out weight, crease_angle, prior, samples and gain_per_view."
             )
         if self.weight is not None:
             weight = number("invert: 'weight'", self.weight, InversionError, "1.0")

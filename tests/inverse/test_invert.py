@@ -278,6 +278,8 @@ def test_mlem(case):
         fspt.invert(matrix, images, method="mlem", samples=20)
     with pytest.raises(InversionError, match="method 'mlem' has no weight, creases"):
         fspt.invert(matrix, images, method="mlem", crease_angle=20)
+    with pytest.raises(InversionError, match="crease_angle, prior, samples"):  # it had no effect
+        fspt.invert(matrix, images, method="mlem", prior=Prior(reference=1e-3))
     with pytest.raises(InversionError, match="'method' must be"):
         fspt.invert(matrix, images, method="art")
     with pytest.raises(InversionError, match="needs electrons"):
