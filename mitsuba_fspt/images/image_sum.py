@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from ..runtime.errors import ImageError
 from .formats import BESIDE, Metadata
 from .image_data import ImageData
-from .noise_model import FRAME, NUMBERS, NoiseModel, covariance, frame_recorded
+from .noise_model import (
+    FRAME,
+    NUMBERS,
+    NoiseModel,
+    covariance,
+    frame_recorded,
+    response_of,
+    same_detector_named,
+)
 from .pixel_axes import PixelAxes
 from .z_test import is_deterministic
 
@@ -59,20 +67,20 @@ def _gain_errors(one: ImageData, other: ImageData, sign: int) -> tuple[float, ND
     same gain error; other factors are not common to its pixels.
     """
     errors = [image.gain_error or 0.0 for image in (one, other)]
-    names = [image.metadata.get("detector") for image in (one, other)]
-    if sign == 1 or (names[0] is not None and names[0] == names[1] and errors[0] == errors[1]):
+    if sign == 1 or (same_detector_named(one, other) and errors[0] == errors[1]):
         return max(errors), 0.0
     parts = (gain * image.power.astype(np.float64) for gain, image in zip(errors, (one, other), strict=True))
     return 0.0, np.hypot(*parts)
 
 
 def _of_one_detector(one: ImageData, other: ImageData) -> bool:
-    """True for measured images with the same electrons per watt, excess noise and response of each pixel."""
+    """True for measured images of one detector with the same electrons per watt, excess noise and response."""
     if not all(name in image.metadata for name in ("electrons_per_watt", *SQUARES) for image in (one, other)):
         return False
     same = [name for name in ("electrons_per_watt", *NUMBERS) if name not in SQUARES]
     return (
         all(one.metadata.get(name) == other.metadata.get(name) for name in same)
+        and response_of(one) == response_of(other)
         and _same(one.flat, other.flat)
         and _same(one.flat_error, other.flat_error)
     )
@@ -86,7 +94,7 @@ def _frames(one: ImageData, other: ImageData) -> tuple[set[str], list[Plane]]:
         if model is None or not model.frame.any():
             planes.append(np.zeros(image.shape))
             continue
-        found.add(str(digest))
+        found.add(str(digest))  # there is one, else `frame` is 0
         planes.append(model.frame * (model.excess / model.shot) ** 2)
     return found, planes
 
@@ -126,7 +134,7 @@ def _error(one: ImageData, other: ImageData, sign: int) -> Plane | None:
     seeds = [image.metadata.get("seed") for image in (one, other)]
     if is_deterministic(one) or is_deterministic(other) or (seeds[0] is not None and seeds[0] == seeds[1]):
         return first + second
-    return np.sqrt(np.maximum(first**2 + second**2 + 2 * sign * covariance(one, other), 0))
+    return np.sqrt(np.maximum(first**2 + second**2 + 2 * sign * covariance(one, other, sign), 0))
 
 
 def _metadata(one: ImageData, other: ImageData) -> Metadata:

@@ -27,6 +27,7 @@ NUMBERS = ("read_noise", "dark_electrons", "excess_noise", "prnu")  # of the met
 
 SAME_SHARE = 1e-6  # largest range of the share of a frame's noise that counts as one number
 FRAME = ("frame_electrons", "frame_share", "frame_digest")  # of the metadata: noise of a subtracted frame
+UNNAMED = (None, "detector")  # names of a detector that say nothing of which one it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,8 @@ class NoiseModel:
     dark : [W²], variance without light: read-out, dark current, spurious charge, rounding, subtracted frames
     relative : relative standard error of the pixel's response
     excess : F²
-    frame : [W²], the part of `dark` by a subtracted frame, which is the same in all images that it was subtracted from
+    frame : [W²], the part of `dark` by a subtracted frame, which is the same in all images that it was subtracted from;
+        0 without a `frame_digest`, which says which one it was
     """
 
     shot: Array
@@ -85,19 +87,28 @@ def response_of(image: ImageData) -> tuple[object, ...]:
     return image.metadata.get("detector"), image.metadata.get("binning", 1), *planes
 
 
-def covariance(one: ImageData, other: ImageData) -> Array:
+def same_detector_named(one: ImageData, other: ImageData) -> bool:
+    """True for two images that name one detector. Without a name they may be of two cameras."""
+    name = one.metadata.get("detector")
+    return name not in UNNAMED and name == other.metadata.get("detector")
+
+
+def covariance(one: ImageData, other: ImageData, sign: int) -> Array:
     """Covariance (h, w) [W²] of two images of the same pixels: by one frame subtracted from both, and by the response.
+
+    sign : 1 for a sum, -1 for a difference, whose error it makes smaller. There the response counts only where both
+        name their detector: without a name each choice is the one with the larger error
 
     0 for images that were not reduced. Raises ImageError as `NoiseModel.of`.
     """
     found, models = np.zeros(one.shape), [NoiseModel.of(image) for image in (one, other)]
     if models[0] is None or models[1] is None:
         return found
-    digests = [image.metadata.get("frame_digest") for image in (one, other)]
-    if digests[0] is not None and digests[0] == digests[1]:
+    if one.metadata.get("frame_digest") == other.metadata.get("frame_digest"):  # without one, `frame` is 0
         found += np.sqrt(models[0].frame * models[1].frame)
     parts = [m.relative * np.maximum(image.power, 0) for m, image in zip(models, (one, other), strict=True) if m]
-    if all(part.any() for part in parts) and response_of(one) == response_of(other):
+    alike = response_of(one) == response_of(other) and (sign == 1 or same_detector_named(one, other))
+    if alike and all(part.any() for part in parts):
         found += parts[0] * parts[1]
     return found
 
@@ -115,7 +126,7 @@ def frame_recorded(digest: str, common: Array | float, total: Array | float) -> 
 
 
 def _of_frame(metadata: Mapping[str, Any], thing: str, dark: Array, each: Array) -> Array:
-    """Part [W²] of the variance `dark` by a subtracted frame; `each`: electrons per watt.
+    """Part [W²] of the variance `dark` by a subtracted frame, 0 without a digest; `each`: electrons per watt.
 
     Raises ImageError for numbers that are no variance and no share.
     """
@@ -128,4 +139,6 @@ def _of_frame(metadata: Mapping[str, Any], thing: str, dark: Array, each: Array)
             f"{thing} has {most:g} e-² of a subtracted frame, or its share {share:g}, outside 0 to 1. Reduce it again "
             "from its counts."
         )
+    if metadata.get("frame_digest") is None:
+        return np.zeros(each.shape)
     return np.minimum(share * dark + most / each**2, dark)

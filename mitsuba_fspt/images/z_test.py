@@ -21,13 +21,13 @@ Plane = NDArray[np.float64]
 class ZTest:
     """Test of the differences in units of their standard error, z = max(|P_cal − P_std| − bound, 0) / s.
 
-    s is the standard error of the difference, √(s_cal² + s_std²), without the noise that two reduced images have in
-    common. The `error` of a deterministic image (`method` =
-    integral in its metadata) is no standard deviation: it is the bound of that image's error. Any other image's `error`
-    is a standard error; that of a measured image beside the integral is taken for the integral's light. If the metadata
-    hold `passes`, s was estimated from the scatter of that number of passes, and z follows Student's t with passes − 1
-    degrees of freedom (for two such images: Welch's number). The values of z below are converted to those of a normal
-    distribution with the same probability.
+    s is the standard error of the difference, √(s_cal² + s_std² − 2 c), with the covariance c of two reduced images: by
+    one frame that was subtracted from both, and by the response of the pixels of one detector that both name. The
+    `error` of a deterministic image (`method` = integral in its metadata) is no standard deviation: it is the bound of
+    that image's error. Any other image's `error` is a standard error; that of a measured image beside the integral is
+    taken for the integral's light. If the metadata hold `passes`, s was estimated from the scatter of that number of
+    passes, and z follows Student's t with passes − 1 degrees of freedom (for two such images: Welch's number). The
+    values of z below are converted to those of a normal distribution with the same probability.
 
     Attributes
     ----------
@@ -94,11 +94,11 @@ def differences(calculated: ImageData, standard: ImageData) -> Plane:
 
 
 def z_test(calculated: ImageData, standard: ImageData) -> ZTest | None:
-    """Test of the differences against their errors; None if no image has a standard error above 0."""
+    """Test of the differences against their errors; None if no pixel with light has a standard error above 0."""
     found = _Differences(calculated, standard)
-    if not found.error.any():
-        return None
     tested = found.tested
+    if not tested.any():
+        return None
     pixels = int(tested.sum())
     z = np.abs(found.signed_z()[tested])
     noisy = tested & (found.bound <= NOISY * found.error)
@@ -126,9 +126,13 @@ def _standard_error(image: ImageData, other: ImageData) -> Plane | None:
     """
     if image.error is None:
         return None
-    if is_deterministic(other) and (model := NoiseModel.of(image)):
+    error, model = np.asarray(image.error, np.float64), NoiseModel.of(image)
+    if model is None:
+        return error
+    if is_deterministic(other):
         return np.sqrt(model.variance(other.power.astype(np.float64)))
-    return np.asarray(image.error, np.float64)
+    exact = np.sqrt(model.variance(image.power.astype(np.float64)))  # of which a file keeps 32 bits
+    return np.where(np.isclose(error, exact, rtol=1e-6, atol=0), exact, error)
 
 
 class _Differences:
@@ -141,6 +145,7 @@ class _Differences:
         pixels alone over its standard deviation and `gain_error`
     bound : error of the deterministic images [W]
     excess : max(|difference| − bound, 0) [W]
+    common : covariance of the two images [W²], which s² has twice less than the sum of their variances
     error : standard error s of the difference [W]
     freedom : its degrees of freedom, Welch's; infinite where s counts as known
     missed : standard deviation [W] in addition to s, of light that no sample met
@@ -164,7 +169,9 @@ class _Differences:
             variance += own
             passes = int(image.metadata.get("passes", 0))
             spread += own * own / (passes - 1) if passes > 1 else 0.0
-        variance -= 2 * covariance(calculated, standard) / self.scale / self.scale
+        both = len(noisy) == 2 and all(error is not None for _, error in noisy)
+        self.common = covariance(calculated, standard, -1) if both else np.zeros(self.power.shape)
+        variance = np.maximum(variance - 2 * self.common / self.scale / self.scale, 0)
         self.error = np.where(self.kept, self.scale * np.sqrt(variance), 0)
         self.freedom = np.divide(variance**2, spread, out=np.full_like(spread, np.inf), where=spread > 0)
         self.tested = (self.error > 0) & ((p_cal != 0) | (self.power != 0))
@@ -179,7 +186,8 @@ class _Differences:
         A share g of the light t, normal about 0 with the deviation δ = `gain_error`, is common to all its pixels. With
         the light b = ± t of the other image in the difference d, Σ (d − g b)²/(s² + bound²) is least for
         g = Σ w b d/Σ w b², whose standard deviation σ follows from the scatter over the pixels; g δ²/(δ² + σ²) is
-        returned. The noise of b itself would count as g = −1 and is taken out of both sums.
+        returned. The noise n of b adds n² to the mean of b², and c − n² to that of b d, with the covariance c of the two
+        images. Both are taken out of the sums.
         """
         deviations = [image.gain_error or 0.0 for image in (calculated, standard)]
         deviation = math.hypot(*deviations)
@@ -191,8 +199,9 @@ class _Differences:
         noise = np.broadcast_to(noise, light.shape)
         given = self.difference, light, self.error, self.bound, noise
         d, b, s, bound, own = (of[self.tested] / self.scale for of in given)
+        common = self.common[self.tested] / self.scale / self.scale
         weight = 1 / (s * s + bound * bound)
-        squares, products = weight * (b * b - own * own), weight * (b * d + own * own)
+        squares, products = weight * (b * b - own * own), weight * (b * d + own * own - common)
         if not (curvature := float(squares.sum())) > 0:
             return 0.0
         alone = float(products.sum()) / curvature
