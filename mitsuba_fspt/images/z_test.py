@@ -186,8 +186,8 @@ class _Differences:
         A share g of the light t, normal about 0 with the deviation δ = `gain_error`, is common to all its pixels. With
         the light b = ± t of the other image in the difference d, Σ (d − g b)²/(s² + bound²) is least for
         g = Σ w b d/Σ w b², whose standard deviation σ follows from the scatter over the pixels; g δ²/(δ² + σ²) is
-        returned. The noise n of b adds n² to the mean of b², and c − n² to that of b d, with the covariance c of the two
-        images. Both are taken out of the sums.
+        returned. The noise n of b adds n² to the mean of b² and c − n² to that of b d, with the covariance c of the two
+        images; both are taken out of the sums.
         """
         deviations = [image.gain_error or 0.0 for image in (calculated, standard)]
         deviation = math.hypot(*deviations)
