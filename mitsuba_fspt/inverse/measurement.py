@@ -7,7 +7,7 @@ import logging
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,7 @@ class Noise:
     frame : [W²], (views, h, w) or a number, the part of `other` by a subtracted frame
     subtracted : (views,) number of that frame: the noise of one is the same in all images
     first : (views, 2) row and column on the film of the first pixel of each view
+    places : pixels of the last call of `common`
     """
 
     shot: Array
@@ -73,6 +74,7 @@ class Noise:
     frame: Array | float = 0.0
     subtracted: NDArray[np.int64] | int = 0
     first: NDArray[np.int64] | int = 0
+    places: dict[bytes, list[CommonNoise]] = field(init=False, repr=False, default_factory=dict)
 
     def variance(self, signal: Array, used: NDArray[np.bool_]) -> Array:
         """Variance [W²] for a fitted signal [W], NaN where it is not known, of the pixels `used`; (views, h, w)."""
@@ -102,15 +104,21 @@ class Noise:
 
         By the response (M.24), and by a subtracted frame.
         """
+        key = np.packbits(used).tobytes()
+        if (places := self.places.get(key)) is None:
+            self.places.clear()  # rows of one fit are the same each time
+            self.places[key] = places = self._places(used)
+        response = np.broadcast_to(self.relative, used.shape)[used] * np.maximum(signal[used], 0)
+        frame = np.sqrt(np.broadcast_to(self.frame, used.shape)[used])
+        return [place.of(part) for place, part in zip(places, (response, frame), strict=True)]
+
+    def _places(self, used: NDArray[np.bool_]) -> list[CommonNoise]:
+        """The pixels `used` of the response and of the frames, without noise."""
         view, row, column = np.nonzero(used)
         top, left = np.broadcast_to(self.first, (len(used), 2))[view].T
         pixel = (row + top) * WIDEST + column + left
-        response = np.broadcast_to(self.relative, used.shape)[used] * np.maximum(signal[used], 0)
-        frame = np.sqrt(np.broadcast_to(self.frame, used.shape)[used])
-        return [
-            CommonNoise(part, np.broadcast_to(origin, len(used))[view], pixel)
-            for part, origin in ((response, self.detector), (frame, self.subtracted))
-        ]
+        origins = (np.broadcast_to(origin, len(used))[view] for origin in (self.detector, self.subtracted))
+        return [CommonNoise(np.zeros(len(view)), origin, pixel) for origin in origins]
 
 
 def sampling_variance(signal: Array, squares: Array, used: NDArray[np.bool_]) -> Array:
@@ -375,7 +383,7 @@ def noise_of(
             )
     detectors = _numbered([response_of(image) for image in images])
     frames = _numbered([image.metadata.get("frame_digest") for image in images])
-    return Noise(shot, other, drawn, relative, excess, detectors, frame, frames, _first(images))
+    return Noise(shot, other, drawn, relative, excess, detectors, frame, frames, _first(images, verb))
 
 
 def _numbered(keys: Sequence[object]) -> NDArray[np.int64]:
@@ -384,11 +392,16 @@ def _numbered(keys: Sequence[object]) -> NDArray[np.int64]:
     return np.array([int.from_bytes(digest[:7], "big") for digest in digests], np.int64)
 
 
-def _first(images: Sequence[Image]) -> NDArray[np.int64]:
-    """(views, 2) row and column on the film of the first pixel of each image."""
-    return np.array(
-        [[int(float(image.metadata.get(f"crop_offset_{axis}", 0))) for axis in "yx"] for image in images], np.int64
-    )
+def _first(images: Sequence[Image], verb: str) -> NDArray[np.int64]:
+    """(views, 2) row and column on the film of the first pixel of each image; InversionError for no such number."""
+    found = np.zeros((len(images), 2), np.int64)
+    for k, image in enumerate(images):
+        for axis, name in enumerate(("crop_offset_y", "crop_offset_x")):
+            given = number(f"{verb}: image {k}, '{name}'", image.metadata.get(name, 0), InversionError, "0")
+            if not abs(given) < WIDEST:
+                raise InversionError(f"{verb}: image {k} has '{name}' {given:g}. Give the place on the film, as 0.")
+            found[k, axis] = int(given)
+    return found
 
 
 def without_glare(power: Array, noise: Noise, masks: NDArray[np.bool_], glare: float) -> tuple[Array, Noise]:

@@ -211,6 +211,8 @@ class SourceFit:
         """Σ (noise/σ)² of each band as its stated noise makes it, and what noise in common to bands adds."""
         each, sigma = list(zip(self.bands, self.parts, strict=True)), found.sigma
         own = [b.measurement.chi2(b.rows, found.signal[part], sigma[part]) for b, part in each]
+        if len(each) == 1:
+            return own
         parts = [b.measurement.common(b.rows, found.signal[part]) for b, part in each]
         alone = sum(squared_correlations(one, sigma[part]) for one, (_, part) in zip(parts, each, strict=True))
         return [*own, Chi2(0.0, 2 * (squared_correlations(joined(parts), sigma) - alone))]

@@ -162,8 +162,9 @@ def structure(
     kept = _directions(cross, mean, noise, settings)
     smoothed = (settings.rougher - 1) * (mean - noise)
     covariance = kept.T @ (mean + smoothed + common @ common.T) @ kept
-    if kept.size and sigma is not None and any(part.deviation.any() for part in parts):
-        covariance = _with(covariance, kept.T @ _by_noise_in_common(z, slopes, lift, parts, sigma) @ kept, settings)
+    shared = [part for part in parts if part.is_shared]
+    if kept.size and sigma is not None and shared:
+        covariance = _with(covariance, kept.T @ _by_noise_in_common(z, slopes, lift, shared, sigma) @ kept, settings)
     white = kept @ np.linalg.inv(np.linalg.cholesky(covariance)).T if kept.size else kept
     score = white.T @ (z.T @ residual)
     effect = white.T @ mean * patterns.lengths
@@ -181,7 +182,9 @@ def _by_noise_in_common(
     for part in parts:
         share = part.deviation / sigma
         groups = csr_array((share, (part.shared, np.arange(len(share)))))
-        sums = _dense(groups @ z) - _dense(groups @ slopes) @ lift
+        sums = (
+            _dense(groups @ z) - (groups @ slopes) @ lift
+        )  # with many vertices, slopes are too large as a dense array
         extra += sums.T @ sums
         for k in range(0, len(share), CHUNK):
             own = slice(k, k + CHUNK)

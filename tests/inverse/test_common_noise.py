@@ -5,6 +5,7 @@ The expected numbers are those of dense covariance matrices, or scatter over ran
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,7 +24,7 @@ SHARE = 0.6  # of the variance, in common
 def measured(variance, frames, **others):
     """Views (v, h, w) of this variance [W²], `SHARE` of it by frames of these numbers."""
     noise = Noise(0 * variance, variance, np.zeros(len(variance), bool), 0.0, 1.0, 0, SHARE * variance, **others)
-    noise = Noise(**{**vars(noise), "subtracted": np.array(frames)})
+    noise = replace(noise, subtracted=np.array(frames))
     return Measurement(np.zeros(variance.size), noise, np.zeros(variance.size, bool), 0.0, matrix=None)
 
 
@@ -59,26 +60,30 @@ def sources(sigma, view, rng, common=0.0):
 
 
 def test_parameters_of_a_scene_from_views_with_one_frame():
-    """Three views, two with one dark frame: the covariance of least squares is exact. It was that of independent noise,
-    whose sd is 1.2 times too small."""
+    """Three views, two with one dark frame, each with other pixels masked: the covariance of least squares is exact.
+
+    It was that of independent noise, whose sd is 1.13 times too small. Seen to fail with pixels counted on from one
+    view to the next where some are masked.
+    """
     rng, frames = np.random.default_rng(1), [7, 7, 8]
     variance = rng.uniform(1, 4, (3, 3, 4))
     base, slopes = rng.uniform(50, 60, (3, 3, 4)), rng.uniform(1, 2, (3, 3, 4, 2))
     slopes[1] = slopes[0] * rng.uniform(0.9, 1.1, (3, 4, 1))
     noise = measured(variance, frames).noise
-    data = Measured(base + slopes @ [1.0, 2.0], noise, np.ones(base.shape, bool), 0.0)
+    used = np.ones(base.shape, bool)
+    used[0, 0, 2] = used[0, 1, 1] = used[1, 2, 0] = used[2, 2, 3] = False
+    rows = np.flatnonzero(used)
+    data = Measured(base + slopes @ [1.0, 2.0], noise, used, 0.0)
     found = CalibrationFit(
         ("a", "b"), np.array([1.0, 2.0]), data, lambda x: (base + slopes @ x, 0 * base), CalibrationSettings()
     ).solved()
-    jacobian, weight = slopes.reshape(-1, 2), 1 / variance.ravel()
+    jacobian, weight, common = slopes[used], 1 / variance[used], covariance_of(variance, frames, rows)
     inverse = np.linalg.inv(jacobian.T @ (weight[:, None] * jacobian))
     estimate = inverse @ (jacobian * weight[:, None]).T
-    expected = inverse + estimate @ covariance_of(variance, frames) @ estimate.T
+    expected = inverse + estimate @ common @ estimate.T
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-5)
-    assert np.diag(expected / inverse).min() > 1.4
-    assert found.noise.variance == pytest.approx(
-        2 * 36 + 2 * (covariance_of(variance, frames) ** 2 * np.outer(weight, weight)).sum()
-    )
+    assert np.diag(expected / inverse).min() > 1.25
+    assert found.noise.variance == pytest.approx(2 * 32 + 2 * (common**2 * np.outer(weight, weight)).sum())
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -163,6 +163,12 @@ def test_noise_of_a_frame_that_none_has_is_refused(wrong):
         noise_of((1, 4, 4), [Image(np.ones((4, 4)), metadata=numbers | wrong)])
 
 
+@pytest.mark.parametrize("wrong", ["abc", np.nan, np.inf])
+def test_a_place_on_the_film_that_is_no_number_is_refused(wrong):
+    with pytest.raises(InversionError, match=r"locate: image 0.* 'crop_offset_x'"):
+        noise_of((1, 4, 4), [Image(np.ones((4, 4)), np.ones((4, 4)), metadata={"crop_offset_x": wrong})], verb="locate")
+
+
 @pytest.mark.parametrize(("electrons", "read_noise"), [(0.02, 0.0), (0.5, 0.0), (3.0, 1.0), (1000.0, 3.5)])
 def test_the_right_noise_gives_no_warning(electrons, read_noise):
     """100 images with the stated noise, of few electrons too: at most one warns, and Σ (noise/σ)² has the stated mean

@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from sphere_views import RADIUS, noisy, sphere_views
 
 import mitsuba_fspt as fspt
+import mitsuba_fspt.inverse.structure as structure_module
 from mitsuba_fspt.inverse.common_noise import CommonNoise
 from mitsuba_fspt.inverse.patterns import Patterns, Seen, views_of
 from mitsuba_fspt.inverse.structure import StructureSettings, _ln_tail, common_errors, structure
@@ -225,3 +226,32 @@ def test_noise_in_common_to_views_is_no_structure():
         sums.append(found.chi2_sum)
     assert np.mean(sums) == pytest.approx(found.directions, rel=0.05)
     assert np.var(sums) == pytest.approx(2 * found.directions, rel=0.4)
+
+
+def test_slopes_of_many_vertices_stay_sparse(monkeypatch):
+    """Two views of 64 pixels and 900 unknowns: the same scores with sparse slopes as with dense ones.
+
+    Noise of pixels that no two images share adds nothing. Seen to fail with slopes (64 pixels, 900) as a dense array.
+    """
+    rng, pixel = np.random.default_rng(4), np.tile(np.arange(64), 2)
+    slopes = csr_array(rng.uniform(0, 0.1, (128, 900)) * (rng.uniform(size=(128, 900)) < 0.01))
+    inverse = np.linalg.inv(slopes.T.toarray() @ slopes.toarray() + np.eye(900))
+    sigma, light = np.full(128, 0.01), np.tile(1 + np.add.outer(np.arange(8.0), np.arange(8.0)), (2, 1, 1))
+    patterns = Patterns.of([Seen(f"view {k}", light[k], pixel[:64], sigma[:64]) for k in range(2)])
+    part = CommonNoise(0.9 * sigma, 0 * pixel, pixel)
+    alone = CommonNoise(0.9 * sigma, np.repeat([0, 1], 64), pixel)
+    residual, known, sizes = rng.standard_normal(128), csr_array((128, 0)), []
+    dense = structure_module._dense
+    monkeypatch.setattr(structure_module, "_dense", lambda one: (sizes.append(one.shape), dense(one))[1])
+
+    def scores(matrix, parts):
+        found = structure(residual, matrix, lambda a: inverse @ a, patterns, known, None, parts, sigma)
+        return found.chi2_sum, found.directions
+
+    expected = scores(slopes.toarray(), [part])
+    sizes.clear()
+    assert scores(slopes, [part]) == pytest.approx(expected)
+    assert max(min(size) for size in sizes) <= patterns.columns.shape[1]
+    assert max(size[0] * size[1] for size in sizes) < 64 * 900
+    assert scores(slopes, [alone]) == pytest.approx(scores(slopes, []))
+    assert scores(slopes, [])[0] != pytest.approx(expected[0])
