@@ -766,6 +766,41 @@ MUTANTS = (
         "self.difference",
         ("tests/images/test_comparison.py",),
     ),
+    Mutant(
+        "noise in common of a difference",
+        "images/image_sum.py",
+        "2 * sign * covariance",
+        "2 * covariance",
+        ("tests/images/test_image_parts.py",),
+    ),
+    Mutant(
+        "noise in common of the z-test",
+        "images/z_test.py",
+        "variance - 2 * self.common",
+        "variance + 2 * self.common",
+        ("tests/images/test_image_parts.py",),
+    ),
+    Mutant(
+        "noise in common of a gain",
+        "images/z_test.py",
+        "+ own * own - common",
+        "+ own * own",
+        ("tests/images/test_image_parts.py",),
+    ),
+    Mutant(
+        "noise in common of parameters of a scene",
+        "inverse/calibration_fit.py",
+        "covariance += beyond_independent(",
+        "covariance += 0 * beyond_independent(",
+        ("tests/inverse/test_common_noise.py",),
+    ),
+    Mutant(
+        "place on the film in noise in common",
+        "inverse/measurement.py",
+        "(row + top) * WIDEST + column + left",
+        "row * WIDEST + column",
+        ("tests/inverse/test_common_noise.py",),
+    ),
 )
 
 

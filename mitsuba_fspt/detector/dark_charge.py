@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..images.formats import Metadata
-from ..images.noise_model import frame_recorded
+from ..images.noise_model import digest_of, frame_recorded
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
 SURE = 5.0  # standard deviations of a dark frame less the bias: noise alone makes a pixel so bright once in 3 million
-DIGITS = 16  # of the digest of a subtracted frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,18 +33,19 @@ class Background:
     added: Array | float = 0.0
     frame: Array | None = None
 
-    def shared(self, independent: Array | float, frames: int) -> Metadata:
+    def shared(self, independent: Array | float, frames: int, metadata: Mapping[str, Any]) -> Metadata:
         """Metadata of the noise that images have in common from which the same frame was subtracted.
 
         `frame_share` of the variance of a pixel without light, where it is the same on all pixels; else
         `frame_electrons` of the median pixel [e-²]. Empty for a number in place of a frame.
 
         independent : variance without light of one of the `frames` frames [e-²], without that of the subtracted one
+        metadata : of the image, with its place on the film
         """
         if self.frame is None or not np.any(self.added):
             return {}
         common = frames * np.asarray(self.added)  # of one frame of the sum, as `independent` is
-        return frame_recorded(_digest(self.frame), common * frames, (independent + common) * frames)
+        return frame_recorded(digest_of([self.frame], metadata), common * frames, (independent + common) * frames)
 
 
 def shown_charge(
@@ -82,8 +83,3 @@ def shown_charge(
     hot = surplus - middle
     sure = (excess * hot > known) & (hot > SURE * np.sqrt(known / frames + zero))
     return stated + np.where(sure, hot, 0.0) if np.any(sure) else stated
-
-
-def _digest(frame: Array) -> str:
-    """Digest of the values of a subtracted frame."""
-    return hashlib.sha256((frame + 0.0).tobytes()).hexdigest()[:DIGITS]  # + 0: of -0, too

@@ -190,8 +190,8 @@ class Detector(DetectorParameters):
         register, `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (variance of dark current, spurious charge,
         rounding and subtracted frames [e-²]), `excess_noise`, `prnu` and `gain_error`; of a subtracted frame
         `frame_digest` and its part of the noise without light, `frame_share` or, where that is not the same on all
-        pixels, `frame_electrons` [e-²]; a pixel where `flat` is f has f times `electrons_per_watt`. Planes are `flat`,
-        `flat_error` and, with maps, `dark_noise`.
+        pixels, `frame_electrons` [e-²]; of a flat field `flat_digest`. A pixel where `flat` is f has f times
+        `electrons_per_watt`. Planes are `flat`, `flat_error` and, with maps, `dark_noise`.
 
         Raises
         ------

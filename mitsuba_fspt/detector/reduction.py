@@ -26,7 +26,7 @@ from ..images.exposure import Exposure
 from ..images.formats import Metadata, read_planes
 from ..images.frame_file import FITS, TIFF
 from ..images.image import Image, image_or_exposure
-from ..images.noise_model import FRAME, NoiseModel
+from ..images.noise_model import FLAT, FRAME, NoiseModel, digest_of
 from ..images.pixel_map import DIGEST, MAP, recorded_map
 from ..optics.light import Light
 from ..rendering.lens_numbers import lens_numbers
@@ -49,6 +49,7 @@ REPLACED = (
     *("quantity", "unit", "bias", "gain", "bits", "full_well", "dark_current", "saturated_pixels"),
     *(
         *FRAME,
+        FLAT,
         "flat_kind",
         "flat_masked_pixels",
         "em_gain",
@@ -207,7 +208,7 @@ def reduce_counts(
     electrons = _corrected(raw.values, dark.level, flat) * gain
     independent = detector.excess * dark.charge + gain**2 / 12  # gain²/12: variance of the rounding
     read = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2
-    shared = dark.shared(independent + read, raw.frames)
+    shared = dark.shared(independent + read, raw.frames, metadata or {})
     independent = independent + raw.frames * dark.added
     mask = full | rays | corrections.bad(shape)
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
@@ -434,6 +435,7 @@ def _image(
         kept |= {"em_gain": detector.em_gain, "excess_noise": detector.excess}
     if flat is not None:
         kept |= {"flat_kind": flat.kind, "flat_masked_pixels": int(flat.mask.sum())}
+        kept[FLAT] = digest_of([flat.response] if flat.error is None else [flat.response, flat.error], kept)
     elif detector.prnu:  # a number, of which the response of each pixel does not follow
         kept["prnu"] = float(detector.prnu) / math.sqrt(max(exposed.area(detector), 1.0))
     if exposed.pixel_pitch is not None:

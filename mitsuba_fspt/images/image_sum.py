@@ -14,6 +14,7 @@ from ..runtime.errors import ImageError
 from .formats import BESIDE, Metadata
 from .image_data import ImageData
 from .noise_model import (
+    FLAT,
     FRAME,
     NUMBERS,
     NoiseModel,
@@ -53,7 +54,7 @@ def combined(one: Sum, other: ImageData, sign: int) -> Sum:
         known |= noise
         planes |= {"flat": one.flat, "flat_error": one.flat_error, "dark_noise": dark_noise}
     else:  # no shot noise of the sum follows from its power: the error alone states it
-        for name in ("electrons_per_watt", *NUMBERS):
+        for name in ("electrons_per_watt", FLAT, *NUMBERS):
             known.pop(name, None)
     if mask is not None:
         known["masked_pixels"] = int(mask.sum())

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,8 @@ NUMBERS = ("read_noise", "dark_electrons", "excess_noise", "prnu")  # of the met
 
 SAME_SHARE = 1e-6  # largest range of the share of a frame's noise that counts as one number
 FRAME = ("frame_electrons", "frame_share", "frame_digest")  # of the metadata: noise of a subtracted frame
+FLAT = "flat_digest"  # of the metadata: digest of the whole flat field at reduction, which parts of the image keep
+DIGITS = 16  # of a digest
 UNNAMED = (None, "detector")  # names of a detector that say nothing of which one it is
 
 
@@ -79,12 +81,18 @@ class NoiseModel:
 
 
 def response_of(image: ImageData) -> tuple[object, ...]:
-    """What images have in common whose pixels have one response: detector, binning, and digests of a flat field."""
+    """What images have in common whose pixels have one response: detector, binning, and digests of a flat field.
+
+    Parts of an image with one flat field have the digest of the whole one, in the metadata since its reduction.
+    """
+    name, binning = image.metadata.get("detector"), image.metadata.get("binning", 1)
+    if image.flat is not None and FLAT in image.metadata:
+        return name, binning, image.metadata[FLAT]
     planes = (
         None if one is None else hashlib.sha256(one.astype(np.float32).tobytes()).hexdigest()
         for one in (image.flat, image.flat_error)
     )
-    return image.metadata.get("detector"), image.metadata.get("binning", 1), *planes
+    return name, binning, *planes
 
 
 def same_detector_named(one: ImageData, other: ImageData) -> bool:
@@ -111,6 +119,17 @@ def covariance(one: ImageData, other: ImageData, sign: int) -> Array:
     if alike and all(part.any() for part in parts):
         found += parts[0] * parts[1]
     return found
+
+
+def digest_of(planes: Sequence[Array], metadata: Mapping[str, Any]) -> str:
+    """Digest of a frame or flat field (h, w) at the reduction of an image with this metadata.
+
+    It contains the place of the first pixel on the film: pixels of two images with one digest and one place on the film
+    are the same elements of the frame.
+    """
+    places = [str(metadata.get(f"crop_offset_{axis}", 0)).removesuffix(".0") for axis in "yx"]
+    texts = [(plane + 0.0).tobytes() for plane in planes]  # + 0: of -0, too
+    return hashlib.sha256(b"".join([*texts, repr(places).encode()])).hexdigest()[:DIGITS]
 
 
 def frame_recorded(digest: str, common: Array | float, total: Array | float) -> Metadata:

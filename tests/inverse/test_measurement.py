@@ -156,6 +156,27 @@ def test_images_of_two_times_have_the_noise_of_one_bias_frame_in_common(tmp_path
     assert len(set(noise_of((2, 8, 8), [images[0], other]).subtracted)) == 2
 
 
+def test_parts_of_one_image_share_its_flat_field_and_frame():
+    """Parts that overlap by two columns have the noise of these in common. Two images at other places on the film, each
+    with the same arrays for a frame and a flat field, have none: no pixel of the film has one element of either.
+
+    Seen to fail: parts had flat fields of two digests, and images at two places shared a frame by its elements.
+    """
+    pytest.importorskip("ccdproc")
+    camera, rng = replace(Detector.typical_ccd(), prnu=0.0), np.random.default_rng(6)
+    counts, dark, flat = (np.rint(rng.normal(level, 9, (3, 4, 6))) for level in (4000, 500, 20000))
+    settings = {"exposure_time": 60, "wavelength_nm": 650, "dark": dark, "flat": flat, "flat_kind": "sensor"}
+    one, other = (camera.reduce(counts, **settings, metadata={"crop_offset_x": left}) for left in (0, 2))
+    used = np.ones((2, 4, 4), bool)
+    for images, common in (((one[:, :4], one[:, 2:]), 8), ((one[:, :4], other[:, :4]), 0)):
+        parts = noise_of(used.shape, images).common(np.stack([image.power for image in images]), used)
+        for part in parts:
+            shared = part.shared.reshape(used.shape)
+            assert part.deviation.min() > 0
+            assert len(np.unique(shared)) == 32 - common
+            assert np.array_equal(shared[0][:, 2:], shared[1][:, :2]) == (common > 0)
+
+
 @pytest.mark.parametrize("wrong", [{"frame_share": 1.5}, {"frame_share": np.nan}, {"frame_electrons": np.inf}])
 def test_noise_of_a_frame_that_none_has_is_refused(wrong):
     numbers = {"electrons_per_watt": 1.0, "read_noise": 2.0}
