@@ -39,7 +39,7 @@ from .row_form import rows_of
 from .sparse_rows import SparseRows
 
 CERTAIN = 0.35  # largest error of the image of J_n = 1, as a rule, over its estimated error
-ROUGH = 4.0  # times rtol of the brightest pixel of that image: rows further from it are computed by lines of sight
+ROUGH = 1.0  # times rtol of the brightest pixel of that image: rows further from it are computed by lines of sight
 UNREACHED = 0.5  # likewise, where the image itself did not reach rtol
 ALL_LINES = 2048  # lines of sight a pixel at rtol 1e-3 where all rows are found by them
 ROW_LINES = 4096  # of these pixels at rtol 1e-3, more where they are few
@@ -366,7 +366,7 @@ def _balanced(found: _Entries, columns: Array, image: Solution, error: Array, et
         scaled = (1 - found.change[some].astype(np.float64)) * coarse[rows][row]
         relative = 1 - np.divide(scaled, factor, out=np.ones_like(factor), where=factor > 0)
         change[some] = np.clip(relative, -MOST_CHANGE, MOST_CHANGE)
-    left = np.maximum(np.abs(power - sums), uncertain) * etendue
+    left = np.maximum.reduce([np.abs(power - sums), np.abs(wanted - before), uncertain]) * etendue
     entries = replace(found, light=values, change=change)
     entries = entries.where(values > 0)  # behind an image-plane stop
     return SparseRows(

@@ -31,7 +31,7 @@ from ..lines.eq9 import eq9, etendue_from_pixel, etendue_from_surface
 from ..lines.occlusion import hidden
 from . import pupil_cells
 from .column_canvas import ColumnCanvas, Plane, Windows
-from .face_light import CORNERS, DROP, INWARD, ColumnRule, FaceLight, Plan
+from .face_light import CORNERS, DROP, ColumnRule, FaceLight, Plan
 from .footprint import SPECK
 from .pixel_sums import most_pixels
 
@@ -44,6 +44,7 @@ LEAST_HEIGHT = 2.0**-18
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
 WHOLE = 1e-6  # by which float32 changes the share of the pupil that is open
+INWARD = 0.05  # of a face: distance from its sides at which rays start that search for the edge of a shadow
 HALVINGS = 4  # of a side of a piece, for the edge of a shadow
 PARABOLA = 4 / 3  # area between a parabola and its chord, over that of the triangle of the same height
 MOST_WORK, LEAST_WORK = 1 << 22, 1 << 20  # entries of windows that are accumulated at a time; with half, 10 % slower
@@ -215,7 +216,7 @@ class FaceLines:
     ) -> Laid:
         """The light of J_n with the values `exitance` at the three corners of each face, and the coverage, on a film
         whose first pixel has this `corner` (x, y)."""
-        image = self._image(scene, camera, faces, corner, cut=True)
+        image = self._image(scene, camera, faces, corner)
         levels = [mi.Float64(dr.gather(mi.Float, own, self.face)) for own in exitance]
         light = [
             sum((w[c] * level for w, level in zip(image.of_corners(), levels, strict=True)), mi.Float64(0))
@@ -223,13 +224,8 @@ class FaceLines:
         ]
         return image.laid([light, [image.cover] * 3])
 
-    def _image(
-        self, scene: mi.Scene, camera: Camera, faces: FaceLight, corner: tuple[float, float], cut: bool = False
-    ) -> _Image:
-        """The image of the lines' pieces through the nodes, or of the nodes' cells through the pieces.
-
-        cut : pieces are cut along the edge of a shadow; otherwise each is lit or not
-        """
+    def _image(self, scene: mi.Scene, camera: Camera, faces: FaceLight, corner: tuple[float, float]) -> _Image:
+        """The image of the lines' pieces through the nodes, or of the nodes' cells through the pieces."""
         m, elements, face = self.m, faces.elements, self.face
         part, i, j = self.number // (m * m), self.number % m, self.number // m % m
         node = pupil_cells.middle(i, j, m)
@@ -241,10 +237,10 @@ class FaceLines:
         if faces.shadows:
             ends = [elements.place(face, mi.Point2f(*at), self.cut, part)[0].p for at in CORNERS]
             mixed = active & dr.gather(mi.Bool, mi.Bool(faces.mixed), face)
-            lit_part = _LitPart.of(scene, camera, node, ends, middle.p, mixed) if cut else None
+            lit_part = _LitPart.of(scene, camera, node, ends, middle.p, mixed)
             within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
             spot, _ = elements.place(face, within, self.cut, part)
-            asked = active & ~lit_part.some if lit_part else active
+            asked = active & ~lit_part.some
             active &= ~hidden(scene, spot.p, camera.open_arrival(spot.p, aim)[1], asked)
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in corner))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)

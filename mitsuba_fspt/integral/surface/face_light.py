@@ -26,7 +26,6 @@ from . import pupil_cells
 
 CORNERS = ((0, 0), (1, 0), (0, 1))  # of a face, in the square that `Elements.place` maps to it
 MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for float32, and of the blur radius, for cells
-INWARD = 0.05  # of a face: distance from its sides at which rays start that search for the edge of a shadow
 FEWEST_SHADED = 2  # pieces along a side where one surface may hide another: with half of them the light differs
 # What middles of M × M cells leave of a half plane averaged over pixels, times r/M² of its step for a blur disc of r
 # pixels: the most of all directions and offsets for r = 0.5 … 32, M = 4 … 32 and M > 1.25 r, below which it is 0.18.
@@ -147,9 +146,8 @@ class FaceLight:
     image [pixels]. slant (F,): depth of the face over its distance. shift (F,): distance by which points of the part
     of the pupil that a second border leaves open move along the face, over the radius of that part. partial (F,): the
     face turns away from part of the pupil. cut (V,): vertices at which the light of the surface ends for part of the
-    pupil, at silhouettes and borders. mixed (F,): one surface hides part of another here. edges (F, 3): of the image,
-    from each corner to the next [pixels]. crossed (F,): share of the lines of sight of which the edge of a shadow lies
-    on the face, along its longest edge. distance: in focus [virtual pixels].
+    pupil, at silhouettes and borders. mixed (F,): one surface hides part of another here. distance: in focus
+    [virtual pixels].
     """
 
     surface: EmittingSurface
@@ -165,8 +163,6 @@ class FaceLight:
     partial: Mask
     cut: Mask
     mixed: Mask
-    edges: Array
-    crossed: Array
     distance: float
     shadows: bool
 
@@ -219,8 +215,6 @@ class FaceLight:
             partial=partial,
             cut=cut,
             mixed=none,
-            edges=lengths,
-            crossed=np.zeros(len(corners)),
             distance=camera.lens.focus_distance / camera.virtual_pitch,
             shadows=False,
         )
@@ -254,12 +248,7 @@ class FaceLight:
         low[hidden_all], high[hidden_all] = np.inf, -np.inf
         cut = self.cut.copy()
         cut[self.corners[mixed | hidden_all].ravel()] = True
-        crossed = np.zeros(len(self.corners))
-        some = np.flatnonzero(mixed & np.isfinite(self.edges).all(axis=1) & (self.sides > 0))
-        shares = _crossed_share(scene, camera, self.elements, some)
-        crossed[mixed] = 1
-        crossed[some] = (shares * self.edges[some]).max(axis=1) / self.sides[some]
-        return replace(self, low=low, high=high, cut=cut, mixed=mixed, crossed=crossed, shadows=True)
+        return replace(self, low=low, high=high, cut=cut, mixed=mixed, shadows=True)
 
     def plan(self, rule: ColumnRule, on: str) -> Plan:
         """How the faces are divided: the cheaper of nodes with images of pieces and pieces with images of cells."""
@@ -296,15 +285,12 @@ class FaceLight:
         return Plan(cells[:, None], cuts[:, None], np.zeros((len(cells), 1), bool))
 
     def _pieces(self, rule: ColumnRule, contrast: Array | None = None) -> Array:
-        """Pieces along a side that are laid through nodes.
+        """Pieces along a side that are laid through nodes, each of which may be cut along one edge of a shadow.
 
-        contrast : largest change of the light along a face, for an image, whose faces smaller than their blur disc are
-            cut along the edges of shadows; None: all pieces of columns are lit or not
+        contrast : largest change of the light along a face, for an image; None for columns
         """
         sides = np.minimum(self.sides, LONGEST)
-        shaded = np.where(self.mixed, np.maximum(sides / rule.shadow, FEWEST_SHADED), 0)
-        displaced = 3 * self.crossed * sides / rule.shadow**2 if contrast is None else 0
-        shaded = np.where(self.small, np.minimum(shaded, np.sqrt(displaced)), shaded)
+        shaded = np.where(self.mixed & ~self.small, np.maximum(sides / rule.shadow, FEWEST_SHADED), 0)
         pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
         pieces = np.maximum(pieces, np.minimum(self._flat_pieces(rule, 1.0 if contrast is None else contrast), sides))
         if self.shift.any():
@@ -410,26 +396,3 @@ def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Inde
     blocked = reaches & hidden(scene, spot.p, lens_point, reaches)
     counted = [np.asarray(flag.numpy()).reshape(-1, cells**2).sum(axis=1) for flag in (reaches, blocked)]
     return 1 - counted[1] / np.maximum(counted[0], 1)
-
-
-def _crossed_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
-    """Share (n, 3) of the lines of sight of some faces, through `cells`² points of the pupil, for which not all of an
-    edge is lit: over those for which any of the face is, for the edges from each corner to the next."""
-    if not faces.size:
-        return np.zeros((0, 3))
-    index = mi.UInt32(np.repeat(faces, cells**2).astype(np.uint32))
-    number = mi.UInt32(np.tile(np.arange(cells**2), len(faces)).astype(np.uint32))
-    node = pupil_cells.middle(number % cells, number // cells, dr.opaque(mi.UInt32, cells))
-    middle, _ = elements.place(index, mi.Point2f(*elements.middle))
-    corners = [elements.place(index, mi.Point2f(*at))[0].p for at in CORNERS]
-    corners = [corner + INWARD * (middle.p - corner) for corner in corners]
-    seen = []
-    for k in range(6):
-        point = 0.5 * (corners[k // 2] + corners[(k + 1) // 2 % 3])
-        _, lens_point, arrival, _, share = camera.open_arrival(point, node)
-        open_to = (share * arrival > 0) & (dr.dot(middle.n, lens_point - point) > 0)
-        seen.append((open_to & ~hidden(scene, point, lens_point, open_to)).numpy().reshape(-1, cells**2))
-    lit = np.stack(seen, axis=-1)
-    some = np.maximum(lit.any(axis=-1).sum(axis=1), 1)
-    edges = [lit[..., [2 * k, 2 * k + 1, (2 * k + 2) % 6]] for k in range(3)]
-    return np.stack([(edge.any(axis=-1) & ~edge.all(axis=-1)).sum(axis=1) / some for edge in edges], axis=-1)
