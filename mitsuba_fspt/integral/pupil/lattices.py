@@ -36,8 +36,8 @@ FIRST, GROWTH, MOST = 1 << 10, 2, 1 << 18  # points of the first lattice; by wha
 SHIFTS = 16
 ORDER = 3 / 4  # power with which the error is expected to fall with the number of points, as at a jump
 CHANCE = 1e-3  # with which the stated error is exceeded, by Student's t, and as all points may miss light
-# Lines of sight that one by way of specular shapes counts as, unless `max_nodes` is given: one more for each of them,
-# and so many at the most.
+# Lines of sight that one counts as in a scene with specular shapes, unless `max_nodes` is given: one more for each of
+# them, and so many at the most.
 LEGS = 8
 
 

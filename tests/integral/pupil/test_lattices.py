@@ -159,7 +159,7 @@ def test_where_all_pixels_would_take_too_many_lines_those_of_the_largest_errors_
     assert _most_points(Quadrature(max_nodes=1 << 16), LEGS, 1) == _most_points(Quadrature(max_nodes=1 << 16), 1, 1)
 
 
-def test_a_line_of_sight_counts_once_more_for_each_specular_shape():
+def test_a_line_of_sight_counts_once_more_for_each_specular_shape_of_the_scene():
     assert _legs(None) == 1
     assert _legs(SimpleNamespace(names=("pane",))) == 2
     assert _legs(SimpleNamespace(names=("pane",) * 20)) == LEGS
