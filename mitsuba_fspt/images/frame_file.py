@@ -46,7 +46,8 @@ def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
 
 
 def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Data of the first image of a FITS file, row 0 at the top, and what its header states; others are told.
+    """Data of the first image of a FITS file, of two axes or more, row 0 at the top, and what its header states; others
+    are told.
 
     EXPTIME or EXPOSURE in s, XBINNING, and XPIXSZ, the side of a binned pixel in µm, as imaging programs write them.
     """
@@ -57,7 +58,7 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     try:
         with warnings.catch_warnings(record=True) as reports, fits.open(path, memmap=False) as file:
             warnings.simplefilter("always")
-            units = [unit for unit in file if unit.is_image and unit.header.get("NAXIS")]
+            units = [unit for unit in file if unit.is_image and unit.header.get("NAXIS", 0) >= 2]
             if not units:
                 raise ValueError("it holds no image")
             unit = units[0]

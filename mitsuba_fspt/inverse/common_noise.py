@@ -1,6 +1,7 @@
 """Noise that several images have in common: by the response of a detector's pixels, or by one subtracted frame.
 
-With the standard deviation a_i of such a part, two images i, j of one physical pixel have the covariance a_i a_j.
+With the standard deviation a_i of such a part, two images i, j of one physical pixel have the covariance a_i a_j (Eq.
+M.54). The response counts as the same at all wavelengths.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ K = B A⁻¹ Bᵀ. Residuals over σ have the covariance I − K, and patterns Z
     C = Zᵀ(I − K)Z + Σ_u [Zᵀ(I − K)u] [Zᵀ(I − K)u]ᵀ,   E s = Zᵀ(I − K)Z a
 
 for known common errors u and patterns a: Eq. M.34 of docs/model.md. Noise with the correlations X that images have in
-common adds Zᵀ(I − K)X(I − K)Z to C.
+common adds Zᵀ(I − K)X(I − K)Z to C (Eq. M.55).
 """
 
 from __future__ import annotations

@@ -152,12 +152,16 @@ def test_of_several_series_the_first_is_read_with_a_line(tmp_path, caplog):
 
 
 def test_of_several_images_of_a_fits_file_the_first_is_read_with_a_line(tmp_path, caplog):
-    """After a table, too, which was taken for the image. The second image was left out without a word."""
+    """After a table or numbers in a row, too, which were taken for the image.
+
+    The second image was left out without a word.
+    """
     fits = pytest.importorskip("astropy.io.fits")
     file, frame = tmp_path / "two.fits", np.arange(12, dtype=np.uint16).reshape(3, 4)
     table = fits.BinTableHDU(np.zeros(3, [("time", "f4")]))
     images = [fits.CompImageHDU(frame, name="LIGHT"), fits.ImageHDU(frame + 5, name="MASK")]
-    fits.HDUList([fits.PrimaryHDU(), table, *images]).writeto(file)
+    spectrum = fits.ImageHDU(np.zeros(5))
+    fits.HDUList([fits.PrimaryHDU(), table, spectrum, *images]).writeto(file)
     np.testing.assert_array_equal(read_counts(file).values, frame)
     assert f"counts '{file}': only the first of its 2 images (LIGHT, MASK) is read" in caplog.text
     fits.HDUList([fits.PrimaryHDU(), table]).writeto(file, overwrite=True)
