@@ -31,10 +31,10 @@ class Comparison(Deviations):
     ratio : Σ P_cal / Σ P_std of the absolute powers; None if it is not finite, as for Σ P_std = 0
     profiles : power along rows and columns
     light_of_one : light that only one of the images contains; None where both follow the same paths
-    z_test : test of the differences against their errors; None if no image has a standard error above 0, or with
+    z_test : test of the differences against their errors; None if no pixel with light has a standard error, or with
         `light_of_one`, which the test would take for an error
     beyond : number of pixels at which the images differ by more than the sum of both integrals' errors; only if no
-        image has a standard error and both contain the same light, else None, as without any errors
+        such pixel has a standard error and both contain the same light, else None, as without any errors
     masked : number of pixels masked in either image, which no number above counts; profiles show them as stored
     """
 

@@ -137,8 +137,8 @@ class Image(ImageData):
 
         Standard errors add up in squares, but for noise that two reduced images have in common, by the response of
         their pixels or by one frame subtracted from both, which adds up itself; the integral's, which are bounds, add
-        up. Of the metadata, entries remain that both have. The sum of two measured images with the same
-        `electrons_per_watt` keeps it, with the read noise of both. The larger `gain_error` remains, an upper bound.
+        up. Of the metadata, entries remain that both have. The sum of two measured images of one detector with the
+        same `electrons_per_watt` keeps it, with the read noise of both. The larger `gain_error` remains, an upper bound.
         What one of them masks is masked.
 
         Raises
@@ -149,7 +149,7 @@ class Image(ImageData):
 
     def __sub__(self, other: object) -> Image:
         """Power of this image less that of the other; errors add up and metadata remain as in a sum; noise in
-        common cancels.
+        common cancels, that of the response where both images name the same detector.
 
         A `gain_error` remains if both images name the same detector and have the same one. Others, times the power of
         their image, are part of the errors.
