@@ -138,8 +138,8 @@ class Image(ImageData):
         Standard errors add up in squares, but for noise that two reduced images have in common, by the response of
         their pixels or by one frame subtracted from both, which adds up itself; the integral's, which are bounds, add
         up. Of the metadata, entries remain that both have. The sum of two measured images of one detector with the
-        same `electrons_per_watt` keeps it, with the read noise of both. The larger `gain_error` remains, an upper bound.
-        What one of them masks is masked.
+        same `electrons_per_watt` keeps it, with the read noise of both. The larger `gain_error` remains, an upper
+        bound. What one of them masks is masked.
 
         Raises
         ------
