@@ -747,7 +747,7 @@ MUTANTS = (
     ),
     Mutant(
         "bent edge of a shadow",
-        "integral/surface/column_form.py",
+        "integral/surface/lit_part.py",
         "PARABOLA = 4 / 3",
         "PARABOLA = 0.0",
         ("tests/integral/surface/test_face_image.py",),

@@ -26,13 +26,13 @@ from ...camera.camera import Camera
 from ...camera.window import MOST_RIM
 from ...emission.elements import of_part
 from ...jit.batches import batch_slices, numbered
-from ...jit.loops import repeat
 from ..lines.eq9 import eq9, etendue_from_pixel, etendue_from_surface
 from ..lines.occlusion import hidden
 from . import pupil_cells
 from .column_canvas import ColumnCanvas, Plane, Windows
 from .face_light import CORNERS, DROP, ColumnRule, FaceLight, Plan
 from .footprint import SPECK
+from .lit_part import LitPart
 from .pixel_sums import most_pixels
 
 AROUND = ((0, 0), (1, 0), (1, 1), (0, 1))  # of a cell of the pupil
@@ -44,9 +44,6 @@ LEAST_HEIGHT = 2.0**-18
 FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, exact however large it is
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
 WHOLE = 1e-6  # by which float32 changes the share of the pupil that is open
-INWARD = 0.05  # of a face: distance from its sides at which rays start that search for the edge of a shadow
-HALVINGS = 4  # of a side of a piece, for the edge of a shadow
-PARABOLA = 4 / 3  # area between a parabola and its chord, over that of the triangle of the same height
 MOST_WORK, LEAST_WORK = 1 << 22, 1 << 20  # entries of windows that are accumulated at a time; with half, 10 % slower
 LEFT = 1 / 3  # error over the change by twice the cells and pieces, of second order
 MOST_CHANGE = 6e4  # relative, below the largest number of float16
@@ -213,16 +210,16 @@ class FaceLines:
         faces: FaceLight,
         exitance: Sequence[mi.Float],
         corner: tuple[float, float],
-    ) -> Laid:
+    ) -> tuple[Laid, Misfit | None]:
         """The light of J_n with the values `exitance` at the three corners of each face, and the coverage, on a film
-        whose first pixel has this `corner` (x, y)."""
+        whose first pixel has this `corner` (x, y); and what of this light the edges of shadows do not explain."""
         image = self._image(scene, camera, faces, corner)
         levels = [mi.Float64(dr.gather(mi.Float, own, self.face)) for own in exitance]
         light = [
             sum((w[c] * level for w, level in zip(image.of_corners(), levels, strict=True)), mi.Float64(0))
             for c in range(3)
         ]
-        return image.laid([light, [image.cover] * 3])
+        return image.laid([light, [image.cover] * 3]), image.spot.light(light) if image.spot else None
 
     def _image(self, scene: mi.Scene, camera: Camera, faces: FaceLight, corner: tuple[float, float]) -> _Image:
         """The image of the lines' pieces through the nodes, or of the nodes' cells through the pieces."""
@@ -237,11 +234,12 @@ class FaceLines:
         if faces.shadows:
             ends = [elements.place(face, mi.Point2f(*at), self.cut, part)[0].p for at in CORNERS]
             mixed = active & dr.gather(mi.Bool, mi.Bool(faces.mixed), face)
-            lit_part = _LitPart.of(scene, camera, node, ends, middle.p, mixed)
+            lit_part = LitPart.of(scene, camera, node, ends, middle.p, mixed)
             within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
             spot, _ = elements.place(face, within, self.cut, part)
-            asked = active & ~lit_part.some
-            active &= ~hidden(scene, spot.p, camera.open_arrival(spot.p, aim)[1], asked)
+            aim = dr.select(lit_part.some, node, aim)
+            open_spot = ~hidden(scene, spot.p, camera.open_arrival(spot.p, aim)[1], active)
+            active &= lit_part.some | open_spot
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in corner))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)
         open_mean = 0.75 * open_share
@@ -261,9 +259,8 @@ class FaceLines:
         centre, radius, side = camera.blur_disc(middle.p)
         active &= side > 0
         cell = [pupil_cells.corner(i + x, j + y, m) for x, y in AROUND]
-        film = camera.film_map.from_ideal
         tiles = [centre + radius * camera.opening(middle.p, c)[0] for c in cell]
-        tile = [mi.Point2d(film(mi.Point2f(corner)) - origin) for corner in tiles]
+        tile = [mi.Point2d(camera.film_map.from_ideal(mi.Point2f(corner)) - origin) for corner in tiles]
         own = dr.select(self.points, pupil_cells.area(cell), dr.pi / mi.Float(m * m))
         virtual_pixel = dr.opaque(mi.Float, camera.virtual_pitch**2)
         etendue = mi.Float64(etendue_from_surface(cos_s, area, open_mean * arrival, own, virtual_pixel))
@@ -272,141 +269,26 @@ class FaceLines:
         turn = _cross(images[1] - images[0], images[2] - images[0])
         large = (open_mean > 1 - WHOLE) & ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
+        scale, spot_light = mi.Float64(1), None
         if lit_part:
-            ring, count, etendue = lit_part.of_image(camera, origin, node, ring, count, etendue)
+            at_spot = mi.Point2d(camera.open_arrival(spot.p, node)[0] - origin)
+            spot_light = _Spot.of(at_spot, light_area, active, *lit_part.beside(ends, spot.p, open_spot))
+            ring, count, scale = lit_part.of_image(camera, origin, node, ring, count)
         # The falloff over the film, which is not linear over a large piece, is put back pixel by pixel.
         even = [falloff(camera, mi.Point2f(image) + origin) for image in images]
         cover = etendue / (light_area * mean)
         values = [cover / f * value for f, value in zip(even, values, strict=True)]
-        return _Image(images, values, shares, depths, turn, flat, constant, cover, ring, count, active)
-
-
-@dataclass(frozen=True)
-class _LitPart:
-    """The part of triangles that is lit, where the edge of a shadow cuts off one of their corners.
-
-    some : True where it does. first, second, third : the corners, that one first. lit : True where it is the lit one.
-    along : shares of the sides from it to the two others where the edge crosses them
-    beyond : share of the way from the corner to the chord between these by which the edge lies beyond its middle
-    """
-
-    some: mi.Bool
-    first: mi.Point3f
-    second: mi.Point3f
-    third: mi.Point3f
-    lit: mi.Bool
-    along: mi.Point2f
-    beyond: mi.Float
-
-    @classmethod
-    def of(
-        cls,
-        scene: mi.Scene,
-        camera: Camera,
-        node: mi.Point2f,
-        ends: list[mi.Point3f],
-        middle: mi.Point3f,
-        active: mi.Bool,
-    ) -> _LitPart:
-        """Of triangles with the corners `ends` as seen through a node of the pupil; found by bisection."""
-
-        def open_from(point: mi.Point3f, asked: mi.Bool) -> mi.Bool:
-            start = point + INWARD * (middle - point)
-            return asked & ~hidden(scene, start, camera.open_arrival(start, node)[1], asked)
-
-        seen = [open_from(end, active) for end in ends]
-        some = active & ((seen[0] != seen[1]) | (seen[0] != seen[2]))
-        odd = [seen[1] == seen[2], seen[0] == seen[2]]  # else the third
-
-        def turned(k: int) -> mi.Point3f:
-            return dr.select(odd[0], ends[k], dr.select(odd[1], ends[(k + 1) % 3], ends[(k + 2) % 3]))
-
-        first, second, third = (turned(k) for k in range(3))
-        lit = dr.select(odd[0], seen[0], dr.select(odd[1], seen[1], seen[2]))
-
-        def halve(k: mi.UInt32, place: mi.Point3f, width: mi.Float) -> tuple[mi.Point3f, mi.Float]:
-            on_side, across = k < sides, k % 2 == 1
-            share = dr.select(on_side, dr.select(across, place.y, place.x), place.z)
-            way = dr.select(across, third, second) - first
-            middle_way = 0.5 * (place.x * (second - first) + place.y * (third - first))
-            point = first + share * dr.select(on_side, way, middle_way)
-            share += dr.select(open_from(point, some) == lit, 1.0, -1.0) * width
-            place = mi.Point3f(
-                dr.select(on_side & ~across, share, place.x),
-                dr.select(on_side & across, share, place.y),
-                dr.select(on_side, _farthest(place) / 2, share),
-            )
-            last = k + 1 == sides
-            halved = dr.select(on_side & ~across, width, 0.5 * width)
-            return place, dr.select(last, _farthest(place) / 4, halved)
-
-        sides = dr.opaque(mi.UInt32, 2 * HALVINGS)
-        place, _ = repeat(dr.select(some, sides + HALVINGS, 0), halve, mi.Point3f(0.5), mi.Float(0.25))
-        along, beyond = _shadow_edge(place)
-        return cls(some, first, second, third, lit, along, beyond)
-
-    def of_image(
-        self,
-        camera: Camera,
-        origin: mi.Vector2f,
-        node: mi.Point2f,
-        ring: list[mi.Point2d],
-        count: mi.UInt32,
-        etendue: mi.Float64,
-    ) -> tuple[list[mi.Point2d], mi.UInt32, mi.Float64]:
-        """Polygon, number of edges and étendue of images through a node of the pupil, without the dark parts.
-
-        The edge counts as a parabola: the polygon ends at its chord, with the light of the area beyond in the étendue.
-        Of an image that is no triangle, see `_polygon`, not the polygon but the étendue becomes smaller.
-        """
-        whole = count == 4
-        chord = mi.Float64(self.along.x * self.along.y)
-        corner = dr.clip(chord * (1 + PARABOLA * mi.Float64(self.beyond)), 0, 1)
-        share = dr.select(self.lit, corner, 1 - corner)
-        share /= dr.select(whole, 1, dr.maximum(dr.select(self.lit, chord, 1 - chord), 1e-6))
-        etendue = dr.select(self.some, etendue * share, etendue)
-        sides = (self.along.x, self.second), (self.along.y, self.third)
-        a, b = (self.first + share * (end - self.first) for share, end in sides)
-        corners = [
-            dr.select(self.lit, self.first, a),
-            dr.select(self.lit, a, self.second),
-            dr.select(self.lit, b, self.third),
-            dr.select(self.lit, self.first, b),
-        ]
-        cut = self.some & ~whole
-        images = [mi.Point2d(camera.open_arrival(corner, node)[0] - origin) for corner in corners]
-        ring = [dr.select(cut, new, old) for new, old in zip(images, ring, strict=True)]
-        return ring, dr.select(cut, dr.select(self.lit, mi.UInt32(3), 4), count), etendue
-
-
-def _farthest(place: mi.Point3f) -> mi.Float:
-    """Where the median of the chord between two sides ends in the triangle, in chords; no farther than twice as far."""
-    return dr.minimum(2, 2 / dr.maximum(place.x + place.y, 0.5))
-
-
-def _shadow_edge(place: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
-    """Where the edge of a shadow crosses two sides of a triangle, and how far it lies beyond the chord between.
-
-    place : where it crosses these sides and the median between, of a triangle smaller by `INWARD`: shares of the sides
-        from their common corner, and of the way to the chord there
-
-    With barycentric coordinates λ of the other two corners the chord is λ₂/a + λ₃/b = 1; on each of the smaller sides
-    one of them is `INWARD`/3. A share of the way beyond the chord is λ₂/a + λ₃/b - 1.
-    """
-    least = INWARD / 3
-    x, y = ((1 - INWARD) * share + least for share in (place.x, place.y))
-    lines = x * y - least * least
-    a, b = dr.minimum(lines / (y - least), 1), dr.minimum(lines / (x - least), 1)
-    there = [0.5 * (1 - INWARD) * place.z * share + least for share in (place.x, place.y)]
-    return mi.Point2f(a, b), there[0] / a + there[1] / b - 1
+        return _Image(
+            images, values, shares, depths, turn, flat, constant, cover, scale, ring, count, active, spot_light
+        )
 
 
 @dataclass(frozen=True)
 class _Image:
     """Images of pieces of faces: the three corners, the density of the light of J_n = 1 there, over the falloff of the
     film, the share of each corner of the face there, the depth up to a factor; twice the signed area; whether the
-    density varies along the longest edge alone, and whether it is constant; the density of the coverage; and the
-    polygon that the light fills, see `Laid`."""
+    density varies along the longest edge alone, and whether it is constant; the density of the coverage; the factor of
+    these densities; the polygon that the light fills, see `Laid`; and light of random points."""
 
     corners: list[mi.Point2d]
     values: list[mi.Float64]
@@ -416,9 +298,11 @@ class _Image:
     flat: mi.Bool
     constant: mi.Bool
     cover: mi.Float64
+    scale: mi.Float64
     ring: list[mi.Point2d]
     count: mi.UInt32
     active: mi.Bool
+    spot: _Spot | None
 
     def of_corners(self) -> list[list[mi.Float64]]:
         """Density at the corners of the light of J_n = 1 at each corner of the face."""
@@ -426,8 +310,43 @@ class _Image:
 
     def laid(self, densities: list[list[mi.Float64]]) -> Laid:
         """The image with these densities at its corners."""
-        planes = [_plane(self.corners, values, self.turn, self.flat, self.constant) for values in densities]
+        scaled = ([self.scale * value for value in values] for values in densities)
+        planes = [_plane(self.corners, values, self.turn, self.flat, self.constant) for values in scaled]
         return planes, self.ring, self.count, self.active
+
+
+@dataclass(frozen=True)
+class _Spot:
+    """Random points of pieces at which `LitPart` is wrong: barycentric coordinates, area of the piece's image
+    [pixels²], negative where it is too bright, place on the film, and where there is any."""
+
+    shares: list[mi.Float]
+    area: mi.Float64
+    place: mi.Point2d
+    active: mi.Bool
+
+    @classmethod
+    def of(cls, place: mi.Point2d, area: mi.Float64, active: mi.Bool, shares: list[mi.Float], sign: mi.Float) -> _Spot:
+        """Those of all points whose `sign` is not 0, for images of pieces of this `area`."""
+        return cls(shares, mi.Float64(sign) * area, place, active & (sign != 0))
+
+    def light(self, density: list[mi.Float64]) -> Misfit:
+        """Their light, for the density of light at the corners of the pieces."""
+        level = sum((mi.Float64(s) * d for s, d in zip(self.shares, density, strict=True)), mi.Float64(0))
+        some = dr.compress(self.active)
+        columns = (self.place.x, self.place.y, self.area * level)
+        x, y, light = (dr.gather(mi.Float64, column, some).numpy() for column in columns)
+        return Misfit(np.floor(x).astype(np.int64), np.floor(y).astype(np.int64), light)
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Light (n,) at random points that the edges of shadows leave out, negative where they let too much pass, over that
+    of a pixel filled by 1 W/mm²/sr; column and row (n,) of the film."""
+
+    column: Index
+    row: Index
+    light: Array
 
 
 def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:

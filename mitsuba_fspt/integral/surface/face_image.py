@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from ...camera.camera import Camera
 from ...camera.window import Window
@@ -43,6 +43,7 @@ from .glow import touching
 # with few nodes may agree by chance: the least error of the third level over the tolerance, for which M is chosen
 # there, and its factor from level to level.
 SAFETY, SHADED, AROUND, EXPECTED, FALL = 0.35, 1.0, 2, 0.5, 0.25
+SURE = 4.0  # standard deviations from which on random points show more than chance: once in 16,000 pixels
 PERSPECTIVE = 0.25  # of the tolerance: error by perspective, which no change shows where a face stays one piece
 FINER = 1.25  # M over that at which an edge as bright as its face is wrong by the tolerance: pixels have several
 DISPLACED = 2e-4  # pixels by which float32 displaces the images of faces against lines of sight
@@ -147,7 +148,7 @@ class FaceImage:
         rule, around = ColumnRule.of(self.quadrature.rtol), _wider(where)
         self.level, self.plans = 0, [plan.halved().halved() for plan in self._plans(rule, least_peak)]
         if where.any() and (first := self._level(self.plans, around, None)):
-            self.value, self.coverage = first
+            self.value, self.coverage, _ = first
         lines = min(most, self.quadrature.most_nodes / 2)
         self._refine(where, least_peak, lambda count: lines * count, progress)
         if self.level == 0:
@@ -179,9 +180,9 @@ class FaceImage:
                 break
             if (found := self._level(plans, around, progress.deadline)) is None:
                 break
-            self.plans, self.level, (value, coverage) = plans, level, found
+            self.plans, self.level, (value, coverage, torn) = plans, level, found
             change = np.where(around, np.abs(value - self.value), 0)
-            recent = safety * _largest(change)
+            recent = np.maximum(safety * _largest(change), _largest(torn))
             least = max(EXPECTED * FALL ** (level - 2), PERSPECTIVE) * self.quadrature.rtol * self._peak(least_peak)
             self.error[mark] = np.maximum(recent, least)[mark]
             self.value[around], self.coverage[around] = value[around], coverage[around]
@@ -271,14 +272,15 @@ class FaceImage:
 
     def _level(
         self, plans: list[Plan], mark: NDArray[np.bool_], deadline: Deadline | None
-    ) -> tuple[Plane, Plane] | None:
-        """Value and coverage on marked pixels, incomplete on others; None where the deadline passes before the end."""
+    ) -> tuple[Plane, Plane, Plane] | None:
+        """Value, coverage and error by shadows without one edge on marked pixels, incomplete on others; None where the
+        deadline passes before the end."""
         height, width = self.window.shape
         whole = np.zeros(2, np.int64)
         windows = Windows(whole, whole, whole + width, whole + height)
         canvas = ColumnCanvas(self.window.shape, windows)
         columns = [dr.opaque(mi.UInt32, k) for k in range(2)]
-        laid = 0
+        laid, misfit, square = 0, np.zeros((height, width)), np.zeros((height, width))
         for faces, plan, corners, index in zip(self.faces, plans, self.exitance, self._touching(mark), strict=True):
             own = plan.of(index)
             items = np.stack([index, own.cells[:, 0], own.cuts[:, 0], own.points[:, 0]])
@@ -288,13 +290,29 @@ class FaceImage:
                 if deadline and deadline.passed():
                     return None
                 lines = FaceLines.numbered(items[:, run])
-                planes, ring, count, active = lines.light(self.scene, self.camera, faces, corners, self.window.corner)
+                (planes, ring, count, active), off = lines.light(
+                    self.scene, self.camera, faces, corners, self.window.corner
+                )
                 canvas.lay(columns, planes, ring, count, active)
                 canvas.evaluate()
+                if off:
+                    on = (off.column >= 0) & (off.column < width) & (off.row >= 0) & (off.row < height)
+                    np.add.at(misfit, (off.row[on], off.column[on]), off.light[on])
+                    np.add.at(square, (off.row[on], off.column[on]), off.light[on] ** 2)
         self.rays += laid
         self.levels.append(f"images of faces: {np.count_nonzero(mark)} pixels, {laid} images")
         light = canvas.light().reshape(2, height, width + 1)[..., :width]
-        return light[0] * self.falloff * self.most, light[1]
+        return light[0] * self.falloff * self.most, light[1], _torn(misfit, square) * self.falloff * self.most
+
+
+def _torn(sums: Plane, squares: Plane) -> Plane:
+    """Error (h, w) from sums of random terms that shadows without one edge leave out, and from their squares.
+
+    A third of the sum over 3 × 3 pixels, as a strip of shadow passes three of them, where it is above `SURE` standard
+    deviations, else 0.
+    """
+    around, variance = (uniform_filter(image, 3, mode="constant") * 9 for image in (sums, squares))
+    return np.where(around**2 > SURE**2 * variance, np.abs(around) / 3, 0.0)
 
 
 def _steepest(image: Plane) -> Plane:
