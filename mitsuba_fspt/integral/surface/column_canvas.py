@@ -126,9 +126,10 @@ class ColumnCanvas:
         level += slope
         return level * QUANTUM
 
-    def evaluate(self) -> None:
-        """Run all kernels begun so far to their end: the arrays of waiting ones would fill the memory."""
-        self._sums.evaluate()
+    def evaluate(self, *others: object) -> None:
+        """Run all kernels begun so far to their end, with those that compute `others`: the arrays of waiting ones would
+        fill the memory."""
+        self._sums.evaluate(*others)
         dr.sync_thread()
 
     def lay(

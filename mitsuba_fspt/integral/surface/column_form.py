@@ -210,7 +210,7 @@ class FaceLines:
         faces: FaceLight,
         exitance: Sequence[mi.Float],
         corner: tuple[float, float],
-    ) -> tuple[Laid, Misfit | None]:
+    ) -> tuple[Laid, Misfits | None]:
         """The light of J_n with the values `exitance` at the three corners of each face, and the coverage, on a film
         whose first pixel has this `corner` (x, y); and what of this light the edges of shadows do not explain."""
         image = self._image(scene, camera, faces, corner)
@@ -330,23 +330,29 @@ class _Spot:
         """Those of all points whose `sign` is not 0, for images of pieces of this `area`."""
         return cls(shares, mi.Float64(sign) * area, place, active & (sign != 0))
 
-    def light(self, density: list[mi.Float64]) -> Misfit:
+    def light(self, density: list[mi.Float64]) -> Misfits:
         """Their light, for the density of light at the corners of the pieces."""
         level = sum((mi.Float64(s) * d for s, d in zip(self.shares, density, strict=True)), mi.Float64(0))
-        some = dr.compress(self.active)
-        columns = (self.place.x, self.place.y, self.area * level)
-        x, y, light = (dr.gather(mi.Float64, column, some).numpy() for column in columns)
-        return Misfit(np.floor(x).astype(np.int64), np.floor(y).astype(np.int64), light)
+        return Misfits(self.place, self.area * level, self.active)
 
 
 @dataclass(frozen=True)
-class Misfit:
-    """Light (n,) at random points that the edges of shadows leave out, negative where they let too much pass, over that
-    of a pixel filled by 1 W/mm²/sr; column and row (n,) of the film."""
+class Misfits:
+    """Light of random points, some of them `active`, that the edges of shadows leave out, over that of a pixel filled
+    by 1 W/mm²/sr, negative where they let too much pass; and their places on the film [pixels]."""
 
-    column: Index
-    row: Index
-    light: Array
+    place: mi.Point2d
+    light: mi.Float64
+    active: mi.Bool
+
+    def on_film(self, shape: tuple[int, int]) -> tuple[Index, Index, Array]:
+        """Row, column and light (n,) of those on a film of this `shape` (h, w)."""
+        some = dr.compress(self.active)
+        columns = (self.place.y, self.place.x, self.light)
+        y, x, light = (dr.gather(mi.Float64, column, some).numpy() for column in columns)
+        row, column = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
+        on = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+        return row[on], column[on], light[on]
 
 
 def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:

@@ -294,15 +294,15 @@ class FaceImage:
                     self.scene, self.camera, faces, corners, self.window.corner
                 )
                 canvas.lay(columns, planes, ring, count, active)
-                canvas.evaluate()
+                canvas.evaluate(*vars(off).values() if off else ())
                 if off:
-                    on = (off.column >= 0) & (off.column < width) & (off.row >= 0) & (off.row < height)
-                    np.add.at(misfit, (off.row[on], off.column[on]), off.light[on])
-                    np.add.at(square, (off.row[on], off.column[on]), off.light[on] ** 2)
+                    row, column, light = off.on_film((height, width))
+                    np.add.at(misfit, (row, column), light)
+                    np.add.at(square, (row, column), light**2)
         self.rays += laid
         self.levels.append(f"images of faces: {np.count_nonzero(mark)} pixels, {laid} images")
-        light = canvas.light().reshape(2, height, width + 1)[..., :width]
-        return light[0] * self.falloff * self.most, light[1], _torn(misfit, square) * self.falloff * self.most
+        value, coverage = canvas.light().reshape(2, height, width + 1)[..., :width]
+        return value * self.falloff * self.most, coverage, _torn(misfit, square) * self.falloff * self.most
 
 
 def _torn(sums: Plane, squares: Plane) -> Plane:
