@@ -753,6 +753,13 @@ MUTANTS = (
         ("tests/integral/surface/test_face_image.py",),
     ),
     Mutant(
+        "shadow of a strip",
+        "integral/surface/face_image.py",
+        "SURE = 4.0",
+        "SURE = 1e30",
+        ("tests/integral/surface/test_face_image.py",),
+    ),
+    Mutant(
         "error of a net of transects",
         "integral/pupil/node_rules.py",
         "NET_SCATTER = 3.0",
