@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ..images.exposure import Exposure
 from ..images.formats import Metadata
 from ..images.image import Image
+from ..images.noise_model import TYPICAL
 from ..images.pixel_axes import CROP
 from ..optics.light import Light, Spectrum
 from ..runtime.errors import DetectorError
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
-NOT_A_SHEET = "typical, not a data sheet"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class Detector(DetectorParameters):
             bias=500,
             bits=16,
             pixel_pitch=0.0135,
-            name=NOT_A_SHEET,
+            name=TYPICAL,
         )
 
     @classmethod
@@ -118,7 +118,7 @@ class Detector(DetectorParameters):
             bias=200,
             bits=16,
             pixel_pitch=0.013,
-            name=NOT_A_SHEET,
+            name=TYPICAL,
             em_gain=300,
             spurious_charge=2e-3,
         )
@@ -140,7 +140,7 @@ class Detector(DetectorParameters):
             bias=100,
             bits=16,
             pixel_pitch=0.0065,
-            name=NOT_A_SHEET,
+            name=TYPICAL,
             prnu=0.005,
         )
 

@@ -26,7 +26,7 @@ from ..images.exposure import Exposure
 from ..images.formats import Metadata, read_planes
 from ..images.frame_file import FITS, TIFF
 from ..images.image import Image, image_or_exposure
-from ..images.noise_model import FLAT, FRAME, NoiseModel, digest_of
+from ..images.noise_model import FLAT, FRAME, PART, NoiseModel, flat_digest
 from ..images.pixel_map import DIGEST, MAP, recorded_map
 from ..optics.light import Light
 from ..rendering.lens_numbers import lens_numbers
@@ -50,6 +50,7 @@ REPLACED = (
     *(
         *FRAME,
         FLAT,
+        PART,
         "flat_kind",
         "flat_masked_pixels",
         "em_gain",
@@ -435,7 +436,6 @@ def _image(
         kept |= {"em_gain": detector.em_gain, "excess_noise": detector.excess}
     if flat is not None:
         kept |= {"flat_kind": flat.kind, "flat_masked_pixels": int(flat.mask.sum())}
-        kept[FLAT] = digest_of([flat.response] if flat.error is None else [flat.response, flat.error], kept)
     elif detector.prnu:  # a number, of which the response of each pixel does not follow
         kept["prnu"] = float(detector.prnu) / math.sqrt(max(exposed.area(detector), 1.0))
     if exposed.pixel_pitch is not None:
@@ -445,7 +445,10 @@ def _image(
     planes = {} if flat is None else {"flat": flat.response, "flat_error": flat.error}
     if np.ndim(read) or np.ndim(dark):  # another noise on each pixel
         planes["dark_noise"] = np.sqrt(np.broadcast_to(np.square(read) + dark * frames, electrons.shape))
-    return _with_error(Image(np.where(mask, 0, electrons) * frames / per_watt, metadata=kept, mask=mask, **planes))
+    image = Image(np.where(mask, 0, electrons) * frames / per_watt, metadata=kept, mask=mask, **planes)
+    if (digest := flat_digest(image)) is not None:
+        image = replace(image, metadata=image.metadata | {FLAT: digest})
+    return _with_error(image)
 
 
 def _with_error(image: Image) -> Image:

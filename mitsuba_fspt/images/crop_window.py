@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from ..runtime.errors import ImageError
 from .formats import BESIDE
 from .image_data import ImageData
+from .noise_model import flat_digest, part_recorded
 
 Part = TypeVar("Part", bound=ImageData)
 
@@ -29,7 +30,8 @@ def cropped(image: Part, key: Any) -> Part:
     parts = {name: plane[top:bottom, left:right] for name, plane in planes.items() if plane is not None}
     if "masked_pixels" in known and "mask" in parts:
         known["masked_pixels"] = int(parts["mask"].sum())
-    return replace(image, **parts, metadata=known)
+    part = replace(image, **parts, metadata=known)
+    return replace(part, metadata=part.metadata | part_recorded(part, flat_digest(image)))
 
 
 def _ends(one: slice, length: int, key: Any) -> tuple[int, int]:

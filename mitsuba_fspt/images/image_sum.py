@@ -17,6 +17,7 @@ from .noise_model import (
     FLAT,
     FRAME,
     NUMBERS,
+    PART,
     NoiseModel,
     covariance,
     frame_recorded,
@@ -54,7 +55,7 @@ def combined(one: Sum, other: ImageData, sign: int) -> Sum:
         known |= noise
         planes |= {"flat": one.flat, "flat_error": one.flat_error, "dark_noise": dark_noise}
     else:  # no shot noise of the sum follows from its power: the error alone states it
-        for name in ("electrons_per_watt", FLAT, *NUMBERS):
+        for name in ("electrons_per_watt", FLAT, PART, *NUMBERS):
             known.pop(name, None)
     if mask is not None:
         known["masked_pixels"] = int(mask.sum())

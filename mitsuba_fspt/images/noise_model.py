@@ -28,8 +28,11 @@ NUMBERS = ("read_noise", "dark_electrons", "excess_noise", "prnu")  # of the met
 SAME_SHARE = 1e-6  # largest range of the share of a frame's noise that counts as one number
 FRAME = ("frame_electrons", "frame_share", "frame_digest")  # of the metadata: noise of a subtracted frame
 FLAT = "flat_digest"  # of the metadata: digest of the whole flat field at reduction, which parts of the image keep
+PART = "flat_part_digest"  # of the metadata of a part: digest of its own planes, without which FLAT is that of others
 DIGITS = 16  # of a digest
-UNNAMED = (None, "detector")  # names of a detector that say nothing of which one it is
+TYPICAL = "typical, not a data sheet"
+UNNAMED = (None, "detector", TYPICAL)  # names of a detector that say nothing of which one it is
+TELLING = ("detector_pixel_pitch", "em_gain", "prnu")  # of the metadata: these tell detectors without a name apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +84,38 @@ class NoiseModel:
 
 
 def response_of(image: ImageData) -> tuple[object, ...]:
-    """What images have in common whose pixels have one response: detector, binning, and digests of a flat field.
+    """What images have in common whose pixels have one response: detector, binning, and the digest of a flat field.
 
-    Parts of an image with one flat field have the digest of the whole one, in the metadata since its reduction.
+    Detectors without a name are told apart by their numbers, else taken as one. Parts of an image with one flat field
+    have the digest of the whole one, in the metadata since its reduction.
     """
     name, binning = image.metadata.get("detector"), image.metadata.get("binning", 1)
-    if image.flat is not None and FLAT in image.metadata:
-        return name, binning, image.metadata[FLAT]
-    planes = (
-        None if one is None else hashlib.sha256(one.astype(np.float32).tobytes()).hexdigest()
-        for one in (image.flat, image.flat_error)
-    )
-    return name, binning, *planes
+    numbers = tuple(image.metadata.get(key) for key in TELLING) if name in UNNAMED else ()
+    return name, binning, *numbers, flat_digest(image)
+
+
+def is_known(image: ImageData) -> bool:
+    """True where the image says of which pixels its response is: by the name of the detector, or by a flat field."""
+    return image.flat is not None or image.metadata.get("detector") not in UNNAMED
+
+
+def flat_digest(image: ImageData) -> str | None:
+    """Digest of the whole flat field at reduction, of which the image may be a part; None without one.
+
+    The one in the metadata holds for the planes at reduction and for parts of them. Of others, such as planes that were
+    replaced since, it is the digest of these planes.
+    """
+    planes = [np.asarray(one, np.float32) for one in (image.flat, image.flat_error) if one is not None]
+    if not planes:
+        return None
+    own, whole = digest_of(planes, image.metadata), image.metadata.get(FLAT)
+    return str(whole) if whole is not None and own == image.metadata.get(PART, whole) else own
+
+
+def part_recorded(part: ImageData, whole: str | None) -> Metadata:
+    """Metadata by which a part of an image keeps the digest of its whole flat field, `whole`; none without one."""
+    planes = [np.asarray(one, np.float32) for one in (part.flat, part.flat_error) if one is not None]
+    return {} if whole is None else {FLAT: whole, PART: digest_of(planes, part.metadata)}
 
 
 def same_detector_named(one: ImageData, other: ImageData) -> bool:
@@ -121,7 +144,7 @@ def covariance(one: ImageData, other: ImageData, sign: int) -> Array:
     return found
 
 
-def digest_of(planes: Sequence[Array], metadata: Mapping[str, Any]) -> str:
+def digest_of(planes: Sequence[NDArray[Any]], metadata: Mapping[str, Any]) -> str:
     """Digest of a frame or flat field (h, w) at the reduction of an image with this metadata.
 
     It contains the place of the first pixel on the film: pixels of two images with one digest and one place on the film

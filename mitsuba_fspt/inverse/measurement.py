@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from ..detector.reduction import measured
 from ..images.exposure import Exposure
 from ..images.image import Image
-from ..images.noise_model import NoiseModel, response_of
+from ..images.noise_model import NoiseModel, is_known, response_of
 from ..runtime.errors import ImageError, InversionError
 from ..runtime.numbers import number
 from .common_noise import CommonNoise, squared_correlations
@@ -381,9 +381,23 @@ def noise_of(
                 f"{verb}: image {k} has neither 'electrons_per_watt' nor an error. Reduce it from its counts"
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
-    detectors = _numbered([response_of(image) for image in images])
+    responses = [response_of(image) for image in images]
+    unnamed = [k for k, image in enumerate(images) if relative[k].any() and not is_known(image)]
+    _tell_one_camera(verb, [responses[k] for k in unnamed])
+    detectors = _numbered(responses)
     frames = _numbered([image.metadata.get("frame_digest") for image in images])
     return Noise(shot, other, drawn, relative, excess, detectors, frame, frames, _first(images, verb))
+
+
+def _tell_one_camera(verb: str, responses: Sequence[object]) -> None:
+    """Say in one line on stderr that images of detectors without a name, of one response, count as of one camera."""
+    if len(set(responses)) < len(responses):
+        LOG.warning(
+            "fspt: %s: %d images name no detector; those with the same numbers count as of one camera, whose "
+            "pixels have one response. Give each camera a 'name', such as its serial number.",
+            verb,
+            len(responses),
+        )
 
 
 def _numbered(keys: Sequence[object]) -> NDArray[np.int64]:

@@ -284,7 +284,7 @@ def test_the_noise_of_one_frame_adds_up_in_a_sum_and_cancels_in_a_difference():
 def test_the_response_of_pixels_adds_up_in_a_sum_and_cancels_in_a_difference():
     """A PRNU of 10 % at 4000 electrons: χ² is 1 for sum and difference of one camera. Seen to fail: 2 and 0.02."""
     pytest.importorskip("ccdproc")
-    camera = replace(CCD, prnu=0.1)
+    camera = replace(CCD, prnu=0.1, name="serial 1")
     light = np.full((64, 64), 4000.0 / PER_WATT)
     one, two = (camera.reduce(counts, **SETTINGS) for counts in counts_of(range(2), light, camera))
     both, less = one + two, one - two

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,13 @@ import pytest
 from sphere_views import passes_of
 
 from mitsuba_fspt.detector.detector import Detector
+from mitsuba_fspt.detector.reduction import measured
 from mitsuba_fspt.images.image import Image
-from mitsuba_fspt.images.noise_model import NoiseModel
+from mitsuba_fspt.images.noise_model import NoiseModel, response_of
 from mitsuba_fspt.inverse.measurement import Measurement, Noise, noise_of, tell_misfit
 from mitsuba_fspt.runtime.errors import InversionError
+
+BARE = Detector(0.9, 0.0, 3.0, 1e5, 1.6, 500, 16)
 
 
 def signal():
@@ -175,6 +179,39 @@ def test_parts_of_one_image_share_its_flat_field_and_frame():
             assert part.deviation.min() > 0
             assert len(np.unique(shared)) == 32 - common
             assert np.array_equal(shared[0][:, 2:], shared[1][:, :2]) == (common > 0)
+
+
+def test_a_flat_field_that_was_replaced_is_not_that_of_the_reduction():
+    """The digest at reduction holds for the image and its parts alone. Seen to fail: it was taken for any other."""
+    pytest.importorskip("ccdproc")
+    rng = np.random.default_rng(6)
+    counts, flat = (np.rint(rng.normal(level, 9, (4, 6))) for level in (4000, 20000))
+    given = {"exposure_time": 60, "wavelength_nm": 650, "flat": flat, "flat_kind": "sensor"}
+    image = Detector.typical_ccd().reduce(counts, **given)
+    other = replace(image, flat=image.flat[::-1])
+    part = image[:, 1:]
+    cases = (image, image, 1), (image, other, 2), (part, other[:, 1:], 2), (part, replace(part, flat=part.flat + 1), 2)
+    for one, two, count in cases:
+        assert len({response_of(one), response_of(two)}) == count
+    assert response_of(part[1:, 1:]) == response_of(image)
+
+
+def test_detectors_without_a_name_are_told_apart_by_their_numbers(caplog):
+    """A PRNU known as a number: names that say nothing count as one camera with a line, not where the numbers differ.
+
+    Seen to fail: a typical CCD and a typical sCMOS had one name, and the pixels of both one response, without a line.
+    """
+    image = Image(np.ones((4, 4)))
+    kinds = Detector.typical_ccd(), Detector.typical_scmos(), Detector.typical_scmos(), replace(BARE, name="no. 1")
+    images = [
+        measured(replace(kind, prnu=0.02).expose(image, 1e-12, 650, seed=k)) for k, kind in enumerate((*kinds, BARE))
+    ]
+    for pair, count, told in (((0, 1), 2, 0), ((1, 2), 1, 1), ((3, 4), 2, 0), ((3, 3), 1, 0)):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            found = noise_of((2, 4, 4), [images[k] for k in pair])
+        assert len(set(found.detector)) == count
+        assert caplog.text.count("invert: 2 images name no detector") == told
 
 
 @pytest.mark.parametrize("wrong", [{"frame_share": 1.5}, {"frame_share": np.nan}, {"frame_electrons": np.inf}])
