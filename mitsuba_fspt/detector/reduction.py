@@ -230,9 +230,11 @@ def _tell_time(raw: Counts, exposed: Exposed) -> None:
 
 
 def _report_darkness(image: Image) -> None:
-    """Say in one line on stderr that the power of all pixels is negative by more than noise makes it."""
+    """Say in one line on stderr that all pixels are masked, or that their power is negative by more than noise."""
     power, error = (np.asarray(plane, np.float64) for plane in (image.power, image.error))
     total, noise = power.sum(), np.sqrt(np.square(error[image.kept]).sum())
+    if image.masked == power.size:
+        LOG.warning("fspt: reduce: all pixels are masked, the image says nothing of the light. Look at the counts.")
     if total < -DARKER * noise:
         LOG.warning(
             "fspt: reduce: the total is %.3g W, %.0f standard deviations below 0: the counts are darker than bias and "

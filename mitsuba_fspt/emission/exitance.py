@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Callable
@@ -24,6 +25,8 @@ FEWEST, MOST_TEXELS = 1 << 14, 1 << 20  # elements checked on a shape: at least 
 COLOURS, SPECTRA = ("SRGB", "D65"), ("Regular", "Irregular", "BlackBody")
 HALF_FLOATS = re.compile(r'name = "[^"]*\.exr"', re.IGNORECASE)  # in the description of a bitmap of 16-bit floats
 SMALLEST_HALF = 2.0**-14  # smallest 16-bit float with all its digits, to 5e-4
+COARSE_HALF = SMALLEST_HALF / 20  # below it a 16-bit float may be wrong by more than 1 %
+LOG = logging.getLogger("mitsuba_fspt")
 CORNERS_AND_CENTRE = ((0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5))
 
 
@@ -197,6 +200,13 @@ def _check_bitmap(texture: mi.Texture) -> None:
         raise ExitanceError(
             f"fspt_surface: 'exitance' is a bitmap of 16-bit floats up to {largest:.3g} W/mm², where these have steps "
             "of 6e-8. Save it with 32-bit floats."
+        )
+    if half and (coarse := (texels > 0) & (texels < COARSE_HALF)).any():
+        LOG.warning(
+            "fspt: fspt_surface: %d of %d texels of 'exitance' are 16-bit floats below %.2g W/mm², which have steps of "
+            "6e-8: J_n there is wrong by up to %.0f %%. Save it with 32-bit floats.",
+            *(np.count_nonzero(coarse[..., 0]), coarse[..., 0].size),
+            *(COARSE_HALF, 100 * 2.0**-25 / float(texels[coarse].min())),
         )
 
 

@@ -74,7 +74,8 @@ class Image(ImageData):
         height, width = self.shape
         total = self.total_power
         error = "unknown" if self.error is None else f"at most {self.error.max(initial=0.0):.3g} W a pixel"
-        return f"Image({width} x {height} pixels, {total:.6g} W in all, error {error})"
+        masked = f", {self.masked} masked" if self.masked else ""
+        return f"Image({width} x {height} pixels{masked}, {total:.6g} W in all, error {error})"
 
     @property
     def x(self) -> NDArray[np.float64]:

@@ -13,6 +13,17 @@ from .surface import CREASE_ANGLE
 from .transport_matrix import TransportMatrix
 from .view_factors import checked_factor
 
+# Options without an effect on 'mlem', and the values that they may have there.
+UNUSED: dict[str, tuple[object, ...]] = {
+    "weight": (None, 0.0),
+    "prior": (None,),
+    "crease_angle": (CREASE_ANGLE,),
+    "samples": (0,),
+    "seed": (0,),
+    "confidence": (0.9,),
+    "gain_per_view": (0.0,),
+}
+
 
 @dataclass(frozen=True)
 class Options:
@@ -38,12 +49,6 @@ class Options:
         object.__setattr__(self, "crease_angle", angle)
         if self.method not in ("smooth", "mlem"):
             raise InversionError(f"invert: 'method' must be 'smooth' or 'mlem', got {self.method!r}. Give one of them.")
-        smooth = self.weight or self.crease_angle != CREASE_ANGLE or self.prior
-        if self.method == "mlem" and (self.samples or smooth or self.gain_per_view):
-            raise InversionError(
-                "invert: method 'mlem' has no weight, creases and intervals, nor a prior and factors of views. Leave "
-                "out weight, crease_angle, prior, samples and gain_per_view."
-            )
         if self.weight is not None:
             weight = number("invert: 'weight'", self.weight, InversionError, "1.0")
             if not 0 <= weight < np.inf:
@@ -62,6 +67,17 @@ class Options:
             object.__setattr__(self, name, value)
         if self.samples == 1:
             raise InversionError("invert: 'samples' = 1 gives no interval. Give for example 200, or 0 for none.")
+        self._require_effect()
+
+    def _require_effect(self) -> None:
+        """Raise InversionError for an option that the method 'mlem' has not."""
+        if self.method == "mlem":
+            for name, allowed in UNUSED.items():
+                if (given := getattr(self, name)) not in allowed:
+                    raise InversionError(
+                        f"invert: '{name}' = {given} has no effect on method 'mlem', which has no penalty, creases, "
+                        "intervals and factors of views. Leave it out."
+                    )
 
 
 def require_matrix(matrix: object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from dataclasses import replace
@@ -206,6 +207,15 @@ def test_saturated_pixels_are_masked_not_clipped():
     assert found.metadata["masked_pixels"] == 2
     stack = np.stack([np.full((4, 5), 1000), counts])
     assert CCD.reduce(stack, **SETTINGS).mask.sum() == 2  # in one frame of two
+
+
+def test_an_image_of_masked_pixels_alone_is_told(caplog):
+    """All pixels saturated: the image had 0 W, without a word."""
+    with caplog.at_level(logging.WARNING):
+        found = fspt.Detector.typical_ccd().reduce(np.full((4, 5), 65535), exposure_time=60, wavelength_nm=650)
+    assert found.masked == 20
+    assert "20 masked" in repr(found)
+    assert "reduce: all pixels are masked" in caplog.text
 
 
 def test_cosmic_rays_are_masked():

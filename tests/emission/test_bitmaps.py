@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import pytest
 from small_scenes import ball, lens, look_at_crop, mi, world_scene
@@ -157,6 +159,19 @@ def test_an_exr_of_16_bit_floats_is_watts(tmp_path):
             continue
         with pytest.raises(RuntimeError, match=r"16-bit floats up to 1\.01e-06 W/mm²"):
             world_scene(ball(bitmap))
+
+
+def test_dark_texels_of_16_bit_floats_are_told(tmp_path, caplog):
+    """Of several decades only the largest was looked at: 1.5e-7 W/mm² beside 0.25 is 1.8e-7, without a word."""
+    path, values = str(tmp_path / "jn.exr"), np.full((2, 4, 1), 0.25, np.float16)
+    for dark, told in ((1e-5, False), (1.5e-7, True)):
+        values[1, 2] = dark
+        mi.Bitmap(values).write(path)
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            world_scene(ball({"type": "bitmap", "filename": path}))
+        assert ("1 of 8 texels of 'exitance' are 16-bit floats" in caplog.text) == told
+    assert "wrong by up to 17 %" in caplog.text
 
 
 @pytest.mark.parametrize(
