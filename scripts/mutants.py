@@ -753,6 +753,13 @@ MUTANTS = (
         ("tests/integral/surface/test_face_image.py",),
     ),
     Mutant(
+        "points beyond a bent edge",
+        "integral/surface/lit_part.py",
+        "dr.maximum(1 - dr.square(u - v), 0)",
+        "(1 - dr.square(u - v))",
+        ("tests/integral/surface/test_lit_part.py",),
+    ),
+    Mutant(
         "shadow of a strip",
         "integral/surface/face_image.py",
         "SURE = 4.0",

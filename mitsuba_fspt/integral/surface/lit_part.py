@@ -94,7 +94,7 @@ class LitPart:
         x, y = _coordinates(ends, point)
         u, v = _coordinates([self.first, self.second, self.third], point)
         u, v = u / dr.maximum(self.along.x, 1e-6), v / dr.maximum(self.along.y, 1e-6)
-        corner = u + v < 1 + self.beyond * (1 - dr.square(u - v))
+        corner = u + v < 1 + self.beyond * dr.maximum(1 - dr.square(u - v), 0)
         within = corner == self.lit
         return [1 - x - y, x, y], dr.select(self.some & (within != lit), dr.select(lit, 1.0, -1.0), 0.0)
 
