@@ -78,7 +78,35 @@ def main() -> None:
 @cache
 def _command() -> Callable[..., Any]:
     """The verbs of `app` with their options, read from the signatures once in a process."""
-    return typer.main.get_command(app)
+    return _with_options_once(typer.main.get_command(app))
+
+
+def _with_options_once(command: Any) -> Any:
+    """The command, and those of its group, which refuse a second value for an option of one value.
+
+    Of two values the first would be passed over without a word, as of `--free A --free B` for `--free A,B`.
+    """
+    for part in getattr(command, "commands", {}).values():
+        _with_options_once(part)
+    original = command.make_parser
+
+    def make_parser(context: Any) -> Any:
+        parser = original(context)
+        parse = parser.parse_args
+
+        def parse_args(args: list[str]) -> Any:
+            found = parse(args=args)
+            given = [one for one in found[2] if one.param_type_name == "option" and not (one.multiple or one.is_flag)]
+            for one in given:
+                if given.count(one) > 1:
+                    context.fail(f"Option '{one.opts[-1]}' is given {given.count(one)} times. Give it once")
+            return found
+
+        parser.parse_args = parse_args
+        return parser
+
+    command.make_parser = make_parser
+    return command
 
 
 def run(arguments: list[str]) -> int:

@@ -359,6 +359,11 @@ COMMANDS = {
     "seed too large": ((*MONTE_CARLO, "--seed", "99999999999"), "'seed' must be in 0"),
     "unknown method": ((*RENDER, "--method", "radiosity"), "'method' must be one of integral, path, ptracer, got"),
     "unknown option": ((*RENDER, "--fast"), "No such option: --fast"),
+    "a second value": ((*RENDER, "--rtol", "1e-2", "--rtol", "1e-3"), "Option '--rtol' is given 2 times. Give it once"),
+    "a second output of a group's verb": (
+        ("scene", "new", "cylinder", "-o", "one.xml", "--output", "two.xml"),
+        "Option '--output' is given 2 times. Give it once. See 'fspt scene new --help'.",
+    ),
     "unknown verb": (("paint",), "No such command 'paint'"),
     "no scene named": (("render",), "Missing argument 'SCENE.xml|PHANTOM.ply'. See 'fspt render --help'."),
     "an image for a scene": (("render", "good.exr"), "good.exr: no scene, which is XML and begins with '<'. Give the"),
