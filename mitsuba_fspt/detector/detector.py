@@ -30,7 +30,7 @@ from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
 from .parameters import RECORDED, DetectorParameters
 from .reduction import Corrections, Exposed, light_of, reduce_counts
-from .stray_light import StrayLight
+from .stray_light import StrayLight, tell_part
 
 if TYPE_CHECKING:
     from .counts import Frame
@@ -252,6 +252,7 @@ class Detector(DetectorParameters):
             return power
         own = StrayLight.of(image.metadata, image.shape)
         if not own:
+            tell_part("expose", image.metadata, image.shape)
             pitch = image.metadata.get("pixel_pitch")
             return np.maximum(self.stray_light.on(None if pitch is None else float(pitch)).forward(power), 0)
         if not own.same(self.stray_light):

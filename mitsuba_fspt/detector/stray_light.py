@@ -9,6 +9,7 @@ g is the share of the film's light that is spread evenly over it, ⟨P⟩ the me
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,12 +22,26 @@ from scipy.signal import convolve
 
 from ..images.formats import Metadata, read_planes
 from ..images.frame_file import FITS, read_frame
+from ..images.pixel_axes import CROP
 from ..runtime.errors import BackendError, DetectorError, FsptError, ImageError
 
 Array = NDArray[np.float64]
 PSF, PSF_DIGEST, GLARE, FILM = "psf", "psf_digest", "veiling_glare", "veiling_glare_film"  # keys of metadata
 DIGITS = 16  # of a digest
+LOG = logging.getLogger("mitsuba_fspt")
 POINTS = 16  # along the side of a kernel's cell that is larger than a pixel
+
+
+def tell_part(verb: str, metadata: Mapping[str, Any], shape: tuple[int, int]) -> None:
+    """Say in one line on stderr that an image (h, w) is a part of its film, so that some of its stray light is missing:
+    that which comes from beyond the edges of the part."""
+    film = tuple(round(float(metadata.get(name, side))) for name, side in zip(CROP[:2], shape[::-1], strict=True))
+    if film != shape[::-1]:
+        LOG.warning(
+            "fspt: %s: the image of %d x %d pixels is a part of a film of %d x %d; the stray light that comes from "
+            "beyond its edges is missing. Give the whole film where light falls beyond.",
+            *(verb, *shape[::-1], *film),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..detector.stray_light import StrayLight
+from ..detector.stray_light import StrayLight, tell_part
 from ..runtime.errors import TransportError
 from .transport_matrix import StrayMatrix, TransportMatrix
 
@@ -24,7 +24,8 @@ def stray_light_of(matrix: TransportMatrix, images: Sequence[Any], verb: str) ->
     from ..images.image import Image
 
     own = matrix.stray if isinstance(matrix, StrayMatrix) else StrayLight(None, 0.0)
-    found = [StrayLight.of(image.metadata, image.shape) for image in images if isinstance(image, Image)]
+    listed = [image for image in images if isinstance(image, Image)]
+    found = [StrayLight.of(image.metadata, image.shape) for image in listed]
     for number, one in enumerate(found):
         if not one.same(found[0]):
             raise TransportError(
@@ -33,6 +34,8 @@ def stray_light_of(matrix: TransportMatrix, images: Sequence[Any], verb: str) ->
             )
     if not found or not found[0]:
         return own
+    if found[0].kernel is not None:
+        tell_part(verb, listed[0].metadata, listed[0].shape)
     if own and not own.same(found[0]):
         raise TransportError(
             f"{verb}: the images have other stray light than the detector of 'through'. Give the matrix without it: "

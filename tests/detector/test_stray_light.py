@@ -9,6 +9,7 @@ import pytest
 import mitsuba_fspt as fspt
 from mitsuba_fspt.detector.reduction import reduced
 from mitsuba_fspt.detector.stray_light import Kernel, StrayLight
+from mitsuba_fspt.inverse.stray_matrix import stray_light_of
 from mitsuba_fspt.runtime.errors import DetectorError
 
 CCD = replace(fspt.Detector.typical_ccd(), dark_current=0.0, full_well=1e9, pixel_pitch=None)
@@ -51,6 +52,25 @@ def test_glare_is_a_share_of_the_light_on_every_pixel(psf):
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     both = spread_of(replace(CCD, veiling_glare=0.01, psf=psf), point())
     np.testing.assert_allclose(both, 0.99 * spread_of(replace(CCD, psf=psf), point()) + 1e-17 / 99, rtol=1e-9)
+
+
+def test_an_image_of_a_part_of_the_film_lacks_the_light_from_beyond(psf, caplog):
+    """A point one pixel beyond the part has 3 of 25 of its light on it in the whole image, and none in the part's.
+
+    The line is told by `expose`, and by `invert` of a part of an exposure. Seen to fail: no word.
+    """
+    camera, whole = replace(CCD, psf=psf), point()
+    part = whole[:4]
+    assert spread_of(camera, whole)[:4].sum() == pytest.approx(3 / 25 * 1e-15)
+    assert not caplog.records
+    assert camera.expected(part, **LIGHT).mean.sum() == 0
+    assert "expose: the image of 11 x 4 pixels is a part of a film of 11 x 9" in caplog.text
+    exposed = reduced(camera.expose(whole, **LIGHT))
+    caplog.clear()
+    assert stray_light_of(None, [exposed], "invert")
+    assert not caplog.records
+    assert stray_light_of(None, [exposed[:4]], "invert")
+    assert "invert: the image of 11 x 4 pixels is a part of a film of 11 x 9" in caplog.text
 
 
 @pytest.mark.parametrize("count", [2, 3])
