@@ -760,6 +760,20 @@ MUTANTS = (
         ("tests/integral/surface/test_lit_part.py",),
     ),
     Mutant(
+        "image of a camera in a mirror",
+        "camera/camera.py",
+        "mirror[:3, 3] = 2 * (point @ normal) * normal",
+        "mirror[:3, 3] = (point @ normal) * normal",
+        ("tests/integral/lines/test_mirror.py",),
+    ),
+    Mutant(
+        "narrow light left to lines of sight",
+        "integral/pupil/draft.py",
+        "dr.maximum(self.error, self.missed)",
+        "dr.maximum(self.error, 0 * self.missed)",
+        ("tests/integral/lines/test_specular.py",),
+    ),
+    Mutant(
         "shadow of a strip",
         "integral/surface/face_image.py",
         "SURE = 4.0",

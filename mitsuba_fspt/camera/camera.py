@@ -150,6 +150,20 @@ class Camera:
         whole.pupil = self.pupil.without_borders()
         return whole
 
+    def reflected(self, point: NDArray[np.float64], normal: NDArray[np.float64]) -> Camera:
+        """The camera's image in a mirror through this `point`, with this unit `normal`, both (3,).
+
+        A point before the mirror has the same image on its film as its mirror image has on that of the camera.
+        """
+        mirror = np.eye(4)
+        mirror[:3, :3] -= 2 * np.outer(normal, normal)
+        mirror[:3, 3] = 2 * (point @ normal) * normal
+        image, matrix = copy(self), mirror @ np.reshape(self.placement, (4, 4))
+        image.to_world, image.placement = mi.Transform4f(matrix), tuple(matrix.ravel().tolist())
+        image._to_camera = np.linalg.inv(matrix)
+        dr.make_opaque(image.to_world)
+        return image
+
     # ------------------------------------------------------------------ lines of sight
 
     def line_of_sight(

@@ -30,7 +30,8 @@ from .lines.visible_window import glowing_boxes
 from .progress import Progress
 from .pupil import interpolated, pupil_form
 from .pupil.interpolated import Blocks, blocks_of
-from .pupil.narrow import NarrowLight, Points, edge_on_light, narrow_light, peak_of_points, points_on_surfaces
+from .pupil.narrow import NarrowLight, edge_on_light, peak_of_points
+from .pupil.seen_points import SeenPoints
 from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
@@ -42,7 +43,6 @@ from .work_log import WorkLog
 
 LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
 NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
-UNCERTAINTY = 2.0  # largest ratio of that light and its estimate
 PLAIN = 0.7  # of rtol: tolerance of the light by plain courses (`Specular.part`); the rest is that of all others
 OTHERS = 4  # largest number of lines of sight of a pixel over that for all other courses
 FAINTER = 0.1  # least weight of these over that of plain ones
@@ -148,15 +148,18 @@ class Solver:
             return find()
         return self._seen_faces.recall(state, find, [geometry_of(shape) for shape in shapes])
 
-    def _narrow_light(self, view: View, window: Window) -> NarrowLight:
-        """Light of bodies and spots that lines of sight may miss; cached."""
+    def _narrow_light(self, view: View, window: Window) -> tuple[NarrowLight, NarrowLight]:
+        """Light of bodies and spots that lines of sight may miss: seen along straight lines, and in mirrors; cached."""
         held = [geometry_of(shape) for shape in view.scene.shapes()]
-        return self._narrow.recall(_seen_state(view, window), lambda: narrow_light(_points(view), window), held)
+        state = _seen_state(view, window)
+        return self._narrow.recall(state, lambda: SeenPoints.of(view).narrow_light(window), held)
 
     def _light_edge_on(self, view: View, window: Window) -> NDArray[np.float64]:
         """`NarrowLight.edge_on` on the pixels of a window; cached."""
         held = [geometry_of(shape) for shape in view.scene.shapes()]
-        return self._edge_on.recall(_seen_state(view, window), lambda: edge_on_light(_points(view), window), held)
+        return self._edge_on.recall(
+            _seen_state(view, window), lambda: edge_on_light(SeenPoints.of(view).straight, window), held
+        )
 
     def _fill(
         self,
@@ -168,15 +171,13 @@ class Solver:
     ) -> None:
         """Solve all tiles. With several, their tolerance follows from a lower bound of the brightest pixel."""
         tiles, window = mosaic.tiles, mosaic.window
-        least_peak, points = 0.0, None
+        least_peak, points = 0.0, None if narrow else SeenPoints.none(view)
         progress(0.0)
         if len(tiles) > 1 and narrow:
-            points = _points(view)
-            least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points, window))
+            points = SeenPoints.of(view)
+            least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points.straight, window))
         for k, tile in enumerate(tiles):
-            light = partial(self._narrow_light, view, tile)
-            if points or not narrow:
-                light = partial(narrow_light, points, tile)
+            light = partial(points.narrow_light, tile) if points else partial(self._narrow_light, view, tile)
             mosaic.put(tile, self._solve_tile(tile, view, quadrature, light, least_peak, progress.part(k, len(tiles))))
 
     def _solve_tile(
@@ -184,7 +185,7 @@ class Solver:
         window: Window,
         view: View,
         quadrature: Quadrature,
-        narrow_light: Callable[[], NarrowLight],
+        narrow_light: Callable[[], tuple[NarrowLight, NarrowLight]],
         least_peak: float,
         progress: Progress,
     ) -> Solution:
@@ -204,32 +205,31 @@ class Solver:
             if solution := self._by_blocks(view, blocks, quadrature, least_peak, progress):
                 return solution
             why = "most blocks of pixels have an edge, or light too narrow for them"
-        narrow = narrow_light()
+        narrow, mirrored = narrow_light()
         where, peak = inside, least_peak
         if not everywhere:
             where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
             peak = max(narrow.brightest / 2, least_peak)
         if specular and specular.bending:  # the surface form contains only light that goes straight to the lens
             where = np.zeros(window.shape, bool)
-        light, form = narrow.in_focus, partial(pupil_form.solve, view, window, quadrature, edge_on=narrow.edge_on)
         if progress.deadline.passed():
             where = np.zeros(window.shape, bool)
         by_faces = self._face_image(window, view, quadrature, peak)
         on_faces = where & window.fully_open(camera) if by_faces else np.zeros(window.shape, bool)
         by_elements = where & ~on_faces
+        form = partial(pupil_form.solve, view, window, quadrature)
         if by_elements.any():
             part, rest = progress.part(0, 2), progress.part(1, 2)
             known = surface_form.solve(scene, camera, window, quadrature, by_elements, peak, part, specular)
             known = _with_dark_coverage(known, view, window)
-            solution = known.completed_by(form(light, known, least_peak, rest, by_faces, on_faces))
+            solution = known.completed_by(form(narrow, known, least_peak, rest, by_faces, on_faces))
         elif by_faces:
-            solution = form(light, None, least_peak, progress, by_faces, on_faces)
+            solution = form(narrow, None, least_peak, progress, by_faces, on_faces)
         elif specular and specular.bending and specular.branching:
-            solution = _by_courses(view, window, quadrature, narrow, least_peak, progress)
+            solution = _by_courses(view, window, quadrature, narrow, mirrored, least_peak, progress)
         else:
-            solution = form(light, None, least_peak, progress)
-        solution = replace(solution, findings=(Finding("smooth blocks", False, why), *solution.findings))
-        return _with_missed(solution, narrow, on_faces | by_elements | ~(inside | cut), cut, window, view)
+            solution = form(narrow.plus(mirrored), None, least_peak, progress)
+        return replace(solution, findings=(Finding("smooth blocks", False, why), *solution.findings))
 
     def _by_surface(
         self, window: Window, view: View, quadrature: Quadrature, least_peak: float, progress: Progress
@@ -273,16 +273,11 @@ class Solver:
         """Solution with values interpolated between blocks; None if that saves no lines of sight."""
         # Light that is narrow for a pixel is narrow for a block, too.
         largest = blocks[0]
-        narrow = self._narrow_light(replace(view, camera=largest.camera), largest.window)
+        narrow, _ = self._narrow_light(replace(view, camera=largest.camera), largest.window)
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
         edge_on = partial(self._light_edge_on, view)
         return interpolated.solve(view, blocks, quadrature, edge_on, least_peak, progress)
-
-
-def _points(view: View) -> Points | None:
-    """Points all over the surfaces of a view's scene."""
-    return points_on_surfaces(view.scene, view.camera, view.specular)
 
 
 def _seen_state(view: View, window: Window) -> tuple[object, ...]:
@@ -308,6 +303,7 @@ def _by_courses(
     window: Window,
     quadrature: Quadrature,
     narrow: NarrowLight,
+    mirrored: NarrowLight,
     least_peak: float,
     progress: Progress,
 ) -> Solution:
@@ -326,10 +322,10 @@ def _by_courses(
         shares[0] = replace(shares[0], max_nodes=max(quadrature.max_nodes - few, 1))
     shares[1] = replace(shares[1], max_nodes=few)
     first, rest = progress.part(0, 2), progress.part(1, 2)
-    light, edge_on = narrow.in_focus, narrow.edge_on  # the latter of straight lines: reflected edges lie elsewhere
-    image = pupil_form.solve(views[0], window, shares[0], light, None, least_peak, first, edge_on=edge_on)
+    image = pupil_form.solve(views[0], window, shares[0], narrow.plus(mirrored), None, least_peak, first)
     peak = max(float((image.power - image.error).max(initial=0.0)) / view.camera.etendue, least_peak)
-    return image.plus(pupil_form.solve(views[1], window, shares[1], light, None, peak, rest))
+    others = replace(mirrored, in_focus=narrow.in_focus)
+    return image.plus(pupil_form.solve(views[1], window, shares[1], others, None, peak, rest))
 
 
 def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solution:
@@ -338,39 +334,6 @@ def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solut
         return solution
     met = np.where(solution.where, pupil_form.coverage_of(view, window), 0)
     return replace(solution, coverage=np.maximum(solution.coverage, met))
-
-
-def _with_missed(
-    solution: Solution,
-    narrow: NarrowLight,
-    where: NDArray[np.bool_],
-    cut: NDArray[np.bool_],
-    window: Window,
-    view: View,
-) -> Solution:
-    """The solution with the light of narrow spots that lines of sight may miss in its error; masks as of `_missed`."""
-    if not narrow.on_pixels.any():
-        return solution
-    missed = _missed(narrow, where, cut, window, view.camera, solution)
-    if view.specular and view.specular.bending:
-        # The positions at which a mirror or glass shows a narrow spot are not known.
-        there = window.seen_in(view.specular.bending, view.camera)
-        most = UNCERTAINTY * narrow.on_pixels.max() * view.camera.etendue
-        missed = np.maximum(missed, window.expand(there * most))
-    return replace(solution, error=np.maximum(solution.error, missed))
-
-
-def _missed(
-    narrow: NarrowLight, where: NDArray[np.bool_], cut: NDArray[np.bool_], window: Window, camera: Camera, of: Solution
-) -> NDArray[np.float64]:
-    """Light of narrow spots that lines of sight may miss [W], shape (h, w), on pixels without the surface form.
-
-    where : pixels of the window that took faces or the surface form, and dark ones beyond the image-plane stop
-    cut : pixels that the border of the image-plane stop crosses, which always take lines of sight
-    """
-    light = np.where(where, 0, UNCERTAINTY * narrow.on_pixels)
-    bright = window.expand(np.where(cut, light, 0)) * camera.etendue - of.power
-    return np.maximum(bright, window.expand(np.where(cut, 0, light)) * camera.etendue)
 
 
 def _outside(window: Window) -> Finding:

@@ -8,7 +8,6 @@ radiance of the surface where each sequence ends (Eq. M.19).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,15 +19,15 @@ from numpy.typing import NDArray
 from ...camera.camera import Camera
 from ...emission.face_table import shape_number
 from ...emission.of_emitter import surfaces_of
-from ...jit.mesh_buffers import box_of, triangles
+from ...jit.mesh_buffers import box_of
 from ...jit.plugin_objects import made
 from ...jit.spectra import at_one_wavelength, scalar
 from ..quadrature import Quadrature
+from .mirror import Box, Mirror, corners_of
 from .nested_bsdfs import blended_parts
 from .occlusion import hidden, ray_to_lens
 
 SMOOTHEST = 1e-4  # roughness below which Mitsuba's rough conductor has the lobe of this roughness: a mirror's
-FLAT = 1e-5  # of its size: how far a flat shape may leave its plane
 ROUNDING = 2e-6  # of the largest coordinate: margin of a box
 LIFT = 4e-7  # of a shape's largest coordinate: distance at which its sides differ in float32
 DELTA = {
@@ -36,8 +35,6 @@ DELTA = {
     "transmission": mi.BSDFFlags.DeltaTransmission,
     "reflection": mi.BSDFFlags.DeltaReflection,
 }
-
-Box = tuple[float, ...]  # x, y, z of the lowest and of the highest corner [mm]
 
 
 @dataclass(frozen=True)
@@ -47,6 +44,7 @@ class Specular:
     names : ids of the shapes
     lobes : kinds of lobes that can lead to light, of 'null', 'transmission' and 'reflection'
     bending : boxes of the shapes that deviate lines of sight
+    mirrors : of the same shapes, None for curved ones and where light is refracted
     bsdf : Dr.Jit's number of a shape's BSDF; 0 where lines of sight end
     parts : components of a shape's BSDF that are sampled one at a time; 0 for those of no blend
     most_parts : largest of `parts`
@@ -62,6 +60,7 @@ class Specular:
     names: tuple[str, ...]
     lobes: tuple[str, ...]
     bending: tuple[Box, ...]
+    mirrors: tuple[Mirror | None, ...]
     bsdf: mi.UInt32
     parts: mi.UInt32
     most_parts: int
@@ -84,7 +83,8 @@ class Specular:
         lobes = {name for _, bsdf in shapes for name in lobes_of(bsdf)}
         bent = [(shape, bsdf) for shape, bsdf in shapes if set(lobes_of(bsdf)) - {"null"}]
         glowing = [_box(surface.shape) for surface in surfaces_of(scene)] or [_box(*scene.shapes())]
-        if len(bent) == 1 and "transmission" not in lobes and _between(bent[0][0], camera, glowing):
+        planes = [Mirror.of(shape) for shape, _ in bent]
+        if len(bent) == 1 and "transmission" not in lobes and _separates(planes[0], camera, glowing):
             lobes, bent = lobes - {"reflection"}, []  # what a pane reflects to the lens is dark
         if not (lobes or even_if_none):
             return None
@@ -96,15 +96,19 @@ class Specular:
             number = shape_number(shape)
             bsdf[number] = dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(its))[0]
             parts[number] = blended_parts(its)
-            others = [
-                box for (other, _), box in zip(bent, boxes, strict=True) if other is not shape or not _plane(shape)
-            ]
+            # Of a flat shape no light reaches itself.
+            beside = zip(bent, boxes, planes, strict=False)
+            others = [box for (other, _), box, plane in beside if other is not shape or not plane]
             reach[number] = _around([*glowing, *others])
             lift[number] = LIFT * np.abs(_box(shape)).max()
         return cls(
             tuple(shape.id() for shape, _ in shapes),
             tuple(name for name in DELTA if name in lobes) or ("null",),
             tuple(boxes),
+            tuple(
+                None if "transmission" in lobes_of(its) else plane
+                for (_, its), plane in zip(bent, planes, strict=False)
+            ),
             mi.UInt32(bsdf),
             mi.UInt32(parts),
             int(parts.max()),
@@ -183,31 +187,9 @@ def _around(boxes: Sequence[Box]) -> NDArray[np.float64]:
     return np.concatenate([ends[:, 0].min(axis=0) - margin, ends[:, 1].max(axis=0) + margin])
 
 
-def _plane(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """A point [mm] and the normal of the plane that a shape lies in; None for a shape that is not flat."""
-    if shape.class_name() == "Disk":
-        matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
-        normal = np.cross(matrix[:3, 0], matrix[:3, 1])
-        return matrix[:3, 3], normal / np.linalg.norm(normal)
-    if not shape.is_mesh():
-        return None
-    points = triangles(shape)[0].numpy().reshape(-1, 3).astype(np.float64)
-    middle = points.mean(axis=0)
-    _, size, axes = np.linalg.svd(points - middle, full_matrices=False)
-    return (middle, axes[2]) if size[2] <= FLAT * size[0] else None
-
-
-def _between(shape: mi.Shape, camera: Camera, glowing: Sequence[Box]) -> bool:
-    """True if a shape is flat and its plane lies between the whole pupil and everything that glows."""
-    if (plane := _plane(shape)) is None:
-        return False
-    point, normal = plane
-    ends = np.array(glowing, np.float64).reshape(-1, 2, 3)
-    corners = ends[:, (np.arange(8)[:, None] >> np.arange(3)) & 1, range(3)].reshape(-1, 3)
-    heights = (corners - point) @ normal
-    own = float((np.array(camera.centre) - point) @ normal)
-    side = math.copysign(1.0, own)
-    return abs(own) > camera.lens.pupil_radius and bool((side * heights < 0).all())
+def _separates(plane: Mirror | None, camera: Camera, glowing: Sequence[Box]) -> bool:
+    """True if a flat shape lies between the whole pupil and everything that glows."""
+    return plane is not None and plane.separates(camera, corners_of(glowing))
 
 
 def transmission(

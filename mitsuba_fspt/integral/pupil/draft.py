@@ -21,6 +21,7 @@ from . import node_rules
 
 if TYPE_CHECKING:
     from ...jit.pixel_grid import Mask, PixelArray
+    from .narrow import NarrowLight
 
 FULL = 1e-6  # rounding of the coverage, a sum of float32 weights
 # Largest error of a rule at a straight silhouette, sharp or blurred, as a share of the light: where the silhouette lies
@@ -42,6 +43,8 @@ class Draft:
     least_blur : smallest blur radius between the nearest and the farthest surface, inf without one [pixels]
     sharp : True where least_blur is below `IN_FOCUS` on the pixel or a neighbour
     edge_on : light of surfaces edge-on as of `NarrowLight`, 0 unless it is set [W/mm²/sr]
+    missed, narrow_radiance : light of narrow spots that lines of sight may miss, and the largest radiance of these
+        spots, 0 unless they are set [W/mm²/sr]
     outline : True within a pixel of lines of sight that meet a glowing surface and of others that do not
     shown : False on the rim of the window; one entry if there is none
     clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
@@ -70,7 +73,8 @@ class Draft:
         self.least_blur = grid.full(mi.Float64, dr.inf)
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
-        self.roughness, self.lost, self.edge_on = (grid.full(mi.Float64, 0) for _ in range(3))
+        self.roughness, self.lost, self.edge_on, self.missed = (grid.full(mi.Float64, 0) for _ in range(4))
+        self.narrow_radiance = 0.0
         self.shown = grid.flat(window.shown()) if window.count < math.prod(window.shape) else mi.Bool(True)
         self.clipped, self.outside = (grid.full(mi.Bool, False) for _ in range(2))
         if math.isfinite(view.camera.lens.seen_field):
@@ -140,6 +144,15 @@ class Draft:
     def restore_given_errors(self) -> None:
         """Set the errors of given values; before, errors of the rules on these pixels count for their neighbours."""
         self.error = dr.select(self.computed, self.error, self.given_error)
+
+    def set_narrow(self, narrow: NarrowLight) -> None:
+        """Set the light of surfaces that lines of sight may miss."""
+        self.edge_on, self.missed = (self.grid.flat(image) for image in (narrow.edge_on, narrow.at_most))
+        self.narrow_radiance = narrow.radiance
+
+    def count_missed(self) -> None:
+        """Count narrow light as an error of the pixels that no other solution gives."""
+        self.error = dr.select(self.computed, dr.maximum(self.error, self.missed), self.error)
 
     def count(self, what: str, pixels: mi.UInt32, rays: int) -> None:
         """Record the name of a rule, the numbers of the pixels it was applied to, and their lines of sight."""

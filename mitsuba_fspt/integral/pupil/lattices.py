@@ -45,7 +45,8 @@ def refine_by_lattices(draft: Draft) -> None:
     """Value and error of the pixels above the tolerance by lattices of more and more points, until they are below it.
 
     The error of a pixel is at least the largest share of pixel × pupil that all points may miss, times the brightest
-    value around; on pixels that another solution gives, times the brightest surface.
+    value around, or the brightest narrow spot where they may miss one; on pixels that another solution gives, times
+    the brightest surface.
     """
     above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
     deadline, tolerance = draft.progress.deadline, draft.tolerance
@@ -58,9 +59,9 @@ def refine_by_lattices(draft: Draft) -> None:
     if most_points(1) < FIRST or not dr.any(above):
         return
     above = _largest_errors(draft, above, most_points)
-    brightest = dr.select(
-        draft.computed, draft.near_edge(draft.value), dr.opaque(mi.Float64, most_radiance(draft.view.scene))
-    )
+    narrow, most = (dr.opaque(mi.Float64, n) for n in (draft.narrow_radiance, most_radiance(draft.view.scene)))
+    brightest = dr.maximum(draft.near_edge(draft.value), dr.select(draft.missed > 0, narrow, 0))
+    brightest = dr.select(draft.computed, brightest, most)
     student_t, missed = (dr.opaque(mi.Float64, n) for n in _exceeded_with(CHANCE))
     means, points = Means.none(draft.grid.pixels(above)), 0
     while not deadline.passed():
@@ -79,8 +80,8 @@ def refine_by_lattices(draft: Draft) -> None:
         dr.eval(images)
         draft.value, draft.coverage, draft.error = images
         # Where another rule's error is smaller, lattices have to get below it.
-        most = max(most_points(dr.width(means.pixels)), points)
-        expected = error * dr.opaque(mi.Float64, (points / most) ** ORDER)
+        last = max(most_points(dr.width(means.pixels)), points)
+        expected = error * dr.opaque(mi.Float64, (points / last) ** ORDER)
         left = (error > tolerance) & (expected <= dr.gather(mi.Float64, draft.error, means.pixels))
         if not dr.any(left):
             break

@@ -32,6 +32,7 @@ from ...jit.spectra import at_one_wavelength, scalar
 from ..lines.specular import Specular, transmission
 from .node_rules import PLASTIC, twelve
 
+UNCERTAINTY = 2.0  # largest ratio of narrow light and its estimate
 OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than every square around, in focus
 # The limb of a wide body is not narrow light, as transects integrate it: its cosine to the lens is below `SLANTED`, the
 # body covers at least the share `COVERED` of a square around, the point is at most `GLARES` times as bright as that.
@@ -51,26 +52,49 @@ class NarrowLight:
     of these on each pixel as if they were in focus; and of surfaces edge-on, times the difference of their blur radii
     [pixels], at most 1.
 
-    Mean radiance on film [W/mm²/sr], to a factor of two.
+    Mean radiance on film [W/mm²/sr], to a factor of two. `radiance`: the largest one of narrow spots [W/mm²/sr].
     """
 
     on_pixels: PixelArray
     brightest: float
     in_focus: PixelArray
     edge_on: PixelArray
+    radiance: float
 
     @classmethod
     def none(cls, shape: tuple[int, int]) -> NarrowLight:
         """Of a window on which no surface shines."""
-        return cls(np.zeros(shape), 0.0, np.zeros(shape), np.zeros(shape))
+        return cls(np.zeros(shape), 0.0, np.zeros(shape), np.zeros(shape), 0.0)
+
+    @property
+    def at_most(self) -> PixelArray:
+        """Upper bound of `on_pixels`."""
+        return UNCERTAINTY * self.on_pixels
+
+    def plus(self, mirrored: NarrowLight) -> NarrowLight:
+        """With the narrow light and the surfaces edge-on that mirrors show."""
+        return replace(
+            self,
+            on_pixels=self.on_pixels + mirrored.on_pixels,
+            edge_on=self.edge_on + mirrored.edge_on,
+            radiance=max(self.radiance, mirrored.radiance),
+        )
+
+    def anywhere_on(self, pixels: NDArray[np.bool_], straight: NarrowLight) -> NarrowLight:
+        """With the largest light of narrow spots, seen so or along `straight` lines, on all of these pixels (h, w)."""
+        most = max(float(one.on_pixels.max(initial=0.0)) for one in (self, straight))
+        on_pixels = np.maximum(self.on_pixels, np.where(pixels, most, 0))
+        return replace(self, on_pixels=on_pixels, radiance=max(self.radiance, straight.radiance))
 
 
-def points_on_surfaces(scene: mi.Scene, camera: Camera, specular: Specular | None = None) -> Points | None:
+def points_on_surfaces(
+    scene: mi.Scene, camera: Camera, specular: Specular | None = None, hidden: bool = True
+) -> Points | None:
     """Points all over the surfaces, imaged by `camera`; None where no emitter is an `fspt_surface`.
 
-    Along straight lines only, also through `specular` shapes.
+    Along straight lines only, also through `specular` shapes. `hidden`: those that other surfaces hide are dark.
     """
-    parts = [_seen(scene, surface, camera, specular) for surface in surfaces_of(scene)]
+    parts = [_seen(scene, surface, camera, specular, hidden) for surface in surfaces_of(scene)]
     return Points.joined(parts) if parts else None
 
 
@@ -85,7 +109,7 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
     shown = points.shown_in(window)
     if not (light[shown] > 0).any():
         shown[:] = True
-    brightest = 0.0
+    brightest = radiance = 0.0
     for k in np.unique(level):
         here, reach = level == k, math.ceil(2 ** (k + 0.5))
         if (counts := here & shown).any():
@@ -95,8 +119,10 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
         here &= there & (points.apart < 1)
         if here.any():
             on_pixels += _spread(light[here], points[here], reach, window.shape)
+            radiance = max(radiance, float(points.radiance[here].max()))
     in_focus = points.on_pixels(light, window.shape)
-    return NarrowLight(on_pixels, float(brightest), in_focus, _edge_on(points, light, window.shape))
+    edge_on = _edge_on(points, light, window.shape)
+    return NarrowLight(on_pixels, float(brightest), in_focus, edge_on, radiance)
 
 
 def edge_on_light(points: Points | None, window: Window) -> PixelArray:
@@ -268,7 +294,7 @@ def _spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) -
     return grid.array(grid.box_sum(grid.flat(sums), reach))[reach : reach + height, reach : reach + width]
 
 
-def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: Specular | None) -> Points:
+def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: Specular | None, hidden: bool) -> Points:
     """Points all over a surface, with their images."""
     shape = surface.shape
     texels = texels_of(surface.exitance)
@@ -286,7 +312,7 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
     thin = np.isfinite(reach) & ((area < WIDE * unit**2 * reach) | crossed) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     at = _on_elements(surface, elements, camera, counts)
-    if len(scene.shapes()) > 1:
+    if hidden and len(scene.shapes()) > 1:
         at.radiance = dr.select(_in_sight(scene, camera, at.place, specular), at.radiance, 0)
     columns = (at.radiance, at.image, at.cosine, at.front, at.edge_on, at.blur, at.centre.x, at.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ...jit.pixel_grid import Mask, PixelArray
+    from .narrow import NarrowLight
 
 # Lines of sight of a pixel that twelve nodes leave above the tolerance, as of a straight silhouette; the same where the
 # faces are projected in any case, for narrow light.
@@ -55,25 +56,23 @@ def solve(
     view: View,
     window: Window,
     quadrature: Quadrature,
-    light: NDArray[np.float64],
+    narrow: NarrowLight,
     given: Solution | None = None,
     least_peak: float = 0.0,
     progress: Progress = SILENT,
     by_faces: ByFaces | None = None,
-    narrow: NDArray[np.bool_] | None = None,
-    edge_on: NDArray[np.float64] | None = None,
+    on_faces: NDArray[np.bool_] | None = None,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window, to the accuracy of `quadrature`.
 
-    Only pixels of the `window` are computed, the others are dark. `light`: of surfaces as if in focus, see
-    `NarrowLight`. Pixels that the partial solution `given` has are not refined. `least_peak`: lower bound of the
-    brightest pixel's mean radiance on film [W/mm²/sr]. `progress` is called after every level. `by_faces`,
-    `narrow` as of `refine`, `edge_on` as of `NarrowLight`.
+    Only pixels of the `window` are computed, the others are dark. `narrow`: light of the surfaces on them; that of
+    narrow spots counts as an error unless the lines of sight of a pixel suffice to meet it. Pixels that the partial
+    solution `given` has are not refined. `least_peak`: lower bound of the brightest pixel's mean radiance on film
+    [W/mm²/sr]. `progress` is called after every level. `by_faces`, `on_faces` as of `refine`.
     """
     draft = Draft(view, window, quadrature, given, least_peak, progress)
-    if edge_on is not None:
-        draft.edge_on = draft.grid.flat(edge_on)
-    refine(draft, light, by_faces, narrow)
+    draft.set_narrow(narrow)
+    refine(draft, narrow.in_focus, by_faces, on_faces)
     return draft.solution()
 
 
@@ -81,12 +80,12 @@ def refine(
     draft: Draft,
     light: NDArray[np.float64],
     by_faces: ByFaces | None = None,
-    narrow: NDArray[np.bool_] | None = None,
+    on_faces: NDArray[np.bool_] | None = None,
 ) -> None:
-    """All steps of the refinement on the pixels of a draft; `light` as of `solve`.
+    """All steps of the refinement on the pixels of a draft; `light`: of surfaces as if in focus, see `NarrowLight`.
 
     `by_faces` gives the pixels that twelve nodes, or some transects, leave above the tolerance from the faces of all
-    surfaces if lines of sight are expected to take more time. Pixels that are `narrow` (h, w), whose light
+    surfaces if lines of sight are expected to take more time. Pixels that are marked in `on_faces` (h, w), whose light
     lines of sight may miss, take their value from the faces in any case.
     """
     quadrature, progress = draft.quadrature, draft.progress
@@ -98,8 +97,8 @@ def refine(
     progress(2 / (2 + len(levels)))
     faces = None
     if by_faces:
-        faces = _Faces(draft, by_faces, np.zeros(draft.window.shape, bool) if narrow is None else narrow)
-        beside = narrow is not None and narrow.any()
+        faces = _Faces(draft, by_faces, np.zeros(draft.window.shape, bool) if on_faces is None else on_faces)
+        beside = on_faces is not None and on_faces.any()
         rough = faces(rough, (BESIDE_NARROW if beside else FIRST_LINES) if levels else 0.0)
     if not levels:
         draft.spread_error(rough)
@@ -108,6 +107,7 @@ def refine(
     draft.restore_given_errors()
     if faces and levels:
         faces.further()
+    draft.count_missed()
     if levels:
         refine_by_lattices(draft)
     progress(1.0)

@@ -318,6 +318,31 @@ def test_narrow_light_in_a_mirror_is_in_the_error():
     assert (abs(image.power - direct.power) <= image.error + direct.error).all()
 
 
+@pytest.mark.parametrize("bounces", [1, 2])
+def test_narrow_light_that_mirrors_alone_show_is_met(bounces):
+    """A sphere of 0.05 pixels behind a plate, in one mirror or in two.
+
+    Expected: its image at its mirror image's place. Seen to fail, with an image of 0 and an error of 0, with the light
+    of narrow spots along straight lines alone.
+    """
+    seen = np.array([0.4, 1.4 * SIDE, FOCUS])
+    mirrors, where = [pane(80, PERFECT, tilt=45, size=20)], mirrored(seen, 80, 45)
+    if bounces == 2:  # the second one, beside the axis, sends the light on along it
+        turned = mi.ScalarTransform4f().translate([40, 0, 80]).rotate([0, 1, 0], -45).scale(20)
+        mirrors.append({"type": "rectangle", "to_world": turned, "bsdf": PERFECT})
+        normal = np.array([-1, 0, 1]) / np.sqrt(2)
+        where -= 2 * (where - [40, 0, 80]) @ normal * normal
+    towards = mi.ScalarTransform4f().look_at(origin=(where * 0.9).tolist(), target=[0, 0, 0], up=[0, 1, 0])
+    plate = {"type": "rectangle", "to_world": towards.scale(2.0), "bsdf": {"type": "diffuse"}}
+    tiny = {"type": "sphere", "center": where.tolist(), "radius": 0.02}
+    around = (14, 9, 12, 12)
+    direct = fspt.render(camera_scene({**tiny, "center": seen.tolist()}, crop=around), rtol=3e-3)
+    image = fspt.render(camera_scene(tiny, bodies=(*mirrors, plate), crop=around), rtol=4e-3)
+    assert direct.power.max() > 0
+    assert (abs(image.power - direct.power) <= image.error + direct.error).all()
+    assert image.error.max() < 0.5 * direct.power.max()
+
+
 def test_the_surface_form_goes_through_panes_alone():
     scene = camera_scene(sphere(150, 9), bodies=(pane(80, PANE),), crop=(7, 6, 8, 8))
     pupil, surface = (fspt.render(scene, rtol=1e-2, domain=domain) for domain in ("pupil", "surface"))
