@@ -325,6 +325,12 @@ def _mask(matrix: TransportMatrix, images: Sequence[Any], mask: ArrayLike | None
         for number_, image in enumerate(images):
             if isinstance(image, Image) and image.mask is not None and image.shape == shape[1:]:
                 whole[number_] |= image.mask
+                if image.mask.all():
+                    LOG.warning(
+                        "fspt: invert: all pixels of image %d are masked, it counts for nothing. Expose for a "
+                        "shorter time.",
+                        number_,
+                    )
     return whole
 
 

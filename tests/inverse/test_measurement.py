@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.detector.reduction import measured
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.images.noise_model import NoiseModel, response_of
-from mitsuba_fspt.inverse.measurement import Measurement, Noise, noise_of, tell_misfit
+from mitsuba_fspt.inverse.measurement import Measurement, Noise, _mask, noise_of, tell_misfit
 from mitsuba_fspt.runtime.errors import InversionError
 
 BARE = Detector(0.9, 0.0, 3.0, 1e5, 1.6, 500, 16)
@@ -194,6 +195,16 @@ def test_a_flat_field_that_was_replaced_is_not_that_of_the_reduction():
     for one, two, count in cases:
         assert len({response_of(one), response_of(two)}) == count
     assert response_of(part[1:, 1:]) == response_of(image)
+
+
+def test_an_image_without_a_pixel_that_counts_is_told(caplog):
+    """The second of two images is saturated everywhere: it was left out without a word."""
+    plane, full = np.ones((4, 4)), np.ones((4, 4), bool)
+    images = [Image(plane, plane, mask=mask) for mask in (np.eye(4, dtype=bool), full)]
+    found = _mask(SimpleNamespace(image_shape=(2, 4, 4)), images, None)
+    assert found.sum(axis=(1, 2)).tolist() == [4, 16]
+    assert caplog.text.count("are masked") == 1
+    assert "invert: all pixels of image 1 are masked" in caplog.text
 
 
 def test_detectors_without_a_name_are_told_apart_by_their_numbers(caplog):
