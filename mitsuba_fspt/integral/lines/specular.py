@@ -44,7 +44,7 @@ class Specular:
     names : ids of the shapes
     lobes : kinds of lobes that can lead to light, of 'null', 'transmission' and 'reflection'
     bending : boxes of the shapes that deviate lines of sight
-    mirrors : of the same shapes, None for curved ones and where light is refracted
+    mirrors : planes of the same shapes, none for curved ones and where light is refracted
     bsdf : Dr.Jit's number of a shape's BSDF; 0 where lines of sight end
     parts : components of a shape's BSDF that are sampled one at a time; 0 for those of no blend
     most_parts : largest of `parts`
@@ -60,7 +60,7 @@ class Specular:
     names: tuple[str, ...]
     lobes: tuple[str, ...]
     bending: tuple[Box, ...]
-    mirrors: tuple[Mirror | None, ...]
+    mirrors: tuple[tuple[Mirror, ...], ...]
     bsdf: mi.UInt32
     parts: mi.UInt32
     most_parts: int
@@ -84,7 +84,7 @@ class Specular:
         bent = [(shape, bsdf) for shape, bsdf in shapes if set(lobes_of(bsdf)) - {"null"}]
         glowing = [_box(surface.shape) for surface in surfaces_of(scene)] or [_box(*scene.shapes())]
         planes = [Mirror.of(shape) for shape, _ in bent]
-        if len(bent) == 1 and "transmission" not in lobes and _separates(planes[0], camera, glowing):
+        if len(bent) == 1 and "transmission" not in lobes and _separate(planes[0], camera, glowing):
             lobes, bent = lobes - {"reflection"}, []  # what a pane reflects to the lens is dark
         if not (lobes or even_if_none):
             return None
@@ -98,7 +98,7 @@ class Specular:
             parts[number] = blended_parts(its)
             # Of a flat shape no light reaches itself.
             beside = zip(bent, boxes, planes, strict=False)
-            others = [box for (other, _), box, plane in beside if other is not shape or not plane]
+            others = [box for (other, _), box, plane in beside if other is not shape or len(plane) != 1]
             reach[number] = _around([*glowing, *others])
             lift[number] = LIFT * np.abs(_box(shape)).max()
         return cls(
@@ -106,8 +106,7 @@ class Specular:
             tuple(name for name in DELTA if name in lobes) or ("null",),
             tuple(boxes),
             tuple(
-                None if "transmission" in lobes_of(its) else plane
-                for (_, its), plane in zip(bent, planes, strict=False)
+                () if "transmission" in lobes_of(its) else plane for (_, its), plane in zip(bent, planes, strict=False)
             ),
             mi.UInt32(bsdf),
             mi.UInt32(parts),
@@ -187,9 +186,9 @@ def _around(boxes: Sequence[Box]) -> NDArray[np.float64]:
     return np.concatenate([ends[:, 0].min(axis=0) - margin, ends[:, 1].max(axis=0) + margin])
 
 
-def _separates(plane: Mirror | None, camera: Camera, glowing: Sequence[Box]) -> bool:
-    """True if a flat shape lies between the whole pupil and everything that glows."""
-    return plane is not None and plane.separates(camera, corners_of(glowing))
+def _separate(planes: tuple[Mirror, ...], camera: Camera, glowing: Sequence[Box]) -> bool:
+    """True if a shape is flat and lies between the whole pupil and everything that glows."""
+    return len(planes) == 1 and planes[0].separates(camera, corners_of(glowing))
 
 
 def transmission(

@@ -6,9 +6,10 @@ without refraction.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from ...camera.window import Window
+from ...camera.window import Window, window_of
 from ..lines.eq9 import View
 from ..lines.mirror import corners_of, images_in
 from ..lines.visible_window import glowing_boxes
@@ -35,10 +36,11 @@ class SeenPoints:
         straight = points_on_surfaces(scene, camera, specular)
         if specular is None or straight is None:
             return cls(view, straight, (), False)
-        mirrors = [mirror for mirror in specular.mirrors if mirror]
-        images = images_in(mirrors, camera, corners_of(glowing_boxes(scene)), specular.most)
-        seen = (points_on_surfaces(scene, image, hidden=False) for image in images or ())
-        anywhere = images is None or len(mirrors) < len(specular.mirrors)
+        mirrors, boxes = [mirror for planes in specular.mirrors for mirror in planes], glowing_boxes(scene)
+        images = images_in(mirrors, camera, corners_of(boxes), specular.most)
+        shown = (image for image in images or () if math.prod(window_of(boxes, image).shape))
+        seen = (points_on_surfaces(scene, image, hidden=False) for image in shown)
+        anywhere = images is None or not all(specular.mirrors)
         return cls(view, straight, tuple(points for points in seen if points), anywhere)
 
     @classmethod

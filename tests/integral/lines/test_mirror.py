@@ -51,3 +51,25 @@ def test_a_mirror_shows_nothing_beyond_its_plane_and_many_images_are_not_listed(
     assert left.separates(camera, np.array([[-40.0, 0.0, 100.0]]))
     assert not left.separates(camera, np.array([[40.0, 0.0, 100.0]]))
     assert images_in([left, right], camera, np.array([[0.0, 0.0, 100.0]]), MOST_IMAGES) is None
+
+
+def test_mirrors_at_a_right_angle_show_three_images(camera):
+    half = np.sqrt(0.5)
+    turned = [np.array([half, 0, -half]), np.array([-half, 0, -half])]
+    corners = np.array([[x, y, z] for x in (-40.0, 40.0) for y in (-20.0, 20.0) for z in (90.0, 170.0)])
+    mirrors = [Mirror(np.array([0.0, 0.0, 170.0]), normal, corners) for normal in turned]
+    images = images_in(mirrors, camera, np.array([[0.0, 0.0, 120.0]]), 8)
+    assert sorted(tuple(np.round(image.centre)) for image in images) == [(-170, 0, 170), (0, 0, 340), (170, 0, 170)]
+
+
+def test_planes_of_a_mesh_are_told_apart(mono):
+    """As of mirrors that Mitsuba merges into one mesh when it loads a dictionary."""
+    cube = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale([1, 2, 3])})
+    planes = Mirror.of(cube)
+    expected = {tuple(sign * axis) for axis in np.eye(3) for sign in (1, -1)}
+    assert {tuple(np.round(plane.normal) + 0.0) for plane in planes} == {
+        tuple(n + 0.0) for n in map(np.array, expected)
+    }
+    for plane in planes:
+        assert np.ptp(plane.corners @ plane.normal) == pytest.approx(0, abs=1e-6)
+    assert Mirror.of(mi.load_dict({"type": "sphere"})) == ()
