@@ -52,9 +52,10 @@ def refine_by_lattices(draft: Draft) -> None:
     deadline, tolerance = draft.progress.deadline, draft.tolerance
     before, legs = draft.rays, _legs(draft.view.specular)
 
-    def most_points(pixels: int) -> int:
-        """Points of the largest lattice that so many pixels may take next."""
-        return _most_points(draft.quadrature, legs, pixels, draft.rays - before)
+    def most_points(pixels: int, points: int = 0) -> int:
+        """Points of the largest lattice that so many pixels may take next, after one of so many points."""
+        on_others = draft.rays - before - points * SHIFTS * pixels
+        return _most_points(draft.quadrature, legs, pixels, on_others)
 
     if most_points(1) < FIRST or not dr.any(above):
         return
@@ -65,7 +66,7 @@ def refine_by_lattices(draft: Draft) -> None:
     student_t, missed = (dr.opaque(mi.Float64, n) for n in _exceeded_with(CHANCE))
     means, points = Means.none(draft.grid.pixels(above)), 0
     while not deadline.passed():
-        more = min(GROWTH * points or FIRST, most_points(dr.width(means.pixels)))
+        more = min(GROWTH * points or FIRST, most_points(dr.width(means.pixels), points))
         if more <= points:
             break
         means, points = means.refined(draft, points, more), more
@@ -80,7 +81,7 @@ def refine_by_lattices(draft: Draft) -> None:
         dr.eval(images)
         draft.value, draft.coverage, draft.error = images
         # Where another rule's error is smaller, lattices have to get below it.
-        last = max(most_points(dr.width(means.pixels)), points)
+        last = max(most_points(dr.width(means.pixels), points), points)
         expected = error * dr.opaque(mi.Float64, (points / last) ** ORDER)
         left = (error > tolerance) & (expected <= dr.gather(mi.Float64, draft.error, means.pixels))
         if not dr.any(left):
@@ -116,7 +117,7 @@ def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]
 def _most_points(quadrature: Quadrature, legs: int, pixels: int, taken: int = 0) -> int:
     """Points of the largest lattice on so many pixels, a power of two, of lines of sight that count as so many.
 
-    taken : lines of sight of smaller lattices, on other pixels as well
+    taken : lines of sight of smaller lattices on other pixels
     """
     lines = quadrature.most_nodes
     if quadrature.max_nodes is None:
