@@ -293,6 +293,8 @@ class SourceFit:
                 break
             positions, self._share = found.positions, step / settings.steps
             found = self._weighted(found, self._noise(found))
+            if not (found.powers > 0).all():  # no image tells the position of a source without power
+                break
             slopes = found.slopes
             lengths = np.linalg.norm(slopes, axis=0)
             normal = slopes.T @ slopes / np.outer(lengths, lengths)
