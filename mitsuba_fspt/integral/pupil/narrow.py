@@ -80,11 +80,11 @@ class NarrowLight:
             radiance=max(self.radiance, mirrored.radiance),
         )
 
-    def anywhere_on(self, pixels: NDArray[np.bool_], straight: NarrowLight) -> NarrowLight:
-        """With the largest light of narrow spots, seen so or along `straight` lines, on all of these pixels (h, w)."""
-        most = max(float(one.on_pixels.max(initial=0.0)) for one in (self, straight))
+    def anywhere_on(self, pixels: NDArray[np.bool_], other: NarrowLight) -> NarrowLight:
+        """With the largest light of these or `other` narrow spots on a pixel, on all of these pixels (h, w)."""
+        most = max(float(one.on_pixels.max(initial=0.0)) for one in (self, other))
         on_pixels = np.maximum(self.on_pixels, np.where(pixels, most, 0))
-        return replace(self, on_pixels=on_pixels, radiance=max(self.radiance, straight.radiance))
+        return replace(self, on_pixels=on_pixels, radiance=max(self.radiance, other.radiance))
 
 
 def points_on_surfaces(

@@ -307,6 +307,18 @@ def test_narrow_light_behind_a_window():
     assert seen.power.sum() / bare.power.sum() == pytest.approx(THROUGH, rel=2e-3)
 
 
+def test_narrow_light_behind_a_plate_of_glass_is_met():
+    """A sphere of 0.05 pixels, as much nearer as the glass makes it, for paraxial light.
+
+    Seen to fail, with a thousandth of the light and no more error, where glass hides what lies behind it.
+    """
+    tiny, around = sphere(FOCUS + THICK * (1 - 1 / N), 0.02, x=0.4, y=1.4 * SIDE), (14, 9, 12, 12)
+    image = fspt.render(camera_scene(tiny, bodies=(slab(80),), crop=around), rtol=1e-2)
+    bare = fspt.render(camera_scene(sphere(FOCUS, 0.02, x=0.4, y=1.4 * SIDE), crop=around), rtol=1e-2)
+    assert image.power.max() > 0
+    assert image.power.sum() == pytest.approx(THROUGH * bare.power.sum(), abs=image.error.max() + bare.error.max())
+
+
 def test_narrow_light_in_a_mirror_is_in_the_error():
     where = mirrored(np.array([0.0, 1.0, 160.0]), 80, 45)
     tiny = {"type": "sphere", "center": where.tolist(), "radius": 0.05}
