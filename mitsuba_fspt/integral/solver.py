@@ -148,8 +148,8 @@ class Solver:
             return find()
         return self._seen_faces.recall(state, find, [geometry_of(shape) for shape in shapes])
 
-    def _narrow_light(self, view: View, window: Window) -> tuple[NarrowLight, NarrowLight]:
-        """Light of bodies and spots that lines of sight may miss: seen along straight lines, and in mirrors; cached."""
+    def _narrow_light(self, view: View, window: Window) -> tuple[NarrowLight, NarrowLight, NDArray[np.float64]]:
+        """Light of bodies and spots that lines of sight may miss, as of `SeenPoints.narrow_light`; cached."""
         held = [geometry_of(shape) for shape in view.scene.shapes()]
         state = _seen_state(view, window)
         return self._narrow.recall(state, lambda: SeenPoints.of(view).narrow_light(window), held)
@@ -171,7 +171,7 @@ class Solver:
     ) -> None:
         """Solve all tiles. With several, their tolerance follows from a lower bound of the brightest pixel."""
         tiles, window = mosaic.tiles, mosaic.window
-        least_peak, points = 0.0, None if narrow else SeenPoints.none(view)
+        least_peak, points = 0.0, None if narrow else SeenPoints(view, None)
         progress(0.0)
         if len(tiles) > 1 and narrow:
             points = SeenPoints.of(view)
@@ -185,7 +185,7 @@ class Solver:
         window: Window,
         view: View,
         quadrature: Quadrature,
-        narrow_light: Callable[[], tuple[NarrowLight, NarrowLight]],
+        narrow_light: Callable[[], tuple[NarrowLight, NarrowLight, NDArray[np.float64]]],
         least_peak: float,
         progress: Progress,
     ) -> Solution:
@@ -205,7 +205,7 @@ class Solver:
             if solution := self._by_blocks(view, blocks, quadrature, least_peak, progress):
                 return solution
             why = "most blocks of pixels have an edge, or light too narrow for them"
-        narrow, mirrored = narrow_light()
+        narrow, mirrored, anywhere = narrow_light()
         where, peak = inside, least_peak
         if not everywhere:
             where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
@@ -229,7 +229,9 @@ class Solver:
             solution = _by_courses(view, window, quadrature, narrow, mirrored, least_peak, progress)
         else:
             solution = form(narrow.plus(mirrored), None, least_peak, progress)
-        return replace(solution, findings=(Finding("smooth blocks", False, why), *solution.findings))
+        error = np.maximum(solution.error, window.expand(anywhere) * camera.etendue)
+        findings = (Finding("smooth blocks", False, why), *solution.findings)
+        return replace(solution, error=error, findings=findings)
 
     def _by_surface(
         self, window: Window, view: View, quadrature: Quadrature, least_peak: float, progress: Progress
@@ -273,7 +275,7 @@ class Solver:
         """Solution with values interpolated between blocks; None if that saves no lines of sight."""
         # Light that is narrow for a pixel is narrow for a block, too.
         largest = blocks[0]
-        narrow, _ = self._narrow_light(replace(view, camera=largest.camera), largest.window)
+        narrow, *_ = self._narrow_light(replace(view, camera=largest.camera), largest.window)
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
         edge_on = partial(self._light_edge_on, view)
@@ -286,7 +288,8 @@ def _seen_state(view: View, window: Window) -> tuple[object, ...]:
     editions = [edition_of(emitter) for emitter in scene.emitters()]
     through = specular.state() if specular else ()
     poses = [pose_of(shape) for shape in scene.shapes()]
-    return editions, glowing_boxes(scene), poses, through, view.camera.state, window
+    most = specular.most if specular else 0
+    return editions, glowing_boxes(scene), poses, through, most, view.camera.state, window
 
 
 def _refuse_bending(specular: Specular | None, quadrature: Quadrature) -> None:

@@ -85,7 +85,7 @@ class Specular:
         glowing = [_box(surface.shape) for surface in surfaces_of(scene)] or [_box(*scene.shapes())]
         planes = [Mirror.of(shape) for shape, _ in bent]
         if len(bent) == 1 and "transmission" not in lobes and _separate(planes[0], camera, glowing):
-            lobes, bent = lobes - {"reflection"}, []  # what a pane reflects to the lens is dark
+            lobes, bent, planes = lobes - {"reflection"}, [], []  # what a pane reflects to the lens is dark
         if not (lobes or even_if_none):
             return None
         boxes = [_box(shape) for shape, _ in bent]
@@ -97,7 +97,7 @@ class Specular:
             bsdf[number] = dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(its))[0]
             parts[number] = blended_parts(its)
             # Of a flat shape no light reaches itself.
-            beside = zip(bent, boxes, planes, strict=False)
+            beside = zip(bent, boxes, planes, strict=True)
             others = [box for (other, _), box, plane in beside if other is not shape or len(plane) != 1]
             reach[number] = _around([*glowing, *others])
             lift[number] = LIFT * np.abs(_box(shape)).max()
@@ -106,7 +106,7 @@ class Specular:
             tuple(name for name in DELTA if name in lobes) or ("null",),
             tuple(boxes),
             tuple(
-                () if "transmission" in lobes_of(its) else plane for (_, its), plane in zip(bent, planes, strict=False)
+                () if "transmission" in lobes_of(its) else plane for (_, its), plane in zip(bent, planes, strict=True)
             ),
             mi.UInt32(bsdf),
             mi.UInt32(parts),

@@ -45,6 +45,7 @@ class Draft:
     edge_on : light of surfaces edge-on as of `NarrowLight`, 0 unless it is set [W/mm²/sr]
     missed, narrow_radiance : light of narrow spots that lines of sight may miss, and the largest radiance of these
         spots, 0 unless they are set [W/mm²/sr]
+    by_narrow : True where that light alone makes the error larger than the tolerance
     outline : True within a pixel of lines of sight that meet a glowing surface and of others that do not
     shown : False on the rim of the window; one entry if there is none
     clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
@@ -74,7 +75,7 @@ class Draft:
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
         self.roughness, self.lost, self.edge_on, self.missed = (grid.full(mi.Float64, 0) for _ in range(4))
-        self.narrow_radiance = 0.0
+        self.narrow_radiance, self.by_narrow = 0.0, mi.Bool(False)
         self.shown = grid.flat(window.shown()) if window.count < math.prod(window.shape) else mi.Bool(True)
         self.clipped, self.outside = (grid.full(mi.Bool, False) for _ in range(2))
         if math.isfinite(view.camera.lens.seen_field):
@@ -152,7 +153,9 @@ class Draft:
 
     def count_missed(self) -> None:
         """Count narrow light as an error of the pixels that no other solution gives."""
-        self.error = dr.select(self.computed, dr.maximum(self.error, self.missed), self.error)
+        error = dr.select(self.computed, dr.maximum(self.error, self.missed), self.error)
+        self.by_narrow = (self.error <= self.tolerance) & (error > self.tolerance)
+        self.error = error
 
     def count(self, what: str, pixels: mi.UInt32, rays: int) -> None:
         """Record the name of a rule, the numbers of the pixels it was applied to, and their lines of sight."""

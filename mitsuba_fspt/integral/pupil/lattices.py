@@ -48,21 +48,28 @@ def refine_by_lattices(draft: Draft) -> None:
     value around, or the brightest narrow spot where they may miss one; on pixels that another solution gives, times
     the brightest surface.
     """
-    above = draft.shown & ~draft.outside & (draft.error > draft.tolerance)
+    above, before = draft.shown & ~draft.outside & (draft.error > draft.tolerance), draft.rays
+    _refine(draft, above & ~draft.by_narrow, before, claimed=True)
+    _refine(draft, above & draft.by_narrow, before, claimed=False)
+
+
+def _refine(draft: Draft, above: Mask, before: int, claimed: bool) -> None:
+    """Value and error of the marked pixels; `before`: lines of sight of the image before its lattices; `claimed` as of
+    `_most_points`."""
     deadline, tolerance = draft.progress.deadline, draft.tolerance
-    before, legs = draft.rays, _legs(draft.view.specular)
+    legs = _legs(draft.view.specular)
 
     def most_points(pixels: int, points: int = 0) -> int:
         """Points of the largest lattice that so many pixels may take next, after one of so many points."""
         on_others = draft.rays - before - points * SHIFTS * pixels
-        return _most_points(draft.quadrature, legs, pixels, on_others)
+        return _most_points(draft.quadrature, legs, pixels, on_others, claimed)
 
-    if most_points(1) < FIRST or not dr.any(above):
+    if not dr.any(above) or most_points(1) < FIRST:
         return
     above = _largest_errors(draft, above, most_points)
-    narrow, most = (dr.opaque(mi.Float64, n) for n in (draft.narrow_radiance, most_radiance(draft.view.scene)))
+    narrow, largest = (dr.opaque(mi.Float64, n) for n in (draft.narrow_radiance, most_radiance(draft.view.scene)))
     brightest = dr.maximum(draft.near_edge(draft.value), dr.select(draft.missed > 0, narrow, 0))
-    brightest = dr.select(draft.computed, brightest, most)
+    brightest = dr.select(draft.computed, brightest, largest)
     student_t, missed = (dr.opaque(mi.Float64, n) for n in _exceeded_with(CHANCE))
     means, points = Means.none(draft.grid.pixels(above)), 0
     while not deadline.passed():
@@ -114,14 +121,14 @@ def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]
     return above & mi.Bool(taken)
 
 
-def _most_points(quadrature: Quadrature, legs: int, pixels: int, taken: int = 0) -> int:
+def _most_points(quadrature: Quadrature, legs: int, pixels: int, taken: int = 0, claimed: bool = True) -> int:
     """Points of the largest lattice on so many pixels, a power of two, of lines of sight that count as so many.
 
-    taken : lines of sight of smaller lattices on other pixels
+    taken : lines of sight of smaller lattices on other pixels; claimed : each pixel may take `most_nodes` in any case
     """
     lines = quadrature.most_nodes
     if quadrature.max_nodes is None:
-        lines = max(lines, (TOGETHER - legs * taken) // pixels) // legs
+        lines = max(lines if claimed else 0, (TOGETHER - legs * taken) // pixels, 0) // legs
     return min(1 << (lines // SHIFTS).bit_length() >> 1, MOST)
 
 

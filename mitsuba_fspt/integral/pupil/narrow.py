@@ -72,7 +72,7 @@ class NarrowLight:
         return UNCERTAINTY * self.on_pixels
 
     def plus(self, mirrored: NarrowLight) -> NarrowLight:
-        """With the narrow light and the surfaces edge-on that mirrors show."""
+        """With the narrow light and the surfaces edge-on that mirrors show; its `brightest` and `in_focus` are kept."""
         return replace(
             self,
             on_pixels=self.on_pixels + mirrored.on_pixels,
@@ -80,11 +80,9 @@ class NarrowLight:
             radiance=max(self.radiance, mirrored.radiance),
         )
 
-    def anywhere_on(self, pixels: NDArray[np.bool_], other: NarrowLight) -> NarrowLight:
-        """With the largest light of these or `other` narrow spots on a pixel, on all of these pixels (h, w)."""
-        most = max(float(one.on_pixels.max(initial=0.0)) for one in (self, other))
-        on_pixels = np.maximum(self.on_pixels, np.where(pixels, most, 0))
-        return replace(self, on_pixels=on_pixels, radiance=max(self.radiance, other.radiance))
+    def on(self, pixels: NDArray[np.bool_]) -> NarrowLight:
+        """The narrow light and the surfaces edge-on of these pixels (h, w) alone."""
+        return replace(self, on_pixels=self.on_pixels * pixels, edge_on=self.edge_on * pixels)
 
 
 def points_on_surfaces(
@@ -123,6 +121,25 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
     in_focus = points.on_pixels(light, window.shape)
     edge_on = _edge_on(points, light, window.shape)
     return NarrowLight(on_pixels, float(brightest), in_focus, edge_on, radiance)
+
+
+def most_narrow_light(points: Points | None) -> float:
+    """Largest light of narrow spots on a pixel, wherever it may lie [W/mm²/sr]."""
+    if points is None:
+        return 0.0
+    points = points[(points.area > 0) & (points.cosine > 0) & (points.radiance > 0)]
+    light, level, most = points.light(), points.level(), 0.0
+    for k in np.unique(level):
+        here = level == k
+        here[here] &= _hidden(points[here], 2**k)
+        here &= points.apart < 1
+        side = 2 * (2 * math.ceil(2 ** (k + 0.5)) + 1)  # twice that of the pixels around that a spot may reach
+        for right, down in ((0, 0), (side / 2, 0), (0, side / 2), (side / 2, side / 2)):
+            place = ((points.x[here] + right) / side, (points.y[here] + down) / side)
+            column, row = (np.floor(np.clip(c, -(2.0**30), 2.0**30)).astype(np.int64) for c in place)
+            cell = np.unique(row * (1 << 32) + column, return_inverse=True)[1]
+            most = max(most, float(np.bincount(cell, light[here], minlength=1).max()))
+    return UNCERTAINTY * most
 
 
 def edge_on_light(points: Points | None, window: Window) -> PixelArray:
