@@ -77,6 +77,8 @@ def plot(
     from ..images.picture import draw_panels, save_figure
     from ..optics.light import Light
 
+    if per_panel and len(images) == 1:
+        raise ImageError("--per-panel has no meaning for one image, which has its own scale. Leave it out.")
     output = output or Path(f"{images[0].stem}.png" if len(images) == 1 else "plot.png")
     require_picture(output)
     require_apart(output, images, error=ImageError)

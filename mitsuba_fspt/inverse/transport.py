@@ -117,7 +117,8 @@ def transport(
 
     As Eq. 9 does, T leaves out the light that surfaces scatter on to the lens; a warning states the largest share of a
     view, for J = 1. The metadata also say in `warnings` on how many pixels `rtol` was not reached, if on any, and what
-    is odd about the scene, such as a mesh of inconsistent orientations; `error` estimates the errors of the pixels.
+    is odd about the scene, such as a mesh of inconsistent orientations, and which views are equal, as those for values
+    of J_n are; `error` estimates the errors of the pixels.
 
     Raises
     ------
@@ -338,7 +339,9 @@ def _joined(
         partial.views = len(tasks)
         blocks = partial
     sensitivity, rtol, unreached, largest = np.zeros(ends[-1]), tasks[0].rtol, 0, 0.0
+    digests = []
     for block in blocks:
+        digests.append(_digest(block))
         sensitivity += np.bincount(block.columns, block.values.astype(np.float64), minlength=ends[-1])
         off = block.relative_row_error
         unreached, largest = unreached + int(np.count_nonzero(off > rtol * (1 + rtol))), max(largest, float(off.max()))
@@ -363,12 +366,34 @@ def _joined(
     told = dict.fromkeys(text for result in ordered for text in result.warnings)
     if of_views := [result.left_out for result in ordered if result.left_out]:
         told[f"{max(of_views)[1]} (for J = 1)"] = None
-    if warnings := [*([off] if unreached else []), *told]:
+    if warnings := [*([off] if unreached else []), *_equal_views(tasks, digests), *told]:
         meta["warnings"] = "; ".join(warnings)
     if partial is None:
         return TransportMatrix(blocks, meta, areas, sensitivity)
     partial.finish(meta, areas, sensitivity)
     return read_transport(partial.path)
+
+
+def _digest(block: SparseRows) -> bytes:
+    """Digest of the entries of a view."""
+    found = hashlib.sha256()
+    for entries in (block.starts, block.columns, block.values):
+        found.update(entries.tobytes())
+    return found.digest()
+
+
+def _equal_views(tasks: list[ViewTask], digests: list[bytes]) -> list[str]:
+    """A line about views whose rows are equal, none where all differ."""
+    first: dict[bytes, int] = {}
+    pairs = [(first.setdefault(digest, k), k) for k, digest in enumerate(digests)]
+    equal = [pair for pair in pairs if pair[0] < pair[1]]
+    if not equal:
+        return []
+    one, other = (tasks[k].label for k in equal[0])
+    return [
+        f"{len(equal)} of {len(tasks)} views are equal to one before, such as '{other}' to '{one}': what differs "
+        "between them has no effect on the matrix"
+    ]
 
 
 def _name_of(scene: Any) -> str:

@@ -298,6 +298,7 @@ def test_plot_draws_images_from_their_files(run, two_images, tmp_path):
         (("--range", "1"), "--range 1: must be two numbers A,B in W/pixel, for example --range 0,1e-9."),
         (("--range", "2,1"), "picture: the range must be A < B in W/pixel, got 2,1. Give 0,1e-9."),
         (("--outline",), "picture: an image without coverage has no outline. Leave it out, or give one that"),
+        (("--per-panel",), "--per-panel has no meaning for one image, which has its own scale. Leave it out."),
         (("-o", "a.jpg"), "output file 'a.jpg' must end in .png. Give a name such as picture.png."),
         (("none.exr",), "image file 'none.exr' does not exist. Give the path of an image that fspt wrote."),
     ],

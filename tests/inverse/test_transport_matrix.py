@@ -112,6 +112,15 @@ def test_vertices_that_no_camera_sees_have_no_entries(scene_file):
     assert 0.4 < found.areas[found.seen].sum() / found.areas.sum() < 0.6
 
 
+def test_equal_views_are_reported(scene_file):
+    """Views that differ by J_n alone, on which no entry depends; those of other poses are not counted."""
+    text = XML.replace('value="vertex_exitance"/>', 'value="vertex_exitance"/><float name="scale" value="$J"/>')
+    scene_file.write_text(text.replace("<default", '<default name="J" value="1"/><default', 1))
+    found = fspt.transport(scene_file, J=[1, 2], view=[0, 90], rtol=1e-2)
+    assert "2 of 4 views are equal to one before, such as 'J=2 view=0' to 'J=1 view=0'" in found.metadata["warnings"]
+    assert "equal" not in fspt.transport(scene_file, view=[0, 90], rtol=1e-2).metadata.get("warnings", "")
+
+
 def test_several_meshes_and_sensors(tmp_path):
     """Columns of one mesh after the other, in the order of the scene; a view a sensor, last and fastest."""
     shapes = []
