@@ -97,7 +97,7 @@ def _with_options_once(command: Any) -> Any:
         def parse_args(args: list[str]) -> Any:
             found = parse(args=args)
             given = [one for one in found[2] if one.param_type_name == "option" and not (one.multiple or one.is_flag)]
-            for one in given:
+            for one in given if not context.resilient_parsing else ():  # not while a shell completes a line
                 if given.count(one) > 1:
                     context.fail(f"Option '{one.opts[-1]}' is given {given.count(one)} times. Give it once")
             return found

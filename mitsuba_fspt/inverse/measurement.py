@@ -325,12 +325,12 @@ def _mask(matrix: TransportMatrix, images: Sequence[Any], mask: ArrayLike | None
         for number_, image in enumerate(images):
             if isinstance(image, Image) and image.mask is not None and image.shape == shape[1:]:
                 whole[number_] |= image.mask
-                if image.mask.all():
-                    LOG.warning(
-                        "fspt: invert: all pixels of image %d are masked, it counts for nothing. Expose for a "
-                        "shorter time.",
-                        number_,
-                    )
+    for left_out in np.flatnonzero(whole.all(axis=(1, 2))):
+        LOG.warning(
+            "fspt: no pixel of image %d counts, as all are masked. If they are saturated, expose for a shorter time. "
+            "If it is left out on purpose, leave it out of the matrix, too.",
+            left_out,
+        )
     return whole
 
 

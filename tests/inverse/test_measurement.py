@@ -204,7 +204,7 @@ def test_an_image_without_a_pixel_that_counts_is_told(caplog):
     found = _mask(SimpleNamespace(image_shape=(2, 4, 4)), images, None)
     assert found.sum(axis=(1, 2)).tolist() == [4, 16]
     assert caplog.text.count("are masked") == 1
-    assert "invert: all pixels of image 1 are masked" in caplog.text
+    assert "no pixel of image 1 counts" in caplog.text
 
 
 def test_detectors_without_a_name_are_told_apart_by_their_numbers(caplog):
