@@ -234,7 +234,10 @@ def _report_darkness(image: Image) -> None:
     power, error = (np.asarray(plane, np.float64) for plane in (image.power, image.error))
     total, noise = power.sum(), np.sqrt(np.square(error[image.kept]).sum())
     if image.masked == power.size:
-        LOG.warning("fspt: reduce: all pixels are masked, the image says nothing of the light. Look at the counts.")
+        LOG.warning(
+            "fspt: reduce: all pixels are masked, as saturated or bad: the image says nothing of the light. Expose "
+            "for a shorter time, or correct the maps of pixels."
+        )
     if total < -DARKER * noise:
         LOG.warning(
             "fspt: reduce: the total is %.3g W, %.0f standard deviations below 0: the counts are darker than bias and "

@@ -70,7 +70,7 @@ class Options:
         self._require_effect()
 
     def _require_effect(self) -> None:
-        """Raise InversionError for an option that the method 'mlem' has not."""
+        """Raise InversionError for an option that has no effect on the method 'mlem'."""
         if self.method == "mlem":
             for name, allowed in UNUSED.items():
                 if (given := getattr(self, name)) not in allowed:
