@@ -25,6 +25,7 @@ from ..images.formats import Metadata
 from ..images.image import Image
 from ..images.noise_model import TYPICAL
 from ..images.pixel_axes import CROP
+from ..images.recorded_number import recorded_number
 from ..optics.light import Light, Spectrum
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
@@ -240,8 +241,8 @@ class Detector(DetectorParameters):
             LOG.warning("fspt: expose: %d masked pixels have no known power; they get no light.", image.mask.sum())
         power = self._with_stray_light(image)
         electrons = _binned(power * (exposure_time * self.electrons_per_joule(light)), binning)
-        pitch = image.metadata.get("pixel_pitch")
-        area = self.area(None if pitch is None else float(pitch) * binning, binning)
+        pitch = _pitch(image)
+        area = self.area(None if pitch is None else pitch * binning, binning)
         dark = self.on_pixels("dark_current", electrons.shape) * exposure_time
         return self._drawn_response(electrons.shape, area) * electrons + (dark + self.spurious_charge) * area
 
@@ -253,8 +254,7 @@ class Detector(DetectorParameters):
         own = StrayLight.of(image.metadata, image.shape)
         if not own:
             tell_part("expose", image.metadata, image.shape)
-            pitch = image.metadata.get("pixel_pitch")
-            return np.maximum(self.stray_light.on(None if pitch is None else float(pitch)).forward(power), 0)
+            return np.maximum(self.stray_light.on(_pitch(image)).forward(power), 0)
         if not own.same(self.stray_light):
             raise DetectorError(
                 "detector: the image has the stray light of another detector already, 'psf' or 'veiling_glare' of its "
@@ -372,11 +372,18 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
 def _pixels_read_out(image: Image, binning: int) -> Metadata:
     """Entries of the metadata about the pixels that are read out: their pitch and crop window."""
     found: Metadata = {}
-    if "pixel_pitch" in image.metadata:
-        found["pixel_pitch"] = float(image.metadata["pixel_pitch"]) * binning
+    if (pitch := _pitch(image)) is not None:
+        found["pixel_pitch"] = pitch * binning
     if binning > 1:  # of a crop window, in pixels of the read-out
-        found |= {key: float(image.metadata[key]) / binning for key in CROP if key in image.metadata}
+        own = {key: recorded_number(image.metadata, key, math.nan) for key in CROP}
+        found |= {key: value / binning for key, value in own.items() if not math.isnan(value)}
     return found
+
+
+def _pitch(image: Image) -> float | None:
+    """Side of the image's pixels [mm], None if unknown."""
+    pitch = recorded_number(image.metadata, "pixel_pitch", math.nan)
+    return None if math.isnan(pitch) else pitch
 
 
 def _time(exposure_time: float) -> float:

@@ -23,6 +23,7 @@ from scipy.signal import convolve
 from ..images.formats import Metadata, read_planes
 from ..images.frame_file import FITS, read_frame
 from ..images.pixel_axes import CROP
+from ..images.recorded_number import recorded_number
 from ..runtime.errors import BackendError, DetectorError, FsptError, ImageError
 
 Array = NDArray[np.float64]
@@ -35,7 +36,9 @@ POINTS = 16  # along the side of a kernel's cell that is larger than a pixel
 def tell_part(verb: str, metadata: Mapping[str, Any], shape: tuple[int, int]) -> None:
     """Say in one line on stderr that an image (h, w) is a part of its film, so that some of its stray light is missing:
     that which comes from beyond the edges of the part."""
-    film = tuple(round(float(metadata.get(name, side))) for name, side in zip(CROP[:2], shape[::-1], strict=True))
+    film = tuple(
+        round(recorded_number(metadata, name, side, verb)) for name, side in zip(CROP[:2], shape[::-1], strict=True)
+    )
     if film != shape[::-1]:
         LOG.warning(
             "fspt: %s: the image of %d x %d pixels is a part of a film of %d x %d; the stray light that comes from "
@@ -173,7 +176,7 @@ class StrayLight:
         DetectorError : its kernel cannot be read or has changed, or the image is only a part of the film over which the
             glare was spread.
         """
-        kernel, glare = None, float(metadata.get(GLARE, 0.0))
+        kernel, glare = None, recorded_number(metadata, GLARE, 0.0, "detector: the image", DetectorError)
         if PSF in metadata:
             kernel = Kernel.read(str(metadata[PSF]))
             if kernel.digest != metadata.get(PSF_DIGEST):

@@ -13,6 +13,7 @@ from .deviations import Deviations, LightOfOne, Profile
 from .formats import Metadata
 from .image import Image
 from .pixel_axes import CROP
+from .recorded_number import recorded_number
 from .z_test import brightest, error_bound, z_test
 
 SURE = 2.0  # standard errors above which a difference of the light that two images contain is significant
@@ -110,7 +111,7 @@ def _light_of_one(calculated: Image, standard: Image) -> LightOfOne | None:
     if not all("method" in image.metadata for image in images.values()):  # a measured image contains all light
         return None
     left, errors = (
-        [float(image.metadata.get(key, 0)) for image in images.values()]
+        [recorded_number(image.metadata, key, 0.0) for image in images.values()]
         for key in ("light_left_out", "light_left_out_error")
     )
     error = math.hypot(*errors)

@@ -19,6 +19,7 @@ from .formats import BESIDE, Metadata, read_planes, write_planes
 from .image_data import ImageData
 from .image_sum import combined
 from .pixel_axes import PixelAxes
+from .recorded_number import recorded_number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,7 +119,7 @@ class Image(ImageData):
         error = None if self.error is None else self.error.astype(np.float64) * watt
         metadata = self.metadata | {"source_power": watt}
         if "electrons_per_watt" in metadata:
-            metadata["electrons_per_watt"] = float(metadata["electrons_per_watt"]) / watt
+            metadata["electrons_per_watt"] = recorded_number(metadata, "electrons_per_watt", math.nan) / watt
         return replace(self, power=self.power.astype(np.float64) * watt, error=error, metadata=metadata)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.floating]:

@@ -25,6 +25,7 @@ from .noise_model import (
     same_detector_named,
 )
 from .pixel_axes import PixelAxes
+from .recorded_number import recorded_number
 from .z_test import is_deterministic
 
 Plane = NDArray[np.float64]
@@ -151,7 +152,11 @@ def _source_power(one: ImageData, other: ImageData, sign: int) -> Metadata:
 
     A sum without it could be scaled again.
     """
-    watts = [float(image.metadata["source_power"]) for image in (one, other) if "source_power" in image.metadata]
+    watts = [
+        recorded_number(image.metadata, "source_power", 0.0)
+        for image in (one, other)
+        if "source_power" in image.metadata
+    ]
     if not watts:
         return {}
     return {"source_power": sum(watts) if sign == 1 else watts[0]}

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .recorded_number import recorded_number
+
 CROP = ("film_width", "film_height", "crop_offset_x", "crop_offset_y")  # [pixels], metadata of a crop window's image
 
 
@@ -57,15 +59,15 @@ class PixelAxes:
 
 def _first(metadata: Mapping[str, object], axis: str) -> float:
     """Number of pixels of the film before the first one of the image, along an axis."""
-    return float(metadata.get(f"crop_offset_{axis}", 0))  # type: ignore[arg-type]
+    return recorded_number(metadata, f"crop_offset_{axis}", 0.0)
 
 
 def _film(metadata: Mapping[str, object], name: str, count: int) -> float:
     """Number of pixels of the film along an axis; `count`, that of the image, if the image is the whole film."""
-    return float(metadata.get(name, count))  # type: ignore[arg-type]
+    return recorded_number(metadata, name, count)
 
 
 def virtual_pitch(metadata: Mapping[str, object]) -> float | None:
     """Side of a pixel [mm] on the virtual detector plane, on the detector without a magnification; None if unknown."""
-    pitch, magnification = (metadata.get(key) for key in ("pixel_pitch", "magnification"))
-    return float(pitch) / float(magnification or 1.0) if pitch else None  # type: ignore[arg-type]
+    pitch, magnification = (recorded_number(metadata, key, 0.0) for key in ("pixel_pitch", "magnification"))
+    return pitch / (magnification or 1.0) if pitch else None

@@ -16,6 +16,7 @@ from ..detector.reduction import measured
 from ..detector.stray_light import StrayLight
 from ..images.exposure import Exposure
 from ..images.image import Image
+from ..images.recorded_number import recorded_number
 from ..rendering.live_scene import LiveScene
 from ..rendering.parameters import texts_of
 from ..rendering.render import render
@@ -26,7 +27,8 @@ from ..runtime.progress_bar import Progress, reported
 from .calibrated_scene import write_calibrated
 from .calibration_fit import CalibrationFit, CalibrationSettings, Fitted, Measured
 from .derivatives import scene_text, varied_value
-from .measurement import noise_of, tell_misfit, told
+from .measurement import noise_of, tell_left_out, tell_misfit, told
+from .view_factors import gain_error_of
 
 Array = NDArray[np.float64]
 GivenImage = Image | Exposure | str | os.PathLike[str]
@@ -272,7 +274,10 @@ def measured_of(
                 f"calibrate: image {number} has the shape {image.shape}, the scene's film {rendering.shape}. Give "
                 "images of the same film."
             )
-        pitch, own = (float(i.metadata.get("pixel_pitch", np.nan)) for i in (image, rendering))
+        pitch, own = (
+            recorded_number(i.metadata, "pixel_pitch", np.nan, f"calibrate: image {number}", InversionError)
+            for i in (image, rendering)
+        )
         if abs(pitch - own) > PITCH_TOLERANCE * own:
             raise InversionError(
                 f"calibrate: image {number} has a pixel pitch of {pitch:g} mm, the scene {own:g} mm. Give images of "
@@ -280,7 +285,8 @@ def measured_of(
             )
     _require_order(images, views)
     noise = noise_of((len(images), *renderings[0].shape), images, sampled=sampled, verb="calibrate")
-    masks = np.stack([np.zeros(i.shape, bool) if i.mask is None else i.mask for i in images])
+    masks = np.stack([~image.kept for image in images])
+    tell_left_out(masks, "out its view")
     lit = np.stack([rendering.power for rendering in renderings]) > 0  # no sample need have met such a pixel
     used = ((noise.shot + noise.other > 0) | (noise.sampled[:, None, None] & lit)) & ~masks
     if used.sum() <= parameters:
@@ -289,7 +295,7 @@ def measured_of(
             "more, or expose for a shorter time."
         )
     power = np.stack([image.power for image in images]).astype(np.float64)
-    gain_error = max(float(image.metadata.get("gain_error", 0.0)) for image in images)
+    gain_error = gain_error_of(images, "calibrate")
     return Measured(power, noise, used, gain_error)
 
 
@@ -300,6 +306,8 @@ def _require_order(images: Sequence[Image], views: Sequence[Mapping[str, str]]) 
         try:
             made = json.loads(str(image.metadata.get("parameters", "{}")))
         except ValueError:
+            continue
+        if not isinstance(made, Mapping):
             continue
         own = {n: float(made[n]) for n in view if is_number(str(made.get(n)))}
         for place, other in enumerate(numbers):

@@ -24,6 +24,7 @@ from ..runtime.numbers import number
 from .common_noise import CommonNoise, squared_correlations
 from .stray_matrix import stray_light_of, without_glare_of
 from .transport_matrix import TransportMatrix
+from .view_factors import gain_error_of
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
@@ -218,10 +219,7 @@ class Measurement:
             float("nan") if gain_error is None else number("invert: 'gain_error'", gain_error, InversionError, "0.05")
         )
         if gain_error is None:
-            found = max(
-                (float(i.metadata.get("gain_error", 0.0)) for i in planes if isinstance(i, Image)) if listed else [0.0],
-                default=0.0,
-            )
+            found = gain_error_of([i for i in planes if isinstance(i, Image)] if listed else [], "invert")
         if not 0 <= found < 1:
             raise InversionError(f"invert: 'gain_error' must be in [0, 1), got {found:g}. Give for example 0.05.")
         if masks.all():
@@ -325,13 +323,19 @@ def _mask(matrix: TransportMatrix, images: Sequence[Any], mask: ArrayLike | None
         for number_, image in enumerate(images):
             if isinstance(image, Image) and image.mask is not None and image.shape == shape[1:]:
                 whole[number_] |= image.mask
-    for left_out in np.flatnonzero(whole.all(axis=(1, 2))):
+    tell_left_out(whole, "it out of the matrix")
+    return whole
+
+
+def tell_left_out(masks: NDArray[np.bool_], what: str) -> None:
+    """Say in a line each on stderr which images (views, h, w) are masked everywhere; `what` to leave out with them."""
+    for left_out in np.flatnonzero(masks.all(axis=(1, 2))):
         LOG.warning(
             "fspt: no pixel of image %d counts, as all are masked. If they are saturated, expose for a shorter time. "
-            "If it is left out on purpose, leave it out of the matrix, too.",
+            "If it is left out on purpose, leave %s, too.",
             left_out,
+            what,
         )
-    return whole
 
 
 def noise_of(

@@ -6,7 +6,7 @@ import json
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from scipy.sparse.linalg import LinearOperator
 from ..detector.stray_light import StrayLight
 from ..images.image import Image
 from ..images.pixel_axes import CROP
+from ..images.recorded_number import recorded_number
 from ..integral.rows.sparse_rows import SparseRows
 from ..rendering.provenance import same_mesh
 from ..runtime.errors import DetectorError, TransportError
@@ -336,28 +337,29 @@ def _differences(
     number: int, metadata: Mapping[str, Any], view: Mapping[str, Any], lens: Mapping[str, Any], matrix: TransportMatrix
 ) -> list[str]:
     """What differs between the metadata of an image and its view; TransportError for pixel pitch and order."""
-    pitch = metadata.get("pixel_pitch")
-    if pitch is not None and abs(float(pitch) - lens["pixel_pitch"]) > PITCH_TOLERANCE * lens["pixel_pitch"]:
+    recorded = partial(recorded_number, metadata, thing=f"transport: image {number}", error=TransportError)
+    pitch = recorded("pixel_pitch", np.nan)
+    if abs(pitch - lens["pixel_pitch"]) > PITCH_TOLERANCE * lens["pixel_pitch"]:
         raise TransportError(
-            f"transport: image {number} has a pixel pitch of {float(pitch):g} mm, the matrix {lens['pixel_pitch']:g} "
-            "mm. Give images of the same film."
+            f"transport: image {number} has a pixel pitch of {pitch:g} mm, the matrix {lens['pixel_pitch']:g} mm. Give "
+            "images of the same film."
         )
-    window = {key: float(metadata[key]) for key in CROP if key in metadata}
+    window = {key: recorded(key, 0.0) for key in CROP if metadata.get(key) is not None}
     if window and any(abs(float(lens.get(key, value)) - value) > 1e-6 for key, value in window.items()):
         raise TransportError(
             f"transport: image {number} is another crop window of the film than its view of the matrix, "
             f"{_text(window)}. Give the same part of the film."
         )
     notes = []
-    own = float(metadata.get("detector_pixel_pitch", np.nan)) * float(metadata.get("binning", 1))
-    if pitch is None and abs(own - lens["pixel_pitch"]) > PITCH_TOLERANCE * lens["pixel_pitch"]:
+    own = recorded("detector_pixel_pitch", np.nan) * recorded("binning", 1.0)
+    if np.isnan(pitch) and abs(own - lens["pixel_pitch"]) > PITCH_TOLERANCE * lens["pixel_pitch"]:
         notes.append(
             f"image {number} was reduced with the dark current of pixels of {own:g} mm, the matrix has pixels of "
             f"{lens['pixel_pitch']:g} mm. Give pixel_pitch to reduce."
         )
     try:
         made = {"sensor": metadata.get("sensor"), **json.loads(str(metadata.get("parameters", "{}")))}
-    except ValueError:
+    except (ValueError, TypeError):  # no JSON, or no dictionary
         made = {}
     other = {name: made[name] for name in view if made.get(name) is not None and made[name] != view[name]}
     if other:

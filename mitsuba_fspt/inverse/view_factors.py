@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,10 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from ..images.image import Image
+from ..images.recorded_number import recorded_number
 from ..runtime.errors import InversionError
 from ..runtime.numbers import number
 
 Array = NDArray[np.float64]
+
+
+def gain_error_of(images: Sequence[Image], verb: str) -> float:
+    """Largest `gain_error` of the images' metadata, 0 without one; InversionError where it is outside [0, 1)."""
+    each = [
+        recorded_number(image.metadata, "gain_error", 0.0, f"{verb}: image {k}", InversionError)
+        for k, image in enumerate(images)
+    ]
+    for k, found in enumerate(each):
+        if not 0 <= found < 1:
+            raise InversionError(f"{verb}: image {k}, 'gain_error' must be in [0, 1), got {found:g}. Give 0.05.")
+    return max(each, default=0.0)
 
 
 def checked_factor(verb: str, value: object) -> float:

@@ -15,7 +15,7 @@ from mitsuba_fspt.inverse import calibrate
 from mitsuba_fspt.inverse.calibration_fit import CalibrationFit, CalibrationSettings, Measured, UndeterminedError
 from mitsuba_fspt.inverse.measurement import Noise, sampling_variance
 from mitsuba_fspt.rendering import live_scene
-from mitsuba_fspt.runtime.errors import InversionError
+from mitsuba_fspt.runtime.errors import FsptError, InversionError
 
 COARSE = CalibrationSettings(rtol=3e-3)  # a third of the noise of `noisy`: half the time, and slopes right to 5 %
 
@@ -232,6 +232,26 @@ def test_order_and_pitch_of_images_are_checked(scene):
     dark = fspt.Image(0 * image.power, image.error, mask=np.ones(image.shape, bool))
     with pytest.raises(InversionError, match="0 pixels have an error"):
         fspt.calibrate(scene, dark, free=["distance"])
+
+
+def test_an_image_of_which_no_pixel_counts_is_told(caplog):
+    """One of two views is saturated everywhere: it was left out without a word."""
+    image = fspt.Image(np.ones((4, 4)), np.ones((4, 4)), metadata={"pixel_pitch": 0.5})
+    images = [image, replace(image, mask=np.ones((4, 4), bool))]
+    found = calibrate.measured_of(images, [{}, {}], [image, image], 1)
+    assert found.used.sum(axis=(1, 2)).tolist() == [16, 0]
+    assert caplog.text.count("are masked") == 1
+    assert "no pixel of image 1 counts" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["pixel_pitch", "gain_error"])
+@pytest.mark.parametrize("wrong", ["abc", np.nan, -1.0])
+def test_metadata_that_are_no_numbers_are_refused(name, wrong):
+    """Seen to fail: a bare ValueError; with NaN as the gain error no error of the gain, with -1 one of 100 %."""
+    image = fspt.Image(np.ones((4, 4)), np.ones((4, 4)), metadata={"pixel_pitch": 0.5})
+    given = replace(image, metadata=image.metadata | {name: wrong})
+    with pytest.raises(FsptError, match=rf"calibrate: image 0.*{name.replace('_', '.')}"):
+        calibrate.measured_of([given], [{}], [image], 1)
 
 
 def test_bad_input(scene):

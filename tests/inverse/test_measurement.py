@@ -8,14 +8,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sphere_views import passes_of
+from sphere_views import noisy, passes_of, sphere_views
 
 from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.detector.reduction import measured
 from mitsuba_fspt.images.image import Image
 from mitsuba_fspt.images.noise_model import NoiseModel, response_of
 from mitsuba_fspt.inverse.measurement import Measurement, Noise, _mask, noise_of, tell_misfit
-from mitsuba_fspt.runtime.errors import InversionError
+from mitsuba_fspt.runtime.errors import FsptError, ImageError, InversionError
 
 BARE = Detector(0.9, 0.0, 3.0, 1e5, 1.6, 500, 16)
 
@@ -236,6 +236,24 @@ def test_noise_of_a_frame_that_none_has_is_refused(wrong):
 def test_a_place_on_the_film_that_is_no_number_is_refused(wrong):
     with pytest.raises(InversionError, match=r"locate: image 0.* 'crop_offset_x'"):
         noise_of((1, 4, 4), [Image(np.ones((4, 4)), np.ones((4, 4)), metadata={"crop_offset_x": wrong})], verb="locate")
+
+
+@pytest.mark.parametrize("name", ["pixel_pitch", "gain_error", "crop_offset_x", "binning", "veiling_glare"])
+@pytest.mark.parametrize("wrong", ["abc", [1.0], np.inf])
+def test_metadata_that_are_no_numbers_are_refused_by_name(name, wrong):
+    """Seen to fail: a bare ValueError or TypeError."""
+    matrix = sphere_views()
+    images = noisy(matrix, np.full(matrix.shape[1], 1e-3), 100, seed=0)
+    images[2] = replace(images[2], metadata=images[2].metadata | {name: wrong})
+    with pytest.raises(FsptError, match=rf"image.* '{name}' of the metadata must be a finite number, got"):
+        Measurement.of(matrix, images, None, None, None)
+
+
+@pytest.mark.parametrize("name", ["electrons_per_watt", "source_power"])
+def test_metadata_of_sums_and_scales_are_numbers(name):
+    image = Image(np.ones((4, 4)), metadata={name: "abc"})
+    with pytest.raises(ImageError, match=f"'{name}' of the metadata must be a finite number"):
+        _ = image.scaled(2.0) if name == "electrons_per_watt" else image + image
 
 
 @pytest.mark.parametrize(("electrons", "read_noise"), [(0.02, 0.0), (0.5, 0.0), (3.0, 1.0), (1000.0, 3.5)])
