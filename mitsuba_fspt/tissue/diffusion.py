@@ -13,6 +13,7 @@ positions of the sources.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -20,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optics.media import Medium, Source
+from ..optics.media import Medium, Source, scattering_warning
 from ..runtime.errors import FluxError
 from .border_curvature import BorderShape
 from .elements import Elements
@@ -34,6 +35,7 @@ Progress = Callable[[str], None]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+LOG = logging.getLogger("mitsuba_fspt")
 LARGEST_IMBALANCE = 1e-5
 SMOOTHED = 1.0  # mean free paths over which the radiance at the border follows its curvature and creases
 
@@ -53,7 +55,8 @@ def solve(
     Parameters
     ----------
     mesh : tetrahedra of the tissue; `media[label]` fills its region `label`
-    media : absorption, reduced scattering and refractive index of each region
+    media : absorption, reduced scattering and refractive index of each region; a line on stderr tells of a scattering
+        that no soft tissue has, as of numbers in 1/cm
     sources : at least one; their shapes must lie inside the mesh
     model : "sp3" or "diffusion"
     a : boundary factor A of diffusion: 'robin' or 'haskell' (from the n of each region, see `optics.boundary`), or a
@@ -68,6 +71,8 @@ def solve(
     BackendError : scikit-fem or SciPy is missing.
     """
     report = progress or (lambda stage: None)
+    if warning := scattering_warning(media):
+        LOG.warning("fspt: solve: %s", warning)
     report("assemble")
     tissue = Tissue(mesh, media, model=model, a=a, order=order)
     report("solve")

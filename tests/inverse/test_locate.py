@@ -17,6 +17,7 @@ from sphere_views import VIEWS, noisy, passes_of, sphere_views
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.band_images import BandImages
+from mitsuba_fspt.inverse.locate import _band_images, _Given
 from mitsuba_fspt.inverse.measurement import Measurement
 from mitsuba_fspt.inverse.optics_fit import unknowns
 from mitsuba_fspt.inverse.source_fit import LocationSettings
@@ -208,6 +209,17 @@ def test_a_band_that_is_not_given_is_named(case, caplog):
         assert not caplog.text
         case.locate(case.images(SOURCE))
     assert "no band is given, of the phantom file's red, green" in caplog.text
+
+
+def test_coefficients_in_1_cm_are_told(case, caplog):
+    """Seen to fail: coefficients that are ten times too large were fitted with without a word."""
+    wrong = replace(case.described, bands={}, medium=replace(case.described.medium, musp=9.1))
+    given = _Given(None, case.matrix, case.images(SOURCE), None, None)
+    with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+        _band_images(replace(case.described, bands={}), [given], None, False, case.surface, lambda *done: None)
+        assert not caplog.text
+        _band_images(wrong, [given], None, False, case.surface, lambda *done: None)
+    assert caplog.text.count("locate: 'musp' = 9.1 1/mm is more than soft tissue has") == 1
 
 
 def test_a_matrix_of_faces(case, plain):

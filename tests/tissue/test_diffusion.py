@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from functools import partial
 from pathlib import Path
 
@@ -329,6 +330,16 @@ def test_cylinder_mesh() -> None:
 def test_sources_refused(sources: list[Source], message: str) -> None:
     with pytest.raises(FluxError, match=message):
         solve(cylinder_tetrahedra(15, 30, 5), [NYLON], sources)
+
+
+@pytest.mark.parametrize(("musp", "told"), [(4.6, 0), (9.1, 1)])
+def test_coefficients_in_1_cm_are_told(musp: float, told: int, caplog: pytest.LogCaptureFixture) -> None:
+    """Rationale: 9.1 1/cm, given as they stand, were a factor of ten too much without a word; skin has 4.6 1/mm."""
+    mesh = cylinder_tetrahedra(15, 30, 7.5)
+    with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+        solve(mesh, [Medium(0.0138, 0.91), Medium(0.0138, musp)], [Source(Sphere((0.0, 0.0, 0.0)))], order=1)
+    assert caplog.text.count(f"solve: 'musp' = {musp:g} 1/mm is more than soft tissue has") == told
+    assert caplog.text.count("in 1/cm, give a tenth of each, 'musp' = 0.91") == told
 
 
 def test_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
