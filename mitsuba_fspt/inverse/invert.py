@@ -78,7 +78,7 @@ def invert(
     gain_per_view : relative standard deviation of a factor of each view, fitted with J_n (Eq. M.35), in [0, 1); 0: none
     sampled : True for images of a Monte Carlo, whose variance is then a smooth function of the fitted signal (Eq. M.27)
         and whose errors may be 0; images whose metadata name `passes` are taken so by themselves
-    samples, seed : number of random draws, from which the intervals follow (0: none), and their seed, 0 … 2⁵³
+    samples, seed : random draws for the intervals, 0 for none or 2/(1 − confidence) − 1 or more; their seed, 0 … 2⁵³
     method : 'smooth', with the penalty; or 'mlem', maximum likelihood without penalty and intervals (Eq. M.28)
     crease_angle : [degree], 0 … 180: J_n is not smoothed across edges of a larger one, such as a rim; 180: across all
     scene : scene with the meshes of the matrix, where its own cannot be read any more

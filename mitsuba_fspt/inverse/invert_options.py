@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ UNUSED: dict[str, tuple[object, ...]] = {
     "confidence": (0.9,),
     "gain_per_view": (0.0,),
 }
+ROUNDING = 1e-6  # of 2/(1 - confidence), which 1 - 0.9 in binary makes larger
 
 
 @dataclass(frozen=True)
@@ -65,9 +67,26 @@ class Options:
             if not 0 <= value <= most:
                 raise InversionError(f"invert: '{name}' must be in 0 … {most}, got {value}. Give for example 200.")
             object.__setattr__(self, name, value)
-        if self.samples == 1:
-            raise InversionError("invert: 'samples' = 1 gives no interval. Give for example 200, or 0 for none.")
         self._require_effect()
+        self._require_samples()
+
+    def _require_samples(self) -> None:
+        """Raise InversionError for fewer draws than intervals of the confidence need, and for a seed without draws.
+
+        The next draw lies between the least and the largest of n with the probability (n - 1)/(n + 1).
+        """
+        least = max(2, math.ceil(2 / (1 - self.confidence) - 1 - ROUNDING))
+        if 0 < self.samples < least:
+            most = 100 * (self.samples - 1) / (self.samples + 1)
+            raise InversionError(
+                f"invert: 'samples' = {self.samples} give intervals that hold {most:.3g} % at most, 'confidence' is "
+                f"{100 * self.confidence:g} %. Give samples = {least} or more, for example {max(200, 4 * least)}, or 0 "
+                "for no intervals."
+            )
+        if self.seed and not self.samples:
+            raise InversionError(
+                f"invert: 'seed' = {self.seed} has no effect without 'samples'. Give both, or leave it out."
+            )
 
     def _require_effect(self) -> None:
         """Raise InversionError for an option that has no effect on the method 'mlem'."""
