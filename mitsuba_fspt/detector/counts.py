@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import re
@@ -19,6 +20,10 @@ from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
 
 Frame = ArrayLike | str | os.PathLike[str]
+LOG = logging.getLogger("mitsuba_fspt")
+# Of the means of frames over their pixels: range over their mean, and over the noise of one of them, above which frames
+# have not the same light. Lamps drift by less; a wrong exposure time is a factor, mostly.
+UNEQUAL, UNEQUAL_BY_NOISE = 0.2, 10.0
 SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
 # Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
@@ -40,6 +45,7 @@ class Counts:
 
     highest : (h, w) the largest count of the frames, None for a single one
     first : (h, w) the first of the frames, None for a single one
+    levels : (frames,) mean [DN] over the pixels of each frame, None for a single one
     raw : True for unsigned integers, as a camera delivers them; False for floats and integers with a sign
     bias, background : frames (h, w) [DN] of a click folder, or None
     exposure_time : [s], None if the file does not state it
@@ -59,6 +65,7 @@ class Counts:
     first: NDArray[np.float64] | None = None
     raw: bool = False
     pixel_pitch: float | None = None
+    levels: NDArray[np.float64] | None = None
 
 
 def frame_of(given: Frame | Counts, name: str, frames: int | None = None) -> Counts:
@@ -159,7 +166,32 @@ def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
     if stack.ndim == 2:
         return Counts(stack, frames or 1, raw=raw)
     _require_frames_first(stack.shape, name, frames)
-    return Counts(stack.mean(axis=0), len(stack), highest=stack.max(axis=0), first=stack[0].copy(), raw=raw)
+    return Counts(
+        stack.mean(axis=0),
+        len(stack),
+        highest=stack.max(axis=0),
+        first=stack[0].copy(),
+        raw=raw,
+        levels=stack.mean(axis=(1, 2)),
+    )
+
+
+def tell_unequal_frames(counts: Counts, dark: float, noise: float) -> None:
+    """Say in one line on stderr that the frames of a stack have not the same light.
+
+    dark : mean level without light [DN];  noise : standard deviation of a pixel of one frame [DN]
+    """
+    if counts.levels is None:
+        return
+    light = counts.levels - dark
+    if np.ptp(light) > max(UNEQUAL * abs(light.mean()), UNEQUAL_BY_NOISE * noise / counts.values.size**0.5):
+        LOG.warning(
+            "fspt: reduce: the %d frames of the counts have not the same light: %.4g DN a pixel in frame %d, %.4g DN "
+            "in frame %d. The image is that of their mean. Give frames of one exposure time and gain; check the light "
+            "source and cosmic rays.",
+            counts.frames,
+            *(light.min(), int(light.argmin()), light.max(), int(light.argmax())),
+        )
 
 
 def _require_frames_first(shape: tuple[int, ...], name: str, frames: int | None) -> None:

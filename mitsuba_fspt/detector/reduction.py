@@ -32,7 +32,7 @@ from ..optics.light import Light
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
-from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time
+from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time, tell_unequal_frames
 from .dark_charge import Background, shown_charge
 from .flat_field import FlatField, flat_field, require_no_flat
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
@@ -214,6 +214,9 @@ def reduce_counts(
     mask = full | rays | corrections.bad(shape)
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
     image = replace(image, metadata=image.metadata | shared)
+    light = detector.excess * np.maximum(electrons.mean(), 0)
+    noise = np.sqrt(np.mean(independent) + np.mean(read) + light) / np.mean(gain)
+    tell_unequal_frames(raw, float(np.mean(dark.level)), float(noise))
     _report_darkness(image)
     return image
 

@@ -199,6 +199,23 @@ def test_a_total_below_zero_is_reported(caplog):
     assert [record.getMessage().count("standard deviations below 0") for record in caplog.records] == [1]
 
 
+@pytest.mark.parametrize(
+    ("most", "times", "told"), [(0.0, (60, 60), 0), (3.0, (60,) * 40, 0), (3e4, (60, 60), 0), (300.0, (60, 120), 1)]
+)
+def test_frames_of_unequal_light_are_told(most, times, told, caplog):
+    """One frame of a stack was exposed for twice the time: the power was 1.5 times too large, without a word.
+
+    Frames of equal light are not told: without any, faint, and with the noise of many electrons.
+    """
+    frames = [CCD.expose(ramp(most), time, 650, seed=k).counts for k, time in enumerate(times)]
+    found = CCD.reduce(np.stack(frames), **SETTINGS)
+    assert caplog.text.count("frames of the counts have not the same light") == told
+    if told:
+        assert found.power.sum() == pytest.approx(1.5 * ramp(most).power.sum(), rel=0.02)
+        assert "in frame 0, " in caplog.text
+        assert "DN in frame 1. The image is that of their mean" in caplog.text
+
+
 def test_saturated_pixels_are_masked_not_clipped():
     counts = np.full((4, 5), 1000, np.uint16)
     counts[1, 2], counts[3, 4] = 65535, 500 + 62500
