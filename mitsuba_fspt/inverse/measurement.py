@@ -214,7 +214,8 @@ class Measurement:
         if not listed:
             planes = np.where(masks, 0.0, _numbers(planes, masks.shape))
         power = matrix.images(planes)
-        noise = noise_of(matrix.image_shape, planes if listed else [], error, sampled)
+        sensors = [view.get("sensor", 0) for view in matrix.views]
+        noise = noise_of(matrix.image_shape, planes if listed else [], error, sampled, sensors=sensors)
         found = (
             float("nan") if gain_error is None else number("invert: 'gain_error'", gain_error, InversionError, "0.05")
         )
@@ -344,17 +345,16 @@ def noise_of(
     error: ArrayLike | None = None,
     sampled: object = False,
     verb: str = "invert",
+    sensors: Sequence[int] | None = None,
 ) -> Noise:
     """Noise of images, one a view, or of an array with its standard `error`, for all views (views, height, width).
 
     sampled : True for a Monte Carlo; images whose metadata name its `passes` are taken for one by themselves
+    sensors : number of the scene's sensor of each view: one is one camera; None: each view may be of another
 
     Raises InversionError, in the name of `verb`, for images without an error, or numbers outside their range.
     """
-    if not isinstance(sampled, (bool, np.bool_)):
-        raise InversionError(
-            f"{verb}: 'sampled' must be True or False, got {sampled!r}. Give True for images of a Monte Carlo."
-        )
+    _require_bool(sampled, verb)
     shot, other, relative, frame = (np.zeros(shape) for _ in range(4))
     excess = np.ones(shape[0])
     drawn = np.full(shape[0], bool(sampled))
@@ -392,11 +392,18 @@ def noise_of(
                 f"{', or in Python give error= [W]' if verb == 'invert' else ''}."
             )
     responses = [response_of(image) for image in images]
-    unnamed = [k for k, image in enumerate(images) if relative[k].any() and not is_known(image)]
-    _tell_one_camera(verb, [responses[k] for k in unnamed])
+    if sensors is None or len(set(sensors)) > 1:
+        _tell_one_camera(verb, [r for k, r in enumerate(responses) if relative[k].any() and not is_known(images[k])])
     detectors = _numbered(responses)
     frames = _numbered([image.metadata.get("frame_digest") for image in images])
     return Noise(shot, other, drawn, relative, excess, detectors, frame, frames, _first(images, verb))
+
+
+def _require_bool(sampled: object, verb: str) -> None:
+    if not isinstance(sampled, (bool, np.bool_)):
+        raise InversionError(
+            f"{verb}: 'sampled' must be True or False, got {sampled!r}. Give True for images of a Monte Carlo."
+        )
 
 
 def _tell_one_camera(verb: str, responses: Sequence[object]) -> None:

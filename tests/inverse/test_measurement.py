@@ -223,6 +223,20 @@ def test_detectors_without_a_name_are_told_apart_by_their_numbers(caplog):
             found = noise_of((2, 4, 4), [images[k] for k in pair])
         assert len(set(found.detector)) == count
         assert caplog.text.count("invert: 2 images name no detector") == told
+        with caplog.at_level(logging.WARNING):  # two sensors of a scene are two cameras, two turns of one are not
+            noise_of((2, 4, 4), [images[k] for k in pair], sensors=[0, 1])
+            noise_of((2, 4, 4), [images[k] for k in pair], sensors=[0, 0])
+        assert caplog.text.count("invert: 2 images name no detector") == 2 * told
+
+
+def test_one_camera_without_a_name_before_a_turntable_is_not_told(caplog):
+    """Seen to fail: a scene with one sensor has one camera, yet a line told that its views count as of one."""
+    matrix = sphere_views()
+    images = noisy(matrix, np.full(matrix.shape[1], 1e-3), 100, seed=0, prnu=0.01)
+    with caplog.at_level(logging.WARNING):
+        found = Measurement.of(matrix, images, None, None, None)
+    assert len(set(found.noise.detector)) == 1
+    assert not caplog.text
 
 
 @pytest.mark.parametrize("wrong", [{"frame_share": 1.5}, {"frame_share": np.nan}, {"frame_electrons": np.inf}])
