@@ -767,6 +767,13 @@ MUTANTS = (
         ("tests/integral/lines/test_mirror.py",),
     ),
     Mutant(
+        "place of a camera through a plate",
+        "integral/lines/plate.py",
+        "1 - passes * cosine",
+        "1 - cosine",
+        ("tests/integral/lines/test_plate.py",),
+    ),
+    Mutant(
         "narrow light left to lines of sight",
         "integral/pupil/draft.py",
         "dr.maximum(self.error, self.missed)",

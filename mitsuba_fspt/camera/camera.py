@@ -158,7 +158,17 @@ class Camera:
         mirror = np.eye(4)
         mirror[:3, :3] -= 2 * np.outer(normal, normal)
         mirror[:3, 3] = 2 * (point @ normal) * normal
-        image, matrix = copy(self), mirror @ np.reshape(self.placement, (4, 4))
+        return self._transformed(mirror)
+
+    def moved(self, way: NDArray[np.float64]) -> Camera:
+        """The same camera elsewhere, by a `way` (3,) [mm] in the world."""
+        matrix = np.eye(4)
+        matrix[:3, 3] = way
+        return self._transformed(matrix)
+
+    def _transformed(self, by: NDArray[np.float64]) -> Camera:
+        """The camera at another place in the world, by a matrix (4, 4)."""
+        image, matrix = copy(self), by @ np.reshape(self.placement, (4, 4))
         image.to_world, image.placement = mi.Transform4f(matrix), tuple(matrix.ravel().tolist())
         image._to_camera = np.linalg.inv(matrix)
         dr.make_opaque(image.to_world)

@@ -105,11 +105,14 @@ class Window:
 
     def seen_in(self, boxes: Boxes, camera: Camera) -> NDArray[np.bool_]:
         """Pixels (h, w) of this window with a line of sight into one of these boxes, and some around."""
-        other = window_of(boxes, camera)
-        left, top = (own - its for own, its in zip(self.corner, other.corner, strict=True))
-        rows, columns = top + np.arange(self.shape[0]), left + np.arange(self.shape[1])
-        inside = (rows >= 0) & (rows < other.shape[0])
-        return inside[:, None] & (columns >= 0) & (columns < other.shape[1])
+        seen = np.zeros(self.shape, bool)
+        for box in boxes:
+            other = window_of((box,), camera)
+            left, top = (own - its for own, its in zip(self.corner, other.corner, strict=True))
+            rows, columns = top + np.arange(self.shape[0]), left + np.arange(self.shape[1])
+            inside = (rows >= 0) & (rows < other.shape[0])
+            seen |= inside[:, None] & (columns >= 0) & (columns < other.shape[1])
+        return seen
 
     def expand(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
         """The crop window with `image` of this window in its place, 0 around it; a view if nothing is around it."""

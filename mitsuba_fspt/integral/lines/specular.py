@@ -26,6 +26,7 @@ from ..quadrature import Quadrature
 from .mirror import Box, Mirror, corners_of
 from .nested_bsdfs import blended_parts
 from .occlusion import hidden, ray_to_lens
+from .plate import Plate
 
 SMOOTHEST = 1e-4  # roughness below which Mitsuba's rough conductor has the lobe of this roughness: a mirror's
 ROUNDING = 2e-6  # of the largest coordinate: margin of a box
@@ -45,6 +46,7 @@ class Specular:
     lobes : kinds of lobes that can lead to light, of 'null', 'transmission' and 'reflection'
     bending : boxes of the shapes that deviate lines of sight
     mirrors : planes of the same shapes, none for curved ones and where light is refracted
+    plate : the only shape that deviates lines of sight, if it is a plate of glass before all that glows; else None
     bsdf : Dr.Jit's number of a shape's BSDF; 0 where lines of sight end
     parts : components of a shape's BSDF that are sampled one at a time; 0 for those of no blend
     most_parts : largest of `parts`
@@ -61,6 +63,7 @@ class Specular:
     lobes: tuple[str, ...]
     bending: tuple[Box, ...]
     mirrors: tuple[tuple[Mirror, ...], ...]
+    plate: Plate | None
     bsdf: mi.UInt32
     parts: mi.UInt32
     most_parts: int
@@ -108,6 +111,7 @@ class Specular:
             tuple(
                 () if "transmission" in lobes_of(its) else plane for (_, its), plane in zip(bent, planes, strict=True)
             ),
+            Plate.of(*bent[0], camera, corners_of(glowing)) if len(bent) == 1 else None,
             mi.UInt32(bsdf),
             mi.UInt32(parts),
             int(parts.max()),
