@@ -7,7 +7,7 @@ sphere comes within a mean free path or two of the border. Positions and powers 
 
 from __future__ import annotations
 
-from bisect import bisect
+from bisect import bisect, bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +33,7 @@ class ExtentSettings:
     rounds : of the radii, where there are several sources, and of the ends of an interval, where a likelier radius is
         found on the way
     close : of the root of the rise of -2 ln L at an end of the interval, the relative distance to interpolate over
+    union : number of radii in the interval, even in the square, over which the intervals of the values are joined
     """
 
     radii: tuple[float, ...] = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95)
@@ -41,6 +42,7 @@ class ExtentSettings:
     steps: int = 8
     rounds: int = 2
     close: float = 0.1
+    union: int = 65
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,19 +83,19 @@ class Profile:
     def extent(self) -> Extent:
         """The radius, and intervals of all radii whose -2 ln L rises by at most z², with the values they give.
 
-        z grows by the share of the errors of the equation itself in the variance of the squared radius.
+        z grows by the share of the errors of the equation itself in the variance of the squared radius. The values are
+        the union over all these radii, not over the known ones alone: for a parabola, and values b a² with the standard
+        deviation s, it ends z (s² + b² var a²)^½ from the best value, at a radius between the best one and an end.
         """
         z, wide, ends = self._z, self._wide, self._ends
-        inside = [q for q, _ in self._known if self._rise_at(q) <= wide**2]
         own = slice(4 * self._number, 4 * self._number + 4)
-        below, above = [], []
-        for square in sorted({*inside, *(q for q in ends if q <= self._known[-1][0])}):
-            values, sd = self._values(square)
-            half = z * max(1 - self._rise_at(square) / wide**2, 0.0) ** 0.5 * sd[own]
-            below.append(values[own] - half)
-            above.append(values[own] + half)
+        squares = np.linspace(ends[0], min(ends[1], self._known[-1][0]), self._settings.union)
+        values, sd = (each[:, own] for each in self._values(squares))
+        rise = np.array([self._rise_at(q) for q in squares])
+        half = z * np.sqrt(np.maximum(1 - rise / wide**2, 0.0))[:, None] * sd
         radius = self._known[self._least()][0] ** 0.5
-        return Extent(radius, (ends[0] ** 0.5, ends[1] ** 0.5), np.min(below, axis=0), np.max(above, axis=0))
+        low, high = (values - half).min(axis=0), (values + half).max(axis=0)
+        return Extent(radius, (ends[0] ** 0.5, ends[1] ** 0.5), low, high)
 
     def _interval(self) -> tuple[float, tuple[float, float]]:
         """Rise at the ends, as its root, and the ends [mm²]; again where one was found that is likelier."""
@@ -173,18 +175,19 @@ class Profile:
             a, b = (square, b) if self._rise_at(square) < z**2 else (a, square)
         return float(square)
 
-    def _values(self, square: float) -> tuple[Array, Array]:
-        """(4K,) values of the sources and their sd for a squared radius, linear between known ones."""
-        squares = np.array([q for q, _ in self._known])
-        at = min(max(int(np.searchsorted(squares, square)), 1), len(squares) - 1) if len(squares) > 1 else 0
-        near = [self._known[k][1] for k in ((at - 1, at) if at else (0, 0))]
-        share = (square - squares[at - 1]) / (squares[at] - squares[at - 1]) if at else 0.0
-        noise = [self._fit.covariance(one) for one in near]
-        beyond = [self._fit.by_model(one, a) + self._fit.by_common(one, a) for one, a in zip(near, noise, strict=True)]
-        sd = [np.sqrt(np.diag(a + b)) for a, b in zip(noise, beyond, strict=True)]
-        each = [(one.values, b) for one, b in zip(near, sd, strict=True)]
-        values, deviations = ((1 - share) * a + share * b for a, b in zip(*each, strict=True))
-        return values, deviations
+    def _values(self, squares: Array) -> tuple[Array, Array]:
+        """(N, 4K) values of the sources and their sd for squared radii, linear between known ones."""
+        known = np.array([q for q, _ in self._known])
+        first = max(bisect(known, squares.min()) - 1, 0)
+        near = slice(first, max(bisect_left(known, squares.max()), first) + 1)
+        values, sd = list[Array](), list[Array]()
+        for _, one in self._known[near]:
+            noise = self._fit.covariance(one)
+            beyond = self._fit.by_model(one, noise) + self._fit.by_common(one, noise)
+            values.append(one.values)
+            sd.append(np.sqrt(np.diag(noise + beyond)))
+        along = [np.array([np.interp(squares, known[near], x) for x in np.transpose(one)]).T for one in (values, sd)]
+        return along[0], along[1]
 
     def _by_model(self) -> float:
         """Variance of the squared radius by errors of the equation itself, and by noise that images have in common
