@@ -769,8 +769,8 @@ MUTANTS = (
     Mutant(
         "place of a camera through a plate",
         "integral/lines/plate.py",
-        "1 - passes * cosine",
-        "1 - cosine",
+        "passes * cosine / inside",
+        "cosine / inside",
         ("tests/integral/lines/test_plate.py",),
     ),
     Mutant(

@@ -21,9 +21,10 @@ from ..runtime.numbers import whole
 
 Frame = ArrayLike | str | os.PathLike[str]
 LOG = logging.getLogger("mitsuba_fspt")
-# Of the means of frames over their pixels: range over their mean, and over the noise of one of them, above which frames
-# have not the same light. Lamps drift by less; a wrong exposure time is a factor, mostly.
-UNEQUAL, UNEQUAL_BY_NOISE = 0.2, 10.0
+# Of the means of frames over their pixels: range over their mean, over the noise of one of them, and in DN, above which
+# frames have not the same light. Lamps drift by less; a wrong exposure time is a factor, mostly.
+UNEQUAL, UNEQUAL_BY_NOISE, UNEQUAL_BY_DRIFT = 0.2, 10.0, 1.0
+BRIGHT = 99.9  # percentile at which the pixels of a frame are cut off for its mean: cosmic rays are no light
 SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
 # Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
@@ -45,7 +46,7 @@ class Counts:
 
     highest : (h, w) the largest count of the frames, None for a single one
     first : (h, w) the first of the frames, None for a single one
-    levels : (frames,) mean [DN] over the pixels of each frame, None for a single one
+    levels : (frames,) mean [DN] over the pixels of each frame, the brightest of them cut off; None for a single one
     raw : True for unsigned integers, as a camera delivers them; False for floats and integers with a sign
     bias, background : frames (h, w) [DN] of a click folder, or None
     exposure_time : [s], None if the file does not state it
@@ -172,7 +173,7 @@ def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
         highest=stack.max(axis=0),
         first=stack[0].copy(),
         raw=raw,
-        levels=stack.mean(axis=(1, 2)),
+        levels=np.array([np.minimum(frame, np.percentile(frame, BRIGHT)).mean() for frame in stack]),
     )
 
 
@@ -184,11 +185,12 @@ def tell_unequal_frames(counts: Counts, dark: float, noise: float) -> None:
     if counts.levels is None:
         return
     light = counts.levels - dark
-    if np.ptp(light) > max(UNEQUAL * abs(light.mean()), UNEQUAL_BY_NOISE * noise / counts.values.size**0.5):
+    by_noise = max(UNEQUAL_BY_NOISE * noise / counts.values.size**0.5, UNEQUAL_BY_DRIFT)
+    if np.ptp(light) > max(UNEQUAL * abs(light.mean()), by_noise):
         LOG.warning(
             "fspt: reduce: the %d frames of the counts have not the same light: %.4g DN a pixel in frame %d, %.4g DN "
             "in frame %d. The image is that of their mean. Give frames of one exposure time and gain; check the light "
-            "source and cosmic rays.",
+            "source and the offset.",
             counts.frames,
             *(light.min(), int(light.argmin()), light.max(), int(light.argmax())),
         )

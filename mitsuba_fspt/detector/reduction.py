@@ -16,6 +16,7 @@ import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ from ..images.frame_file import FITS, TIFF
 from ..images.image import Image, image_or_exposure
 from ..images.noise_model import FLAT, FRAME, PART, NoiseModel, flat_digest
 from ..images.pixel_map import DIGEST, MAP, recorded_map
+from ..images.recorded_number import recorded_number
 from ..optics.light import Light
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
@@ -270,14 +272,15 @@ def reduced(exposure: Exposure) -> Image:
         if (one := recorded_map(found, name)) is not None:
             numbers[name] = one.path
     detector = DetectorParameters(**numbers, name=str(found.get("detector", "detector")))
-    pitch = found.get("pixel_pitch")
+    recorded = partial(recorded_number, found, thing="reduce: the exposure", error=DetectorError)
+    pitch = recorded("pixel_pitch", math.nan)
     exposed = Exposed(
         found["exposure_time"],  # type: ignore[arg-type]
         light,  # type: ignore[arg-type]  # there is one
-        int(found.get("binning", 1)),
-        None if pitch is None else float(pitch),
+        int(recorded("binning", 1)),
+        None if math.isnan(pitch) else pitch,
     )
-    detector = replace(detector, gain_error=float(found.get("gain_error", 0.0)))
+    detector = replace(detector, gain_error=recorded("gain_error", 0.0))
     charge = exposed.dark(detector, exposure.shape) + exposed.spurious(detector)
     electrons = exposure.electrons.astype(np.float64)
     full = (electrons >= detector.full_well) | saturated(detector, exposure.counts.astype(np.float64))

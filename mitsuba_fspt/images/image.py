@@ -118,7 +118,7 @@ class Image(ImageData):
             )
         error = None if self.error is None else self.error.astype(np.float64) * watt
         metadata = self.metadata | {"source_power": watt}
-        if "electrons_per_watt" in metadata:
+        if metadata.get("electrons_per_watt") is not None:
             metadata["electrons_per_watt"] = recorded_number(metadata, "electrons_per_watt", math.nan) / watt
         return replace(self, power=self.power.astype(np.float64) * watt, error=error, metadata=metadata)
 

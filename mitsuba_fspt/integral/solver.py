@@ -205,7 +205,7 @@ class Solver:
             if solution := self._by_blocks(view, blocks, quadrature, least_peak, progress):
                 return solution
             why = "most blocks of pixels have an edge, or light too narrow for them"
-        narrow, mirrored, anywhere = narrow_light()
+        narrow, elsewhere, anywhere = narrow_light()
         where, peak = inside, least_peak
         if not everywhere:
             where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
@@ -226,9 +226,9 @@ class Solver:
         elif by_faces:
             solution = form(narrow, None, least_peak, progress, by_faces, on_faces)
         elif specular and specular.bending and specular.branching:
-            solution = _by_courses(view, window, quadrature, narrow, mirrored, least_peak, progress)
+            solution = _by_courses(view, window, quadrature, narrow, elsewhere, least_peak, progress)
         else:
-            solution = form(narrow.plus(mirrored), None, least_peak, progress)
+            solution = form(narrow.plus(elsewhere), None, least_peak, progress)
         error = np.maximum(solution.error, window.expand(anywhere) * camera.etendue)
         findings = (Finding("smooth blocks", False, why), *solution.findings)
         return replace(solution, error=error, findings=findings)
@@ -306,7 +306,7 @@ def _by_courses(
     window: Window,
     quadrature: Quadrature,
     narrow: NarrowLight,
-    mirrored: NarrowLight,
+    elsewhere: NarrowLight,
     least_peak: float,
     progress: Progress,
 ) -> Solution:
@@ -325,9 +325,9 @@ def _by_courses(
         shares[0] = replace(shares[0], max_nodes=max(quadrature.max_nodes - few, 1))
     shares[1] = replace(shares[1], max_nodes=few)
     first, rest = progress.part(0, 2), progress.part(1, 2)
-    image = pupil_form.solve(views[0], window, shares[0], narrow.plus(mirrored), None, least_peak, first)
+    image = pupil_form.solve(views[0], window, shares[0], narrow.plus(elsewhere), None, least_peak, first)
     peak = max(float((image.power - image.error).max(initial=0.0)) / view.camera.etendue, least_peak)
-    others = replace(mirrored, in_focus=narrow.in_focus)
+    others = replace(elsewhere, in_focus=narrow.in_focus)
     return image.plus(pupil_form.solve(views[1], window, shares[1], others, None, peak, rest))
 
 

@@ -284,7 +284,9 @@ def measured_of(
                 "the same film."
             )
     _require_order(images, views)
-    noise = noise_of((len(images), *renderings[0].shape), images, sampled=sampled, verb="calibrate", sensors=[0])
+    noise = noise_of(
+        (len(images), *renderings[0].shape), images, sampled=sampled, verb="calibrate", sensors=[0] * len(images)
+    )
     masks = np.stack([~image.kept for image in images])
     tell_left_out(masks, "out its view")
     lit = np.stack([rendering.power for rendering in renderings]) > 0  # no sample need have met such a pixel

@@ -24,7 +24,8 @@ UNUSED: dict[str, tuple[object, ...]] = {
     "confidence": (0.9,),
     "gain_per_view": (0.0,),
 }
-ROUNDING = 1e-6  # of 2/(1 - confidence), which 1 - 0.9 in binary makes larger
+MOST_SAMPLES = 1_000_000
+ROUNDING = 1e-6  # by which 2/(1 - confidence) may be too large: 1 - 0.9 in binary is less than 0.1
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Options:
         if not 0 < confidence < 1:
             raise InversionError(f"invert: 'confidence' must be in (0, 1), got {confidence:g}. Give for example 0.9.")
         object.__setattr__(self, "confidence", confidence)
-        for name, most in (("samples", 1_000_000), ("seed", 1 << 53)):
+        for name, most in (("samples", MOST_SAMPLES), ("seed", 1 << 53)):
             value = whole(f"invert: '{name}'", getattr(self, name), InversionError, "200")
             if not 0 <= value <= most:
                 raise InversionError(f"invert: '{name}' must be in 0 … {most}, got {value}. Give for example 200.")
@@ -79,9 +80,9 @@ class Options:
         if 0 < self.samples < least:
             most = 100 * (self.samples - 1) / (self.samples + 1)
             raise InversionError(
-                f"invert: 'samples' = {self.samples} give intervals that hold {most:.3g} % at most, 'confidence' is "
-                f"{100 * self.confidence:g} %. Give samples = {least} or more, for example {max(200, 4 * least)}, or 0 "
-                "for no intervals."
+                f"invert: with 'samples' = {self.samples} intervals hold {most:.3g} % at most, 'confidence' is "
+                f"{100 * self.confidence:.9g} %. Give samples = {least} or more, a lower confidence, or 0 for no "
+                "intervals."
             )
         if self.seed and not self.samples:
             raise InversionError(

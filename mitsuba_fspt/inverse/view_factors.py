@@ -26,7 +26,9 @@ def gain_error_of(images: Sequence[Image], verb: str) -> float:
     ]
     for k, found in enumerate(each):
         if not 0 <= found < 1:
-            raise InversionError(f"{verb}: image {k}, 'gain_error' must be in [0, 1), got {found:g}. Give 0.05.")
+            raise InversionError(
+                f"{verb}: image {k}, 'gain_error' must be in [0, 1), got {found:g}. Give for example 0.05."
+            )
     return max(each, default=0.0)
 
 

@@ -12,7 +12,7 @@ from .shapes import Shape
 LARGEST = 1e6  # 1/mm: a mean free path of 1 nm, far below a wavelength
 MOST_FORWARD = 0.99  # largest anisotropy
 LARGEST_POWER = 1e30  # W
-# µs' [1/mm] above that of soft tissue in visible and infrared light: skin has 4.6 at 500 nm, other tissues less (S. L.
+# µs' [1/mm] above that of soft tissue in light of 500 nm and more: skin has 4.6 at 500 nm, other tissues less (S. L.
 # Jacques, Phys. Med. Biol. 58, R37 (2013), table 1). Tables in 1/cm give numbers ten times as large.
 UNUSUAL_SCATTERING = 5.0
 
@@ -59,8 +59,8 @@ def scattering_warning(media: Sequence[Medium]) -> str | None:
     if musp <= UNUSUAL_SCATTERING:
         return None
     return (
-        f"'musp' = {musp:g} 1/mm is more than soft tissue has, up to {UNUSUAL_SCATTERING:g} 1/mm. If the coefficients "
-        f"are in 1/cm, give a tenth of each, 'musp' = {musp / 10:g}."
+        f"'musp' = {musp:g} 1/mm is more than soft tissue has from 500 nm on, up to {UNUSUAL_SCATTERING:g} 1/mm. If "
+        f"the coefficients are in 1/cm, give a tenth of each, 'musp' = {musp / 10:g}."
     )
 
 

@@ -71,10 +71,10 @@ def solve(
     BackendError : scikit-fem or SciPy is missing.
     """
     report = progress or (lambda stage: None)
-    if warning := scattering_warning(media):
-        LOG.warning("fspt: solve: %s", warning)
     report("assemble")
     tissue = Tissue(mesh, media, model=model, a=a, order=order)
+    if warning := scattering_warning(tissue.media):
+        LOG.warning("fspt: solve: %s", warning)
     report("solve")
     return tissue.solve(sources)
 

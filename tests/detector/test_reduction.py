@@ -216,6 +216,15 @@ def test_frames_of_unequal_light_are_told(most, times, told, caplog):
         assert "DN in frame 1. The image is that of their mean" in caplog.text
 
 
+def test_a_cosmic_ray_and_a_drift_of_the_offset_are_no_other_light(caplog):
+    """Seen to fail with the mean of all pixels, and with the noise of the frames alone."""
+    frames = np.stack([CCD.expose(ramp(0.3, 128), 60, 650, seed=k).counts for k in range(2)]).astype(np.float64)
+    frames[1] += 0.9
+    frames[1, 3, 4] += 5e4
+    CCD.reduce(frames, **SETTINGS)
+    assert "not the same light" not in caplog.text
+
+
 def test_saturated_pixels_are_masked_not_clipped():
     counts = np.full((4, 5), 1000, np.uint16)
     counts[1, 2], counts[3, 4] = 65535, 500 + 62500

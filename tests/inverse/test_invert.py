@@ -451,7 +451,7 @@ BAD = [
     ({"weight": -1.0}, "'weight'"),
     ({"weight": np.nan}, "'weight'"),
     ({"samples": 1}, "'samples' = 1"),
-    ({"samples": 18}, "'samples' = 18 give intervals that hold 89.5 % at most.* samples = 19 or more"),
+    ({"samples": 18}, "'samples' = 18 intervals hold 89.5 % at most.* samples = 19 or more"),
     ({"samples": 100, "confidence": 0.99}, "hold 98 % at most, 'confidence' is 99 %. Give samples = 199 or more"),
     ({"seed": 1}, "'seed' = 1 has no effect without 'samples'"),
     ({"samples": 2.5}, "'samples'"),

@@ -54,20 +54,20 @@ class Plate:
 
     @property
     def rim_boxes(self) -> tuple[Box, ...]:
-        """Boxes of the places of the plate from which lines of sight may meet its other sides."""
-        far = self.thickness
+        """Boxes of the places of the plate from which lines, reflected twice or not, may meet its other sides."""
+        far = self.thickness * max(3 / np.sqrt(max(self.index**2 - 1, 1e-3)), 1)  # aside at grazing angles
         return tuple((*(x - far for x in rim.box[:3]), *(x + far for x in rim.box[3:])) for rim in self.rims)
 
     def images(self, camera: Camera, boxes: Sequence[Box]) -> list[Camera] | None:
         """The camera at the places from which it looks straight at boxes behind the plate: without a reflection inside
         and after two; None where lines of sight to different parts of the boxes come from places too far apart."""
-        cosine, depth = self._cosines(camera, boxes)
-        if depth <= 0:
+        cosine, inside, depth = self._cosines(camera, boxes)
+        if depth <= 0 or not inside.min() > 0:  # behind the lens, or beyond total reflection
             return None
         pixel = camera.virtual_pitch * depth / camera.lens.focus_distance
         aside, found = float(np.sqrt(max(1 - cosine.min() ** 2, 0))), []
         for passes in (1, 3):
-            nearer = self.thickness * (1 - passes * cosine / np.sqrt(self.index**2 - 1 + cosine**2))
+            nearer = self.thickness * (1 - passes * cosine / inside)
             if 0.5 * float(np.ptp(nearer)) * aside > MISPLACED * pixel:
                 return None
             found.append(camera.moved(-0.5 * float(nearer.min() + nearer.max()) * self.towards.normal))
@@ -76,19 +76,20 @@ class Plate:
     def reflected_more(self, camera: Camera, boxes: Sequence[Box]) -> float:
         """Largest share of the light of boxes behind the plate that is reflected inside more than twice, of any
         polarisation."""
-        cosine, _ = self._cosines(camera, boxes)
-        inside = np.sqrt(self.index**2 - 1 + cosine**2)
+        cosine, inside, _ = self._cosines(camera, boxes)
         return float((((inside - cosine) / (inside + cosine)) ** 8).max())
 
-    def _cosines(self, camera: Camera, boxes: Sequence[Box]) -> tuple[Array, float]:
-        """cosθ (n,) of lines of sight from all over the pupil to all over the boxes, and the least depth of these."""
+    def _cosines(self, camera: Camera, boxes: Sequence[Box]) -> tuple[Array, Array, float]:
+        """Of lines of sight from all over the pupil to all over the boxes: cosθ (n,), n times that in the glass (n,), 0
+        where all light is reflected; and the least depth of the boxes."""
         frame = np.reshape(camera.placement, (4, 4))[:3]
         rim = camera.lens.pupil_radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         pupil = frame[:, 3] + rim @ frame[:, :2].T / np.linalg.norm(frame[:, 0])
         way = np.concatenate([_places(box) for box in boxes]) - pupil[:, None]
         cosine = np.abs(way @ self.towards.normal) / np.linalg.norm(way, axis=-1)
         axis = frame[:, 2] / np.linalg.norm(frame[:, 2])
-        return cosine.ravel(), float((way @ axis).min())
+        inside = np.sqrt(np.maximum(self.index**2 - 1 + cosine**2, 0))
+        return cosine.ravel(), inside.ravel(), float((way @ axis).min())
 
 
 def _places(box: Box) -> Array:

@@ -71,13 +71,13 @@ class NarrowLight:
         """Upper bound of `on_pixels`."""
         return UNCERTAINTY * self.on_pixels
 
-    def plus(self, mirrored: NarrowLight) -> NarrowLight:
-        """With the narrow light and the surfaces edge-on that mirrors show; its `brightest` and `in_focus` are kept."""
+    def plus(self, elsewhere: NarrowLight) -> NarrowLight:
+        """With narrow light and surfaces edge-on mirrors or glass show; its `brightest` and `in_focus` are kept."""
         return replace(
             self,
-            on_pixels=self.on_pixels + mirrored.on_pixels,
-            edge_on=self.edge_on + mirrored.edge_on,
-            radiance=max(self.radiance, mirrored.radiance),
+            on_pixels=self.on_pixels + elsewhere.on_pixels,
+            edge_on=self.edge_on + elsewhere.edge_on,
+            radiance=max(self.radiance, elsewhere.radiance),
         )
 
     def on(self, pixels: NDArray[np.bool_]) -> NarrowLight:

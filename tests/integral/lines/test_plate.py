@@ -21,10 +21,10 @@ def camera(mono):
     return camera_of(camera_scene(disk(FOCUS, 6)).sensors()[0])
 
 
-def glass(tilt=0.0, thickness=THICK, bsdf="dielectric"):
+def glass(tilt=0.0, thickness=THICK, bsdf="dielectric", index=N):
     """A plate of glass about the y axis [°], 160 mm wide."""
     turned = mi.ScalarTransform4f().translate([0, 0, DEPTH]).rotate([0, 1, 0], tilt).scale([80, 80, thickness / 2])
-    bsdf = {"type": bsdf} if bsdf == "diffuse" else {"type": bsdf, "int_ior": N, "ext_ior": 1.0}
+    bsdf = {"type": bsdf} if bsdf == "diffuse" else {"type": bsdf, "int_ior": index, "ext_ior": 1.0}
     return mi.load_dict({"type": "cube", "to_world": turned, "bsdf": bsdf})
 
 
@@ -73,3 +73,6 @@ def test_only_a_plate_between_the_lens_and_all_that_glows_has_images(camera):
     assert plate_of(camera, ball) is None
     thick = plate_of(camera, glass(tilt=30, thickness=60))  # its rays to the sides of the box are too far apart
     assert thick.images(camera, [BOX]) is None
+    gap = plate_of(camera, glass(tilt=50, index=0.75))  # of air in water, beyond the critical angle
+    assert gap.images(camera, [BOX]) is None
+    assert gap.reflected_more(camera, [BOX]) == 1
