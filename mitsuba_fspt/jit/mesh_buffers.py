@@ -43,6 +43,11 @@ def face_count(mesh: mi.Shape) -> int:
     return mesh.face_count()
 
 
+def is_shaded_smoothly(mesh: mi.Shape) -> bool:
+    """True if BSDFs see a normal that varies over the faces of a mesh; that of a `cube` does not."""
+    return mesh.class_name() != "Cube" and bool(mesh.has_vertex_normals())
+
+
 def buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
     """Vertex positions (3 V,) [mm] and face indices (3 F,) of a mesh.
 

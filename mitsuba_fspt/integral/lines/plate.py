@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...camera.camera import Camera
+from ...jit.mesh_buffers import is_shaded_smoothly
 from .mirror import ALIKE, Box, Mirror
 
 PLACES = 5  # of a box along each axis, at which lines of sight are taken
@@ -36,10 +37,8 @@ class Plate:
     @classmethod
     def of(cls, shape: mi.Shape, bsdf: mi.BSDF, camera: Camera, corners: Array) -> Plate | None:
         """That of a shape, if both of its sides lie between the pupil and all points `corners` (n, 3); else None."""
-        if bsdf.class_name() != "SmoothDielectric" or not shape.is_mesh():
+        if bsdf.class_name() != "SmoothDielectric" or not shape.is_mesh() or is_shaded_smoothly(shape):
             return None
-        if shape.class_name() != "Cube" and shape.has_vertex_normals():
-            return None  # which bend light as a curved side does
         planes, lens = Mirror.of(shape), np.array(camera.centre)
         for near in planes:
             for far in planes:
