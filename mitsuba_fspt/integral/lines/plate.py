@@ -35,11 +35,14 @@ class Plate:
     rims: tuple[Mirror, ...]
 
     @classmethod
-    def of(cls, shape: mi.Shape, bsdf: mi.BSDF, camera: Camera, corners: Array) -> Plate | None:
-        """That of a shape, if both of its sides lie between the pupil and all points `corners` (n, 3); else None."""
+    def of(
+        cls, shape: mi.Shape, bsdf: mi.BSDF, planes: Sequence[Mirror], camera: Camera, corners: Array
+    ) -> Plate | None:
+        """That of a shape with these planes, if both of its sides lie between the pupil and all points `corners`
+        (n, 3); else None."""
         if bsdf.class_name() != "SmoothDielectric" or not shape.is_mesh() or is_shaded_smoothly(shape):
             return None
-        planes, lens = Mirror.of(shape), np.array(camera.centre)
+        lens = np.array(camera.centre)
         for near in planes:
             for far in planes:
                 opposite = float(near.normal @ far.normal) <= -np.cos(ALIKE)

@@ -111,7 +111,7 @@ class Specular:
             tuple(
                 () if "transmission" in lobes_of(its) else plane for (_, its), plane in zip(bent, planes, strict=True)
             ),
-            Plate.of(*bent[0], camera, corners_of(glowing)) if len(bent) == 1 else None,
+            Plate.of(*bent[0], planes[0], camera, corners_of(glowing)) if len(bent) == 1 else None,
             mi.UInt32(bsdf),
             mi.UInt32(parts),
             int(parts.max()),

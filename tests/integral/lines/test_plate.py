@@ -7,7 +7,7 @@ import pytest
 from small_scenes import FOCUS, camera_scene, disk, mi
 
 from mitsuba_fspt.camera.of_sensor import camera_of
-from mitsuba_fspt.integral.lines.mirror import corners_of
+from mitsuba_fspt.integral.lines.mirror import Mirror, corners_of
 from mitsuba_fspt.integral.lines.plate import Plate
 
 N, THICK, DEPTH = 1.5, 3.0, 80.0
@@ -29,7 +29,7 @@ def glass(tilt=0.0, thickness=THICK, bsdf="dielectric", index=N):
 
 
 def plate_of(camera, shape, box=BOX):
-    return Plate.of(shape, shape.bsdf(), camera, corners_of([box]))
+    return Plate.of(shape, shape.bsdf(), Mirror.of(shape), camera, corners_of([box]))
 
 
 def behind(slope, passes, far, tilt):
