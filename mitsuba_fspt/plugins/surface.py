@@ -54,7 +54,8 @@ class FsptSurface(mi.Emitter):
        - Refractive index n >= 1 of the tissue relative to outside; not with lambert.
      * - mua, musp
        - |float| [1/mm]
-       - Absorption µa >= 0 and reduced scattering µs' > 0; only with last_flight.
+       - Absorption µa >= 0 and reduced scattering µs' > 0; only with last_flight. A warning tells of a µs'
+         above that of soft tissue, as of numbers in 1/cm.
      * - fluence
        - |volume|
        - Fluence Φ > 0 in the tissue, in any unit, a gridvolume around the shape; only with last_flight. Updatable.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import pytest
 
@@ -308,6 +310,14 @@ def test_fluence_updated_by_itself_is_followed():
 def test_bad_laws_are_refused(law, message):
     with pytest.raises((ExitanceError, RuntimeError), match=message):
         glowing_sphere(law)
+
+
+@pytest.mark.parametrize(("musp", "told"), [(4.6, 0), (9.1, 1)])
+def test_coefficients_in_1_cm_are_told(musp, told, caplog):
+    """Rationale: 9.1 1/cm, given as they stand, shorten the last flight to a tenth, without a word."""
+    with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+        glowing_sphere(last_flight(*SLOPING, musp=musp))
+    assert caplog.text.count("fspt_surface: 'musp' = 9.1 1/mm is more than soft tissue has") == told
 
 
 def test_fluence_that_does_not_fit_the_shape_is_refused():

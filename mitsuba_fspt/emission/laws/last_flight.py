@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -10,11 +11,12 @@ import mitsuba as mi
 import numpy as np
 
 from ...jit.loops import repeat
-from ...optics.media import Medium
+from ...optics.media import Medium, scattering_warning
 from ...runtime.errors import ExitanceError
 from ..elements import elements_of
 from . import ExitLaw, refractive_index, required, required_number
 
+LOG = logging.getLogger("mitsuba_fspt")
 NODES = 8  # of the quadrature along the line of sight inside the tissue
 RINGS, SPOKES = 8, 8  # of the quadrature over the hemisphere, which normalises the law to J_n
 
@@ -46,7 +48,10 @@ class LastFlight(ExitLaw):
 
     @classmethod
     def of(cls, props: mi.Properties) -> LastFlight:
-        """Law with the medium of `mua`, `musp` and `int_ior`, and the volume `fluence`."""
+        """Law with the medium of `mua`, `musp` and `int_ior`, and the volume `fluence`.
+
+        A line on stderr tells of a scattering that no soft tissue has, as of numbers in 1/cm.
+        """
         n = refractive_index(props)
         mua, musp = (
             required_number(props, name, "a float [1/mm]", example)
@@ -55,7 +60,10 @@ class LastFlight(ExitLaw):
         fluence = required(props, "fluence", "a volume, such as a gridvolume")
         if not isinstance(fluence, mi.Volume):
             raise ExitanceError(f"fspt_surface: 'fluence' must be a volume, got {fluence!r}. Give a gridvolume.")
-        return cls(Medium(mua, musp, n), fluence)
+        medium = Medium(mua, musp, n)
+        if warning := scattering_warning([medium]):
+            LOG.warning("fspt: fspt_surface: %s", warning)
+        return cls(medium, fluence)
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         """Expose the volume `fluence`."""
