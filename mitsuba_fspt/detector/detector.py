@@ -25,7 +25,7 @@ from ..images.formats import Metadata
 from ..images.image import Image
 from ..images.noise_model import TYPICAL
 from ..images.pixel_axes import CROP
-from ..images.recorded_number import recorded_number
+from ..images.recorded_number import recorded_number, recorded_positive
 from ..optics.light import Light, Spectrum
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
@@ -382,8 +382,7 @@ def _pixels_read_out(image: Image, binning: int) -> Metadata:
 
 def _pitch(image: Image) -> float | None:
     """Side of the image's pixels [mm], None if unknown."""
-    pitch = recorded_number(image.metadata, "pixel_pitch", math.nan)
-    return None if math.isnan(pitch) else pitch
+    return recorded_positive(image.metadata, "pixel_pitch")
 
 
 def _time(exposure_time: float) -> float:

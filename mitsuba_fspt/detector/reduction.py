@@ -29,7 +29,7 @@ from ..images.frame_file import FITS, TIFF
 from ..images.image import Image, image_or_exposure
 from ..images.noise_model import FLAT, FRAME, PART, NoiseModel, flat_digest
 from ..images.pixel_map import DIGEST, MAP, recorded_map
-from ..images.recorded_number import recorded_number
+from ..images.recorded_number import recorded_number, recorded_positive
 from ..optics.light import Light
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
@@ -273,12 +273,11 @@ def reduced(exposure: Exposure) -> Image:
             numbers[name] = one.path
     detector = DetectorParameters(**numbers, name=str(found.get("detector", "detector")))
     recorded = partial(recorded_number, found, thing="reduce: the exposure", error=DetectorError)
-    pitch = recorded("pixel_pitch", math.nan)
     exposed = Exposed(
         found["exposure_time"],  # type: ignore[arg-type]
         light,  # type: ignore[arg-type]  # there is one
         int(recorded("binning", 1)),
-        None if math.isnan(pitch) else pitch,
+        recorded_positive(found, "pixel_pitch", "reduce: the exposure", DetectorError),
     )
     detector = replace(detector, gain_error=recorded("gain_error", 0.0))
     charge = exposed.dark(detector, exposure.shape) + exposed.spurious(detector)

@@ -23,7 +23,7 @@ from scipy.signal import convolve
 from ..images.formats import Metadata, read_planes
 from ..images.frame_file import FITS, read_frame
 from ..images.pixel_axes import CROP
-from ..images.recorded_number import recorded_number
+from ..images.recorded_number import recorded_number, recorded_positive
 from ..runtime.errors import BackendError, DetectorError, FsptError, ImageError
 
 Array = NDArray[np.float64]
@@ -103,8 +103,8 @@ def _content(path: Path, thing: str) -> tuple[NDArray[Any], float | None]:
     """Values and pitch [mm] of a kernel's file."""
     try:
         planes, metadata = read_planes(path)
-        pitch = metadata.get("pixel_pitch")
-        return next(iter(planes.values())), None if pitch is None else float(pitch)
+        pitch = recorded_positive(metadata, "pixel_pitch", thing, DetectorError)
+        return next(iter(planes.values())), pitch
     except BackendError:
         raise
     except ImageError as cause:

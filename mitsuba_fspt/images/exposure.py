@@ -16,6 +16,7 @@ from ..runtime.errors import BackendError, DetectorError, ImageError
 from .electrons import Electrons
 from .formats import Metadata, write_planes
 from .pixel_map import recorded
+from .recorded_number import recorded_number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -105,5 +106,6 @@ def exposure_of(path: str | os.PathLike[str], planes: Mapping[str, NDArray], met
         raise DetectorError(f"'{path}': its gain must be > 0 e-/DN, it is {np.min(gain):g}. Expose the image again.")
     with np.errstate(over="ignore"):  # beyond the converter's range
         counts = np.rint(bias + electrons / np.float64(gain))
-    top = 2 ** int(metadata["bits"]) - 1
+    bits = recorded_number(metadata, "bits", 16, f"'{path}'", DetectorError)
+    top = 2 ** int(np.clip(bits, 1, 16)) - 1
     return Exposure(electrons, np.clip(counts, 0, top).astype(np.uint16), metadata)

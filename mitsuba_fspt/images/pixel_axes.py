@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .recorded_number import recorded_number
+from .recorded_number import recorded_number, recorded_positive
 
 CROP = ("film_width", "film_height", "crop_offset_x", "crop_offset_y")  # [pixels], metadata of a crop window's image
 
@@ -69,5 +69,5 @@ def _film(metadata: Mapping[str, object], name: str, count: int) -> float:
 
 def virtual_pitch(metadata: Mapping[str, object]) -> float | None:
     """Side of a pixel [mm] on the virtual detector plane, on the detector without a magnification; None if unknown."""
-    pitch, magnification = (recorded_number(metadata, key, 0.0) for key in ("pixel_pitch", "magnification"))
-    return pitch / (magnification or 1.0) if pitch else None
+    pitch, magnification = (recorded_positive(metadata, key) for key in ("pixel_pitch", "magnification"))
+    return None if pitch is None else pitch / (magnification or 1.0)

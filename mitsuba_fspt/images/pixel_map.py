@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..runtime.errors import DetectorError, FsptError
 from .frame_file import read_frame
+from .recorded_number import recorded_number
 
 Array = NDArray[np.float64]
 MAP, DIGEST = "_map", "_map_digest"  # ends of the metadata's keys beside that of a parameter, whose value is the mean
@@ -82,10 +84,11 @@ def recorded(metadata: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> 
 
     Raises
     ------
-    DetectorError : the map cannot be read, has another shape, or has changed since.
+    DetectorError : the number is none, or the map cannot be read, has another shape, or has changed since.
     """
-    found = recorded_map(metadata, name)
-    return float(metadata[name]) if found is None else found.on(shape, f"detector: '{name}'")
+    if (found := recorded_map(metadata, name)) is not None:
+        return found.on(shape, f"detector: '{name}'")
+    return recorded_number(metadata, name, math.nan, "detector: the exposure", DetectorError)
 
 
 def recorded_map(metadata: Mapping[str, Any], name: str) -> PixelMap | None:

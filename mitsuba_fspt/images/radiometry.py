@@ -15,7 +15,8 @@ from ..optics.vignetting import Vignetting
 from ..runtime.errors import ImageError, OpticsError
 from .formats import Metadata, write_planes
 from .image_data import ImageData
-from .pixel_axes import PixelAxes
+from .pixel_axes import CROP, PixelAxes
+from .recorded_number import recorded_number
 from .vignetting_file import recorded_vignetting
 
 UNITS = {"W": "power", "photons/s": "photon_rate", "p/s/cm2/sr": "radiance"}  # with the quantity of each
@@ -107,10 +108,10 @@ def etendue_of(shape: tuple[int, int], known: Metadata) -> Plane:
             distortion=known.get("distortion"),
             **{name: float(known[name]) for name in names},  # type: ignore[arg-type]
         )
-    except (OpticsError, ValueError) as cause:
+    except (OpticsError, TypeError, ValueError) as cause:
         raise ImageError(f"image: its metadata describe no lens: {cause}") from cause
     axes = PixelAxes.of(shape, known | {"magnification": lens.magnification})
-    passed, pixel = float(known.get("transmittance", 1.0)), str(known.get("pixel", "area"))
+    passed, pixel = recorded_number(known, "transmittance", 1.0), str(known.get("pixel", "area"))
     whole = pixel_etendues(lens, axes.step, axes.x, -axes.y, passed, pixel)
     try:
         vignetting = recorded_vignetting(known)
@@ -122,7 +123,6 @@ def etendue_of(shape: tuple[int, int], known: Metadata) -> Plane:
 def _shares(vignetting: Vignetting, shape: tuple[int, int], known: Metadata) -> Plane:
     """Shares of the pixels (h, w) of an image with the metadata `known`."""
     height, width = shape
-    film = round(float(known.get("film_width", width))), round(float(known.get("film_height", height)))
-    first = float(known.get("crop_offset_x", 0)), float(known.get("crop_offset_y", 0))
-    bins = int(known.get("binning", 1))
-    return vignetting.on_pixels(float(known["pixel_pitch"]), film, first, (width, height), bins)
+    usual = (*zip(CROP, (width, height, 0, 0), strict=True), ("binning", 1), ("pixel_pitch", 0))
+    wide, high, left, top, bins, pitch = (recorded_number(known, name, value) for name, value in usual)
+    return vignetting.on_pixels(pitch, (round(wide), round(high)), (left, top), (width, height), int(bins))

@@ -31,3 +31,18 @@ def recorded_number(
             "again."
         )
     return found
+
+
+def recorded_positive(
+    metadata: Mapping[str, object], name: str, thing: str = "image", error: type[FsptError] = ImageError
+) -> float | None:
+    """The number `name` > 0 of the metadata, such as the pixel pitch [mm]; None where it is missing.
+
+    Raises `error` as `recorded_number`, and for numbers <= 0.
+    """
+    found = recorded_number(metadata, name, math.inf, thing, error)
+    if found <= 0:
+        raise error(
+            f"{thing}: '{name}' of the metadata must be > 0, got {found:g}. Correct it, or make the image again."
+        )
+    return None if found == math.inf else found

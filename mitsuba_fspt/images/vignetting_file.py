@@ -16,6 +16,7 @@ from ..runtime.errors import BackendError, FsptError, OpticsError
 from .formats import Metadata, read_planes
 from .frame_file import read_frame
 from .pixel_axes import CROP
+from .recorded_number import recorded_number
 
 DIGITS = 16  # of a digest
 FRAMES = (".tif", ".tiff", ".fits", ".fit", ".fts", ".npy")  # of other programs, without planes
@@ -39,7 +40,7 @@ def read_vignetting(path: str | os.PathLike[str]) -> Vignetting:
     else:
         heights, (shares, metadata) = None, _plane(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS]
-    return Vignetting(str(path), digest, heights, shares, _crop(metadata))
+    return Vignetting(str(path), digest, heights, shares, _crop(metadata, path))
 
 
 def recorded_vignetting(metadata: Mapping[str, Any]) -> Vignetting | None:
@@ -58,11 +59,12 @@ def recorded_vignetting(metadata: Mapping[str, Any]) -> Vignetting | None:
     return found
 
 
-def _crop(metadata: Metadata) -> tuple[tuple[int, int], tuple[int, int]] | None:
+def _crop(metadata: Metadata, path: Path) -> tuple[tuple[int, int], tuple[int, int]] | None:
     """Size of the film and first pixel of the crop window of an image with these metadata; None without one."""
     if not all(name in metadata for name in CROP):
         return None
-    width, height, left, top = (round(float(metadata[name])) for name in CROP)
+    thing = f"'{VIGNETTING}' = '{path}'"
+    width, height, left, top = (round(recorded_number(metadata, name, 0.0, thing, OpticsError)) for name in CROP)
     return (width, height), (left, top)
 
 

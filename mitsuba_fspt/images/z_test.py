@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .image_data import ImageData
 from .noise_model import NoiseModel, covariance
+from .recorded_number import recorded_number
 
 LEVEL = 0.01  # probability of a false alarm, to which `ZTest.detectable` refers
 NOISY = 0.5  # largest bound over standard error of a pixel that counts for chi2: a bias of that size adds 0.25 to it
@@ -167,7 +168,7 @@ class _Differences:
                 continue
             own = np.square(error / self.scale)  # over their largest: s⁴ must not underflow
             variance += own
-            passes = int(image.metadata.get("passes", 0))
+            passes = int(recorded_number(image.metadata, "passes", 0))
             spread += own * own / (passes - 1) if passes > 1 else 0.0
         both = len(noisy) == 2 and all(error is not None for _, error in noisy)
         self.common = covariance(calculated, standard, -1) if both else np.zeros(self.power.shape)

@@ -16,7 +16,7 @@ from ..detector.reduction import measured
 from ..detector.stray_light import StrayLight
 from ..images.exposure import Exposure
 from ..images.image import Image
-from ..images.recorded_number import recorded_number
+from ..images.recorded_number import recorded_positive
 from ..rendering.live_scene import LiveScene
 from ..rendering.parameters import texts_of
 from ..rendering.render import render
@@ -275,7 +275,7 @@ def measured_of(
                 "images of the same film."
             )
         pitch, own = (
-            recorded_number(i.metadata, "pixel_pitch", np.nan, f"calibrate: image {number}", InversionError)
+            recorded_positive(i.metadata, "pixel_pitch", f"calibrate: image {number}", InversionError) or np.nan
             for i in (image, rendering)
         )
         if abs(pitch - own) > PITCH_TOLERANCE * own:

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import LinearOperator
 from ..detector.stray_light import StrayLight
 from ..images.image import Image
 from ..images.pixel_axes import CROP
-from ..images.recorded_number import recorded_number
+from ..images.recorded_number import recorded_number, recorded_positive
 from ..integral.rows.sparse_rows import SparseRows
 from ..rendering.provenance import same_mesh
 from ..runtime.errors import DetectorError, TransportError
@@ -338,7 +338,7 @@ def _differences(
 ) -> list[str]:
     """What differs between the metadata of an image and its view; TransportError for pixel pitch and order."""
     recorded = partial(recorded_number, metadata, thing=f"transport: image {number}", error=TransportError)
-    pitch = recorded("pixel_pitch", np.nan)
+    pitch = recorded_positive(metadata, "pixel_pitch", f"transport: image {number}", TransportError) or np.nan
     if abs(pitch - lens["pixel_pitch"]) > PITCH_TOLERANCE * lens["pixel_pitch"]:
         raise TransportError(
             f"transport: image {number} has a pixel pitch of {pitch:g} mm, the matrix {lens['pixel_pitch']:g} mm. Give "

@@ -99,6 +99,8 @@ def write_planes(
     with atomic_path(path, ImageError) as temporary:
         try:
             kind.write(temporary, floats, stored)
+        except ImageError:  # of the metadata
+            raise
         except (RuntimeError, ValueError) as cause:
             reason = " ".join(str(cause).split()).replace(str(temporary), str(path)).rstrip(".")
             raise ImageError(f"image file '{path}': {reason}. Make room or give another place for it.") from cause
