@@ -4,7 +4,8 @@
     lens     f = (F/U)/⟨F/U⟩      uniform screen through the scene's lens; U is its image by the model (Eq. M.6)
 
 F are the flat's counts less its bias and dark current, ⟨⟩ is the mean over the pixels that are kept. U includes cos⁴θ
-and the vignetting by the borders of the lens. The matrix and every rendered image contain it, so f must not.
+and the vignetting by the borders of the lens, and the veiling glare of detector and lens (Eq. M.38). The matrix and
+every rendered image contain the former, the model of `invert` the latter, so f must not.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from ..runtime.numbers import number
 from .counts import Counts, Frame, frame_like, require_same_time
 from .parameters import DetectorParameters
 from .saturation import full_pixels
+from .stray_light import Spread
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -100,6 +102,7 @@ def flat_field(
     full = _full(detector, found, light)
     screen = np.ones(shape) if scene is None else uniform_screen(scene, shape, pixel_pitch, binning)
     lit = screen > LEAST * screen.max()
+    screen = Spread(None, detector.veiling_glare).forward(screen)  # a kernel leaves a smooth image as it is
     usable = lit & ~full & (light > 0)
     if not usable.any():
         raise DetectorError(

@@ -3,7 +3,8 @@
     share = (F/U)/f / level       F: the flat less its bias and dark current;  U: the screen by Eq. 9 (Eq. M.6)
 
 f is the response of the pixels, from a flat of the sensor without a lens. Without one it stays in the shares. The
-level is the largest of F/U/f, smoothed, so that noise does not raise it; shares above 1 become 1.
+level is the largest of F/U/f, smoothed, so that noise does not raise it; shares above 1 become 1. The veiling glare of
+the detector with its lens, a share of the mean of F/f, is taken off F/f before (Eq. M.38).
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from ..optics.vignetting import VIGNETTING
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import DetectorError
 from .counts import Counts, Frame, frame_like, frame_of
-from .flat_field import FlatField, flat_field
+from .flat_field import LEAST, FlatField, flat_field, uniform_screen
 from .parameters import DetectorParameters
+from .stray_light import Spread
 
 if TYPE_CHECKING:
     from .flat_field import Scene
@@ -63,7 +65,7 @@ class MeasuredVignetting:
 
         flat : frame or stack [DN], or its file
         scene : what `render` takes, with the camera's lens, film and crop window
-        detector : for saturated pixels, gain and bias
+        detector : for saturated pixels, gain and bias, and the veiling glare, which is no vignetting
         flat_dark : as of `Detector.reduce`; of both flats
         sensor_flat : frame or stack of a uniform light on the sensor without the lens; None: the pixels' response stays
             in the shares
@@ -90,7 +92,7 @@ class MeasuredVignetting:
             ratio, good = ratio / response.response, good & ~response.mask
         if not good.any():
             raise DetectorError("reduce: no pixel is usable in both flats. Give flats that do not saturate.")
-        shares, clipped = _scaled(ratio, good)
+        shares, clipped = _scaled(_without_glare(ratio, good, uniform_screen(scene, shape), known.veiling_glare), good)
         entries: Metadata = {
             "quantity": VIGNETTING,
             "unit": "1",
@@ -127,6 +129,18 @@ def _sensor_flat(
     found = frame_like(frame_of(flat, "sensor_flat"), "sensor_flat", shape)
     _require_bias(detector, found, flat_dark)
     return flat_field(known, found, "sensor", None, shape, flat_dark=flat_dark)
+
+
+def _without_glare(ratio: Array, good: NDArray[np.bool_], screen: Array, glare: float) -> Array:
+    """Shares (h, w), up to a factor, from the light on the film over the `screen` with its veiling glare (Eq. M.38).
+
+    Of the lit pixels those that are not good count with the mean of the others.
+    """
+    if not glare:
+        return ratio
+    light, lit = ratio * Spread(None, glare).forward(screen), float((screen > LEAST * screen.max()).mean())
+    mean = light[good].mean() * lit / (1 - glare + glare * lit)  # over the whole film
+    return np.divide(light - glare * mean, screen, out=np.zeros_like(screen), where=good)
 
 
 def _scaled(ratio: Array, good: NDArray[np.bool_]) -> tuple[Array, float]:
