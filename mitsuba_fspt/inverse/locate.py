@@ -26,6 +26,7 @@ from ..tissue.diffusion import Tissue
 from ..tissue.elements import Elements
 from ..tissue.phantom_file import PhantomFile, Spread
 from .band_images import BandImages
+from .band_light import tell_bands
 from .extent import SHAPES, Profile, with_radii
 from .location import Intervals, Location
 from .measurement import Measurement, tell_misfit, told
@@ -285,6 +286,11 @@ def _band_images(
             surface = Surface.of(one.matrix, scene)
             measurement = Measurement.of(one.matrix, one.images, one.error, one.mask, gain_error, sampled)
         read.append((surface, measurement, described.band(one.name)))
+    tell_bands(
+        "locate",
+        {one.name: measurement.light_nm for one, (_, measurement, _) in zip(given, read, strict=True)},
+        {name: band.wavelength_nm for name, band in described.bands.items()},
+    )
     report("tissue", 0.0)
     mesh = described.checked_mesh()
     if described.bands and any(one.name is None for one in given):

@@ -21,6 +21,7 @@ from ..images.image import Image
 from ..images.noise_model import NoiseModel, is_known, response_of
 from ..runtime.errors import ImageError, InversionError
 from ..runtime.numbers import number
+from .band_light import light_of_images
 from .common_noise import CommonNoise, squared_correlations
 from .stray_matrix import stray_light_of, without_glare_of
 from .transport_matrix import TransportMatrix
@@ -164,6 +165,7 @@ class Measurement:
     mask : True where a pixel is left out
     gain_error : relative standard deviation of a factor common to all pixels
     matrix : T for these images, behind the point-spread function of their detector, if they name one
+    light_nm : mean wavelength of the images' light [nm], NaN where they state none
 
     The veiling glare g of a detector is taken out of the images: power and noise are those of (P − g ⟨P⟩)/(1 − g).
     """
@@ -173,6 +175,7 @@ class Measurement:
     mask: NDArray[np.bool_]
     gain_error: float
     matrix: TransportMatrix
+    light_nm: float = float("nan")
 
     @property
     def shot(self) -> Array:
@@ -216,18 +219,17 @@ class Measurement:
         power = matrix.images(planes)
         sensors = [view.get("sensor", 0) for view in matrix.views]
         noise = noise_of(matrix.image_shape, planes if listed else [], error, sampled, sensors=sensors)
-        found = (
-            float("nan") if gain_error is None else number("invert: 'gain_error'", gain_error, InversionError, "0.05")
-        )
-        if gain_error is None:
-            found = gain_error_of([i for i in planes if isinstance(i, Image)] if listed else [], "invert")
+        shown = [plane for plane in planes if isinstance(plane, Image)] if listed else []
+        found = gain_error_of(shown, "invert") if gain_error is None else gain_error
+        found = number("invert: 'gain_error'", found, InversionError, "0.05")
         if not 0 <= found < 1:
             raise InversionError(f"invert: 'gain_error' must be in [0, 1), got {found:g}. Give for example 0.05.")
         if masks.all():
             raise InversionError("invert: every pixel is masked or saturated. Expose for a shorter time.")
         stray = stray_light_of(matrix, planes if listed else [], "invert")
         power, noise = without_glare(power, noise, masks, stray.glare)
-        return cls(np.where(masks, 0, power).ravel(), noise, masks.ravel(), found, without_glare_of(matrix, stray))
+        known, light = np.where(masks, 0, power).ravel(), light_of_images(shown, "invert")
+        return cls(known, noise, masks.ravel(), found, without_glare_of(matrix, stray), light)
 
     @property
     def relative(self) -> Array:

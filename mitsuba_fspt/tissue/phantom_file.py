@@ -93,11 +93,13 @@ class Band:
     """Band of wavelengths: `share` of a source's power that is emitted in it, in (0, 1], and the `media` in it.
 
     media, spreads : of the tissue outside the regions, then of each region; no `spreads`: the media are exact
+    wavelength_nm : of the light [nm]; None where the file does not name it
     """
 
     share: float
     media: tuple[Medium, ...]
     spreads: tuple[Spread, ...] = ()
+    wavelength_nm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -302,7 +304,7 @@ def _bands(table: Table, parts: tuple[Region, ...]) -> dict[str, Band]:
             with named(part.name):
                 media.append(_band_medium(part, of.medium, at))
             spreads.append(_spread(part, of.spread))
-        bands[name] = Band(share, tuple(media), tuple(spreads))
+        bands[name] = Band(share, tuple(media), tuple(spreads), at)
         for part in (own, *regions):
             part.done()
     return bands

@@ -211,6 +211,26 @@ def test_a_band_that_is_not_given_is_named(case, caplog):
     assert "no band is given, of the phantom file's red, green" in caplog.text
 
 
+def test_bands_in_exchange_are_told(case, caplog):
+    """By the wavelengths of file and images. Seen to fail: each was fitted with the other's coefficients silently."""
+    at = {"red": 650.0, "green": 560.0}
+    bands = {name: replace(band, wavelength_nm=at[name]) for name, band in case.described.bands.items()}
+    images = case.images(SOURCE)
+    for names, told in ((("red", "green"), 0), (("green", "red"), 1)):
+        given = [
+            _Given(
+                name,
+                case.matrix,
+                [replace(i, metadata=i.metadata | {"wavelength_nm": nm}) for i in images],
+                *2 * [None],
+            )
+            for name, nm in zip(names, at.values(), strict=True)
+        ]
+        with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+            _band_images(replace(case.described, bands=bands), given, None, False, case.surface, lambda *done: None)
+        assert caplog.text.count("locate: the images of band 'green' have light of 650 nm, that of band 'red'") == told
+
+
 def test_coefficients_in_1_cm_are_told(case, caplog):
     """Seen to fail: coefficients that are ten times too large were fitted with without a word."""
     wrong = replace(case.described, bands={}, medium=replace(case.described.medium, musp=9.1))

@@ -118,6 +118,7 @@ def test_band_of_a_phantom_file(tmp_path: Path) -> None:
     )
     found, expected = (described(tmp_path, text).bands["red"] for text in (PHANTOM, numbers))
     assert found.share == expected.share
+    assert (found.wavelength_nm, expected.wavelength_nm) == (650, None)
     assert expected.media[0] == Medium(mua, musp, 1.37)
     assert found.media[1] == expected.media[1]
     for name in ("mua", "musp", "n"):
