@@ -1,19 +1,23 @@
-"""Light of measured images, as their metadata state it: that of one fit is the same, that of a band is its own."""
+"""Light of measured images, as their metadata state it: that of one fit is the same, that of a band is its own, and
+that of a view is the one of its lens with its filter.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from ..images.image import Image
 from ..optics.light import Light
-from ..runtime.errors import InversionError
+from ..runtime.errors import InversionError, TransportError
 
 LOG = logging.getLogger("mitsuba_fspt")
 ALIKE = 1.0  # nm, between mean wavelengths of the same light, by rounding
+FILTER = 10.0  # nm, from the light of a filter: half of its usual width, within which that is named by one wavelength
 FAR = 30.0  # nm, from a band's wavelength: more than between the ways to name the light of a filter, 40 nm wide
 
 
@@ -33,6 +37,22 @@ def light_of_images(images: Sequence[Image], verb: str) -> float:
             *(min(each), max(each)),
         )
     return float(np.mean(each))
+
+
+def light_notes(number: int, metadata: Mapping[str, Any], lens: Mapping[str, Any]) -> list[str]:
+    """Note of image `number` whose light is not that for which the lens of its view has its transmittance; else [].
+
+    Raises TransportError for metadata of a light that is none.
+    """
+    own = Light.recorded(lens, TransportError, "transport: the lens")
+    light = None if own is None else Light.recorded(metadata, TransportError, f"transport: image {number}")
+    if own is None or light is None or abs(light.mean_wavelength_nm - own.mean_wavelength_nm) <= FILTER:
+        return []
+    return [
+        f"image {number} has light of {light.mean_wavelength_nm:.4g} nm, the lens of its view "
+        f"{own.mean_wavelength_nm:.4g} nm, for which it has the transmittance {float(lens['transmittance']):.4g}. Give "
+        "the lens that light."
+    ]
 
 
 def tell_bands(verb: str, lights: Mapping[str | None, float], stated: Mapping[str, float | None]) -> None:

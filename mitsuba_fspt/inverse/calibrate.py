@@ -24,6 +24,7 @@ from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, named, renamed
 from ..runtime.progress_bar import Progress, reported
+from .band_light import light_notes
 from .calibrated_scene import write_calibrated
 from .calibration_fit import CalibrationFit, CalibrationSettings, Fitted, Measured
 from .derivatives import scene_text, varied_value
@@ -268,6 +269,7 @@ def measured_of(
     sampled: bool = False,
 ) -> Measured:
     """Pixels of the images, after checks against the views and the scene's renderings."""
+    notes = list[str]()
     for number, (image, rendering) in enumerate(zip(images, renderings, strict=True)):
         if image.shape != rendering.shape:
             raise InversionError(
@@ -283,6 +285,8 @@ def measured_of(
                 f"calibrate: image {number} has a pixel pitch of {pitch:g} mm, the scene {own:g} mm. Give images of "
                 "the same film."
             )
+        notes += light_notes(number, image.metadata, rendering.metadata)
+    told("calibrate", notes[:1])
     _require_order(images, views)
     noise = noise_of(
         (len(images), *renderings[0].shape), images, sampled=sampled, verb="calibrate", sensors=[0] * len(images)

@@ -22,6 +22,7 @@ from ..images.recorded_number import recorded_number, recorded_positive
 from ..integral.rows.sparse_rows import SparseRows
 from ..rendering.provenance import same_mesh
 from ..runtime.errors import DetectorError, TransportError
+from .band_light import light_notes
 from .stray_rows import spread_rows
 from .transport_file import contents, write
 
@@ -370,6 +371,7 @@ def _differences(
                     "the images in the order of the views."
                 )
         notes.append(f"image {number} was made with {_text(other)}, its view of the matrix has {_text(view)}.")
+    notes += light_notes(number, metadata, lens)
     digest = metadata.get("mesh_digest")
     if digest is not None and not same_mesh(str(digest), str(matrix.metadata["mesh_digest"])):
         notes.append(f"image {number} shows another mesh than the one of the matrix.")

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.inverse.band_light import light_of_images, tell_bands
+from mitsuba_fspt.inverse import calibrate
+from mitsuba_fspt.inverse.band_light import light_notes, light_of_images, tell_bands
 from mitsuba_fspt.runtime.errors import InversionError
 
 STATED = {"red": 650.0, "green": 560.0, "blue": None}
@@ -58,3 +59,29 @@ def test_light_that_is_none_is_refused_and_may_be_missing():
     assert math.isnan(light_of_images([image(), image()], "invert"))
     with pytest.raises(InversionError, match="invert: image 0: 'spectrum' of its metadata is damaged"):
         light_of_images([image(spectrum="abc")], "invert")
+
+
+SPECTRUM = "[[540, 0], [560, 1], [580, 0]]"
+
+
+@pytest.mark.parametrize(
+    ("lens", "light", "told"),
+    [
+        ({"wavelength_nm": 560.0}, {"wavelength_nm": 660.0}, True),
+        ({"wavelength_nm": 560.0}, {"wavelength_nm": 568.0}, False),
+        ({"spectrum": SPECTRUM}, {"wavelength_nm": 560.0}, False),
+        ({"spectrum": SPECTRUM}, {"wavelength_nm": 600.0}, True),
+        ({"wavelength_nm": 560.0}, {}, False),
+        ({}, {"wavelength_nm": 660.0}, False),
+    ],
+)
+def test_the_light_of_a_lens_with_a_filter_is_that_of_its_images(lens, light, told, caplog):
+    """Rationale: of a filter with 0.38 at 560 and 0.68 at 660 nm, J_n came out 1.8 times too large without a word."""
+    notes = light_notes(1, light, lens | {"transmittance": 0.38})
+    assert len(notes) == told
+    known = {"pixel_pitch": 0.5, **lens, "transmittance": 0.38}
+    with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+        rendered = fspt.Image(np.ones((4, 4)), metadata=known)
+        given = fspt.Image(np.ones((4, 4)), np.ones((4, 4)), metadata={"pixel_pitch": 0.5, **light})
+        calibrate.measured_of([given], [{}], [rendered], 1)
+    assert caplog.text.count("the lens of its view 560 nm, for which it has the transmittance 0.38") == told

@@ -17,6 +17,7 @@ import mitsuba_fspt as fspt
 from mitsuba_fspt.integral.rows.sparse_rows import SparseRows
 from mitsuba_fspt.inverse import transport as module
 from mitsuba_fspt.inverse.transport_file import PartialFile
+from mitsuba_fspt.inverse.transport_matrix import _differences
 from mitsuba_fspt.rendering.provenance import mesh_digest, same_mesh
 from mitsuba_fspt.runtime import workers
 from mitsuba_fspt.runtime.errors import BackendError, SceneError, TransportError
@@ -295,6 +296,16 @@ def test_images_are_held_against_the_views(scene_file, matrix, caplog):
     caplog.clear()
     matrix.backward([camera.reduce(c, pixel_pitch=images[0].metadata["pixel_pitch"], **numbers) for c in counts])
     assert not caplog.records
+
+
+def test_images_of_another_light_than_the_lens_s_filter_are_told(scene_file, matrix):
+    """The matrix holds the transmittance of the filter for the light of its lens alone."""
+    image = fspt.render(fspt.load(scene_file, view=0, f_number=2.8))
+    lens = matrix.metadata["lenses"][0] | {"wavelength_nm": 560.0, "transmittance": 0.38}
+    metadata = {"pixel_pitch": image.metadata["pixel_pitch"]}
+    for light, told in ((560.0, 0), (660.0, 1)):
+        notes = _differences(0, metadata | {"wavelength_nm": light}, matrix.views[0], lens, matrix)
+        assert [note.startswith("image 0 has light of 660 nm") for note in notes] == told * [True]
 
 
 def test_a_digest_of_a_mesh_does_not_depend_on_its_pose():
