@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter
 
 from ..images.radiometry import etendue_of
 from ..rendering.lens_numbers import lens_numbers
@@ -41,6 +41,8 @@ KINDS = ("lens", "sensor")
 LEAST = 0.05  # of the median response, and of the screen's brightest pixel: darker ones have > 20 times the noise
 HOT = 2.0  # times the median of its 5 × 5 neighbours: an unmasked hot pixel of n changes the mean by less than 1/n
 NEIGHBOURS = 5  # pixels a side
+SMOOTHED = 8  # squares of the shorter side over this show what a lens loses, which is smooth
+LOSS = 0.02  # by which the mean response may lie below the largest smooth one without a word
 NORMALISED = 2.0  # largest median of a flat that was divided by its mean before; that of DN is larger
 SAME_PITCH = 1e-3  # relative difference of pixel pitches that rounding in files may cause
 
@@ -118,6 +120,25 @@ def flat_field(
     response = np.where(usable, relative / relative[usable].mean(), 1.0)
     error = _error(detector, np.where(usable, electrons, 1.0), found.frames, frames) if _is_in_dn(found) else None
     return FlatField(response, ~usable, error, str(kind))
+
+
+def tell_loss(field: FlatField, gain_error: float) -> None:
+    """Say in one line on stderr that a flat through the lens falls off over the film beyond the model of the lens.
+
+    The mean counts as 1, with what the lens loses. Where the quantum efficiency is the sensor's, the power comes out
+    too small by that; told if by more than its relative uncertainty `gain_error`.
+    """
+    side = max(NEIGHBOURS, min(field.response.shape) // SMOOTHED) | 1
+    if field.kind != "lens" or min(field.response.shape) < 2 * side:
+        return
+    smooth = uniform_filter(field.response, side, mode="nearest")
+    if (loss := 1 - 1 / float(smooth.max())) > max(LOSS, gain_error):
+        LOG.warning(
+            "fspt: reduce: the flat field falls from %.3g to %.3g over the film beyond the model of the lens. Its mean "
+            "counts as 1: the power is too small by %.2g %% if the lens loses that, but for a 'quantum_efficiency' "
+            "measured through it. Give the scene's lens its 'vignetting', see --vignetting.",
+            *(smooth.max(), smooth.min(), 100 * loss),
+        )
 
 
 def uniform_screen(

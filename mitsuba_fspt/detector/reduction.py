@@ -36,7 +36,7 @@ from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
 from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time, tell_unequal_frames
 from .dark_charge import Background, shown_charge
-from .flat_field import FlatField, flat_field, require_no_flat
+from .flat_field import FlatField, flat_field, require_no_flat, tell_loss
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
 from .saturation import full_pixels, saturated
 
@@ -146,7 +146,7 @@ class Corrections:
                 )
             return self.flat
         bias = counts.bias if self.bias is None else frame_like(self.bias, "bias", shape).values
-        return flat_field(
+        found = flat_field(
             detector,
             self.flat,
             self.flat_kind,
@@ -158,6 +158,8 @@ class Corrections:
             area=replace(exposed, binning=exposed.binning or counts.binning or 1).area(detector),
             binning=exposed.binning or counts.binning,
         )
+        tell_loss(found, detector.gain_error)
+        return found
 
     def bad(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """True (h, w) on the pixels to leave out; DetectorError for a mask of another size."""

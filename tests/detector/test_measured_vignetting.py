@@ -101,6 +101,27 @@ def test_a_lens_with_it_sees_the_screen_evenly(files, run):
     assert not (files / "no.exr").exists()
 
 
+def test_a_loss_in_a_flat_through_the_lens_is_told(files, caplog):
+    """Rationale: the mean of the flat counts as 1, with the lens's loss: 15 % of the power were lost without a word.
+
+    Not told: the same loss where the lens has it, or in a stated uncertainty of the gain.
+    """
+    np.save(files / "v.npy", true_shares())
+    text = (files / "s.xml").read_text()
+    named = '<string name="vignetting" value="v.npy"/><transform name="to_world">'
+    (files / "v.xml").write_text(text.replace('<transform name="to_world">', named))
+    detector = fspt.Detector.from_toml(files / "camera.toml")
+    flat = np.load(files / "lens.npy")
+    given = {"exposure_time": 1.0, "wavelength_nm": 660, "flat": flat, "flat_kind": "lens"}
+    plain, known = (detector.reduce(flat, **given, scene=files / name) for name in ("s.xml", "v.xml"))
+    good = plain.kept & known.kept
+    lost = (plain.power / np.where(good, known.power, 1) * true_shares())[good]
+    np.testing.assert_allclose(lost, 0.85, rtol=2e-3)  # of the power by Eq. 9, on every pixel
+    assert caplog.text.count("the power is too small by 15 % if the lens loses that") == 1
+    replace(detector, gain_error=0.2).reduce(flat, **given, scene=files / "s.xml")
+    assert caplog.text.count("beyond the model of the lens") == 1
+
+
 def test_the_glare_of_the_flat_is_no_vignetting(files):
     """The screen itself makes the veiling glare, here 5 % of its light, which is the same on all pixels.
 
