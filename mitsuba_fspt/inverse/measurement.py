@@ -453,7 +453,7 @@ def without_glare(power: Array, noise: Noise, masks: NDArray[np.bool_], glare: f
                 break
             filled = np.where(left, _median_around(filled), filled)
         LOG.warning(
-            "fspt: invert: %d masked pixels count in the veiling glare with the median of their neighbours. Expose so "
+            "fspt: %d masked pixels count in the veiling glare with the median of their neighbours. Expose so "
             "that no pixel saturates.",
             int(masks.sum()),
         )

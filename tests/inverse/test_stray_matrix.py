@@ -129,7 +129,7 @@ def test_masked_pixels_count_with_their_neighbours(matrix, camera, caplog):
     mask[0, 7:9, 7:9] = True
     part = Measurement.of(matrix, images, None, mask, None)
     kept = ~mask.ravel()
-    assert [r.getMessage().count("4 masked pixels count in the veiling glare") for r in caplog.records] == [1]
+    assert [r.getMessage().count("fspt: 4 masked pixels count in the veiling glare") for r in caplog.records] == [1]
     np.testing.assert_allclose(part.power[kept], whole.power[kept], atol=3e-5 * whole.power.max())
 
 
