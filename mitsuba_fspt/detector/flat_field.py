@@ -42,6 +42,7 @@ LEAST = 0.05  # of the median response, and of the screen's brightest pixel: dar
 HOT = 2.0  # times the median of its 5 × 5 neighbours: an unmasked hot pixel of n changes the mean by less than 1/n
 NEIGHBOURS = 5  # pixels a side
 SMOOTHED = 8  # squares of the shorter side over this show what a lens loses, which is smooth
+CHANCE = 4.0  # standard deviations of a mean over pixels: more is no noise
 LOSS = 0.02  # by which the mean response may lie below the largest smooth one without a word
 NORMALISED = 2.0  # largest median of a flat that was divided by its mean before; that of DN is larger
 SAME_PITCH = 1e-3  # relative difference of pixel pitches that rounding in files may cause
@@ -131,8 +132,9 @@ def tell_loss(field: FlatField, gain_error: float) -> None:
     side = max(NEIGHBOURS, min(field.response.shape) // SMOOTHED) | 1
     if field.kind != "lens" or min(field.response.shape) < 2 * side:
         return
-    smooth = uniform_filter(field.response, side, mode="nearest")
-    if (loss := 1 - 1 / float(smooth.max())) > max(LOSS, gain_error):
+    smooth = uniform_filter(field.response, side, mode="reflect")
+    noise = CHANCE * float(np.std(field.response - smooth)) / (side // 2)  # in a corner, of a quarter of a square
+    if (loss := 1 - 1 / float(smooth.max())) > max(LOSS, gain_error, noise):
         LOG.warning(
             "fspt: reduce: the flat field falls from %.3g to %.3g over the film beyond the model of the lens. Its mean "
             "counts as 1: the power is too small by %.2g %% if the lens loses that, but for a 'quantum_efficiency' "

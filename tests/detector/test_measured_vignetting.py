@@ -104,7 +104,7 @@ def test_a_lens_with_it_sees_the_screen_evenly(files, run):
 def test_a_loss_in_a_flat_through_the_lens_is_told(files, caplog):
     """Rationale: the mean of the flat counts as 1, with the lens's loss: 15 % of the power were lost without a word.
 
-    Not told: the same loss where the lens has it, or in a stated uncertainty of the gain.
+    Not told: the same loss where the lens has it, or in a stated uncertainty of the gain, and noise.
     """
     np.save(files / "v.npy", true_shares())
     text = (files / "s.xml").read_text()
@@ -119,6 +119,9 @@ def test_a_loss_in_a_flat_through_the_lens_is_told(files, caplog):
     np.testing.assert_allclose(lost, 0.85, rtol=2e-3)  # of the power by Eq. 9, on every pixel
     assert caplog.text.count("the power is too small by 15 % if the lens loses that") == 1
     replace(detector, gain_error=0.2).reduce(flat, **given, scene=files / "s.xml")
+    assert caplog.text.count("beyond the model of the lens") == 1
+    dim = np.random.default_rng(2).poisson(200 * screen(), SHAPE) + 500.0  # 7 % of noise a pixel, and no loss
+    detector.reduce(flat, **(given | {"flat": dim.astype(np.uint16)}), scene=files / "s.xml")
     assert caplog.text.count("beyond the model of the lens") == 1
 
 
