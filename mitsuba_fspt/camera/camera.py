@@ -324,10 +324,10 @@ class Camera:
         nearest = float((ends * axis).min(axis=0).sum() + offset)
         return min(max(CLEAR * nearest, 0.0), MOST_CLEAR * self.lens.focus_distance)
 
-    def farthest_depth(self, points: NDArray[np.float64]) -> float:
-        """Depth [mm] of the farthest of world points (n, 3)."""
+    def depths(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depths [mm] of world points (n, 3) along the optical axis, (n,)."""
         axis, offset = self._to_camera[2, :3], self._to_camera[2, 3]
-        return float((points @ axis).max() + offset)
+        return np.asarray(points @ axis + offset)
 
     def film_discs(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Discs on the film that contain the blur discs of world points (…, 3): centres (…, 2), radii (…, 1) [pixels].

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from .camera import Camera
 
-Boxes = tuple[tuple[float, ...], ...]
+Box = tuple[float, ...]  # x, y, z of the lowest and of the highest corner [mm]
+Boxes = tuple[Box, ...]
 Ends = NDArray[np.float64]
+Region = tuple[float, float, float, float]  # of the film: x, y of its lowest and of its highest corner [pixels]
 
 # Rim around the crop window that is searched for silhouettes: its width in blur radii, and the largest one in pixels.
 SEARCHED_RIM, MOST_RIM = 0.6, 16
@@ -103,16 +105,11 @@ class Window:
         whole = share > 1 - OPEN
         return whole[:-1, :-1] & whole[:-1, 1:] & whole[1:, :-1] & whole[1:, 1:]
 
-    def seen_in(self, boxes: Boxes, camera: Camera) -> NDArray[np.bool_]:
-        """Pixels (h, w) of this window with a line of sight into one of these boxes, and some around."""
-        seen = np.zeros(self.shape, bool)
-        for box in boxes:
-            other = window_of((box,), camera)
-            left, top = (own - its for own, its in zip(self.corner, other.corner, strict=True))
-            rows, columns = top + np.arange(self.shape[0]), left + np.arange(self.shape[1])
-            inside = (rows >= 0) & (rows < other.shape[0])
-            seen |= inside[:, None] & (columns >= 0) & (columns < other.shape[1])
-        return seen
+    def within(self, region: Region) -> NDArray[np.bool_]:
+        """Pixels (h, w) of this window in a region of the film, those on its border included."""
+        left, top, right, bottom = region
+        x, y = (start + np.arange(size) for start, size in zip(self.corner, self.shape[::-1], strict=True))
+        return ((y + 1 > top) & (y < bottom))[:, None] & (x + 1 > left) & (x < right)
 
     def expand(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
         """The crop window with `image` of this window in its place, 0 around it; a view if nothing is around it."""
@@ -149,21 +146,31 @@ class Window:
         return here, tuple(slice(a, b) for a, b in ends)
 
 
-def window_of(boxes: Boxes, camera: Camera, everywhere: bool = False, bending: Boxes = ()) -> Window:
-    """Window of the pixels with a line of sight into these boxes, or into those of `bending` shapes; or `everywhere`.
-
-    Perspective keeps straight lines straight, so that corners bound a box's blurred image, before its distortion.
-    """
-    boxes = (*boxes, *bending)
-    (height, width), offset = camera.film.shape, camera.film.crop_offset
+def corners_of(boxes: Sequence[Box]) -> Ends:
+    """Corners of boxes, (8 n, 3) [mm]."""
     ends = np.array(boxes, np.float64).reshape(-1, 2, 3)
-    points = np.array([ends[:, list(pick), range(3)] for pick in itertools.product((0, 1), repeat=3)]).reshape(-1, 3)
+    return ends[:, (np.arange(8)[:, None] >> np.arange(3)) & 1, range(3)].reshape(-1, 3)
+
+
+def window_of(boxes: Boxes, camera: Camera, everywhere: bool = False, bending: Boxes = ()) -> Window:
+    """Window of the pixels with a line of sight into these boxes or those of `bending` shapes; or `everywhere`."""
+    points, far = corners_of((*boxes, *bending)), 0.0
+    if bending:  # an image behind a mirror is as far as its light travels in front of it
+        far = camera.depths(points).max() + float(np.linalg.norm(np.ptp(points, axis=0)))
+    return window_around(points, camera, everywhere, far)
+
+
+def window_around(points: Ends, camera: Camera, everywhere: bool = False, far: float = 0.0) -> Window:
+    """Window of the pixels with a line of sight to what lies between these points (n, 3) [mm]; or `everywhere`.
+
+    Perspective keeps straight lines straight, so that the points bound the blurred image of what lies between them,
+    before its distortion. far : depth of images farther away [mm], if there are any
+    """
+    (height, width), offset = camera.film.shape, camera.film.crop_offset
     discs, radii = camera.ideal_discs(points)
     blur = radii.max(initial=0.0)
-    if bending:  # an image behind a mirror is as far as its light travels in front of it
-        size = float(np.linalg.norm(np.ptp(points, axis=0)))
-        far = camera.blur_radius(mi.Float64(camera.farthest_depth(points) + size))
-        blur = max(blur, abs(float(far[0])))
+    if far:
+        blur = max(blur, abs(float(camera.blur_radius(mi.Float64(far))[0])))
     low, high = (discs - radii).min(axis=0, initial=np.inf), (discs + radii).max(axis=0, initial=-np.inf)
     if everywhere or not len(points):
         low, high = np.full(2, -np.inf), np.full(2, np.inf)

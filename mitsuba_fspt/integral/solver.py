@@ -45,7 +45,6 @@ LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by flo
 NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
 PLAIN = 0.7  # of rtol: tolerance of the light by plain courses (`Specular.part`); the rest is that of all others
 OTHERS = 4  # largest number of lines of sight of a pixel over that for all other courses
-FAINTER = 0.1  # least weight of these over that of plain ones
 MOST_KEPT = 1 << 20  # faces as a camera sees them, of 130 bytes each, that are kept between renders
 
 
@@ -288,7 +287,7 @@ def _seen_state(view: View, window: Window) -> tuple[object, ...]:
     editions = [edition_of(emitter) for emitter in scene.emitters()]
     through = specular.state() if specular else ()
     poses = [pose_of(shape) for shape in scene.shapes()]
-    most = specular.most if specular else 0
+    most = (specular.most, specular.least) if specular else ()
     return editions, glowing_boxes(scene), poses, through, most, view.camera.state, window
 
 
@@ -318,7 +317,7 @@ def _by_courses(
     if view.specular is None:
         raise TypeError("no specular surfaces")
     plain, others = (replace(view.specular, part=part) for part in ("plain", "others"))
-    views = [replace(view, specular=own) for own in (plain, replace(others, least=FAINTER * others.least))]
+    views = [replace(view, specular=own) for own in (plain, replace(others, least=others.faintest))]
     shares = [replace(quadrature, rtol=max(share * quadrature.rtol, FLOAT32_FLOOR)) for share in (PLAIN, 1 - PLAIN)]
     few = max(quadrature.most_nodes // OTHERS, 1)
     if quadrature.max_nodes is not None:

@@ -14,6 +14,8 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
 POSITIONS, NORMALS = ("vertex_positions", "positions"), ("vertex_normals", "normals")  # of `mi.traverse`: 3.9, 3.10
 FACES = "faces"
@@ -75,6 +77,12 @@ def triangles(shape: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
         return _of_parameters(shape, parameters)
     corners = mi.Transform4f(parameters["to_world"]) @ mi.Point3f([-1, 1, -1, 1], [-1, -1, 1, 1], 0)
     return dr.ravel(corners), mi.UInt32(1, 2, 0, 1, 3, 2)
+
+
+def corners_of_faces(mesh: mi.Shape) -> NDArray[np.float64]:
+    """Corners of the faces of a mesh or of a rectangle, (F, 3, 3) [mm]."""
+    positions, faces = triangles(mesh)
+    return positions.numpy().reshape(-1, 3).astype(np.float64)[faces.numpy().reshape(-1, 3)]
 
 
 def box_of(shapes: Iterable[mi.Shape]) -> mi.ScalarBoundingBox3f:

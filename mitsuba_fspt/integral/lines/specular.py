@@ -17,19 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...camera.camera import Camera
+from ...camera.window import Box, corners_of
 from ...emission.face_table import shape_number
 from ...emission.of_emitter import surfaces_of
-from ...jit.mesh_buffers import box_of
+from ...jit.mesh_buffers import box_of, is_shaded_smoothly
 from ...jit.plugin_objects import made
 from ...jit.spectra import at_one_wavelength, scalar
 from ..quadrature import Quadrature
-from .mirror import Box, Mirror, corners_of
+from .glass import Glass
+from .mirror import Mirror, Untraced, index_of
 from .nested_bsdfs import blended_parts
 from .occlusion import hidden, ray_to_lens
-from .plate import Plate
+from .places import Deviating
+from .plane import Plane
 
 SMOOTHEST = 1e-4  # roughness below which Mitsuba's rough conductor has the lobe of this roughness: a mirror's
 ROUNDING = 2e-6  # of the largest coordinate: margin of a box
+FAINTER = 0.1  # least weight of courses with weaker lobes, where they are followed apart, over that of others
 LIFT = 4e-7  # of a shape's largest coordinate: distance at which its sides differ in float32
 DELTA = {
     "null": mi.BSDFFlags.Null,
@@ -45,8 +49,7 @@ class Specular:
     names : ids of the shapes
     lobes : kinds of lobes that can lead to light, of 'null', 'transmission' and 'reflection'
     bending : boxes of the shapes that deviate lines of sight
-    mirrors : planes of the same shapes, none for curved ones and where light is refracted
-    plate : the only shape that deviates lines of sight, if it is a plate of glass before all that glows; else None
+    deviating : the same shapes, with the places from which a camera looks straight at what they show
     bsdf : Dr.Jit's number of a shape's BSDF; 0 where lines of sight end
     parts : components of a shape's BSDF that are sampled one at a time; 0 for those of no blend
     most_parts : largest of `parts`
@@ -62,8 +65,7 @@ class Specular:
     names: tuple[str, ...]
     lobes: tuple[str, ...]
     bending: tuple[Box, ...]
-    mirrors: tuple[tuple[Mirror, ...], ...]
-    plate: Plate | None
+    deviating: tuple[Deviating, ...]
     bsdf: mi.UInt32
     parts: mi.UInt32
     most_parts: int
@@ -86,7 +88,7 @@ class Specular:
         lobes = {name for _, bsdf in shapes for name in lobes_of(bsdf)}
         bent = [(shape, bsdf) for shape, bsdf in shapes if set(lobes_of(bsdf)) - {"null"}]
         glowing = [_box(surface.shape) for surface in surfaces_of(scene)] or [_box(*scene.shapes())]
-        planes = [Mirror.of(shape) for shape, _ in bent]
+        planes = [Plane.of(shape) for shape, _ in bent]
         if len(bent) == 1 and "transmission" not in lobes and _separate(planes[0], camera, glowing):
             lobes, bent, planes = lobes - {"reflection"}, [], []  # what a pane reflects to the lens is dark
         if not (lobes or even_if_none):
@@ -109,9 +111,9 @@ class Specular:
             tuple(name for name in DELTA if name in lobes) or ("null",),
             tuple(boxes),
             tuple(
-                () if "transmission" in lobes_of(its) else plane for (_, its), plane in zip(bent, planes, strict=True)
+                _deviating(*pair, plane, box, [*glowing, *(other for other in boxes if other is not box)])
+                for pair, plane, box in zip(bent, planes, boxes, strict=True)
             ),
-            Plate.of(*bent[0], planes[0], camera, corners_of(glowing)) if len(bent) == 1 else None,
             mi.UInt32(bsdf),
             mi.UInt32(parts),
             int(parts.max()),
@@ -126,6 +128,11 @@ class Specular:
         """Key of the parameters that light through these shapes depends on, without their poses."""
         values = [mi.traverse(bsdf) for bsdf in self.kept]
         return self.names, self.lobes, tuple(_key(value[name]) for value in values for name in value.keys())
+
+    @property
+    def faintest(self) -> float:
+        """Smallest weight with which any sequence of lobes is followed."""
+        return FAINTER * self.least
 
     @property
     def straight(self) -> bool:
@@ -190,7 +197,19 @@ def _around(boxes: Sequence[Box]) -> NDArray[np.float64]:
     return np.concatenate([ends[:, 0].min(axis=0) - margin, ends[:, 1].max(axis=0) + margin])
 
 
-def _separate(planes: tuple[Mirror, ...], camera: Camera, glowing: Sequence[Box]) -> bool:
+def _deviating(shape: mi.Shape, bsdf: mi.BSDF, planes: tuple[Plane, ...], box: Box, others: Sequence[Box]) -> Deviating:
+    """A shape with these planes that deviates lines of sight; `others`: boxes of what may lie inside of it."""
+    corners = corners_of([box])
+    if "transmission" in lobes_of(bsdf):
+        glass = Glass.of(shape, bsdf, planes, [corners_of([other]) for other in others])
+        return glass or Untraced(corners)
+    if not planes or (len(planes) > 1 and is_shaded_smoothly(shape)):
+        return Untraced(corners)
+    index = index_of(bsdf) if bsdf.class_name() == "ThinDielectric" else None
+    return Mirror(planes, index, "null" in lobes_of(bsdf))
+
+
+def _separate(planes: tuple[Plane, ...], camera: Camera, glowing: Sequence[Box]) -> bool:
     """True if a shape is flat and lies between the whole pupil and everything that glows."""
     return len(planes) == 1 and planes[0].separates(camera, corners_of(glowing))
 

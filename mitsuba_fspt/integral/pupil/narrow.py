@@ -80,9 +80,12 @@ class NarrowLight:
             radiance=max(self.radiance, elsewhere.radiance),
         )
 
-    def on(self, pixels: NDArray[np.bool_]) -> NarrowLight:
-        """The narrow light and the surfaces edge-on of these pixels (h, w) alone."""
-        return replace(self, on_pixels=self.on_pixels * pixels, edge_on=self.edge_on * pixels)
+    def times(self, share: PixelArray) -> NarrowLight:
+        """These shares (h, w) of the narrow light and of surfaces edge-on."""
+        most = float(share.max(initial=0.0))
+        return replace(
+            self, on_pixels=self.on_pixels * share, edge_on=self.edge_on * share, radiance=self.radiance * most
+        )
 
 
 def points_on_surfaces(

@@ -1,24 +1,20 @@
-"""Points all over the surfaces as a camera sees them: along straight lines, in mirrors, and through a plate of glass.
+"""Points all over the surfaces as a camera sees them: along straight lines, in mirrors, and through plates of glass.
 
-Flat mirrors and panes show them as the camera's mirror images see them along straight lines, on all courses of Eq. M.19
-without refraction; a plate of glass as the camera does at another place (Eq. M.56).
+The camera sees them straight on from other places, one for each course over specular surfaces (Eq. M.19).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...camera.camera import Camera
-from ...camera.window import Window, window_of
+from ...camera.window import Window, corners_of
 from ..lines.eq9 import View
-from ..lines.mirror import Box, Mirror, MirrorImages, corners_of
+from ..lines.place import Place, Unplaced
+from ..lines.places import Places
 from ..lines.visible_window import glowing_boxes
 from .narrow import NarrowLight, Points, most_narrow_light, narrow_light, points_on_surfaces
 
@@ -29,15 +25,16 @@ Array = NDArray[np.float64]
 class SeenPoints:
     """Points all over the surfaces of a view's scene, as its camera sees them along `straight` lines and `elsewhere`.
 
-    The latter, each with the plane that lines of sight meet first, in mirrors and through a plate of glass; they
-    include points that other bodies hide. anywhere : where curved mirrors, glass or many mirrors may show narrow spots
-    in other places, too: boxes of what shows them, and the largest light of spots that face the camera [W/mm²/sr]
+    elsewhere : as it sees them by specular surfaces, from other places, each with the courses that lead there; they
+        include points that other bodies hide
+    unplaced : lines of sight that may see narrow spots in places that are not known, and the largest light of spots
+        that face the camera [W/mm²/sr]
     """
 
     view: View
     straight: Points | None
-    elsewhere: tuple[tuple[Points, Mirror], ...] = ()
-    anywhere: tuple[tuple[tuple[Box, ...], float], ...] = ()
+    elsewhere: tuple[tuple[Points, tuple[Place, ...]], ...] = ()
+    unplaced: tuple[tuple[Unplaced, ...], float] = ((), 0.0)
 
     @classmethod
     def of(cls, view: View) -> SeenPoints:
@@ -46,29 +43,17 @@ class SeenPoints:
         straight = points_on_surfaces(scene, camera, specular)
         if specular is None or straight is None:
             return cls(view, straight)
-        boxes = glowing_boxes(scene)
-        most = partial(_most_narrow_light, scene, camera)
-        if specular.plate and (images := specular.plate.images(camera, boxes)):
-            first, left = specular.plate.towards, specular.plate.reflected_more(camera, boxes)
-            seen, bound = cls._from(scene, [(image, first) for image in images], boxes), most()
-            anywhere = ((specular.bending, left * bound), (specular.plate.rim_boxes, bound))
-            return cls(view, straight, seen, anywhere)
-        mirrors = [mirror for planes in specular.mirrors for mirror in planes]
-        found = MirrorImages.of(mirrors, camera, corners_of(boxes), specular.most)
-        complete = found.complete and all(specular.mirrors)
-        seen = cls._from(scene, found.images, boxes)
-        return cls(view, straight, seen, () if complete else ((specular.bending, most()),))
-
-    @staticmethod
-    def _from(
-        scene: mi.Scene, images: Sequence[tuple[Camera, Mirror]], boxes: Sequence[Box]
-    ) -> tuple[tuple[Points, Mirror], ...]:
-        """The points as a camera sees them from other places, each of which comes with the plane that shows them."""
-        found = []
-        for image, first in images:
-            if math.prod(window_of(boxes, image).shape) and (points := points_on_surfaces(scene, image, hidden=False)):
-                found.append((points[(points.area > 0) & (points.cosine > 0)], first))
-        return tuple(found)
+        places = Places.of(
+            specular.deviating, camera, corners_of(glowing_boxes(scene)), specular.most, specular.faintest
+        )
+        seen, courses = list[tuple[Points, tuple[Place, ...]]](), dict[tuple[float, ...], list[Place]]()
+        for place in places.found:
+            courses.setdefault(place.where, []).append(place)
+        for same in courses.values():
+            if (points := points_on_surfaces(scene, same[0].camera, hidden=False)) is not None:
+                seen.append((points[(points.area > 0) & (points.cosine > 0)], tuple(same)))
+        most = most_narrow_light(points_on_surfaces(scene, camera, hidden=False)) if places.unplaced else 0.0
+        return cls(view, straight, tuple(seen), (places.unplaced, most))
 
     def narrow_light(self, window: Window) -> tuple[NarrowLight, NarrowLight, Array]:
         """Light of narrow spots on the pixels of a window: along straight lines, elsewhere, and, with places that are
@@ -76,18 +61,17 @@ class SeenPoints:
 
         That elsewhere has neither `in_focus` nor `brightest`.
         """
-        camera = self.view.camera
         straight, elsewhere = narrow_light(self.straight, window), NarrowLight.none(window.shape)
-        for points, plane in self.elsewhere:
-            there = window.seen_in((plane.box,), camera)
-            elsewhere = elsewhere.plus(narrow_light(points, window).on(there))
-        anywhere = np.zeros(window.shape)
-        for boxes, most in self.anywhere:
-            if boxes and most:
-                anywhere = np.maximum(anywhere, most * window.seen_in(boxes, camera))
-        return straight, elsewhere, anywhere
+        for points, courses in self.elsewhere:
+            share = _share(courses, window).clip(max=1)
+            elsewhere = elsewhere.plus(narrow_light(points, window).times(share))
+        lines, most = self.unplaced
+        return straight, elsewhere, most * _share(lines, window).clip(max=1)
 
 
-def _most_narrow_light(scene: mi.Scene, camera: Camera) -> float:
-    """Largest light on a pixel of narrow spots that face a camera, whatever hides them [W/mm²/sr]."""
-    return most_narrow_light(points_on_surfaces(scene, camera, hidden=False))
+def _share(courses: Sequence[Place | Unplaced], window: Window) -> Array:
+    """Sum of the shares of courses on each pixel of a window, (h, w)."""
+    share = np.zeros(window.shape)
+    for course in courses:
+        share += course.share * window.within(course.region)
+    return share
