@@ -499,6 +499,20 @@ MUTANTS = (
         ("tests/detector/test_flat_field.py",),
     ),
     Mutant(
+        "glare of a flat's screen",
+        "detector/flat_field.py",
+        "Spread(None, detector.veiling_glare)",
+        "Spread(None, 0.0)",
+        ("tests/detector/test_measured_vignetting.py",),
+    ),
+    Mutant(
+        "glare of a vignetting's screen",
+        "detector/vignetting.py",
+        "light - glare * mean",
+        "light",
+        ("tests/detector/test_measured_vignetting.py",),
+    ),
+    Mutant(
         "share of the glare",
         "detector/stray_light.py",
         "(1 - self.glare) * spread + self.glare * images.mean(",
