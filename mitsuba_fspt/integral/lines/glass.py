@@ -48,7 +48,8 @@ class Glass:
 
         None if it is no such body, or if one of the `others`, given by the corners of their boxes, may lie inside.
         """
-        if bsdf.class_name() != "SmoothDielectric" or not planes or is_shaded_smoothly(shape):
+        flat = bool(planes) and shape.is_mesh() and not is_shaded_smoothly(shape)
+        if bsdf.class_name() != "SmoothDielectric" or not flat:
             return None
         corners = corners_of_faces(shape)
         rounding = MARGIN * np.abs(corners).max()

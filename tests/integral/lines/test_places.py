@@ -216,3 +216,8 @@ def test_lines_of_sight_that_end_at_places_not_known_are_told(camera, case, shar
     assert max(line.share for line in places.unplaced) == share
     middle = [line for line in places.unplaced if line.region[0] < 20 < line.region[2]]
     assert bool(middle) == (case != "rim")
+
+
+def test_a_disk_of_glass_is_no_body(mono):
+    disk_of_glass = mi.load_dict({"type": "disk", "bsdf": {"type": "dielectric"}})
+    assert Glass.of(disk_of_glass, disk_of_glass.bsdf(), Plane.of(disk_of_glass), []) is None
