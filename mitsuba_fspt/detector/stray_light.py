@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import convolve
 
+from ..images.comparison import GLARE, PSF
 from ..images.formats import Metadata, read_planes
 from ..images.frame_file import FITS, read_frame
 from ..images.pixel_axes import CROP
@@ -27,7 +28,7 @@ from ..images.recorded_number import recorded_number, recorded_positive
 from ..runtime.errors import BackendError, DetectorError, FsptError, ImageError
 
 Array = NDArray[np.float64]
-PSF, PSF_DIGEST, GLARE, FILM = "psf", "psf_digest", "veiling_glare", "veiling_glare_film"  # keys of metadata
+PSF_DIGEST, FILM = "psf_digest", "veiling_glare_film"  # keys of metadata
 DIGITS = 16  # of a digest
 LOG = logging.getLogger("mitsuba_fspt")
 POINTS = 16  # along the side of a kernel's cell that is larger than a pixel

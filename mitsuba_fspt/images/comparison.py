@@ -18,6 +18,7 @@ from .z_test import brightest, error_bound, z_test
 
 SURE = 2.0  # standard errors above which a difference of the light that two images contain is significant
 LEAST_LIGHT = 1e-5  # of the power: smaller differences are rounding errors
+PSF, GLARE = "psf", "veiling_glare"  # keys of the metadata of images with stray light
 
 
 class Comparison(Deviations):
@@ -36,6 +37,8 @@ class Comparison(Deviations):
         `light_of_one`, which the test would take for an error
     beyond : number of pixels at which the images differ by more than the sum of both integrals' errors; only if no
         such pixel has a standard error and both contain the same light, else None, as without any errors
+    stray_light : 'calculated' or 'standard', the only image whose metadata tell of the stray light of a detector; None
+        where both do or neither
     masked : number of pixels masked in either image, which no number above counts; profiles show them as stored
     """
 
@@ -102,7 +105,15 @@ def compare(
         beyond=None if test or light else _beyond(difference, error_bound(calculated, standard)[kept]),
         masked=int(kept.size - kept.sum()),
         light_of_one=light,
+        stray_light=_with_stray_light(calculated, standard),
     )
+
+
+def _with_stray_light(calculated: Image, standard: Image) -> str | None:
+    """The only image whose metadata tell of stray light: 'calculated' or 'standard'; None for both or neither."""
+    images = {"calculated": calculated, "standard": standard}
+    found = [name for name, image in images.items() if any(image.metadata.get(key) for key in (PSF, GLARE))]
+    return found[0] if len(found) == 1 else None
 
 
 def _light_of_one(calculated: Image, standard: Image) -> LightOfOne | None:

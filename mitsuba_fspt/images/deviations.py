@@ -65,6 +65,7 @@ class Deviations:
     beyond: int | None = None
     masked: int = 0
     light_of_one: LightOfOne | None = None
+    stray_light: str | None = None
 
     def render_text(self) -> str:
         """The numbers as text, one a line with its meaning; without the profiles."""
@@ -84,6 +85,11 @@ class Deviations:
             lines.append(self.z_test.render_text())
         elif self.beyond is not None:
             lines.append(f"beyond {self.beyond}   pixels that differ by more than the errors of both together")
+        if self.stray_light:
+            lines.append(
+                f"stray  only the {self.stray_light} contains the stray light of a detector ('psf', 'veiling_glare'), "
+                "which counts as a difference"
+            )
         if self.masked:
             lines.append(f"masked {self.masked}   pixels masked in either image, left out above")
         return "\n".join(lines)
@@ -102,4 +108,4 @@ class Deviations:
         ]
         light, test = (part and asdict(part) for part in (self.light_of_one, self.z_test))
         tests = {"light_of_one": light, "z_test": test, "beyond": self.beyond, "masked": self.masked}
-        return numbers | tests | {"profiles": profiles}
+        return numbers | tests | {"stray_light": self.stray_light, "profiles": profiles}

@@ -48,6 +48,15 @@ def test_equal_images_differ_by_nothing():
     assert comparison.z_test is None
 
 
+def test_stray_light_of_one_image_is_told():
+    power = np.array([[1.0, 2.0], [3.0, 4.0]])
+    clear, veiled = Image(power), Image(power, metadata={"veiling_glare": 0.02})
+    assert compare(clear, veiled).stray_light == "standard"
+    assert "only the calculated contains the stray light" in compare(veiled, clear).render_text()
+    assert compare(veiled, veiled).stray_light is None
+    assert "stray" not in compare(clear, clear).render_text()
+
+
 @pytest.mark.parametrize("scale", [1e-30, 1e-200, 1e200])
 def test_metrics_do_not_depend_on_the_scale_of_both(scale):
     comparison = compare(Image(CALCULATED.power * scale), Image(STANDARD.power * scale))
