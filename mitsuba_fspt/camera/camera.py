@@ -6,6 +6,7 @@ image. A line of sight runs from a point a of the lens plane through a point r_v
 
 from __future__ import annotations
 
+import math
 from copy import copy
 
 import drjit as dr
@@ -27,6 +28,7 @@ STRETCH = 1e-5  # deviation of a rotation's matrix from orthonormality that floa
 NOMINAL_NM = 600.0  # wavelength of the Airy disc where the lens has no filter
 CLEAR, MOST_CLEAR = 0.999, 0.9  # shares of the nearest depth of the scene and of u; rays start at the smaller product
 EPSILON = 2.0**-23  # float32's rounding error of a length, relative to the largest length it is computed from
+MOST_RIM = 16  # pixels around a film that are searched for silhouettes
 NO_FILTERS = Filters()
 
 
@@ -149,6 +151,12 @@ class Camera:
         whole = copy(self)
         whole.pupil = self.pupil.without_borders()
         return whole
+
+    @property
+    def pupil_reach(self) -> float:
+        """Largest distance from the axis at which lines of sight pass the lens plane, with a rim of the film [mm]."""
+        field = (0.5 * math.hypot(*self.film.size) + MOST_RIM) * self.virtual_pitch
+        return self.lens.pupil_radius + abs(self.lens.discs[0].shift) * field
 
     def reflected(self, point: NDArray[np.float64], normal: NDArray[np.float64]) -> Camera:
         """The camera's image in a mirror through this `point`, with this unit `normal`, both (3,).

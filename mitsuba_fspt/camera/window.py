@@ -12,15 +12,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import Camera
+from .camera import MOST_RIM, Camera
 
 Box = tuple[float, ...]  # x, y, z of the lowest and of the highest corner [mm]
 Boxes = tuple[Box, ...]
 Ends = NDArray[np.float64]
 Region = tuple[float, float, float, float]  # of the film: x, y of its lowest and of its highest corner [pixels]
 
-# Rim around the crop window that is searched for silhouettes: its width in blur radii, and the largest one in pixels.
-SEARCHED_RIM, MOST_RIM = 0.6, 16
+SEARCHED_RIM = 0.6  # blur radii around the crop window that are searched for silhouettes, up to `MOST_RIM`
 # Of a rectangle whose distorted image is bounded: points along each side, share of its size that is added, and the
 # largest rectangle, in sizes of the film beyond it.
 SIDE_POINTS, DISTORTED_MARGIN, FAR = 65, 1e-3, 1.0

@@ -92,7 +92,9 @@ class MeasuredVignetting:
             ratio, good = ratio / response.response, good & ~response.mask
         if not good.any():
             raise DetectorError("reduce: no pixel is usable in both flats. Give flats that do not saturate.")
-        shares, clipped = _scaled(_without_glare(ratio, good, uniform_screen(scene, shape), known.veiling_glare), good)
+        ratio = _without_glare(ratio, good, uniform_screen(scene, shape), known.veiling_glare)
+        good &= ratio > LEAST * np.median(ratio[good])
+        shares, clipped = _scaled(ratio, good)
         entries: Metadata = {
             "quantity": VIGNETTING,
             "unit": "1",

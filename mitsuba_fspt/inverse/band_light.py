@@ -16,7 +16,7 @@ from ..optics.light import Light
 from ..runtime.errors import InversionError, TransportError
 
 LOG = logging.getLogger("mitsuba_fspt")
-ALIKE = 1.0  # nm, between mean wavelengths of the same light, by rounding
+ALIKE = 5.0  # nm, between mean wavelengths of the same light by two cameras, from their measured curves
 FILTER = 10.0  # nm, from the light of a filter: half of its usual width, within which that is named by one wavelength
 FAR = 30.0  # nm, from a band's wavelength: more than between the ways to name the light of a filter, 40 nm wide
 

@@ -50,6 +50,13 @@ def is_shaded_smoothly(mesh: mi.Shape) -> bool:
     return mesh.class_name() != "Cube" and bool(mesh.has_vertex_normals())
 
 
+def vertex_normals(mesh: mi.Shape) -> NDArray[np.float64]:
+    """Normals (V, 3) at the vertices of a mesh; none, (0, 3), for one without."""
+    parameters = mi.traverse(mesh)
+    found = [flat(parameters[name]).numpy() for name in NORMALS if name in parameters]
+    return np.reshape(found[0] if found else [], (-1, 3)).astype(np.float64)
+
+
 def buffers(mesh: mi.Shape) -> tuple[mi.Float, mi.UInt32]:
     """Vertex positions (3 V,) [mm] and face indices (3 F,) of a mesh.
 

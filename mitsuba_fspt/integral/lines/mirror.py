@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .place import Place, Unplaced
 from .plane import Plane
+from .pose import Pose, Unlocated
 
 Array = NDArray[np.float64]
 
@@ -25,40 +25,43 @@ class Mirror:
 
     @property
     def corners(self) -> Array:
-        """As of `places.Deviating`."""
+        """As of `poses.Deviating`."""
         return np.concatenate([plane.corners for plane in self.planes])
 
-    def onward(self, place: Place, most: int, least: float) -> Iterator[Place | Unplaced]:
-        """As of `places.Deviating`."""
+    def onward(self, pose: Pose, most: int, least: float) -> Iterator[Pose | Unlocated]:
+        """As of `poses.Deviating`."""
         for plane in self.planes:
-            if (here := place.towards(plane.corners)) is None:
+            if (here := pose.towards(plane.corners)) is None:
                 continue
             share = 1.0
             if self.index is not None:
                 once = float(reflected_share(np.abs(here.cosines(plane)), self.index).max())
                 share = 2 * once / (1 + once)  # of both sides
-            yield here.reflected(plane, share)
+            seen = here.reflected(plane, share)
+            yield seen
+            if abs(float(plane.height(np.array(pose.camera.centre)))) < pose.camera.pupil_reach and seen.after:
+                yield replace(seen, after=replace(seen.after, normal=-seen.after.normal))  # for the rest of the pupil
 
-    def hides(self, place: Place, points: Array) -> bool:
-        """As of `places.Deviating`."""
-        return not self.through and any(place.meets(plane, points) for plane in self.planes)
+    def hides(self, pose: Pose, points: Array) -> bool:
+        """As of `poses.Deviating`."""
+        return not self.through and any(pose.meets(plane, points) for plane in self.planes)
 
 
 @dataclass(frozen=True, eq=False)
 class Untraced:
-    """A shape that deviates lines of sight to places that are not known: curved, or of many sides.
+    """A shape of which the poses are not known: curved, or of many sides.
 
     corners : of its box, (8, 3) [mm]
     """
 
     corners: Array
 
-    def onward(self, place: Place, most: int, least: float) -> Iterator[Place | Unplaced]:
-        """As of `places.Deviating`."""
-        yield from place.unplaced(self.corners)
+    def onward(self, pose: Pose, most: int, least: float) -> Iterator[Pose | Unlocated]:
+        """As of `poses.Deviating`."""
+        yield from pose.unlocated(self.corners)
 
-    def hides(self, place: Place, points: Array) -> bool:
-        """As of `places.Deviating`: not known."""
+    def hides(self, pose: Pose, points: Array) -> bool:
+        """As of `poses.Deviating`: not known."""
         return False
 
 

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from ...camera.camera import Camera
 from ...jit.mesh_buffers import corners_of_faces
 
-FLAT, ROUNDING = 1e-5, 1e-6  # of its size, and of its largest coordinate: how far a flat shape may leave its plane
+FLAT, ROUNDING = 1e-5, 1e-6  # of its size, and of its largest coordinate: how far points may leave their plane
 ALIKE = 0.02  # rad: largest angle between normals of faces of one plane, which are rounded
 MOST_PLANES = 8  # of one shape
-FILLED = 1e-5  # share of a rectangle that faces may leave free, by rounding
-MARGIN = 3e-5  # of the largest coordinate: height over a plane up to which a point counts as in the plane
 
 Array = NDArray[np.float64]
 
@@ -39,7 +37,8 @@ class Plane:
         if shape.class_name() == "Disk":
             matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
             corners = matrix[:3, 3] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ matrix[:3, :2].T
-            return (cls._around(corners, np.cross(matrix[:3, 0], matrix[:3, 1]), matrix[:3, :1].T, 0.0),)
+            normal = np.cross(matrix[:3, 0], matrix[:3, 1])
+            return (cls._around(corners[None], normal / np.linalg.norm(normal), matrix[:3, :1].T),)
         return cls._of_mesh(shape) if shape.is_mesh() else ()
 
     @classmethod
@@ -54,45 +53,53 @@ class Plane:
                 return ()
             largest = int(area.argmax())
             alike = (area > 0) & (normals @ normals[largest] >= math.cos(ALIKE) * area * area[largest])
-            normal = normals[alike].sum(axis=0)  # weighted by area: that of one small face is rounded
-            normal /= np.linalg.norm(normal)
-            point = corners[largest].mean(axis=0)
-            within = alike & (np.abs((corners - point) @ normal) <= least).all(axis=1)
+            normal, point = normals[largest] / area[largest], corners[largest].mean(axis=0)
+            # The normal of one small face is rounded: that of all faces near its plane, weighted by area, is not.
+            from_point = corners - point
+            turned = 2 * ROUNDING * np.abs(corners).max() / np.sqrt(area[largest]) * np.linalg.norm(from_point, axis=-1)
+            near = alike & (np.abs(from_point @ normal) <= least + turned).all(axis=1)
+            normal = normals[near].sum(axis=0) / np.linalg.norm(normals[near].sum(axis=0))
+            within = alike & (np.abs(from_point @ normal) <= least).all(axis=1)
             within[largest] = True
-            edges = corners[largest] - np.roll(corners[largest], 1, axis=0)
-            found.append(cls._around(corners[within].reshape(-1, 3), normal, edges, area[within].sum() / 2))
+            found.append(cls._around(corners[within], normal, corners[largest] - np.roll(corners[largest], 1, axis=0)))
             area = np.where(within, 0, area)
         return tuple(found)
 
     @classmethod
-    def _around(cls, points: Array, normal: Array, edges: Array, area: float) -> Plane:
-        """The plane with this normal, of any length, and points (n, 3) of faces with this `area`.
+    def _around(cls, faces: Array, normal: Array, edges: Array) -> Plane:
+        """The plane with this unit normal and the corners (F, m, 3) of its faces.
 
-        The rectangle has a side along one of the edges (m, 3), that of the smallest one.
+        The rectangle around these has a side along one of the edges (n, 3), that of the smallest one.
         """
-        normal, middle, smallest = normal / np.linalg.norm(normal), points.mean(axis=0), np.inf
+        points, smallest = faces.reshape(-1, 3), np.inf
+        middle = points.mean(axis=0)
         for edge in edges - (edges @ normal)[:, None] * normal:
             axes = np.array([edge, np.cross(normal, edge)]) / np.linalg.norm(edge)
             aside = (points - middle) @ axes.T
             (left, low), (right, high) = aside.min(axis=0), aside.max(axis=0)
             if (size := (right - left) * (high - low)) < smallest:
-                smallest, corners = size, np.array([[left, low], [right, low], [right, high], [left, high]]) @ axes
-        return cls(middle, normal, middle + corners, bool(area > (1 - FILLED) * smallest))
+                smallest, around = size, np.array([[left, low], [right, low], [right, high], [left, high]]) @ axes
+        return cls(middle, normal, middle + around, _are_halves(faces, middle + around))
 
     def height(self, points: Array) -> Array:
         """Heights [mm] of points (..., 3) over the plane, > 0 on the side that the normal points to."""
         return np.asarray((points - self.point) @ self.normal)
 
     def part_above(self, points: Array) -> Array:
-        """Corners (m, 3) of the part above the plane of what lies between points (n, 3); m = 0 if there is none."""
-        height = self.height(points)
-        least = MARGIN * np.abs(points).max()
-        above, below = points[height > least], points[height <= least]
-        from_above, from_below = height[height > least][:, None, None], height[height <= least][:, None]
+        """Corners (m, 3) of the part above the plane of what lies between points (n, 3).
+
+        m = 0 if there is none: what lies in the plane but for rounding is not above it.
+        """
+        height, rounding = self.height(points), ROUNDING * np.abs(points).max()
+        if not (height > rounding).any():
+            return points[:0]
+        is_above = height >= -rounding  # also what touches the plane
+        above, below = points[is_above], points[~is_above]
+        from_above, from_below = np.maximum(height[is_above], 0)[:, None, None], height[~is_above][:, None]
         crossed = above[:, None] + from_above / (from_above - from_below) * (below - above[:, None])
         return np.concatenate([above, crossed.reshape(-1, 3)])
 
-    def towards(self, camera: Camera) -> Plane:
+    def facing(self, camera: Camera) -> Plane:
         """The same plane with the normal on the side of a camera's lens centre."""
         return self if self.height(np.array(camera.centre)) >= 0 else replace(self, normal=-self.normal)
 
@@ -102,6 +109,16 @@ class Plane:
 
     def separates(self, camera: Camera, points: Array) -> bool:
         """True if the plane lies between the whole pupil and all these points (n, 3)."""
-        facing = self.towards(camera)
-        clear = facing.height(np.array(camera.centre)) > camera.lens.pupil_radius
+        facing = self.facing(camera)
+        clear = facing.height(np.array(camera.centre)) > camera.pupil_reach
         return bool(clear and (facing.height(points) < 0).all())
+
+
+def _are_halves(faces: Array, rectangle: Array) -> bool:
+    """True if faces (F, m, 3) are the two triangles on both sides of a diagonal of a rectangle (4, 3)."""
+    if faces.shape[:2] != (2, 3):
+        return False
+    rounding = FLAT * float(np.ptp(rectangle, axis=0).max())
+    apart = np.linalg.norm(faces[:, :, None] - rectangle, axis=-1)
+    at_corners = bool((apart.min(axis=-1) < rounding).all())
+    return at_corners and bool(np.abs(faces.mean(axis=1).sum(axis=0) - 2 * rectangle.mean(axis=0)).max() < rounding)

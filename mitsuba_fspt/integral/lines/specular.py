@@ -20,7 +20,7 @@ from ...camera.camera import Camera
 from ...camera.window import Box, corners_of
 from ...emission.face_table import shape_number
 from ...emission.of_emitter import surfaces_of
-from ...jit.mesh_buffers import box_of, is_shaded_smoothly
+from ...jit.mesh_buffers import box_of, is_shaded_smoothly, vertex_normals
 from ...jit.plugin_objects import made
 from ...jit.spectra import at_one_wavelength, scalar
 from ..quadrature import Quadrature
@@ -28,9 +28,10 @@ from .glass import Glass
 from .mirror import Mirror, Untraced, index_of
 from .nested_bsdfs import blended_parts
 from .occlusion import hidden, ray_to_lens
-from .places import Deviating
-from .plane import Plane
+from .plane import FLAT, Plane
+from .poses import Deviating
 
+Array = NDArray[np.float64]
 SMOOTHEST = 1e-4  # roughness below which Mitsuba's rough conductor has the lobe of this roughness: a mirror's
 ROUNDING = 2e-6  # of the largest coordinate: margin of a box
 FAINTER = 0.1  # least weight of courses with weaker lobes, where they are followed apart, over that of others
@@ -49,7 +50,7 @@ class Specular:
     names : ids of the shapes
     lobes : kinds of lobes that can lead to light, of 'null', 'transmission' and 'reflection'
     bending : boxes of the shapes that deviate lines of sight
-    deviating : the same shapes, with the places from which a camera looks straight at what they show
+    deviating : the same shapes, with the poses from which a camera looks straight at what they show
     bsdf : Dr.Jit's number of a shape's BSDF; 0 where lines of sight end
     parts : components of a shape's BSDF that are sampled one at a time; 0 for those of no blend
     most_parts : largest of `parts`
@@ -94,6 +95,10 @@ class Specular:
         if not (lobes or even_if_none):
             return None
         boxes = [_box(shape) for shape, _ in bent]
+        corners = [
+            np.concatenate([plane.corners for plane in sides]) if sides else corners_of([box])
+            for sides, box in zip(planes, boxes, strict=True)
+        ]
         count = 1 + max(map(shape_number, scene.shapes()))
         bsdf, parts = np.zeros((2, count), np.uint32)
         reach, lift = np.zeros((count, 6), np.float32), np.zeros(count, np.float32)
@@ -111,8 +116,10 @@ class Specular:
             tuple(name for name in DELTA if name in lobes) or ("null",),
             tuple(boxes),
             tuple(
-                _deviating(*pair, plane, box, [*glowing, *(other for other in boxes if other is not box)])
-                for pair, plane, box in zip(bent, planes, boxes, strict=True)
+                _deviating(
+                    *pair, plane, corners[k], [corners_of([box]) for box in glowing] + corners[:k] + corners[k + 1 :]
+                )
+                for k, (pair, plane) in enumerate(zip(bent, planes, strict=True))
             ),
             mi.UInt32(bsdf),
             mi.UInt32(parts),
@@ -197,16 +204,27 @@ def _around(boxes: Sequence[Box]) -> NDArray[np.float64]:
     return np.concatenate([ends[:, 0].min(axis=0) - margin, ends[:, 1].max(axis=0) + margin])
 
 
-def _deviating(shape: mi.Shape, bsdf: mi.BSDF, planes: tuple[Plane, ...], box: Box, others: Sequence[Box]) -> Deviating:
-    """A shape with these planes that deviates lines of sight; `others`: boxes of what may lie inside of it."""
-    corners = corners_of([box])
+def _deviating(
+    shape: mi.Shape, bsdf: mi.BSDF, planes: tuple[Plane, ...], corners: Array, others: Sequence[Array]
+) -> Deviating:
+    """A shape with these planes that lies between `corners` (n, 3) and deviates lines of sight.
+
+    others : points between which what may lie inside of it does
+    """
     if "transmission" in lobes_of(bsdf):
-        glass = Glass.of(shape, bsdf, planes, [corners_of([other]) for other in others])
-        return glass or Untraced(corners)
-    if not planes or (len(planes) > 1 and is_shaded_smoothly(shape)):
+        return Glass.of(shape, bsdf, planes, others) or Untraced(corners)
+    if not planes or _is_shaded_otherwise(shape, planes):
         return Untraced(corners)
     index = index_of(bsdf) if bsdf.class_name() == "ThinDielectric" else None
     return Mirror(planes, index, "null" in lobes_of(bsdf))
+
+
+def _is_shaded_otherwise(shape: mi.Shape, planes: tuple[Plane, ...]) -> bool:
+    """True if a shape reflects with other normals than those of its planes."""
+    if not shape.is_mesh() or not is_shaded_smoothly(shape):
+        return False
+    across = np.cross(vertex_normals(shape), planes[0].normal)
+    return len(planes) > 1 or bool((np.linalg.norm(across, axis=-1) > FLAT).any())
 
 
 def _separate(planes: tuple[Plane, ...], camera: Camera, glowing: Sequence[Box]) -> bool:

@@ -127,10 +127,11 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
 
 
 def most_narrow_light(points: Points | None) -> float:
-    """Largest light of narrow spots on a pixel, wherever it may lie [W/mm²/sr]."""
+    """Largest light of narrow spots on a pixel, wherever it may lie, and in focus there [W/mm²/sr]."""
     if points is None:
         return 0.0
     points = points[(points.area > 0) & (points.cosine > 0) & (points.radiance > 0)]
+    points = replace(points, signed_blur=np.zeros_like(points.x))
     light, level, most = points.light(), points.level(), 0.0
     for k in np.unique(level):
         here = level == k

@@ -1,22 +1,25 @@
 """Points all over the surfaces as a camera sees them: along straight lines, in mirrors, and through plates of glass.
 
-The camera sees them straight on from other places, one for each course over specular surfaces (Eq. M.19).
+The camera sees them straight on in other poses, one for each course over specular surfaces (Eq. M.19).
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...camera.window import Window, corners_of
+from ...camera.window import Region, Window, corners_of
 from ..lines.eq9 import View
-from ..lines.place import Place, Unplaced
-from ..lines.places import Places
+from ..lines.pose import Pose, Unlocated
+from ..lines.poses import Poses
 from ..lines.visible_window import glowing_boxes
 from .narrow import NarrowLight, Points, most_narrow_light, narrow_light, points_on_surfaces
+
+MOST_BOXES = 8  # of what glows, one by one; the box around more of them counts in their place
 
 Array = NDArray[np.float64]
 
@@ -25,16 +28,16 @@ Array = NDArray[np.float64]
 class SeenPoints:
     """Points all over the surfaces of a view's scene, as its camera sees them along `straight` lines and `elsewhere`.
 
-    elsewhere : as it sees them by specular surfaces, from other places, each with the courses that lead there; they
+    elsewhere : as it sees them by specular surfaces, from other poses, each with the courses that lead there; they
         include points that other bodies hide
-    unplaced : lines of sight that may see narrow spots in places that are not known, and the largest light of spots
+    unlocated : lines of sight in poses that are not known, which may see narrow spots, and the largest light of spots
         that face the camera [W/mm²/sr]
     """
 
     view: View
     straight: Points | None
-    elsewhere: tuple[tuple[Points, tuple[Place, ...]], ...] = ()
-    unplaced: tuple[tuple[Unplaced, ...], float] = ((), 0.0)
+    elsewhere: tuple[tuple[Points, tuple[Pose, ...]], ...] = ()
+    unlocated: tuple[tuple[Unlocated, ...], float] = ((), 0.0)
 
     @classmethod
     def of(cls, view: View) -> SeenPoints:
@@ -43,20 +46,22 @@ class SeenPoints:
         straight = points_on_surfaces(scene, camera, specular)
         if specular is None or straight is None:
             return cls(view, straight)
-        places = Places.of(
-            specular.deviating, camera, corners_of(glowing_boxes(scene)), specular.most, specular.faintest
-        )
-        seen, courses = list[tuple[Points, tuple[Place, ...]]](), dict[tuple[float, ...], list[Place]]()
-        for place in places.found:
-            courses.setdefault(place.where, []).append(place)
+        boxes = glowing_boxes(scene)
+        if len(boxes) > MOST_BOXES:
+            ends = corners_of(boxes)
+            boxes = ((*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist()),)
+        poses = Poses.of(specular.deviating, camera, corners_of(boxes), specular.most, specular.faintest)
+        seen, courses = list[tuple[Points, tuple[Pose, ...]]](), dict[tuple[float, ...], list[Pose]]()
+        for pose in poses.found:
+            courses.setdefault(pose.where, []).append(pose)
         for same in courses.values():
             if (points := points_on_surfaces(scene, same[0].camera, hidden=False)) is not None:
                 seen.append((points[(points.area > 0) & (points.cosine > 0)], tuple(same)))
-        most = most_narrow_light(points_on_surfaces(scene, camera, hidden=False)) if places.unplaced else 0.0
-        return cls(view, straight, tuple(seen), (places.unplaced, most))
+        most = most_narrow_light(points_on_surfaces(scene, camera, hidden=False)) if poses.unlocated else 0.0
+        return cls(view, straight, tuple(seen), (poses.unlocated, most))
 
     def narrow_light(self, window: Window) -> tuple[NarrowLight, NarrowLight, Array]:
-        """Light of narrow spots on the pixels of a window: along straight lines, elsewhere, and, with places that are
+        """Light of narrow spots on the pixels of a window: along straight lines, elsewhere, and, in poses that are
         not known, at the most on each pixel (h, w) [W/mm²/sr].
 
         That elsewhere has neither `in_focus` nor `brightest`.
@@ -65,13 +70,16 @@ class SeenPoints:
         for points, courses in self.elsewhere:
             share = _share(courses, window).clip(max=1)
             elsewhere = elsewhere.plus(narrow_light(points, window).times(share))
-        lines, most = self.unplaced
+        lines, most = self.unlocated
         return straight, elsewhere, most * _share(lines, window).clip(max=1)
 
 
-def _share(courses: Sequence[Place | Unplaced], window: Window) -> Array:
+def _share(courses: Sequence[Pose | Unlocated], window: Window) -> Array:
     """Sum of the shares of courses on each pixel of a window, (h, w)."""
+    shares: dict[Region, float] = defaultdict(float)
     share = np.zeros(window.shape)
     for course in courses:
-        share += course.share * window.within(course.region)
+        shares[course.region] += course.share
+    for region, its in shares.items():
+        share += its * window.within(region)
     return share

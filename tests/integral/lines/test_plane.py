@@ -12,6 +12,16 @@ from mitsuba_fspt.integral.lines.plane import Plane
 pytestmark = pytest.mark.usefixtures("mono")
 
 
+def mesh_of(points, faces):
+    """A mesh of points (V, 3) and faces (F, 3)."""
+    mesh = mi.Mesh("mesh", len(points), len(faces))
+    values = mi.traverse(mesh)
+    values["vertex_positions"] = mi.Float(points.astype(np.float32).ravel())
+    values["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+    values.update()
+    return mesh
+
+
 def test_planes_of_a_mesh_are_told_apart(mono):
     """As of mirrors that Mitsuba merges into one mesh when it loads a dictionary."""
     cube = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale([1, 2, 3])})
@@ -38,13 +48,7 @@ def test_a_fine_mesh_far_from_the_origin_is_one_plane(mono):
     faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     for count in (1, 2):
         places = np.concatenate([points + np.array([0, 0, 60 * k]) for k in range(count)]) @ turn.T
-        mesh = mi.Mesh("plane", len(places), count * len(faces))
-        values = mi.traverse(mesh)
-        values["vertex_positions"] = mi.Float(places.astype(np.float32).ravel())
-        corners = np.concatenate([faces + k * x.size for k in range(count)])
-        values["faces"] = mi.UInt32(corners.astype(np.uint32).ravel())
-        values.update()
-        planes = Plane.of(mesh)
+        planes = Plane.of(mesh_of(places, np.concatenate([faces + k * x.size for k in range(count)])))
         assert len(planes) == count
         assert all(abs(plane.normal @ turn[:, 2]) == pytest.approx(1, abs=1e-9) for plane in planes)
 
@@ -62,3 +66,28 @@ def test_the_part_of_a_triangle_above_a_plane():
     part = level.part_above(np.array([[0.0, 0, 3], [0, 0, -1], [4, 0, -1]]))
     assert sorted(part.round(9).tolist()) == [[0, 0, 0], [0, 0, 3], [3, 0, 0]]
     assert len(level.part_above(np.array([[0.0, 0, 0], [1, 0, -1]]))) == 0
+
+
+def test_facets_of_similar_directions_have_their_own_normals(mono):
+    """Of 45° and 46°, in one mesh. Seen to fail with the mean of both for one of them."""
+    square = 10 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    corners = []
+    for degrees in (45, 46):
+        turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0])[:3, :3]
+        corners.append(square @ turn.T + [21.0 * (degrees - 45), 0, 0])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    planes = Plane.of(mesh_of(np.concatenate(corners), np.concatenate([faces, faces + 4])))
+    found = sorted(round(float(np.degrees(np.arctan2(plane.normal[0], plane.normal[2]))), 4) for plane in planes)
+    assert found == [45.0, 46.0]
+    assert all(plane.filled for plane in planes)
+
+
+def test_bars_that_overlap_fill_no_frame(mono):
+    """Four bars around an opening, as wide in all as the square. Seen to fail by the sum of their areas."""
+    bars = [(-8, 8, -8, -4), (-8, 8, 4, 8), (-8, -4, -8, 8), (4, 8, -8, 8)]
+    points = np.array([[x, y, 0.0] for a, b, c, d in bars for x, y in ((a, c), (b, c), (b, d), (a, d))])
+    faces = np.array(
+        [[4 * k, 4 * k + 1, 4 * k + 2] for k in range(4)] + [[4 * k, 4 * k + 2, 4 * k + 3] for k in range(4)]
+    )
+    (frame,) = Plane.of(mesh_of(points, faces))
+    assert not frame.filled
