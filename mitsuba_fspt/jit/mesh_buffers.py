@@ -50,7 +50,7 @@ def is_shaded_smoothly(mesh: mi.Shape) -> bool:
     return mesh.class_name() != "Cube" and bool(mesh.has_vertex_normals())
 
 
-def vertex_normals(mesh: mi.Shape) -> NDArray[np.float64]:
+def shading_normals(mesh: mi.Shape) -> NDArray[np.float64]:
     """Normals (V, 3) at the vertices of a mesh; none, (0, 3), for one without."""
     parameters = mi.traverse(mesh)
     found = [flat(parameters[name]).numpy() for name in NORMALS if name in parameters]

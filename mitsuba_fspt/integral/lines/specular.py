@@ -20,7 +20,7 @@ from ...camera.camera import Camera
 from ...camera.window import Box, corners_of
 from ...emission.face_table import shape_number
 from ...emission.of_emitter import surfaces_of
-from ...jit.mesh_buffers import box_of, is_shaded_smoothly, vertex_normals
+from ...jit.mesh_buffers import box_of, is_shaded_smoothly, shading_normals
 from ...jit.plugin_objects import made
 from ...jit.spectra import at_one_wavelength, scalar
 from ..quadrature import Quadrature
@@ -223,7 +223,7 @@ def _is_shaded_otherwise(shape: mi.Shape, planes: tuple[Plane, ...]) -> bool:
     """True if a shape reflects with other normals than those of its planes."""
     if not shape.is_mesh() or not is_shaded_smoothly(shape):
         return False
-    across = np.cross(vertex_normals(shape), planes[0].normal)
+    across = np.cross(shading_normals(shape), planes[0].normal)
     return len(planes) > 1 or bool((np.linalg.norm(across, axis=-1) > FLAT).any())
 
 
