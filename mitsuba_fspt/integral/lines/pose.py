@@ -112,7 +112,8 @@ class Pose:
             return False
         sides = plane.corners[[1, 3]] - plane.corners[0]
         along = (crossing - plane.corners[0]) @ sides.T / (sides**2).sum(axis=1)
-        return bool((along >= 0).all() and (along <= 1).all())
+        rim = self.misplaced / np.linalg.norm(sides, axis=1)
+        return bool((along >= rim).all() and (along <= 1 - rim).all())
 
     def cosines(self, plane: Plane) -> Array:
         """Of lines of sight all over the region to the normal of a plane, of either sign, (n,)."""
