@@ -725,6 +725,13 @@ MUTANTS = (
         ("tests/inverse/test_calibrate.py",),
     ),
     Mutant(
+        "lengths of the columns in damped steps",
+        "inverse/damped_steps.py",
+        "return scaled / self.lengths, float(",
+        "return scaled, float(",
+        ("tests/inverse/test_damped_steps.py",),
+    ),
+    Mutant(
         "correction along transects",
         "integral/pupil/transects.py",
         "if count >= MANY:",

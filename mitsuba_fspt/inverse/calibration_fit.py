@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from ..runtime.errors import InversionError
 from .common_noise import beyond_independent
+from .damped_steps import DampedSteps, LinearFit
 from .measurement import Chi2, Noise
 
 Array = NDArray[np.float64]
@@ -35,11 +36,10 @@ class CalibrationSettings:
         1e-4, and in proportion to rtol^½. The slopes are then right to about 0.5 %, half of it from the images and
         half from the step; at an rtol of 1e-3 to 3 %.
     chi2 : change of Σ (residual/σ)² at which the fit ends: 1e-2 leaves parameters within 0.1 of their sd
-    reweighted : relative change of the standard deviations, root mean square, at which they count as converged
     nearby : steps of the differences within which slopes are taken again; they then belong to an image that differs by
         less than half of `change`
-    rounds : most rounds of standard deviations and slopes;  evaluations : most images of a round beside those of slopes
-    reach : of the first step of the fit, in steps of the differences: 20 of them change an image by a tenth
+    steps : most steps of the fit
+    reach : of its first step, in steps of the differences: 20 of them change an image by a tenth
     condition : of the Jacobian with columns of length 1, above which parameters count as not determined separately: the
         combination that is least determined then has a standard deviation so many times that of each parameter alone
     doubtful : share of its slope by which a combination's slope may change with a doubled step. Above it the standard
@@ -50,10 +50,8 @@ class CalibrationSettings:
     rtols: tuple[float, float] = (1e-4, 1e-3)
     change: float = 5e-3
     chi2: float = 1e-2
-    reweighted: float = 1e-3
     nearby: float = 0.5
-    rounds: int = 8
-    evaluations: int = 40
+    steps: int = 40
     reach: float = 20.0
     condition: float = 1e3
     doubtful: float = 0.3
@@ -113,14 +111,6 @@ class Fitted:
     condition: float
 
 
-class _AtMinimum(Exception):
-    """Ends the search at y (p,)."""
-
-    def __init__(self, y: Array) -> None:
-        self.y = np.array(y, np.float64)
-        super().__init__()
-
-
 @dataclass(frozen=True, eq=False)
 class Slopes:
     """Slopes [W] of the images by y, (views, h, w, p), at `y` (p,), where the images are `power`.
@@ -163,20 +153,11 @@ class CalibrationFit:
 
     def solved(self) -> Fitted:
         """Minimum of Σ (residual/σ)², with σ of its own image."""
-        y = np.zeros(len(self.start))
-        image, numerical = self._images(self.start)
-        self._steps = self._chosen_steps(image)
-        sigma = self.measured.sigma(image, numerical)
-        self._require_determined(y, sigma)
-        for _ in range(self.settings.rounds):
-            y = self._minimum(y, sigma)
-            image, numerical = self._images(self._values(y))
-            before, sigma = sigma, self.measured.sigma(image, numerical)
-            known = self._are_measured(y)
-            if known and np.sqrt(np.mean((sigma / before - 1) ** 2)) < self.settings.reweighted:
-                break
-            self._slopes(y, sigma)
-        slopes, condition = self._require_determined(y, sigma)
+        self._steps = self._chosen_steps(self._images(self.start)[0])
+        self._require_determined(np.zeros(len(self.start)))
+        y = self._minimum()
+        image, sigma = self._weighted(y)
+        slopes, condition = self._require_determined(y)
         used = self.measured.used
         residual = ((image - self.measured.power) / sigma)[used]
         noise = self.measured.noise.chi2(image, sigma, used)
@@ -192,48 +173,42 @@ class CalibrationFit:
     def _values(self, y: Array) -> Array:
         return self.start + self._steps * y
 
-    def _minimum(self, y: Array, sigma: Array) -> Array:
-        """y (p,) of the minimum for these standard deviations."""
-        try:
-            found = least_squares(
-                lambda x: self._residual(x, sigma),
-                y,
-                lambda x: self._slopes_beyond(x, sigma),
-                x_scale=self.settings.reach,
-                ftol=self.settings.chi2 / max(int(self.measured.used.sum()), 1),
-                xtol=1e-6,
-                gtol=None,
-                max_nfev=self.settings.evaluations,
-            )
-        except _AtMinimum as reached:
-            return reached.y
-        if found.status == 0:
-            values = zip(self.names, self._values(found.x), strict=True)
-            shown = ", ".join(f"{name} = {value:.6g}" for name, value in values)
-            raise InversionError(
-                f"calibrate: the fit has not ended after {self.settings.evaluations} images, at {shown}. Start "
-                "nearer, with other <default> values."
-            )
-        return np.asarray(found.x, np.float64)
+    def _weighted(self, y: Array) -> tuple[Array, Array]:
+        """Images at y [W] and the standard deviations of the pixels by them [W], (views, h, w)."""
+        image, numerical = self._images(self._values(y))
+        return image, self.measured.sigma(image, numerical)
 
-    def _residual(self, y: Array, sigma: Array) -> Array:
-        return np.asarray(((self._power(y) - self.measured.power) / sigma)[self.measured.used])
+    def _minimum(self) -> Array:
+        """y (p,) of the minimum; slopes are then measured there or nearby.
 
-    def _slopes_beyond(self, y: Array, sigma: Array) -> Array:
-        """Slopes at y; raises _AtMinimum where no step lowers Σ (residual/σ)² by more than the fit's end.
-
-        Of a smaller change the errors of the images would be the larger part, and the search only tries ever shorter
-        steps. With secants for slopes the search ends after its first short step, for measured slopes to go on with.
+        Of a fall of Σ (residual/σ)² below the fit's end the errors of the images would be the larger part.
         """
-        if self._is_near(y) and not self._kept.measured:
-            raise _AtMinimum(y)
-        if not self._is_near(y):
-            self._kept = self._kept.at(y, self._power(y))
-        slopes, residual = self._whitened(sigma), self._residual(y, sigma)
-        step = np.linalg.lstsq(slopes, residual)[0]
-        if np.sum((slopes @ step) ** 2) <= self.settings.chi2:
-            raise _AtMinimum(y)
-        return slopes
+        y, damped = np.zeros(len(self.start)), DampedSteps(self.settings.chi2, longest=self.settings.reach)
+        for _ in range(self.settings.steps):
+            image, sigma = self._weighted(y)
+            linear = LinearFit.of(self._whitened(sigma), self._residual(image, sigma))
+            nearer = damped.lower(linear, partial(self._nearer, y, sigma))
+            if nearer is not None:
+                y = nearer
+                self._follow(y)
+            elif self._are_measured(y):
+                return y
+            else:
+                self._measure(y)
+        shown = ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.names, self._values(y), strict=True))
+        raise InversionError(
+            f"calibrate: the fit has not ended after {self.settings.steps} steps, at {shown}. Start nearer, with other "
+            "<default> values."
+        )
+
+    def _nearer(self, y: Array, sigma: Array, step: Array) -> Array | None:
+        """y + step if Σ (residual/σ)² is less there than at y."""
+        before, after = (np.sum(self._residual(self._power(one), sigma) ** 2) for one in (y, y + step))
+        return y + step if after < before else None
+
+    def _residual(self, image: Array, sigma: Array) -> Array:
+        """(pixels that count,) measured − fitted power, in standard deviations."""
+        return np.asarray(((self.measured.power - image) / sigma)[self.measured.used])
 
     def _power(self, y: Array) -> Array:
         return self._images(self._values(y))[0]
@@ -246,15 +221,20 @@ class CalibrationFit:
         """True where y is so near the place of the slopes that are kept that these are taken again."""
         return bool(np.abs(self._kept.y - y).max() <= self.settings.nearby)
 
-    def _slopes(self, y: Array, sigma: Array) -> Array:
-        """(pixels that count, p) of residuals: differences a step to both sides; those of a point nearby if there."""
-        if not self._are_measured(y):
-            slopes = np.stack([self._slope(y, one) for one in np.eye(len(y))], axis=-1)
-            self._kept = Slopes(y.copy(), self._power(y), slopes, True)
-        return self._whitened(sigma)
+    def _follow(self, y: Array) -> None:
+        """Slopes at y after a step: by the secant, but after a short step from a secant measured."""
+        if not self._is_near(y):
+            self._kept = self._kept.at(y, self._power(y))
+        elif not self._kept.measured:
+            self._measure(y)
+
+    def _measure(self, y: Array) -> None:
+        """Slopes by differences a step to both sides of y."""
+        slopes = np.stack([self._slope(y, one) for one in np.eye(len(y))], axis=-1)
+        self._kept = Slopes(y.copy(), self._power(y), slopes, True)
 
     def _whitened(self, sigma: Array) -> Array:
-        """(pixels that count, p) slopes of residuals: those that are kept, in standard deviations."""
+        """(pixels that count, p) slopes of the fitted power: those that are kept, in standard deviations."""
         return (self._kept.slopes / sigma[..., None])[self.measured.used]
 
     def _slope(self, y: Array, way: Array, length: float = 1.0) -> Array:
@@ -283,9 +263,12 @@ class CalibrationFit:
             steps[k] = step
         return steps
 
-    def _require_determined(self, y: Array, sigma: Array) -> tuple[Array, float]:
+    def _require_determined(self, y: Array) -> tuple[Array, float]:
         """Slopes and condition number of the Jacobian; UndeterminedError with the combinations that stay free."""
-        slopes = self._slopes(y, sigma)
+        if not self._are_measured(y):
+            self._measure(y)
+        sigma = self._weighted(y)[1]
+        slopes = self._whitened(sigma)
         lengths = np.linalg.norm(slopes, axis=0)
         for name, length in zip(self.names, lengths, strict=True):
             if not length > 0:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -24,6 +25,7 @@ from ..runtime.numbers import number
 from ..runtime.progress_bar import Progress
 from .band_images import BandImages, of_each
 from .common_noise import CommonNoise, beyond_independent, joined, squared_correlations
+from .damped_steps import DampedSteps, LinearFit
 from .measurement import Chi2
 from .patterns import Patterns, Seen, views_of
 from .sensitivity_picture import view_labels
@@ -40,13 +42,13 @@ class LocationSettings:
 
     chi2 : fall of Σ (residual/σ)² by a step at which the fit ends: 1e-2 leaves parameters within 0.1 of their sd
     step : of the differences for slopes, over the edge of the tetrahedra; the slopes are right to about 1 %
-    steps : most accepted steps;  damping, least : first and least factor of Levenberg and Marquardt
+    steps : most accepted steps
     flat, patience : fall of Σ (residual/σ)² below which a step counts as one along a valley, and steps in a row after
         which the fit ends there: the images do not determine the place along it, which the intervals and p-values say;
         steps that only the border of the tissue shortens lead to no minimum inside
     model_error : factor of the stated error of SP3 or diffusion (Eq. M.51); 0: images made with the same equation
     chance : p-value of a source above which a warning says that noise alone may look like it
-    stuck : factor of damping at which no step is left: the minimum is at the border, or beyond
+    stuck : share of `chi2` below which no step is tried: the minimum is at the border, or beyond
     apart : least singular value of the slopes with columns of length 1, over the largest; below it sources count as not
         determined separately
     """
@@ -54,13 +56,11 @@ class LocationSettings:
     chi2: float = 1e-2
     step: float = 0.01
     steps: int = 40
-    damping: float = 1e-3
-    least: float = 1e-9
     flat: float = 0.5
     patience: int = 3
     model_error: float = 1.0
     chance: float = 1e-3
-    stuck: float = 1e8
+    stuck: float = 1e-2
     apart: float = 1e-3
 
     def __post_init__(self) -> None:
@@ -283,7 +283,7 @@ class SourceFit:
 
         radii : (K,) of spheres [mm]; points if not given
         """
-        settings, damping = self.settings, self.settings.damping
+        settings, damped = self.settings, DampedSteps(self.settings.stuck * self.settings.chi2)
         even = np.concatenate([band.flat_sigma() for band in self.bands])
         radii = np.zeros(len(positions)) if radii is None else radii
         found, _ = self._tried(positions, radii, PixelNoise(even, np.zeros_like(even), self.view), np.inf)
@@ -295,20 +295,13 @@ class SourceFit:
             found = self._weighted(found, self._noise(found))
             if not (found.powers > 0).all():  # no image tells the position of a source without power
                 break
-            slopes = found.slopes
-            lengths = np.linalg.norm(slopes, axis=0)
-            normal = slopes.T @ slopes / np.outer(lengths, lengths)
-            right = slopes.T @ found.residual(self._target) / lengths
-            if flat == settings.patience or right @ np.linalg.lstsq(normal, right)[0] < settings.chi2:
+            linear = LinearFit.of(found.slopes, found.residual(self._target))
+            if flat == settings.patience or linear.fall < settings.chi2:
                 return found
-            tried, border = None, False
-            while tried is None and damping < settings.stuck:
-                moved = np.linalg.solve(normal + damping * np.eye(len(normal)), right) / lengths
-                tried, inside = self._tried(positions + moved.reshape(-1, 4)[:, :3], radii, found.noise, found.cost)
-                border |= not inside
-                damping *= 10 if tried is None else 0.1
+            inside = list[bool]()  # of each attempt
+            tried = damped.lower(linear, partial(self._moved, found, inside))
             flat = flat + 1 if tried is not None and found.cost - tried.cost < settings.flat else 0
-            found, damping = tried, max(damping, settings.least)
+            found, border = tried, not all(inside)
         shown = "; ".join(f"({', '.join(f'{x:.4g}' for x in position)})" for position in positions)
         raise InversionError(
             f"locate: the fit does not end with sources inside the tissue; the last positions are {shown} mm. Give "
@@ -396,6 +389,13 @@ class SourceFit:
         """(N,) residual over the σ of `found` for other `values` (4K,); raises FluxError as `BandImages.exitance`."""
         positions, powers = values.reshape(-1, 4)[:, :3], values.reshape(-1, 4)[:, 3]
         return found.noise.over(self._target - self._images(positions, found.radii)[1] @ powers)
+
+    def _moved(self, found: PointSources, inside: list[bool], step: Array) -> PointSources | None:
+        """Sources a step (4K,) of the `values` on, if they fit better; `inside` gets whether they are in the tissue."""
+        positions = found.positions + step.reshape(-1, 4)[:, :3]
+        tried, is_inside = self._tried(positions, found.radii, found.noise, found.cost)
+        inside.append(is_inside)
+        return tried
 
     def _tried(
         self, positions: Array, radii: Array, noise: PixelNoise, below: float

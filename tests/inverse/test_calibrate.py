@@ -153,9 +153,9 @@ def test_each_sign_of_a_degenerate_set_counts(apart, rough):
 
 
 def test_slopes_are_measured_at_both_ends_of_the_search_alone():
-    """Three numbers of a curved image, far away: they come back within 0.2 sd, from 26 images.
+    """Three numbers of a curved image, far away: they come back within 0.2 sd, from 25 images.
 
-    Seen to fail (48 images) with slopes measured at every step.
+    Seen to fail (42 images) with slopes measured at every step.
     """
     y, x = np.mgrid[:12, :12] / 6 - 1
     seen = []

@@ -1,0 +1,75 @@
+"""Damped steps to the least Σ r², r residuals over their σ, by the method of Levenberg and Marquardt.
+
+    (NᵀN + λ 1) s' = Nᵀ r,   N the slopes with columns of length 1,   s = s'/lengths
+
+`SourceFit` and `CalibrationFit` take such steps with the σ of where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """Least squares about the present values, in steps times the lengths (p,) of the slopes.
+
+    normal : (p, p) NᵀN;  right : (p,) Nᵀ r
+    """
+
+    lengths: Array
+    normal: Array
+    right: Array
+
+    @classmethod
+    def of(cls, slopes: Array, residual: Array) -> LinearFit:
+        """From the changes (N, p) of the fitted values and the residuals (N,), measured − fitted, both over σ."""
+        lengths = np.linalg.norm(slopes, axis=0)
+        normal = slopes.T @ slopes / np.outer(lengths, lengths)
+        return cls(lengths, normal, slopes.T @ residual / lengths)
+
+    @property
+    def fall(self) -> float:
+        """Fall of Σ r² by the step without damping."""
+        return float(self.right @ np.linalg.lstsq(self.normal, self.right)[0])
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """Change (p,) of the values by the step with λ = `damping`, and the fall of Σ r² by it."""
+        scaled = np.linalg.solve(self.normal + damping * np.eye(len(self.normal)), self.right)
+        return scaled / self.lengths, float(scaled @ (2 * self.right - self.normal @ scaled))
+
+
+class DampedSteps:
+    """Steps each of which lowers Σ r², with a λ that follows their success.
+
+    end : fall of Σ r² for which no step is tried
+    longest : of the changes of values by the first step
+    damping, least : first and least λ
+    """
+
+    def __init__(self, end: float, longest: float = np.inf, damping: float = 1e-3, least: float = 1e-9) -> None:
+        self._end, self._longest, self._first, self._least = end, longest, damping, least
+        self._damping = damping
+
+    def lower(self, linear: LinearFit, attempt: Callable[[Array], T | None]) -> T | None:
+        """What `attempt` makes of the longest step (p,) for which it is not None; None where no step is left.
+
+        λ rises tenfold after each step that fails, and falls tenfold after one that does not.
+        """
+        while True:
+            step, fall = linear.step(self._damping)
+            if fall <= self._end:
+                self._damping = self._first
+                return None
+            if np.abs(step).max() <= self._longest and (found := attempt(step)) is not None:
+                self._damping, self._longest = max(0.1 * self._damping, self._least), np.inf
+                return found
+            self._damping *= 10

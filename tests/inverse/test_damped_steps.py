@@ -1,0 +1,76 @@
+"""Steps of Levenberg and Marquardt: they lead to a minimum in a curved valley, and end where none is left."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsuba_fspt.inverse.damped_steps import DampedSteps, LinearFit
+
+
+def residual(at):
+    """Of Rosenbrock's valley, whose minimum is 0 at (1, 1)."""
+    return np.array([10 * (at[0] ** 2 - at[1]), at[0] - 1])
+
+
+def slopes(at):
+    """Minus the derivatives of the residuals: the changes of what is fitted."""
+    return -np.array([[20 * at[0], -10.0], [1.0, 0.0]])
+
+
+def test_steps_lead_along_a_curved_valley():
+    """From (-1.2, 1) to (1, 1), with columns whose lengths differ by 24; each step lowers the sum.
+
+    Seen to fail with a λ that never falls (100 steps).
+    """
+    at, damped, sums = np.array([-1.2, 1.0]), DampedSteps(1e-20), []
+
+    def lower(step):
+        there = at + step
+        return there if np.sum(residual(there) ** 2) < np.sum(residual(at) ** 2) else None
+
+    while (nearer := damped.lower(LinearFit.of(slopes(at), residual(at)), lower)) is not None and len(sums) < 100:
+        at = nearer
+        sums.append(np.sum(residual(at) ** 2))
+    np.testing.assert_allclose(at, 1, atol=1e-8)
+    assert len(sums) < 40
+
+
+def test_fall_and_step_of_linear_slopes():
+    """The step without damping is that of least squares, and the falls are those of the sum of squares."""
+    rng = np.random.default_rng(1)
+    matrix, measured = rng.normal(size=(9, 3)) * [1, 100, 0.01], rng.normal(size=9)
+    linear = LinearFit.of(matrix, measured)
+    best = np.linalg.lstsq(matrix, measured)[0]
+    for damping, expected in ((0.0, best), (0.3, None)):
+        step, fall = linear.step(damping)
+        left = measured - matrix @ step
+        assert fall == pytest.approx(measured @ measured - left @ left)
+        if expected is not None:
+            np.testing.assert_allclose(step, expected)
+            assert linear.fall == pytest.approx(fall)
+
+
+def test_no_step_is_left_where_none_succeeds():
+    """λ rises until a step would lower the sum by no more than `end`; the next steps start with the first λ again."""
+    seen = list[float]()
+
+    def never(step):
+        seen.append(float(np.abs(step).max()))
+
+    linear, damped = LinearFit.of(np.eye(2), np.array([3.0, 4.0])), DampedSteps(0.01)
+    assert damped.lower(linear, never) is None
+    assert linear.step(1e-3 * 10 ** (len(seen) - 1))[1] > 0.01 >= linear.step(1e-3 * 10 ** len(seen))[1]
+    assert seen == sorted(seen, reverse=True)
+    assert seen[0] == pytest.approx(4, rel=2e-3)
+    assert damped.lower(linear, lambda step: step) == pytest.approx([3, 4], rel=2e-3)
+
+
+def test_the_first_step_alone_is_bounded():
+    """10 sd away with `longest` 1: the first step is at most 1 long, the second goes as far as the slopes say."""
+    damped = DampedSteps(1e-9, longest=1.0)
+    linear = LinearFit.of(np.eye(1), np.array([10.0]))
+    first = damped.lower(linear, lambda step: step)
+    assert 0.05 < first[0] <= 1
+    second = damped.lower(linear, lambda step: step)
+    assert second[0] > first[0]
