@@ -17,13 +17,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.errors import InversionError
+from ..runtime.errors import ExitanceError, InversionError, OpticsError, SceneError
 from .common_noise import beyond_independent
 from .damped_steps import DampedSteps, LinearFit
 from .measurement import Chi2, Noise
 
 Array = NDArray[np.float64]
 Images = Callable[[Array], tuple[Array, Array]]
+REFUSALS = (ExitanceError, OpticsError, SceneError)  # of values for which there is no image, such as f_number = -1
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,8 @@ class Slopes:
 class CalibrationFit:
     """Fit of parameters `names` to what was `measured`.
 
-    images : values (p,) → power and numerical error, (views, h, w) [W];  start : (p,) values
+    images : values (p,) → power and numerical error, (views, h, w) [W]; raises one of `REFUSALS` for values without
+    start : (p,) values
 
     Inside, y (p,) are the distances from the start in units of the steps of the differences.
     """
@@ -150,6 +152,7 @@ class CalibrationFit:
         self._images = images
         self._steps = np.ones(len(start))
         self._kept = Slopes(np.full(len(start), np.inf), np.empty(0), np.empty(0), False)  # of no place
+        self._refusal: Exception | None = None  # of the last step that was tried to values without an image
 
     def solved(self) -> Fitted:
         """Minimum of Σ (residual/σ)², with σ of its own image."""
@@ -181,17 +184,21 @@ class CalibrationFit:
     def _minimum(self) -> Array:
         """y (p,) of the minimum; slopes are then measured there or nearby.
 
-        Of a fall of Σ (residual/σ)² below the fit's end the errors of the images would be the larger part.
+        Of a fall of Σ (residual/σ)² below the fit's end the errors of the images would be the larger part. Steps to
+        values without an image are made shorter; where no other leads on, the error of these values is raised.
         """
         y, damped = np.zeros(len(self.start)), DampedSteps(self.settings.chi2, longest=self.settings.reach)
         for _ in range(self.settings.steps):
             image, sigma = self._weighted(y)
             linear = LinearFit.of(self._whitened(sigma), self._residual(image, sigma))
+            self._refusal = None
             nearer = damped.lower(linear, partial(self._nearer, y, sigma))
             if nearer is not None:
                 y = nearer
                 self._follow(y)
             elif self._are_measured(y):
+                if self._refusal is not None:
+                    raise self._refusal
                 return y
             else:
                 self._measure(y)
@@ -202,8 +209,12 @@ class CalibrationFit:
         )
 
     def _nearer(self, y: Array, sigma: Array, step: Array) -> Array | None:
-        """y + step if Σ (residual/σ)² is less there than at y."""
-        before, after = (np.sum(self._residual(self._power(one), sigma) ** 2) for one in (y, y + step))
+        """y + step if there is an image and Σ (residual/σ)² is less than at y."""
+        try:
+            before, after = (np.sum(self._residual(self._power(one), sigma) ** 2) for one in (y, y + step))
+        except REFUSALS as refusal:
+            self._refusal = refusal
+            return None
         return y + step if after < before else None
 
     def _residual(self, image: Array, sigma: Array) -> Array:

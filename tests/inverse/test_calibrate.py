@@ -15,7 +15,7 @@ from mitsuba_fspt.inverse import calibrate
 from mitsuba_fspt.inverse.calibration_fit import CalibrationFit, CalibrationSettings, Measured, UndeterminedError
 from mitsuba_fspt.inverse.measurement import Noise, sampling_variance
 from mitsuba_fspt.rendering import live_scene
-from mitsuba_fspt.runtime.errors import FsptError, InversionError
+from mitsuba_fspt.runtime.errors import FsptError, InversionError, OpticsError
 
 COARSE = CalibrationSettings(rtol=3e-3)  # a third of the noise of `noisy`: half the time, and slopes right to 5 %
 
@@ -174,6 +174,44 @@ def test_slopes_are_measured_at_both_ends_of_the_search_alone():
     found = CalibrationFit(("a", "b", "c"), np.array([-0.2, 0.3, 2.0]), data, pictures, settings).solved()
     assert (np.abs(found.values - true) < 0.2 * np.sqrt(np.diag(found.covariance))).all()
     assert len(set(seen)) <= 30
+
+
+def test_steps_to_values_that_a_scene_refuses_are_made_shorter():
+    """From f/8 to f/0.5 of images in proportion to 1/N²: straight slopes lead to N < 0.
+
+    Seen to fail: the error of the first such step.
+    """
+    screen = np.linspace(1, 2, 16).reshape(1, 4, 4)
+
+    def pictures(values):
+        if not values[0] > 0:
+            raise OpticsError("f_number must be > 0")
+        return screen / values[0] ** 2, np.zeros_like(screen)
+
+    noise = Noise(np.zeros_like(screen), np.full(screen.shape, 1e-3), np.zeros(1, bool))
+    data = Measured(4 * screen, noise, np.ones(screen.shape, bool), 0.0)
+    fit = CalibrationFit(("f_number",), np.array([8.0]), data, pictures, CalibrationSettings().for_noise(1e-3))
+    assert fit.solved().values[0] == pytest.approx(0.5, abs=1e-4)
+
+
+def test_a_minimum_beyond_what_a_scene_allows_is_refused():
+    """Parameters at -1 and 3, of which a scene allows the second up to 1.05: the error of the larger one.
+
+    Their slopes are nearly the same, the start at (1, 1) is 1.2 sd away. Seen to fail: (1.018, 1.024) without a word.
+    """
+    one, other = np.random.default_rng(1).random((2, 1, 8, 8))
+
+    def pictures(values):
+        if values[1] > 1.05:
+            raise OpticsError("the second must be <= 1.05")
+        power = values[0] * one + values[1] * (one + 0.03 * other)
+        return power, np.zeros_like(power)
+
+    noise = Noise(np.zeros_like(one), np.full(one.shape, 0.086), np.zeros(1, bool))
+    data = Measured(2 * one + 0.09 * other, noise, np.ones(one.shape, bool), 0.0)
+    fit = CalibrationFit(("a", "b"), np.ones(2), data, pictures, CalibrationSettings().for_noise(1e-3))
+    with pytest.raises(OpticsError, match="the second must be <="):
+        fit.solved()
 
 
 def test_variances_of_counts_follow_the_fitted_signal(scene):
