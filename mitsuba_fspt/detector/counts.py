@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
-from ..images.frame_file import FITS, TIFF, read_frame
+from ..images.frame_file import FIRST, FITS, TIFF, read_frame
 from ..images.tiff_pages import channels_of, read_tiff
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
@@ -52,6 +52,7 @@ class Counts:
     exposure_time : [s], None if the file does not state it
     binning : side of the square of pixels read out as one, None if the file does not state it
     pixel_pitch : of the pixels read out [mm], None if the file does not state it
+    top_row : 'first' or 'last' row of the file; None if it is a FITS file that does not state it
     info : `Key: value` lines of a click folder, those of the luminescent image first
     """
 
@@ -67,6 +68,7 @@ class Counts:
     raw: bool = False
     pixel_pitch: float | None = None
     levels: NDArray[np.float64] | None = None
+    top_row: str | None = FIRST
 
 
 def frame_of(given: Frame | Counts, name: str, frames: int | None = None) -> Counts:

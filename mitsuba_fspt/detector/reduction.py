@@ -204,6 +204,7 @@ def reduce_counts(
     if exposed.pixel_pitch is None and detector.pixel_pitch is None:
         exposed = replace(exposed, pixel_pitch=raw.pixel_pitch)
     _tell_time(raw, exposed)
+    _tell_rows(raw)
     shape = raw.values.shape
     full = full_pixels(detector, raw, "counts")
     rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)
@@ -233,6 +234,15 @@ def _tell_time(raw: Counts, exposed: Exposed) -> None:
             "fspt: reduce: 'exposure_time' is %g s, the file of the counts states %g s. The given one is used.",
             given,
             stated,
+        )
+
+
+def _tell_rows(raw: Counts) -> None:
+    """Say in one line on stderr that the file of the counts does not state which of its rows is the top one."""
+    if raw.top_row is None:
+        LOG.warning(
+            "fspt: reduce: the FITS file of the counts has no ROWORDER; its first row is taken for the top one. If the "
+            "image is upside down, set ROWORDER = BOTTOM-UP in all frames of this camera."
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,16 @@ from .tiff_pages import read_tiff, tell_left_out
 LOG = logging.getLogger("mitsuba_fspt")
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 UM_PER_MM = 1e3
+ROW_ORDER, BOTTOM_UP = "ROWORDER", "BOTTOM-UP"
+KEYWORDS = ("EXPTIME", "EXPOSURE", "XBINNING", "YBINNING", "XPIXSZ", "YPIXSZ", ROW_ORDER)  # of FITS headers
+FIRST, LAST = "first", "last"  # which row of a file is the top one
 
 
 def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     """Array of a .tif, .fits or .npy file as it is stored, row 0 at the top, and what a FITS header states.
 
-    The header's entries are `exposure_time` [s], `binning` and `pixel_pitch` [mm], as far as it has them.
+    The header's entries are `exposure_time` [s], `binning` and `pixel_pitch` [mm], as far as it has them, and
+    `top_row`, the row of the file that is the top one: 'first' or 'last', None if the header does not say it.
 
     thing : what the file is, for messages, such as "counts 'a.tif'"
 
@@ -50,6 +55,8 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     are told.
 
     EXPTIME or EXPOSURE in s, XBINNING, and XPIXSZ, the side of a binned pixel in µm, as imaging programs write them.
+    `top_row` is None where no ROWORDER says which row is the top one; the first is taken then. Pixels of integers that
+    are BLANK become NaN.
     """
     try:
         from astropy.io import fits
@@ -62,15 +69,10 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
             if not units:
                 raise ValueError("it holds no image")
             unit = units[0]
-            keys = ("EXPTIME", "EXPOSURE", "XBINNING", "YBINNING", "ROWORDER", "XPIXSZ", "YPIXSZ")
-            time, other, sides, rows, order, wide, high = (
-                unit.header.get(key, file[0].header.get(key)) for key in keys
-            )
-            time = other if time is None else time
+            header = {key: unit.header.get(key, file[0].header.get(key)) for key in KEYWORDS}
+            blank = unit.header.get("BLANK")
+            blank = None if blank is None else blank * unit.header.get("BSCALE", 1) + unit.header.get("BZERO", 0)
             data = np.asarray(unit.data)
-            found: dict[str, Any] = {} if time is None else {"exposure_time": float(time)}
-            found |= {} if sides is None else {"binning": int(sides)}
-            found |= {} if wide is None or high not in (None, wide) else {"pixel_pitch": float(wide) / UM_PER_MM}
     except Exception as cause:
         raise ImageError(
             f"{thing}: no readable FITS file: {one_line(cause, LONGEST_TEXT)}. Copy the file again."
@@ -84,8 +86,41 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     if len(units) > 1:
         names = ", ".join(unit.name or "without a name" for unit in units)
         tell_left_out(thing, f"{len(units)} images ({names})")
-    if None not in (sides, rows) and sides != rows:
-        raise ImageError(f"{thing}: binned {sides} x {rows}. Give a frame of square binning.")
-    if str(order).strip().upper() == "BOTTOM-UP" and data.ndim > 1:
+    if blank is not None and data.dtype.kind in "iu" and (empty := data == blank).any():
+        data = np.where(empty, np.nan, data)
+    found = _stated(header, thing)
+    if found["top_row"] == LAST:
+        LOG.warning("fspt: %s: its first row is the lowest one (ROWORDER = %s); it is turned.", thing, BOTTOM_UP)
         data = np.flip(data, axis=-2)
     return data, found
+
+
+def _stated(header: dict[str, Any], thing: str) -> dict[str, Any]:
+    """What the `KEYWORDS` of a FITS header state; one line on stderr says of each that should be a number and is not.
+
+    Raises ImageError for pixels that are not squares of the sensor's.
+    """
+    numbers = {key: _number(value, key, thing) for key, value in header.items() if key != ROW_ORDER}
+    sides, rows, wide, high = (numbers[key] for key in ("XBINNING", "YBINNING", "XPIXSZ", "YPIXSZ"))
+    if None not in (sides, rows) and sides != rows:
+        raise ImageError(f"{thing}: binned {sides:g} x {rows:g}. Give a frame of square binning.")
+    order = str(header[ROW_ORDER]).strip().upper()
+    found: dict[str, Any] = {"top_row": {"TOP-DOWN": FIRST, BOTTOM_UP: LAST}.get(order)}
+    time = numbers["EXPOSURE"] if numbers["EXPTIME"] is None else numbers["EXPTIME"]
+    found |= {} if time is None else {"exposure_time": time}
+    found |= {} if sides is None else {"binning": int(sides)}
+    return found | ({} if wide is None or high not in (None, wide) else {"pixel_pitch": wide / UM_PER_MM})
+
+
+def _number(value: object, key: str, thing: str) -> float | None:
+    """The value of a keyword as a number; None for one that is missing or, which is told, none."""
+    if value is None:
+        return None
+    try:
+        found = float(value)  # type: ignore[arg-type]  # a text may be a number
+    except (TypeError, ValueError):
+        found = math.nan
+    if math.isfinite(found):
+        return found
+    LOG.warning("fspt: %s: %s = %s is no number; it is left out.", thing, key, one_line(repr(value), LONGEST_TEXT))
+    return None

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.errors import LONGEST_TEXT, ImageError, one_line
+from ..runtime.errors import LONGEST_TEXT, BackendError, ImageError, one_line
 from ..runtime.extras import require
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ TAG = re.compile(r"TiffTag (\d+)")
 SMALLEST_PAGE = 18  # bytes of a page with one tag
 PRIVATE = 32768  # least number of a private tag, which says nothing about the pixels
 ORIENTATION = 274  # number of the tag; 1 where the first row is the top one and the first column that on the left
+CODECS = "imagecodecs"  # package of which tifffile takes LZW and further compressions
 CHANNELS = "CS"  # axes of tifffile: colours, and samples of a pixel
 
 
@@ -39,7 +40,7 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
     Raises
     ------
     ImageError : the file is no TIFF, or is damaged or incomplete, so that pixels or pages would be wrong.
-    BackendError : tifffile is not installed.
+    BackendError : tifffile is not installed, or imagecodecs, which the compression of the file needs.
     """
     require("tifffile", thing)
     import tifffile
@@ -53,6 +54,11 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
             inverted = series.keyframe.photometric == tifffile.PHOTOMETRIC.MINISWHITE
             missing = sum(page is None for page in series.pages)
     except Exception as cause:  # whatever a damaged file makes tifffile raise
+        if CODECS in str(cause):
+            raise BackendError(
+                f"{thing}: its compression needs {CODECS}, which is not installed. pip install {CODECS}, or save the "
+                "file without compression."
+            ) from cause
         raise _damaged(thing, cause) from cause
     if missing:
         raise _damaged(thing, f"{missing} of its {len(series.pages)} pages are missing")

@@ -304,7 +304,7 @@ def test_another_exposure_time_in_the_file_is_reported(tmp_path, caplog):
     """EXPTIME of 60 s says nothing beside 60 s, and one line beside 30 s, which are used."""
     fits = pytest.importorskip("astropy.io.fits")
     hdu = fits.PrimaryHDU(CCD.expose(ramp(), 60, 650, seed=1).counts)
-    hdu.header["EXPTIME"] = 60.0
+    hdu.header.update({"EXPTIME": 60.0, "ROWORDER": "TOP-DOWN"})
     hdu.writeto(tmp_path / "a.fits")
     CCD.reduce(tmp_path / "a.fits", **SETTINGS)
     assert not caplog.records
@@ -314,8 +314,11 @@ def test_another_exposure_time_in_the_file_is_reported(tmp_path, caplog):
     assert "'exposure_time' is 30 s, the file of the counts states 60 s" in told
 
 
-def test_rows_of_fits_files(tmp_path):
-    """ROWORDER = BOTTOM-UP turns the rows over, a binning that is not square is refused, and colour, too."""
+def test_rows_of_fits_files(tmp_path, caplog):
+    """ROWORDER = BOTTOM-UP turns the rows over, a binning that is not square is refused, and colour, too.
+
+    One line says that rows are turned, or that the header leaves it open. Seen to fail: neither was told.
+    """
     fits = pytest.importorskip("astropy.io.fits")
     from mitsuba_fspt.detector.counts import read_counts
 
@@ -325,12 +328,48 @@ def test_rows_of_fits_files(tmp_path):
         hdu.header["ROWORDER"] = order
         hdu.writeto(tmp_path / "a.fits", overwrite=True)
         np.testing.assert_array_equal(read_counts(tmp_path / "a.fits").values, rows)
+        assert ("it is turned" in caplog.text) == (order == "BOTTOM-UP")
+    fits.PrimaryHDU(counts).writeto(tmp_path / "open.fits")
+    np.testing.assert_array_equal(read_counts(tmp_path / "open.fits").values, counts)
+    CCD.reduce(tmp_path / "open.fits", **SETTINGS)
+    assert caplog.text.count("has no ROWORDER; its first row is taken for the top one") == 1
     hdu.header.update({"XBINNING": 1, "YBINNING": 2})
     hdu.writeto(tmp_path / "a.fits", overwrite=True)
     with pytest.raises(ImageError, match="binned 1 x 2"):
         read_counts(tmp_path / "a.fits")
     with pytest.raises(ImageError, match="got uint16 of shape"):
         CCD.reduce(np.ones((20, 30, 3), np.uint16), **SETTINGS)
+
+
+@pytest.mark.parametrize("wrong", ["60.0 s", "", "inf"])
+def test_a_keyword_that_is_no_number_is_left_out(tmp_path, caplog, wrong):
+    """Of an exposure time and a binning. Seen to fail: the file was refused as damaged, with the fix to copy it."""
+    fits = pytest.importorskip("astropy.io.fits")
+    from mitsuba_fspt.detector.counts import read_counts
+
+    header = fits.Header({"EXPTIME": wrong, "XBINNING": wrong, "XPIXSZ": 13.5})
+    fits.PrimaryHDU(np.ones((3, 4), np.uint16), header).writeto(tmp_path / "a.fits")
+    found = read_counts(tmp_path / "a.fits")
+    assert (found.exposure_time, found.binning, found.pixel_pitch) == (None, None, 0.0135)
+    assert f"EXPTIME = {wrong!r} is no number" in caplog.text
+
+
+def test_blank_pixels_of_unsigned_counts_are_refused(tmp_path):
+    """Counts of 16 bits without a sign, of which one is BLANK. Seen to fail: 32775 DN of light on that pixel."""
+    fits = pytest.importorskip("astropy.io.fits")
+    from mitsuba_fspt.detector.counts import read_counts
+
+    hdu = fits.PrimaryHDU(np.arange(12, dtype=np.uint16).reshape(3, 4) + 32768)
+    hdu.writeto(tmp_path / "a.fits")
+    for blank, held in ((99, False), (7, True)):
+        with fits.open(tmp_path / "a.fits", do_not_scale_image_data=True) as file:
+            file[0].header["BLANK"] = blank
+            file.writeto(tmp_path / "b.fits", overwrite=True)
+        if held:
+            with pytest.raises(ImageError, match="hold 1 NaN"):
+                read_counts(tmp_path / "b.fits")
+        else:
+            assert read_counts(tmp_path / "b.fits").raw
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".fits"])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import struct
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from mitsuba_fspt.detector.counts import read_counts
 from mitsuba_fspt.images.tiff_pages import read_tiff
-from mitsuba_fspt.runtime.errors import ImageError
+from mitsuba_fspt.runtime.errors import BackendError, ImageError
 
 tifffile = pytest.importorskip("tifffile", reason="the extra 'formats' is not installed")
 FRAMES = np.arange(3 * 6 * 5, dtype=np.uint16).reshape(3, 6, 5)
@@ -108,6 +109,17 @@ def test_frames_over_time_or_depth_are_a_stack(tmp_path):
     for axes in ("TYX", "ZYX"):
         tifffile.imwrite(tmp_path / "counts.tif", FRAMES, ome=True, metadata={"axes": axes})
         assert read_counts(tmp_path / "counts.tif").frames == 3
+
+
+@pytest.mark.skipif(find_spec("imagecodecs") is not None, reason="imagecodecs is installed")
+def test_a_compression_without_its_package_is_named(tmp_path):
+    """LZW, which tifffile reads with imagecodecs alone. Seen to fail: the file was called damaged."""
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "lzw.tif", np.ones((4, 5), np.uint16))
+    with tifffile.TiffFile(tmp_path / "lzw.tif", mode="r+") as file:
+        file.pages[0].tags["Compression"].overwrite(5)
+    with pytest.raises(BackendError, match=r"needs imagecodecs, which is not installed\. pip install imagecodecs, or"):
+        read_counts(tmp_path / "lzw.tif")
 
 
 def test_pages_in_a_circle_are_refused(stack):
