@@ -20,6 +20,7 @@ from .table import read_table, whole_numbers
 
 # Columns of a .param by its kind; the third one is n.
 COLUMNS = {"stnd": 3, "blt": 3, "fluor": 8}
+TETGEN = "A TetGen .node has to be converted, for example by meshio to VTU."
 
 
 def read_nirfast(mesh: Path) -> RawMesh:
@@ -30,12 +31,15 @@ def read_nirfast(mesh: Path) -> RawMesh:
     FluxError : a file is missing or of another layout (TetGen's, or a mesh of triangles).
     """
     stem = mesh.with_suffix("") if mesh.suffix.lower() in (".node", ".elem", ".param") else mesh
-    nodes, _ = read_table(stem.with_name(f"{stem.name}.node"))
+    try:
+        nodes, _ = read_table(stem.with_name(f"{stem.name}.node"))
+    except FluxError as cause:  # TetGen's first line has as many columns as the others by chance only
+        raise FluxError(f"NIRFAST: {cause} {TETGEN}") from cause
     elements, _ = read_table(stem.with_name(f"{stem.name}.elem"))
     if nodes.shape[1] != 4 or not np.isin(nodes[:, 0], (0, 1)).all():
         raise FluxError(
             f"NIRFAST: lines of '{stem}.node' must be 'boundary x y z', boundary 0 or 1, these have "
-            f"{nodes.shape[1]} columns. A TetGen .node has to be converted, for example by meshio to VTU."
+            f"{nodes.shape[1]} columns. {TETGEN}"
         )
     if elements.shape[1] != 4:
         raise FluxError(
