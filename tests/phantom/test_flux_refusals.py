@@ -217,6 +217,23 @@ def test_gmsh_values_of_no_node(tmp_path, old, new, message):
         import_flux(path)
 
 
+def test_values_of_triangles_in_another_order_than_the_tetrahedra(tmp_path):
+    """One value a boundary face, of a file that lists these as triangles: its order, where it is the same, or no mesh.
+
+    Seen to fail: the values of the triangles came on other faces.
+    """
+    values = np.arange(1.0, 5)
+    faces = import_flux((POINTS, ELEMENT), values, per="face").faces
+    for turned, order in ((False, [0, 1, 2, 3]), (True, [2, 0, 3, 1])):
+        mesh = meshio.Mesh(POINTS, [("tetra", ELEMENT), ("triangle", faces[order])])
+        mesh.write(tmp_path / "m.mesh")
+        if turned:
+            with pytest.raises(FluxError, match=r"values: 4 values fit the boundary faces.* order is another one"):
+                import_flux(tmp_path / "m.mesh", values, per="face")
+        else:
+            np.testing.assert_array_equal(import_flux(tmp_path / "m.mesh", values, per="face").exitance, values)
+
+
 def test_one_real_field_is_found_among_labels_and_vectors(tmp_path):
     mesh = meshio.Mesh(
         POINTS,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...runtime.errors import BackendError, FluxError, one_line
+from ..surface_mesh import Indices
 from .gmsh import put_in_order
 from .raw import Field, RawMesh, scalars
 from .table import require_file
@@ -53,17 +54,24 @@ def read_meshio(path: Path) -> RawMesh:
     if FORMATS.get(path.suffix.lower()) == "gmsh" and _has_values(mesh):
         put_in_order(mesh, path)
     blocks = [k for k, block in enumerate(mesh.cells) if block.type in wanted]
-    cells = np.concatenate([mesh.cells[k].data[:, : wanted[mesh.cells[k].type]] for k in blocks]).astype(np.int64)
+    cells = _corners(mesh, wanted)
     fields = [Field(name, values, "vertex") for name, values in mesh.point_data.items()]
-    source = path.name
+    source, triangles = path.name, None
     if kinds & set(TRIANGLES) and kinds & set(TETRAHEDRA):
+        triangles = _corners(mesh, TRIANGLES)
         # Either kind may carry the values; a guess could be wrong.
         source += " (its cell data passed over: both on triangles and on tetrahedra)"
     else:
         for name, data in mesh.cell_data.items():
             if not name.startswith(LABELS):
                 fields.append(Field(name, np.concatenate([data[k] for k in blocks]), "cell"))
-    return RawMesh(np.asarray(mesh.points, np.float64), cells, source, scalars(fields))
+    return RawMesh(np.asarray(mesh.points, np.float64), cells, source, scalars(fields), triangles=triangles)
+
+
+def _corners(mesh: Any, kinds: dict[str, int]) -> Indices:
+    """Corner nodes of the cells of these kinds, in the order of the file."""
+    found = [block.data[:, : kinds[block.type]] for block in mesh.cells if block.type in kinds]
+    return np.concatenate(found).astype(np.int64)
 
 
 def _has_values(mesh: Any) -> bool:

@@ -45,6 +45,7 @@ class RawMesh:
         face
     point_order : False if the file defines no order of the vertices (STL), so that values cannot refer to it
     index : refractive index at the points (V,), NaN if the parameter file does not contain it; None without such a file
+    triangles : of a file of tetrahedra that lists triangles, too (F, 3), in its order; else None
     """
 
     points: Points
@@ -54,6 +55,7 @@ class RawMesh:
     quantity: str = "exitance"
     point_order: bool = True
     index: NDArray[np.float64] | None = None
+    triangles: Indices | None = None
 
     def __post_init__(self) -> None:
         points, cells = self.points, self.cells
@@ -107,6 +109,8 @@ def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceV
         faces, owner = mesh.cells, np.arange(len(mesh.cells))
     chosen = _choose(mesh, name, per)
     on = chosen.on or _carrier(chosen, mesh, len(faces), per)
+    if on == "face" and mesh.triangles is not None:
+        _require_same_order(mesh.triangles, faces, chosen.name)
     vertices, faces, kept = compact(mesh.points, faces)
     if on == "vertex":
         if not mesh.point_order:
@@ -120,6 +124,15 @@ def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceV
     per = "vertex" if on == "vertex" else "face"
     index = None if mesh.index is None else mesh.index[kept]
     return SurfaceValues(vertices, faces, values.astype(np.float64), per, chosen.name, index)
+
+
+def _require_same_order(triangles: Indices, faces: Indices, name: str) -> None:
+    """Raise FluxError for values of the boundary `faces` of a file that lists as many triangles in another order."""
+    if len(triangles) == len(faces) and not np.array_equal(np.sort(triangles, axis=1), np.sort(faces, axis=1)):
+        raise FluxError(
+            f"{name}: {len(faces)} values fit the boundary faces, tetrahedron by tetrahedron, and the triangles of the "
+            "file, whose order is another one. Give a mesh of the triangles alone, or of the tetrahedra alone."
+        )
 
 
 def _choose(mesh: RawMesh, name: str | None, per: str | None) -> Field:
