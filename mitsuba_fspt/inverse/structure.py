@@ -245,7 +245,9 @@ def _causes(
         best_log.append(float(min(likely, 0.0)))
         taken = _span(np.concatenate([effects[k] for k in found], axis=1))
     joint = np.concatenate([effects[k] for k in found], axis=1) if found else np.empty((len(score), 0))
-    fitted = np.linalg.pinv(joint)
+    # Of length 1: the effect of a background of 1 W a pixel is so long that `pinv` would leave out all others.
+    lengths = np.linalg.norm(joint, axis=0).clip(1e-300)
+    fitted = np.linalg.pinv(joint / lengths) / lengths[:, None]
     # Not from the inverse of the normal equations, whose diagonal rounding makes negative where effects nearly depend.
     size, sd, causes, first = fitted @ score, np.linalg.norm(fitted, axis=1), list[Cause](), 0
     for k, log in zip(found, best_log, strict=True):

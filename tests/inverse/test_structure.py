@@ -102,6 +102,26 @@ def test_a_cause_is_named_with_its_size(kind, where, sizes):
     assert 0.4 < np.sqrt((z**2).mean()) < 1.6
 
 
+def test_causes_of_all_units_have_sizes_beside_each_other():
+    """A factor and a background, in W a pixel, of images as dim as a camera's: sizes as of those of 1 W.
+
+    Seen to fail: beside a background of 1e-20 W every other cause had the size 0 ± 0.
+    """
+    found = []
+    for watt in (1.0, 1e-18):
+        model = Linear()
+        model.views = views_of(VIEWS, watt * model.signal, model.rows, watt * model.sigma)
+        patterns = Patterns.of(model.views)
+        columns = patterns.columns.toarray() * patterns.lengths
+        known = {(one.kind, one.where): one.columns[0] for one in patterns.causes}
+        extra = 0.1 * columns[:, known["factor", "view=90"]] + 0.02 * watt * columns[:, known["background", "view=0"]]
+        causes = model.found(model.residual(np.random.default_rng(7), extra)).causes
+        assert {one.kind for one in causes} == {"factor", "background"}
+        units = [watt if one.kind == "background" else 1.0 for one in causes]
+        found.append([x / unit for one, unit in zip(causes, units, strict=True) for x in (one.size[0], one.sd[0])])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-5)
+
+
 def test_what_the_fit_absorbs_is_no_cause():
     """With a factor of each view among the unknowns, of 5 % uncertainty, no factor is named, whatever the residual is.
 
